@@ -1,7 +1,7 @@
 """Errors and levels of the filter in simulated streets: ``python tests/city_score.py FIRST LAST``.
 
 Runs of 20 minutes of the shipped scenario ``city``, seeds FIRST to LAST, two antennas, 1 Hz or ``--rate``; other
-options go to ``railfix run`` (``--set tracking.level=on`` for levels). A line for each antenna with an error beyond
+options go to ``railfix run`` (``--set tracking.level=off`` to do without levels). A line for each antenna with an error beyond
 10 m where the status says that the place is known, or over its level.
 """
 

@@ -367,7 +367,7 @@ def test_messages_of_the_demonstration(logs: dict[str, tuple[Observations, ...]]
 
 
 def test_bounds_of_the_filter_where_it_has_a_level(logs: dict[str, tuple[Observations, ...]]) -> None:
-    engine = LiveEngine(processor("front", filter="track", tracking={"level": "on"}), LiveSettings())
+    engine = LiveEngine(processor("front", filter="track"), LiveSettings())
     outputs = played(engine, [(tag_ns(epoch), "front", epoch) for epoch in logs["front"][:40]])
     output = outputs[-2]
     assert output.result is not None

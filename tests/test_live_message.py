@@ -23,7 +23,7 @@ from railfix.tracking import TrackStatus
 def test_no_bound_of_a_position_that_failed_a_check_goes_out_as_coasting() -> None:
     """Codes that contradict the place after a tunnel are left out, though the single epoch has a level."""
     processor = EpochProcessor(
-        parse_config({"filter": "track"}),
+        parse_config({"filter": "track", "tracking": {"level": "off"}}),
         {"front": clean_trajectories()["front"]},
         navigation=read_navigation(demo_files()["nav"]),
     )

@@ -335,7 +335,7 @@ def test_messages_and_rows_of_the_filter_are_those_of_the_run(tmp_path: Path) ->
         railfix.write_observations(railfix.read_observations(files[name])[:70], path)
     common = ["--front", str(parts["front"]), "--rear", str(parts["rear"]), "--track", str(files["track"])]
     common += ["--vehicle", str(files["vehicle"]), "--nav", str(files["nav"])]
-    common += ["--set", "tracking.level=on", "--reference", "centre"]
+    common += ["--reference", "centre"]
     send = [f"json@{tmp_path / 'messages'}", f"train@{tmp_path / 'train'}", f"positions@{tmp_path / 'positions'}"]
     words = [word for text in send for word in ("--send", text)]
     done = RUNNER.invoke(app, ["live", *common, "--live", "no_input=skip", *words])

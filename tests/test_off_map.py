@@ -83,7 +83,7 @@ def test_the_filter_begins_anew_when_the_train_comes_back() -> None:
 def on_moved_map(across_m: float = 0.0, up_m: float = 0.0, risk: float = 1e-3) -> tuple[AntennaResult, Tracked]:
     """The demonstration, one epoch a second, on a line moved aside or up, with the filter's answer."""
     line = moved(clean_trajectories()["front"], across_m=across_m, up_m=up_m)
-    config = parse_config({"filter": "track", "tracking": {"level": "on"}, "map_offset": {"risk": risk}})
+    config = parse_config({"filter": "track", "map_offset": {"risk": risk}})
     processor = EpochProcessor(config, {"front": line}, navigation=read_navigation(demo_files()["nav"]))
     result, _ = processor.process({"front": demo_observations()["front"][::10]})
     return result.antennas["front"], result.fusion["front"].tracked

@@ -470,7 +470,7 @@ def test_places_are_doubtful_for_a_while_after_the_antennas_have_disagreed(cuts:
 def test_filtered_places_that_are_not_apart_as_the_antennas_are_doubtful(screens: list[str]) -> None:
     """The log of the front antenna is given for both; with the rear one's own there is no doubt."""
     parts = {name: log[:60] for name, log in clean_observations().items()}
-    one = processor({"screens": screens, "filter": "track", "tracking": {"level": "on"}})
+    one = processor({"screens": screens, "filter": "track"})
     good, _ = one.process(parts)
     wrong, _ = one.process({"front": parts["front"], "rear": parts["front"]})
     judged = "antenna_spacing" in screens

@@ -168,7 +168,7 @@ def test_the_summary_of_a_run_has_the_level_of_the_filter(tmp_path: Path) -> Non
     options = [word for name, path in files.items() for word in (f"--{name}", path)]
     done = CliRunner().invoke(
         app,
-        ["run", *options, "--end", "2024-03-05T03:10:10", "--set", "tracking.level=on", "--out", str(tmp_path / "out")],
+        ["run", *options, "--end", "2024-03-05T03:10:10", "--out", str(tmp_path / "out")],
         env={"COLUMNS": "100"},
     )
     assert done.exit_code == 0, done.output

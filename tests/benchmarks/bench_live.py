@@ -4,7 +4,8 @@ Prints median, 99th percentile and largest time an epoch, wall and processor tim
 run that comes with railfix, or over another simulated one::
 
     python tests/benchmarks/bench_live.py [--run FOLDER] [--epochs 1500] [--rounds 3] [--screens all|mask]
-                                          [--filter off|track] [--gap 600]
+                                          [--filter off|track] [--level on|off]
+                                          [--gap 600]
 
 The last line has the least processor time of the rounds at each epoch, which other work on the machine changes least.
 With ``--gap`` that many seconds are left out in the middle, and the slowest of the 20 epochs after them is printed; the
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 from railfix import kernels
 from railfix.gnss.observations import Observations
 from railfix.io.rinex import read_navigation, read_observations
-from railfix.pipeline.config import Config
+from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.run.processor import processor_of
 from railfix.simulate.demo_data import demo_files
@@ -89,10 +90,12 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--screens", choices=("all", "mask"), default="all", help="mask: elevation only")
     parser.add_argument("--filter", choices=("off", "track"), default="off")
+    parser.add_argument("--level", choices=("on", "off"), default="on", help="of the filter")
     parser.add_argument("--gap", type=float, default=0.0, help="seconds left out, as while nothing is received")
     parser.add_argument("--profile", action="store_true", help="print where the time goes, for one more round")
     options = parser.parse_args()
-    config = Config(filter=options.filter, **({"screens": ("elevation",)} if options.screens == "mask" else {}))
+    screens = {"screens": ["elevation"]} if options.screens == "mask" else {}
+    config = parse_config({"filter": options.filter, "tracking": {"level": options.level}, **screens})
     gap = round(options.gap / PERIOD_S)
     loaded = kernels.load()
     processor, observations = prepared(options.run, options.epochs + WARM_UP + gap, config)

@@ -4,7 +4,7 @@ The two 86 MB logs are simulated first (or taken from ``--run``). Both programs 
 started in turn; medians of the rounds, and their ratio, are printed::
 
     python tests/benchmarks/bench_run.py [--run FOLDER] [--rounds 3] [--screens all|mask] [--filter off|track]
-        [--hours 3]
+        [--level on|off] [--hours 3]
 """
 
 from __future__ import annotations
@@ -80,10 +80,10 @@ def simulate(folder: Path, hours: int = 1) -> None:
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 
-def railfix_command(folder: Path, out: Path, config: Path | None, tracking: str) -> list[str]:
+def railfix_command(folder: Path, out: Path, config: Path | None, tracking: list[str]) -> list[str]:
     command = [sys.executable, "-m", "railfix", "run", "--front", f"{folder}/front.rnx", "--rear", f"{folder}/rear.rnx"]
     command += ["--nav", f"{folder}/nav.rnx", "--track", f"{folder}/track.csv", "--vehicle", f"{folder}/vehicle.toml"]
-    command += ["--filter", tracking]
+    command += tracking
     return [*command, "--out", str(out), *(["--config", str(config)] if config else [])]
 
 
@@ -103,7 +103,7 @@ def line(name: str, rounds: list[Spent]) -> float:
 
 
 def compare(
-    folder: Path, scratch: Path, *, rounds: int, config: Path | None, tracking: str, hours: int = 1
+    folder: Path, scratch: Path, *, rounds: int, config: Path | None, tracking: list[str], hours: int = 1
 ) -> tuple[float, float]:
     """Print what both programs take, and return their wall times; rnx2rtkp's is NaN where it is not installed."""
     own: list[Spent] = []
@@ -132,7 +132,7 @@ def compare(
     return wall, theirs
 
 
-def profiled(folder: Path, scratch: Path, config: Path | None, tracking: str) -> None:
+def profiled(folder: Path, scratch: Path, config: Path | None, tracking: list[str]) -> None:
     from railfix.cli import main as railfix_main
 
     def once() -> None:
@@ -155,6 +155,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--screens", choices=("all", "mask"), default="all", help="mask: as RTKLIB, elevation only")
     parser.add_argument("--filter", choices=("off", "track"), default="off", help="off: single epochs, as rnx2rtkp")
+    parser.add_argument("--level", choices=("on", "off"), default="on", help="of the filter")
     parser.add_argument("--hours", type=int, default=1, help="longer logs as well: what each further hour takes")
     parser.add_argument("--profile", action="store_true", help="print where the time of one more run goes")
     options = parser.parse_args()
@@ -168,21 +169,22 @@ def main() -> None:
             config = scratch / "mask.toml"
             config.write_text(MASK_ONLY)
         size = sum((folder / f"{a}.rnx").stat().st_size for a in ("front", "rear")) / 1e6
-        what = f"screens: {options.screens}, filter: {options.filter}"
+        what = f"screens: {options.screens}, filter: {options.filter}, its level: {options.level}"
+        tracking = ["--filter", options.filter, "--set", f"tracking.level={options.level}"]
         print(f"two logs of an hour at 10 Hz, {size:.0f} MB in all, {what}")
-        chosen: dict[str, Any] = {"rounds": options.rounds, "config": config, "tracking": options.filter}
+        chosen: dict[str, Any] = {"rounds": options.rounds, "config": config, "tracking": tracking}
         first = compare(folder, scratch, **chosen)
         if options.hours > 1:
             longer = scratch / "hours"
             simulate(longer, options.hours)
             print(f"logs of {options.hours} hours")
-            command = railfix_command(longer, scratch / "first", config, options.filter)
+            command = railfix_command(longer, scratch / "first", config, tracking)
             line("railfix run, their first hour", [run([*command, *first_hour(longer)])])
             whole = compare(longer, scratch, hours=options.hours, **chosen)
             own, theirs = ((b - a) / (options.hours - 1) for a, b in zip(first, whole, strict=True))
             print(f"a further hour: railfix {own:.2f} s, rnx2rtkp {theirs:.2f} s, {theirs / own:.2f} times as fast")
         if options.profile:
-            profiled(folder, scratch, config, options.filter)
+            profiled(folder, scratch, config, tracking)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ The two logs of an hour at 10 Hz of `bench_run.py` are simulated first, or taken
 without the stages inside it, the least of the rounds; threads that polars starts count as everything else.
 ``RAILFIX_KERNELS`` chooses the kernels::
 
-    python tests/benchmarks/bench_stages.py [--run FOLDER] [--rounds 3] [--filter off|track]
+    python tests/benchmarks/bench_stages.py [--run FOLDER] [--rounds 3] [--filter off|track] [--level on|off]
 """
 
 from __future__ import annotations
@@ -125,11 +125,12 @@ def main() -> None:
     parser.add_argument("--run", type=Path, help="folder of a simulated run, made with --plain")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--filter", choices=("off", "track"), default="off")
+    parser.add_argument("--level", choices=("on", "off"), default="on", help="of the filter")
     options = parser.parse_args()
     if "PYTHONDONTWRITEBYTECODE" in os.environ:  # an installed package has its compiled modules
         compileall.compile_dir(Path(railfix.__file__).parent, quiet=1)
         os.execve(sys.executable, [sys.executable, *sys.argv], bench_run.as_installed())
-    from railfix.pipeline.config import Config
+    from railfix.pipeline.config import parse_config
     from railfix.run import RunInputs, RunOptions, run_files
 
     with tempfile.TemporaryDirectory(prefix="railfix-bench-") as scratch:
@@ -149,9 +150,8 @@ def main() -> None:
         for number in range(options.rounds + 1):
             stages.spent.clear()
             begin = time.process_time()
-            summary = run_files(
-                inputs, Config(filter=options.filter), out=Path(scratch) / f"out{number}", options=RunOptions(workers=1)
-            )
+            config = parse_config({"filter": options.filter, "tracking": {"level": options.level}})
+            summary = run_files(inputs, config, out=Path(scratch) / f"out{number}", options=RunOptions(workers=1))
             whole = time.process_time() - begin
             epochs = summary.tally.epochs
             spent = {**stages.spent, "all": whole, "everything else": whole - sum(stages.spent.values())}

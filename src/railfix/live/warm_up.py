@@ -17,7 +17,7 @@ from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 #: Settings and numbers of epochs that together call every kernel; the second run has too few satellites for 3-D.
 _RUNS = (
-    ({"filter": "track", "tracking": {"level": "on"}}, 60),
+    ({"filter": "track"}, 60),
     ({"systems": ["G"], "elevation": {"mask_deg": 45.0}, "protection": "off"}, 5),
 )
 

@@ -42,7 +42,7 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "branch_probability": "probability of the place given against other places of the line",
     "hypotheses": "places that are possible",
     "protection_level_m": "the error exceeds it with the stated risk, a fault of one source included; infinite without "
-    "a sub-filter and where the weights contradict the track, empty where `tracking.level` is off",
+    "a sub-filter and where the weights contradict the track, empty with `tracking.level` off",
     "protection_noise_m": "its part by noise without a fault",
     "protection_separation_m": "largest distance of a sub-filter without one satellite, constellation or sensor",
     "over_reading_m": "how far the train may be behind: the level, at least 2 % of the way since codes were used",

@@ -90,7 +90,7 @@ class TrackingLimits(Settings):
     bend_m : float
         Where motion contradicts the track at an epoch, places so far before and behind (and twice as far) are tried.
     level : {"on", "off"}
-        Whether a bank of sub-filters gives a protection level; off for what it costs, as many filters as satellites.
+        Whether a bank of sub-filters gives a protection level; it costs as many filters as there are satellites.
     level_period_s : float
         Time between the epochs that the bank takes: codes of neighbouring epochs have the same errors.
     level_acceleration_mps2 : float
@@ -158,7 +158,7 @@ class TrackingLimits(Settings):
     lost_code_weight: float = Field(default=0.5, ge=0)
     lost_code_s: float = Field(default=12.0, gt=0)
     bend_m: float = Field(default=20.0, gt=0)
-    level: Literal["on", "off"] = "off"
+    level: Literal["on", "off"] = "on"
     level_period_s: float = Field(default=1.0, gt=0)
     level_acceleration_mps2: float = Field(default=3.0, ge=0)
     level_risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
