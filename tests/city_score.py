@@ -1,8 +1,8 @@
 """Errors and levels of the filter in simulated streets: ``python tests/city_score.py FIRST LAST``.
 
 Runs of 20 minutes of the shipped scenario ``city``, seeds FIRST to LAST, two antennas, 1 Hz or ``--rate``; other
-options go to ``railfix run`` (``--set tracking.level=off`` to do without levels). A line for each antenna with an error beyond
-10 m where the status says that the place is known, or over its level.
+options go to ``railfix run`` (``--set tracking.level=off`` to do without levels). A line for each antenna with an error
+beyond 10 m where the status says that the place is known, or over its level.
 """
 
 from __future__ import annotations

@@ -239,8 +239,9 @@ def checked(
         disagreed[1:], error = np.where(spacing.reject, time, np.datetime64("NaT", "ns")), spacing.metric
     disagreed = np.fmax.accumulate(disagreed)
     held = seconds(time - disagreed[1:]) <= held_s
-    doubtful = held & np.isin(result.tracked.status, BOUNDED)
-    tracked = _doubted(result.tracked, doubtful, TrackStatus.ANTENNAS_DISAGREE)
+    tracked = result.tracked
+    if held.any():
+        tracked = _doubted(tracked, held & np.isin(tracked.status, BOUNDED), TrackStatus.ANTENNAS_DISAGREE)
     return replace(result, tracked=tracked, spacing_error_m=error), replace(state, disagreed=disagreed[-1])
 
 

@@ -165,6 +165,9 @@ def sensor_epochs(
     surroundings : Surroundings, optional
         Features of the line and ground units.
     """
+    if not (samples or state.samples):
+        last = time[-1] if len(time) else state.time
+        return SensorEpochs(), nothing_sensed(len(time)), replace(state, time=last)
     samples = samples or SensorSamples()
     pulses = _together(state.samples.tachometer, samples.tachometer)
     inertial = _together(state.samples.inertial, samples.inertial)

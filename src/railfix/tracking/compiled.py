@@ -32,6 +32,7 @@ _ALWAYS: Final = np.array([
 ])  # fmt: skip
 #: Unknowns of sensors, as the kernel names them, and the columns of measurements that need them.
 _SENSORS: Final = ((Unknown.WHEEL, 0), (Unknown.FORCE_OFFSET, 2), (Unknown.RADAR, 1))
+_OF_SENSORS: Final = np.isin(np.arange(OFFSETS), [unknown for unknown, _ in _SENSORS])
 #: Unknowns of an epoch, as the kernel orders them after those in use.
 _OF_EPOCH: Final = np.array([
     Unknown.BEFORE, Unknown.SPEED_BEFORE, Unknown.PHASE_CLOCK, Unknown.STEP_RIGHT, Unknown.STEP_UP, Unknown.STEP_ALONG,
@@ -195,7 +196,7 @@ class Compiled:
         channels = np.flatnonzero(chunk.has[:, first:last].any(axis=(0, 1)))
         correlated[OFFSETS + chunk.offset[channels]] = True
         correlated[SATELLITES + chunk.slot[channels]] = True
-        correlated[:OFFSETS] &= np.isin(np.arange(OFFSETS), [unknown for unknown, _ in _SENSORS])
+        correlated[:OFFSETS] &= _OF_SENSORS
         return np.concatenate([_ALWAYS, np.flatnonzero(correlated)]).astype(np.intp)
 
     def _take_back(self, state: TrackState, full: Indices, memory: Any, sub: Any, first: int, done: int) -> None:
