@@ -20,7 +20,7 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
 from railfix.ranges.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
 from railfix.run.processor import processor_of
-from railfix.run.sensors import read_sensors, until
+from railfix.run.sensors import read_sensors
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
 from railfix.simulate.sbas.service import sbas_messages, write_sbas
@@ -218,7 +218,7 @@ def ridden(bench: Bench) -> Campaign:
     received = np.datetime64("NaT", "ns")
     for piece in bench.pieces():
         end = max(p.observations.time[-1] for p in piece.values())
-        since, received = until(bench.sensors, received, end), end
+        since, received = bench.sensors.between(received, end), end
         for antenna, one in piece.items():
             geometry = one.geometry
             truths[antenna].append(

@@ -19,7 +19,7 @@ from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import State
 from railfix.run.processor import processor_of
-from railfix.run.sensors import read_sensors, read_units, until
+from railfix.run.sensors import read_sensors, read_units
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario_file import load_recipe
@@ -82,7 +82,7 @@ class Ride:
         for first, last in zip([0, *cuts], [*cuts, len(whole)], strict=True):
             chunk = whole[first:last]
             end = chunk.time[-1]
-            result, state = processor.process({"front": chunk}, state, sensors=until(samples, received, end))
+            result, state = processor.process({"front": chunk}, state, sensors=samples.between(received, end))
             received = end
             parts.append(result.fusion["front"])
         return joined(parts)

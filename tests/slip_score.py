@@ -22,7 +22,6 @@ from railfix.motion.slip import MotionState, SlipLimits, SlipResult, find_slips
 from railfix.motion.tachometer import way_m
 from railfix.pipeline import sensed_motion as stage
 from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, sensor_epochs
-from railfix.run.sensors import until
 from railfix.simulate import Simulation
 from railfix.simulate.scenario_file import load_recipe
 from railfix.simulate.sensors.wheel import wheel_slips
@@ -106,7 +105,7 @@ def scored(simulation: Simulation, scores: dict[str, Score]) -> None:
             for k, time in enumerate(begin + timedelta(edges_s)):
                 if state.motion.tick:
                     state = replace(state, motion=replace(state.motion, arc_m=float(place[k - 1])))
-                heard = until(samples, state.time, time)
+                heard = samples.between(state.time, time)
                 _, _, state = sensor_epochs(
                     heard, np.array([time]), trajectory, state,
                     limits=given, sine_at=sine_at, sources=("wheel", "force"),

@@ -12,7 +12,7 @@ from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.timescale import timedelta
 from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
 from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, sensor_epochs
-from railfix.run.sensors import check_units, read_sensors, read_units, until
+from railfix.run.sensors import check_units, read_sensors, read_units
 from tracking_cases import START, bent_line
 
 LIMITS = SensorLimits()
@@ -118,7 +118,7 @@ def test_any_cutting_gives_the_same(cuts: list[int]) -> None:
     state, received, parts = SensorState.empty(), np.datetime64("NaT", "ns"), []
     for begin, end in zip([0, *cuts], [*cuts, len(EPOCHS)], strict=True):
         now = EPOCHS[end - 1]
-        part, _, state = sensor_epochs(until(samples, received, now), EPOCHS[begin:end], line, state, limits=LIMITS)
+        part, _, state = sensor_epochs(samples.between(received, now), EPOCHS[begin:end], line, state, limits=LIMITS)
         received = now
         parts.append(part)
         # Of a long log only the samples that the next epoch needs are kept.

@@ -35,6 +35,21 @@ def live(
         list[Path] | None,
         typer.Option("--nav", metavar="FILE", help="Navigation files known from the start."),
     ] = None,
+    tachometer: Annotated[
+        str | None,
+        typer.Option(
+            "--tachometer",
+            metavar="SOURCE",
+            help="Pulses of a tachometer: the rows of the table of `railfix run` as lines of CSV, header first, from a "
+            "source as of --front; or the whole table, a file. A row with the time alone says that no pulse came.",
+        ),
+    ] = None,
+    inertial: Annotated[
+        str | None, typer.Option("--inertial", metavar="SOURCE", help="The same of an inertial unit.")
+    ] = None,
+    radar: Annotated[
+        str | None, typer.Option("--radar", metavar="SOURCE", help="The same of the speeds of a Doppler radar.")
+    ] = None,
     live_setting: Annotated[
         list[str] | None,
         typer.Option(
@@ -84,7 +99,7 @@ def live(
 
     Streams are UBX, SBF or RTCM 3 with observations, ephemerides and other messages mixed; ephemerides are used from
     the moment they are complete, SBAS messages with `--sbas stream`. The answers are those of `railfix run` on the
-    same epochs. A period without input has a message too. Connections that break are opened again. The program ends
+    same epochs, with sensors on board too. A period without input has a message. Connections that break are opened again. The program ends
     when files end, or on SIGINT or SIGTERM; SIGHUP reloads nothing, and says so.
 
     Example:
@@ -102,6 +117,9 @@ def live(
     sources: dict[Literal["front", "rear"], str] = {"front": front}
     if rear is not None:
         sources["rear"] = rear
+    named: dict[Literal["tachometer", "inertial", "radar"], str | None] = {
+        "tachometer": tachometer, "inertial": inertial, "radar": radar,
+    }  # fmt: skip
     settings, asked = settings_of(choices)
     if "filter" not in asked:
         settings = settings.replaced(filter="track")
@@ -113,6 +131,7 @@ def live(
         track=tuple(track),
         vehicle=vehicle,
         nav=tuple(nav or ()),
+        sensors={name: source for name, source in named.items() if source is not None},
         config=settings,
         reading=reading,
         logs=logs,

@@ -31,7 +31,6 @@ from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import package_versions, run_record
-from railfix.run.sensors import until
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS, ScreenSetup
 from railfix.track.trajectory import Trajectory
@@ -200,7 +199,7 @@ def ablate_files(
         parts: dict[tuple[str, str], list[dict[str, Floats]]] = {}
         for chunk in aligned({name: log.parts() for name, log in logs.items()}):
             end = max(part.time[-1] for part in chunk.values() if len(part))
-            since = until(sensors, received, end)
+            since = sensors.between(received, end)
             received = end
             for name, processor in processors.items():
                 result, states[name] = processor.process(chunk, states[name], sensors=since)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 import hashlib
 import multiprocessing
+from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any, Final
 
@@ -19,6 +20,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.train_message import encode
 from railfix.live.engine import EngineState, LiveEngine, LiveOutput
+from railfix.live.sensor_lines import Sensed
 from railfix.live.settings import LiveSettings
 from railfix.pipeline.processor import EpochProcessor
 from railfix.ranges.sbas import SbasMessages
@@ -59,9 +61,11 @@ def _digest(arrays: list[Any]) -> str:
     return text.hexdigest()
 
 
-def _second_channel(connection: Connection, processor: EpochProcessor, settings: LiveSettings) -> None:
+def _second_channel(
+    connection: Connection, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str]
+) -> None:
     """The second process: carries out calls until the connection closes."""
-    engine = LiveEngine(processor, settings)
+    engine = LiveEngine(processor, settings, sensors)
     gc.freeze()  # as the first channel's
     while True:
         try:
@@ -77,11 +81,11 @@ def _second_channel(connection: Connection, processor: EpochProcessor, settings:
 class TwoChannels(LiveEngine):
     """A `LiveEngine` with a second one beside it, in a process of its own, that gets every call as well."""
 
-    def __init__(self, processor: EpochProcessor, settings: LiveSettings) -> None:
-        super().__init__(processor, settings)
+    def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
+        super().__init__(processor, settings, sensors)
         context = multiprocessing.get_context("spawn")
         self._connection, other = context.Pipe()
-        self._process = context.Process(target=_second_channel, args=(other, processor, settings), daemon=True)
+        self._process = context.Process(target=_second_channel, args=(other, processor, settings, sensors), daemon=True)
         self._process.start()
         other.close()
 
@@ -104,6 +108,11 @@ class TwoChannels(LiveEngine):
         """As `LiveEngine.hear`."""
         super().hear(messages)
         self._call("hear", messages)
+
+    def sense(self, sensed: Sensed) -> None:
+        """As `LiveEngine.sense`."""
+        super().sense(sensed)
+        self._call("sense", sensed)
 
     def push(self, antenna: str, epoch: Observations, *, now_ns: int) -> None:
         """As `LiveEngine.push`."""

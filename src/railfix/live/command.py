@@ -23,12 +23,14 @@ from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.metrics import Metrics, serve_metrics
 from railfix.live.outlets import Outlet
 from railfix.live.record import ResultTables
+from railfix.live.sensor_lines import FOREVER, Sensed
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
 from railfix.live.sinks import file_of, open_sink
 from railfix.live.sources import check_source, is_file
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
 from railfix.live.warm_up import compile_kernels
+from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
@@ -36,6 +38,7 @@ from railfix.run.driver import time_of
 from railfix.run.options import LogReading, TrackReading
 from railfix.run.output import check_not_input
 from railfix.run.processor import processor_of
+from railfix.run.sensors import read_sensors
 from railfix.run.sources import Line, open_line
 
 #: Longest distance from the reference location that a position report of ETCS can say, doubts apart [m].
@@ -49,6 +52,7 @@ class LiveInputs(Settings):
     track: tuple[Path, ...]
     vehicle: Path | None = None
     nav: tuple[Path, ...] = ()
+    sensors: dict[Literal["tachometer", "inertial", "radar"], str] = Field(default_factory=dict)
     config: Config = Field(default_factory=lambda: Config(filter="track"))
     reading: TrackReading = Field(default_factory=TrackReading)
     logs: LogReading = Field(default_factory=LogReading)
@@ -72,7 +76,8 @@ class LiveInputs(Settings):
     @property
     def read(self) -> list[Path]:
         """Every file that the session reads."""
-        logs = [Path(source.removeprefix("file:")) for source in self.sources.values() if is_file(source)]
+        sources = [*self.sources.values(), *self.sensors.values()]
+        logs = [Path(source.removeprefix("file:")) for source in sources if is_file(source)]
         parameters = [] if self.reading.jgd_parameters is None else [self.reading.jgd_parameters]
         return [*self.files.values(), *self.nav, *logs, *parameters]
 
@@ -92,14 +97,18 @@ async def run_live(inputs: LiveInputs) -> list[str]:
     SIGHUP reloads nothing: it is logged and counted. RailfixError: when a source, sink, file or setting is not what it
     should be, or two channels disagree.
     """
-    for source in inputs.sources.values():
+    for source in (*inputs.sources.values(), *inputs.sensors.values()):
         check_source(source)
     inputs.check_outputs()
     live = validated(LiveSettings, inputs.live, source="--live")
     line, processor = _prepared(inputs)
     if any(text.startswith("etcs@") for text in inputs.send):
         _check_reference(line, live)
-    replay = inputs.speed is None and all(is_file(source) for source in inputs.sources.values())
+    tables = read_sensors(
+        **{name: Path(path.removeprefix("file:")) for name, path in inputs.sensors.items() if is_file(path)}
+    )
+    listened = {str(name): source for name, source in inputs.sensors.items() if not is_file(source)}
+    replay = inputs.speed is None and not listened and all(is_file(source) for source in inputs.sources.values())
     async with contextlib.AsyncExitStack() as held:
         messages_on_terminal = sys.stdout.isatty() and any(text.endswith("@-") for text in inputs.send)
         log = SessionLog(inputs.log, live, status=not messages_on_terminal)
@@ -111,10 +120,13 @@ async def run_live(inputs: LiveInputs) -> list[str]:
             full = "wait" if replay else "drop"
             sinks.append(await open_sink(text, live, overwrite=inputs.overwrite, full=full))
             held.callback(sinks[-1].close)
-        engine = LiveEngine(processor, live)
+        engine = LiveEngine(processor, live, tuple(inputs.sensors))
         if inputs.channels == 2:
-            engine = TwoChannels(processor, live)
+            engine = TwoChannels(processor, live, tuple(inputs.sensors))
             held.callback(engine.close)
+        for name in set(inputs.sensors) - set(listened):
+            samples = SensorSamples(**{str(name): getattr(tables, name)})
+            engine.sense(Sensed(sensor=name, samples=samples, until=FOREVER))
         metrics = Metrics()
         if inputs.metrics is not None:
             held.callback((await serve_metrics(metrics, inputs.metrics)).close)
@@ -126,6 +138,7 @@ async def run_live(inputs: LiveInputs) -> list[str]:
                 dict(inputs.sources.items()),
                 sinks,
                 speed=inputs.speed,
+                sensors=listened,
                 metrics=metrics,
                 hooks=hooks,
                 date=inputs.logs.instant,
@@ -204,7 +217,7 @@ def _prepared(inputs: LiveInputs) -> tuple[Line, EpochProcessor]:
     if at is None:
         at = np.datetime64("now", "ns") if inputs.logs.instant is None else inputs.logs.instant
     line = open_line(inputs.track, inputs.vehicle, antennas=tuple(inputs.sources), reading=inputs.reading, at=at)
-    return line, processor_of(config, navigation, line.trajectories)
+    return line, processor_of(config, navigation, line.trajectories, track=line.track)
 
 
 def _check_reference(line: Line, live: LiveSettings) -> None:

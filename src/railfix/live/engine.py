@@ -7,7 +7,7 @@ and nothing grows: at most a few epochs wait for their pair, and expired records
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final, Literal
@@ -20,7 +20,9 @@ from railfix.gnss.observations import Observations
 from railfix.io.train_message import TrainMessage
 from railfix.kernels import load
 from railfix.live.message import message_of, no_input_message
+from railfix.live.sensor_lines import FOREVER, Sensed
 from railfix.live.settings import LiveSettings
+from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import merged_navigation
 from railfix.pipeline.results import Result, State
@@ -113,13 +115,13 @@ class LiveEngine:
     counts : Counter of str
         Epochs by what became of them: "paired", "front alone", "rear alone", "duplicate", "late", "out of order",
         "tag step", "restart", "no input", "superseded" (processed, but a newer one had the message of the period),
-        "dropped, too many waiting".
+        "dropped, too many waiting", "tachometer silent" and the like (not heard up to the epoch in time).
     told : deque of str
         Sentences for the log on what happened: what is used in place of what was asked for, and when that ends,
         restarts, what became of a saved state.
     """
 
-    def __init__(self, processor: EpochProcessor, settings: LiveSettings) -> None:
+    def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
         load()
         self.processor = processor
         self.settings = settings
@@ -136,6 +138,8 @@ class LiveEngine:
         self._saved: EngineState | None = None
         self._from_satellites: deque[_FromSatellites] = deque()
         self._heard = self._heard_at_push = 0
+        self._samples = SensorSamples()
+        self._heard_to = dict.fromkeys(sensors, np.datetime64("NaT", "ns"))
         self._sequence = 0
         self._due_ns: int | None = None
         self._pending: LiveOutput | None = None
@@ -150,6 +154,17 @@ class LiveEngine:
     def hear(self, messages: SbasMessages) -> None:
         """Take SBAS messages; they are used from the next epoch on."""
         self._hear(_FromSatellites(heard=self._heard + 1, messages=messages))
+
+    def sense(self, sensed: Sensed) -> None:
+        """Take samples of a sensor on board that was named when the engine was made."""
+        self._heard_to[sensed.sensor] = np.fmax(self._heard_to[sensed.sensor], sensed.until)
+        if sensed.samples:
+            self._samples = self._samples.joined(sensed.samples)
+
+    def _unheard(self, tag_ns: int) -> frozenset[str]:
+        """Sensors that have not been heard up to an epoch."""
+        time = GPS_EPOCH + np.timedelta64(tag_ns, "ns")
+        return frozenset(name for name, heard in self._heard_to.items() if not heard >= time)
 
     def _hear(self, item: _FromSatellites) -> None:
         self._heard = item.heard
@@ -208,6 +223,7 @@ class LiveEngine:
         age_s = (tag_ns - saved.done_ns) * 1e-9
         if 0.0 < age_s <= self.settings.state_age_s:
             self._state, self._done_ns, self._last_tag = saved.state, saved.done_ns, dict(saved.last_tag)
+            self._samples = self._samples.between(GPS_EPOCH + np.timedelta64(saved.done_ns, "ns"), FOREVER)
             self.told.append(f"state file: positioning continues {age_s:.1f} s after the last epoch of the file")
         else:
             self._state = State(received=saved.state.received)
@@ -251,6 +267,7 @@ class LiveEngine:
         self.told.append("a receiver came back with older time tags: positioning begins anew")
         self._state = None if self._state is None else State(received=self._state.received)
         self._done_ns = -1
+        self._samples = SensorSamples()
         for name in self._antennas:
             self._waiting[name].clear()
 
@@ -325,7 +342,9 @@ class LiveEngine:
             times.append((self._due_ns - now_ns + longest) * 1e-9)
         for queue in self._waiting.values():
             if queue:
-                times.append((queue[0].arrived_ns - now_ns) * 1e-9 + self.settings.pair_wait_s)
+                since_s = (now_ns - queue[0].arrived_ns) * 1e-9
+                waits = (self.settings.pair_wait_s, self.settings.sensor_wait_s if self._heard_to else 0.0)
+                times += [wait_s - since_s for wait_s in waits if wait_s > since_s]
         return max(0.0, min(times))
 
     def _pairs(self, now_ns: int) -> Iterator[dict[str, _Waiting]]:
@@ -337,8 +356,10 @@ class LiveEngine:
             first = min(heads.values(), key=lambda head: head.tag_ns)
             together = {n: h for n, h in heads.items() if h.tag_ns - first.tag_ns <= self._tolerance_ns}
             complete = len(together) == len(self._antennas) or len(heads) == len(self._antennas)
-            waited = (now_ns - first.arrived_ns) * 1e-9 >= self.settings.pair_wait_s
-            if not (complete or waited):
+            waited_s = (now_ns - first.arrived_ns) * 1e-9
+            if not complete and waited_s < self.settings.pair_wait_s:
+                return
+            if waited_s < self.settings.sensor_wait_s and self._unheard(first.tag_ns):
                 return
             for name in together:
                 self._waiting[name].popleft()
@@ -351,13 +372,25 @@ class LiveEngine:
         while self._from_satellites and self._from_satellites[0].heard <= heard:
             news = news.with_later(self._from_satellites.popleft())
         epochs = {name: head.epoch for name, head in heads.items()}
-        result, self._state = self.processor.process(
-            epochs, self._state, navigation=news.navigation, messages=news.messages
-        )
         self._done_ns = max(head.tag_ns for head in heads.values())
+        result, self._state = self.processor.process(
+            epochs,
+            self._state,
+            navigation=news.navigation,
+            messages=news.messages,
+            sensors=self._samples_until(self._done_ns) if self._heard_to else None,
+        )
         self._tell_changes((self._state.received or self.processor.received).notes)
         self._check_order(result)
         return LiveOutput(message=message_of(result, self.settings, sequence=0, sent_ns=0), result=result)
+
+    def _samples_until(self, tag_ns: int) -> SensorSamples:
+        """Samples since the epoch before up to an epoch; later ones wait."""
+        time, silent = GPS_EPOCH + np.timedelta64(tag_ns, "ns"), self._unheard(tag_ns)
+        self.counts.update(f"{name} silent" for name in silent)
+        samples = self._samples.between(np.datetime64("NaT", "ns"), time)
+        self._samples = self._samples.between(time, FOREVER)
+        return replace(samples, silent=silent)
 
     def _tell_changes(self, notes: tuple[str, ...]) -> None:
         """Tell what is used in place of what was asked for since the received data changed, and what no longer is."""

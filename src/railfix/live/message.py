@@ -14,11 +14,16 @@ from railfix.io.train_message import MessageStatus, Source, TrainMessage
 from railfix.live.settings import LiveSettings
 from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.results import AntennaResult, Result
-from railfix.tracking import TrackStatus
+from railfix.pipeline.sensed_motion import CARRIED
+from railfix.tracking import Kind, TrackStatus
 
 #: Sigmas that the speed's bound stands for: 1e-7 two-sided, as the protection level's starting point (P1 2.4).
 _SPEED_K = 5.33
 _BOUNDS = ("over_cm", "under_cm", "protection_level_cm")
+_SOURCE_OF_KIND = {
+    Kind.PHASE: Source.CARRIER_PHASE, Kind.DOPPLER: Source.DOPPLER, Kind.WHEEL: Source.TACHOMETER,
+    Kind.RADAR: Source.RADAR, Kind.FORCE: Source.INERTIAL, Kind.PLACE: Source.FEATURES,
+}  # fmt: skip
 _SOURCE_OF_ANTENNA = {"front": Source.FRONT_RECEIVER, "rear": Source.REAR_RECEIVER}
 
 
@@ -80,7 +85,7 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
         if math.isfinite(speed):
             values["speed_cmps"], values["speed_bound_cmps"] = round(speed * 100.0), _up_cm(_SPEED_K * sigma)
         values["direction"], values["standstill"] = int(track.direction[-1]), bool(track.standstill[-1])
-        sources |= Source.DOPPLER | Source.CARRIER_PHASE if math.isfinite(speed) else Source(0)
+        sources |= _measured_with(track)
         probability = float(track.tracked.probability[-1])
         if math.isfinite(probability):
             values["track_permille"] = int(min(max(probability, 0.0), 1.0) * 1000.0)
@@ -96,6 +101,16 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
         sources=sources,
         **values,  # type: ignore[arg-type]
     )
+
+
+def _measured_with(track: AlongTrack) -> Source:
+    """What the filter measured the last epoch with, beside codes."""
+    sources = Source(0)
+    for kind in np.flatnonzero(track.tracked.used[-1]).tolist():
+        sources |= _SOURCE_OF_KIND.get(Kind(kind), Source(0))
+    if track.motion[-1] in CARRIED and Source.TACHOMETER in sources:
+        sources = sources & ~Source.TACHOMETER | Source.INERTIAL
+    return sources
 
 
 def antenna_of(result: Result) -> str:
@@ -127,7 +142,7 @@ def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple
         return place, MessageStatus.POSITION if good else MessageStatus.DOUBTFUL
     filtered = float(track.chainage_m[-1])
     status = TrackStatus(int(track.tracked.status[-1]))
-    if status is TrackStatus.COASTING:
+    if status is TrackStatus.COASTING or (status is TrackStatus.TRACKING and not math.isfinite(place)):
         return filtered, MessageStatus.COASTING
     good = status is TrackStatus.TRACKING and _passed(antenna)
     return filtered, MessageStatus.POSITION if good else MessageStatus.DOUBTFUL

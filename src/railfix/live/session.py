@@ -16,8 +16,9 @@ from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
 from railfix.live.arrivals import arrivals, fresh_state, next_arrival
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
 from railfix.live.metrics import Metrics
+from railfix.live.sensor_lines import FOREVER, Sensed, SensorLines
 from railfix.live.sinks import Sink
-from railfix.live.sources import Lost, hidden, is_file
+from railfix.live.sources import Connected, Lost, hidden, is_file, read_source
 from railfix.live.state import SavedSession
 from railfix.live.stream import Received, ReceiverState
 from railfix.ranges.sbas import from_receiver
@@ -30,7 +31,7 @@ _BETWEEN_COLLECTIONS: Final = 100
 _STATUS_S: Final = 0.5
 
 _LOG: Final = logging.getLogger("railfix.live")
-_Queue = asyncio.Queue[tuple[str, Received | None]]
+_Queue = asyncio.Queue[tuple[str, Received | None] | Sensed]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +59,7 @@ async def run_session(
     sinks: Sequence[Sink],
     *,
     speed: float | None,
+    sensors: Mapping[str, str] | None = None,
     metrics: Metrics | None = None,
     hooks: Hooks | None = None,
     date: np.datetime64 | None = None,
@@ -72,6 +74,8 @@ async def run_session(
     speed : float or None
         For recorded files: times as fast as recorded. None: as fast as they go; the clock is then that of the time
         tags (set `LiveSettings.no_input` to "skip" for one message an epoch and no more).
+    sensors : mapping of str to str, optional
+        Streams of sensors on board (`railfix.live.sensor_lines`) by name; the engine has tables of files before.
     date : datetime64, optional
         Some time within half a week of RTCM 3 streams, whose observations carry no week: now where they are live.
     streams : mapping of str to ReceiverState, optional
@@ -80,7 +84,7 @@ async def run_session(
     Raises
     ------
     InputFileError
-        A source cannot be opened, or breaks and is not opened again.
+        A source cannot be opened, or breaks and is not opened again; a sensor's stream begins with another table.
     OutputError
         A sink of a replay cannot be written.
     ChannelsDisagreeError
@@ -88,7 +92,7 @@ async def run_session(
     """
     session = _Session(engine=engine, sinks=sinks, metrics=metrics or Metrics(), hooks=hooks or Hooks())
     session.metrics.epochs, session.metrics.sinks = engine.counts, sinks
-    replay = speed is None and all(is_file(source) for source in sources.values())
+    replay = speed is None and not sensors and all(is_file(source) for source in sources.values())
     session.streams = {name: (streams or {}).get(name) or fresh_state(source, date) for name, source in sources.items()}
     queue: _Queue = asyncio.Queue(_LONGEST_QUEUE)
     gc.collect()
@@ -105,6 +109,7 @@ async def run_session(
         asyncio.create_task(session.pump(name, source, turn if name in files else None, queue))
         for name, source in sources.items()
     ]
+    pumps += [asyncio.create_task(session.listen(name, source, queue)) for name, source in (sensors or {}).items()]
     try:
         await session.process(queue, pumps, replay=replay)
     finally:
@@ -145,7 +150,10 @@ class _Session:
                 wait = None if replay else max(self.engine.wait_s(now_ns=time.monotonic_ns()), 0.001)
                 item = await next_arrival(queue, pumps, wait_s=wait)
                 now = time.monotonic_ns()
-                if item is not None:
+                if isinstance(item, Sensed):
+                    self.metrics.skipped[f"lines of the {item.sensor} that are no rows"] += item.skipped
+                    self.engine.sense(item)
+                elif item is not None:
                     name, received = item
                     if received is None:
                         read_to_ns.pop(name)
@@ -175,17 +183,33 @@ class _Session:
             turn.ended(name)
         await queue.put((name, None))
 
+    async def listen(self, sensor: str, source: str, queue: _Queue) -> None:
+        """Move what a sensor's stream completes into the queue; where it has ended, no epoch waits for it."""
+        lines = SensorLines(sensor=sensor, source=hidden(source))
+        async for part in read_source(source, self.engine.settings):
+            if isinstance(part, bytes):
+                await queue.put(lines.take(part))
+            else:
+                lines.after_break()
+                self.tell(sensor, source, part)
+        await queue.put(Sensed(sensor=sensor, until=FOREVER))
+
     async def received(self, name: str, source: str) -> AsyncIterator[Received]:
         """What a source's data complete, item by item; breaks of its connection are logged and counted."""
         async for item in arrivals(source, self.streams[name], self.engine.settings):
             if isinstance(item, Received):
                 yield item
-            elif isinstance(item, Lost):
-                self.metrics.lost[hidden(source)] += 1
-                _LOG.warning("%s: %s: %s; next attempt in %.1f s", name, hidden(source), item.reason, item.wait_s)
             else:
-                again = f", after {item.broken} breaks" if item.broken else ""
-                _LOG.info("%s: connected to %s%s", name, hidden(source), again)
+                self.tell(name, source, item)
+
+    def tell(self, name: str, source: str, item: Connected | Lost) -> None:
+        """Log and count what became of a connection."""
+        if isinstance(item, Lost):
+            self.metrics.lost[hidden(source)] += 1
+            _LOG.warning("%s: %s: %s; next attempt in %.1f s", name, hidden(source), item.reason, item.wait_s)
+        else:
+            again = f", after {item.broken} breaks" if item.broken else ""
+            _LOG.info("%s: connected to %s%s", name, hidden(source), again)
 
     def take(self, name: str, received: Received, now_ns: int | None) -> int:
         """Hand what one source has completed to the engine; without a clock the epochs arrive at their tags.

@@ -18,6 +18,9 @@ class LiveSettings(Settings):
         A message is due every period, also without input (P1 2.1: 0.1 s).
     pair_wait_s : float [s]
         Longest wait for the other antenna's epoch after the first one of a pair has arrived.
+    sensor_wait_s : float [s]
+        Longest wait for the sensors on board to be heard up to an epoch; what one of them says since the epoch before
+        is left out then.
     no_input : {"send", "skip"}
         Whether a period without input has a message.
     restart_epochs : int
@@ -54,6 +57,7 @@ class LiveSettings(Settings):
 
     period_s: float = Field(default=0.1, gt=0.0, le=60.0)
     pair_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
+    sensor_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
     no_input: Literal["send", "skip"] = "send"
     restart_epochs: int = Field(default=3, ge=1)
     reconnect: Literal["on", "off"] = "on"

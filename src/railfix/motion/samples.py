@@ -7,11 +7,14 @@ the tables that `railfix simulate` writes.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Strings, read_only
+
+#: Sensors on board by the names of their samples.
+SENSORS: Final = ("tachometer", "inertial", "radar", "ranging")
 
 
 def _times() -> Datetimes:
@@ -151,12 +154,42 @@ class SensorSamples:
     radar : RadarSpeeds
     ranging : StationRanges
         Each without rows where the sensor is absent or has sent nothing.
+    silent : frozenset of str
+        Sensors not yet heard up to the epoch that the samples are given with (live): what they say since the epoch
+        before is not known. Their samples may come with the next epoch.
     """
 
     tachometer: TachometerPulses = field(default_factory=TachometerPulses)
     inertial: InertialSamples = field(default_factory=InertialSamples)
     radar: RadarSpeeds = field(default_factory=RadarSpeeds)
     ranging: StationRanges = field(default_factory=StationRanges)
+    silent: frozenset[str] = frozenset()
+
+    @property
+    def tables(self) -> dict[str, TachometerPulses | InertialSamples | RadarSpeeds | StationRanges]:
+        """Samples by sensor."""
+        return {name: getattr(self, name) for name in SENSORS}
+
+    def between(self, begin: np.datetime64, end: np.datetime64) -> SensorSamples:
+        """Return the samples after one instant (all where it is NaT) up to another."""
+        parts: dict[str, Any] = {}
+        for name, rows in self.tables.items():
+            first = 0 if np.isnat(begin) else int(np.searchsorted(rows.time, begin, side="right"))
+            last = int(np.searchsorted(rows.time, end, side="right"))
+            parts[name] = type(rows)(**{f.name: getattr(rows, f.name)[first:last] for f in fields(rows)})
+        return SensorSamples(**parts, silent=self.silent)
+
+    def joined(self, later: SensorSamples) -> SensorSamples:
+        """Return these samples and others in order of time; some of the others may be older than some of these."""
+        parts: dict[str, Any] = {}
+        for name, after in later.tables.items():
+            before: Any = getattr(self, name)
+            values = {f.name: np.concatenate([getattr(before, f.name), getattr(after, f.name)]) for f in fields(after)}
+            if len(before) and len(after) and after.time[0] < before.time[-1]:
+                order = np.argsort(values["time"], kind="stable")
+                values = {column: rows[order] for column, rows in values.items()}
+            parts[name] = type(after)(**values)
+        return SensorSamples(**parts, silent=later.silent)
 
     def __bool__(self) -> bool:
-        return any(len(getattr(self, sensor.name)) > 0 for sensor in fields(self))
+        return any(len(rows) > 0 for rows in self.tables.values())

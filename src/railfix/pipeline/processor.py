@@ -34,7 +34,7 @@ from railfix.pipeline.corrected_ranges import CorrectedRanges, correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
 from railfix.pipeline.received import Received, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
-from railfix.pipeline.sensor_epochs import Surroundings
+from railfix.pipeline.sensor_epochs import Surroundings, waiting_samples
 from railfix.pipeline.solution import Solution, solve
 from railfix.positioning.map_offset import beyond_threshold
 from railfix.positioning.section_search import SearchIndex
@@ -184,7 +184,8 @@ class EpochProcessor:
         messages : SbasMessages, optional
             SBAS messages received since the chunk before.
         sensors : SensorSamples, optional
-            Samples of the sensors on board since the chunk before, for the filter along the track.
+            Samples of the sensors on board since the chunk before, for the filter along the track. An antenna without
+            observations in this chunk has them with its next one.
 
         Raises
         ------
@@ -205,6 +206,13 @@ class EpochProcessor:
             messages=messages,
         )
         state = replace(state, received=received)
+        if sensors:
+            waiting = {
+                name: replace(own, sensors=waiting_samples(own.sensors, sensors))
+                for name, own in state.fusion.items()
+                if name not in observations
+            }
+            state = replace(state, fusion={**state.fusion, **waiting})
         chunks = {name: self.chunk(name, part, state, sensors=sensors) for name, part in observations.items()}
         self.compare(chunks)
         return self.gathered(chunks, state)

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
-from railfix.core.timescale import seconds
+from railfix.core.timescale import seconds, timedelta
 from railfix.motion.features import FeatureLimits
 from railfix.motion.ranging import EchoLimits
 from railfix.motion.samples import (
@@ -135,6 +135,19 @@ class SensorState:
         return cls(time=np.datetime64("NaT", "ns"), samples=SensorSamples())
 
 
+def with_samples(state: SensorState, samples: SensorSamples | None) -> SensorState:
+    """Return the state with samples that wait for the next epoch."""
+    return replace(state, samples=state.samples.joined(samples)) if samples else state
+
+
+def waiting_samples(state: SensorState, samples: SensorSamples) -> SensorState:
+    """Return the state of an antenna without an epoch, with the samples that its next one can use."""
+    state = with_samples(state, samples)
+    newest = max(rows.time[-1] for rows in state.samples.tables.values() if len(rows))
+    oldest = newest - REACH - timedelta(np.asarray(_LONGEST_S))
+    return replace(state, samples=state.samples.between(oldest, newest))
+
+
 def sensor_epochs(
     samples: SensorSamples | None,
     time: Datetimes,
@@ -168,14 +181,11 @@ def sensor_epochs(
     if not (samples or state.samples):
         last = time[-1] if len(time) else state.time
         return SensorEpochs(), nothing_sensed(len(time)), replace(state, time=last)
-    samples = samples or SensorSamples()
-    pulses = _together(state.samples.tachometer, samples.tachometer)
-    inertial = _together(state.samples.inertial, samples.inertial)
-    radar = _together(state.samples.radar, samples.radar)
-    ranging = _together(state.samples.ranging, samples.ranging)
+    state = with_samples(state, samples)
     if not len(time):
-        kept = SensorSamples(tachometer=pulses, inertial=inertial, radar=radar, ranging=ranging)
-        return SensorEpochs(), nothing_sensed(0), replace(state, samples=kept)
+        return SensorEpochs(), nothing_sensed(0), state
+    pulses, inertial = state.samples.tachometer, state.samples.inertial
+    radar, ranging = state.samples.radar, state.samples.ranging
     first = time[0] if np.isnat(state.time) else state.time
     edges = np.concatenate([[first], time])
     facing = 1.0 if trajectory.facing == "rising" else -1.0
@@ -213,6 +223,7 @@ def sensor_epochs(
             & (np.diff(faults_until(pulses, edges)) == 0)
         )
         quantum = limits.tachometer.pulse_m / np.sqrt(6.0)
+        known &= ~_silent("tachometer", samples, len(time))
         carried = np.isin(sensed.state, CARRIED)
         known &= ~carried & (sensed.state != MotionState.EXPIRED)
         rolled = np.where(known, way, np.where(carried & usable, sensed.way_m, np.nan))
@@ -226,12 +237,12 @@ def sensor_epochs(
         }
     if len(radar) and "radar" in sources:
         mean, share = _mean_between(radar.time, radar.speed_mps, edges)
-        known = usable & (share >= _COMPLETE)
+        known = usable & (share >= _COMPLETE) & ~_silent("radar", samples, len(time))
         sigma = limits.radar_sigma_mps * np.sqrt(np.maximum(span, limits.radar_step_s) * limits.radar_step_s)
         values |= {"radar_m": np.where(known, facing * mean * span, np.nan), "radar_sigma_m": sigma}
     if force:
         mean, share = _mean_between(inertial.time, inertial.force_mps2[:, 0], edges)
-        known = usable & (share >= _COMPLETE)
+        known = usable & (share >= _COMPLETE) & ~_silent("inertial", samples, len(time))
         values |= {
             "force_mps2": np.where(known, facing * (mean - sensed.swing_mps2), np.nan),
             "force_sigma_mps2": np.full(len(time), limits.force_sigma_mps2),
@@ -325,10 +336,10 @@ def _mean_between(time: Datetimes, values: Floats, edges: Datetimes) -> tuple[Fl
         return np.diff(total[at]) / there, np.where(many > 0, there / np.maximum(many, 1), 0.0)
 
 
-def _together(before: Samples, after: Samples) -> Samples:
-    """Samples of both, in order of time."""
-    values = {f.name: np.concatenate([getattr(before, f.name), getattr(after, f.name)]) for f in fields(before)}
-    return type(before)(**values)
+def _silent(sensor: str, samples: SensorSamples | None, epochs: int) -> Masks:
+    """Intervals of which a sensor has not been heard to the end: the last one, or none."""
+    last = np.arange(epochs) == epochs - 1
+    return last if samples is not None and sensor in samples.silent else np.zeros(epochs, dtype=np.bool_)
 
 
 def _latest(samples: Samples, first: int) -> Samples:

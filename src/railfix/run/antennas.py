@@ -34,7 +34,6 @@ from railfix.run import sources
 from railfix.run.chunks import Pieces
 from railfix.run.inputs import Antenna
 from railfix.run.output import OutputFolder
-from railfix.run.sensors import until
 from railfix.run.sources import Log
 from railfix.run.tally import AntennaTally
 from railfix.screens import AntennaRanges, FilteredMotion, Screened, Verdict
@@ -107,7 +106,7 @@ class AntennaRun:
     def begin(self, epochs: int, after: np.datetime64, end: np.datetime64) -> None:
         """Begin the next chunk: so many epochs, and the samples of the sensors after one instant up to another."""
         self._chunk = self._processor.chunk(
-            self.name, self._pieces.take(epochs), self._state, sensors=until(self._sensors, after, end)
+            self.name, self._pieces.take(epochs), self._state, sensors=self._sensors.between(after, end)
         )
 
     @property

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Final, Literal
 
 import numpy as np
@@ -100,11 +99,11 @@ def check_sbas_time(sbas: SbasCorrections | None, tally: Tally) -> None:
 def check_sensor_time(sensors: SensorSamples, tally: Tally) -> None:
     """Raise MismatchError where a sensor has not one sample during the logs."""
     spans = [(a.first, a.last) for a in tally.antennas.values() if a.first is not None and a.last is not None]
-    for sensor in fields(sensors):
-        time = getattr(sensors, sensor.name).time
+    for name, samples in sensors.tables.items():
+        time = samples.time
         if len(time) and spans and not any(first <= time[-1] and time[0] <= last for first, last in spans):
             raise MismatchError(
-                f"the samples of --{sensor.name} of {_period(time[0], time[-1])} and the logs of "
+                f"the samples of --{name} of {_period(time[0], time[-1])} and the logs of "
                 f"{_period(*spans[0])} (GPS time) have no time in common; give those of that day"
             )
 

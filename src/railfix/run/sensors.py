@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -101,17 +100,6 @@ def check_units(samples: SensorSamples, units: GroundUnits | None, path: Path | 
         raise MismatchError(
             f"ranges name the ground unit {missing[0]}, and {where}; give the surveyed position of each"
         )
-
-
-def until(samples: SensorSamples, begin: np.datetime64, end: np.datetime64) -> SensorSamples:
-    """Return the samples after one instant (all where it is NaT) up to another."""
-    parts: dict[str, Any] = {}
-    for sensor in fields(samples):
-        rows = getattr(samples, sensor.name)
-        first = 0 if np.isnat(begin) else int(np.searchsorted(rows.time, begin, side="right"))
-        last = int(np.searchsorted(rows.time, end, side="right"))
-        parts[sensor.name] = type(rows)(**{f.name: getattr(rows, f.name)[first:last] for f in fields(rows)})
-    return SensorSamples(**parts)
 
 
 def _times(table: pl.DataFrame) -> np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]:

@@ -1,0 +1,295 @@
+"""Sensors on board in a live session: their lines, epochs that wait for them, the same answers as from a whole log."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from typer.testing import CliRunner
+
+from railfix.cli import app
+from railfix.core.errors import InputFileError
+from railfix.core.settings import write_toml
+from railfix.core.timescale import GPS_EPOCH
+from railfix.io.train_message import MessageStatus, Source
+from railfix.live.engine import END_NS, LiveEngine, LiveOutput
+from railfix.live.sensor_lines import SENSORS, SensorLines
+from railfix.live.settings import LiveSettings
+from railfix.motion.samples import SensorSamples
+from railfix.pipeline.along_track import AlongTrack
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.results import State
+from railfix.run.processor import processor_of
+from railfix.simulate.run import vehicle_table
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
+from railfix.tracking import Kind
+from sensed_ride import Ride, joined, ride
+
+pytestmark = pytest.mark.requirement("A8", "E5")
+RUNNER = CliRunner(env={"COLUMNS": "100", "TERM": "dumb", "NO_COLOR": "1"})
+#: A tunnel between 61 and 68 s; the wheel slips in it.
+RIDE = """{
+    "duration_s": 80.0, "rate_hz": 2.0,
+    "sensors": {
+        "tachometer": {"jitter_s": 2e-6, "lowest_mps": 0.3, "slips": [{"start_s": 62.5, "end_s": 65.0, "ratio": 0.25}]},
+        "inertial": UNIT,
+    },
+}"""
+HEADERS = {
+    "tachometer": "pulse,time_gpst,direction",
+    "inertial": "time_gpst,force_forward_mps2,force_right_mps2,force_down_mps2,roll_rate_radps,pitch_rate_radps,"
+    "yaw_rate_radps",
+    "radar": "time_gpst,speed_mps",
+}
+
+
+@pytest.fixture(scope="module")
+def case() -> Ride:
+    return ride(RIDE)
+
+
+def lines_of(samples: SensorSamples) -> dict[str, list[tuple[np.datetime64, bytes]]]:
+    """Rows of the sensors as lines, each with its time."""
+    pulses, unit, radar = samples.tachometer, samples.inertial, samples.radar
+    six = np.concatenate([unit.force_mps2, unit.rate_radps], axis=1).tolist()
+    return {
+        "tachometer": [
+            (t, f"{number},{t},{way}\n".encode())
+            for t, number, way in zip(pulses.time, pulses.pulse, pulses.direction, strict=True)
+        ],
+        "inertial": [(t, f"{t},{','.join(map(repr, row))}\n".encode()) for t, row in zip(unit.time, six, strict=True)],
+        "radar": [(t, f"{t},{v!r}\n".encode()) for t, v in zip(radar.time, radar.speed_mps.tolist(), strict=True)],
+    }
+
+
+def engine_of(case: Ride, folder: Path, **settings: float) -> LiveEngine:
+    path = folder / "vehicle.toml"
+    if not path.exists():
+        write_toml(path, vehicle_table(case.simulation.scenario.vehicle))
+    track = case.simulation.line.track()
+    paths = {"front": antenna_trajectory(track, read_vehicle(path), "front")}
+    config = parse_config({"filter": "track", "protection": "off"})
+    processor = processor_of(config, case.simulation.navigation, paths, track=track)
+    return LiveEngine(processor, LiveSettings(period_s=0.5, no_input="skip", **settings), SENSORS)
+
+
+def live(case: Ride, engine: LiveEngine, *, latency_s: float, beat: bool = True) -> list[LiveOutput]:
+    """Epochs 5 ms after their tags; rows of the sensors so long after theirs, 20 ms of them at a time, cut anywhere."""
+    start = case.observations.time[0] - np.timedelta64(1, "s")
+
+    def at_ns(time: np.datetime64) -> int:
+        return int((time - GPS_EPOCH).astype(np.int64))
+
+    events: list[tuple[int, int, object]] = []
+    for k in range(len(case.observations)):
+        epoch = case.observations[k : k + 1]
+        events.append((at_ns(epoch.time[0]) + 5_000_000, 2, epoch))
+    for sensor, rows in lines_of(case.samples).items():
+        if sensor == "tachometer" and beat:  # so that its standing still is heard
+            beats = start + np.arange(0, 82_000, 20) * np.timedelta64(1, "ms")
+            rows = sorted([*rows, *((t, f",{t},\n".encode()) for t in beats)], key=lambda row: row[0])
+        parts: dict[int, bytes] = {}
+        for t, line in rows:
+            sent = -(-at_ns(t) // 20_000_000) * 20_000_000
+            parts[sent] = parts.get(sent, b"") + line
+        lines = SensorLines(sensor=sensor, source="test")
+        engine.sense(lines.take(f"{HEADERS[sensor]}\n".encode()))
+        rest = b""
+        for sent, data in parts.items():
+            data, rest = (rest + data)[:-7], (rest + data)[-7:]
+            events.append((sent + round(latency_s * 1e9), 1, (lines, data)))
+        events.append((END_NS - 2, 1, (lines, rest)))
+    outputs = []
+    for now, kind, event in sorted(events, key=lambda item: item[:2]):
+        if kind == 2:
+            engine.push("front", event, now_ns=now)  # type: ignore[arg-type]
+        else:
+            lines, data = event  # type: ignore[misc]
+            engine.sense(lines.take(data))
+        outputs += engine.poll(now_ns=now)
+    return [*outputs, *engine.poll(now_ns=END_NS)]
+
+
+def places(outputs: list[LiveOutput]) -> AlongTrack:
+    found: AlongTrack = joined(output.result.fusion["front"] for output in outputs if output.result is not None)
+    return found
+
+
+def test_a_live_session_with_sensors_gives_what_the_log_gives(case: Ride, tmp_path: Path) -> None:
+    engine = engine_of(case, tmp_path, sensor_wait_s=0.2)
+    outputs = live(case, engine, latency_s=0.05)
+    found, whole = places(outputs), case.run()
+    np.testing.assert_allclose(found.chainage_m, whole.chainage_m, atol=1e-6)
+    np.testing.assert_array_equal(found.motion, whole.motion)
+    np.testing.assert_array_equal(found.tracked.used, whole.tracked.used)
+    assert not any("silent" in what for what in engine.counts)
+    inside = ~np.isfinite(case.observations.code_m).any(axis=1) & (case.time_s > 50.0)
+    assert inside.sum() > 10
+    told = [output.message for output, tunnel in zip(outputs, inside, strict=True) if tunnel]
+    assert {message.status for message in told} == {MessageStatus.COASTING}
+    assert all(Source.INERTIAL in message.sources for message in told)
+    assert not any(Source.CARRIER_PHASE in message.sources for message in told)
+    assert all(message.over_cm is not None for message in told)
+
+
+def test_a_sensor_that_is_late_is_left_out_and_no_way_is_made_up(case: Ride, tmp_path: Path) -> None:
+    """Rows 0.3 s late, a wait of 0.1 s: no epoch has the way since the one before, and none a way that is too short."""
+    engine = engine_of(case, tmp_path, sensor_wait_s=0.1)
+    found = places(live(case, engine, latency_s=0.3))
+    assert {engine.counts[f"{sensor} silent"] for sensor in SENSORS} == {len(case.observations)}
+    assert not (found.tracked.used[:, 3:] > 0).any()
+    alone = case.run(filter_sources=("code", "phase", "doppler"))
+    np.testing.assert_allclose(found.chainage_m, alone.chainage_m, atol=1e-6)
+
+
+def test_an_epoch_waits_no_longer_than_asked_for(case: Ride, tmp_path: Path) -> None:
+    engine = engine_of(case, tmp_path, sensor_wait_s=0.1)
+    first = case.observations[:1]
+    engine.push("front", first, now_ns=0)
+    assert engine.poll(now_ns=90_000_000) == []
+    assert engine.wait_s(now_ns=90_000_000) == pytest.approx(0.01)
+    assert len(engine.poll(now_ns=100_000_000)) == 1
+
+
+def test_samples_wait_for_an_antenna_without_an_epoch(case: Ride, tmp_path: Path) -> None:
+    """The rear antenna's epochs are missing for a second: its next one has the way of the wheel over all of it."""
+    write_toml(tmp_path / "v.toml", vehicle_table(case.simulation.scenario.vehicle))
+    track, vehicle = case.simulation.line.track(), read_vehicle(tmp_path / "v.toml")
+    paths = {name: antenna_trajectory(track, vehicle, name) for name in ("front", "rear")}
+    config = parse_config({"filter": "track", "protection": "off"})
+    processor = processor_of(config, case.simulation.navigation, paths, track=track)
+    rear = next(iter(case.simulation.pieces("rear", chunk_epochs=100_000))).observations
+    gap = [100, 101]
+    state, parts, since = State(), [], np.datetime64("NaT", "ns")
+    for k in range(len(rear)):
+        time = rear.time[k]
+        chunk = {"front": case.observations[k : k + 1], "rear": rear[k : k + 1]}
+        if k in gap:
+            del chunk["rear"]
+        result, state = processor.process(chunk, state, sensors=case.samples.between(since, time))
+        since = time
+        if "rear" in result.fusion:
+            parts.append(result.fusion["rear"])
+    found = joined(parts)
+    after = int(np.flatnonzero(found.time > rear.time[gap[-1]])[0])
+    assert (found.tracked.used[after, [Kind.WHEEL, Kind.RADAR, Kind.FORCE]] > 0).all()
+    assert len(state.fusion["rear"].sensors.samples.inertial) < 500
+
+
+def test_lines_cut_anywhere_are_the_table(case: Ride) -> None:
+    rng = np.random.default_rng(1)
+    for sensor, rows in lines_of(case.samples).items():
+        text = f"{HEADERS[sensor]}\r\n".encode() + b"".join(line for _, line in rows[:500])
+        cuts = np.sort(rng.integers(0, len(text), 40)).tolist()
+        lines, samples = SensorLines(sensor=sensor, source="test"), SensorSamples()
+        for first, last in zip([0, *cuts], [*cuts, len(text)], strict=True):
+            sensed = lines.take(text[first:last])
+            assert sensed.skipped == 0
+            samples = samples.joined(sensed.samples)
+        expected = case.samples.tables[sensor]
+        for name, values in vars(samples.tables[sensor]).items():
+            np.testing.assert_array_equal(values, getattr(expected, name)[:500])
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "2024-03-05T03:10:02,x,1", "2024-03-05T03:10:02,5", "yesterday,5,1", ",5,1", "2024-03-05T03:10:00,5,1", "\xff",
+        "2024-03-05T03:10:02,inf,1", "2024-03-05T03:10:02,,1",
+    ],
+)  # fmt: skip
+def test_a_line_that_is_no_row_is_counted_and_left_out(line: str) -> None:
+    lines = SensorLines(sensor="tachometer", source="tcp://127.0.0.1:9")
+    text = f"# a comment\ntime_gpst,pulse,direction\n2024-03-05T03:10:01,4,1\n{line}\n2024-03-05T03:10:03,6,\n"
+    sensed = lines.take(text.encode("latin-1"))
+    assert (sensed.skipped, sensed.samples.tachometer.pulse.tolist()) == (1, [4, 6])
+    assert sensed.samples.tachometer.direction.tolist() == [1, 0]
+    assert sensed.until == np.datetime64("2024-03-05T03:10:03")
+
+
+def test_a_stream_of_another_table_is_refused_by_name() -> None:
+    with pytest.raises(
+        InputFileError, match=r"tcp://127.0.0.1:9: the first line has no column pulse; expected a header"
+    ):
+        SensorLines(sensor="tachometer", source="tcp://127.0.0.1:9").take(b"time_gpst,speed_mps\n")
+    assert set(HEADERS) == set(SENSORS)
+
+
+@pytest.fixture
+def served() -> Iterator[dict[bytes, int]]:
+    """Servers of one answer each: a port by its content, made as they are asked for."""
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever, daemon=True)
+    thread.start()
+    servers: list[asyncio.Server] = []
+
+    class Ports(dict[bytes, int]):
+        def __missing__(self, content: bytes) -> int:
+            async def answer(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+                writer.write(content)
+                await writer.drain()
+                writer.close()
+
+            async def serve() -> int:
+                servers.append(await asyncio.start_server(answer, "127.0.0.1", 0))
+                return int(servers[-1].sockets[0].getsockname()[1])
+
+            self[content] = asyncio.run_coroutine_threadsafe(serve(), loop).result(10)
+            return self[content]
+
+    async def close() -> None:
+        for server in servers:
+            server.close()
+            await server.wait_closed()
+
+    yield Ports()
+    asyncio.run_coroutine_threadsafe(close(), loop).result(10)
+    loop.call_soon_threadsafe(loop.stop)
+    thread.join(5)
+    loop.close()
+
+
+def test_the_command_with_tables_and_with_streams_is_the_run(served: dict[bytes, int], tmp_path: Path) -> None:
+    """`railfix live` with the tables of `railfix run`, and with their rows over TCP: the same places."""
+    out = tmp_path / "sim"
+    sets = ["--set", "sensors.tachometer={}", "--set", "sensors.inertial={}", "--set", "rate_hz=2"]
+    made = RUNNER.invoke(app, ["simulate", "demo", "--seconds", "75", "--plain", *sets, "--out", str(out)])
+    assert made.exit_code == 0, made.output
+    given = [f"--{name}={out / file}" for name, file in {
+        "front": "front.rnx", "nav": "nav.rnx", "track": "track.csv", "vehicle": "vehicle.toml",
+    }.items()]  # fmt: skip
+    tables = [f"--{name}={out / name}.csv" for name in ("tachometer", "inertial")]
+    run = RUNNER.invoke(app, ["run", *given, *tables, "--out", str(tmp_path / "run")])
+    assert run.exit_code == 0, run.output
+    expected = pl.read_parquet(tmp_path / "run" / "train.parquet")
+    assert expected["sources"].str.contains("wheel").any()
+    send = ["--live", "no_input=skip", "--live", "reconnect=off", "--send", f"json@{tmp_path / 'm'}", "--overwrite"]
+    ports = {name: served[(out / f"{name}.csv").read_bytes()] for name in ("tachometer", "inertial")}
+    streams = [f"--{name}=tcp://127.0.0.1:{port}" for name, port in ports.items()]
+    for folder, words in (
+        ("tables", tables),
+        ("streams", [*streams, "--speed", "15", "--live", "sensor_wait_s=5", "--live", "period_s=0.03"]),
+    ):
+        said = RUNNER.invoke(app, ["live", *given, *words, *send, "--out", str(tmp_path / folder)])
+        assert said.exit_code == 0, said.output
+        assert "silent" not in said.output
+        found = pl.read_parquet(tmp_path / folder / "train.parquet")
+        np.testing.assert_allclose(found["chainage_m"], expected["chainage_m"], atol=1e-6)
+        assert found["sources"].equals(expected["sources"])
+
+
+def test_a_table_of_a_sensor_is_no_output(case: Ride, tmp_path: Path) -> None:
+    table = tmp_path / "radar.csv"
+    table.write_text("time_gpst,speed_mps\n2024-03-05T03:10:01,4\n")
+    words = ["--front", "x.ubx", "--track", "t.csv", "--radar", str(table), "--send", f"json@{table}", "--overwrite"]
+    said = RUNNER.invoke(app, ["live", *words])
+    assert said.exit_code == 8, said.output
+    assert replace(case.samples, silent=frozenset({"radar"})).between(
+        np.datetime64("NaT", "ns"), case.observations.time[-1]
+    ).silent == {"radar"}
