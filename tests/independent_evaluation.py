@@ -321,7 +321,7 @@ def levels(epochs, position):
         "positions": len(fixes),
         "infinite": sum(math.isinf(one["level"]) for one in fixes),
         "with_level": len(finite),
-        "level_share": len(finite) / observed,
+        "level_share": sum(one["observed"] for one in finite) / observed,
         "level_p50_m": statistics.median([one["level"] for one in finite]),
         "level_p95_m": percentile([one["level"] for one in finite], 0.95),
         "errors": len(judged),

@@ -467,6 +467,11 @@ def test_protection_levels_by_hand(tmp_path: Path):
     assert [row[name] for name in counts] == [5, 4, 1, 3, 3, 1]
     assert row["level_share"] == pytest.approx(3 / 5)
     assert found.integrity == {}
+    # in a tunnel the filter has levels where nothing was observed
+    status = ["ok", "ok", "ok", "no_observation", "ok"]
+    seen = write_run(tmp_path / "seen", time, answer, status=status, along_protection_level_m=level)
+    row = evaluate_run(seen, reference(time, place)).levels.filter(position="constrained").row(0, named=True)
+    assert (row["observed"], row["with_level"], row["level_share"]) == (4, 3, pytest.approx(2 / 4))
     bare = evaluate_run(write_run(tmp_path / "bare", time, answer), reference(time, place))
     assert bare.levels is None
 

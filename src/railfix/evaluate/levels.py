@@ -17,7 +17,7 @@ LEVEL_COLUMNS: Final[dict[str, str]] = {
     "positions": "epochs with a position",
     "infinite": "positions with an infinite level",
     "with_level": "positions with a finite level",
-    "level_share": "with_level / observed",
+    "level_share": "share of `observed` with a finite level",
     "level_p50_m": "finite levels, median",
     "level_p95_m": "finite levels, 95th percentile",
     "errors": "finite levels with an error",
@@ -46,7 +46,7 @@ def level_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame | None:
                 .with_columns(
                     level=pl.lit(level),
                     position=pl.lit(position),
-                    level_share=pl.when(pl.col("observed") > 0).then(pl.col("with_level") / pl.col("observed")),
+                    level_share=pl.when(pl.col("observed") > 0).then(pl.col("observed_level") / pl.col("observed")),
                     over_level_share=pl.when(pl.col("errors") > 0).then(pl.col("over_level") / pl.col("errors")),
                 )
                 .select(*by, *LEVEL_COLUMNS)
@@ -62,6 +62,7 @@ def _counts(level: str) -> list[pl.Expr]:
         "positions": has,
         "infinite": has & value.is_infinite(),
         "with_level": finite,
+        "observed_level": finite & pl.col("observed"),
         "errors": judged,
         "over_level": judged & (pl.col("error_m").abs() > value),
     }
