@@ -395,6 +395,7 @@ def stanford_counts(by_antenna):
                         "observed": sum(one["observed"] for one in inside),
                         "judged": sum(one["has map"] and one["good"] for one in inside),
                         "available": sum(fit),
+                        "available_observed": sum(f and one["observed"] for f, one in zip(fit, inside, strict=True)),
                         "beyond": len(over),
                         "beyond_blocks": len(
                             {(one["time"] - inside[0]["time"]) // round(BLOCK_S * 1e9) for one in over}
@@ -411,13 +412,14 @@ def stanford_counts(by_antenna):
     for counts in found.values():
         shares = {
             "availability": ("available", "epochs"),
-            "availability_of_observed": ("available", "observed"),
+            "availability_of_observed": ("available_observed", "observed"),
             "beyond_share": ("beyond", "judged"),
             "continuity_15_s": ("kept_15_s", "windows_15_s"),
             "continuity_60_s": ("kept_60_s", "windows_60_s"),
         }
         for name, (above, below) in shares.items():
             counts[name] = counts[above] / counts[below] if counts.get(below) else NAN
+        del counts["available_observed"]
     return found
 
 

@@ -178,3 +178,9 @@ def test_the_summary_of_a_run_has_the_level_of_the_filter(tmp_path: Path) -> Non
     assert re.search(rf"indicative protection level, p50 │ +{finite.quantile(0.5):.2f} m", summary)
     assert len(finite) > 50
     assert f"{len(finite)} │" in summary.split("with a level")[1]
+    words = ["evaluate", str(tmp_path / "out"), "--reference", str(demo_files()["truth"])]
+    judged = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+    assert judged.exit_code == 0, judged.output
+    for kind, name in (("separation", "out"), ("train", "out (train)")):
+        table = judged.output.split(f"against errors ({kind})")[1]
+        assert re.search(rf"{re.escape(name)} +front +usable +20 \(own\)", table.split("Errors over their level")[0])

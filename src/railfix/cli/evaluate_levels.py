@@ -34,7 +34,6 @@ _COUNTS: Final = {
 
 def show_integrity(evaluation: Evaluation, console: Console) -> None:
     """Levels of each kind against the errors."""
-    several = len(evaluation.runs) > 1
     for text in dict.fromkeys(standing(run.protection) for run in evaluation.runs if run.protection):
         console.print(f"Protection levels: {text}", markup=False, soft_wrap=True)
     for kind, found in evaluation.integrity.items():
@@ -46,6 +45,7 @@ def show_integrity(evaluation: Evaluation, console: Console) -> None:
             soft_wrap=True,
         )
         overall = found.stanford.filter(pl.col("grouping") == "all")
+        several = "all" in overall["run"]
         console.print(_counts(overall.filter(pl.col("run") == "all") if several else overall, first=()))
         _show_environments(found.stanford, console)
         _show_beyond(found, kind, console)

@@ -99,8 +99,8 @@ def live(
 
     Streams are UBX, SBF or RTCM 3 with observations, ephemerides and other messages mixed; ephemerides are used from
     the moment they are complete, SBAS messages with `--sbas stream`. The answers are those of `railfix run` on the
-    same epochs, with sensors on board too. A period without input has a message. Connections that break are opened again. The program ends
-    when files end, or on SIGINT or SIGTERM; SIGHUP reloads nothing, and says so.
+    same epochs, with sensors on board too. A period without input has a message. Connections that break are opened
+    again. The program ends when files end, or on SIGINT or SIGTERM; SIGHUP reloads nothing, and says so.
 
     Example:
 

@@ -322,7 +322,8 @@ def _part(
         ]
     if folder.level_kind == UNKNOWN_KIND:
         notes.append("run.json does not state the basis of the protection levels; their kind is unknown")
-    if folder.level_kind is not None and "protection_status" not in folder.positions.columns:
+    stated = folder.table != POSITIONS_TABLE or "protection_status" in folder.positions.columns
+    if folder.level_kind is not None and not stated:
         notes.append("the run has no protection_status: levels are taken as usable where the status is ok")
     more = [note for antenna in antennas.values() for note in antenna.errors.notes]
     return _Part(

@@ -61,7 +61,7 @@ STANFORD_COLUMNS: Final[dict[str, str]] = {
     "no_position": "neither position nor level",
     "available": "levels within AL, with or without an error",
     "availability": "available / epochs",
-    "availability_of_observed": "available / observed",
+    "availability_of_observed": "share of `observed` with a level within the limit",
     "beyond": "errors above their level; the same at every AL",
     "beyond_share": "beyond / judged",
     "beyond_blocks": "blocks of time (60 s) with an error above its level, per antenna",
@@ -247,6 +247,7 @@ def _counted(
     environments = part.partition_by("environment", maintain_order=True)
     groups += [("environment", str(mine["environment"][0]), mine) for mine in environments]
     for grouping, group, spanned in groups:
+        observed = spanned["observed"].to_numpy()
         for levels_of in LEVELS_OF:
             error, level = _judged(spanned, run.kind, levels_of)
             for limit in limits:
@@ -260,10 +261,11 @@ def _counted(
                     "alarm_limit_m": limit,
                     "own_limit": limit == run.alarm_limit_m,
                     "epochs": len(spanned),
-                    "observed": int(spanned["observed"].sum()),
+                    "observed": int(observed.sum()),
                     "judged": int(diagram.histogram.sum()),
                     **regions,
                     "available": round(diagram.available_rate * len(spanned)),
+                    "available_observed": int(np.count_nonzero(observed & (level <= limit))),
                     "beyond": len(diagram.beyond),
                     "beyond_blocks": int(np.count_nonzero(diagram.blocks.misleading)),
                 }
@@ -289,7 +291,7 @@ def _pooled(rows: list[dict[str, Any]]) -> pl.DataFrame:
     sums = sums.with_columns(pl.when(pl.col("grouping") == ALL).then(pl.col(name)).alias(name) for name in windows)
     shares = {
         "availability": ("available", "epochs"),
-        "availability_of_observed": ("available", "observed"),
+        "availability_of_observed": ("available_observed", "observed"),
         "beyond_share": ("beyond", "judged"),
         **{f"continuity_{window:g}_s": (f"kept_{window:g}_s", f"windows_{window:g}_s") for window in WINDOWS_S},
     }
