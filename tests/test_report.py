@@ -313,7 +313,17 @@ def test_a_background_is_drawn_below_the_plan(folder: Path, tmp_path: Path) -> N
 def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tmp_path: Path) -> None:
     mine = tmp_path / "run"
     shutil.copytree(folder, mine)
-    columns = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")
+    columns = (
+        "time_gpst",
+        "antenna",
+        "status",
+        "chainage_m",
+        "along_sigma_m",
+        "x_m",
+        "y_m",
+        "z_m",
+        "protection_level_m",
+    )
     train = pl.read_parquet(mine / "positions.parquet").select(columns).with_columns(status=pl.lit("tracking"))
     train.write_parquet(mine / "train.parquet")
     runs, evaluation = read_runs([mine], [demo_truth()])
@@ -326,6 +336,15 @@ def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tm
     assert "The filter along the track, which joins the epochs, has a position at" in document
     assert f"the worst {largest:.1f} m off." in document
     assert f"filtered {largest:.2f} m</dd>" in document
+    assert evaluation.levels is not None
+    level = evaluation.levels.filter(run="run (train)", antenna="front", position="constrained_ok")[
+        "level_p50_m"
+    ].item()
+    beyond = len(evaluation.integrity["train"].beyond.filter(pl.col("usable"), antenna="front"))
+    assert f"filtered {level:.1f} m</dd>" in document
+    assert f", filtered {beyond:,}</dd>" in document
+    assert "Stanford diagram, usable levels (filter along the track)" in document
+    assert "filter-stanford-by-antenna" in document
 
 
 def test_hostile_words_stay_words(folder: Path, tmp_path: Path) -> None:

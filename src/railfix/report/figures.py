@@ -12,7 +12,7 @@ import polars as pl
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError
 from railfix.evaluate import EvaluationOptions
-from railfix.evaluate.integrity import LEVELS_OF, epochs_diagram
+from railfix.evaluate.integrity import LEVELS_OF, epochs_diagram, level_name
 from railfix.report.plots.chart import Chart, SkyEpochs
 from railfix.report.plots.columns import floats, start_of
 from railfix.report.plots.errors import error_over_chainage, error_over_time, good_errors
@@ -99,7 +99,7 @@ def antenna_groups(
     limit = _alarm_limit(run)
     levels = _kept(levels_over_time(positions, limit), levels_over_chainage(positions, limit))
     if levels and errors is not None:
-        levels = _kept(*_stanford(run, errors, limit)) + levels
+        levels = _kept(*_stanford(run, antenna, errors, limit)) + levels
     absent = () if levels else (NO_LEVELS,)
     yield Group(title="Protection level", charts=levels, start=start, absent=absent)
     table = positions if errors is None else errors
@@ -160,14 +160,17 @@ def _kept(*charts: Chart) -> tuple[Chart, ...]:
     return tuple(chart for chart in charts if not chart.empty)
 
 
-def _stanford(run: ReportedRun, errors: pl.DataFrame, limit_m: float) -> Iterator[Chart]:
-    """Stanford diagrams of the usable levels, and of all levels."""
-    kind = run.folder.level_kind
+def _stanford(run: ReportedRun, antenna: str, errors: pl.DataFrame, limit_m: float) -> Iterator[Chart]:
+    """Stanford diagrams of the usable levels, of all levels, and of the filter's usable levels."""
+    kind, filtered, options = run.folder.level_kind, run.filtered_of(antenna), EvaluationOptions()
     if kind is None:
         return
     for levels_of, words in zip(LEVELS_OF, ("usable levels", "all levels"), strict=True):
-        diagram = epochs_diagram(errors, kind, alarm_limit_m=limit_m, levels_of=levels_of, options=EvaluationOptions())
+        diagram = epochs_diagram(errors, kind, alarm_limit_m=limit_m, levels_of=levels_of, options=options)
         yield stanford(diagram, title=f"Stanford diagram, {words} ({kind})")
+    if filtered is not None and level_name("train") in filtered.columns:
+        diagram = epochs_diagram(filtered, "train", alarm_limit_m=limit_m, levels_of="usable", options=options)
+        yield stanford(diagram, title="Stanford diagram, usable levels (filter along the track)")
 
 
 def _aligned(positions: pl.DataFrame, errors: pl.DataFrame) -> Floats:

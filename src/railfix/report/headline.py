@@ -163,10 +163,17 @@ def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, ow
     )
     beyond = evaluation.integrity[kind].beyond.filter(pl.col("usable"), run=run.name_in(evaluation), antenna=antenna)
     median = levels["level_p50_m"].item() if len(levels) == 1 else None
+    above, filtered = f"{len(beyond):,}", ""
+    if "train" in evaluation.integrity and (name := run.name_in(evaluation, "train")):
+        of_filter = evaluation.levels.filter(run=name, antenna=antenna, position="constrained_ok")
+        filtered = number(of_filter["level_p50_m"].item(), 1, " m") if len(of_filter) == 1 else ""
+        over = evaluation.integrity["train"].beyond.filter(pl.col("usable"), run=name, antenna=antenna)
+        above += f", filtered {len(over):,}"
     return KeyFigure(
         name=f"{_level_name(run)}, median",
         value=number(median, 1, " m"),
-        beside=f"usable errors above their level: {len(beyond):,}",
+        filtered=filtered,
+        beside=f"usable errors above their level: {above}",
     )
 
 

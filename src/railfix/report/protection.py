@@ -54,7 +54,19 @@ def protection(run: ReportedRun, evaluation: Evaluation | None) -> list[Block]:
         *_environments(rows.filter(pl.col("grouping") == "environment", pl.col("own_limit"))),
         *level_sizes(evaluation, name),
         _worst(counts, name, kind),
+        *_of_the_filter(run, evaluation),
     ]
+
+
+def _of_the_filter(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
+    """The same of the levels of the filter along the track; nothing where it has none."""
+    name = run.name_in(evaluation, "train")
+    if not name or "train" not in evaluation.integrity:
+        return []
+    counts = evaluation.integrity["train"]
+    rows = counts.stanford.filter(pl.col("antenna") != "all", run=name, grouping="all")
+    caption = "The same of the filter along the track. Usable levels: status tracking or coasting"
+    return [_stanford("antenna", rows, f"{caption}.", of="filter-"), _worst(counts, name, "train", of="filter-")]
 
 
 def _assumptions(run: ReportedRun, kind: str) -> Table:
@@ -101,7 +113,7 @@ def _environments(rows: pl.DataFrame) -> list[Block]:
     return [Folded("Protection level by environment", [table])]
 
 
-def _stanford(first: str, rows: pl.DataFrame, caption: str) -> Table:
+def _stanford(first: str, rows: pl.DataFrame, caption: str, *, of: str = "") -> Table:
     grouped = first == "environment"
     shown = [*_REGIONS, *(["unjudged"] if rows["unjudged"].sum() else [])]
     head = [first, "levels", "limit, m", "epochs", *(_REGIONS.get(name, name) for name in shown), "available"]
@@ -120,7 +132,7 @@ def _stanford(first: str, rows: pl.DataFrame, caption: str) -> Table:
     meaning = "Available: share of all epochs, tunnels included"
     meaning += "" if grouped else "; 15 s, 60 s: share of windows beginning at an available epoch that stay available"
     return Table(
-        name=f"stanford-by-{first}",
+        name=f"{of}stanford-by-{first}",
         head=head,
         rows=cells,
         caption=f"{caption} {meaning}.",
@@ -129,11 +141,11 @@ def _stanford(first: str, rows: pl.DataFrame, caption: str) -> Table:
     )
 
 
-def _worst(counts: Integrity, name: str, kind: str) -> Block:
+def _worst(counts: Integrity, name: str, kind: str, *, of: str = "") -> Block:
     """The epochs whose error exceeds the level most."""
     beyond = counts.beyond.filter(pl.col("run") == name)
     if not len(beyond):
-        return Sentence("No error exceeds its level, usable or not.")
+        return Sentence(f"No error {'of the filter ' if of else ''}exceeds its level, usable or not.")
     usable = int(beyond["usable"].sum())
     head = "time|antenna|chainage|environment|error|level|parts|set by|verdict|status|satellites|usable".split("|")
     rows = []
@@ -160,7 +172,7 @@ def _worst(counts: Integrity, name: str, kind: str) -> Block:
         f"{f'; the {WORST} largest excesses' if len(beyond) > WORST else ''}. Metres; parts: without a fault, "
         "one fault, two faults"
     )
-    return Table(name="above-level", head=head, rows=rows, caption=caption, numeric=[2, 4, 5, 6, 10])
+    return Table(name=f"{of}above-level", head=head, rows=rows, caption=caption, numeric=[2, 4, 5, 6, 10])
 
 
 def _word(value: str | None) -> str:
