@@ -19,8 +19,9 @@ from railfix.core.settings import write_toml
 from railfix.core.timescale import GPS_EPOCH
 from railfix.io.train_message import MessageStatus, Source
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
-from railfix.live.sensor_lines import SENSORS, SensorLines
+from railfix.live.sensor_lines import FOREVER, SENSORS, Sensed, SensorLines
 from railfix.live.settings import LiveSettings
+from railfix.live.state import SavedSession, load_state, write_state
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.config import parse_config
@@ -146,6 +147,35 @@ def test_a_sensor_that_is_late_is_left_out_and_no_way_is_made_up(case: Ride, tmp
     assert not (found.tracked.used[:, 3:] > 0).any()
     alone = case.run(filter_sources=("code", "phase", "doppler"))
     np.testing.assert_allclose(found.chainage_m, alone.chainage_m, atol=1e-6)
+
+
+def test_a_restart_in_a_slip_goes_on_from_the_state_file(case: Ride, tmp_path: Path) -> None:
+    """The tables are read again from their beginning: what the state has heard already does not count twice."""
+
+    def begun() -> LiveEngine:
+        engine = engine_of(case, tmp_path)
+        for name in SENSORS:
+            samples = SensorSamples(**{name: case.samples.tables[name]})
+            engine.sense(Sensed(sensor=name, samples=samples, until=FOREVER))
+        return engine
+
+    engine, outputs = begun(), []
+    for k in range(len(case.observations)):
+        if case.time_s[k] == 63.5:
+            saved = engine.saved()
+            assert saved is not None
+            write_state(tmp_path / "state", SavedSession(engine=saved, streams={}), {})
+            loaded = load_state(tmp_path / "state", {})
+            assert loaded.session is not None, loaded.outcome
+            engine = begun()
+            engine.resume(loaded.session.engine)
+        epoch = case.observations[k : k + 1]
+        now = int((epoch.time[0] - GPS_EPOCH).astype(np.int64))
+        engine.push("front", epoch, now_ns=now)
+        outputs += engine.poll(now_ns=now)
+    found, whole = places(outputs), case.run()
+    np.testing.assert_allclose(found.chainage_m, whole.chainage_m, atol=1e-6)
+    np.testing.assert_array_equal(found.tracked.used, whole.tracked.used)
 
 
 def test_an_epoch_waits_no_longer_than_asked_for(case: Ride, tmp_path: Path) -> None:

@@ -43,6 +43,7 @@ _PLAIN: Final = {
     ("builtins", "frozenset"),
     ("builtins", "slice"),
     ("collections", "Counter"),
+    ("collections", "deque"),
     ("collections", "OrderedDict"),
     ("types", "MappingProxyType"),
 }
