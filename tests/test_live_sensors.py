@@ -314,12 +314,20 @@ def test_the_command_with_tables_and_with_streams_is_the_run(served: dict[bytes,
         assert found["sources"].equals(expected["sources"])
 
 
-def test_a_table_of_a_sensor_is_no_output(case: Ride, tmp_path: Path) -> None:
+def test_a_table_of_a_sensor_is_no_output_and_needs_the_filter(case: Ride, tmp_path: Path) -> None:
     table = tmp_path / "radar.csv"
     table.write_text("time_gpst,speed_mps\n2024-03-05T03:10:01,4\n")
     words = ["--front", "x.ubx", "--track", "t.csv", "--radar", str(table), "--send", f"json@{table}", "--overwrite"]
     said = RUNNER.invoke(app, ["live", *words])
     assert said.exit_code == 8, said.output
+    words = ["--front", "x.ubx", "--track", "t.csv", "--radar", str(table), "--filter", "off"]
+    for command in (["live", *words], ["run", *words, "--nav", str(table), "--out", str(tmp_path / "out")]):
+        (tmp_path / "x.ubx").touch()
+        (tmp_path / "t.csv").touch()
+        command = [str(tmp_path / word) if word in ("x.ubx", "t.csv") else word for word in command]
+        said = RUNNER.invoke(app, command)
+        assert said.exit_code == 4, said.output
+        assert "--radar needs the filter along the track; leave out --filter off" in said.output
     assert replace(case.samples, silent=frozenset({"radar"})).between(
         np.datetime64("NaT", "ns"), case.observations.time[-1]
     ).silent == {"radar"}

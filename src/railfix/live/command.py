@@ -38,7 +38,7 @@ from railfix.run.driver import time_of
 from railfix.run.options import LogReading, TrackReading
 from railfix.run.output import check_not_input
 from railfix.run.processor import processor_of
-from railfix.run.sensors import read_sensors
+from railfix.run.sensors import check_filter, read_sensors
 from railfix.run.sources import Line, open_line
 
 #: Longest distance from the reference location that a position report of ETCS can say, doubts apart [m].
@@ -100,6 +100,7 @@ async def run_live(inputs: LiveInputs) -> list[str]:
     for source in (*inputs.sources.values(), *inputs.sensors.values()):
         check_source(source)
     inputs.check_outputs()
+    check_filter(inputs.config, inputs.sensors)
     live = validated(LiveSettings, inputs.live, source="--live")
     line, processor = _prepared(inputs)
     if any(text.startswith("etcs@") for text in inputs.send):

@@ -20,7 +20,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.gnss.navigation import Navigation
 from railfix.io.logs import read_navigation
-from railfix.motion.samples import GroundUnits, SensorSamples
+from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import basis_of, level_facts, risk_of, standing
 from railfix.pipeline.processor import EpochProcessor
@@ -33,7 +33,7 @@ from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filtered, levels, package_versions, run_record
 from railfix.run.sensor_checks import doppler_speeds, sensor_notes
-from railfix.run.sensors import check_units, read_sensors, read_units
+from railfix.run.sensors import check_filter, check_units, read_sensors, read_units
 from railfix.run.smoothed_columns import add_smoothed
 from railfix.run.sources import TRACK_FILE, Line, Log, open_line
 from railfix.run.tally import Tally
@@ -118,6 +118,8 @@ def run_files(
     began = clock.perf_counter()
     options = options or RunOptions()
     inputs, config = inputs.checked(config or Config())
+    needing = [name for name in SENSORS if getattr(inputs, name) is not None]
+    check_filter(config, [*needing, *(["smooth"] if options.smooth == "on" else [])])
     with ExitStack() as stack:
         # Forked before any thread is started, and before polars starts its own.
         others = [
@@ -131,8 +133,6 @@ def run_files(
         sensors, units = sensors_of(inputs)
         processor = processor_of(config, navigation, line.trajectories, track=line.track, units=units)
         write, smooth = options.observations == "write", options.smooth == "on"
-        if smooth and config.filter == "off":
-            raise SettingsError("--smooth needs the filter along the track; leave out --filter off")
         runs: dict[str, AntennaRun | OtherProcess] = {
             name: AntennaRun(name, processor, log, sensors, observations=write, smooth=smooth)
             for name, log in logs.items()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from polars.exceptions import PolarsError
 
-from railfix.core.errors import InputFileError, MismatchError
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.motion.samples import (
     GroundUnits,
     InertialSamples,
@@ -19,6 +19,7 @@ from railfix.motion.samples import (
     StationRanges,
     TachometerPulses,
 )
+from railfix.pipeline.config import Config
 
 #: Columns of each table beside ``time_gpst``, as `railfix simulate` writes them; those in brackets may be absent.
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -89,6 +90,13 @@ def read_units(path: Path) -> GroundUnits:
     return GroundUnits(
         name=names.to_numpy().astype(np.str_), ecef_m=table.select("x_m", "y_m", "z_m").cast(pl.Float64).to_numpy()
     )
+
+
+def check_filter(config: Config, options: Iterable[str]) -> None:
+    """Raise SettingsError where an option is given that only the filter along the track uses, and that is off."""
+    for name in options:
+        if config.filter == "off":
+            raise SettingsError(f"--{name} needs the filter along the track; leave out --filter off")
 
 
 def check_units(samples: SensorSamples, units: GroundUnits | None, path: Path | None) -> None:
