@@ -16,7 +16,7 @@ from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.io.position_log import read_positions
 from railfix.track import ThinningLimits, from_position_log, from_positions, read_track, thin
-from railfix.track.from_positions import ANTENNA_PATH
+from railfix.track.from_positions import ANTENNA_PATH, usable_rows
 from railfix.track.trajectory import Trajectory
 from recordings_truth import TRUTHS, write_truth_csv
 
@@ -126,6 +126,22 @@ def test_csv_with_rows_without_a_position(tmp_path: Path) -> None:
     assert np.isnan(log.ecef_m[2]).all()
     assert np.isnat(log.time[2])
     np.testing.assert_array_equal(log.quality, [1, 2, -1])
+
+
+def test_csv_with_weeks_seconds_and_sigmas(tmp_path: Path) -> None:
+    """The form in which post-processing programs export: the hand-counted time is that of the log by date."""
+    path = tmp_path / "run.csv"
+    header = "week,tow_s,latitude_deg,longitude_deg,height_m,quality,sigma_north_m,sigma_east_m,sigma_up_m\n"
+    first = "2176,282600.000,35.34205801,139.521986546,47.5764,2,0.1,0.2,0.3\n"
+    path.write_text(header + first + "2176,282601.2,35.342057994,-139.521986524,-47.5750,5,,,\n", encoding="utf-8")
+    log = read_positions(path)
+    np.testing.assert_array_equal(log.time, START + np.array([0, 1_200_000_000]).astype("timedelta64[ns]"))
+    np.testing.assert_array_equal(log.sigma_m, [[0.1, 0.2, 0.3], [np.nan] * 3])
+    with pytest.raises(InputFileError, match="no position has quality 1; the log has 1 of quality 2, 1 of"):
+        usable_rows(log)
+    path.write_text(header + first.replace("282600", "700000"), encoding="utf-8")
+    with pytest.raises(InputFileError, match="line 2: week 2176 and tow_s 700000 are no GPS week and seconds of it"):
+        read_positions(path)
 
 
 def test_csv_in_ecef_and_under_other_names(tmp_path: Path) -> None:
@@ -261,7 +277,10 @@ def test_bends_between_two_points_are_kept() -> None:
 
 @pytest.mark.parametrize(
     ("options", "said"),
-    [({"quality": (4,)}, "left, a track needs two"), ({"max_sigma_m": 0.001}, "left, a track needs two")],
+    [
+        ({"quality": (4,)}, "has quality 4; the log has 1 of quality 1"),
+        ({"max_sigma_m": 0.001}, "left, a track needs two"),
+    ],
 )
 def test_a_log_without_enough_good_positions(tmp_path: Path, options: dict[str, object], said: str) -> None:
     path = tmp_path / "run.pos"

@@ -178,8 +178,9 @@ def from_positions_command(
         list[str] | None,
         typer.Option(
             metavar="NAME=COLUMN",
-            help="Column of a CSV under another name, e.g. `latitude_deg=Lat`; may be repeated. Names: time_gpst, "
-            "latitude_deg, longitude_deg, height_m, x_m, y_m, z_m, quality.",
+            help="Column of a CSV under another name, e.g. `latitude_deg=Lat`; may be repeated. Names: time_gpst, or "
+            "week and tow_s; latitude_deg, longitude_deg, height_m, or x_m, y_m, z_m; quality, ratio, sigma_north_m, "
+            "sigma_east_m, sigma_up_m.",
         ),
     ] = None,
     name: Annotated[str | None, typer.Option(metavar="NAME", help="Name of the track; else that of the file.")] = None,

@@ -18,8 +18,14 @@ from railfix.core.spelling import misspelt
 from railfix.core.timescale import from_week, timedelta, utc_to_gpst
 from railfix.io.named_columns import NamedColumns, read_named_columns
 
-#: Columns of a CSV log; coordinates are geodetic or ECEF.
-CSV_COLUMNS: Final = ("time_gpst", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m", "z_m", "quality", "ratio")
+#: Standard deviations of a CSV log.
+_SIGMAS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")
+#: Columns of a CSV log; the time is a date, or week and seconds of it, coordinates are geodetic or ECEF.
+CSV_COLUMNS: Final = (
+    "time_gpst", "week", "tow_s", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m", "z_m", "quality", "ratio",
+    *_SIGMAS,
+)  # fmt: skip
+_WEEK_S: Final = 604_800
 _GEODETIC: Final = ("latitude_deg", "longitude_deg", "height_m")
 _CARTESIAN: Final = ("x_m", "y_m", "z_m")
 
@@ -130,10 +136,20 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
         time=positions_times(table),
         ecef_m=ecef_from_geodetic(*values.T) if geodetic else values,
         quality=np.where(np.isfinite(quality), quality, -1.0).astype(np.int64),
-        sigma_m=np.full((len(table), 3), np.nan),
+        sigma_m=np.stack([_numbers_or_nan(table, name) for name in _SIGMAS], axis=-1),
         line=table.line,
-        ratio=table.numbers("ratio", blank=np.nan) if "ratio" in table else None,
+        ratio=_numbers_or_nan(table, "ratio") if "ratio" in table else None,
     )
+
+
+def _numbers_or_nan(table: NamedColumns, name: str) -> Floats:
+    return table.numbers(name, blank=np.nan) if name in table else np.full(len(table), np.nan)
+
+
+def qualities_in_words(log: PositionLog) -> str:
+    """Count the rows of each quality: "1155 of quality 2, 3 of quality 5"."""
+    numbers, counts = np.unique(log.quality, return_counts=True)
+    return ", ".join(f"{count} of quality {number}" for number, count in zip(numbers, counts, strict=True))
 
 
 def renamed(table: NamedColumns, columns: dict[str, str]) -> NamedColumns:
@@ -157,7 +173,20 @@ def _check_latitude(table: NamedColumns, geodetic: Floats) -> None:
 
 
 def positions_times(table: NamedColumns) -> Datetimes:
-    """Parse the column ``time_gpst``; NaT where it is blank or absent."""
+    """Parse the column ``time_gpst``, else ``week`` and ``tow_s`` of GPS time; NaT where they are blank or absent."""
+    if "time_gpst" not in table and "week" in table and "tow_s" in table:
+        week, seconds = table.numbers("week", blank=np.nan), table.numbers("tow_s", blank=np.nan)
+        known = np.isfinite(week) & np.isfinite(seconds)
+        wrong = known & ((week != np.floor(week)) | (week < 0) | (seconds < 0) | (seconds > _WEEK_S))
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            message = (
+                f"week {week[row]:g} and tow_s {seconds[row]:g} are no GPS week and seconds of it (0 to {_WEEK_S})"
+            )
+            raise table.error(row, message)
+        time = np.full(len(table), np.datetime64("NaT", "ns"))
+        time[known] = from_week(week[known].astype(np.int64), seconds[known])
+        return time
     if "time_gpst" not in table:
         return np.full(len(table), np.datetime64("NaT", "ns"))
     cells = table.cells["time_gpst"].to_list()

@@ -34,7 +34,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import ending, write_whole
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.io.nmea import read_any_positions
-from railfix.io.position_log import PositionLog, positions_of_table
+from railfix.io.position_log import PositionLog, positions_of_table, qualities_in_words
 
 #: Columns of the file, in this order.
 COLUMNS: Final = (
@@ -137,7 +137,10 @@ def read_reference(
             "with one (railfix reference makes it of a log of one antenna)",
         )
     columns = _columns(log, table)
-    what = f" and quality {', '.join(map(str, quality))}" if log.has_quality else ""
+    what = ""
+    if log.has_quality:
+        wanted, there = ", ".join(map(str, quality)), qualities_in_words(log)
+        what = f" and quality {wanted} (the log has {there}; railfix evaluate --reference-quality takes others)"
     return {name: _of_antenna(path, name, owner, usable, columns, what) for name in antennas}
 
 
@@ -176,7 +179,7 @@ def _of_antenna(
     rows = np.flatnonzero(usable & (owner == name))
     _, first = np.unique(columns["time"][rows], return_index=True)
     if len(first) < 2:
-        raise InputFileError(path, f"fewer than two positions with a time{what} for the antenna {name}")
+        raise InputFileError(path, f"fewer than two positions for the antenna {name} with a time{what}")
     return AntennaReference(**{key: values[rows[first]] for key, values in columns.items()})  # type: ignore[arg-type]
 
 

@@ -16,7 +16,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
-from railfix.io.position_log import PositionLog
+from railfix.io.position_log import PositionLog, qualities_in_words
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 
 #: Note of every map of this kind.
@@ -319,7 +319,10 @@ def track_of(
             f"the longest {thinned.jump_m.max():.0f} m"
         )
     if len(thinned.turns):
-        notes.append(f"the path turns back at {len(thinned.turns)} point(s)")
+        notes.append(
+            f"the path turns back at {len(thinned.turns)} point(s): where it lies beside itself, positions are "
+            "ambiguous and the filter may follow the wrong leg; give positions of one way"
+        )
     return Track.from_ecef(
         ecef_m[thinned.kept],
         name=name,
@@ -334,13 +337,20 @@ def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_s
 
     Accepted quality numbers are by default 1 (fix) where the log has a quality, else all rows; with a largest standard
     deviation in north, east and up [m], rows without one are rejected. InputFileError: when the log has no column for a
-    filter that is given.
+    filter that is given, or no row of an accepted quality.
     """
     usable = np.ones(len(log), dtype=np.bool_)
     if quality is not None and not log.has_quality:
         raise InputFileError(log.path, "a quality was given, but the log has no column 'quality'")
     if log.has_quality:
-        usable &= np.isin(log.quality, (1,) if quality is None else tuple(quality))
+        wanted = (1,) if quality is None else tuple(quality)
+        usable &= np.isin(log.quality, wanted)
+        if not usable.any():
+            accepted = " or ".join(map(str, wanted))
+            message = (
+                f"no position has quality {accepted}; the log has {qualities_in_words(log)} (--quality takes others)"
+            )
+            raise InputFileError(log.path, message)
     if max_sigma_m is not None:
         if not np.isfinite(log.sigma_m).any():
             raise InputFileError(log.path, "a largest sigma was given, but the log has no standard deviations")
