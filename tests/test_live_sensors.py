@@ -19,10 +19,10 @@ from railfix.core.settings import write_toml
 from railfix.core.timescale import GPS_EPOCH
 from railfix.io.train_message import MessageStatus, Source
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
-from railfix.live.sensor_lines import FOREVER, SENSORS, Sensed, SensorLines
+from railfix.live.sensor_lines import FOREVER, Sensed, SensorLines
 from railfix.live.settings import LiveSettings
 from railfix.live.state import SavedSession, load_state, write_state
-from railfix.motion.samples import SensorSamples
+from railfix.motion.samples import SENSORS, SensorSamples, StationRanges
 from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.results import State
@@ -40,14 +40,23 @@ RIDE = """{
     "sensors": {
         "tachometer": {"jitter_s": 2e-6, "lowest_mps": 0.3, "slips": [{"start_s": 62.5, "end_s": 65.0, "ratio": 0.25}]},
         "inertial": UNIT,
+        "ranging": {
+            "noise_sigma_m": 0.19,
+            "units": [{"name": "A", "chainage_m": 480.0}, {"name": "07", "chainage_m": 500.0, "lateral_m": -3.0}],
+        },
     },
 }"""
+#: Place of the vehicle's ranging unit.
+PLACE = {"range_ahead_m": 9.0, "range_above_m": -1.0}
 HEADERS = {
     "tachometer": "pulse,time_gpst,direction",
     "inertial": "time_gpst,force_forward_mps2,force_right_mps2,force_down_mps2,roll_rate_radps,pitch_rate_radps,"
     "yaw_rate_radps",
     "radar": "time_gpst,speed_mps",
+    "ranging": "time_gpst,unit,range_m,sigma_m",
 }
+#: Rows that say that nothing was measured until then.
+BEATS = {"tachometer": ",{},\n", "ranging": "{},,,\n"}
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +66,7 @@ def case() -> Ride:
 
 def lines_of(samples: SensorSamples) -> dict[str, list[tuple[np.datetime64, bytes]]]:
     """Rows of the sensors as lines, each with its time."""
-    pulses, unit, radar = samples.tachometer, samples.inertial, samples.radar
+    pulses, unit, radar, ranges = samples.tachometer, samples.inertial, samples.radar, samples.ranging
     six = np.concatenate([unit.force_mps2, unit.rate_radps], axis=1).tolist()
     return {
         "tachometer": [
@@ -66,6 +75,10 @@ def lines_of(samples: SensorSamples) -> dict[str, list[tuple[np.datetime64, byte
         ],
         "inertial": [(t, f"{t},{','.join(map(repr, row))}\n".encode()) for t, row in zip(unit.time, six, strict=True)],
         "radar": [(t, f"{t},{v!r}\n".encode()) for t, v in zip(radar.time, radar.speed_mps.tolist(), strict=True)],
+        "ranging": [
+            (t, f"{t},{name},{metres!r},\n".encode())
+            for t, name, metres in zip(ranges.time, ranges.station, ranges.range_m.tolist(), strict=True)
+        ],
     }
 
 
@@ -75,8 +88,8 @@ def engine_of(case: Ride, folder: Path, **settings: float) -> LiveEngine:
         write_toml(path, vehicle_table(case.simulation.scenario.vehicle))
     track = case.simulation.line.track()
     paths = {"front": antenna_trajectory(track, read_vehicle(path), "front")}
-    config = parse_config({"filter": "track", "protection": "off"})
-    processor = processor_of(config, case.simulation.navigation, paths, track=track)
+    config = parse_config({"filter": "track", "protection": "off", "sensors": PLACE})
+    processor = processor_of(config, case.simulation.navigation, paths, track=track, units=case.units)
     return LiveEngine(processor, LiveSettings(period_s=0.5, no_input="skip", **settings), SENSORS)
 
 
@@ -92,9 +105,9 @@ def live(case: Ride, engine: LiveEngine, *, latency_s: float, beat: bool = True)
         epoch = case.observations[k : k + 1]
         events.append((at_ns(epoch.time[0]) + 5_000_000, 2, epoch))
     for sensor, rows in lines_of(case.samples).items():
-        if sensor == "tachometer" and beat:  # so that its standing still is heard
+        if sensor in BEATS and beat:  # so that its standing still, and that no unit is near, is heard
             beats = start + np.arange(0, 82_000, 20) * np.timedelta64(1, "ms")
-            rows = sorted([*rows, *((t, f",{t},\n".encode()) for t in beats)], key=lambda row: row[0])
+            rows = sorted([*rows, *((t, BEATS[sensor].format(t).encode()) for t in beats)], key=lambda row: row[0])
         parts: dict[int, bytes] = {}
         for t, line in rows:
             sent = -(-at_ns(t) // 20_000_000) * 20_000_000
@@ -125,7 +138,8 @@ def places(outputs: list[LiveOutput]) -> AlongTrack:
 def test_a_live_session_with_sensors_gives_what_the_log_gives(case: Ride, tmp_path: Path) -> None:
     engine = engine_of(case, tmp_path, sensor_wait_s=0.2)
     outputs = live(case, engine, latency_s=0.05)
-    found, whole = places(outputs), case.run()
+    found, whole = places(outputs), case.run(sensors=PLACE)
+    assert (whole.tracked.used[:, Kind.RANGE] > 0).sum() > 10
     np.testing.assert_allclose(found.chainage_m, whole.chainage_m, atol=1e-6)
     np.testing.assert_array_equal(found.motion, whole.motion)
     np.testing.assert_array_equal(found.tracked.used, whole.tracked.used)
@@ -142,7 +156,8 @@ def test_a_live_session_with_sensors_gives_what_the_log_gives(case: Ride, tmp_pa
 def test_a_sensor_that_is_late_is_left_out_and_no_way_is_made_up(case: Ride, tmp_path: Path) -> None:
     """Rows 0.3 s late, a wait of 0.1 s: no epoch has the way since the one before, and none a way that is too short."""
     engine = engine_of(case, tmp_path, sensor_wait_s=0.1)
-    found = places(live(case, engine, latency_s=0.3))
+    no_ranges = replace(case, samples=replace(case.samples, ranging=StationRanges()))  # these are places, not ways
+    found = places(live(no_ranges, engine, latency_s=0.3, beat=False))
     assert {engine.counts[f"{sensor} silent"] for sensor in SENSORS} == {len(case.observations)}
     assert not (found.tracked.used[:, 3:] > 0).any()
     alone = case.run(filter_sources=("code", "phase", "doppler"))
@@ -173,7 +188,7 @@ def test_a_restart_in_a_slip_goes_on_from_the_state_file(case: Ride, tmp_path: P
         now = int((epoch.time[0] - GPS_EPOCH).astype(np.int64))
         engine.push("front", epoch, now_ns=now)
         outputs += engine.poll(now_ns=now)
-    found, whole = places(outputs), case.run()
+    found, whole = places(outputs), case.run(sensors=PLACE)
     np.testing.assert_allclose(found.chainage_m, whole.chainage_m, atol=1e-6)
     np.testing.assert_array_equal(found.tracked.used, whole.tracked.used)
 
@@ -251,6 +266,18 @@ def test_a_stream_of_another_table_is_refused_by_name() -> None:
     assert set(HEADERS) == set(SENSORS)
 
 
+def test_a_range_to_a_unit_that_is_not_surveyed_is_counted(case: Ride, tmp_path: Path) -> None:
+    engine, lines = engine_of(case, tmp_path), SensorLines(sensor="ranging", source="test")
+    rows = "2024-03-05T03:10:01,A,50.5,\n2024-03-05T03:10:01,C,60.5,0.2\n2024-03-05T03:10:02,A,,\n,A,5,\n"
+    sensed = lines.take(f"{HEADERS['ranging']}\n{rows}".encode())
+    assert sensed.skipped == 2
+    assert isinstance(sensed.samples.ranging, StationRanges)
+    assert sensed.samples.ranging.station.tolist() == ["A", "C"]
+    np.testing.assert_array_equal(sensed.samples.ranging.sigma_m, [np.nan, 0.2])
+    assert sensed.unsurveyed(engine.processor.units) == 1
+    assert sensed.unsurveyed(None) == 2
+
+
 @pytest.fixture
 def served() -> Iterator[dict[bytes, int]]:
     """Servers of one answer each: a port by its content, made as they are asked for."""
@@ -288,19 +315,25 @@ def served() -> Iterator[dict[bytes, int]]:
 def test_the_command_with_tables_and_with_streams_is_the_run(served: dict[bytes, int], tmp_path: Path) -> None:
     """`railfix live` with the tables of `railfix run`, and with their rows over TCP: the same places."""
     out = tmp_path / "sim"
-    sets = ["--set", "sensors.tachometer={}", "--set", "sensors.inertial={}", "--set", "rate_hz=2"]
+    unit = 'sensors.ranging={units=[{name="A", chainage_m=480.0}]}'
+    sets = ["--set", "sensors.tachometer={}", "--set", "sensors.inertial={}", "--set", unit, "--set", "rate_hz=2"]
     made = RUNNER.invoke(app, ["simulate", "demo", "--seconds", "75", "--plain", *sets, "--out", str(out)])
     assert made.exit_code == 0, made.output
     given = [f"--{name}={out / file}" for name, file in {
         "front": "front.rnx", "nav": "nav.rnx", "track": "track.csv", "vehicle": "vehicle.toml",
     }.items()]  # fmt: skip
-    tables = [f"--{name}={out / name}.csv" for name in ("tachometer", "inertial")]
+    given.append(f"--ranging-units={out / 'ranging_units.csv'}")
+    tables = [f"--{name}={out / name}.csv" for name in ("tachometer", "inertial", "ranging")]
     run = RUNNER.invoke(app, ["run", *given, *tables, "--out", str(tmp_path / "run")])
     assert run.exit_code == 0, run.output
     expected = pl.read_parquet(tmp_path / "run" / "train.parquet")
     assert expected["sources"].str.contains("wheel").any()
+    assert expected["sources"].str.contains("range").any()
     send = ["--live", "no_input=skip", "--live", "reconnect=off", "--send", f"json@{tmp_path / 'm'}", "--overwrite"]
-    ports = {name: served[(out / f"{name}.csv").read_bytes()] for name in ("tachometer", "inertial")}
+    content = {name: (out / f"{name}.csv").read_bytes() for name in ("tachometer", "inertial", "ranging")}
+    first = content["ranging"].splitlines(keepends=True)[1]
+    content["ranging"] = content["ranging"].replace(first, first + first.replace(b",A,", b",B,"))
+    ports = {name: served[rows] for name, rows in content.items()}
     streams = [f"--{name}=tcp://127.0.0.1:{port}" for name, port in ports.items()]
     for folder, words in (
         ("tables", tables),
@@ -309,6 +342,7 @@ def test_the_command_with_tables_and_with_streams_is_the_run(served: dict[bytes,
         said = RUNNER.invoke(app, ["live", *given, *words, *send, "--out", str(tmp_path / folder)])
         assert said.exit_code == 0, said.output
         assert "silent" not in said.output
+        assert ("skipped: 1 ranges to ground units that are not surveyed" in said.output) == (folder == "streams")
         found = pl.read_parquet(tmp_path / folder / "train.parquet")
         np.testing.assert_allclose(found["chainage_m"], expected["chainage_m"], atol=1e-6)
         assert found["sources"].equals(expected["sources"])

@@ -69,7 +69,7 @@ def test_a_slip_in_a_tunnel_is_carried_by_inertia(case: Ride) -> None:
 def test_ranges_to_ground_units_place_the_train_in_the_tunnel(case: Ride) -> None:
     found = case.run(filter_sources=(*GNSS, "range"), sensors=PLACE)
     inside = tunnel(case)
-    ranged = inside & (found.tracked.used[:, Kind.PLACE] > 0)
+    ranged = inside & (found.tracked.used[:, Kind.RANGE] > 0)
     assert ranged.sum() >= 0.8 * inside.sum()
     error = case.error_m(found)[ranged]
     assert np.abs(error).max() < 0.6
@@ -140,5 +140,5 @@ def test_the_innovation_of_each_sensor_stands_in_the_table(case: Ride) -> None:
         known = np.isfinite(table[column].fill_null(float("nan")).to_numpy())
         assert known[found.tracked.used[:, kind] > 0].all()
         assert known.sum() > 100
-    ranged = table["innovation_place_m"].fill_null(float("nan")).to_numpy()[tunnel(case)]
+    ranged = table["innovation_range_m"].fill_null(float("nan")).to_numpy()[tunnel(case)]
     assert np.nanmedian(np.abs(ranged)) < 1.0

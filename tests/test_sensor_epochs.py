@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from railfix.core.errors import InputFileError, MismatchError
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.timescale import timedelta
 from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
 from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, sensor_epochs
-from railfix.run.sensors import check_units, read_sensors, read_units
+from railfix.run.sensors import read_sensors, read_units, units_of_ranges
 from tracking_cases import START, bent_line
 
 LIMITS = SensorLimits()
@@ -152,9 +152,17 @@ def test_ranges_and_ground_units_are_read_and_held_against_each_other(tmp_path: 
     assert samples.ranging.station.tolist() == ["A", "B"]
     assert np.isnan(samples.ranging.sigma_m).all()
     np.testing.assert_array_equal(surveyed.ecef_m[1], [4.0, 5.0, 6.0])
-    check_units(samples, surveyed, units)
-    with pytest.raises(MismatchError, match="ground unit A, and there is no --ranging-units"):
-        check_units(samples, None, None)
+    assert units_of_ranges(samples, None, ranging=None) is None
+    found = units_of_ranges(samples, units, ranging=ranges)
+    assert found is not None
+    np.testing.assert_array_equal(found.ecef_m, surveyed.ecef_m)
+    with pytest.raises(SettingsError, match="--ranging needs --ranging-units"):
+        units_of_ranges(samples, None, ranging=ranges)
+    with pytest.raises(SettingsError, match="--ranging-units is given without --ranging"):
+        units_of_ranges(samples, units, ranging=None)
+    units.write_text("unit,x_m,y_m,z_m\nA,1.0,2.0,3.0\n")
+    with pytest.raises(MismatchError, match=r"the ground unit B, and .*units.csv has no such unit"):
+        units_of_ranges(samples, units, ranging=ranges)
     units.write_text("unit,x_m,y_m,z_m\nA,1.0,2.0,3.0\nA,4.0,5.0,6.0\n")
     with pytest.raises(InputFileError, match="names unit A twice"):
         read_units(units)

@@ -113,6 +113,7 @@ def test_an_empty_file_is_the_default(tmp_path: Path) -> None:
         ('[line]\nkind = "wiggly"', "setting line.kind: Input should be 'pattern', 'elements', 'generated' or 'file'"),
         ("[vehicle]\nfront = [1, 2]", "vehicle.front.2 is missing"),
         ('[sky]\nunhealthy = ["G01", 2]', "sky.unhealthy.1: .*string"),
+        ("[sensors.ranging]\nsigma_m = 1", "unknown setting sensors.ranging.sigma_m; known are .*noise_sigma_m"),
         ("[errors.satellites.G]\nclock = 1", "unknown setting errors.satellites.G.clock"),
         ("[errors]\nsatellites = {G = 1}", "errors.satellites.G: .*valid dictionary"),
         ('[environment]\nsections = [{from_m = 0, to_m = 9, kind = "moon"}]', "environment.sections.0.kind"),

@@ -50,6 +50,13 @@ def live(
     radar: Annotated[
         str | None, typer.Option("--radar", metavar="SOURCE", help="The same of the speeds of a Doppler radar.")
     ] = None,
+    ranging: Annotated[
+        str | None, typer.Option("--ranging", metavar="SOURCE", help="The same of two-way ranges to ground units.")
+    ] = None,
+    ranging_units: Annotated[
+        Path | None,
+        typer.Option("--ranging-units", metavar="CSV", help="Surveyed ground units: unit, x_m, y_m, z_m (ECEF)."),
+    ] = None,
     live_setting: Annotated[
         list[str] | None,
         typer.Option(
@@ -109,7 +116,7 @@ def live(
 
     Exit codes as `railfix --help` says; 9 where two channels disagree.
     """
-    from railfix.live.command import LiveInputs, run_live
+    from railfix.live.command import LiveInputs, Sensor, run_live
 
     if channels == "2" or any(text.startswith("cbor@") for text in send or ()):
         import cbor2  # noqa: F401  a missing one is reported before anything is opened
@@ -117,8 +124,8 @@ def live(
     sources: dict[Literal["front", "rear"], str] = {"front": front}
     if rear is not None:
         sources["rear"] = rear
-    named: dict[Literal["tachometer", "inertial", "radar"], str | None] = {
-        "tachometer": tachometer, "inertial": inertial, "radar": radar,
+    named: dict[Sensor, str | None] = {
+        "tachometer": tachometer, "inertial": inertial, "radar": radar, "ranging": ranging,
     }  # fmt: skip
     settings, asked = settings_of(choices)
     if "filter" not in asked:
@@ -132,6 +139,7 @@ def live(
         vehicle=vehicle,
         nav=tuple(nav or ()),
         sensors={name: source for name, source in named.items() if source is not None},
+        ranging_units=ranging_units,
         config=settings,
         reading=reading,
         logs=logs,

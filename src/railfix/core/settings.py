@@ -9,6 +9,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
+from types import NoneType
 from typing import Any, Self, TypeVar, get_args, get_origin
 
 import tomli_w
@@ -103,7 +104,8 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> 
             known = sorted(_fields_at(model, first["loc"][:-1]))
             close = [*misspelt([str(first["loc"][-1])], known).values()] or _in_groups(model, str(first["loc"][-1]))
             hint = "".join(f"; is {name!r} meant?" for name in close)
-            raise SettingsError(f"{source}: unknown setting {where}; known are {', '.join(known)}{hint}") from None
+            names = f"; known are {', '.join(known)}" if known else ""
+            raise SettingsError(f"{source}: unknown setting {where}{names}{hint}") from None
         if first["type"] == "missing":
             raise SettingsError(f"{source}: setting {where} is missing") from None
         message = first["msg"].removeprefix("Value error, ").replace("a valid tuple", "a list")
@@ -135,6 +137,9 @@ def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[s
             kind = kind.model_fields[str(part)].annotation
         else:
             return set()
+        present = [member for member in get_args(kind) if member is not NoneType]
+        if NoneType in get_args(kind) and len(present) == 1:
+            kind = present[0]
     return set(kind.model_fields) if isinstance(kind, type) and issubclass(kind, BaseModel) else set()
 
 

@@ -38,11 +38,15 @@ from railfix.run.driver import time_of
 from railfix.run.options import LogReading, TrackReading
 from railfix.run.output import check_not_input
 from railfix.run.processor import processor_of
-from railfix.run.sensors import check_filter, read_sensors
+from railfix.run.sensors import check_filter, read_sensors, units_of_ranges
 from railfix.run.sources import Line, open_line
 
 #: Longest distance from the reference location that a position report of ETCS can say, doubts apart [m].
 _REACH_OF_REFERENCE_M: Final = 300_000.0
+
+
+#: Sensors on board.
+Sensor = Literal["tachometer", "inertial", "radar", "ranging"]
 
 
 class LiveInputs(Settings):
@@ -52,7 +56,8 @@ class LiveInputs(Settings):
     track: tuple[Path, ...]
     vehicle: Path | None = None
     nav: tuple[Path, ...] = ()
-    sensors: dict[Literal["tachometer", "inertial", "radar"], str] = Field(default_factory=dict)
+    sensors: dict[Sensor, str] = Field(default_factory=dict)
+    ranging_units: Path | None = None
     config: Config = Field(default_factory=lambda: Config(filter="track"))
     reading: TrackReading = Field(default_factory=TrackReading)
     logs: LogReading = Field(default_factory=LogReading)
@@ -70,7 +75,10 @@ class LiveInputs(Settings):
     def files(self) -> dict[str, Path]:
         """Files that the positions depend on, by their role."""
         named = {f"track {k}": path for k, path in enumerate(self.track)}
-        given = {"vehicle": self.vehicle, "cn0 curve": self.config.cn0_curve, "error model": self.config.error_model}
+        given = {
+            "vehicle": self.vehicle, "ranging units": self.ranging_units, "cn0 curve": self.config.cn0_curve,
+            "error model": self.config.error_model,
+        }  # fmt: skip
         return named | {name: path for name, path in given.items() if path is not None}
 
     @property
@@ -102,12 +110,12 @@ async def run_live(inputs: LiveInputs) -> list[str]:
     inputs.check_outputs()
     check_filter(inputs.config, inputs.sensors)
     live = validated(LiveSettings, inputs.live, source="--live")
-    line, processor = _prepared(inputs)
-    if any(text.startswith("etcs@") for text in inputs.send):
-        _check_reference(line, live)
     tables = read_sensors(
         **{name: Path(path.removeprefix("file:")) for name, path in inputs.sensors.items() if is_file(path)}
     )
+    line, processor = _prepared(inputs, tables)
+    if any(text.startswith("etcs@") for text in inputs.send):
+        _check_reference(line, live)
     listened = {str(name): source for name, source in inputs.sensors.items() if not is_file(source)}
     replay = inputs.speed is None and not listened and all(is_file(source) for source in inputs.sources.values())
     async with contextlib.AsyncExitStack() as held:
@@ -203,7 +211,7 @@ def _closed(outlet: Outlet[Any], log: SessionLog) -> None:
         log.say(f"{outlet.name}: {outlet.dropped} items dropped, {outlet.failed} refused {outlet.failure}")
 
 
-def _prepared(inputs: LiveInputs) -> tuple[Line, EpochProcessor]:
+def _prepared(inputs: LiveInputs, tables: SensorSamples) -> tuple[Line, EpochProcessor]:
     """The line, and the epoch processor with everything known from the start."""
     config = inputs.config
     if config.sbas and config.sbas != "stream":
@@ -211,6 +219,7 @@ def _prepared(inputs: LiveInputs) -> tuple[Line, EpochProcessor]:
             "--sbas names recorded messages; live they come with the receivers' streams (--sbas stream), and "
             "--set sbas_prn=PRN names the satellite"
         )
+    units = units_of_ranges(tables, inputs.ranging_units, ranging=inputs.sensors.get("ranging"))
     navigation = no_navigation()
     if inputs.nav:
         navigation = read_navigation(list(inputs.nav), date=inputs.logs.instant)
@@ -218,7 +227,7 @@ def _prepared(inputs: LiveInputs) -> tuple[Line, EpochProcessor]:
     if at is None:
         at = np.datetime64("now", "ns") if inputs.logs.instant is None else inputs.logs.instant
     line = open_line(inputs.track, inputs.vehicle, antennas=tuple(inputs.sources), reading=inputs.reading, at=at)
-    return line, processor_of(config, navigation, line.trajectories, track=line.track)
+    return line, processor_of(config, navigation, line.trajectories, track=line.track, units=units)
 
 
 def _check_reference(line: Line, live: LiveSettings) -> None:

@@ -22,7 +22,7 @@ _SPEED_K = 5.33
 _BOUNDS = ("over_cm", "under_cm", "protection_level_cm")
 _SOURCE_OF_KIND = {
     Kind.PHASE: Source.CARRIER_PHASE, Kind.DOPPLER: Source.DOPPLER, Kind.WHEEL: Source.TACHOMETER,
-    Kind.RADAR: Source.RADAR, Kind.FORCE: Source.INERTIAL, Kind.PLACE: Source.FEATURES,
+    Kind.RADAR: Source.RADAR, Kind.FORCE: Source.INERTIAL, Kind.PLACE: Source.FEATURES, Kind.RANGE: Source.RANGING,
 }  # fmt: skip
 _SOURCE_OF_ANTENNA = {"front": Source.FRONT_RECEIVER, "rear": Source.REAR_RECEIVER}
 

@@ -14,13 +14,20 @@ from typing import Any, Final
 import numpy as np
 
 from railfix.core.errors import InputFileError
-from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
+from railfix.motion.samples import (
+    GroundUnits,
+    InertialSamples,
+    RadarSpeeds,
+    SensorSamples,
+    StationRanges,
+    TachometerPulses,
+)
 from railfix.run.sensors import COLUMNS
 
-#: Sensors that a live session can have.
-SENSORS: Final = ("tachometer", "inertial", "radar")
 #: After every epoch.
 FOREVER: Final = np.datetime64("2200-01-01", "ns")
+#: Columns without which a row says nothing but its time.
+_NEEDED: Final = ("pulse", "range_m")
 #: Longest line; a longer one is no row.
 _LINE_BYTES: Final = 4096
 
@@ -44,6 +51,10 @@ class Sensed:
     until: np.datetime64
     skipped: int = 0
 
+    def unsurveyed(self, units: GroundUnits | None) -> int:
+        """Count the ranges to ground units that are not among these, which are not used."""
+        return int(np.count_nonzero(~np.isin(self.samples.ranging.station, () if units is None else units.name)))
+
 
 @dataclass(kw_only=True)
 class SensorLines:
@@ -52,7 +63,7 @@ class SensorLines:
     Attributes
     ----------
     sensor, source : str
-        Which of `SENSORS`, and its source for the messages.
+        Which of `railfix.motion.samples.SENSORS`, and its source for the messages.
     columns : tuple of str
         Names of the columns; empty before the header line.
     until : datetime64[ns]
@@ -109,24 +120,26 @@ class SensorLines:
             )
         return tuple(cells)
 
-    def _row(self, cells: list[str]) -> tuple[np.datetime64, Mapping[str, float]] | None:
-        """Time and numbers of a row, none of them where the time stands alone; None for what is no row."""
+    def _row(self, cells: list[str]) -> tuple[np.datetime64, Mapping[str, float | str]] | None:
+        """Time and values of a row, none of them where the time stands alone; None for what is no row."""
         if len(cells) != len(self.columns):
             return None
         given = dict(zip(self.columns, cells, strict=True))
         try:
             time = np.datetime64(given.pop("time_gpst"), "ns")
-            numbers = {name.strip("[]"): given.get(name.strip("[]"), "") for name in COLUMNS[self.sensor]}
-            if not any(numbers.values()):
+            texts = {name.strip("[]"): given.get(name.strip("[]"), "") for name in COLUMNS[self.sensor]}
+            if not any(texts.values()):
                 return None if np.isnat(time) else (time, {})
-            values = {name: float(text) if text else np.nan for name, text in numbers.items()}
+            unit = {"unit": texts.pop("unit")} if "unit" in texts else {}
+            values = {name: float(text) if text else np.nan for name, text in texts.items()}
         except ValueError:
             return None
-        if np.isnat(time) or np.isinf([*values.values()]).any() or np.isnan(values.get("pulse", 0.0)):
+        lacking = any(np.isnan(values.get(name, 0.0)) for name in _NEEDED) or "" in unit.values()
+        if np.isnat(time) or np.isinf([*values.values()]).any() or lacking:
             return None
-        return time, values
+        return time, {**unit, **values}
 
-    def _samples(self, times: list[np.datetime64], rows: list[Mapping[str, float]]) -> SensorSamples:
+    def _samples(self, times: list[np.datetime64], rows: list[Mapping[str, float | str]]) -> SensorSamples:
         if not rows:
             return SensorSamples()
         columns: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in rows[0]}
@@ -136,5 +149,7 @@ class SensorLines:
             return SensorSamples(tachometer=TachometerPulses(time=time, **whole))
         if self.sensor == "radar":
             return SensorSamples(radar=RadarSpeeds(time=time, **columns))
+        if self.sensor == "ranging":
+            return SensorSamples(ranging=StationRanges(time=time, station=columns.pop("unit"), **columns))
         six = np.stack([columns[name] for name in COLUMNS["inertial"]], axis=1)
         return SensorSamples(inertial=InertialSamples(time=time, force_mps2=six[:, :3], rate_radps=six[:, 3:]))

@@ -151,7 +151,9 @@ class _Session:
                 item = await next_arrival(queue, pumps, wait_s=wait)
                 now = time.monotonic_ns()
                 if isinstance(item, Sensed):
-                    self.metrics.skipped[f"lines of the {item.sensor} that are no rows"] += item.skipped
+                    skipped, units = self.metrics.skipped, self.engine.processor.units
+                    skipped[f"lines of the {item.sensor} that are no rows"] += item.skipped
+                    skipped["ranges to ground units that are not surveyed"] += item.unsurveyed(units)
                     self.engine.sense(item)
                 elif item is not None:
                     name, received = item

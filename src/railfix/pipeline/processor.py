@@ -84,6 +84,7 @@ class EpochProcessor:
     ----------
     received : Received
         Navigation records and SBAS corrections known from the start.
+    units : GroundUnits or None
     notes : tuple of str
         Differences between what was asked for and what is used, one sentence each.
 
@@ -127,7 +128,7 @@ class EpochProcessor:
             spacing_known=all(t.body_chainage_m is not None for t in self.trajectories.values()),
             cn0_curve=cn0_curve,
         )
-        self._track, self._units = track, units
+        self._track, self.units = track, units
         self._features: dict[str, LineFeatures] = {}
         self._has_coordinates = with_coordinates(config.failed_checks)
         self._before_filter = FilterState()
@@ -268,7 +269,7 @@ class EpochProcessor:
         if wanted and self._track is not None and name not in self._features:
             limits = self.config.sensors.feature
             self._features[name] = LineFeatures.of(self._track, self.trajectories[name], limits)
-        return Surroundings(features=self._features.get(name), units=self._units)
+        return Surroundings(features=self._features.get(name), units=self.units)
 
     def compare(self, chunks: Mapping[str, ChunkSteps]) -> None:
         """Take the same chunk of all antennas through the screens that compare them, up to their last step.

@@ -52,7 +52,7 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "than the train), `rolling` (away, below the tachometer's least), `expired` (carried for too long). In `standing`, "
     "`low_speed`, `inertial_spin`, `inertial_slide`, `rolling` the way of the wheel is not used: inertia carries",
     "sources": "measurements used with a weight of more than a half: `code` (once a second), `phase`, `doppler`, "
-    "`wheel` (`carry` where inertia takes its place), `radar`, `force`, `place` (a feature of the line or a range)",
+    "`wheel` (`carry` where inertia takes its place), `radar`, `force`, `place` (by a feature of the line), `range`",
     "latitude_deg": "antenna, WGS 84",
     "longitude_deg": "antenna, WGS 84",
     "height_m": "antenna, above the ellipsoid",
@@ -69,7 +69,8 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "innovation_wheel_m": "way of the wheel since the epoch before less the predicted one",
     "innovation_radar_m": "the same of the radar",
     "innovation_force_mps2": "mean specific force forward less the predicted one",
-    "innovation_place_m": "place by a feature of the line, or range to a ground unit, less the predicted one",
+    "innovation_place_m": "place by a feature of the line less the predicted one",
+    "innovation_range_m": "range to a ground unit less the predicted one",
 }
 
 #: Columns that smoothing adds (`railfix run --smooth`).
@@ -174,7 +175,9 @@ def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
             "metric_antenna_spacing_m": float_column(result.spacing_error_m),
             **{
                 f"innovation_{kind.name.lower()}_{unit}": float_column(tracked.sensed[:, kind - 3])
-                for kind, unit in ((Kind.WHEEL, "m"), (Kind.RADAR, "m"), (Kind.FORCE, "mps2"), (Kind.PLACE, "m"))
+                for kind in Kind
+                if kind >= Kind.WHEEL
+                for unit in ("mps2" if kind is Kind.FORCE else "m",)
             },
         }
     )

@@ -17,7 +17,7 @@ import polars as pl
 
 from railfix import __version__
 from railfix.core.arrays import Floats
-from railfix.core.errors import MismatchError, SettingsError
+from railfix.core.errors import MismatchError
 from railfix.gnss.navigation import Navigation
 from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
@@ -33,7 +33,7 @@ from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filtered, levels, package_versions, run_record
 from railfix.run.sensor_checks import doppler_speeds, sensor_notes
-from railfix.run.sensors import check_filter, check_units, read_sensors, read_units
+from railfix.run.sensors import check_filter, read_sensors, units_of_ranges
 from railfix.run.smoothed_columns import add_smoothed
 from railfix.run.sources import TRACK_FILE, Line, Log, open_line
 from railfix.run.tally import Tally
@@ -263,11 +263,7 @@ def sensors_of(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
     samples = read_sensors(
         tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar, ranging=inputs.ranging
     )
-    if inputs.ranging is None and inputs.ranging_units is not None:
-        raise SettingsError("--ranging-units is given without --ranging; give the ranges, or leave the units out")
-    units = None if inputs.ranging_units is None else read_units(inputs.ranging_units)
-    check_units(samples, units, inputs.ranging_units)
-    return samples, units
+    return samples, units_of_ranges(samples, inputs.ranging_units, ranging=inputs.ranging)
 
 
 def _position(

@@ -78,6 +78,24 @@ def read_sensors(
     return SensorSamples(**values)
 
 
+def units_of_ranges(samples: SensorSamples, units: Path | None, *, ranging: Path | str | None) -> GroundUnits | None:
+    """Read the ground units that ranges, a table or a stream, are measured to; None without ranges.
+
+    InputFileError: no such table. MismatchError: a range is to a unit that it does not have. SettingsError: one of the
+    two is given without the other.
+    """
+    if ranging is None and units is not None:
+        raise SettingsError("--ranging-units is given without --ranging; give the ranges, or leave the units out")
+    if ranging is not None and units is None:
+        raise SettingsError("--ranging needs --ranging-units, the surveyed positions of the ground units")
+    surveyed = None if units is None else read_units(units)
+    if surveyed is not None:
+        missing = sorted(set(samples.ranging.station.tolist()) - set(surveyed.name.tolist()))
+        if missing:
+            raise MismatchError(f"ranges name the ground unit {missing[0]}, and {units} has no such unit; add it")
+    return surveyed
+
+
 def read_units(path: Path) -> GroundUnits:
     """Read the surveyed positions of ground units: ``unit,x_m,y_m,z_m``, ECEF of the line's frame.
 
@@ -97,17 +115,6 @@ def check_filter(config: Config, options: Iterable[str]) -> None:
     for name in options:
         if config.filter == "off":
             raise SettingsError(f"--{name} needs the filter along the track; leave out --filter off")
-
-
-def check_units(samples: SensorSamples, units: GroundUnits | None, path: Path | None) -> None:
-    """Raise MismatchError where a unit with a range has not been surveyed."""
-    measured = set(samples.ranging.station.tolist())
-    missing = sorted(measured - set([] if units is None else units.name.tolist()))
-    if missing:
-        where = "there is no --ranging-units" if path is None else f"{path} has no such unit"
-        raise MismatchError(
-            f"ranges name the ground unit {missing[0]}, and {where}; give the surveyed position of each"
-        )
 
 
 def _times(table: pl.DataFrame) -> np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]:
@@ -133,7 +140,10 @@ def _columns(path: Path, kind: str) -> pl.DataFrame:
             table = pl.read_parquet(path)
         else:
             table = pl.read_csv(
-                path, schema_overrides={"time_gpst": pl.Datetime("ns")}, infer_schema_length=None, comment_prefix="#"
+                path,
+                schema_overrides={"time_gpst": pl.Datetime("ns"), "unit": pl.String},
+                infer_schema_length=None,
+                comment_prefix="#",
             )
     except (PolarsError, OSError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__

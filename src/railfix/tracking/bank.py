@@ -34,7 +34,7 @@ from railfix.tracking.rows import MOTION, Kind, Rows, SensorRows, rows_of
 from railfix.tracking.state import CLOCKS, SATELLITES, Bank, Unknown
 
 #: Sensors by the kind of their rows.
-SENSORS: Final = {Kind.WHEEL: "wheel", Kind.RADAR: "radar", Kind.FORCE: "force", Kind.PLACE: "place"}
+SENSORS: Final = {kind: kind.name.lower() for kind in Kind if kind >= Kind.WHEEL}
 #: Share of a way that a source without codes may be wrong by: a worn or wrongly entered wheel.
 SCALE_BOUND: Final = 0.02
 _PLACES: Final = [Unknown.PLACE, Unknown.BEFORE]

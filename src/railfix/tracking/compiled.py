@@ -300,8 +300,12 @@ def _own(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 
 
 def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
-    """Measurements of the wheel, radar, force and place and their standard deviations, shape (T, 4)."""
-    value, sigma = np.full((epochs, 4), np.nan), np.ones((epochs, 4))
+    """Measurements of the wheel, radar, force and place and their standard deviations, shape (T, len(bank.SENSORS)).
+
+    The column of ranges is blank: their epochs are left to numpy.
+    """
+    shape = (epochs, len(bank.SENSORS))
+    value, sigma = np.full(shape, np.nan), np.ones(shape)
     for column, (values, sigmas) in enumerate(
         (
             (sensors.wheel_m, sensors.wheel_sigma_m),

@@ -227,7 +227,7 @@ def _measure(
     if levels:
         bank = Bank.empty(mean.shape[1]) if state.bank is None or lost or best else state.bank
         stepped = np.diagonal(covariance[best]) != np.diagonal(predicted_covariance[best])
-        named = np.where(rows.column >= 0, chunk.satellite[rows.column], "")
+        named = np.append(chunk.satellite, "")[rows.column]  # column -1: no satellite's, as of a place
         remembered = frozenset(state.satellite[chunk.remembered[epoch]].tolist())
         own = (mean[best], covariance[best])
         scale, map_scale = state.log_scale, state.map_scale

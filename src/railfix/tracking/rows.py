@@ -53,7 +53,8 @@ class Kind(IntEnum):
     WHEEL = 3
     RADAR = 4
     FORCE = 5
-    PLACE = 6
+    PLACE = 6  # by a feature of the line
+    RANGE = 7  # to a ground unit
 
 
 _KINDS: Final = np.array([Kind.CODE, Kind.PHASE, Kind.DOPPLER], dtype=np.int64)
@@ -317,5 +318,5 @@ def _range_rows(
             Unknown.MAP_UP: slopes[:, 2],
         }
         value = float(ranges.range_m[epoch, k]) - size
-        listed.append((coefficients, value, float(ranges.sigma_m[epoch, k]), Kind.PLACE))
+        listed.append((coefficients, value, float(ranges.sigma_m[epoch, k]), Kind.RANGE))
     return listed

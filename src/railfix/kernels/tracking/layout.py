@@ -16,7 +16,7 @@ OF_EPOCH = 7
 #: Combinations of phases and Dopplers after the clock of the codes.
 C_WAY, C_CLOCK, C_RIGHT, C_UP, C_SPEED, C_DRIFT = 1, 2, 3, 4, 5, 6
 COMBINED = 7
-SENSORS = 4
+SENSORS = 5
 WHEEL_ROW, RADAR_ROW, FORCE_ROW, PLACE_ROW = 0, 1, 2, 3
 
 
