@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -326,6 +327,9 @@ def test_the_command_with_tables_and_with_streams_is_the_run(served: dict[bytes,
     tables = [f"--{name}={out / name}.csv" for name in ("tachometer", "inertial", "ranging")]
     run = RUNNER.invoke(app, ["run", *given, *tables, "--out", str(tmp_path / "run")])
     assert run.exit_code == 0, run.output
+    fits = float(re.findall(r"sensors.range_ahead_m = ([0-9.]+) would fit", " ".join(run.output.split()))[0])
+    assert fits == pytest.approx(9.0, abs=2.0)
+    assert "--set sensors.range_ahead_m=9 " in (out / "README.md").read_text()
     expected = pl.read_parquet(tmp_path / "run" / "train.parquet")
     assert expected["sources"].str.contains("wheel").any()
     assert expected["sources"].str.contains("range").any()

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import polars as pl
 
 from railfix import __version__
 from railfix.core.arrays import Floats
@@ -32,7 +31,7 @@ from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filtered, levels, package_versions, run_record
-from railfix.run.sensor_checks import doppler_speeds, sensor_notes
+from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sensors import check_filter, read_sensors, units_of_ranges
 from railfix.run.smoothed_columns import add_smoothed
 from railfix.run.sources import TRACK_FILE, Line, Log, open_line
@@ -139,15 +138,15 @@ def run_files(
             if name not in {other.name for other in others}
         }
         runs |= {other.name: other.reads(logs[other.name]) for other in others}
-        speeds: list[pl.DataFrame] = []
-        tally = _position(runs, line, processor, folder, beside, progress, speeds if sensors else None)
+        checks = SensorChecks()
+        tally = _position(runs, line, processor, folder, beside, progress, checks if sensors else None)
         if smooth:
             add_smoothed(runs, folder)
         check_whole_run(navigation, tally, sbas=processor.received.sbas, sensors=sensors)
         notes = (
             *notes_of(line, navigation, tally, logs, note_statistic=config.map_offset.note_threshold),
             *_notes_of_levels(config, tally),
-            *(sensor_notes(sensors, pl.concat(speeds), config.sensors.tachometer) if speeds else ()),
+            *checks.notes(sensors, units, next(iter(line.trajectories.values())), config.sensors),
         )
         sources = [entry.result() for entry in entries]
         folder.end_parquet(_footer(sources, notes))
@@ -273,12 +272,12 @@ def _position(
     folder: OutputFolder,
     beside: Executor,
     progress: Progress | None,
-    speeds: list[pl.DataFrame] | None,
+    checks: SensorChecks | None,
 ) -> Tally:
     """Position chunk by chunk: counts and rows. Other processes come last in `runs`, and are asked first.
 
-    The rows of a chunk are written by `beside` while the next one is positioned. `speeds` takes those by satellites of
-    the first antenna, where they are wanted.
+    The rows of a chunk are written by `beside` while the next one is positioned. `checks` takes those of the first
+    antenna, where there are sensors.
     """
     tally = Tally(min_satellites=processor.config.min_satellites, order=processor.antenna_order())
     after = np.datetime64("NaT", "ns")
@@ -297,9 +296,9 @@ def _position(
         for name, of_antenna in rows.items():
             tally.antennas[name] = of_antenna.tally
             tally.notes.update(dict.fromkeys(of_antenna.notes))
-        train = next(iter(rows.values())).train
-        if speeds is not None and train is not None:
-            speeds.append(doppler_speeds(train))
+        first = next(iter(rows.values()))
+        if checks is not None and first.train is not None:
+            checks.take(first.positions, first.train)
         check_same_day(processor.received.navigation, tally)
         check_same_place(tally, antennas="all")
         if written is not None:

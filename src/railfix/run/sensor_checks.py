@@ -1,17 +1,22 @@
-"""Notes on sensors on board whose unit, time tags or wheel diameter contradict the satellites."""
+"""Notes on sensors that contradict the satellites: units, time tags, wheel diameter, place of the ranging device."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats
+from railfix.core.geodesy import enu_axes
 from railfix.core.timescale import seconds
-from railfix.motion.samples import SensorSamples
+from railfix.motion.samples import GroundUnits, SensorSamples, StationRanges
 from railfix.motion.tachometer import SpeedCheck, TachometerLimits, check_speeds, pulse_speeds
+from railfix.pipeline.feature_stage import ahead_m
+from railfix.pipeline.sensor_epochs import SensorLimits
+from railfix.track.trajectory import Trajectory
 
 #: Speeds of the wheel are compared this far apart [ns].
 _STEP_NS: Final = 500_000_000
@@ -20,6 +25,110 @@ _NEAR_S: Final = 1.5
 #: Scale and lag that are told.
 _SCALE: Final = 0.01
 _LAG_S: Final = 0.3
+#: Ranges are compared with places by satellites that are so near in time [s], from a moving train, to a unit no further
+#: away [m] and seen along the track by this share; so many are needed on a side.
+_BETWEEN_S: Final = 3.0
+_MOVED_M: Final = 1.0
+_FAR_M: Final = 500.0
+_AHEAD: Final = 0.7
+_LEAST_RANGES: Final = 10
+#: Difference between ranges and satellites that is told: twice what codes are off by for minutes [m].
+_RANGE_M: Final = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorChecks:
+    """What the satellites say of one antenna, to hold the sensors on board against.
+
+    Attributes
+    ----------
+    speeds, places : list of polars.DataFrame
+        By Dopplers (`doppler_speeds`), and of single epochs that passed every check; of each chunk.
+    """
+
+    speeds: list[pl.DataFrame] = field(default_factory=list)
+    places: list[pl.DataFrame] = field(default_factory=list)
+
+    def take(self, positions: pl.DataFrame, train: pl.DataFrame) -> None:
+        """Take the rows of a chunk."""
+        columns = ("time_gpst", "chainage_m", "latitude_deg", "longitude_deg", "x_m", "y_m", "z_m")
+        self.places.append(positions.filter(pl.col("status") == "ok").select(columns))
+        self.speeds.append(doppler_speeds(train))
+
+    def notes(
+        self, samples: SensorSamples, units: GroundUnits | None, trajectory: Trajectory, limits: SensorLimits
+    ) -> tuple[str, ...]:
+        """Return a sentence on each sensor that contradicts the satellites."""
+        if not self.speeds:
+            return ()
+        notes = sensor_notes(samples, pl.concat(self.speeds), limits.tachometer)
+        if units is not None and len(samples.ranging):
+            notes += tuple(range_notes(samples.ranging, units, pl.concat(self.places), trajectory, limits))
+        return notes
+
+
+def range_notes(
+    ranging: StationRanges, units: GroundUnits, places: pl.DataFrame, trajectory: Trajectory, limits: SensorLimits
+) -> Iterator[str]:
+    """Yield sentences on ranges that are moved along the track, or too long, against the places by satellites.
+
+    Parameters
+    ----------
+    ranging : StationRanges
+    units : GroundUnits
+    places : polars.DataFrame
+        Time, chainage and coordinates of an antenna, as in ``positions.csv``.
+    trajectory : Trajectory
+        Of that antenna.
+    limits : SensorLimits
+        The place of the vehicle's ranging unit as entered.
+    """
+    of_unit = {str(name): k for k, name in enumerate(units.name)}
+    unit = np.array([of_unit.get(str(name), -1) for name in ranging.station], dtype=np.intp)
+    time = places["time_gpst"].to_numpy().astype("datetime64[ns]")
+    if len(time) < 2:
+        return
+    after = np.clip(np.searchsorted(time, ranging.time), 1, len(time) - 1)
+    before = after - 1
+    ecef, chainage = places.select("x_m", "y_m", "z_m").to_numpy(), places["chainage_m"].to_numpy()
+    way, ran = ecef[after] - ecef[before], chainage[after] - chainage[before]
+    share = seconds(ranging.time - time[before]) / np.maximum(seconds(time[after] - time[before]), 1e-9)
+    near = (share >= 0.0) & (share <= 1.0) & (seconds(time[after] - time[before]) <= _BETWEEN_S)
+    near &= (np.abs(ran) > _MOVED_M) & (unit >= 0) & np.isfinite(ranging.range_m)
+    rows, facing = np.flatnonzero(near), 1.0 if trajectory.facing == "rising" else -1.0
+    way, ran, share = way[rows], ran[rows], share[rows]
+    forward = way * (np.sign(ran) / np.linalg.norm(way, axis=1))[:, None]
+    up = enu_axes(places["latitude_deg"].to_numpy()[after[rows]], places["longitude_deg"].to_numpy()[after[rows]])[:, 2]
+    right = np.cross(forward, up)
+    device = ecef[before[rows]] + share[:, None] * way
+    device += (facing * limits.range_ahead_m - ahead_m(trajectory)) * forward
+    device += facing * limits.range_right_m * right + limits.range_above_m * up
+    sight = units.ecef_m[unit[rows]] - device
+    distance = np.linalg.norm(sight, axis=1)
+    ahead = (sight * forward).sum(axis=1) / np.maximum(distance, 1e-9)
+    longer = ranging.range_m[rows] - distance
+    sides = [longer[(distance < _FAR_M) & (side * ahead > _AHEAD)] for side in (1.0, -1.0)]
+    seen = [float(np.median(side)) for side in sides if len(side) >= _LEAST_RANGES]
+    if not seen:
+        yield "ranging: too few ranges beside places by satellites; the places of its units are not checked"
+        return
+    if len(seen) == 2:
+        moved, excess = (seen[1] - seen[0]) / 2.0, (seen[1] + seen[0]) / 2.0
+    else:
+        moved, excess = (-seen[0] if len(sides[0]) >= _LEAST_RANGES else seen[0]), 0.0
+    if abs(moved) > _RANGE_M:
+        fits = limits.range_ahead_m + facing * moved
+        which = "ahead of" if moved > 0 else "behind"
+        yield (
+            f"ranging: places by the ranges are {abs(moved):.1f} m {which} those by satellites in rising chainage; "
+            f"sensors.range_ahead_m = {fits:.1f} would fit, or the units' surveyed places are displaced"
+        )
+    if abs(excess) > _RANGE_M:
+        which = "long" if excess > 0 else "short"
+        yield (
+            f"ranging: the ranges are {abs(excess):.1f} m too {which} against the satellites; the devices may have a "
+            "delay"
+        )
 
 
 def doppler_speeds(train: pl.DataFrame) -> pl.DataFrame:

@@ -95,6 +95,14 @@ def _switched_on(scenario: Scenario) -> str:
         parts.append("SBAS messages that correct GPS and the ionosphere.")
     if scenario.vehicle.sway_sigma_deg:
         parts.append("The body sways.")
+    ranging = None if scenario.sensors is None else scenario.sensors.ranging
+    if ranging is not None:
+        right, above = (unit - antenna for unit, antenna in zip(
+            (ranging.across_m, ranging.up_m), scenario.vehicle.front[1:], strict=True
+        ))  # fmt: skip
+        place = {"ahead": ranging.along_m, "right": right, "above": above}
+        given = " ".join(f"--set sensors.range_{name}_m={metres:g}" for name, metres in place.items() if metres)
+        parts.append(f"The place of the vehicle's ranging unit, for `railfix run`: `{given}`.")
     if scenario.multipath:
         parts.append("Disturbances from Python, which no setting below describes.")
     return " ".join(parts)
