@@ -1,7 +1,8 @@
-"""Notes on ranges to ground units, on a hand-made straight line."""
+"""Notes on sensors that contradict the satellites, by rides written as formulas."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Literal
 
@@ -10,13 +11,22 @@ import polars as pl
 import pytest
 
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
-from railfix.motion.samples import GroundUnits, StationRanges
+from railfix.motion.samples import (
+    GroundUnits,
+    InertialSamples,
+    RadarSpeeds,
+    SensorSamples,
+    StationRanges,
+    TachometerPulses,
+)
+from railfix.motion.tachometer import TachometerLimits
 from railfix.pipeline.sensor_epochs import SensorLimits
-from railfix.run.sensor_checks import range_notes
+from railfix.run.sensor_checks import SensorChecks, range_notes
+from railfix.run.sensor_signs import motion_of, sign_notes
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
-pytestmark = pytest.mark.requirement("E4")
+pytestmark = pytest.mark.requirement("E5")
 START = np.datetime64("2024-03-05T03:10:00", "ns")
 ORIGIN = ecef_from_geodetic(35.0, 139.0, 60.0)
 EAST, _, UP = enu_axes(35.0, 139.0)
@@ -50,6 +60,7 @@ def ranges(table: pl.DataFrame, ahead_m: float, excess_m: float) -> StationRange
     return StationRanges(time=time[row], station=UNITS.name[unit], range_m=values, sigma_m=np.full(len(values), np.nan))
 
 
+@pytest.mark.requirement("E4")
 @pytest.mark.parametrize("facing", ["rising", "falling"])
 @pytest.mark.parametrize("speed", [10.0, -10.0])
 def test_the_place_of_the_device_is_found_whichever_way_the_train_runs_and_faces(
@@ -65,6 +76,7 @@ def test_the_place_of_the_device_is_found_whichever_way_the_train_runs_and_faces
     assert "sensors.range_ahead_m = 8.0 would fit" in note
 
 
+@pytest.mark.requirement("E4")
 def test_ranges_that_are_too_long_are_told_apart_from_a_displaced_device() -> None:
     table, limits = places(10.0), SensorLimits(range_above_m=1.0)
     (note,) = range_notes(ranges(table, 0.0, 5.0), UNITS, table, LINE, limits)
@@ -74,3 +86,102 @@ def test_ranges_that_are_too_long_are_told_apart_from_a_displaced_device() -> No
     assert "4.0 m too short" in both[1]
     (note,) = range_notes(ranges(table, 0.0, 0.0), UNITS, table[:3], LINE, limits)
     assert "too few ranges" in note
+
+
+#: A ride on a circle to the right that climbs: speed 12 + 6 sin(2 pi t / 80), so 80 s of braking and accelerating.
+RADIUS_M, CLIMB, SECONDS = 1500.0, 0.01, 320.0
+
+
+def way_m(t: np.ndarray) -> np.ndarray:
+    return 12.0 * t + 6.0 * 80.0 / (2.0 * np.pi) * (1.0 - np.cos(2.0 * np.pi * t / 80.0))
+
+
+def circle(t: np.ndarray, noise_m: float = 0.0) -> pl.DataFrame:
+    """Places at these seconds, with a white error along the line."""
+    way = way_m(t) + noise_m * np.random.default_rng(1).standard_normal(len(t))
+    angle = way / RADIUS_M  # heading, from east to the south
+    flat = np.cos(angle)[:, None] * -SOUTH + np.sin(angle)[:, None] * EAST
+    ecef = ORIGIN + RADIUS_M * (flat + SOUTH) + CLIMB * way[:, None] * UP
+    latitude, longitude, _ = geodetic_from_ecef(ecef)
+    columns = {"chainage_m": way, "latitude_deg": latitude, "longitude_deg": longitude}
+    axes = dict(zip(("x_m", "y_m", "z_m"), ecef.T, strict=True))
+    return pl.DataFrame({"time_gpst": START + (t * 1e9).astype("timedelta64[ns]"), **columns, **axes})
+
+
+def on_the_circle(facing: float) -> SensorSamples:
+    """What a vehicle measures there, its front toward rising chainage or the other way."""
+    t = np.arange(0.0, SECONDS, 0.02)
+    time = START + (t * 1e9).astype("timedelta64[ns]")
+    speed = 12.0 + 6.0 * np.sin(2.0 * np.pi * t / 80.0)
+    gained = 6.0 * 2.0 * np.pi / 80.0 * np.cos(2.0 * np.pi * t / 80.0)
+    nothing = np.zeros_like(t)
+    force = np.column_stack([facing * (gained + 9.80665 * CLIMB), facing * speed**2 / RADIUS_M, nothing - 9.80665])
+    pulse = np.arange(0.0, way_m(np.array([SECONDS]))[0], TachometerLimits().pulse_m)
+    at = np.interp(pulse, way_m(t), t)
+    return SensorSamples(
+        inertial=InertialSamples(
+            time=time, force_mps2=force, rate_radps=np.column_stack([nothing, nothing, speed / RADIUS_M])
+        ),
+        radar=RadarSpeeds(time=time[::5], speed_mps=facing * speed[::5]),
+        tachometer=TachometerPulses(
+            time=START + (at * 1e9).astype("timedelta64[ns]"),
+            pulse=np.arange(len(pulse)),
+            direction=np.full(len(pulse), int(facing)),
+        ),
+    )
+
+
+def test_motion_by_places_is_that_of_the_ride() -> None:
+    t = np.arange(0.0, SECONDS, 1.0)
+    motion = motion_of(circle(t).filter(pl.Series((t < 100.0) | (t > 130.0))))
+    at = (motion.time - START) / np.timedelta64(1, "s")
+    wave = 2.0 * np.pi * at / 80.0
+    known = np.isfinite(motion.acceleration_mps2)
+    assert known.sum() > 60
+    np.testing.assert_allclose(motion.speed_mps[known], (12.0 + 6.0 * np.sin(wave))[known], atol=0.3)
+    np.testing.assert_allclose(motion.acceleration_mps2[known], (0.4712 * np.cos(wave))[known], atol=0.06)
+    np.testing.assert_allclose(motion.gradient[known], CLIMB, atol=4e-4)  # the earth is round
+    turned = np.isfinite(motion.heading_rate_radps)
+    np.testing.assert_allclose(motion.heading_rate_radps[turned], motion.speed_mps[turned] / RADIUS_M, atol=4e-4)
+
+
+def _turned(samples: SensorSamples, sensor: str, column: str, factor: object) -> SensorSamples:
+    table = getattr(samples, sensor)
+    return replace(samples, **{sensor: replace(table, **{column: getattr(table, column) * factor})})
+
+
+@pytest.mark.parametrize("facing", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("sensor", "column", "factor", "said"),
+    [
+        ("tachometer", "direction", -1, "tachometer: the direction of its pulses is opposite"),
+        ("radar", "speed_mps", -1.0, "radar: the sign of its speeds is opposite"),
+        ("inertial", "force_mps2", [-1.0, -1.0, 1.0], "inertial: its force forward is opposite"),
+        ("inertial", "force_mps2", 1.0 / 9.80665, "inertial: its forces are in g"),
+        ("inertial", "force_mps2", [1.0, 1.0, -1.0], r"force_down_mps2 is \+9.8 in the mean"),
+        ("inertial", "force_mps2", [1.0, 1.0, 0.5], "inertial: its mean force is 4.9"),
+        ("inertial", "rate_radps", -1.0, "inertial: its yaw rate is opposite"),
+        ("inertial", "rate_radps", 57.29578, "inertial: its rates are in degrees"),
+    ],
+)  # fmt: skip
+def test_a_sensor_that_is_turned_or_in_another_unit_is_told(
+    sensor: str, column: str, factor: object, said: str, facing: float
+) -> None:
+    places, samples = circle(np.arange(0.0, SECONDS, 1.0), noise_m=0.7), on_the_circle(facing)
+    assert list(sign_notes(samples, places, TachometerLimits(), facing)) == []
+    factor = np.array(factor) if isinstance(factor, list) else factor
+    (note,) = sign_notes(_turned(samples, sensor, column, factor), places, TachometerLimits(), facing)
+    assert re.search(said, note), note
+
+
+def test_exchanged_axes_are_told_and_nothing_else_rests_on_them() -> None:
+    """The speeds of the filter are wrong with such a unit: what they say of the other sensors is not told."""
+    places, samples = circle(np.arange(0.0, SECONDS, 1.0)), on_the_circle(1.0)
+    unit = samples.inertial
+    samples = replace(samples, inertial=replace(unit, force_mps2=unit.force_mps2[:, ::-1]))
+    checks = SensorChecks(places=[places], speeds=[pl.DataFrame({"time_gpst": places["time_gpst"], "speed_mps": 30.0})])
+    notes = checks.notes(samples, None, LINE, SensorLimits())
+    assert "inertial: gravity is in force_forward_mps2, not in force_down_mps2; exchange the columns" in notes[0]
+    assert not any("tachometer" in note for note in notes)
+    right = checks.notes(on_the_circle(1.0), None, LINE, SensorLimits())
+    assert any("tachometer: the way of its wheel" in note for note in right)

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from railfix.motion.slip import GRAVITY_MPS2, MotionState, SlipLimits, SlipResult, find_slips
+from railfix.core.constants import GRAVITY_MPS2
+from railfix.motion.slip import MotionState, SlipLimits, SlipResult, find_slips
 
 RATE_HZ = 50.0
 SLIPPING = (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE)

@@ -28,6 +28,9 @@ PZ90_SEMI_MAJOR_AXIS: Final = 6_378_136.0
 #: Second zonal harmonic of the geopotential, PZ-90 [-] (GLONASS ICD 5.1, A.3.1.2).
 PZ90_J2: Final = 1.082_625_7e-3
 
+#: Standard gravity [m/s2] (CGPM 1901).
+GRAVITY_MPS2: Final = 9.806_65
+
 #: BDT - GPST [s]: BeiDou time lags GPS time by a constant (BDS-SIS-ICD-B1I 3.0, 3.3).
 BDT_MINUS_GPST_S: Final = -14.0
 

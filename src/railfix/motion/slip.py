@@ -24,16 +24,14 @@ from copy import copy
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
-from typing import Final, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Codes, Floats
+from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.settings import Settings
-
-#: Standard gravity [m/s2].
-GRAVITY_MPS2: Final = 9.80665
 
 
 class MotionState(IntEnum):

@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers
+from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.timescale import seconds
 from railfix.motion.samples import InertialSamples, TachometerPulses
 from railfix.motion.slip import (
-    GRAVITY_MPS2,
     MotionState,
     SlipLimits,
     SlipState,

@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
@@ -38,8 +39,6 @@ from railfix.reference.smoother import (
 from railfix.reference.ways import LONGEST_STEP_S, Speeds, fused, instants, nearest
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
-#: Standard gravity [m/s2].
-GRAVITY_MPS2: Final = 9.80665
 #: Rounds of Dopplers and smoother; the first starts from an even run between the fixes.
 _ROUNDS: Final = 3
 #: Fixes show the direction of travel when they are this many standard deviations apart.

@@ -16,6 +16,7 @@ from railfix.motion.samples import GroundUnits, SensorSamples, StationRanges
 from railfix.motion.tachometer import SpeedCheck, TachometerLimits, check_speeds, pulse_speeds
 from railfix.pipeline.feature_stage import ahead_m
 from railfix.pipeline.sensor_epochs import SensorLimits
+from railfix.run.sensor_signs import sign_notes
 from railfix.track.trajectory import Trajectory
 
 #: Speeds of the wheel are compared this far apart [ns].
@@ -61,9 +62,13 @@ class SensorChecks:
         """Return a sentence on each sensor that contradicts the satellites."""
         if not self.speeds:
             return ()
+        places = pl.concat(self.places)
+        turned = tuple(sign_notes(samples, places, limits.tachometer, 1.0 if trajectory.facing == "rising" else -1.0))
+        if turned:  # the speeds of the filter, which the rest is held against, rest on these sensors too
+            return turned
         notes = sensor_notes(samples, pl.concat(self.speeds), limits.tachometer)
         if units is not None and len(samples.ranging):
-            notes += tuple(range_notes(samples.ranging, units, pl.concat(self.places), trajectory, limits))
+            notes += tuple(range_notes(samples.ranging, units, places, trajectory, limits))
         return notes
 
 

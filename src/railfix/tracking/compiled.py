@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices
+from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.timescale import seconds, timedelta
 from railfix.tracking import bank, branches, clocks, misfit, possible_speed, predict, rows
 from railfix.tracking.chunk import Chunk
@@ -346,7 +347,7 @@ def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
         "speed_sigmas": possible_speed.SPEED_SIGMAS,
         "direction_mps": rows.DIRECTION_MPS,
         "chord_m": rows.CHORD_M,
-        "gravity_mps2": rows.GRAVITY_MPS2,
+        "gravity_mps2": GRAVITY_MPS2,
         "beside_after_s": branches.BESIDE_AFTER_S,
         "switch": branches.SWITCH,
         "most_odds": branches.MOST_ODDS,

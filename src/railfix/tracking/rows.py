@@ -26,7 +26,7 @@ from typing import Any, Final
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers
-from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
+from railfix.core.constants import EARTH_ROTATION_RATE, GRAVITY_MPS2, SPEED_OF_LIGHT
 from railfix.core.geodesy import range_with_rotation
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.epochs import RangeEpochs, SensorEpochs
@@ -34,8 +34,6 @@ from railfix.tracking.line import Line
 from railfix.tracking.state import OFFSETS, SATELLITES, Unknown
 
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
-#: Standard gravity, enough for the share of it along a gradient [m/s2].
-GRAVITY_MPS2: Final = 9.80665
 #: Slower than this ranges to ground units are not used [m/s].
 _STILL_MPS: Final = 0.3
 #: Slower than this a speed does not tell the direction [m/s]: four sigmas of what a wheel of one hertz leaves of it.
