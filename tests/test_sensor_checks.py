@@ -174,6 +174,16 @@ def test_a_sensor_that_is_turned_or_in_another_unit_is_told(
     assert re.search(said, note), note
 
 
+@pytest.mark.parametrize(("lag_s", "said"), [(-18.0, "1[789] s early .* UTC"), (6.0, "6 s late .* mend them")])
+@pytest.mark.parametrize("sensor", ["tachometer", "radar", "inertial"])
+def test_time_tags_that_are_seconds_off_are_told(sensor: str, lag_s: float, said: str) -> None:
+    places, samples = circle(np.arange(0.0, SECONDS, 1.0), noise_m=0.7), on_the_circle(1.0)
+    table = getattr(samples, sensor)
+    late = replace(table, time=table.time + np.timedelta64(round(lag_s * 1e9), "ns"))
+    (note,) = sign_notes(replace(samples, **{sensor: late}), places, TachometerLimits(), 1.0)
+    assert re.search(f"{sensor}: its time tags are {said}", note), note
+
+
 def test_exchanged_axes_are_told_and_nothing_else_rests_on_them() -> None:
     """The speeds of the filter are wrong with such a unit: what they say of the other sensors is not told."""
     places, samples = circle(np.arange(0.0, SECONDS, 1.0)), on_the_circle(1.0)

@@ -26,6 +26,8 @@ _NEAR_S: Final = 1.5
 #: Scale and lag that are told.
 _SCALE: Final = 0.01
 _LAG_S: Final = 0.3
+#: No worn wheel differs by so much.
+_OTHER_TEETH: Final = 0.1
 #: Ranges are compared with places by satellites that are so near in time [s], from a moving train, to a unit no further
 #: away [m] and seen along the track by this share; so many are needed on a side.
 _BETWEEN_S: Final = 3.0
@@ -160,10 +162,10 @@ def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: Tacho
         heard = np.isfinite(wheel.speed_mps)
         found = _checked(wheel.time[heard], wheel.speed_mps[heard], right_time, right)
         real = np.nan if found is None else tachometer.wheel_diameter_m / found.ratio
-        scale = (
-            "the way of its wheel is {:+.1f} % off that by satellites; sensors.tachometer.wheel_diameter_m = "
-            f"{real:.3f} would fit"
-        )
+        fits = f"sensors.tachometer.wheel_diameter_m = {real:.3f}"
+        if found is not None and abs(found.ratio - 1.0) > _OTHER_TEETH:
+            fits = f"sensors.tachometer.pulses_per_turn = {found.ratio * tachometer.pulses_per_turn:.0f} or {fits}"
+        scale = f"the way of its wheel is {{:+.1f}} % off that by satellites; {fits} would fit"
         notes += _sentences("tachometer", found, scale)
     return tuple(notes)
 

@@ -1,12 +1,13 @@
-"""Signs, units and axes of the sensors on board, held against the places of single epochs.
+"""Signs, units, axes and time tags of the sensors on board, held against the places of single epochs.
 
 These do not depend on the sensors, as speeds of the filter do: a sensor that is turned round moves the filter too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -15,8 +16,8 @@ import polars as pl
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.geodesy import enu_axes
-from railfix.core.timescale import seconds, timedelta
-from railfix.motion.samples import InertialSamples, SensorSamples
+from railfix.core.timescale import gpst_minus_utc, seconds, timedelta
+from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
 from railfix.motion.tachometer import TachometerLimits, pulse_speeds
 
 #: Places are averaged over cells of this length [s].
@@ -24,14 +25,19 @@ _CELL_S: Final = 4.0
 #: A train that moves, for signs of speeds [m/s], and as far between cells that its heading is known [m].
 _MOVING_MPS: Final = 1.0
 _HEADED_M: Final = 8.0
-#: Cells that are needed for a statement, and the least root mean square of what is compared: changes of a force [m/s2],
-#: a rate [rad/s].
+#: Cells that are needed for a statement, and the least root mean square of what is compared: changes of a force [m/s2]
+#: and of a speed [m/s], a rate [rad/s].
 _LEAST_CELLS: Final = 15
 _LEAST_FORCE_MPS2: Final = 0.08
+_LEAST_SPEED_MPS: Final = 1.0
 _LEAST_RATE_RADPS: Final = 0.003
 #: A slope of measured over expected below this is a turned sign, above that a rate in degrees.
 _TURNED: Final = -0.3
 _IN_DEGREES: Final = 10.0
+#: Lags that are tried, and the least that is told [s]; what is left unexplained at no lag is more by this factor.
+_LONGEST_LAG_S: Final = 20.0
+_LEAST_LAG_S: Final = 2.0
+_LESS_ALIKE: Final = 2.0
 #: Share of gravity that a force at rest may differ from it by.
 _GRAVITY_SHARE: Final = 0.12
 
@@ -93,7 +99,7 @@ def motion_of(places: pl.DataFrame) -> Motion:
 def sign_notes(
     samples: SensorSamples, places: pl.DataFrame, tachometer: TachometerLimits, facing: float
 ) -> Iterator[str]:
-    """Yield a sentence on each sensor that is turned round, in another unit or on other axes.
+    """Yield a sentence on each sensor that is turned round, in another unit, on other axes or seconds off in time.
 
     Parameters
     ----------
@@ -104,28 +110,99 @@ def sign_notes(
     facing : float
         1 where the vehicle's front points toward rising chainage, else -1.
     """
-    yield from _forces_at_rest(samples.inertial)
+    wheel, radar, inertial = samples.tachometer, samples.radar, samples.inertial
+    yield from _forces_at_rest(inertial)
     if len(places) < 2:
         return
     motion = motion_of(places)
-    moving = np.abs(motion.speed_mps) > _MOVING_MPS
-    time, forward = motion.time[moving], facing * motion.speed_mps[moving]
-    if len(samples.tachometer) and samples.tachometer.direction.any():
-        wheel = pulse_speeds(samples.tachometer, time, limits=tachometer).speed_mps
-        yield from _turned_speeds("tachometer", wheel, forward, "the direction of its pulses is")
-    if len(samples.radar):
-        at = np.clip(np.searchsorted(samples.radar.time, time), 0, len(samples.radar) - 1)
-        near = np.abs(seconds(samples.radar.time[at] - time)) < 1.0
-        radar = np.where(near, samples.radar.speed_mps[at], np.nan)
-        yield from _turned_speeds("radar", radar, forward, "the sign of its speeds is")
-    if len(samples.inertial):
-        yield from _turned_unit(samples.inertial, motion, facing)
+    known = ~np.isnat(motion.time)
+    time, forward = motion.time[known], facing * motion.speed_mps[known]
+    if len(wheel):
+        directed = "the direction of its pulses is" if wheel.direction.any() else None
+        speeds = partial(_wheel_speeds, wheel, tachometer)
+        yield from _of_speeds("tachometer", time, forward, speeds, directed)
+    if len(radar):
+        yield from _of_speeds("radar", time, forward, partial(_radar_speeds, radar), "the sign of its speeds is")
+    if len(inertial):
+        expected = facing * (motion.acceleration_mps2[known] + GRAVITY_MPS2 * motion.gradient[known])
+        force = partial(_means, inertial.time, inertial.force_mps2[:, 0])
+        lag = _lag_s(time, expected, force, _LEAST_FORCE_MPS2)
+        if lag:
+            yield _late("inertial", lag, time[0])
+            return
+        slope = _slope(_centred(expected), _centred(force(time)), _LEAST_FORCE_MPS2)
+        if slope < _TURNED:
+            yield (
+                "inertial: its force forward is opposite to the acceleration by satellites; the unit is turned round, "
+                "or the vehicle file's facing is wrong"
+            )
+        yaw = _means(inertial.time, inertial.rate_radps[:, 2], time)
+        slope = _slope(motion.heading_rate_radps[known], yaw, _LEAST_RATE_RADPS)
+        if slope < _TURNED:
+            yield "inertial: its yaw rate is opposite to that of the line; it must be positive to the right, about down"
+        if abs(slope) > _IN_DEGREES:
+            yield "inertial: its rates are in degrees per second, not in radians; convert them"
 
 
-def _turned_speeds(name: str, speed: Floats, forward: Floats, what: str) -> Iterator[str]:
-    known = np.isfinite(speed) & np.isfinite(forward)
-    if known.sum() >= _LEAST_CELLS and np.mean(speed[known] * forward[known] < 0.0) > 0.5:
-        yield f"{name}: {what} opposite to the motion by satellites; turn it, or the vehicle file's facing is wrong"
+def _of_speeds(
+    name: str, time: Datetimes, forward: Floats, speeds: Callable[[Datetimes], Floats], directed: str | None
+) -> Iterator[str]:
+    """Lag of a sensor of speeds, and its direction where it has one, called `directed`."""
+    lag = _lag_s(time, np.abs(forward), lambda at: np.abs(speeds(at)), _LEAST_SPEED_MPS)
+    if lag:
+        yield _late(name, lag, time[0])
+        return
+    measured = speeds(time)
+    known = np.isfinite(measured) & (np.abs(forward) > _MOVING_MPS)
+    if directed and known.sum() >= _LEAST_CELLS and np.mean(measured[known] * forward[known] < 0.0) > 0.5:
+        yield f"{name}: {directed} opposite to the motion by satellites; turn it, or the vehicle file's facing is wrong"
+
+
+def _lag_s(time: Datetimes, expected: Floats, measured: Callable[[Datetimes], Floats], least: float) -> float:
+    """Lag of the sensor's time tags behind the satellites' [s]; 0 where none of seconds is certain."""
+    x, found = _centred(expected), {}
+    for lag in np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S + 1.0).tolist():
+        y = measured(time + timedelta(np.array([lag])))
+        both = np.isfinite(x) & np.isfinite(y)
+        if both.sum() >= _LEAST_CELLS and x[both].std() >= least and y[both].std() > 0.0:
+            found[lag] = float(np.corrcoef(x[both], y[both])[0, 1]) ** 2
+    if 0.0 not in found:
+        return 0.0
+    best = max(found, key=lambda lag: found[lag])
+    certain = found[best] > 0.5 and 1.0 - found[0.0] > _LESS_ALIKE * (1.0 - found[best])
+    return best if certain and abs(best) >= _LEAST_LAG_S else 0.0
+
+
+def _late(name: str, lag_s: float, time: np.datetime64) -> str:
+    leap = int(gpst_minus_utc(time))
+    utc = "they are UTC, GPS time is expected" if abs(lag_s + leap) <= 1.0 else "mend them"
+    way = "late" if lag_s > 0 else "early"
+    return f"{name}: its time tags are {abs(lag_s):.0f} s {way} against the satellites'; {utc}"
+
+
+def _wheel_speeds(pulses: TachometerPulses, limits: TachometerLimits, time: Datetimes) -> Floats:
+    return pulse_speeds(pulses, time, limits=limits).speed_mps
+
+
+def _radar_speeds(radar: RadarSpeeds, time: Datetimes) -> Floats:
+    at = np.clip(np.searchsorted(radar.time, time), 0, len(radar) - 1)
+    return np.where(np.abs(seconds(radar.time[at] - time)) < 1.0, radar.speed_mps[at], np.nan)
+
+
+def _means(time: Datetimes, values: Floats, middle: Datetimes) -> Floats:
+    """Means of samples over two cells about instants; NaN where the samples do not reach so far."""
+    half = timedelta(np.array([_CELL_S]))
+    begin, end = middle - half, middle + half
+    first, last = np.searchsorted(time, begin), np.searchsorted(time, end)
+    whole = (last > first) & (begin >= time[0]) & (end <= time[-1])
+    total = np.concatenate([[0.0], np.cumsum(np.nan_to_num(values))])
+    return np.where(whole, (total[last] - total[first]) / np.maximum(last - first, 1), np.nan)
+
+
+def _centred(values: Floats) -> Floats:
+    """Values less their mean: an offset of the unit on the body has no part in what it is compared by."""
+    known = np.isfinite(values)
+    return values - (values[known].mean() if known.any() else 0.0)
 
 
 def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
@@ -143,35 +220,6 @@ def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
         yield f"inertial: gravity is in {axis}, not in force_down_mps2; exchange the columns of the axes"
     elif down > 0.0:
         yield f"inertial: force_down_mps2 is {down:+.1f} in the mean, -9.8 was expected; turn its sign, or the unit"
-
-
-def _turned_unit(inertial: InertialSamples, motion: Motion, facing: float) -> Iterator[str]:
-    """Forward force against acceleration and gradient, yaw rate against the heading's, by the slope of a line."""
-    half = timedelta(np.array([_CELL_S]))[0]
-    known = ~np.isnat(motion.time)
-    begin, end = motion.time[known] - half, motion.time[known] + half
-    first, last = np.searchsorted(inertial.time, begin), np.searchsorted(inertial.time, end)
-    whole = (last > first) & (begin >= inertial.time[0]) & (end <= inertial.time[-1])
-
-    def mean(values: Floats) -> Floats:
-        total = np.concatenate([[0.0], np.cumsum(np.nan_to_num(values))])
-        return np.where(whole, (total[last] - total[first]) / np.maximum(last - first, 1), np.nan)
-
-    expected = facing * (motion.acceleration_mps2[known] + GRAVITY_MPS2 * motion.gradient[known])
-    force = mean(inertial.force_mps2[:, 0])
-    both = np.isfinite(expected) & np.isfinite(force)
-    offsets = (expected[both].mean(), force[both].mean()) if both.any() else (0.0, 0.0)  # of the unit on the body
-    slope = _slope(expected - offsets[0], force - offsets[1], _LEAST_FORCE_MPS2)
-    if slope < _TURNED:
-        yield (
-            "inertial: its force forward is opposite to the acceleration by satellites; the unit is turned round, or "
-            "the vehicle file's facing is wrong"
-        )
-    slope = _slope(motion.heading_rate_radps[known], mean(inertial.rate_radps[:, 2]), _LEAST_RATE_RADPS)
-    if slope < _TURNED:
-        yield "inertial: its yaw rate is opposite to that of the line; it must be positive to the right, about down"
-    if abs(slope) > _IN_DEGREES:
-        yield "inertial: its rates are in degrees per second, not in radians; convert them"
 
 
 def _slope(expected: Floats, measured: Floats, least: float) -> float:
