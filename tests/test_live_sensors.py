@@ -19,8 +19,10 @@ from railfix.core.errors import InputFileError
 from railfix.core.settings import write_toml
 from railfix.core.timescale import GPS_EPOCH
 from railfix.io.train_message import MessageStatus, Source
+from railfix.live import sensor_watch
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
 from railfix.live.sensor_lines import FOREVER, Sensed, SensorLines
+from railfix.live.sensor_watch import SensorWatch
 from railfix.live.settings import LiveSettings
 from railfix.live.state import SavedSession, load_state, write_state
 from railfix.motion.samples import SENSORS, SensorSamples, StationRanges
@@ -279,6 +281,34 @@ def test_a_range_to_a_unit_that_is_not_surveyed_is_counted(case: Ride, tmp_path:
     assert sensed.unsurveyed(None) == 2
 
 
+def test_the_watch_of_the_sensors_speaks_once_and_forgets(
+    case: Ride, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sensor_watch, "WATCHED_NS", 70_000_000_000)
+    engine = engine_of(case, tmp_path, sensor_wait_s=0.2)
+    outputs, said = live(case, engine, latency_s=0.05), list[str]()
+    watch = SensorWatch(engine.processor, said.append)
+    ranges = case.samples.ranging
+    wrong = replace(case.samples, ranging=replace(ranges, range_m=ranges.range_m + 5.0))
+    for rows in np.array_split(np.arange(len(case.observations)), 7):  # as they come, sensor by sensor
+        begin, end = case.observations.time[rows[0]] - np.timedelta64(500, "ms"), case.observations.time[rows[-1]]
+        for sensor, table in wrong.between(begin, end).tables.items():
+            watch.take(Sensed(sensor=sensor, samples=SensorSamples(**{sensor: table}), until=end))
+        for k in rows:
+            watch.take(outputs[k])
+    (note,) = said
+    assert "ranges are 5." in note or "ranges are 4." in note
+    watch.judge()
+    assert said == [note]
+    assert not any(vars(watch)[name] for name in ("_places", "_speeds", "_samples"))
+    right = SensorWatch(engine.processor, said.append)
+    right.take(Sensed(sensor="all", samples=case.samples, until=FOREVER))
+    for output in outputs:
+        right.take(output)
+    right.judge()
+    assert said == [note]
+
+
 @pytest.fixture
 def served() -> Iterator[dict[bytes, int]]:
     """Servers of one answer each: a port by its content, made as they are asked for."""
@@ -346,6 +376,7 @@ def test_the_command_with_tables_and_with_streams_is_the_run(served: dict[bytes,
         said = RUNNER.invoke(app, ["live", *given, *words, *send, "--out", str(tmp_path / folder)])
         assert said.exit_code == 0, said.output
         assert "silent" not in said.output
+        assert f"sensors.range_ahead_m = {fits:.1f} would fit" in " ".join(said.output.split())
         assert ("skipped: 1 ranges to ground units that are not surveyed" in said.output) == (folder == "streams")
         found = pl.read_parquet(tmp_path / folder / "train.parquet")
         np.testing.assert_allclose(found["chainage_m"], expected["chainage_m"], atol=1e-6)

@@ -7,7 +7,7 @@ import contextlib
 import gc
 import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -24,6 +24,7 @@ from railfix.live.metrics import Metrics, serve_metrics
 from railfix.live.outlets import Outlet
 from railfix.live.record import ResultTables
 from railfix.live.sensor_lines import FOREVER, Sensed
+from railfix.live.sensor_watch import SensorWatch
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
 from railfix.live.sinks import file_of, open_sink
@@ -133,13 +134,16 @@ async def run_live(inputs: LiveInputs) -> list[str]:
         if inputs.channels == 2:
             engine = TwoChannels(processor, live, tuple(inputs.sensors))
             held.callback(engine.close)
-        for name in set(inputs.sensors) - set(listened):
-            samples = SensorSamples(**{str(name): getattr(tables, name)})
-            engine.sense(Sensed(sensor=name, samples=samples, until=FOREVER))
         metrics = Metrics()
         if inputs.metrics is not None:
             held.callback((await serve_metrics(metrics, inputs.metrics)).close)
         hooks, streams = _hooks(inputs, live, engine, log, held, full="wait" if replay else "drop")
+        for name in set(inputs.sensors) - set(listened):
+            samples = SensorSamples(**{str(name): getattr(tables, name)})
+            table = Sensed(sensor=name, samples=samples, until=FOREVER)
+            engine.sense(table)
+            if hooks.sensed is not None:
+                hooks.sensed(table)
         gc.freeze()  # what is loaded stays: looking through it for garbage would hold an epoch up for 0.1 s
         session = asyncio.create_task(
             run_session(
@@ -177,13 +181,21 @@ def _hooks(
     *,
     full: str,
 ) -> tuple[Hooks, Mapping[str, Any]]:
-    """Tables of results, state file and status line; and the streams' states where the state file is used."""
-    observe, save, streams = None, None, {}
+    """Tables of results, state file, status line and watch of sensors; and streams' states where the file is used."""
+    observers: list[Callable[[LiveOutput], None]] = []
+    sensed, save, streams = None, None, {}
     if inputs.out is not None:
         tables = held.enter_context(ResultTables(inputs.out, overwrite=inputs.overwrite, inputs=inputs.read))
         rows: Outlet[LiveOutput] = Outlet(f"tables {inputs.out}", tables.add, waiting=live.waiting * 10, full=full)
         held.callback(_closed, rows, log)
-        observe = rows.send
+        observers.append(rows.send)
+    if inputs.sensors:
+        watch = SensorWatch(engine.processor, log.say)
+        held.callback(watch.judge)
+        watched: Outlet[LiveOutput | Sensed] = Outlet("watch of the sensors", watch.take, waiting=1000, full=full)
+        held.callback(_closed, watched, log)
+        observers.append(watched.send)
+        sensed = watched.send
     if inputs.state is not None:
         path, under = (
             inputs.state,
@@ -201,7 +213,13 @@ def _hooks(
         )
         held.callback(_closed, states, log)
         save = states.send
-    return Hooks(observe=observe, save=save, show=log.show if log.shows_status else None), streams
+
+    def observe(output: LiveOutput) -> None:
+        for observer in observers:
+            observer(output)
+
+    show = log.show if log.shows_status else None
+    return Hooks(observe=observe, sensed=sensed, save=save, show=show), streams
 
 
 def _closed(outlet: Outlet[Any], log: SessionLog) -> None:

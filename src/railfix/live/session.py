@@ -42,6 +42,8 @@ class Hooks:
     ----------
     observe : callable or None
         Called with every output, after the sinks.
+    sensed : callable or None
+        Called with what each source of a sensor completes.
     save : callable or None
         Called every `LiveSettings.state_every_s`, in idle time, with what a restart needs.
     show : callable or None
@@ -49,6 +51,7 @@ class Hooks:
     """
 
     observe: Callable[[LiveOutput], None] | None = None
+    sensed: Callable[[Sensed], None] | None = None
     save: Callable[[SavedSession], None] | None = None
     show: Callable[[str], None] | None = None
 
@@ -155,6 +158,8 @@ class _Session:
                     skipped[f"lines of the {item.sensor} that are no rows"] += item.skipped
                     skipped["ranges to ground units that are not surveyed"] += item.unsurveyed(units)
                     self.engine.sense(item)
+                    if self.hooks.sensed is not None:
+                        self.hooks.sensed(item)
                 elif item is not None:
                     name, received = item
                     if received is None:

@@ -53,9 +53,10 @@ class SensorChecks:
     places: list[pl.DataFrame] = field(default_factory=list)
 
     def take(self, positions: pl.DataFrame, train: pl.DataFrame) -> None:
-        """Take the rows of a chunk."""
+        """Take the rows of a chunk; two places a second are kept."""
         columns = ("time_gpst", "chainage_m", "latitude_deg", "longitude_deg", "x_m", "y_m", "z_m")
-        self.places.append(positions.filter(pl.col("status") == "ok").select(columns))
+        passed = positions.filter(pl.col("status") == "ok").select(columns)
+        self.places.append(passed.unique(pl.col("time_gpst").dt.truncate("500ms"), keep="first", maintain_order=True))
         self.speeds.append(doppler_speeds(train))
 
     def notes(

@@ -1,0 +1,106 @@
+"""The sensors on board of a live session, held once against the satellites of its first minutes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+import polars as pl
+
+from railfix.core.arrays import Datetimes
+from railfix.core.reasons import Status
+from railfix.core.timescale import GPS_EPOCH
+from railfix.live.engine import LiveOutput
+from railfix.live.sensor_lines import Sensed
+from railfix.motion.samples import SensorSamples
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.results import AntennaResult
+from railfix.run.sensor_checks import SensorChecks
+from railfix.tracking.rows import Kind
+
+#: The sensors are judged after so long, by places at least so far apart [ns].
+WATCHED_NS: Final = 600_000_000_000
+_EVERY_NS: Final = 500_000_000
+_PLACE: Final = ("chainage_m", "latitude_deg", "longitude_deg", "x_m", "y_m", "z_m")
+
+
+class SensorWatch:
+    """Places and speeds of the first antenna and the samples of the sensors, up to their judgement.
+
+    Parameters
+    ----------
+    processor : EpochProcessor
+    say : callable
+        Takes a sentence on each sensor that contradicts the satellites (`railfix.run.sensor_checks.SensorChecks`).
+    """
+
+    def __init__(self, processor: EpochProcessor, say: Callable[[str], None]) -> None:
+        self._name, self._trajectory = next(iter(processor.trajectories.items()))
+        self._processor, self._say = processor, say
+        self._place_ns: list[int] = []
+        self._places: list[tuple[float, ...]] = []
+        self._speed_ns: list[int] = []
+        self._speeds: list[float] = []
+        self._samples: list[SensorSamples] = []
+        self._judged = False
+
+    def take(self, item: LiveOutput | Sensed) -> None:
+        """Take an output of the engine, or what a sensor's source has completed."""
+        if self._judged:
+            return
+        if isinstance(item, Sensed):
+            if item.samples:
+                self._samples.append(item.samples)
+        elif item.result is not None and self._name in item.result.antennas:
+            antenna, track = item.result.antennas[self._name], item.result.fusion.get(self._name)
+            time_ns = int((antenna.time[-1] - GPS_EPOCH).astype(np.int64))
+            if antenna.status[-1] == Status.OK and time_ns >= _last(self._place_ns) + _EVERY_NS:
+                self._place_ns.append(time_ns)
+                self._places.append(_place(antenna))
+            if track is not None and track.tracked.used[-1, Kind.DOPPLER] and time_ns > _last(self._speed_ns):
+                self._speed_ns.append(time_ns)
+                self._speeds.append(float(track.tracked.speed_mps[-1]))
+            if self._place_ns and time_ns - self._place_ns[0] >= WATCHED_NS:
+                self.judge()
+
+    def judge(self) -> None:
+        """Judge the sensors by what there is, once."""
+        if self._judged:
+            return
+        self._judged = True
+        if self._places and self._speeds and self._samples:
+            end = _times(self._speed_ns)[-1]
+            samples = _joined(self._samples).between(np.datetime64("NaT", "ns"), end)
+            places = pl.DataFrame(self._places, schema=_PLACE, orient="row")
+            speeds = pl.DataFrame({"time_gpst": _times(self._speed_ns), "speed_mps": self._speeds})
+            checks = SensorChecks(
+                places=[places.with_columns(time_gpst=pl.Series(_times(self._place_ns)))],
+                speeds=[speeds.filter(pl.col("speed_mps").is_finite())],
+            )
+            processor = self._processor
+            for note in checks.notes(samples, processor.units, self._trajectory, processor.config.sensors):
+                self._say(note)
+        self._place_ns, self._places, self._speed_ns, self._speeds, self._samples = [], [], [], [], []
+
+
+def _place(antenna: AntennaResult) -> tuple[float, ...]:
+    """Its last place, in the order of `_PLACE`."""
+    geodetic = (antenna.chainage_m[-1], antenna.latitude_deg[-1], antenna.longitude_deg[-1])
+    return tuple(float(value) for value in (*geodetic, *antenna.ecef_m[-1]))
+
+
+def _last(time_ns: list[int]) -> int:
+    return time_ns[-1] if time_ns else -_EVERY_NS
+
+
+def _times(time_ns: list[int]) -> Datetimes:
+    return GPS_EPOCH + np.array(time_ns).astype("timedelta64[ns]")
+
+
+def _joined(parts: list[SensorSamples]) -> SensorSamples:
+    """All parts as one, neighbours first: each sample is copied a few times, not once a part."""
+    while len(parts) > 1:
+        pairs = zip(parts[::2], parts[1::2], strict=False)
+        parts = [early.joined(late) for early, late in pairs] + parts[len(parts) // 2 * 2 :]
+    return parts[0]
