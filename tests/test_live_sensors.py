@@ -25,7 +25,7 @@ from railfix.live.sensor_lines import FOREVER, Sensed, SensorLines
 from railfix.live.sensor_watch import SensorWatch
 from railfix.live.settings import LiveSettings
 from railfix.live.state import SavedSession, load_state, write_state
-from railfix.motion.samples import SENSORS, SensorSamples, StationRanges
+from railfix.motion.samples import SENSORS, RadarSpeeds, SensorSamples, StationRanges
 from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.results import State
@@ -279,6 +279,30 @@ def test_a_range_to_a_unit_that_is_not_surveyed_is_counted(case: Ride, tmp_path:
     np.testing.assert_array_equal(sensed.samples.ranging.sigma_m, [np.nan, 0.2])
     assert sensed.unsurveyed(engine.processor.units) == 1
     assert sensed.unsurveyed(None) == 2
+
+
+def test_a_radar_whose_mounting_moves_is_told_in_a_running_session(case: Ride, tmp_path: Path) -> None:
+    """The ride's outputs over and over, each time later; from the eleventh on the radar reads 4 % more."""
+    engine, said = engine_of(case, tmp_path, sensor_wait_s=0.2), list[str]()
+    outputs, radar = live(case, engine, latency_s=0.05), case.samples.radar
+    watch = SensorWatch(engine.processor, said.append)
+    watch.judge()
+    for turn in range(20):
+        shift = np.timedelta64(90 * turn, "s")
+        scale = 1.04 if turn > 10 else 1.0
+        rows = RadarSpeeds(time=radar.time + shift, speed_mps=scale * radar.speed_mps)
+        for part in np.array_split(np.arange(len(rows)), 40):
+            some = RadarSpeeds(time=rows.time[part], speed_mps=rows.speed_mps[part])
+            watch.take(Sensed(sensor="radar", samples=SensorSamples(radar=some), until=some.time[-1]))
+            assert len(vars(watch)["_radar"].radar) < 130 * 10
+        for output in outputs:
+            assert output.result is not None
+            front, track = output.result.antennas["front"], output.result.fusion["front"]
+            later = replace(front, time=front.time + shift)
+            result = replace(output.result, antennas={"front": later}, fusion={"front": track})
+            watch.take(replace(output, result=result))
+    (note,) = said
+    assert re.search(r"from .* its speeds are \+[34].\d % off those by satellites, [+-]0.\d % before", note), note
 
 
 def test_the_watch_of_the_sensors_speaks_once_and_forgets(

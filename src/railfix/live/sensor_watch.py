@@ -1,4 +1,4 @@
-"""The sensors on board of a live session, held once against the satellites of its first minutes."""
+"""Sensors on board of a live session, held against the satellites: once after ten minutes, the radar all the time."""
 
 from __future__ import annotations
 
@@ -12,21 +12,24 @@ from railfix.core.arrays import Datetimes
 from railfix.core.reasons import Status
 from railfix.core.timescale import GPS_EPOCH
 from railfix.live.engine import LiveOutput
-from railfix.live.sensor_lines import Sensed
+from railfix.live.sensor_lines import FOREVER, Sensed
+from railfix.motion.radar_mounting import RadarMounting
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
 from railfix.run.sensor_checks import SensorChecks
 from railfix.tracking.rows import Kind
 
-#: The sensors are judged after so long, by places at least so far apart [ns].
+#: The sensors are judged after so long, by places at least so far apart; the radar's mounting every so often [ns].
 WATCHED_NS: Final = 600_000_000_000
+_MOUNTING_NS: Final = 60_000_000_000
 _EVERY_NS: Final = 500_000_000
+_NEVER: Final = np.datetime64("NaT", "ns")
 _PLACE: Final = ("chainage_m", "latitude_deg", "longitude_deg", "x_m", "y_m", "z_m")
 
 
 class SensorWatch:
-    """Places and speeds of the first antenna and the samples of the sensors, up to their judgement.
+    """Places and speeds of the first antenna and the samples of the sensors, until they have been judged.
 
     Parameters
     ----------
@@ -43,18 +46,23 @@ class SensorWatch:
         self._speed_ns: list[int] = []
         self._speeds: list[float] = []
         self._samples: list[SensorSamples] = []
+        self._begin = _NEVER
         self._judged = False
+        self._mounting, self._radar = RadarMounting(), SensorSamples()
+        self._rolled_ns: list[int] = []
+        self._rolled: list[float] = []
 
     def take(self, item: LiveOutput | Sensed) -> None:
         """Take an output of the engine, or what a sensor's source has completed."""
-        if self._judged:
-            return
         if isinstance(item, Sensed):
-            if item.samples:
-                self._samples.append(item.samples)
+            self._hear(item)
         elif item.result is not None and self._name in item.result.antennas:
             antenna, track = item.result.antennas[self._name], item.result.fusion.get(self._name)
             time_ns = int((antenna.time[-1] - GPS_EPOCH).astype(np.int64))
+            if track is not None and track.tracked.used[-1, Kind.DOPPLER]:
+                self._roll(time_ns, float(track.tracked.speed_mps[-1]))
+            if self._judged:
+                return
             if antenna.status[-1] == Status.OK and time_ns >= _last(self._place_ns) + _EVERY_NS:
                 self._place_ns.append(time_ns)
                 self._places.append(_place(antenna))
@@ -64,6 +72,34 @@ class SensorWatch:
             if self._place_ns and time_ns - self._place_ns[0] >= WATCHED_NS:
                 self.judge()
 
+    def _hear(self, sensed: Sensed) -> None:
+        """Keep samples, of streams no longer than they can be needed: there may be no place for hours."""
+        table = bool(sensed.until == FOREVER)
+        if sensed.samples and not self._judged:
+            self._samples.append(sensed.samples)
+            self._begin = np.fmin(self._begin, sensed.until)
+            if not table and sensed.until - self._begin > 2 * np.timedelta64(WATCHED_NS, "ns"):
+                if self._places:
+                    self.judge()
+                self._samples, self._begin = [], _NEVER
+        if len(sensed.samples.radar):
+            self._radar = self._radar.joined(SensorSamples(radar=sensed.samples.radar))
+            if not table:
+                self._radar = self._radar.between(sensed.until - 2 * np.timedelta64(_MOUNTING_NS, "ns"), FOREVER)
+
+    def _roll(self, time_ns: int, speed_mps: float) -> None:
+        """Take a speed by satellites for the radar's mounting."""
+        if time_ns <= _last(self._rolled_ns):
+            return
+        self._rolled_ns.append(time_ns)
+        self._rolled.append(speed_mps)
+        if time_ns - self._rolled_ns[0] >= _MOUNTING_NS:
+            time = _times(self._rolled_ns)
+            now, self._radar = self._radar.between(_NEVER, time[-1]), self._radar.between(time[-1], FOREVER)
+            for step in self._mounting.take_samples(now.radar, time, np.array(self._rolled)):
+                self._say(step.sentence)
+            self._rolled_ns, self._rolled = [], []
+
     def judge(self) -> None:
         """Judge the sensors by what there is, once."""
         if self._judged:
@@ -71,7 +107,7 @@ class SensorWatch:
         self._judged = True
         if self._places and self._speeds and self._samples:
             end = _times(self._speed_ns)[-1]
-            samples = _joined(self._samples).between(np.datetime64("NaT", "ns"), end)
+            samples = _joined(self._samples).between(_NEVER, end)
             places = pl.DataFrame(self._places, schema=_PLACE, orient="row")
             speeds = pl.DataFrame({"time_gpst": _times(self._speed_ns), "speed_mps": self._speeds})
             checks = SensorChecks(

@@ -62,6 +62,7 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "code_weight": "mean weight of codes; 1 is that of an error of one standard deviation",
     "motion_weight": "mean weight of Dopplers and phases",
     "wheel_scale": "share that the wheel's way is too short by, as estimated",
+    "radar_scale": "share that the radar's way is too short by, as estimated",
     "force_offset_mps2": "offset of the accelerometer, as estimated",
     "map_scale": "factor on the error of lengths along the map (`tracking.map_scale_m`): above 1 where the "
     "pseudoranges keep moving against the map",
@@ -170,6 +171,7 @@ def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
             "code_weight": float_column(tracked.code_weight),
             "motion_weight": float_column(tracked.motion_weight),
             "wheel_scale": float_column(tracked.wheel_scale),
+            "radar_scale": float_column(tracked.radar_scale),
             "force_offset_mps2": float_column(tracked.force_offset_mps2),
             "map_scale": float_column(tracked.map_scale),
             "metric_antenna_spacing_m": float_column(result.spacing_error_m),

@@ -12,6 +12,7 @@ import polars as pl
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.geodesy import enu_axes
 from railfix.core.timescale import seconds
+from railfix.motion.radar_mounting import RadarMounting
 from railfix.motion.samples import GroundUnits, SensorSamples, StationRanges
 from railfix.motion.tachometer import SpeedCheck, TachometerLimits, check_speeds, pulse_speeds
 from railfix.pipeline.feature_stage import ahead_m
@@ -69,7 +70,11 @@ class SensorChecks:
         turned = tuple(sign_notes(samples, places, limits.tachometer, 1.0 if trajectory.facing == "rising" else -1.0))
         if turned:  # the speeds of the filter, which the rest is held against, rest on these sensors too
             return turned
-        notes = sensor_notes(samples, pl.concat(self.speeds), limits.tachometer)
+        speeds = pl.concat(self.speeds)
+        notes = sensor_notes(samples, speeds, limits.tachometer)
+        time = speeds["time_gpst"].to_numpy().astype("datetime64[ns]")
+        steps = RadarMounting().take_samples(samples.radar, time, speeds["speed_mps"].to_numpy())
+        notes += tuple(step.sentence for step in steps)
         if units is not None and len(samples.ranging):
             notes += tuple(range_notes(samples.ranging, units, places, trajectory, limits))
         return notes
