@@ -104,7 +104,7 @@ def joined(parts: Iterable[Any]) -> Any:
     for name, value in vars(parts[0]).items():
         if isinstance(value, np.ndarray):
             values[name] = np.concatenate([getattr(p, name) for p in parts])
-        elif name == "tracked":
+        elif name in ("tracked", "sensed"):
             values[name] = joined(getattr(p, name) for p in parts)
     return replace(parts[0], **values)
 

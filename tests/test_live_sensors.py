@@ -144,7 +144,8 @@ def test_a_live_session_with_sensors_gives_what_the_log_gives(case: Ride, tmp_pa
     found, whole = places(outputs), case.run(sensors=PLACE)
     assert (whole.tracked.used[:, Kind.RANGE] > 0).sum() > 10
     np.testing.assert_allclose(found.chainage_m, whole.chainage_m, atol=1e-6)
-    np.testing.assert_array_equal(found.motion, whole.motion)
+    np.testing.assert_array_equal(found.sensed.state, whole.sensed.state)
+    np.testing.assert_allclose(found.sensed.curvature_1pm, whole.sensed.curvature_1pm, atol=1e-9)
     np.testing.assert_array_equal(found.tracked.used, whole.tracked.used)
     assert not any("silent" in what for what in engine.counts)
     inside = ~np.isfinite(case.observations.code_m).any(axis=1) & (case.time_s > 50.0)

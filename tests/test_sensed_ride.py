@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from railfix.motion.features import line_series
 from railfix.motion.samples import GroundUnits, RadarSpeeds
 from railfix.motion.slip import MotionState
 from railfix.motion.tachometer import TachometerLimits
 from railfix.pipeline.train_table import antenna_train
 from railfix.run.sensor_checks import doppler_speeds, sensor_notes
+from railfix.track.trajectory import Trajectory
 from railfix.tracking import Kind
 from sensed_ride import Ride, ride
 
@@ -47,7 +49,7 @@ def test_any_cutting_of_the_log_gives_the_same(case: Ride) -> None:
     cuts = [1, 2, 37, 38, 95, *range(118, 142), 150]
     cut = case.run(sensors=PLACE, cuts=cuts)
     np.testing.assert_allclose(cut.chainage_m, whole.chainage_m, atol=1e-6)
-    np.testing.assert_array_equal(cut.motion, whole.motion)
+    np.testing.assert_array_equal(cut.sensed.state, whole.sensed.state)
     np.testing.assert_array_equal(cut.tracked.used, whole.tracked.used)
 
 
@@ -57,7 +59,7 @@ def test_a_slip_in_a_tunnel_is_carried_by_inertia(case: Ride) -> None:
     both = case.run(filter_sources=(*GNSS, "wheel", "force"))
     inside = tunnel(case)
     slipping = (case.time_s > 63.0) & (case.time_s < 65.0)
-    assert (both.motion[slipping] == MotionState.INERTIAL_SPIN).all()
+    assert (both.sensed.state[slipping] == MotionState.INERTIAL_SPIN).all()
     assert np.abs(case.error_m(wheel_alone)[inside]).max() > 2.5
     assert np.abs(case.error_m(both)[inside]).max() < 1.0
     table = antenna_train("front", both)
@@ -142,3 +144,28 @@ def test_the_innovation_of_each_sensor_stands_in_the_table(case: Ride) -> None:
         assert known.sum() > 100
     ranged = table["innovation_range_m"].fill_null(float("nan")).to_numpy()[tunnel(case)]
     assert np.nanmedian(np.abs(ranged)) < 1.0
+
+
+@pytest.mark.requirement("E3")
+def test_gradient_curvature_and_cant_are_those_of_the_map(case: Ride) -> None:
+    """Under the body's middle, where the map's curvature is even over 30 m (the bodies' bogies are 14 m apart)."""
+    found, line = case.run(), case.simulation.line
+    track = line.track()
+    series = line_series(Trajectory.from_track(track))
+    body = found.chainage_m - case.simulation.scenario.vehicle.front[0]
+    curvature, gradient = (np.interp(body, series.arc_m, v) for v in (series.curvature_1pm, series.gradient))
+    near = [np.interp(body + d, series.arc_m, series.curvature_1pm) for d in (-15.0, 15.0)]
+    sensed = found.sensed
+    even = np.isfinite(sensed.curvature_1pm) & (np.abs(np.subtract(*near)) < 2e-4)
+    curves = even & (np.abs(curvature) > 1e-3)
+    assert even.sum() > 60
+    assert curves.sum() > 20
+    np.testing.assert_allclose(sensed.curvature_1pm[even], curvature[even], atol=6e-4)  # the map has points
+    cant = np.sign(curvature) * np.interp(body, track.chainage_m, np.nan_to_num(track.cant_m))
+    np.testing.assert_allclose(sensed.cant_m[even], np.where(curves, cant, 0.0)[even], atol=5e-3)
+    off = (sensed.gradient - gradient)[even]  # the accelerometer's offset of 0.02 m/s2 is 2 permille
+    assert np.median(off) == pytest.approx(2e-3, abs=5e-4)
+    assert np.percentile(np.abs(off - np.median(off)), 90.0) < 3e-3  # not the fifth of a second before a slip is found
+    table = antenna_train("front", found)
+    np.testing.assert_allclose(table["measured_cant_mm"].to_numpy()[curves], 1e3 * cant[curves], atol=5.0)
+    assert np.isnan(sensed.curvature_1pm[~(np.abs(case.speed_mps) > 0.9)]).all()

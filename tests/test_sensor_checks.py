@@ -1,4 +1,4 @@
-"""Notes on sensors that contradict the satellites, by rides written as formulas."""
+"""Sensors on board against the satellites and the line, by rides written as formulas."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from railfix.motion.samples import (
     TachometerPulses,
 )
 from railfix.motion.tachometer import TachometerLimits
-from railfix.pipeline.sensor_epochs import SensorLimits
+from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, sensor_epochs
 from railfix.run.sensor_checks import SensorChecks, range_notes
 from railfix.run.sensor_signs import motion_of, sign_notes
 from railfix.track import Track
@@ -117,7 +117,7 @@ def on_the_circle(facing: float) -> SensorSamples:
     gained = 6.0 * 2.0 * np.pi / 80.0 * np.cos(2.0 * np.pi * t / 80.0)
     nothing = np.zeros_like(t)
     force = np.column_stack([facing * (gained + 9.80665 * CLIMB), facing * speed**2 / RADIUS_M, nothing - 9.80665])
-    pulse = np.arange(0.0, way_m(np.array([SECONDS]))[0], TachometerLimits().pulse_m)
+    pulse = np.arange(0.0, way_m(t[-1:])[0], TachometerLimits().pulse_m)
     at = np.interp(pulse, way_m(t), t)
     return SensorSamples(
         inertial=InertialSamples(
@@ -239,3 +239,27 @@ def test_a_run_names_a_mounting_that_moves() -> None:
     assert checks.notes(samples, None, LINE, SensorLimits()) == ()
     notes = checks.notes(moved, None, LINE, SensorLimits())
     assert any("-3.0 % off those by satellites, +0.0 % before; has its mounting moved" in note for note in notes), notes
+
+
+@pytest.mark.requirement("E3")
+@pytest.mark.parametrize("facing", [1.0, -1.0])
+def test_the_line_under_the_body_whichever_way_the_vehicle_faces(facing: float) -> None:
+    """A circle to the right that climbs, the body leaning by 60 mm over 1.5 m, seen by a vehicle that runs or backs."""
+    samples, lean = on_the_circle(facing), 0.06 / 1.5
+    unit = samples.inertial
+    force = unit.force_mps2 - np.array([0.0, facing * 9.80665 * lean, 0.0])
+    samples = replace(samples, inertial=replace(unit, force_mps2=force))
+    trajectory = replace(LINE, facing="rising" if facing > 0 else "falling", contact_m=1.5)
+    time = START + (np.arange(20.0, SECONDS - 20.0) * 1e9).astype("timedelta64[ns]")
+    state, limits = SensorState.empty(), SensorLimits()
+    climb = CLIMB / np.sqrt(1.0 + CLIMB**2)
+    _, sensed, _ = sensor_epochs(
+        samples, time, trajectory, state, limits=limits, sine_at=lambda arc_m: np.full(arc_m.shape, climb)
+    )
+    late = slice(30, None)  # once the wheel is known to roll
+    np.testing.assert_allclose(sensed.curvature_1pm[late], 1.0 / RADIUS_M, rtol=0.02)
+    np.testing.assert_allclose(sensed.cant_m[late], 0.06, atol=1e-3)
+    np.testing.assert_allclose(sensed.gradient[late], CLIMB, atol=5e-4)
+    _, without, _ = sensor_epochs(samples, time, replace(trajectory, contact_m=None), state, limits=limits)
+    assert np.isnan(without.cant_m).all()
+    assert np.isfinite(without.curvature_1pm[late]).all()

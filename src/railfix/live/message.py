@@ -108,7 +108,7 @@ def _measured_with(track: AlongTrack) -> Source:
     sources = Source(0)
     for kind in np.flatnonzero(track.tracked.used[-1]).tolist():
         sources |= _SOURCE_OF_KIND.get(Kind(kind), Source(0))
-    if track.motion[-1] in CARRIED and Source.TACHOMETER in sources:
+    if track.sensed.state[-1] in CARRIED and Source.TACHOMETER in sources:
         sources = sources & ~Source.TACHOMETER | Source.INERTIAL
     return sources
 

@@ -168,7 +168,8 @@ def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
     interval = seconds(np.diff(pulses.time))
     before, after = interval[:-2], interval[2:]
     even = np.abs(before - after) < 0.3 * np.minimum(before, after)
-    lost[2:-1] = even & (np.abs(interval[1:-1] / (0.5 * (before + after)) - 2.0) < 0.3)
+    with np.errstate(divide="ignore", invalid="ignore"):  # pulses of one time tag
+        lost[2:-1] = even & (np.abs(interval[1:-1] / (0.5 * (before + after)) - 2.0) < 0.3)
     lost[1:] |= np.diff(pulses.pulse) > 1
     pair = interval[1:-2] + interval[2:-1]
     outer = 0.5 * (interval[:-3] + interval[3:])

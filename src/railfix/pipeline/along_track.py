@@ -19,6 +19,7 @@ from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.return_gate import ReturnState, refused_codes
+from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import SensorState, Surroundings, sensor_epochs
 from railfix.pipeline.smoothing import Replay, SmoothedTrack
 from railfix.positioning.carrier import SlipState, corrected_phase_m, find_slips
@@ -138,8 +139,8 @@ class AlongTrack:
     direction : ndarray of int8, shape (T,)
         1 toward rising chainage, -1 toward falling, 0 where the speed does not tell.
     standstill : ndarray of bool, shape (T,)
-    motion : ndarray of int8, shape (T,)
-        `railfix.motion.slip.MotionState` since the epoch before, by wheel and inertial unit.
+    sensed : SensedMotion
+        Motion since the epoch before and the line under the body, by wheel and inertial unit.
     spacing_error_m : ndarray, shape (T,) [m]
         Distance from the place of the other antenna less that of the antennas; NaN where it was not looked at.
     replay : tuple of Replay
@@ -155,7 +156,7 @@ class AlongTrack:
     height_m: Floats
     direction: Codes
     standstill: Masks
-    motion: Codes
+    sensed: SensedMotion
     spacing_error_m: Floats
     replay: tuple[Replay, ...] = ()
 
@@ -198,7 +199,7 @@ def along_track(
     epochs, slips = gnss_epochs(ranges, single.noise_scale, navigation, config, state.slips)
     epochs = replace(epochs, off_map=single.off_map)
     line = Line.of(trajectory) if state.line is None else state.line
-    tracked, motion, replays, after = _tracked(
+    tracked, sensed, replays, after = _tracked(
         epochs, trajectory, line, config, replace(state, slips=slips), samples, surroundings,
         (single.arc_m, single.sigma_m),
     )  # fmt: skip
@@ -219,7 +220,7 @@ def along_track(
         height_m=height,
         direction=direction.astype(np.int8),
         standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS,
-        motion=motion,
+        sensed=sensed,
         spacing_error_m=np.full(len(tracked), np.nan),
         replay=replays,
     )
@@ -262,7 +263,7 @@ def _tracked(
     samples: SensorSamples | None,
     surroundings: Surroundings | None,
     alone: tuple[Floats, Floats],
-) -> tuple[Tracked, Codes, tuple[Replay, ...], FilterState]:
+) -> tuple[Tracked, SensedMotion, tuple[Replay, ...], FilterState]:
     """Places of the filter, motion by the sensors, and the state to pass on.
 
     With sensors the epochs are taken in stretches of `_STRETCH_NS` of GPS time, however the log is cut: the place by
@@ -277,7 +278,7 @@ def _tracked(
     number = epochs.time.astype(np.int64) // _STRETCH_NS
     edges = np.flatnonzero(np.diff(number, prepend=number[:1], append=number[-1:])) if sensing else np.empty(0, np.intp)
     parts: list[Tracked] = []
-    motions: list[Codes] = []
+    motions: list[SensedMotion] = []
     replays: list[Replay] = []
     for first, last in pairwise([0, *edges.tolist(), len(epochs)]):
         part = epochs if last - first == len(epochs) else epochs.take(slice(first, last))
@@ -301,8 +302,8 @@ def _tracked(
             tracked, level = with_levels(tracked, part, line, state.level, config.tracking, sensors)
             state = replace(state, level=level)
         parts.append(tracked)
-        motions.append(sensed.state)
-    return _joined(parts), np.concatenate(motions), tuple(replays), state
+        motions.append(sensed)
+    return _joined(parts), SensedMotion.joined(motions), tuple(replays), state
 
 
 def _gated(

@@ -15,7 +15,7 @@ from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
 
 #: Slower than this the rates say nothing of the line [m/s].
-_SLOWEST_MPS: Final = 1.0
+SLOWEST_MPS: Final = 1.0
 #: Rates over a length are the mean of so many metres: the body's swings are shorter.
 _LEAST_POINTS: Final = 30
 
@@ -187,7 +187,7 @@ def feature_fixes(
         np.concatenate([[0.0], np.cumsum(turns)]) + begin
         for turns, begin in zip((rates.turned_rad, rates.climbed_rad), state.angles, strict=True)
     )
-    usable = rates.rolls & (np.abs(rates.speed_mps) > _SLOWEST_MPS) & np.isfinite(heading[1:] + pitch[1:])
+    usable = rates.rolls & (np.abs(rates.speed_mps) > SLOWEST_MPS) & np.isfinite(heading[1:] + pitch[1:])
     fixes: list[FeatureFix] = []
     metre, headings, pitches = state.metre, state.heading_rad, state.pitch_rad
     kept, last, done = int(2.5 * limits.half_length_m), state.last, state.done_m

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
@@ -19,9 +19,10 @@ from railfix.motion.slip import (
     find_slips,
     heading_rate_radps,
     pitch_rate_radps,
+    roll_sine,
 )
 from railfix.motion.tachometer import TachometerLimits, faults_until, pulse_acceleration, pulse_speeds, way_m
-from railfix.pipeline.feature_stage import RateSeries
+from railfix.pipeline.feature_stage import SLOWEST_MPS, RateSeries
 
 #: Spacing of the samples of the slip detection, at multiples of it in GPS time [ns].
 _TICK_NS: Final = 20_000_000
@@ -63,12 +64,25 @@ class SensedMotion:
         Speed that a slip not detected yet may have had.
     swing_mps2 : ndarray, shape (T,) [m/s2]
         Part of the mean specific force forward that the pitching of the body makes, 0 without a gyro.
+    gradient, curvature_1pm, cant_m : ndarray, shape (T,)
+        Of the line under the body, toward rising arc length (P2 2.3): climb over way by wheel and accelerometer
+        (an offset of 0.01 m/s2 is 0.001),
+        curvature by the yaw rate, + to the right, lean of the body over the contact points of the wheels, + with the
+        left rail higher. NaN where the wheel does not roll faster than `SLOWEST_MPS`; cant without a vehicle.
     """
 
     state: Codes
     way_m: Floats
     doubt_mps: Floats
     swing_mps2: Floats
+    gradient: Floats
+    curvature_1pm: Floats
+    cant_m: Floats
+
+    @classmethod
+    def joined(cls, parts: Sequence[SensedMotion]) -> SensedMotion:
+        """Return parts one after the other."""
+        return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,6 +118,9 @@ def nothing_sensed(intervals: int) -> SensedMotion:
         way_m=np.full(intervals, np.nan),
         doubt_mps=np.zeros(intervals),
         swing_mps2=np.zeros(intervals),
+        gradient=np.full(intervals, np.nan),
+        curvature_1pm=np.full(intervals, np.nan),
+        cant_m=np.full(intervals, np.nan),
     )
 
 
@@ -112,6 +129,7 @@ def sensed_motion(
     inertial: InertialSamples,
     edges: Datetimes,
     facing: float,
+    contact_m: float | None,
     sine_at: Callable[[Floats], Floats],
     state: SensedState,
     *,
@@ -129,6 +147,8 @@ def sensed_motion(
     edges : ndarray of datetime64[ns], shape (T + 1,)
     facing : float
         1 where the front points to rising arc length, else -1.
+    contact_m : float or None
+        Distance of the contact points of the wheels.
     sine_at : callable
         Sine of the gradient in rising arc length at arc lengths.
     state : SensedState
@@ -175,7 +195,15 @@ def sensed_motion(
     lag = limits.look_back_s + limits.confirm_s + limits.smoothing_s
     doubt = GRAVITY_MPS2 * lag * np.abs(found.smooth)
     at = np.searchsorted(ticks * _TICK_NS, ends, side="right")
-    sensed = _by_interval(found.state, found.speed_mps, doubt, swing, at, seconds(np.diff(edges)))
+    turned, rolls = heading_rate_radps(force, rates, known_speed), found.state == MotionState.NORMAL
+    sine = facing * (found.metric + found.pitch)
+    under = np.stack([
+        sine / np.sqrt(1.0 - np.clip(sine, -0.5, 0.5) ** 2),
+        facing * turned / np.where(known_speed == 0.0, np.nan, known_speed),
+        facing * roll_sine(force, rates, known_speed) * (np.nan if contact_m is None else contact_m),
+    ])  # fmt: skip
+    under[:, ~(rolls & (np.abs(known_speed) > SLOWEST_MPS))] = np.nan
+    sensed = _by_interval(found.state, found.speed_mps, doubt, swing, under, at, seconds(np.diff(edges)))
     step = 1e-9 * _TICK_NS
     # mean rates are those of the middle of their time
     middle = (ticks * _TICK_NS - _MEAN_NS // 2).astype("datetime64[ns]")
@@ -185,10 +213,10 @@ def sensed_motion(
         known=when,
         way_m=facing * (passed[1:] - passed[0]),
         arc_m=state.arc_m + facing * (passed[1:] - ways[0]),
-        turned_rad=step * heading_rate_radps(force, rates, known_speed),
+        turned_rad=step * turned,
         climbed_rad=step * (turning - found.gyro_bias_radps),
         speed_mps=facing * speed.speed_mps,
-        rolls=found.state == MotionState.NORMAL,
+        rolls=rolls,
     )
     return sensed, series, replace(state, tick=int(ticks[-1]), arc_m=float(arc[-1]), slip=slip)
 
@@ -203,9 +231,12 @@ def _means(inertial: InertialSamples, begin: Datetimes, end: Datetimes) -> Float
 
 
 def _by_interval(
-    state: Codes, speed_mps: Floats, doubt_mps: Floats, swing_mps2: Floats, at: Integers, span_s: Floats
+    state: Codes, speed_mps: Floats, doubt_mps: Floats, swing_mps2: Floats, under: Floats, at: Integers, span_s: Floats
 ) -> SensedMotion:
-    """Samples brought together by interval: `at` is the first sample after each instant, 0 after the first."""
+    """Samples brought together by interval: `at` is the first sample after each instant, 0 after the first.
+
+    `under` has gradient, curvature and cant, shape (3, N).
+    """
     count = np.diff(at)
     some = np.flatnonzero(count > 0)
     result = nothing_sensed(len(count))
@@ -219,4 +250,8 @@ def _by_interval(
     result.way_m[some] = np.where(np.isin(named, CARRIED), mean * span_s[some], np.nan)
     result.doubt_mps[some] = np.maximum.reduceat(doubt_mps[:end], first)
     result.swing_mps2[some] = np.add.reduceat(swing_mps2[:end], first) / count[some]
+    for values, out in zip(under[:, :end], (result.gradient, result.curvature_1pm, result.cant_m), strict=True):
+        there = np.add.reduceat(np.isfinite(values).astype(np.float64), first)
+        with np.errstate(invalid="ignore"):
+            out[some] = np.add.reduceat(np.nan_to_num(values), first) / np.where(there > 0.0, there, np.nan)
     return result

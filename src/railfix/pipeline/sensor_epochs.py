@@ -203,6 +203,7 @@ def sensor_epochs(
             inertial,
             edges,
             facing,
+            trajectory.contact_m,
             sine_at or _unknown,
             motion,
             tachometer=limits.tachometer,

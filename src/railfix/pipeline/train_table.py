@@ -66,6 +66,11 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "force_offset_mps2": "offset of the accelerometer, as estimated",
     "map_scale": "factor on the error of lengths along the map (`tracking.map_scale_m`): above 1 where the "
     "pseudoranges keep moving against the map",
+    "measured_gradient_permille": "gradient under the body since the epoch before, by tachometer and accelerometer, "
+    "+ where the line rises with chainage; empty where the wheel slips or is slower than 1 m/s",
+    "measured_curvature_1pm": "curvature there by the yaw rate, + to the right in rising chainage",
+    "measured_cant_mm": "cant there by the lean of the body, + with the left rail higher (it leans to the right); "
+    "needs a vehicle file",
     "metric_antenna_spacing_m": "distance of the two antennas' places less that of the antennas; empty for one antenna",
     "innovation_wheel_m": "way of the wheel since the epoch before less the predicted one",
     "innovation_radar_m": "the same of the radar",
@@ -137,7 +142,7 @@ def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
     states = pl.Series(values=MOTION_TYPE.categories, dtype=MOTION_TYPE)
     kinds = [*(kind.name.lower() for kind in Kind), "carry"]
     with_wheel = tracked.used[:, Kind.WHEEL] > 0
-    carried = with_wheel & np.isin(result.motion, CARRIED)
+    carried = with_wheel & np.isin(result.sensed.state, CARRIED)
     has = np.column_stack([tracked.used > 0, carried])
     has[:, Kind.WHEEL] &= ~carried
     used, which = np.unique(has, axis=0, return_inverse=True)
@@ -162,7 +167,7 @@ def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
             "protection_separation_m": float_column(tracked.separation_m),
             "over_reading_m": float_column(tracked.amount_m),
             "under_reading_m": float_column(tracked.amount_m),
-            "motion": states.gather(pl.Series(values=result.motion.astype(np.uint32))),
+            "motion": states.gather(pl.Series(values=result.sensed.state.astype(np.uint32))),
             "sources": texts.gather(pl.Series(values=which.reshape(-1).astype(np.uint32))),
             "latitude_deg": float_column(result.latitude_deg),
             "longitude_deg": float_column(result.longitude_deg),
@@ -174,6 +179,9 @@ def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
             "radar_scale": float_column(tracked.radar_scale),
             "force_offset_mps2": float_column(tracked.force_offset_mps2),
             "map_scale": float_column(tracked.map_scale),
+            "measured_gradient_permille": float_column(1e3 * result.sensed.gradient),
+            "measured_curvature_1pm": float_column(result.sensed.curvature_1pm),
+            "measured_cant_mm": float_column(1e3 * result.sensed.cant_m),
             "metric_antenna_spacing_m": float_column(result.spacing_error_m),
             **{
                 f"innovation_{kind.name.lower()}_{unit}": float_column(tracked.sensed[:, kind - 3])

@@ -59,6 +59,8 @@ class Trajectory(FrozenArrays, NotebookTable):
         relates the positions of two antennas of one vehicle. None without a vehicle.
     facing : {"rising", "falling"}
         Direction of the vehicle's front along the line; "rising" without a vehicle.
+    contact_m : float or None [m]
+        Distance of the contact points of the wheels of an axle, over which cant is measured; None without a vehicle.
     sigma_plan_m, sigma_height_m : float [m]
         Standard deviations of the map, included in the solution.
     notes : tuple of str
@@ -74,6 +76,7 @@ class Trajectory(FrozenArrays, NotebookTable):
     reference: str = "antenna"
     body_chainage_m: Floats | None = None
     facing: Literal["rising", "falling"] = "rising"
+    contact_m: float | None = None
     sigma_plan_m: float = SIGMA_PLAN_M
     sigma_height_m: float = SIGMA_HEIGHT_M
     notes: tuple[str, ...] = ()

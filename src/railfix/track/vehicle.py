@@ -375,6 +375,7 @@ def antenna_trajectory(
         reference=reference,
         body_chainage_m=middle,
         facing=vehicle.facing,
+        contact_m=vehicle.contact_spacing_m,
         sigma_plan_m=track.sigma_plan_m,
         sigma_height_m=track.sigma_height_m,
         notes=(*line.notes, *track.provenance.notes),
