@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -107,6 +108,14 @@ def check(
 def features(
     tracks: TracksArgument,
     *,
+    run: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of `railfix run` with --tachometer and --inertial: the features as the train measured them, "
+            "beside those of the map; may be repeated.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="CSV", help="File for the features; printed alone without it.")
     ] = None,
@@ -116,38 +125,62 @@ def features(
     """List the features of a line: the places where its gradient or its curvature changes.
 
     A train that measures the same change knows where it is (`railfix.motion.features`). Changes are taken over 15 m,
-    about the distance of two bogies.
+    about the distance of two bogies. With `--run` the features are those that runs have measured together: the
+    places by single runs, their spread (as in P2's table 1) and the distance from the map's stand beside each.
 
     Example:
 
         railfix map features line.csv --out features.csv
 
-    Exit codes: 0 done; 2 the command line was misused; 3 a file is not a track map; 4 an option is wrong; 8 the file
-    cannot be written; 1 a defect of railfix.
+        railfix map features line.csv --run results-1 --run results-2
+
+    Exit codes: 0 done; 2 the command line was misused; 3 a file is not a track map, or a run has measured nothing; 4 an
+    option is wrong; 8 the file cannot be written; 1 a defect of railfix.
     """
     import polars as pl
 
-    from railfix.motion.features import line_series, map_features
+    from railfix.motion.features import FeatureLimits, line_series, map_features
+    from railfix.run.measured_features import centred, measured_features, read_measured
     from railfix.track.trajectory import Trajectory
 
-    check_outputs((out, "csv"), overwrite=overwrite, inputs=tracks)
+    tables = [folder / "train.parquet" for folder in run or ()]
+    check_outputs((out, "csv"), overwrite=overwrite, inputs=[*tracks, *tables])
     track = read_track(list(tracks), crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
     trajectory = Trajectory.from_track(track)
-    found = map_features(line_series(trajectory))
-    arc = np.array([feature.arc_m for feature in found])
+    series = line_series(trajectory)
+    found = map_features(series)
+    if run:
+        found = centred(found, series, FeatureLimits())
+    at = trajectory.chainage_at(np.array([feature.arc_m for feature in found]))
+    found = [replace(feature, arc_m=float(chainage)) for feature, chainage in zip(found, at, strict=True)]
+    beside: dict[str, list[float]] = {}
+    if run:
+        measured = measured_features([read_measured(folder) for folder in run], found)
+        found = [each.feature for each in measured]
+        beside = {
+            "runs": [float(len(each.places_m)) for each in measured],
+            "spread_m": [float(np.std(each.places_m)) if len(each.places_m) else np.nan for each in measured],
+            "map_chainage_m": [each.map_m for each in measured],
+        }
     rows = pl.DataFrame(
         {
-            "chainage_m": trajectory.chainage_at(arc).round(2),
+            "chainage_m": np.array([feature.arc_m for feature in found]).round(2),
             "quantity": pl.Series([feature.quantity for feature in found], dtype=pl.String),
             "change": np.array([feature.change for feature in found], dtype=np.float64),
+            **{name: np.round(np.array(values, dtype=np.float64), 2) for name, values in beside.items()},
         }
-    )
+    ).with_columns(pl.col(pl.Float64).fill_nan(None))
     if out is not None:
         rows.write_csv(out)
-    table = Table("chainage m", "quantity", "change", title=f"{track.name}: {len(found)} features")
-    for chainage, quantity, change in rows.head(_SHOWN).iter_rows():
+    columns = ["chainage m", "quantity", "change", *(["runs", "spread m", "from the map m"] if run else [])]
+    table = Table(*columns, title=f"{track.name}: {len(found)} features")
+    for chainage, quantity, change, *others in rows.head(_SHOWN).iter_rows():
         unit = f"{1e3 * change:+.1f} permille" if quantity == "gradient" else f"{1e3 * change:+.2f} / km"
-        table.add_row(f"{chainage:.1f}", quantity, unit)
+        if others:
+            runs, spread, there = others
+            gap = "not in the map" if there is None else f"{chainage - there:+.1f}"
+            others = [f"{runs:.0f} of {len(run or ())}", "" if spread is None else f"{spread:.2f}", gap]
+        table.add_row(f"{chainage:.1f}", quantity, unit, *others)
     console_of_tables().print(table)
     if len(found) > _SHOWN:
         typer.echo(f"and {len(found) - _SHOWN} more")

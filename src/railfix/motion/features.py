@@ -7,6 +7,7 @@ fits there) and one more: no other place of the window explains the measurement 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -109,21 +110,36 @@ def line_series(trajectory: Trajectory, *, limits: FeatureLimits | None = None) 
     ahead = flat[1:] / np.linalg.norm(flat[1:], axis=1, keepdims=True)
     behind = flat[:-1] / np.linalg.norm(flat[:-1], axis=1, keepdims=True)
     turn = -(np.cross(behind, ahead) * up[1:]).sum(axis=1) / limits.step_m
-    return LineSeries(arc_m=arc, gradient=gradient, curvature_1pm=np.concatenate([turn[:1], turn]))
+    # each turn belongs to the middle of its step
+    curvature = np.concatenate([turn[:1], 0.5 * (turn[1:] + turn[:-1]), turn[-1:]])
+    return LineSeries(arc_m=arc, gradient=gradient, curvature_1pm=curvature)
 
 
-def map_features(series: LineSeries, *, limits: FeatureLimits | None = None) -> list[Feature]:
-    """Return the features of a line in order: where gradient or curvature change most within `base_m`."""
+def map_features(
+    series: LineSeries, *, limits: FeatureLimits | None = None, least: Mapping[Quantity, Floats] | None = None
+) -> list[Feature]:
+    """Return the features of a line in order: where gradient or curvature change most within `base_m`.
+
+    Parameters
+    ----------
+    series : LineSeries
+    limits : FeatureLimits, optional
+    least : mapping of ndarray, shape (N,), optional
+        Of a measured line, by quantity: a change must also be larger than that of either side together (root sum of
+        squares).
+    """
     limits = limits or FeatureLimits()
     lag = max(round(limits.base_m / limits.step_m), 1)
     found = []
-    for quantity, least in (("gradient", limits.gradient_change), ("curvature", limits.curvature_change_1pm)):
+    for quantity, smallest in (("gradient", limits.gradient_change), ("curvature", limits.curvature_change_1pm)):
         values = series.gradient if quantity == "gradient" else series.curvature_1pm
         change = values[2 * lag :] - values[: -2 * lag] if len(values) > 2 * lag else np.empty(0)
         size = np.abs(change)
-        while len(size) and size.max() >= least:
+        name: Quantity = "gradient" if quantity == "gradient" else "curvature"
+        if least is not None and len(size):
+            size[size < np.hypot(least[name][2 * lag :], least[name][: -2 * lag])] = 0.0
+        while len(size) and size.max() >= smallest:
             k = int(np.argmax(size))
-            name: Quantity = "gradient" if quantity == "gradient" else "curvature"
             found.append(Feature(arc_m=float(series.arc_m[k + lag]), quantity=name, change=float(change[k])))
             size[max(k - 2 * lag, 0) : k + 2 * lag + 1] = 0.0
     return sorted(found, key=lambda feature: feature.arc_m)

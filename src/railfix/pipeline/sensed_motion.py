@@ -23,6 +23,7 @@ from railfix.motion.slip import (
 )
 from railfix.motion.tachometer import TachometerLimits, faults_until, pulse_acceleration, pulse_speeds, way_m
 from railfix.pipeline.feature_stage import SLOWEST_MPS, RateSeries
+from railfix.track.trajectory import Trajectory
 
 #: Spacing of the samples of the slip detection, at multiples of it in GPS time [ns].
 _TICK_NS: Final = 20_000_000
@@ -64,11 +65,12 @@ class SensedMotion:
         Speed that a slip not detected yet may have had.
     swing_mps2 : ndarray, shape (T,) [m/s2]
         Part of the mean specific force forward that the pitching of the body makes, 0 without a gyro.
-    gradient, curvature_1pm, cant_m : ndarray, shape (T,)
+    gradient, curvature_1pm, cant_m, under_m : ndarray, shape (T,)
         Of the line under the body, toward rising arc length (P2 2.3): climb over way by wheel and accelerometer
         (an offset of 0.01 m/s2 is 0.001),
         curvature by the yaw rate, + to the right, lean of the body over the contact points of the wheels, + with the
-        left rail higher. NaN where the wheel does not roll faster than `SLOWEST_MPS`; cant without a vehicle.
+        left rail higher; and chainage of the body's middle then. NaN where the wheel does not roll faster than
+        `SLOWEST_MPS`; cant without a vehicle.
     """
 
     state: Codes
@@ -78,6 +80,7 @@ class SensedMotion:
     gradient: Floats
     curvature_1pm: Floats
     cant_m: Floats
+    under_m: Floats
 
     @classmethod
     def joined(cls, parts: Sequence[SensedMotion]) -> SensedMotion:
@@ -121,6 +124,7 @@ def nothing_sensed(intervals: int) -> SensedMotion:
         gradient=np.full(intervals, np.nan),
         curvature_1pm=np.full(intervals, np.nan),
         cant_m=np.full(intervals, np.nan),
+        under_m=np.full(intervals, np.nan),
     )
 
 
@@ -128,8 +132,7 @@ def sensed_motion(
     pulses: TachometerPulses,
     inertial: InertialSamples,
     edges: Datetimes,
-    facing: float,
-    contact_m: float | None,
+    trajectory: Trajectory,
     sine_at: Callable[[Floats], Floats],
     state: SensedState,
     *,
@@ -145,16 +148,15 @@ def sensed_motion(
     inertial : InertialSamples
         Both from `REACH` before the first instant on.
     edges : ndarray of datetime64[ns], shape (T + 1,)
-    facing : float
-        1 where the front points to rising arc length, else -1.
-    contact_m : float or None
-        Distance of the contact points of the wheels.
+    trajectory : Trajectory
+        Of the antenna: tells which way the front points, and where the body is.
     sine_at : callable
         Sine of the gradient in rising arc length at arc lengths.
     state : SensedState
     tachometer : TachometerLimits
     limits : SlipLimits
     """
+    facing = 1.0 if trajectory.facing == "rising" else -1.0
     ends = edges.astype("datetime64[ns]").astype(np.int64)
     begin = state.tick or max(int(ends[0]), int(inertial.time[0].astype(np.int64))) // _TICK_NS
     ticks = np.arange(begin + 1, int(ends[-1]) // _TICK_NS + 1)
@@ -196,23 +198,27 @@ def sensed_motion(
     doubt = GRAVITY_MPS2 * lag * np.abs(found.smooth)
     at = np.searchsorted(ticks * _TICK_NS, ends, side="right")
     turned, rolls = heading_rate_radps(force, rates, known_speed), found.state == MotionState.NORMAL
+    # mean rates are those of the middle of their time
+    middle = (ticks * _TICK_NS - _MEAN_NS // 2).astype("datetime64[ns]")
+    passed = way_m(pulses, np.concatenate([[start - np.timedelta64(_MEAN_NS // 2, "ns")], middle]), limits=tachometer)
+    passed_m = state.arc_m + facing * (passed[1:] - ways[0])
     sine = facing * (found.metric + found.pitch)
     under = np.stack([
         sine / np.sqrt(1.0 - np.clip(sine, -0.5, 0.5) ** 2),
         facing * turned / np.where(known_speed == 0.0, np.nan, known_speed),
-        facing * roll_sine(force, rates, known_speed) * (np.nan if contact_m is None else contact_m),
+        facing * roll_sine(force, rates, known_speed) * (trajectory.contact_m or np.nan),
+        passed_m,
     ])  # fmt: skip
     under[:, ~(rolls & (np.abs(known_speed) > SLOWEST_MPS))] = np.nan
     sensed = _by_interval(found.state, found.speed_mps, doubt, swing, under, at, seconds(np.diff(edges)))
+    along = trajectory.body_at if trajectory.body_chainage_m is not None else trajectory.chainage_at
+    sensed = replace(sensed, under_m=along(sensed.under_m))
     step = 1e-9 * _TICK_NS
-    # mean rates are those of the middle of their time
-    middle = (ticks * _TICK_NS - _MEAN_NS // 2).astype("datetime64[ns]")
-    passed = way_m(pulses, np.concatenate([[start - np.timedelta64(_MEAN_NS // 2, "ns")], middle]), limits=tachometer)
     series = RateSeries(
         time=middle,
         known=when,
         way_m=facing * (passed[1:] - passed[0]),
-        arc_m=state.arc_m + facing * (passed[1:] - ways[0]),
+        arc_m=passed_m,
         turned_rad=step * turned,
         climbed_rad=step * (turning - found.gyro_bias_radps),
         speed_mps=facing * speed.speed_mps,
@@ -235,7 +241,7 @@ def _by_interval(
 ) -> SensedMotion:
     """Samples brought together by interval: `at` is the first sample after each instant, 0 after the first.
 
-    `under` has gradient, curvature and cant, shape (3, N).
+    `under` has gradient, curvature, cant and the antenna's arc length, shape (4, N).
     """
     count = np.diff(at)
     some = np.flatnonzero(count > 0)
@@ -250,7 +256,8 @@ def _by_interval(
     result.way_m[some] = np.where(np.isin(named, CARRIED), mean * span_s[some], np.nan)
     result.doubt_mps[some] = np.maximum.reduceat(doubt_mps[:end], first)
     result.swing_mps2[some] = np.add.reduceat(swing_mps2[:end], first) / count[some]
-    for values, out in zip(under[:, :end], (result.gradient, result.curvature_1pm, result.cant_m), strict=True):
+    outs = (result.gradient, result.curvature_1pm, result.cant_m, result.under_m)
+    for values, out in zip(under[:, :end], outs, strict=True):
         there = np.add.reduceat(np.isfinite(values).astype(np.float64), first)
         with np.errstate(invalid="ignore"):
             out[some] = np.add.reduceat(np.nan_to_num(values), first) / np.where(there > 0.0, there, np.nan)

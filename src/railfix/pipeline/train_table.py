@@ -66,7 +66,9 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "force_offset_mps2": "offset of the accelerometer, as estimated",
     "map_scale": "factor on the error of lengths along the map (`tracking.map_scale_m`): above 1 where the "
     "pseudoranges keep moving against the map",
-    "measured_gradient_permille": "gradient under the body since the epoch before, by tachometer and accelerometer, "
+    "measured_chainage_m": "chainage of the vehicle's middle (without a vehicle file of the antenna) to which the next "
+    "three belong: means since the epoch before",
+    "measured_gradient_permille": "gradient under the body by tachometer and accelerometer, "
     "+ where the line rises with chainage; empty where the wheel slips or is slower than 1 m/s",
     "measured_curvature_1pm": "curvature there by the yaw rate, + to the right in rising chainage",
     "measured_cant_mm": "cant there by the lean of the body, + with the left rail higher (it leans to the right); "
@@ -179,6 +181,7 @@ def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
             "radar_scale": float_column(tracked.radar_scale),
             "force_offset_mps2": float_column(tracked.force_offset_mps2),
             "map_scale": float_column(tracked.map_scale),
+            "measured_chainage_m": float_column(result.sensed.under_m),
             "measured_gradient_permille": float_column(1e3 * result.sensed.gradient),
             "measured_curvature_1pm": float_column(result.sensed.curvature_1pm),
             "measured_cant_mm": float_column(1e3 * result.sensed.cant_m),
