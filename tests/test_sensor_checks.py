@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
-from railfix.motion.radar_mounting import RadarMounting
+from railfix.motion.radar_watch import RadarWatch
 from railfix.motion.samples import (
     GroundUnits,
     InertialSamples,
@@ -208,7 +208,7 @@ def test_a_mounting_that_moves_by_a_degree_is_found_and_one_that_does_not_is_lef
     angle = np.radians(45.0 + np.where(t > 1300.0, degrees, 0.0))
     radar = speed * np.cos(angle) / np.cos(np.radians(45.0)) + 0.1 * random.standard_normal(len(t))
     right = speed + 0.05 * random.standard_normal(len(t))
-    whole, piecewise = RadarMounting(), RadarMounting()
+    whole, piecewise = RadarWatch(), RadarWatch()
     steps = whole.take(time, radar, right)
     cuts = np.sort(random.integers(0, len(t), 50))
     pieces = np.split(np.arange(len(t)), cuts)
@@ -223,8 +223,27 @@ def test_a_mounting_that_moves_by_a_degree_is_found_and_one_that_does_not_is_lef
     assert step.after == pytest.approx(-np.radians(degrees), abs=0.003)
     assert step.before == pytest.approx(0.0, abs=0.002)
     samples = SensorSamples(radar=RadarSpeeds(time=time[::2], speed_mps=radar[::2]))
-    (again,) = RadarMounting().take_samples(samples.radar, time, right)
+    (again,) = RadarWatch().take_samples(samples.radar, time, right)
     assert again.time == step.time
+
+
+@pytest.mark.requirement("E4")
+def test_a_radar_that_falls_silent_is_told_once_and_again_after_it_was_heard() -> None:
+    """Standing is no silence, and neither are single speeds that are missing."""
+    t = np.arange(0.0, 1200.0, 0.5)
+    time = START + (t * 1e9).astype("timedelta64[ns]")
+    speed = np.where((t > 600.0) & (t < 800.0), 0.0, 15.0)
+    radar = np.where(np.arange(len(t)) % 3 == 0, np.nan, speed)
+    radar[(t > 600.0) & (t < 800.0)] = np.nan
+    assert RadarWatch().take(time, radar, speed) == []
+    silent = ((t > 200.0) & (t < 420.0)) | (t > 1000.0)
+    alarms = RadarWatch().take(time, np.where(silent, np.nan, radar), speed)
+    assert [alarm.kind for alarm in alarms] == ["silent", "silent"]
+    for alarm, since in zip(alarms, (200.0, 1000.0), strict=True):
+        assert 0.0 <= (alarm.time - START) / np.timedelta64(1, "s") - since <= 60.0
+    assert "no speed while the train moves; is it covered" in alarms[0].sentence
+    nothing = RadarSpeeds(time=time[:0], speed_mps=radar[:0])
+    assert [alarm.kind for alarm in RadarWatch().take_samples(nothing, time, speed)] == ["silent"]
 
 
 def test_a_run_names_a_mounting_that_moves() -> None:

@@ -13,16 +13,16 @@ from railfix.core.reasons import Status
 from railfix.core.timescale import GPS_EPOCH
 from railfix.live.engine import LiveOutput
 from railfix.live.sensor_lines import FOREVER, Sensed
-from railfix.motion.radar_mounting import RadarMounting
+from railfix.motion.radar_watch import RadarWatch
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
 from railfix.run.sensor_checks import SensorChecks
 from railfix.tracking.rows import Kind
 
-#: The sensors are judged after so long, by places at least so far apart; the radar's mounting every so often [ns].
+#: The sensors are judged after so long, by places at least so far apart; the radar every so often [ns].
 WATCHED_NS: Final = 600_000_000_000
-_MOUNTING_NS: Final = 60_000_000_000
+_RADAR_NS: Final = 60_000_000_000
 _EVERY_NS: Final = 500_000_000
 _NEVER: Final = np.datetime64("NaT", "ns")
 _PLACE: Final = ("chainage_m", "latitude_deg", "longitude_deg", "x_m", "y_m", "z_m")
@@ -47,8 +47,8 @@ class SensorWatch:
         self._speeds: list[float] = []
         self._samples: list[SensorSamples] = []
         self._begin = _NEVER
-        self._judged = False
-        self._mounting, self._radar = RadarMounting(), SensorSamples()
+        self._judged = self._has_radar = False
+        self._watch, self._radar = RadarWatch(), SensorSamples()
         self._rolled_ns: list[int] = []
         self._rolled: list[float] = []
 
@@ -82,22 +82,23 @@ class SensorWatch:
                 if self._places:
                     self.judge()
                 self._samples, self._begin = [], _NEVER
+        self._has_radar = self._has_radar or len(sensed.samples.radar) > 0
         if len(sensed.samples.radar):
             self._radar = self._radar.joined(SensorSamples(radar=sensed.samples.radar))
             if not table:
-                self._radar = self._radar.between(sensed.until - 2 * np.timedelta64(_MOUNTING_NS, "ns"), FOREVER)
+                self._radar = self._radar.between(sensed.until - 2 * np.timedelta64(_RADAR_NS, "ns"), FOREVER)
 
     def _roll(self, time_ns: int, speed_mps: float) -> None:
-        """Take a speed by satellites for the radar's mounting."""
+        """Take a speed by satellites for the watch of the radar."""
         if time_ns <= _last(self._rolled_ns):
             return
         self._rolled_ns.append(time_ns)
         self._rolled.append(speed_mps)
-        if time_ns - self._rolled_ns[0] >= _MOUNTING_NS:
+        if time_ns - self._rolled_ns[0] >= _RADAR_NS:
             time = _times(self._rolled_ns)
             now, self._radar = self._radar.between(_NEVER, time[-1]), self._radar.between(time[-1], FOREVER)
-            for step in self._mounting.take_samples(now.radar, time, np.array(self._rolled)):
-                self._say(step.sentence)
+            for alarm in self._watch.take_samples(now.radar, time, np.array(self._rolled)) if self._has_radar else ():
+                self._say(alarm.sentence)
             self._rolled_ns, self._rolled = [], []
 
     def judge(self) -> None:

@@ -12,7 +12,7 @@ import polars as pl
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.geodesy import enu_axes
 from railfix.core.timescale import seconds
-from railfix.motion.radar_mounting import RadarMounting
+from railfix.motion.radar_watch import RadarWatch
 from railfix.motion.samples import GroundUnits, SensorSamples, StationRanges
 from railfix.motion.tachometer import SpeedCheck, TachometerLimits, check_speeds, pulse_speeds
 from railfix.pipeline.feature_stage import ahead_m
@@ -72,9 +72,11 @@ class SensorChecks:
             return turned
         speeds = pl.concat(self.speeds)
         notes = sensor_notes(samples, speeds, limits.tachometer)
-        time = speeds["time_gpst"].to_numpy().astype("datetime64[ns]")
-        steps = RadarMounting().take_samples(samples.radar, time, speeds["speed_mps"].to_numpy())
-        notes += tuple(step.sentence for step in steps)
+        if len(radar := samples.radar):
+            time = speeds["time_gpst"].to_numpy().astype("datetime64[ns]")
+            both = (time >= radar.time[0]) & (time <= radar.time[-1])  # a shorter table is no silence
+            alarms = RadarWatch().take_samples(radar, time[both], speeds["speed_mps"].to_numpy()[both])
+            notes += tuple(alarm.sentence for alarm in alarms)
         if units is not None and len(samples.ranging):
             notes += tuple(range_notes(samples.ranging, units, places, trajectory, limits))
         return notes

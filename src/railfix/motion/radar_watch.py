@@ -1,14 +1,14 @@
-"""A moved mounting of the radar, by a step of the ratio of its speeds to those by satellites.
+"""Alarms of the radar, by its speeds against those by satellites: a moved mounting, and an antenna that is covered.
 
 The speed of a radar that looks down at the angle alpha is wrong by ``tan(alpha)`` times the error of the angle: 1.7 %
-a degree at 45 degrees (P2 3.1).
+a degree at 45 degrees (P2 3.1). Otherwise there is no moment without a speed while the train moves (P2 3.2).
 """
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -26,24 +26,39 @@ _MOVING_MPS: Final = 3.0
 _LEAST_BEFORE: Final = 5
 _MOST_BEFORE: Final = 20
 _AFTER: Final = 3
+#: Windows without a speed that are told.
+_SILENT: Final = 2
 #: Least step that is told, and how many times the scatter of the windows.
 _STEP: Final = 0.01
 _SCATTERS: Final = 5.0
 _LEAST_SCATTER: Final = 0.001
 
 
-@dataclass(frozen=True)
-class MountingStep:
-    """The radar's speeds over those by satellites, less 1, before and from an instant on."""
+@dataclass(frozen=True, kw_only=True)
+class RadarAlarm:
+    """What the radar's speeds show against those by satellites.
 
+    Attributes
+    ----------
+    kind : {"mounting", "silent"}
+        A step of the ratio of the speeds; no speed while the train moves.
+    time : datetime64[ns]
+        From when on.
+    before, after : float
+        Ratio less 1 before a step and after it.
+    """
+
+    kind: Literal["mounting", "silent"]
     time: np.datetime64
-    before: float
-    after: float
+    before: float = float("nan")
+    after: float = float("nan")
 
     @property
     def sentence(self) -> str:
         """What to say of it."""
         at = np.datetime_as_string(self.time, unit="s")
+        if self.kind == "silent":
+            return f"radar: from {at} on it has no speed while the train moves; is it covered, by snow or dirt?"
         after, before = (f"{round(100.0 * share, 1) + 0.0:+.1f} %" for share in (self.after, self.before))
         return (
             f"radar: from {at} on its speeds are {after} off those by satellites, {before} before; has its mounting "
@@ -52,7 +67,7 @@ class MountingStep:
 
 
 @dataclass(kw_only=True)
-class RadarMounting:
+class RadarWatch:
     """Ratios by window of GPS time, taken in order of time; nothing grows with the length of a session.
 
     Attributes
@@ -61,15 +76,18 @@ class RadarMounting:
         Of the last windows.
     window : deque of int
         Their numbers since the epoch of the clock.
+    silent : int
+        Windows without a speed, one after the other.
     """
 
     ratio: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
     window: deque[int] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
+    silent: int = 0
     _open: int = -1
-    _sums: Floats = field(default_factory=lambda: np.zeros(3))
+    _sums: Floats = field(default_factory=lambda: np.zeros(4))
 
-    def take(self, time: Datetimes, radar_mps: Floats, right_mps: Floats) -> list[MountingStep]:
-        """Take speeds of both at the same instants, later than those before; return the steps that they show.
+    def take(self, time: Datetimes, radar_mps: Floats, right_mps: Floats) -> list[RadarAlarm]:
+        """Take speeds of both at the same instants, later than those before; return the alarms that they raise.
 
         Parameters
         ----------
@@ -77,23 +95,24 @@ class RadarMounting:
         radar_mps, right_mps : ndarray, shape (N,) [m/s]
             NaN where nothing was measured.
         """
-        use = np.isfinite(radar_mps) & (np.abs(right_mps) > _MOVING_MPS)
-        radar, right = np.abs(radar_mps[use]), np.abs(right_mps[use])
-        windows, row = np.unique(time[use].astype(np.int64) // _WINDOW_NS, return_inverse=True)
-        weights = (np.ones(len(right)), radar * right, right * right)
+        moving = np.abs(right_mps) > _MOVING_MPS
+        heard = np.isfinite(radar_mps[moving])
+        radar, right = np.abs(np.nan_to_num(radar_mps[moving])), np.abs(right_mps[moving])
+        windows, row = np.unique(time[moving].astype(np.int64) // _WINDOW_NS, return_inverse=True)
+        weights = (np.ones(len(right)), heard, heard * radar * right, heard * right * right)
         sums = np.stack([np.bincount(row, weight, minlength=len(windows)) for weight in weights], axis=-1)
         found = []
         for window, of_window in zip(windows.tolist(), sums, strict=True):
             if window != self._open:
                 found += self._closed()
-                self._open, self._sums = window, np.zeros(3)
+                self._open, self._sums = window, np.zeros(4)
             self._sums = self._sums + of_window
         return found
 
-    def take_samples(self, radar: RadarSpeeds, time: Datetimes, right_mps: Floats) -> list[MountingStep]:
+    def take_samples(self, radar: RadarSpeeds, time: Datetimes, right_mps: Floats) -> list[RadarAlarm]:
         """Take speeds by satellites with the radar's own that are nearest to each; see `take`."""
         if not len(radar):
-            return []
+            return self.take(time, np.full(len(time), np.nan), right_mps)
         after = np.clip(np.searchsorted(radar.time, time), 1, max(len(radar) - 1, 1))
         late = np.abs(seconds(radar.time[np.minimum(after, len(radar) - 1)] - time))
         early = np.abs(seconds(time - radar.time[after - 1]))
@@ -101,9 +120,13 @@ class RadarMounting:
         near = np.minimum(late, early) <= _NEAR_S
         return self.take(time, np.where(near, radar.speed_mps[nearest], np.nan), right_mps)
 
-    def _closed(self) -> list[MountingStep]:
-        """End a window; a step it completes."""
-        count, product, square = self._sums.tolist()
+    def _closed(self) -> list[RadarAlarm]:
+        """End a window; the alarm that it completes."""
+        moving, count, product, square = self._sums.tolist()
+        if moving >= _LEAST_SPEEDS:
+            self.silent = self.silent + 1 if count == 0 else 0
+            if self.silent == _SILENT:
+                return [RadarAlarm(kind="silent", time=np.datetime64((self._open - _SILENT + 1) * _WINDOW_NS, "ns"))]
         if count < _LEAST_SPEEDS:
             return []
         self.ratio.append(product / square - 1.0)
@@ -121,4 +144,4 @@ class RadarMounting:
         for _ in range(len(ratios) - _AFTER):  # what comes next is held against what is now
             self.ratio.popleft()
             self.window.popleft()
-        return [MountingStep(begin, middle, float(np.median(after)))]
+        return [RadarAlarm(kind="mounting", time=begin, before=middle, after=float(np.median(after)))]
