@@ -201,7 +201,7 @@ MISTAKES: Final[dict[str, tuple[dict[str, str], str, int, str]]] = {
         _RUN + " --tachometer {desk}/s.csv", 3, "s.csv: row 2: pulse is 'abc', a number was expected; correct the row",
     ),
     "pulse_missing": (
-        {"s.csv": "time_gpst,pulse\n2024-03-05T03:10:00,1\n2024-03-05T03:10:01,\n"},
+        {"s.csv": "time_gpst,pulse,direction\n2024-03-05T03:10:00,1,1\n2024-03-05T03:10:01,,1\n"},
         _RUN + " --tachometer {desk}/s.csv", 3, "s.csv: row 3: pulse is None, a number was expected",
     ),
     "speed_of_letters": (

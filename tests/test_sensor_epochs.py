@@ -133,6 +133,19 @@ def test_tables_are_read_and_bad_ones_named(tmp_path: Path) -> None:
     good = tmp_path / "pulses.csv"
     good.write_text("time_gpst,pulse\n2024-03-05T03:10:00.1,1\n2024-03-05T03:10:00.2,2\n")
     assert len(read_sensors(tachometer=good).tachometer) == 2
+    beating = tmp_path / "beating.csv"
+    beating.write_text(
+        "time_gpst,pulse,direction\n2024-03-05T03:10:00.1,1,1\n2024-03-05T03:10:00.2,,\n2024-03-05T03:10:00.3,2,\n"
+    )
+    found = read_sensors(tachometer=beating).tachometer
+    assert found.pulse.tolist() == [1, 2]
+    assert found.direction.tolist() == [1, 0]
+    beating.write_text("time_gpst,pulse,direction\n2024-03-05T03:10:00.1,1,1\n2024-03-05T03:10:00.2,,1\n")
+    with pytest.raises(InputFileError, match="row 3: pulse is None, a number was expected"):
+        read_sensors(tachometer=beating)
+    beating.write_text("time_gpst,pulse\n2024-03-05T03:10:00.1,\n")
+    with pytest.raises(InputFileError, match="has no row of the tachometer but its time"):
+        read_sensors(tachometer=beating)
     bad = tmp_path / "bad.csv"
     bad.write_text("time_gpst,count\n2024-03-05T03:10:00.1,1\n")
     with pytest.raises(InputFileError, match="has no column pulse"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 import polars as pl
@@ -32,6 +32,10 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "ranging": ("unit", "range_m", "[sigma_m]"),
     "ranging_units": ("unit", "x_m", "y_m", "z_m"),
 }  # fmt: skip
+
+
+#: Sensors that may have nothing to say for a while, and say so by rows with the time alone.
+_SILENT: Final = ("tachometer", "ranging")
 
 
 def read_sensors(
@@ -131,7 +135,16 @@ def _table(path: Path, kind: str) -> pl.DataFrame:
     falling = np.flatnonzero(np.diff(_times(table)) < np.timedelta64(0, "ns"))
     if len(falling):
         raise InputFileError(path, f"row {int(falling[0]) + 3}: time_gpst falls; sort the table by time")
+    if kind in _SILENT:  # a stream that was recorded has rows with the time alone (`railfix.live.sensor_lines`)
+        table = table.filter(~pl.all_horizontal(_columns_of(table, kind).is_null()))
+        if not len(table):
+            raise InputFileError(path, f"has no row of the {kind} but its time; leave the file out")
     return table
+
+
+def _columns_of(table: pl.DataFrame, kind: str) -> pl.Expr:
+    """Those that the table has beside the time."""
+    return pl.col([name for column in COLUMNS[kind] if (name := column.strip("[]")) in table.columns])
 
 
 def _columns(path: Path, kind: str) -> pl.DataFrame:
@@ -155,17 +168,18 @@ def _columns(path: Path, kind: str) -> pl.DataFrame:
         raise InputFileError(path, f"has no column {missing[0]}; expected {', '.join(needed)} of the {kind}")
     if not len(table):
         raise InputFileError(path, f"has no rows; expected those of the {kind}, or leave the file out")
+    empty = table.select(pl.all_horizontal(_columns_of(table, kind).is_null())).to_series()
     return table.with_columns(
-        _numbers(path, table[name], empty="refuse" if name == "pulse" else "keep")
+        _numbers(path, table[name], may_be_empty=empty if name == "pulse" else pl.Series([True]))
         for name in (column.strip("[]") for column in COLUMNS[kind])
         if name != "unit" and name in table.columns
     )
 
 
-def _numbers(path: Path, column: pl.Series, *, empty: Literal["refuse", "keep"]) -> pl.Series:
+def _numbers(path: Path, column: pl.Series, *, may_be_empty: pl.Series) -> pl.Series:
     """A column as numbers; those of pulses and directions are whole."""
     numbers = column.cast(pl.Int64 if column.name in ("pulse", "direction") else pl.Float64, strict=False)
-    wrong = numbers.is_null() & (column.is_not_null() | (empty == "refuse"))
+    wrong = numbers.is_null() & (column.is_not_null() | ~may_be_empty)
     if wrong.any():
         row = int(wrong.arg_max() or 0)
         message = f"row {row + 2}: {column.name} is {column[row]!r}, a number was expected; correct the row"
