@@ -24,6 +24,8 @@ from railfix.tracking.rows import Kind
 WATCHED_NS: Final = 600_000_000_000
 _RADAR_NS: Final = 60_000_000_000
 _EVERY_NS: Final = 500_000_000
+#: Pieces of samples that are joined to one.
+_PIECES: Final = 256
 _NEVER: Final = np.datetime64("NaT", "ns")
 _PLACE: Final = ("chainage_m", "latitude_deg", "longitude_deg", "x_m", "y_m", "z_m")
 
@@ -46,6 +48,7 @@ class SensorWatch:
         self._speed_ns: list[int] = []
         self._speeds: list[float] = []
         self._samples: list[SensorSamples] = []
+        self._blocks: list[SensorSamples] = []
         self._begin = _NEVER
         self._judged = self._has_radar = False
         self._watch, self._radar = RadarWatch(), SensorSamples()
@@ -77,11 +80,14 @@ class SensorWatch:
         table = bool(sensed.until == FOREVER)
         if sensed.samples and not self._judged:
             self._samples.append(sensed.samples)
+            if len(self._samples) == _PIECES:  # a stream gives row by row, and each takes the room of a hundred
+                self._blocks.append(_joined(self._samples))
+                self._samples = []
             self._begin = np.fmin(self._begin, sensed.until)
             if not table and sensed.until - self._begin > 2 * np.timedelta64(WATCHED_NS, "ns"):
                 if self._places:
                     self.judge()
-                self._samples, self._begin = [], _NEVER
+                self._samples, self._blocks, self._begin = [], [], _NEVER
         self._has_radar = self._has_radar or len(sensed.samples.radar) > 0
         if len(sensed.samples.radar):
             self._radar = self._radar.joined(SensorSamples(radar=sensed.samples.radar))
@@ -106,9 +112,9 @@ class SensorWatch:
         if self._judged:
             return
         self._judged = True
-        if self._places and self._speeds and self._samples:
+        if self._places and self._speeds and (parts := [*self._blocks, *self._samples]):
             end = _times(self._speed_ns)[-1]
-            samples = _joined(self._samples).between(_NEVER, end)
+            samples = _joined(parts).between(_NEVER, end)
             places = pl.DataFrame(self._places, schema=_PLACE, orient="row")
             speeds = pl.DataFrame({"time_gpst": _times(self._speed_ns), "speed_mps": self._speeds})
             checks = SensorChecks(
@@ -118,7 +124,8 @@ class SensorWatch:
             processor = self._processor
             for note in checks.notes(samples, processor.units, self._trajectory, processor.config.sensors):
                 self._say(note)
-        self._place_ns, self._places, self._speed_ns, self._speeds, self._samples = [], [], [], [], []
+        self._place_ns, self._places, self._speed_ns, self._speeds = [], [], [], []
+        self._samples, self._blocks = [], []
 
 
 def _place(antenna: AntennaResult) -> tuple[float, ...]:
