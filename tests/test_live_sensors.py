@@ -155,6 +155,10 @@ def test_a_live_session_with_sensors_gives_what_the_log_gives(case: Ride, tmp_pa
     assert all(Source.INERTIAL in message.sources for message in told)
     assert not any(Source.CARRIER_PHASE in message.sources for message in told)
     assert all(message.over_cm is not None for message in told)
+    ranged = found.tracked.used[:, Kind.RANGE] > 0
+    sources = [output.message.sources for output in outputs]
+    assert [Source.RANGING in some for some in sources] == ranged.tolist()
+    assert not any(Source.FEATURES in some for some in sources)
 
 
 def test_a_sensor_that_is_late_is_left_out_and_no_way_is_made_up(case: Ride, tmp_path: Path) -> None:

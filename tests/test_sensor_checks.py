@@ -50,10 +50,10 @@ def places(speed_mps: float) -> pl.DataFrame:
     return pl.DataFrame({"time_gpst": time, **columns, **dict(zip(("x_m", "y_m", "z_m"), ecef.T, strict=True))})
 
 
-def ranges(table: pl.DataFrame, ahead_m: float, excess_m: float) -> StationRanges:
-    """Half a second after each place, within 150 m, by a device so far ahead of the antenna and 1 m above it."""
+def ranges(table: pl.DataFrame, ahead_m: float, excess_m: float, *, right_m: float = 0.0) -> StationRanges:
+    """Half a second after each place, within 150 m, by a device so far from the antenna and 1 m above it."""
     at = table["chainage_m"].to_numpy()
-    device = ORIGIN + (0.5 * (at[1:] + at[:-1]) + ahead_m)[:, None] * EAST + UP
+    device = ORIGIN + (0.5 * (at[1:] + at[:-1]) + ahead_m)[:, None] * EAST + right_m * SOUTH + UP
     time = table["time_gpst"].to_numpy().astype("datetime64[ns]")[:-1] + np.timedelta64(500, "ms")
     distance = np.linalg.norm(device[:, None] - UNITS.ecef_m, axis=2)
     row, unit = np.nonzero(distance < 150.0)
@@ -85,6 +85,10 @@ def test_ranges_that_are_too_long_are_told_apart_from_a_displaced_device() -> No
     both = list(range_notes(ranges(table, -6.0, -4.0), UNITS, table, LINE, limits))
     assert "6.0 m behind" in both[0]
     assert "4.0 m too short" in both[1]
+    beside = ranges(table, 0.0, 0.0, right_m=-85.0)
+    away = SensorLimits(range_above_m=1.0, range_right_m=-85.0)
+    assert list(range_notes(beside, UNITS, table, LINE, away)) == []
+    assert "too long" in "".join(range_notes(beside, UNITS, table, LINE, limits))
     (note,) = range_notes(ranges(table, 0.0, 0.0), UNITS, table[:3], LINE, limits)
     assert "too few ranges" in note
 
@@ -225,6 +229,16 @@ def test_a_mounting_that_moves_by_a_degree_is_found_and_one_that_does_not_is_lef
     samples = SensorSamples(radar=RadarSpeeds(time=time[::2], speed_mps=radar[::2]))
     (again,) = RadarWatch().take_samples(samples.radar, time, right)
     assert again.time == step.time
+
+
+@pytest.mark.requirement("E4")
+def test_a_radar_that_swings_has_not_moved() -> None:
+    """Half a minute too much, half a minute too little: a step stays on one side."""
+    t = np.arange(0.0, 900.0, 0.5)
+    time = np.datetime64("2024-03-05T03:10:00", "ns") + (t * 1e9).astype("timedelta64[ns]")
+    swing = np.where(t > 600.0, np.where(t % 60.0 < 30.0, 1.03, 0.97), 1.0)
+    assert RadarWatch().take(time, 15.0 * swing, np.full(len(t), 15.0)) == []
+    assert len(RadarWatch().take(time, np.where(t > 600.0, 15.45, 15.0), np.full(len(t), 15.0))) == 1
 
 
 @pytest.mark.requirement("E4")
