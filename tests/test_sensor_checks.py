@@ -85,8 +85,8 @@ def test_ranges_that_are_too_long_are_told_apart_from_a_displaced_device() -> No
     both = list(range_notes(ranges(table, -6.0, -4.0), UNITS, table, LINE, limits))
     assert "6.0 m behind" in both[0]
     assert "4.0 m too short" in both[1]
-    beside = ranges(table, 0.0, 0.0, right_m=-85.0)
-    away = SensorLimits(range_above_m=1.0, range_right_m=-85.0)
+    beside = ranges(table, 0.0, 0.0, right_m=-65.0)
+    away = SensorLimits(range_above_m=1.0, range_right_m=-65.0)
     assert list(range_notes(beside, UNITS, table, LINE, away)) == []
     assert "too long" in "".join(range_notes(beside, UNITS, table, LINE, limits))
     (note,) = range_notes(ranges(table, 0.0, 0.0), UNITS, table[:3], LINE, limits)
