@@ -331,7 +331,7 @@ def test_the_watch_of_the_sensors_speaks_once_and_forgets(
     assert "ranges are 5." in note or "ranges are 4." in note
     watch.judge()
     assert said == [note]
-    assert not any(vars(watch)[name] for name in ("_places", "_speeds", "_samples", "_blocks"))
+    assert not any(vars(watch)[name] for name in ("_place_ns", "_samples", "_blocks"))
     right = SensorWatch(engine.processor, said.append)
     right.take(Sensed(sensor="all", samples=case.samples, until=FOREVER))
     for output in outputs:

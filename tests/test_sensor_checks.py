@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.motion.radar_watch import RadarWatch
 from railfix.motion.samples import (
     GroundUnits,
@@ -43,11 +43,8 @@ UNITS = GroundUnits(
 def places(speed_mps: float) -> pl.DataFrame:
     """The antenna once a second; the line runs east, the train at this speed."""
     chainage = AT[:: 1 if speed_mps > 0 else -1]
-    ecef = ORIGIN + chainage[:, None] * EAST
-    latitude, longitude, _ = geodetic_from_ecef(ecef)
-    columns = {"chainage_m": chainage, "latitude_deg": latitude, "longitude_deg": longitude}
     time = START + (np.arange(len(AT)) * 1e9).astype("timedelta64[ns]")
-    return pl.DataFrame({"time_gpst": time, **columns, **dict(zip(("x_m", "y_m", "z_m"), ecef.T, strict=True))})
+    return pl.DataFrame({"time_gpst": time, "chainage_m": chainage})
 
 
 def ranges(table: pl.DataFrame, ahead_m: float, excess_m: float, *, right_m: float = 0.0) -> StationRanges:
@@ -104,13 +101,17 @@ def way_m(t: np.ndarray) -> np.ndarray:
 def circle(t: np.ndarray, noise_m: float = 0.0) -> pl.DataFrame:
     """Places at these seconds, with a white error along the line."""
     way = way_m(t) + noise_m * np.random.default_rng(1).standard_normal(len(t))
+    return pl.DataFrame({"time_gpst": START + (t * 1e9).astype("timedelta64[ns]"), "chainage_m": way})
+
+
+def round_line() -> Trajectory:
+    """The circle, its points 5 m apart."""
+    way = np.arange(-50.0, way_m(np.array([SECONDS]))[0] + 50.0, 5.0)
     angle = way / RADIUS_M  # heading, from east to the south
     flat = np.cos(angle)[:, None] * -SOUTH + np.sin(angle)[:, None] * EAST
     ecef = ORIGIN + RADIUS_M * (flat + SOUTH) + CLIMB * way[:, None] * UP
-    latitude, longitude, _ = geodetic_from_ecef(ecef)
-    columns = {"chainage_m": way, "latitude_deg": latitude, "longitude_deg": longitude}
-    axes = dict(zip(("x_m", "y_m", "z_m"), ecef.T, strict=True))
-    return pl.DataFrame({"time_gpst": START + (t * 1e9).astype("timedelta64[ns]"), **columns, **axes})
+    line = Trajectory.from_track(Track.from_ecef(ecef, name="circle"))
+    return replace(line, chainage_m=way)
 
 
 def on_the_circle(facing: float) -> SensorSamples:
@@ -138,7 +139,7 @@ def on_the_circle(facing: float) -> SensorSamples:
 
 def test_motion_by_places_is_that_of_the_ride() -> None:
     t = np.arange(0.0, SECONDS, 1.0)
-    motion = motion_of(circle(t).filter(pl.Series((t < 100.0) | (t > 130.0))))
+    motion = motion_of(circle(t).filter(pl.Series((t < 100.0) | (t > 130.0))), round_line())
     at = (motion.time - START) / np.timedelta64(1, "s")
     wave = 2.0 * np.pi * at / 80.0
     known = np.isfinite(motion.acceleration_mps2)
@@ -173,19 +174,20 @@ def test_a_sensor_that_is_turned_or_in_another_unit_is_told(
     sensor: str, column: str, factor: object, said: str, facing: float
 ) -> None:
     places, samples = circle(np.arange(0.0, SECONDS, 1.0), noise_m=0.7), on_the_circle(facing)
-    assert list(sign_notes(samples, places, TachometerLimits(), facing)) == []
+    line = replace(round_line(), facing="rising" if facing > 0 else "falling")
+    assert list(sign_notes(samples, places, line, TachometerLimits())) == []
     factor = np.array(factor) if isinstance(factor, list) else factor
-    (note,) = sign_notes(_turned(samples, sensor, column, factor), places, TachometerLimits(), facing)
+    (note,) = sign_notes(_turned(samples, sensor, column, factor), places, line, TachometerLimits())
     assert re.search(said, note), note
 
 
-@pytest.mark.parametrize(("lag_s", "said"), [(-18.0, "1[789] s early .* UTC"), (6.0, "6 s late .* mend them")])
+@pytest.mark.parametrize(("lag_s", "said"), [(-18.0, "1[789] s early .* UTC"), (6.0, "6 s late .* correct them")])
 @pytest.mark.parametrize("sensor", ["tachometer", "radar", "inertial"])
 def test_time_tags_that_are_seconds_off_are_told(sensor: str, lag_s: float, said: str) -> None:
     places, samples = circle(np.arange(0.0, SECONDS, 1.0), noise_m=0.7), on_the_circle(1.0)
     table = getattr(samples, sensor)
     late = replace(table, time=table.time + np.timedelta64(round(lag_s * 1e9), "ns"))
-    (note,) = sign_notes(replace(samples, **{sensor: late}), places, TachometerLimits(), 1.0)
+    (note,) = sign_notes(replace(samples, **{sensor: late}), places, round_line(), TachometerLimits())
     assert re.search(f"{sensor}: its time tags are {said}", note), note
 
 
@@ -195,10 +197,10 @@ def test_exchanged_axes_are_told_and_nothing_else_rests_on_them() -> None:
     unit = samples.inertial
     samples = replace(samples, inertial=replace(unit, force_mps2=unit.force_mps2[:, ::-1]))
     checks = SensorChecks(places=[places], speeds=[pl.DataFrame({"time_gpst": places["time_gpst"], "speed_mps": 30.0})])
-    notes = checks.notes(samples, None, LINE, SensorLimits())
-    assert "inertial: gravity is in force_forward_mps2, not in force_down_mps2; exchange the columns" in notes[0]
+    notes = checks.notes(samples, None, round_line(), SensorLimits())
+    assert "inertial: gravity is in force_forward_mps2, not in force_down_mps2; swap the columns" in notes[0]
     assert not any("tachometer" in note for note in notes)
-    right = checks.notes(on_the_circle(1.0), None, LINE, SensorLimits())
+    right = checks.notes(on_the_circle(1.0), None, round_line(), SensorLimits())
     assert any("tachometer: the way of its wheel" in note for note in right)
 
 
@@ -269,8 +271,9 @@ def test_a_run_names_a_mounting_that_moves() -> None:
     radar = samples.radar
     scale = np.where(radar.time > START + np.timedelta64(200, "s"), 0.97, 1.0)
     moved = replace(samples, radar=replace(radar, speed_mps=scale * radar.speed_mps))
-    assert checks.notes(samples, None, LINE, SensorLimits()) == ()
-    notes = checks.notes(moved, None, LINE, SensorLimits())
+    assert checks.notes(samples, None, round_line(), SensorLimits()) == ()
+    assert checks.radar_alarms(samples.radar) == ()
+    notes = checks.radar_alarms(moved.radar)
     assert any("-3.0 % off those by satellites, +0.0 % before; has its mounting moved" in note for note in notes), notes
 
 

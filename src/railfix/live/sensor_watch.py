@@ -1,4 +1,4 @@
-"""Sensors on board of a live session, held against the satellites: once after ten minutes, the radar all the time."""
+"""Sensors on board of a live session, compared with the satellites: once after ten minutes, the radar always."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from railfix.live.sensor_lines import FOREVER, Sensed
 from railfix.motion.radar_watch import RadarWatch
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
-from railfix.pipeline.results import AntennaResult
 from railfix.run.sensor_checks import SensorChecks
 from railfix.tracking.rows import Kind
 
@@ -27,7 +26,6 @@ _EVERY_NS: Final = 500_000_000
 #: Pieces of samples that are joined to one.
 _PIECES: Final = 256
 _NEVER: Final = np.datetime64("NaT", "ns")
-_PLACE: Final = ("chainage_m", "latitude_deg", "longitude_deg", "x_m", "y_m", "z_m")
 
 
 class SensorWatch:
@@ -44,16 +42,15 @@ class SensorWatch:
         self._name, self._trajectory = next(iter(processor.trajectories.items()))
         self._processor, self._say = processor, say
         self._place_ns: list[int] = []
-        self._places: list[tuple[float, ...]] = []
+        self._places_m: list[float] = []
         self._speed_ns: list[int] = []
         self._speeds: list[float] = []
+        self._shown = 0
         self._samples: list[SensorSamples] = []
         self._blocks: list[SensorSamples] = []
         self._begin = _NEVER
         self._judged = self._has_radar = False
         self._watch, self._radar = RadarWatch(), SensorSamples()
-        self._rolled_ns: list[int] = []
-        self._rolled: list[float] = []
 
     def take(self, item: LiveOutput | Sensed) -> None:
         """Take an output of the engine, or what a sensor's source has completed."""
@@ -62,16 +59,18 @@ class SensorWatch:
         elif item.result is not None and self._name in item.result.antennas:
             antenna, track = item.result.antennas[self._name], item.result.fusion.get(self._name)
             time_ns = int((antenna.time[-1] - GPS_EPOCH).astype(np.int64))
-            if track is not None and track.tracked.used[-1, Kind.DOPPLER]:
-                self._roll(time_ns, float(track.tracked.speed_mps[-1]))
+            speed = float("nan") if track is None else float(track.tracked.speed_mps[-1])
+            measured = track is not None and track.tracked.used[-1, Kind.DOPPLER] and np.isfinite(speed)
+            if measured and time_ns > _last(self._speed_ns):
+                self._speed_ns.append(time_ns)
+                self._speeds.append(speed)
+                if time_ns - self._speed_ns[self._shown] >= _RADAR_NS:
+                    self._look_at_radar()
             if self._judged:
                 return
             if antenna.status[-1] == Status.OK and time_ns >= _last(self._place_ns) + _EVERY_NS:
                 self._place_ns.append(time_ns)
-                self._places.append(_place(antenna))
-            if track is not None and track.tracked.used[-1, Kind.DOPPLER] and time_ns > _last(self._speed_ns):
-                self._speed_ns.append(time_ns)
-                self._speeds.append(float(track.tracked.speed_mps[-1]))
+                self._places_m.append(float(antenna.chainage_m[-1]))
             if self._place_ns and time_ns - self._place_ns[0] >= WATCHED_NS:
                 self.judge()
 
@@ -85,7 +84,7 @@ class SensorWatch:
                 self._samples = []
             self._begin = np.fmin(self._begin, sensed.until)
             if not table and sensed.until - self._begin > 2 * np.timedelta64(WATCHED_NS, "ns"):
-                if self._places:
+                if self._place_ns:
                     self.judge()
                 self._samples, self._blocks, self._begin = [], [], _NEVER
         self._has_radar = self._has_radar or len(sensed.samples.radar) > 0
@@ -94,44 +93,35 @@ class SensorWatch:
             if not table:
                 self._radar = self._radar.between(sensed.until - 2 * np.timedelta64(_RADAR_NS, "ns"), FOREVER)
 
-    def _roll(self, time_ns: int, speed_mps: float) -> None:
-        """Take a speed by satellites for the watch of the radar."""
-        if time_ns <= _last(self._rolled_ns):
-            return
-        self._rolled_ns.append(time_ns)
-        self._rolled.append(speed_mps)
-        if time_ns - self._rolled_ns[0] >= _RADAR_NS:
-            time = _times(self._rolled_ns)
-            now, self._radar = self._radar.between(_NEVER, time[-1]), self._radar.between(time[-1], FOREVER)
-            for alarm in self._watch.take_samples(now.radar, time, np.array(self._rolled)) if self._has_radar else ():
-                self._say(alarm.sentence)
-            self._rolled_ns, self._rolled = [], []
+    def _look_at_radar(self) -> None:
+        """Compare the radar with the speeds by satellites since the last look."""
+        time, speeds = _times(self._speed_ns[self._shown :]), np.array(self._speeds[self._shown :])
+        now, self._radar = self._radar.between(_NEVER, time[-1]), self._radar.between(time[-1], FOREVER)
+        for alarm in self._watch.take_samples(now.radar, time, speeds) if self._has_radar else ():
+            self._say(alarm.sentence)
+        self._shown = len(self._speeds)
+        if self._judged:
+            self._forget_speeds()
+
+    def _forget_speeds(self) -> None:
+        """Drop the speeds that the radar has been compared with, except the last."""
+        kept = slice(max(self._shown - 1, 0), None)
+        self._speed_ns, self._speeds, self._shown = self._speed_ns[kept], self._speeds[kept], min(self._shown, 1)
 
     def judge(self) -> None:
-        """Judge the sensors by what there is, once."""
+        """Compare the sensors with the satellites so far, once."""
         if self._judged:
             return
         self._judged = True
-        if self._places and self._speeds and (parts := [*self._blocks, *self._samples]):
-            end = _times(self._speed_ns)[-1]
-            samples = _joined(parts).between(_NEVER, end)
-            places = pl.DataFrame(self._places, schema=_PLACE, orient="row")
+        if self._place_ns and self._speeds and (parts := [*self._blocks, *self._samples]):
             speeds = pl.DataFrame({"time_gpst": _times(self._speed_ns), "speed_mps": self._speeds})
-            checks = SensorChecks(
-                places=[places.with_columns(time_gpst=pl.Series(_times(self._place_ns)))],
-                speeds=[speeds.filter(pl.col("speed_mps").is_finite())],
-            )
-            processor = self._processor
+            places = pl.DataFrame({"time_gpst": _times(self._place_ns), "chainage_m": self._places_m})
+            samples = _joined(parts).between(_NEVER, _times(self._speed_ns)[-1])
+            checks, processor = SensorChecks(places=[places], speeds=[speeds]), self._processor
             for note in checks.notes(samples, processor.units, self._trajectory, processor.config.sensors):
                 self._say(note)
-        self._place_ns, self._places, self._speed_ns, self._speeds = [], [], [], []
-        self._samples, self._blocks = [], []
-
-
-def _place(antenna: AntennaResult) -> tuple[float, ...]:
-    """Its last place, in the order of `_PLACE`."""
-    geodetic = (antenna.chainage_m[-1], antenna.latitude_deg[-1], antenna.longitude_deg[-1])
-    return tuple(float(value) for value in (*geodetic, *antenna.ecef_m[-1]))
+        self._place_ns, self._places_m, self._samples, self._blocks = [], [], [], []
+        self._forget_speeds()
 
 
 def _last(time_ns: list[int]) -> int:

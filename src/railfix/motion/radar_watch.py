@@ -141,7 +141,7 @@ class RadarWatch:
         if not (np.abs(apart).min() > max(_STEP, _SCATTERS * scatter) and abs(np.sign(apart).sum()) == _AFTER):
             return []
         begin = np.datetime64(self.window[-_AFTER] * _WINDOW_NS, "ns")
-        for _ in range(len(ratios) - _AFTER):  # what comes next is held against what is now
+        for _ in range(len(ratios) - _AFTER):  # the next windows are compared with these
             self.ratio.popleft()
             self.window.popleft()
         return [RadarAlarm(kind="mounting", time=begin, before=middle, after=float(np.median(after)))]

@@ -50,7 +50,7 @@ class AntennaOrder:
         ahead = front.at_arc(arcs[0] + 1.0) - front.at_arc(arcs[0])
         rising = float(np.median(np.einsum("ni,ni->n", along, ahead)))
         apart = float(np.median(front.chainage_at(arcs[0]) - rear.chainage_at(arcs[1])))
-        self._facing = 1.0 if front.facing == "rising" else -1.0
+        self._facing = front.front_sign
         self.distance_m = self._facing * rising
         self._reference_m = apart - rising  # chainages may be those of a point of the vehicle
         self._tolerance_s = tolerance_s

@@ -156,7 +156,7 @@ def sensed_motion(
     tachometer : TachometerLimits
     limits : SlipLimits
     """
-    facing = 1.0 if trajectory.facing == "rising" else -1.0
+    facing = trajectory.front_sign
     ends = edges.astype("datetime64[ns]").astype(np.int64)
     begin = state.tick or max(int(ends[0]), int(inertial.time[0].astype(np.int64))) // _TICK_NS
     ticks = np.arange(begin + 1, int(ends[-1]) // _TICK_NS + 1)

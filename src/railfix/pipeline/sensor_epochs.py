@@ -188,7 +188,7 @@ def sensor_epochs(
     radar, ranging = state.samples.radar, state.samples.ranging
     first = time[0] if np.isnat(state.time) else state.time
     edges = np.concatenate([[first], time])
-    facing = 1.0 if trajectory.facing == "rising" else -1.0
+    facing = trajectory.front_sign
     span = seconds(np.diff(edges))
     usable = (span > 0.0) & (span <= _LONGEST_S)
     values: dict[str, Any] = {}
@@ -248,10 +248,7 @@ def sensor_epochs(
             "force_sigma_mps2": np.full(len(time), limits.force_sigma_mps2),
         }
     if len(ranging) and "range" in sources and surroundings is not None and surroundings.units is not None:
-        lever = np.array([
-            facing * limits.range_ahead_m - ahead_m(trajectory), facing * limits.range_right_m, limits.range_above_m
-        ])  # fmt: skip
-        values["ranges"] = _ranges(ranging, edges, surroundings.units, lever, limits)
+        values["ranges"] = _ranges(ranging, edges, surroundings.units, ranging_lever_m(trajectory, limits), limits)
     kept = SensorSamples(
         tachometer=_latest(pulses, _needed(pulses, edges[-1] - REACH, limits)),
         inertial=_latest(inertial, np.searchsorted(inertial.time, edges[-1] - REACH, side="right") - 1),
@@ -284,6 +281,13 @@ def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes, limits:
             since = limits.feature.scale_sigma * limits.feature.half_length_m
             sigma[epoch] = np.sqrt(fix.located.sigma_m**2 + since**2 + limits.feature_sigma_m**2)
     return {"place_m": place, "place_sigma_m": sigma}
+
+
+def ranging_lever_m(trajectory: Trajectory, limits: SensorLimits) -> Floats:
+    """Return the place of the vehicle's ranging unit from the antenna: along, right and up of its path, shape (3,)."""
+    facing = trajectory.front_sign
+    along = facing * limits.range_ahead_m - ahead_m(trajectory)
+    return np.array([along, facing * limits.range_right_m, limits.range_above_m])
 
 
 def _ranges(

@@ -147,6 +147,7 @@ def run_files(
             *notes_of(line, navigation, tally, logs, note_statistic=config.map_offset.note_threshold),
             *_notes_of_levels(config, tally),
             *checks.notes(sensors, units, next(iter(line.trajectories.values())), config.sensors),
+            *checks.radar_alarms(sensors.radar),
         )
         sources = [entry.result() for entry in entries]
         folder.end_parquet(_footer(sources, notes))

@@ -1,4 +1,4 @@
-"""Notes on sensors that contradict the satellites: units, time tags, wheel diameter, place of the ranging device."""
+"""Notes on sensors that contradict the satellites: units, time tags, wheel diameter, position of the ranging unit."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats
-from railfix.core.geodesy import enu_axes
 from railfix.core.timescale import seconds
 from railfix.motion.radar_watch import RadarWatch
-from railfix.motion.samples import GroundUnits, SensorSamples, StationRanges
+from railfix.motion.samples import GroundUnits, RadarSpeeds, SensorSamples, StationRanges
 from railfix.motion.tachometer import SpeedCheck, TachometerLimits, check_speeds, pulse_speeds
-from railfix.pipeline.feature_stage import ahead_m
-from railfix.pipeline.sensor_epochs import SensorLimits
+from railfix.pipeline.sensor_epochs import SensorLimits, ranging_lever_m
 from railfix.run.sensor_signs import sign_notes
 from railfix.track.trajectory import Trajectory
+from railfix.tracking import Line
 
 #: Speeds of the wheel are compared this far apart [ns].
 _STEP_NS: Final = 500_000_000
@@ -42,7 +41,7 @@ _RANGE_M: Final = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class SensorChecks:
-    """What the satellites say of one antenna, to hold the sensors on board against.
+    """Positions and speeds of one antenna by satellites, to compare the sensors on board with.
 
     Attributes
     ----------
@@ -55,31 +54,33 @@ class SensorChecks:
 
     def take(self, positions: pl.DataFrame, train: pl.DataFrame) -> None:
         """Take the rows of a chunk; two places a second are kept."""
-        columns = ("time_gpst", "chainage_m", "latitude_deg", "longitude_deg", "x_m", "y_m", "z_m")
-        passed = positions.filter(pl.col("status") == "ok").select(columns)
+        passed = positions.filter(pl.col("status") == "ok").select("time_gpst", "chainage_m")
         self.places.append(passed.unique(pl.col("time_gpst").dt.truncate("500ms"), keep="first", maintain_order=True))
         self.speeds.append(doppler_speeds(train))
 
     def notes(
         self, samples: SensorSamples, units: GroundUnits | None, trajectory: Trajectory, limits: SensorLimits
     ) -> tuple[str, ...]:
-        """Return a sentence on each sensor that contradicts the satellites."""
+        """Return a sentence on each sensor whose settings or tables contradict the satellites."""
         if not self.speeds:
             return ()
         places = pl.concat(self.places)
-        turned = tuple(sign_notes(samples, places, limits.tachometer, 1.0 if trajectory.facing == "rising" else -1.0))
-        if turned:  # the speeds of the filter, which the rest is held against, rest on these sensors too
-            return turned
-        speeds = pl.concat(self.speeds)
-        notes = sensor_notes(samples, speeds, limits.tachometer)
-        if len(radar := samples.radar):
-            time = speeds["time_gpst"].to_numpy().astype("datetime64[ns]")
-            both = (time >= radar.time[0]) & (time <= radar.time[-1])  # a shorter table is no silence
-            alarms = RadarWatch().take_samples(radar, time[both], speeds["speed_mps"].to_numpy()[both])
-            notes += tuple(alarm.sentence for alarm in alarms)
+        reversed_ones = tuple(sign_notes(samples, places, trajectory, limits.tachometer))
+        if reversed_ones:  # the filter's speeds, which the rest is compared with, depend on these sensors
+            return reversed_ones
+        notes = sensor_notes(samples, pl.concat(self.speeds), limits.tachometer)
         if units is not None and len(samples.ranging):
             notes += tuple(range_notes(samples.ranging, units, places, trajectory, limits))
         return notes
+
+    def radar_alarms(self, radar: RadarSpeeds) -> tuple[str, ...]:
+        """Return a sentence on each alarm of the radar while its table lasts (live: `railfix.live.sensor_watch`)."""
+        if not self.speeds or not len(radar):
+            return ()
+        speeds = pl.concat(self.speeds)
+        time, speed = speeds["time_gpst"].to_numpy().astype("datetime64[ns]"), speeds["speed_mps"].to_numpy()
+        both = (time >= radar.time[0]) & (time <= radar.time[-1])
+        return tuple(alarm.sentence for alarm in RadarWatch().take_samples(radar, time[both], speed[both]))
 
 
 def range_notes(
@@ -92,7 +93,7 @@ def range_notes(
     ranging : StationRanges
     units : GroundUnits
     places : polars.DataFrame
-        Time, chainage and coordinates of an antenna, as in ``positions.csv``.
+        ``time_gpst`` and ``chainage_m`` of an antenna.
     trajectory : Trajectory
         Of that antenna.
     limits : SensorLimits
@@ -105,22 +106,18 @@ def range_notes(
         return
     after = np.clip(np.searchsorted(time, ranging.time), 1, len(time) - 1)
     before = after - 1
-    ecef, chainage = places.select("x_m", "y_m", "z_m").to_numpy(), places["chainage_m"].to_numpy()
-    way, ran = ecef[after] - ecef[before], chainage[after] - chainage[before]
-    share = seconds(ranging.time - time[before]) / np.maximum(seconds(time[after] - time[before]), 1e-9)
-    near = (share >= 0.0) & (share <= 1.0) & (seconds(time[after] - time[before]) <= _BETWEEN_S)
+    chainage = places["chainage_m"].to_numpy()
+    ran, between = chainage[after] - chainage[before], seconds(time[after] - time[before])
+    share = seconds(ranging.time - time[before]) / np.maximum(between, 1e-9)
+    arc = trajectory.arc_at_chainage(chainage[before] + share * ran)
+    near = (share >= 0.0) & (share <= 1.0) & (between <= _BETWEEN_S) & np.isfinite(arc)
     near &= (np.abs(ran) > _MOVED_M) & (unit >= 0) & np.isfinite(ranging.range_m)
-    rows, facing = np.flatnonzero(near), 1.0 if trajectory.facing == "rising" else -1.0
-    way, ran, share = way[rows], ran[rows], share[rows]
-    forward = way * (np.sign(ran) / np.linalg.norm(way, axis=1))[:, None]
-    up = enu_axes(places["latitude_deg"].to_numpy()[after[rows]], places["longitude_deg"].to_numpy()[after[rows]])[:, 2]
-    right = np.cross(forward, up)
-    device = ecef[before[rows]] + share[:, None] * way
-    device += (facing * limits.range_ahead_m - ahead_m(trajectory)) * forward
-    device += facing * limits.range_right_m * right + limits.range_above_m * up
-    sight = units.ecef_m[unit[rows]] - device
+    rows = np.flatnonzero(near)
+    along, right, up = ranging_lever_m(trajectory, limits).tolist()
+    point, axes = Line.of(trajectory).at(arc[rows] + along)
+    sight = units.ecef_m[unit[rows]] - point - right * axes[:, 1] - up * axes[:, 2]
     distance = np.linalg.norm(sight, axis=1)
-    ahead = (sight * forward).sum(axis=1) / np.maximum(distance, 1e-9)
+    ahead = (sight * axes[:, 0]).sum(axis=1) / np.maximum(distance, 1e-9)
     longer = ranging.range_m[rows] - distance
     sides = [longer[(distance < _FAR_M) & (side * ahead > _AHEAD)] for side in (1.0, -1.0)]
     seen = [float(np.median(side)) for side in sides if len(side) >= _LEAST_RANGES]
@@ -132,7 +129,7 @@ def range_notes(
     else:
         moved, excess = (-seen[0] if len(sides[0]) >= _LEAST_RANGES else seen[0]), 0.0
     if abs(moved) > _RANGE_M:
-        fits = limits.range_ahead_m + facing * moved
+        fits = limits.range_ahead_m + trajectory.front_sign * moved
         which = "ahead of" if moved > 0 else "behind"
         yield (
             f"ranging: places by the ranges are {abs(moved):.1f} m {which} those by satellites in rising chainage; "
@@ -201,4 +198,4 @@ def _sentences(name: str, found: SpeedCheck | None, scale: str) -> Iterator[str]
         yield f"{name}: {scale.format(100.0 * (found.ratio - 1.0))}"
     if abs(found.lag_s) >= _LAG_S:
         late = "late" if found.lag_s > 0 else "early"
-        yield f"{name}: its time tags are {abs(found.lag_s):.1f} s {late} against the satellites'; mend them"
+        yield f"{name}: its time tags are {abs(found.lag_s):.1f} s {late} against the satellites'; correct them"

@@ -1,6 +1,6 @@
-"""Signs, units, axes and time tags of the sensors on board, held against the places of single epochs.
+"""Signs, units, axes and time tags of the sensors on board, compared with the positions of single epochs.
 
-These do not depend on the sensors, as speeds of the filter do: a sensor that is turned round moves the filter too.
+These do not depend on the sensors, as the speeds of the filter do: a sensor mounted backwards moves the filter too.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.constants import GRAVITY_MPS2
-from railfix.core.geodesy import enu_axes
 from railfix.core.timescale import gpst_minus_utc, seconds, timedelta
 from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
 from railfix.motion.tachometer import TachometerLimits, pulse_speeds
+from railfix.track.trajectory import Trajectory
+from railfix.tracking import Line
 
 #: Places are averaged over cells of this length [s].
 _CELL_S: Final = 4.0
-#: A train that moves, for signs of speeds [m/s], and as far between cells that its heading is known [m].
+#: A train that moves, for signs of speeds [m/s].
 _MOVING_MPS: Final = 1.0
-_HEADED_M: Final = 8.0
 #: Cells that are needed for a statement, and the least root mean square of what is compared: changes of a force [m/s2]
 #: and of a speed [m/s], a rate [rad/s].
 _LEAST_CELLS: Final = 15
 _LEAST_FORCE_MPS2: Final = 0.08
 _LEAST_SPEED_MPS: Final = 1.0
 _LEAST_RATE_RADPS: Final = 0.003
-#: A slope of measured over expected below this is a turned sign, above that a rate in degrees.
-_TURNED: Final = -0.3
+#: A slope of measured over expected values below this is a reversed sign, above that a rate in degrees.
+_REVERSED: Final = -0.3
 _IN_DEGREES: Final = 10.0
 #: Lags that are tried, and the least that is told [s]; what is left unexplained at no lag is more by this factor.
 _LONGEST_LAG_S: Final = 20.0
@@ -44,13 +44,14 @@ _GRAVITY_SHARE: Final = 0.12
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of an antenna by its places, M cells of time one after the other; NaN where a neighbour is missing.
+    """Motion of an antenna by its places, M cells of time; NaN where a neighbour is missing.
 
     Attributes
     ----------
     time : ndarray of datetime64[ns], shape (M,)
     speed_mps, acceleration_mps2, gradient, heading_rate_radps : ndarray, shape (M,)
-        Along the line toward rising chainage; the gradient as rise over way, the rate positive to the right.
+        Toward rising chainage; the gradient is that of the line, as climb over horizontal length, and the heading, too,
+        with its rate positive to the right.
     """
 
     time: Datetimes
@@ -60,63 +61,47 @@ class Motion:
     heading_rate_radps: Floats
 
 
-def motion_of(places: pl.DataFrame) -> Motion:
-    """Compute the motion by places: time, chainage, coordinates and ECEF by the names of ``positions.csv``."""
-    start = places["time_gpst"].to_numpy().astype("datetime64[ns]").min()
-    columns = ("chainage_m", "latitude_deg", "longitude_deg", "x_m", "y_m", "z_m")
-    cells = (
-        places.with_columns(pl.Series("t", seconds(places["time_gpst"].to_numpy().astype("datetime64[ns]") - start)))
-        .group_by((pl.col("t") // _CELL_S).cast(pl.Int64).alias("cell"))
-        .agg(pl.col("t", *columns).mean())
-        .sort("cell")
-    )
-    whole = pl.DataFrame({"cell": np.arange(int(cells["cell"][-1]) + 1)}).join(cells, on="cell", how="left")
-    t, chainage, latitude, longitude = (whole[name].to_numpy() for name in ("t", "chainage_m", *columns[1:3]))
-    ecef = whole.select(columns[3:]).to_numpy()
-    speed, rise, heading = (np.full(len(t), np.nan) for _ in range(3))
-    east, north, up = np.moveaxis(enu_axes(latitude, longitude), 1, 0)
-    way, span = ecef[2:] - ecef[:-2], t[2:] - t[:-2]
-    moved = np.linalg.norm(way, axis=1)
+def motion_of(places: pl.DataFrame, trajectory: Trajectory) -> Motion:
+    """Compute the motion by ``time_gpst`` and ``chainage_m`` of single epochs, from cells of 4 s that have some."""
+    time = places["time_gpst"].to_numpy().astype("datetime64[ns]")
+    since = seconds(time - time[0])
+    cell = (since // _CELL_S).astype(np.int64)
+    with np.errstate(invalid="ignore"):
+        count = np.bincount(cell)
+        t, chainage = (np.bincount(cell, values) / count for values in (since, places["chainage_m"].to_numpy()))
+    arc = trajectory.arc_at_chainage(chainage)
+    heading = np.radians(trajectory.heading_deg)[trajectory.segment_at(arc)[0]]
+    step, way, turned = np.diff(t), np.diff(chainage), heading[2:] - heading[:-2]
+    span = t[2:] - t[:-2]
+    speed, gained, rate = (np.full(len(t), np.nan) for _ in range(3))
     speed[1:-1] = (chainage[2:] - chainage[:-2]) / span
-    sign = np.sign(speed[1:-1])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rise[1:-1] = (way * up[1:-1]).sum(axis=1) / moved * sign
-    heading[1:-1] = np.arctan2((way * east[1:-1]).sum(axis=1) * sign, (way * north[1:-1]).sum(axis=1) * sign)
-    heading[1:-1][~(moved > _HEADED_M)] = np.nan
-    rate, gained = np.full(len(t), np.nan), np.full(len(t), np.nan)
-    turned = heading[2:] - heading[:-2]
+    gained[1:-1] = 2.0 * (way[1:] / step[1:] - way[:-1] / step[:-1]) / span
     rate[1:-1] = np.arctan2(np.sin(turned), np.cos(turned)) / span
-    before, after = t[1:-1] - t[:-2], t[2:] - t[1:-1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        steps = np.diff(chainage)
-        gained[1:-1] = 2.0 * (steps[1:] / after - steps[:-1] / before) / span
-    time = np.full(len(t), np.datetime64("NaT", "ns"))
-    known = np.isfinite(t)
-    time[known] = start + timedelta(t[known])
-    return Motion(time, speed, gained, np.nan_to_num(rise), rate)
+    known = count > 0
+    gradient = Line.of(trajectory).gradient_at(arc)
+    return Motion(time[0] + timedelta(t[known]), speed[known], gained[known], gradient[known], rate[known])
 
 
 def sign_notes(
-    samples: SensorSamples, places: pl.DataFrame, tachometer: TachometerLimits, facing: float
+    samples: SensorSamples, places: pl.DataFrame, trajectory: Trajectory, tachometer: TachometerLimits
 ) -> Iterator[str]:
-    """Yield a sentence on each sensor that is turned round, in another unit, on other axes or seconds off in time.
+    """Yield a sentence on each sensor with a wrong sign, unit, axis, or time tags seconds off.
 
     Parameters
     ----------
     samples : SensorSamples
     places : polars.DataFrame
-        Of single epochs of one antenna that passed every check.
+        ``time_gpst`` and ``chainage_m`` of single epochs of one antenna that passed every check.
+    trajectory : Trajectory
+        Of that antenna.
     tachometer : TachometerLimits
-    facing : float
-        1 where the vehicle's front points toward rising chainage, else -1.
     """
     wheel, radar, inertial = samples.tachometer, samples.radar, samples.inertial
     yield from _forces_at_rest(inertial)
     if len(places) < 2:
         return
-    motion = motion_of(places)
-    known = ~np.isnat(motion.time)
-    time, forward = motion.time[known], facing * motion.speed_mps[known]
+    motion, facing = motion_of(places, trajectory), trajectory.front_sign
+    time, forward = motion.time, facing * motion.speed_mps
     if len(wheel):
         directed = "the direction of its pulses is" if wheel.direction.any() else None
         speeds = partial(_wheel_speeds, wheel, tachometer)
@@ -124,21 +109,21 @@ def sign_notes(
     if len(radar):
         yield from _of_speeds("radar", time, forward, partial(_radar_speeds, radar), "the sign of its speeds is")
     if len(inertial):
-        expected = facing * (motion.acceleration_mps2[known] + GRAVITY_MPS2 * motion.gradient[known])
+        expected = facing * (motion.acceleration_mps2 + GRAVITY_MPS2 * motion.gradient)
         force = partial(_means, inertial.time, inertial.force_mps2[:, 0])
         lag = _lag_s(time, expected, force, _LEAST_FORCE_MPS2)
         if lag:
             yield _late("inertial", lag, time[0])
             return
         slope = _slope(_centred(expected), _centred(force(time)), _LEAST_FORCE_MPS2)
-        if slope < _TURNED:
+        if slope < _REVERSED:
             yield (
-                "inertial: its force forward is opposite to the acceleration by satellites; the unit is turned round, "
-                "or the vehicle file's facing is wrong"
+                "inertial: its force forward is opposite to the acceleration by satellites; the unit is mounted "
+                "backwards, or facing in the vehicle file is wrong"
             )
         yaw = _means(inertial.time, inertial.rate_radps[:, 2], time)
-        slope = _slope(motion.heading_rate_radps[known], yaw, _LEAST_RATE_RADPS)
-        if slope < _TURNED:
+        slope = _slope(motion.heading_rate_radps, yaw, _LEAST_RATE_RADPS)
+        if slope < _REVERSED:
             yield "inertial: its yaw rate is opposite to that of the line; it must be positive to the right, about down"
         if abs(slope) > _IN_DEGREES:
             yield "inertial: its rates are in degrees per second, not in radians; convert them"
@@ -147,7 +132,7 @@ def sign_notes(
 def _of_speeds(
     name: str, time: Datetimes, forward: Floats, speeds: Callable[[Datetimes], Floats], directed: str | None
 ) -> Iterator[str]:
-    """Lag of a sensor of speeds, and its direction where it has one, called `directed`."""
+    """Check the time tags of a sensor of speeds, and its sign; `directed` names what has the sign."""
     lag = _lag_s(time, np.abs(forward), lambda at: np.abs(speeds(at)), _LEAST_SPEED_MPS)
     if lag:
         yield _late(name, lag, time[0])
@@ -155,7 +140,7 @@ def _of_speeds(
     measured = speeds(time)
     known = np.isfinite(measured) & (np.abs(forward) > _MOVING_MPS)
     if directed and known.sum() >= _LEAST_CELLS and np.mean(measured[known] * forward[known] < 0.0) > 0.5:
-        yield f"{name}: {directed} opposite to the motion by satellites; turn it, or the vehicle file's facing is wrong"
+        yield f"{name}: {directed} opposite to the motion by satellites; reverse it, or correct the vehicle's facing"
 
 
 def _lag_s(time: Datetimes, expected: Floats, measured: Callable[[Datetimes], Floats], least: float) -> float:
@@ -175,7 +160,7 @@ def _lag_s(time: Datetimes, expected: Floats, measured: Callable[[Datetimes], Fl
 
 def _late(name: str, lag_s: float, time: np.datetime64) -> str:
     leap = int(gpst_minus_utc(time))
-    utc = "they are UTC, GPS time is expected" if abs(lag_s + leap) <= 1.0 else "mend them"
+    utc = "they are UTC, GPS time is expected" if abs(lag_s + leap) <= 1.0 else "correct them"
     way = "late" if lag_s > 0 else "early"
     return f"{name}: its time tags are {abs(lag_s):.0f} s {way} against the satellites'; {utc}"
 
@@ -217,9 +202,9 @@ def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
         yield f"inertial: its mean force is {size:.2f} m/s2, gravity {GRAVITY_MPS2:.2f}; specific forces are expected"
     elif abs(down) < 0.8 * size:
         axis = "force_forward_mps2" if abs(forward) > abs(right) else "force_right_mps2"
-        yield f"inertial: gravity is in {axis}, not in force_down_mps2; exchange the columns of the axes"
+        yield f"inertial: gravity is in {axis}, not in force_down_mps2; swap the columns of the axes"
     elif down > 0.0:
-        yield f"inertial: force_down_mps2 is {down:+.1f} in the mean, -9.8 was expected; turn its sign, or the unit"
+        yield f"inertial: force_down_mps2 is {down:+.1f} in the mean, -9.8 was expected; the unit is upside down"
 
 
 def _slope(expected: Floats, measured: Floats, least: float) -> float:

@@ -177,6 +177,11 @@ class Trajectory(FrozenArrays, NotebookTable):
         enu = np.einsum("vij,vj->vi", self._axes, self.tangent)
         return read_only(1e3 * enu[:, 2] / np.hypot(enu[:, 0], enu[:, 1]))
 
+    @property
+    def front_sign(self) -> float:
+        """1 where the vehicle's front points toward rising chainage, else -1."""
+        return 1.0 if self.facing == "rising" else -1.0
+
     def body_azimuth_deg(self, arc_m: ArrayLike) -> Floats:
         """Compute the azimuth of the vehicle's front at arc lengths, clockwise from north [deg]; NaN for NaN."""
         heading = self.heading_deg[self.segment_at(arc_m)[0]] + (0.0 if self.facing == "rising" else 180.0)
