@@ -243,7 +243,7 @@ def smartloc(data: Path, config: Config = SETTINGS, movement: Movement | None = 
     start = np.broadcast_to(trajectory.ecef_m.mean(axis=0), (len(ranges), 3))
     point = single_point(ranges, start)
     clocks = tuple(CLOCK_GROUP[str(log.satellite[group.start])[0]] for group in ranges.groups)
-    ties, _ = tie_clocks(log.time, clocks, "G", ranges, point, OffsetState(), limits=config.clock_offsets)
+    ties, _ = tie_clocks(log.time, clocks, "G", ranges, point, [OffsetState()], limits=config.clock_offsets)
     ranges = replace(ranges, ties=ties)
     arc = smartloc_chain(log.time, ranges, trajectory, point.ecef_m, config, movement)
     reference = interpolate_reference(log.time, time, ecef)

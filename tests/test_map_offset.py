@@ -12,6 +12,7 @@ from scipy.stats import chi2, ncx2
 import raim_oracle as oracle
 import synthetic
 from railfix.core.timescale import seconds, timedelta
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.map_offset import (
     MapOffset,
     MapOffsetLimits,
@@ -20,12 +21,14 @@ from railfix.positioning.map_offset import (
     map_offset,
 )
 from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.section_search import SearchIndex
 from railfix.positioning.single_point import SinglePoint, single_point
 
 pytestmark = pytest.mark.requirement("C4")
 
 EPOCHS = 40
 LINE = replace(oracle.LINE, sigma_plan_m=0.4, sigma_height_m=0.9)
+ALONE = AntennaRows.of(SearchIndex(LINE))
 LIMITS = MapOffsetLimits(window_s=70.0, correlation_s=14.0, least_samples=2.5)
 SYSTEMS = "GGGGGEEE"
 #: Epochs at which the train is away from the line: they have a window of their own.
@@ -53,7 +56,9 @@ def case() -> tuple[np.ndarray, Ranges, SinglePoint, np.ndarray, np.ndarray, np.
 
 def of_case(limits: MapOffsetLimits = LIMITS) -> tuple[MapOffset, MapOffsetState]:
     time, ranges, point, nominal, variance, arc = case()
-    return map_offset(time, ranges, point, nominal, variance, LINE, arc, AWAY, MapOffsetState(), limits=limits)
+    start = [MapOffsetState()]
+    result, (end,) = map_offset(time, ranges, point, nominal, variance, ALONE, arc, AWAY, start, limits=limits)
+    return result, end
 
 
 def written_out(limits: MapOffsetLimits) -> list[tuple[np.ndarray, np.ndarray] | None]:
@@ -149,16 +154,16 @@ def test_chunks_give_the_same(cut: int) -> None:
         some = replace(
             ranges, sat_ecef_m=ranges.sat_ecef_m[part], code_m=ranges.code_m[part], weight=ranges.weight[part]
         )
-        result, state = map_offset(
+        result, (state,) = map_offset(
             time[part],
             some,
             point.take(part),
             nominal[part],
             variance[part],
-            LINE,
+            ALONE,
             arc[part],
             AWAY[part],
-            state,
+            [state],
             limits=LIMITS,
         )
         parts.append(result)

@@ -21,6 +21,7 @@ from railfix.integrity.protection.open_places import places_beyond_the_level
 from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.section_search import SearchIndex
 from railfix.run.processor import processor_of
 from railfix.simulate.demonstration import demo_inputs
@@ -108,7 +109,7 @@ def test_open_places_are_those_that_solving_every_subset_leaves_open(
     elevation, azimuth = elevation_azimuth(ranges.sat_ecef_m, line.at_arc(arc))
     right = np.sin(np.radians(azimuth - line.heading_deg[section][:, None])) > 0
     sides = np.stack([(elevation < 45.0) & ~right, (elevation < 45.0) & right], axis=1)
-    found = places_beyond_the_level(index, arc, model, level, scale, systems, risk, sides, every)
+    found = places_beyond_the_level(AntennaRows.of(index), arc, model, level, scale, systems, risk, sides, every)
     points = line.at_arc(np.arange(0.0, line.arc_m[-1], 0.5))
     open_ones = 0
     for t in range(len(rows)):
@@ -159,10 +160,14 @@ def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPa
         return exact(index, arc_m, *rest)  # type: ignore[arg-type]
 
     monkeypatch.setattr(open_places, "_risk_of_block", counted)
-    bounded = places_beyond_the_level(SearchIndex(path), arc, model, level, scale, systems, RiskBudget(), sides, rows)
+    bounded = places_beyond_the_level(
+        AntennaRows.of(SearchIndex(path)), arc, model, level, scale, systems, RiskBudget(), sides, rows
+    )
     assert 0 < sum(looked_at) < 0.3 * len(rows)
     monkeypatch.setattr(open_places, "risk_off_tangent", lambda _, scale, *__: np.full(len(scale), 1.0))
-    every = places_beyond_the_level(SearchIndex(path), arc, model, level, scale, systems, RiskBudget(), sides, rows)
+    every = places_beyond_the_level(
+        AntennaRows.of(SearchIndex(path)), arc, model, level, scale, systems, RiskBudget(), sides, rows
+    )
     np.testing.assert_array_equal(bounded, every)
     assert every.any() == (share < 1.0)
 
@@ -178,7 +183,7 @@ def test_bounds_are_the_same_compiled(
 
     def recorded(*arrays: Any) -> np.ndarray:
         calls.append(arrays)
-        return np.zeros(len(arrays[0]))
+        return np.zeros(len(arrays[1]))
 
     monkeypatch.setattr(open_places, "risk_off_tangent", recorded)
     pixel.solved(integrity_tables.SETTINGS.model_copy(update={"risk": RiskBudget(side_prior=1e-2)}))

@@ -223,8 +223,9 @@ def test_standing_draws_no_loops(seed: int, sigma: float, drift: float, stand: i
     time, ecef = run_of(speed, sigma, seed, drift)
     track = from_positions(time, ecef)
     north = ((track.ecef_m - ecef_from_geodetic(*ORIGIN)) @ enu_axes(*ORIGIN[:2]).T)[:, 1]
-    # where the reference itself drifted sideways while standing, the map steps sideways: never back
-    assert (np.diff(north) > -4.0 * sigma - 1e-6).all()
+    # where the reference itself drifted sideways while standing, the map steps sideways: back by no more than noise,
+    # the largest of some stops (five standard deviations of a difference)
+    assert (np.diff(north) > -7.0 * sigma - 1e-6).all()
     assert 65 <= len(track) <= 85  # 400 m at 5 m, positions every metre
     assert north[-1] - north[0] > 390.0
 

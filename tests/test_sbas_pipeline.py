@@ -26,8 +26,9 @@ from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.fault_exclusion import fault_free
 from railfix.pipeline.level_stage import level_facts, low_sides, protection_levels, standing
 from railfix.pipeline.processor import AntennaResult
-from railfix.pipeline.results import AntennaState, State
+from railfix.pipeline.results import State
 from railfix.pipeline.solve import place_on_line
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.single_point import single_point
 from railfix.ranges.atmosphere import saastamoinen_delay_m
@@ -161,14 +162,15 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     assert level_facts(parse_config({}))["kind"] == "separation"
     processor = processor_of(config, recording.navigation, {"front": recording.line})
     obs = recording.observations[180:200]
-    one, _ = processor._screened("front", obs, processor.received, AntennaState())
+    one = processor.chunks({"front": obs}, State())["front"].screened()
     ranges = one.ranges()
     point = single_point(ranges, one.anchor_ecef_m)
-    index = processor._index["front"]
+    index = processor.indices["front"]
     place = place_on_line(ranges, index, point, config)
+    antennas = AntennaRows.of(index)
     scale = np.ones(len(ranges))
     ranges, place, raim = fault_free(
-        ranges, index, place, scale, ranges.weight > 0, config.model_copy(update={"screens": ()})
+        ranges, antennas, place, scale, ranges.weight > 0, config.model_copy(update={"screens": ()})
     )
     section = np.maximum(place.constrained.section, 0)
     model_on_line = constrained_model(ranges, index.trajectory, place.constrained.arc_m, section=section)

@@ -188,7 +188,8 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     """
     if not parts:
         raise ValueError("concatenate needs at least one part")
-    keys = sorted({(str(s), str(g)) for p in parts for s, g in zip(p.satellite, p.signal, strict=True)})
+    of_parts = [list(zip(p.satellite.tolist(), p.signal.tolist(), strict=True)) for p in parts]
+    keys = sorted({key for of_part in of_parts for key in of_part})
     column = {key: i for i, key in enumerate(keys)}
     total = sum(len(p) for p in parts)
     shape = (total, len(keys))
@@ -200,8 +201,8 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         for target in floats.values():
             target.fill(np.nan)
     row = 0
-    for part in parts:
-        columns: Any = [column[str(s), str(g)] for s, g in zip(part.satellite, part.signal, strict=True)]
+    for part, of_part in zip(parts, of_parts, strict=True):
+        columns: Any = [column[key] for key in of_part]
         if columns == list(range(len(keys))):
             columns = slice(None)
         rows = slice(row, row + len(part))

@@ -1,4 +1,4 @@
-"""Result of one antenna: every intermediate value side by side, coordinates where the status allows them."""
+"""Results of antennas: every intermediate value side by side, coordinates where the status allows them."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from railfix.pipeline.level_stage import judged
 from railfix.pipeline.reason_table import reason_of_all_channels, satellites_rejected
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.solution import Solution
+from railfix.positioning.antenna_rows import AntennaRows
+from railfix.track.track import interpolate_kilometrage
 from railfix.track.trajectory import Trajectory
 
 
@@ -26,18 +28,17 @@ def with_coordinates(failed_checks: str) -> Masks:
     return read_only(np.array([status in POSITIONED and status not in dropped for status in sorted(Status)]))
 
 
-def antenna_result(
-    corrected: CorrectedRanges, trajectory: Trajectory, solution: Solution, config: Config
+def antenna_results(
+    corrected: CorrectedRanges, antennas: AntennaRows, solution: Solution, config: Config
 ) -> AntennaResult:
-    """Return the result of one antenna."""
+    """Return the result of one antenna, or of the rows of several."""
     obs, point, constrained = corrected.observations, solution.point, solution.place.constrained
     has = with_coordinates(config.failed_checks)[solution.status]
     arc = np.where(has, solution.arc_m, np.nan)
-    ecef = trajectory.at_arc(arc)
+    ecef, chainage, kilometrage = antennas.each(lambda index, rows: _places(index.trajectory, arc[rows]))
     latitude, longitude, height = geodetic_from_ecef(ecef)
-    nearest, offset = trajectory.nearest(point.ecef_m)
+    nearest, offset, beside = antennas.each(lambda index, rows: _nearest(index.trajectory, point.ecef_m[rows]))
     reason = reason_of_all_channels(corrected)
-    chainage = trajectory.chainage_at(arc)
     protection = solution.protection
 
     def on_all_channels(values: Floats) -> Floats:
@@ -51,7 +52,7 @@ def antenna_result(
         signal=obs.signal,
         status=solution.status,
         chainage_m=chainage,
-        kilometrage_m=trajectory.kilometrage_at(arc),
+        kilometrage_m=kilometrage,
         arc_m=arc,
         along_sigma_m=np.where(has, solution.along_sigma_m, np.nan),
         own_sigma_m=solution.own_sigma_m,
@@ -64,7 +65,7 @@ def antenna_result(
         n_rejected=satellites_rejected(corrected.channels.member, reason),
         conventional_ecef_m=point.ecef_m,
         conventional_arc_m=nearest,
-        conventional_chainage_m=trajectory.chainage_at(nearest),
+        conventional_chainage_m=beside,
         conventional_offset_m=offset,
         reason=reason,
         elevation_deg=on_all_channels(corrected.elevation_deg),
@@ -88,3 +89,15 @@ def antenna_result(
         clock_offset_m=solution.ties.offset_m,
         clock_offset_sigma_m=solution.ties.sigma_m,
     )
+
+
+def _places(line: Trajectory, arc_m: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return points (T, 3), chainages and kilometrage (T,) of a line at arc lengths [m]."""
+    chainage = line.chainage_at(arc_m)
+    return line.at_arc(arc_m), chainage, interpolate_kilometrage(chainage, line.chainage_m, line.kilometrage_m)
+
+
+def _nearest(line: Trajectory, ecef_m: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return arc length and distance of the nearest point of a line, and its chainage, shape (T,) each [m]."""
+    arc, offset = line.nearest(ecef_m)
+    return arc, offset, line.chainage_at(arc)

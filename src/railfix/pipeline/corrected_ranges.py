@@ -16,6 +16,7 @@ from railfix.gnss.orbits import SatelliteStates, satellite_states
 from railfix.pipeline.channels import Channels
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import Slips
 from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.section_search import SearchIndex, search
@@ -38,7 +39,7 @@ SOMEWHERE_ABOVE_M: Final = (2.6e7, 0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectedRanges(AntennaRanges):
-    """Corrected pseudoranges of one antenna before positioning: T epochs by the K channels that the settings allow.
+    """Corrected pseudoranges before positioning: T epochs by the K channels that the settings allow.
 
     Attributes
     ----------
@@ -112,7 +113,7 @@ def correct_ranges(
     channels: Channels,
     config: Config,
     received: Received,
-    index: SearchIndex,
+    antennas: AntennaRows,
     *,
     error_model: ErrorModel | None = None,
 ) -> CorrectedRanges:
@@ -127,8 +128,7 @@ def correct_ranges(
     received : Received
         Navigation records and coefficients; where SBAS is used, its corrections replace the models, and satellites
         without a valid one are rejected.
-    index : SearchIndex
-        Of the antenna's trajectory.
+    antennas : AntennaRows
     error_model : ErrorModel, optional
         Gives the least sigmas of the protection level; the weights are those of ``config.noise``.
 
@@ -165,7 +165,7 @@ def correct_ranges(
     clean = code + states.clock_m - states.group_delay_m
     if fixes is not None:
         clean = clean + np.nan_to_num(fixes.fast_m)
-    anchor = _anchor(index, config, usable_ranges(states, clean, _ANCHOR_WEIGHT, reason, groups))
+    anchor = _anchor(antennas, config, usable_ranges(states, clean, _ANCHOR_WEIGHT, reason, groups))
     seen, frequency = SeenFrom.of(anchor, states.position_ecef_m), channels.frequency_hz
     if sbas is None or fixes is None:
         delays = modelled_delays(
@@ -186,7 +186,7 @@ def correct_ranges(
     sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), beyond)
     bound, bias = np.zeros(code.shape), np.zeros(code.shape)
     if error_model is not None:
-        bound, bias = _by_error_model(error_model, seen, cn0, index)
+        bound, bias = _by_error_model(error_model, seen, cn0, antennas)
         bound = np.hypot(bound, nominal) if error_model.covers == "local" or sbas is not None else bound
     uncorrected = (reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma) & np.isfinite(bound))
     return CorrectedRanges(
@@ -215,10 +215,14 @@ def correct_ranges(
     )
 
 
-def _by_error_model(model: ErrorModel, seen: SeenFrom, cn0: Floats, index: SearchIndex) -> tuple[Floats, Floats]:
+def _by_error_model(model: ErrorModel, seen: SeenFrom, cn0: Floats, antennas: AntennaRows) -> tuple[Floats, Floats]:
     """Return overbounding sigma and bias of the ranges by the error model: shapes (T, K) [m]."""
-    arc, _ = index.trajectory.nearest(seen.receiver_ecef_m)
-    turned = seen.azimuth_deg - index.trajectory.body_azimuth_deg(arc)[:, None]
+
+    def front_deg(index: SearchIndex, rows: slice) -> Floats:
+        arc, _ = index.trajectory.nearest(seen.receiver_ecef_m[rows])
+        return index.trajectory.body_azimuth_deg(arc)
+
+    turned = seen.azimuth_deg - antennas.each(front_deg)[:, None]
     sigma, bias = model.at(seen.elevation_deg, turned, cn0)
     return sigma, np.nan_to_num(bias)
 
@@ -226,25 +230,24 @@ def _by_error_model(model: ErrorModel, seen: SeenFrom, cn0: Floats, index: Searc
 _ANCHOR_WEIGHT: Final = np.array(1.0 / ANCHOR_SIGMA_M**2)
 
 
-def _anchor(index: SearchIndex, config: Config, ranges: Ranges) -> Floats:
+def _anchor(antennas: AntennaRows, config: Config, ranges: Ranges) -> Floats:
     """Return an approximate place of the antenna, good to some hundred metres, shape (T, 3) [m].
 
     The point of the line nearest to a 3-D position from raw ranges of equal weight, started from
     the middle of the line at every epoch so that no epoch depends on another; the 3-D position
     itself where it is far from the line; the best-fitting point of the line where there is no 3-D position.
     """
-    trajectory = index.trajectory
-    middle = np.broadcast_to(index.middle_ecef_m, (len(ranges), 3))
+    middle = antennas.each(lambda index, rows: np.broadcast_to(index.middle_ecef_m, (len(ranges.code_m[rows]), 3)))
     point = single_point(ranges, middle, limits=_rough(config.single_point))
     anchor = point.ecef_m.copy()
-    found = np.flatnonzero(np.isfinite(anchor[:, 0]))
-    distance, vertex = index.tree.query(anchor[found])
-    beside = np.asarray(distance) < BESIDE_THE_LINE_M
-    anchor[found[beside]] = trajectory.ecef_m[np.asarray(vertex)[beside]]
-    rest = np.flatnonzero(np.isnan(anchor[:, 0]))
-    if len(rest):
+    solved = np.isfinite(anchor[:, 0])
+    for index, found in antennas.split(np.flatnonzero(solved)):
+        distance, vertex = index.tree.query(anchor[found])
+        beside = np.asarray(distance) < BESIDE_THE_LINE_M
+        anchor[found[beside]] = index.trajectory.ecef_m[np.asarray(vertex)[beside]]
+    for index, rest in antennas.split(np.flatnonzero(~solved)):
         best = search(ranges.take(rest), index, point.take(rest), limits=config.section).vertex
-        anchor[rest] = np.where((best >= 0)[:, None], trajectory.ecef_m[best], middle[rest])
+        anchor[rest] = np.where((best >= 0)[:, None], index.trajectory.ecef_m[best], middle[rest])
     return anchor
 
 

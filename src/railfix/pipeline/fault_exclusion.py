@@ -23,6 +23,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import without
 from railfix.pipeline.results import RaimResult, patched
 from railfix.pipeline.solve import Place, place_on_line, redundancy_of
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.section_search import SearchIndex
 from railfix.positioning.single_point import single_point
@@ -30,7 +31,7 @@ from railfix.positioning.single_point import single_point
 
 def fault_free(
     ranges: Ranges,
-    index: SearchIndex,
+    antennas: AntennaRows,
     place: Place,
     scale: Floats,
     agreeing: Masks,
@@ -46,7 +47,7 @@ def fault_free(
     ----------
     ranges : Ranges
         T epochs by K channels.
-    index : SearchIndex
+    antennas : AntennaRows
     place : Place
         Positions from these ranges.
     scale : ndarray, shape (T,)
@@ -67,9 +68,23 @@ def fault_free(
         own_error_m=np.full(ranges.code_m.shape, np.nan),
         protection_level_m=np.full(len(ranges), np.nan),
     )
-    failing = np.flatnonzero(test.detected & on)
-    if not len(failing):
-        return ranges, place, raim
+    for index, failing in antennas.split(np.flatnonzero(test.detected & on)):
+        ranges, place, raim = _faults_excluded(ranges, index, place, raim, failing, scale, agreeing, config)
+    return ranges, place, raim
+
+
+def _faults_excluded(
+    ranges: Ranges,
+    index: SearchIndex,
+    place: Place,
+    raim: RaimResult,
+    failing: Indices,
+    scale: Floats,
+    agreeing: Masks,
+    config: Config,
+) -> tuple[Ranges, Place, RaimResult]:
+    """Return the same with the failing epochs of one antenna looked into."""
+    limits, constrained = config.raim, place.constrained
     arc, section = constrained.arc_m[failing], constrained.section[failing]
     model = constrained_model(ranges.take(failing), index.trajectory, arc, section=section)
     exclusion = exclude(model, limits=limits, scale=scale[failing])

@@ -20,14 +20,14 @@ from railfix.integrity.protection import (
 )
 from railfix.integrity.protection.open_places import places_beyond_the_level
 from railfix.integrity.protection.risk import SUPPORTED_SIDE_PRIOR
-from railfix.integrity.raim import LinearModel, constrained_model
+from railfix.integrity.raim import LinearModel
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.results import ProtectionResult, RaimResult
-from railfix.pipeline.solve import Place
+from railfix.pipeline.solve import Place, line_model
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.normal_equations import Ranges
-from railfix.positioning.section_search import SearchIndex
 
 #: Basis of a level: the integrity of an SBAS and fault hypotheses of local causes; or hypotheses of
 #: satellites' own faults as well (ARAIM).
@@ -162,7 +162,7 @@ def protection_levels(
 def places_left_open(
     corrected: CorrectedRanges,
     ranges: Ranges,
-    index: SearchIndex,
+    antennas: AntennaRows,
     place: Place,
     model: LinearModel,
     protection: ProtectionResult,
@@ -178,7 +178,7 @@ def places_left_open(
         As for `protection_levels`.
     ranges : Ranges
         That `place` was found from.
-    index : SearchIndex
+    antennas : AntennaRows
     place : Place
         Epochs that are ambiguous already are not looked at.
     protection : ProtectionResult
@@ -187,11 +187,10 @@ def places_left_open(
     if config.error_model is not None:
         sigma = np.maximum(corrected.bound_sigma_m, scale[:, None] * corrected.sigma_m)
         weight = np.where(ranges.weight > 0, 1.0 / sigma**2, 0.0)
-        section = np.maximum(constrained.section, 0)
-        model = constrained_model(replace(ranges, weight=weight), index.trajectory, constrained.arc_m, section=section)
+        model = line_model(replace(ranges, weight=weight), antennas, constrained)
         scale = np.ones(len(ranges))
     return places_beyond_the_level(
-        index,
+        antennas,
         constrained.arc_m,
         model,
         protection.level.level_m,

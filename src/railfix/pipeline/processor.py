@@ -8,35 +8,31 @@ any cutting gives the same results.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from railfix.core.arrays import Floats, changed
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, SensorSamples
-from railfix.pipeline.along_track import AlongTrack, FilterState, SingleEpochs, along_track, checked
+from railfix.pipeline.along_track import FilterState
+from railfix.pipeline.antenna_chunk import AntennaChunk, SolvedTogether, few, one_after_the_other
 from railfix.pipeline.antenna_order import AntennaOrder
-from railfix.pipeline.assemble import antenna_result, with_coordinates
-from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.compared import (
     ChunkSteps,
-    PositionVerdict,
     filter_verdicts,
     pair_verdicts,
     position_verdicts,
 )
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import CorrectedRanges, correct_ranges
+from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
 from railfix.pipeline.received import Received, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
 from railfix.pipeline.sensor_epochs import Surroundings, waiting_samples
-from railfix.pipeline.solution import Solution, solve
-from railfix.positioning.map_offset import beyond_threshold
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.ranges.error_model import Conditions, ErrorModel, condition_differences
@@ -44,12 +40,8 @@ from railfix.ranges.sbas import SbasMessages
 from railfix.screens import (
     SCREENS,
     AntennaRanges,
-    FilteredMotion,
-    ObservationScreen,
     PairedEpochs,
-    Screened,
     ScreenSetup,
-    Verdict,
 )
 from railfix.screens.pairs import pair_antennas
 from railfix.track import Track
@@ -85,6 +77,11 @@ class EpochProcessor:
     received : Received
         Navigation records and SBAS corrections known from the start.
     units : GroundUnits or None
+    indices : dict of str to SearchIndex
+        Of the trajectories.
+    screens : tuple
+        Screens that are on, with their limits.
+    setup : ScreenSetup
     notes : tuple of str
         Differences between what was asked for and what is used, one sentence each.
 
@@ -120,17 +117,16 @@ class EpochProcessor:
         }
         self.received = known_from_start(config, navigation=navigation, messages=messages)
         self._channels = ChannelBook(config)
-        self._index = {name: SearchIndex(t) for name, t in self.trajectories.items()}
+        self.indices = {name: SearchIndex(t) for name, t in self.trajectories.items()}
         self._error_model = error_model
-        self._screens = tuple((s, getattr(config, s.name)) for s in SCREENS if s.name in config.screens)
-        self._setup = ScreenSetup(
+        self.screens = tuple((s, getattr(config, s.name)) for s in SCREENS if s.name in config.screens)
+        self.setup = ScreenSetup(
             antennas=len(self.trajectories),
             spacing_known=all(t.body_chainage_m is not None for t in self.trajectories.values()),
             cn0_curve=cn0_curve,
         )
         self._track, self.units = track, units
         self._features: dict[str, LineFeatures] = {}
-        self._has_coordinates = with_coordinates(config.failed_checks)
         self._before_filter = FilterState()
         self._lacking = self._unable()
 
@@ -141,7 +137,7 @@ class EpochProcessor:
 
     def _unable(self) -> tuple[str, ...]:
         """Return one sentence for each part of the settings that cannot work as asked."""
-        notes = [note for screen, limits in self._screens for note in screen.notes(limits, self._setup)]
+        notes = [note for screen, limits in self.screens for note in screen.notes(limits, self.setup)]
         conditions = None if self._error_model is None else self._error_model.conditions
         if conditions and (differences := condition_differences(conditions, conditions_of(self.config))):
             notes.append(f"error model: made under other conditions than this run's: {'; '.join(differences)}")
@@ -157,7 +153,7 @@ class EpochProcessor:
 
     def antenna_order(self) -> AntennaOrder | None:
         """Return a test, without positions as yet, of the order of two antennas; None without two of one vehicle."""
-        if len(self.trajectories) < 2 or not self._setup.spacing_known:
+        if len(self.trajectories) < 2 or not self.setup.spacing_known:
             return None
         tolerance = self.config.antenna_pair.tag_tolerance_s
         return AntennaOrder(self.trajectories["front"], self.trajectories["rear"], tolerance_s=tolerance)
@@ -214,32 +210,56 @@ class EpochProcessor:
                 if name not in observations
             }
             state = replace(state, fusion={**state.fusion, **waiting})
-        chunks = {name: self.chunk(name, part, state, sensors=sensors) for name, part in observations.items()}
+        chunks = self.chunks(observations, state, sensors=sensors)
         self.compare(chunks)
         return self.gathered(chunks, state)
 
-    def chunk(
-        self, name: str, observations: Observations, state: State, *, sensors: SensorSamples | None = None
-    ) -> AntennaChunk:
-        """Return a chunk of one antenna, to be taken through its steps by `compare` and `gathered`.
+    def chunks(
+        self, observations: Mapping[str, Observations], state: State, *, sensors: SensorSamples | None = None
+    ) -> dict[str, AntennaChunk]:
+        """Return a chunk of each antenna, to be taken through their steps by `compare` and `gathered`.
+
+        Few epochs of several antennas are rows of the same arrays.
 
         Parameters
         ----------
-        name : str
-            The antenna.
-        observations : Observations
+        observations : mapping of str to Observations
+            By antenna.
         state : State
             After the chunk before this one.
         sensors : SensorSamples, optional
         """
-        return AntennaChunk(
-            self,
-            name,
-            observations,
-            state.received or self.received,
-            state.antennas.get(name) or AntennaState(),
-            state.fusion.get(name) or self._before_filter,
-            sensors,
+        received = state.received or self.received
+        groups = [tuple(observations)] if self._joinable(observations) else [(name,) for name in observations]
+        return {
+            name: AntennaChunk(
+                self,
+                name,
+                observations[name],
+                together,
+                received,
+                state.antennas.get(name) or AntennaState(),
+                state.fusion.get(name) or self._before_filter,
+                sensors,
+            )
+            for names in groups
+            for together in (self._corrected({name: observations[name] for name in names}, received),)
+            for name in names
+        }
+
+    def _joinable(self, observations: Mapping[str, Observations]) -> bool:
+        """Whether the epochs of all antennas are rows of the same arrays."""
+        sigmas = {(t.sigma_plan_m, t.sigma_height_m) for t in (self.trajectories[name] for name in observations)}
+        return self.config.carrier == "off" and len(sigmas) == 1 and few(list(observations.values()))
+
+    def _corrected(self, observations: Mapping[str, Observations], received: Received) -> SolvedTogether:
+        """Return the corrected ranges of one antenna, or of the rows of several."""
+        indices = tuple(self.indices[name] for name in observations)
+        obs, parts = one_after_the_other(list(observations.values()))
+        antennas, channels = AntennaRows(indices, parts), self._channels.of(obs, received.navigation)
+        model = self._error_model
+        return SolvedTogether(
+            correct_ranges(obs, channels, self.config, received, antennas, error_model=model), antennas, self.config
         )
 
     def gathered(self, chunks: Mapping[str, AntennaChunk], state: State) -> tuple[Result, State]:
@@ -281,42 +301,20 @@ class EpochProcessor:
         """
         ranges = {name: chunk.screened() for name, chunk in chunks.items()}
         pair = self._pair(ranges)
-        verdicts = pair_verdicts(self._screens, pair, ranges)
+        verdicts = pair_verdicts(self.screens, pair, ranges)
         for name, chunk in chunks.items():
             chunk.judge(verdicts.get(name, ()))
         published = {name: chunk.solved() for name, chunk in chunks.items()}
-        checks = position_verdicts(self._screens, pair, published)
+        checks = position_verdicts(self.screens, pair, published)
         for name, chunk in chunks.items():
             chunk.check(checks.get(name, ()))
-        spacing = filter_verdicts(self._screens, pair, {name: chunk.filtered() for name, chunk in chunks.items()})
+        spacing = filter_verdicts(self.screens, pair, {name: chunk.filtered() for name, chunk in chunks.items()})
         for name, chunk in chunks.items():
             chunk.check_filter(spacing.get(name))
 
-    def _screened(
-        self, name: str, obs: Observations, received: Received, state: AntennaState
-    ) -> tuple[CorrectedRanges, AntennaState]:
-        """Return the corrected ranges of one antenna after its own screens, and its new state."""
-        channels = self._channels.of(obs, received.navigation)
-        ranges = correct_ranges(obs, channels, self.config, received, self._index[name], error_model=self._error_model)
-        states = dict(state.screens)
-        for screen, limits in self._screens:
-            if isinstance(screen, ObservationScreen):
-                verdicts, after = screen.judge(ranges, limits, self._setup, states.get(screen.name))
-                ranges = ranges.judged(verdicts)
-                if after is not None:
-                    states[screen.name] = after
-        state = replace(state, screens=states)
-        if self.config.carrier != "off":
-            before = state.carrier or CarrierState()
-            ranges, carrier = with_slips(ranges, received.navigation, self.config, before)
-            if self.config.carrier == "smoothed":
-                ranges, carrier = smoothed(ranges, self.config, carrier)
-            state = replace(state, carrier=carrier)
-        return ranges, state
-
     def _pair(self, ranges: Mapping[str, AntennaRanges]) -> PairedEpochs | None:
         """Return the common epochs of two antennas of one vehicle; None where there are no such antennas."""
-        if len(ranges) < 2 or not self._setup.spacing_known:
+        if len(ranges) < 2 or not self.setup.spacing_known:
             return None
         front, rear = ranges["front"], ranges["rear"]
         return pair_antennas(
@@ -326,112 +324,6 @@ class EpochProcessor:
             self.trajectories["front"],
             self.trajectories["rear"],
             tolerance_s=self.config.antenna_pair.tag_tolerance_s,
-        )
-
-
-class AntennaChunk:
-    """A chunk of one antenna: the steps between which antennas are compared (`ChunkSteps`).
-
-    Attributes
-    ----------
-    state : AntennaState
-        Before the chunk; after it once `finished` was called.
-    filter_state : FilterState
-        Likewise.
-    tracked : AlongTrack or None
-        By the filter along the track, where it is on.
-    notes : tuple of str
-        On a C/N0 curve of another antenna or receiver.
-    """
-
-    def __init__(
-        self,
-        processor: EpochProcessor,
-        name: str,
-        observations: Observations,
-        received: Received,
-        state: AntennaState,
-        filter_state: FilterState,
-        sensors: SensorSamples | None,
-    ) -> None:
-        self.state, self.filter_state = state, filter_state
-        self.tracked: AlongTrack | None = None
-        curve = processor._setup.cn0_curve if "cn0" in processor.config.screens else None
-        self.notes = () if curve is None else tuple(f"{name}: {n}" for n in curve.notes_for(observations.header))
-        self._processor, self._name, self._received, self._sensors = processor, name, received, sensors
-        self._ranges, self.state = processor._screened(name, observations, received, state)
-        self._solution: Solution | None = None
-        self._result: AntennaResult | None = None
-
-    def screened(self) -> CorrectedRanges:
-        """Return the corrected ranges after the screens of this antenna alone."""
-        return self._ranges
-
-    def judge(self, verdicts: Iterable[Verdict]) -> None:
-        """Take the verdicts of the screens of common observations."""
-        self._ranges = self._ranges.judged(verdicts)
-
-    def solved(self) -> Floats:
-        """Solve and return the chainages that are published, NaN where there is none, shape (T,) [m]."""
-        processor = self._processor
-        self._ranges, self._solution, self.state = solve(
-            self._ranges, processor._index[self._name], processor.config, self.state
-        )
-        return processor.trajectories[self._name].chainage_at(self._solution.arc_m)
-
-    def check(self, verdicts: Iterable[PositionVerdict]) -> None:
-        """Take the verdicts of the screens of the published positions."""
-        assert self._solution is not None, "solved() comes first"
-        for verdict in verdicts:
-            status = self._solution.status
-            doubtful = verdict.screened.reject & self._processor._has_coordinates[status]
-            status = np.where(doubtful, verdict.status, status).astype(np.int8)
-            screens = {**self._ranges.screens, verdict.name: verdict.screened}
-            self._ranges = changed(self._ranges, screens=screens)
-            self._solution = changed(self._solution, status=status)
-
-    def filtered(self) -> FilteredMotion:
-        """Filter along the track and return its places; NaN where the filter is off."""
-        assert self._solution is not None, "solved() comes first"
-        processor, trajectory = self._processor, self._processor.trajectories[self._name]
-        result = self._result = antenna_result(self._ranges, trajectory, self._solution, processor.config)
-        if processor.config.filter == "off":
-            nowhere = np.full(len(result), np.nan)
-            return FilteredMotion(nowhere, nowhere, nowhere, nowhere)
-        self.tracked, self.filter_state = along_track(
-            self._ranges,
-            self._single_epochs(result),
-            trajectory,
-            self._received.navigation,
-            processor.config,
-            self.filter_state,
-            samples=self._sensors,
-            surroundings=processor.surroundings(self._name, self._sensors),
-        )
-        found = self.tracked.tracked
-        return FilteredMotion(self.tracked.chainage_m, found.sigma_m, found.speed_mps, found.speed_sigma_mps)
-
-    def check_filter(self, spacing: Screened | None) -> None:
-        """Take the verdict on the distance and speeds of those places; None where they were not looked at."""
-        if self.tracked is not None:
-            held_s = self._processor.config.antenna_spacing.filter_held_s
-            self.tracked, self.filter_state = checked(self.tracked, spacing, self.filter_state, held_s)
-
-    def finished(self) -> AntennaResult:
-        """Return the result of the chunk."""
-        assert self._result is not None, "filtered() comes first"
-        return self._result
-
-    def _single_epochs(self, result: AntennaResult) -> SingleEpochs:
-        """Results of single epochs that the filter along the track uses."""
-        assert self._solution is not None
-        found, limits = self._solution, self._processor.config.map_offset
-        return SingleEpochs(
-            noise_scale=found.noise_scale,
-            arc_m=result.arc_m,
-            sigma_m=result.own_sigma_m,
-            off_map=found.off_map,
-            map_offset=beyond_threshold(found.map_offset, limits),
         )
 
 

@@ -134,7 +134,9 @@ class State:
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaResult(NotebookTable):
-    """Results of one antenna, T epochs by M channels (those of the observations given).
+    """Results of one antenna, T epochs by M channels.
+
+    The channels are those of the observations given, of all antennas where few epochs of several are given together.
 
     Attributes
     ----------

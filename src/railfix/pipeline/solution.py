@@ -1,7 +1,8 @@
-"""Positions of one antenna: conventional and on the line, with faults excluded, sigma, level and status."""
+"""Positions of antennas: conventional and on the line, with faults excluded, sigma, level and status."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -11,16 +12,17 @@ from scipy.special import chdtri, expit
 from railfix.core.arrays import Codes, Floats, Masks, changed
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
-from railfix.integrity.raim import LinearModel, constrained_model
+from railfix.integrity.raim import LinearModel
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
 from railfix.pipeline.level_stage import low_sides, places_left_open, protection_levels
-from railfix.pipeline.off_map import off_map_epochs
+from railfix.pipeline.off_map import OffMapState, off_map_epochs
 from railfix.pipeline.reason_table import alone_on_their_clocks
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
-from railfix.pipeline.solve import Place, place_on_line, redundancy_of
+from railfix.pipeline.solve import Place, line_model, place_on_line, redundancy_of
+from railfix.positioning.antenna_rows import AntennaRows, rows_of
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.constrained import constrained_position
 from railfix.positioning.intersystem_bias import tie_clocks
@@ -37,7 +39,6 @@ from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, fi
 from railfix.positioning.robust_fit import RobustFit, map_information, robust_fit
 from railfix.positioning.section_search import SearchIndex
 from railfix.positioning.single_point import SinglePoint, single_point
-from railfix.track.trajectory import Trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,78 +82,89 @@ class Solution:
 
 
 def solve(
-    corrected: CorrectedRanges,
-    index: SearchIndex,
-    config: Config,
-    state: AntennaState,
-) -> tuple[CorrectedRanges, Solution, AntennaState]:
-    """Return the positions of one antenna, its ranges with the reasons of this stage, and its new state.
+    corrected: CorrectedRanges, antennas: AntennaRows, config: Config, states: Sequence[AntennaState]
+) -> tuple[CorrectedRanges, Solution, list[AntennaState]]:
+    """Return the ranges with the reasons of this stage, the positions, and the new state of each antenna.
 
     Parameters
     ----------
     corrected : CorrectedRanges
         After the screens of the observations.
-    index : SearchIndex
+    antennas : AntennaRows
+        More than one only where no carrier phase is used.
     config : Config
-    state : AntennaState
+    states : sequence of AntennaState
+        By antenna.
     """
-    trajectory, ranges, time = index.trajectory, corrected.ranges(), corrected.time
+    ranges, time = corrected.ranges(), corrected.time
     point = single_point(ranges, corrected.anchor_ecef_m, limits=config.single_point)
     agreeing, free = _agreeing(ranges, point, corrected.anchor_ecef_m, config)
     reference = CLOCK_GROUP[config.systems[0]]
+    offset_states = [state.offsets for state in states]
     ties, offsets = tie_clocks(
-        time, corrected.clocks, reference, agreeing, free, state.offsets, limits=config.clock_offsets
-    )
+        time, corrected.clocks, reference, agreeing, free, offset_states,
+        parts=antennas.parts, limits=config.clock_offsets,
+    )  # fmt: skip
     tied = point
     if len(corrected.groups) > 1:
         ranges = replace(ranges, ties=ties)
         tied = _tied(ranges, ties, point, corrected.anchor_ecef_m, config)
-    place = place_on_line(ranges, index, tied, config)
+    place = antennas.each(lambda index, rows: place_on_line(rows_of(ranges, rows), index, rows_of(tied, rows), config))
     corrected = corrected.rejected(alone_on_their_clocks(corrected, ties), Reason.ALONE_ON_ITS_CLOCK)
-    age = noise_age(time, state.noise, limits=config.noise_scale)
-    robust, robust_sums, on_line = _robust_scale(corrected, ranges, trajectory, place, age, config, state)
-    ranges, place, raim = fault_free(ranges, index, place, robust, on_line.kept, config)
+    ages = antennas.apart(lambda _, rows, state: noise_age(time[rows], state.noise, limits=config.noise_scale), states)
+    robust, robust_sums, on_line = _robust_scale(corrected, ranges, antennas, place, ages, config, states)
+    ranges, place, raim = fault_free(ranges, antennas, place, robust, on_line.kept, config)
     constrained, redundancy = place.constrained, redundancy_of(ranges)
-    off_map = _off_map(ranges, trajectory, place, constrained.arc_m, config)
+    off_map = _off_map(ranges, antennas, place, constrained.arc_m, config)
     teaching = ~off_map & ~raim.faulty
     if "raim" not in config.screens:
         teaching[:] = False
-    scale, stated_sums = stated_scale(
-        age, constrained.wsse, redundancy, teaching, robust, state.noise, limits=config.noise_scale
-    )
+
+    def own_scale(_: SearchIndex, rows: slice, age: Floats, state: AntennaState) -> tuple[Floats, Floats]:
+        return stated_scale(
+            age, constrained.wsse[rows], redundancy[rows], teaching[rows], robust[rows], state.noise,
+            limits=config.noise_scale,
+        )  # fmt: skip
+
+    scale, stated_sums = antennas.each_with_state(own_scale, ages, states)
     scale = np.maximum(scale, _least_scale(config))
-    away, off_map_state = off_map_epochs(
-        time, np.isfinite(constrained.arc_m) & ~off_map, off_map, state.off_map, least_s=config.off_map_s
-    )
-    offset, map_state = map_offset(
-        time, agreeing, free, corrected.nominal_m, np.maximum(scale, 1.0) ** 2, trajectory,
-        constrained.arc_m, away, state.map_offset, limits=config.map_offset,
+    on_map = np.isfinite(constrained.arc_m) & ~off_map
+
+    def own_absence(_: SearchIndex, rows: slice, state: AntennaState) -> tuple[Masks, OffMapState]:
+        return off_map_epochs(time[rows], on_map[rows], off_map[rows], state.off_map, least_s=config.off_map_s)
+
+    away, off_map_states = antennas.each_with_state(own_absence, states)
+    offset, map_states = map_offset(
+        time, agreeing, free, corrected.nominal_m, np.maximum(scale, 1.0) ** 2, antennas,
+        constrained.arc_m, away, [state.map_offset for state in states], limits=config.map_offset,
     )  # fmt: skip
-    model = constrained_model(ranges, trajectory, constrained.arc_m, section=np.maximum(constrained.section, 0))
+    model = line_model(ranges, antennas, constrained)
     if "raim" in config.screens and config.raim_protection == "on":
         raim = with_p4_level(raim, model, scale, config)
     corrected = corrected.rejected(raim.excluded, Reason.FAULT_EXCLUDED)
     level, open_elsewhere = None, np.zeros(len(ranges), dtype=bool)
     if config.protection == "on" and config.carrier != "float":
-        heading = trajectory.heading_deg[np.maximum(constrained.section, 0)]
+        section = np.maximum(constrained.section, 0)
+        heading = antennas.each(lambda index, rows: index.trajectory.heading_deg[section[rows]])
         sides = low_sides(corrected, heading, config.risk.side_elevation_deg)
         level = protection_levels(corrected, model, offset, raim, scale, sides, config)
-        open_elsewhere = places_left_open(corrected, ranges, index, place, model, level, scale, sides, config)
+        open_elsewhere = places_left_open(corrected, ranges, antennas, place, model, level, scale, sides, config)
     own_sigma = own_sigma_m(redundancy, constrained.wsse, constrained.exact_map_sigma_m, scale)
     arc, exact, total = constrained.arc_m, constrained.exact_map_sigma_m, constrained.sigma_m
     variance = epoch_variance(scale, constrained.wsse, redundancy, limits=config.noise_scale)
     nominal = _nominal_variance_m2(model, corrected, config)
-    phase, carrier = None, state.carrier
+    phase, carriers = None, [state.carrier for state in states]
     if config.carrier == "float" and corrected.slips is not None:
-        phase, carrier = code_and_phase(
-            corrected, corrected.slips, ranges, trajectory, arc, config, carrier or CarrierState()
+        (index,), (carrier,) = antennas.indices, carriers
+        phase, carriers[0] = code_and_phase(
+            corrected, corrected.slips, ranges, index.trajectory, arc, config, carrier or CarrierState()
         )
         arc, exact, total, variance = phase.arc_m, phase.noise_sigma_m, phase.sigma_m, scale**2
     along_sigma = np.sqrt(variance * exact**2 + (total**2 - exact**2) + nominal)
     judged = own_sigma if phase is None else along_sigma
-    along_sigma = np.sqrt(along_sigma**2 + _other_place_m2(ranges, trajectory, place, arc, config))
+    along_sigma = np.sqrt(along_sigma**2 + _other_place_m2(ranges, antennas, place, arc, config))
     if phase is not None:
-        off_map = _off_map(ranges, trajectory, place, arc, config)
+        off_map = _off_map(ranges, antennas, place, arc, config)
     solution = Solution(
         point=point,
         place=place,
@@ -169,10 +181,14 @@ def solve(
         off_map=away,
     )
     solution = changed(solution, status=_status(corrected, ranges, solution, judged, off_map, open_elsewhere, config))
-    noise = state.noise
-    if len(time):
-        noise = NoiseState(time=time[-1], age=float(age[-1]), robust=robust_sums, remaining=stated_sums)
-    after = replace(state, offsets=offsets, noise=noise, map_offset=map_state, off_map=off_map_state, carrier=carrier)
+    after = []
+    for k, (state, rows) in enumerate(zip(states, antennas.parts, strict=True)):
+        noise = state.noise
+        if len(time[rows]):
+            sums = {"robust": robust_sums[k], "remaining": stated_sums[k]}
+            noise = NoiseState(time=time[rows][-1], age=float(ages[k][-1]), **sums)
+        values = {"offsets": offsets[k], "noise": noise, "map_offset": map_states[k], "off_map": off_map_states[k]}
+        after.append(changed(state, **values, carrier=carriers[k]))
     return corrected, solution, after
 
 
@@ -203,19 +219,24 @@ def _agreeing(ranges: Ranges, point: SinglePoint, anchor_ecef_m: Floats, config:
 def _robust_scale(
     corrected: CorrectedRanges,
     ranges: Ranges,
-    trajectory: Trajectory,
+    antennas: AntennaRows,
     place: Place,
-    age: Floats,
+    ages: Sequence[Floats],
     config: Config,
-    state: AntennaState,
-) -> tuple[Floats, Floats, RobustFit]:
+    states: Sequence[AntennaState],
+) -> tuple[Floats, list[Floats], RobustFit]:
     """Return the noise scale that RAIM tests with, its new sums, and the robust fit on the line that it comes from."""
     arc, section = place.constrained.arc_m, np.maximum(place.constrained.section, 0)
     known = np.isfinite(arc)
-    at = np.where(known[:, None], trajectory.at_arc(np.where(known, arc, 0.0)), corrected.anchor_ecef_m)
-    fit = robust_fit(ranges, at, information=map_information(trajectory, section), limits=config.robust_fit)
-    teaching = known & ~_off_map(ranges, trajectory, place, arc, config)
-    scale, sums = robust_scale(age, fit, teaching, state.noise, limits=config.noise_scale)
+    at = np.where(known[:, None], antennas.at_arc(arc), corrected.anchor_ecef_m)
+    information = antennas.each(lambda index, rows: map_information(index.trajectory, section[rows]))
+    fit = robust_fit(ranges, at, information=information, limits=config.robust_fit)
+    teaching = known & ~_off_map(ranges, antennas, place, arc, config)
+
+    def own_scale(_: SearchIndex, rows: slice, age: Floats, state: AntennaState) -> tuple[Floats, Floats]:
+        return robust_scale(age, rows_of(fit, rows), teaching[rows], state.noise, limits=config.noise_scale)
+
+    scale, sums = antennas.each_with_state(own_scale, ages, states)
     return np.maximum(scale, _least_scale(config)), sums, fit
 
 
@@ -233,7 +254,7 @@ def _nominal_variance_m2(model: LinearModel, corrected: CorrectedRanges, config:
     return np.asarray((share**2).sum(axis=1))
 
 
-def _other_place_m2(ranges: Ranges, trajectory: Trajectory, place: Place, arc: Floats, config: Config) -> Floats:
+def _other_place_m2(ranges: Ranges, antennas: AntennaRows, place: Place, arc: Floats, config: Config) -> Floats:
     """Return the mean square distance to the best other place of ambiguous epochs, shape (T,).
 
     The other place fits worse by the excess x, so that it is the true one with the probability ``1/(1 + exp(x/2))``
@@ -241,12 +262,11 @@ def _other_place_m2(ranges: Ranges, trajectory: Trajectory, place: Place, arc: F
     """
     section, square = place.section, np.zeros(len(ranges))
     open_ones = (section.other_vertex >= 0) & (section.excess <= config.section.threshold) & np.isfinite(arc)
-    rows = np.flatnonzero(open_ones)
-    if not len(rows):
-        return square
-    other = constrained_position(ranges.take(rows), trajectory, section.other_vertex[rows], limits=config.constrained)
-    apart = trajectory.at_arc(other.arc_m) - trajectory.at_arc(arc[rows])
-    square[rows] = np.nan_to_num((apart**2).sum(axis=1)) * expit(-section.excess[rows] / 2.0)
+    for index, rows in antennas.split(np.flatnonzero(open_ones)):
+        line, vertex = index.trajectory, section.other_vertex[rows]
+        other = constrained_position(ranges.take(rows), line, vertex, limits=config.constrained)
+        apart = line.at_arc(other.arc_m) - line.at_arc(arc[rows])
+        square[rows] = np.nan_to_num((apart**2).sum(axis=1)) * expit(-section.excess[rows] / 2.0)
     return square
 
 
@@ -256,7 +276,7 @@ def _chi_square_limit(risk: float, freedom: int) -> float:
     return float(chdtri(freedom, risk))
 
 
-def _off_map(ranges: Ranges, trajectory: Trajectory, place: Place, arc: Floats, config: Config) -> Masks:
+def _off_map(ranges: Ranges, antennas: AntennaRows, place: Place, arc: Floats, config: Config) -> Masks:
     """Return the epochs whose ranges contradict the map at the position, or pull it beyond an end, shape (T,).
 
     The line fits worse than the 3-D position, in variances that the 3-D fit itself shows (1 at least): the misfit of
@@ -266,12 +286,12 @@ def _off_map(ranges: Ranges, trajectory: Trajectory, place: Place, arc: Floats, 
     wsse = constrained.wsse
     if arc is not constrained.arc_m:
         known = np.isfinite(arc)
-        position = np.where(known[:, None], trajectory.at_arc(arc), 0.0)
+        position = np.where(known[:, None], antennas.at_arc(arc), 0.0)
         wsse = np.where(known, fit(ranges, position), np.nan)
     freedom = ranges.n_used - ranges.n_clocks - 3
     shown = np.maximum(1.0, point.wsse / np.maximum(freedom, 1))
     lost = (freedom >= 1) & ((wsse - point.wsse) / shown > _chi_square_limit(config.off_map_risk, 2))
-    beyond = constrained.overshoot_m > np.maximum(4.0 * constrained.sigma_m, trajectory.sigma_plan_m)
+    beyond = constrained.overshoot_m > np.maximum(4.0 * constrained.sigma_m, antennas.sigma_plan_m)
     return np.asarray(lost | beyond)
 
 

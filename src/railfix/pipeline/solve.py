@@ -1,4 +1,4 @@
-"""Section search and constrained fix of one antenna."""
+"""Section search and constrained fix of one antenna, and the linear model there."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from railfix.core.arrays import Integers
+from railfix.integrity.raim.model import LinearModel, model_on_line
 from railfix.pipeline.config import Config
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.constrained import Constrained, constrained_position
 from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.section_search import SearchIndex, Section, search
@@ -48,6 +50,14 @@ def place_on_line(ranges: Ranges, index: SearchIndex, point: SinglePoint, config
     vertex = np.where(ranges.n_used >= config.min_satellites, section.vertex, -1)
     constrained = constrained_position(ranges, index.trajectory, vertex, limits=config.constrained)
     return Place(point=point, section=section, constrained=constrained)
+
+
+def line_model(ranges: Ranges, antennas: AntennaRows, constrained: Constrained) -> LinearModel:
+    """Return the model of positions on the line (`constrained_model`); NaN in the epochs without one."""
+    section = np.maximum(constrained.section, 0)
+    axes = antennas.each(lambda index, rows: index.trajectory.axes_of(section[rows]))
+    place = antennas.at_arc(constrained.arc_m)
+    return model_on_line(ranges, place, axes, antennas.sigma_plan_m, antennas.sigma_height_m)
 
 
 def redundancy_of(ranges: Ranges) -> Integers:

@@ -79,6 +79,46 @@ def decayed_sums(age: Floats, values: Floats, start: Floats, last_age: float) ->
     return decayed(age, np.ascontiguousarray(values), np.asarray(start, dtype=np.float64), float(last_age))
 
 
+def correlated_sums(
+    time: Datetimes,
+    values: Floats,
+    start: Floats,
+    last: np.datetime64,
+    last_age: float,
+    *,
+    window_s: float,
+    correlation_s: float,
+) -> tuple[Floats, Floats, Floats, float]:
+    """Sums over a window of epochs whose errors are alike for a time: each counts by the time since the one before.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    values : ndarray, shape (T, K)
+        Of one sample.
+    start, last, last_age
+        As for `decayed_sums` and `ages`.
+    window_s : float [s]
+    correlation_s : float [s]
+        Epochs nearer to each other than this count as one sample.
+
+    Returns
+    -------
+    before : ndarray, shape (T, K)
+        Decayed sums at each epoch, its own values not included.
+    own : ndarray, shape (T, K)
+        What each epoch adds.
+    after : ndarray, shape (K,)
+        Running sums after the last epoch.
+    age : float [windows]
+        Of the last epoch.
+    """
+    own = np.minimum(steps_s(time, last) / correlation_s, 1.0)[:, None] * values
+    age = ages(time, last, last_age, window_s=window_s, least_epochs=window_s / correlation_s)
+    before, after = decayed_sums(age, own, start, last_age)
+    return before, own, after, float(age[-1]) if len(time) else last_age
+
+
 @compiled_by("forgetting")
 def decayed(age: Floats, values: Floats, start: Floats, last_age: float) -> tuple[Floats, Floats]:
     """Compute `decayed_sums`; arrays in C order."""

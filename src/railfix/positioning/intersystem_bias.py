@@ -10,15 +10,16 @@ are equal, whatever the chunks.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes
+from railfix.core.arrays import Datetimes, Floats
 from railfix.core.settings import Settings
-from railfix.positioning.forgetting import ages, decayed_sums, steps_s
+from railfix.positioning.antenna_rows import EVERY
+from railfix.positioning.forgetting import correlated_sums
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges
 from railfix.positioning.single_point import SinglePoint
 
@@ -64,6 +65,21 @@ class OffsetState:
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     age: float = 0.0
 
+    def sums(self, letters: Sequence[str]) -> Floats:
+        """Return the information of some clocks, then their moments, in one array."""
+        of_each = (self.information, self.moment)
+        return np.array([values.get(letter, 0.0) for values in of_each for letter in letters], dtype=np.float64)
+
+    def later(self, letters: Sequence[str], sums: Floats, last: np.datetime64, age: float) -> OffsetState:
+        """Return the state with new sums of some clocks (`sums`), those of the others as they are."""
+        information, moment = (zip(letters, half, strict=True) for half in np.split(sums, 2))
+        return OffsetState(
+            information={**self.information, **dict(information)},
+            moment={**self.moment, **dict(moment)},
+            last=last,
+            age=age,
+        )
+
 
 def tie_clocks(
     time: Datetimes,
@@ -71,10 +87,11 @@ def tie_clocks(
     reference: str,
     ranges: Ranges,
     free: SinglePoint,
-    state: OffsetState,
+    states: Sequence[OffsetState],
     *,
+    parts: Sequence[slice] = (EVERY,),
     limits: ClockOffsetLimits | None = None,
-) -> tuple[ClockTies, OffsetState]:
+) -> tuple[ClockTies, list[OffsetState]]:
     """Offsets known at each epoch from the epochs before it.
 
     Parameters
@@ -88,50 +105,49 @@ def tie_clocks(
         Without ties; those that agree with each other alone, so that a faulty satellite moves no offset.
     free : SinglePoint
         Position from these ranges with every clock on its own, where one range at least is redundant.
-    state : OffsetState
+    states : sequence of OffsetState
+        Of each receiver.
+    parts : sequence of slice
+        Rows of each.
     limits : ClockOffsetLimits, optional
 
     Returns
     -------
     ClockTies
-    OffsetState
+    list of OffsetState
     """
     limits = limits or ClockOffsetLimits()
     epochs = len(time)
     offset, sigma = np.zeros((epochs, len(clocks))), np.full((epochs, len(clocks)), UNTIED_M)
-    information, moment = dict(state.information), dict(state.moment)
-    step = steps_s(time, state.last)
-    fresh = np.minimum(step / limits.correlation_s, 1.0)
-    samples = limits.window_s / limits.correlation_s
-    age = ages(time, state.last, state.age, window_s=limits.window_s, least_epochs=samples)
     freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
     misfit = np.maximum(1.0, free.wsse / freedom)
     others = [g for g, letter in enumerate(clocks) if letter != reference]
     letters = [clocks[g] for g in others]
-    weight, difference = np.zeros((2, epochs, len(others)))
+    sample = np.zeros((epochs, 2 * len(others)))
     if reference in clocks:
         base = [clocks.index(reference)]
         sigma[:, base] = 0.0
-        of_clocks = [ranges.weight[:, group] for group in ranges.groups]
-        total = np.maximum(np.stack([weights.sum(axis=1) for weights in of_clocks], axis=1), 1e-12)
-        two = np.stack([(weights > 0).sum(axis=1) >= 2 for weights in of_clocks], axis=1)
+        used = ranges.weight > 0
+        total = np.maximum(np.add.reduceat(ranges.weight, ranges.starts, axis=1), 1e-12)
+        two = np.add.reduceat(used, ranges.starts, axis=1, dtype=np.intp) >= 2
         known = np.isfinite(free.wsse) & (ranges.n_used - ranges.n_clocks > 3)
         usable = two[:, others] & two[:, base] & known[:, None]
         variance = misfit[:, None] * (1.0 / total[:, others] + 1.0 / total[:, base])
-        weight = np.where(usable, fresh[:, None] / variance, 0.0)
+        weight = np.where(usable, 1.0 / variance, 0.0)
         difference = np.where(usable, free.clock_m[:, others] - free.clock_m[:, base], 0.0)
-    start = np.array([*(information.get(name, 0.0) for name in letters), *(moment.get(name, 0.0) for name in letters)])
-    before, after = decayed_sums(age, np.concatenate([weight, weight * difference], axis=1), start, state.age)
+        sample = np.concatenate([weight, weight * difference], axis=1)
+    before, after = np.empty(sample.shape), []
+    for state, rows in zip(states, parts, strict=True):
+        own, when = state.sums(letters), time[rows]
+        before[rows], _, sums, age = correlated_sums(
+            when, sample[rows], own, state.last, state.age,
+            window_s=limits.window_s, correlation_s=limits.correlation_s,
+        )  # fmt: skip
+        after.append(state.later(letters, sums, when[-1] if len(when) else state.last, age))
     of_information, of_moment = before[:, : len(others)], before[:, len(others) :]
     has = of_information > 0.0
     safe = np.where(has, of_information, 1.0)
     offset[:, others] = np.where(has, of_moment / safe, 0.0)
     spread = np.sqrt(limits.stability_m**2 + 1.0 / safe)
     sigma[:, others] = np.where(has & (spread < UNTIED_M), spread, UNTIED_M)
-    sums = after.tolist()
-    information |= zip(letters, sums[: len(others)], strict=True)
-    moment |= zip(letters, sums[len(others) :], strict=True)
-    last = time[-1] if epochs else state.last
-    return ClockTies(offset_m=offset, sigma_m=sigma), OffsetState(
-        information=information, moment=moment, last=last, age=float(age[-1]) if epochs else state.age
-    )
+    return ClockTies(offset_m=offset, sigma_m=sigma), after

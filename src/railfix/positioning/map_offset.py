@@ -8,6 +8,7 @@ stated error of the map.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
@@ -19,7 +20,8 @@ from scipy.special import chdtri, chndtrinc
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
 from railfix.kernels import compiled_by
-from railfix.positioning.forgetting import ages, decayed_sums, steps_s
+from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.forgetting import correlated_sums
 from railfix.positioning.normal_equations import RangeArrays, Ranges, reduced_equations
 from railfix.positioning.single_point import SinglePoint
 from railfix.track.trajectory import Trajectory
@@ -144,13 +146,13 @@ def map_offset(
     point: SinglePoint,
     nominal_m: Floats,
     variance: Floats,
-    trajectory: Trajectory,
+    antennas: AntennaRows,
     arc_m: Floats,
     off_map: Masks,
-    state: MapOffsetState,
+    states: Sequence[MapOffsetState],
     *,
     limits: MapOffsetLimits | None = None,
-) -> tuple[MapOffset, MapOffsetState]:
+) -> tuple[MapOffset, list[MapOffsetState]]:
     """Compute the mean offset of 3-D positions from the line, each epoch's own position included.
 
     Parameters
@@ -164,42 +166,39 @@ def map_offset(
         Standard deviations of satellites and atmosphere in the ranges.
     variance : ndarray, shape (T,)
         Of the ranges against their weights.
-    trajectory : Trajectory
+    antennas : AntennaRows
     arc_m : ndarray, shape (T,) [m]
         Positions on the line; NaN where there is none.
     off_map : ndarray of bool, shape (T,)
         The train is away from the line. These epochs have a window of their own: what a train was beside while it was
         away says nothing of the map once it is on it.
-    state : MapOffsetState
+    states : sequence of MapOffsetState
+        By antenna.
     limits : MapOffsetLimits, optional
 
     Returns
     -------
     MapOffset
-    MapOffsetState
+    list of MapOffsetState
     """
     limits = limits or MapOffsetLimits()
     usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.n_used - ranges.n_clocks > 3)
     arc = np.where(usable, arc_m, 0.0)
-    section = trajectory.segment_at(arc)[0]
-    axes = np.stack([trajectory.across[section], trajectory.up[section]], axis=1)
-    place = trajectory.at_arc(arc)
+    axes, place = antennas.each(lambda index, rows: _across_and_up(index.trajectory, arc[rows]))
     at = np.where(usable[:, None], point.ecef_m, place)
     covariance = np.where(usable[:, None, None], point.covariance_m2, np.eye(3))
     terms = terms_of_epochs(ranges.arrays, at, covariance, place, axes, np.ascontiguousarray(nominal_m), variance)
-    step = steps_s(time, state.time)
-    fresh = np.where(usable, np.minimum(step / limits.correlation_s, 1.0), 0.0)
-    values = fresh[:, None] * terms
-    samples = limits.window_s / limits.correlation_s
-    age = ages(time, state.time, state.age, window_s=limits.window_s, least_epochs=samples)
-    values = np.concatenate([np.where(off_map[:, None] == off, values, 0.0) for off in (False, True)], axis=1)
-    before, after = decayed_sums(age, values, state.sums, state.age)
-    both = before + values
+    sample = np.zeros((len(time), 2, _SUMS))
+    rows = np.flatnonzero(usable)
+    sample[rows, off_map[rows].astype(np.intp)] = terms[rows]
+    both, after = antennas.each_with_state(
+        lambda _, rows, state: _window(time[rows], sample[rows].reshape(-1, 2 * _SUMS), state, limits), states
+    )
     sums = np.where(off_map[:, None], both[:, _SUMS:], both[:, :_SUMS])
     enough = sums[:, 8] >= limits.least_samples
     sums = np.where(enough[:, None], sums, [1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     mean, known, statistic, detectable = means_of_windows(
-        sums, trajectory.sigma_plan_m, trajectory.sigma_height_m, limits.detectable_sigmas
+        sums, antennas.sigma_plan_m, antennas.sigma_height_m, limits.detectable_sigmas
     )
 
     def judged(values: Floats) -> Floats:
@@ -212,7 +211,22 @@ def map_offset(
         statistic=judged(statistic),
         detectable_m=np.where(enough[:, None], detectable, np.nan),
     )
-    return result, MapOffsetState(time=time[-1], age=float(age[-1]), sums=after) if len(time) else state
+    return result, after
+
+
+def _across_and_up(line: Trajectory, arc_m: Floats) -> tuple[Floats, Floats]:
+    """Return unit vectors across and up (T, 2, 3), and the points (T, 3) [m], of a line at arc lengths."""
+    return line.axes_of(line.segment_at(arc_m)[0])[:, 1:], line.at_arc(arc_m)
+
+
+def _window(
+    time: Datetimes, sample: Floats, state: MapOffsetState, limits: MapOffsetLimits
+) -> tuple[Floats, MapOffsetState]:
+    """Return the sums of the window at each epoch, its own included, shape (T, 18), and the state after them."""
+    before, own, sums, age = correlated_sums(
+        time, sample, state.sums, state.time, state.age, window_s=limits.window_s, correlation_s=limits.correlation_s
+    )
+    return before + own, MapOffsetState(time=time[-1], age=age, sums=sums) if len(time) else state
 
 
 @compiled_by("map_offset")

@@ -24,8 +24,9 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import RailfixError, SettingsError
 from railfix.motion.samples import SensorSamples
+from railfix.pipeline.antenna_chunk import AntennaChunk
 from railfix.pipeline.compared import PositionVerdict
-from railfix.pipeline.processor import AntennaChunk, EpochProcessor
+from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import State
 from railfix.pipeline.smoothing import Replay, smooth
 from railfix.pipeline.tables import in_time_order, observations_table, positions_table, rounded
@@ -105,9 +106,9 @@ class AntennaRun:
 
     def begin(self, epochs: int, after: np.datetime64, end: np.datetime64) -> None:
         """Begin the next chunk: so many epochs, and the samples of the sensors after one instant up to another."""
-        self._chunk = self._processor.chunk(
-            self.name, self._pieces.take(epochs), self._state, sensors=self._sensors.between(after, end)
-        )
+        observations = {self.name: self._pieces.take(epochs)}
+        sensors = self._sensors.between(after, end)
+        self._chunk = self._processor.chunks(observations, self._state, sensors=sensors)[self.name]
 
     @property
     def chunk(self) -> AntennaChunk:

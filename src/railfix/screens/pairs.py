@@ -52,6 +52,9 @@ def pair_channels(
     signal_rear: Strings,
 ) -> tuple[Indices, Indices]:
     """Return the channels of the same satellite and signal at both receivers, in the order of the front one's."""
+    if satellite_front is satellite_rear and signal_front is signal_rear:  # epochs of both are rows of the same arrays
+        every = np.arange(len(satellite_front))
+        return every, every
     rear = {key: m for m, key in enumerate(zip(satellite_rear.tolist(), signal_rear.tolist(), strict=True))}
     keys = enumerate(zip(satellite_front.tolist(), signal_front.tolist(), strict=True))
     pairs = [(m, rear[key]) for m, key in keys if key in rear]

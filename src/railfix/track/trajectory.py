@@ -165,6 +165,10 @@ class Trajectory(FrozenArrays, NotebookTable):
         right = np.cross(self.tangent, self.up)
         return read_only(right / np.linalg.norm(right, axis=1, keepdims=True))
 
+    def axes_of(self, segment: Indices) -> Floats:
+        """Unit vectors along, across and up at some segments, shape (n, 3, 3)."""
+        return np.stack([self.tangent[segment], self.across[segment], self.up[segment]], axis=1)
+
     @cached_property
     def heading_deg(self) -> Floats:
         """Azimuth of each segment in rising chainage, clockwise from north, shape (V - 1,) [deg]."""

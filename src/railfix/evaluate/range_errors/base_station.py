@@ -20,6 +20,7 @@ from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.processor import EpochProcessor
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.section_search import SearchIndex
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
@@ -89,7 +90,7 @@ def base_station(
     times: list[Datetimes] = []
     errors: list[dict[str, Floats]] = []
     for obs in parts:
-        corrected = correct_ranges(obs, book.of(obs, received.navigation), config, received, index)
+        corrected = correct_ranges(obs, book.of(obs, received.navigation), config, received, AntennaRows.of(index))
         corrected, state = with_slips(corrected, received.navigation, config, state)
         corrected, state = smoothed(corrected, config, state)
         phases |= bool(np.isfinite(obs.phase_cycles).any())

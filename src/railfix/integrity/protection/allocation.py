@@ -31,6 +31,8 @@ from railfix.integrity.raim import LinearModel
 
 #: Shared faults at a time that may be hypotheses; the probability of more is taken off the risk.
 _MOST_SHARED: Final = 3
+#: Epochs of two antennas, live: their allocation is kept.
+FEW: Final = 2
 #: Sets of a class that are left out one by one at most: four of 34 satellites.
 _MOST_SETS: Final = 46_376
 
@@ -90,10 +92,9 @@ def allocate(
         Whether a wrong map is a hypothesis.
     """
     used = model.used
-    if len(used) == 1:  # live, where the same satellites are used epoch after epoch
-        return _of_one_epoch(
-            _Same(risk), tuple(systems), used.tobytes(), int(out[0]), sides.tobytes(), sides.shape[1], wrong_map
-        )
+    if len(used) <= FEW:  # live, where the same satellites are used epoch after epoch
+        given = (used.tobytes(), out.tobytes(), sides.tobytes())
+        return _of_few_epochs(_Same(risk), tuple(systems), *given, sides.shape[1], wrong_map)
     return _allocated(used, systems, risk, out, sides, wrong_map=wrong_map)
 
 
@@ -111,17 +112,17 @@ class _Same:
 
 
 @lru_cache(maxsize=64)
-def _of_one_epoch(
-    risk: _Same, systems: tuple[str, ...], used: bytes, out: int, sides: bytes, count: int, wrong_map: bool
+def _of_few_epochs(
+    risk: _Same, systems: tuple[str, ...], used: bytes, out: bytes, sides: bytes, count: int, wrong_map: bool
 ) -> Allocation:
-    """Allocation of one epoch, kept: nobody writes into it."""
-    channels = len(systems)
+    """Allocation of few epochs, kept: nobody writes into it."""
+    channels, excluded = len(systems), np.frombuffer(out, dtype=np.int64).copy()
     return _allocated(
-        np.frombuffer(used, dtype=bool).reshape(1, channels).copy(),
+        np.frombuffer(used, dtype=bool).reshape(len(excluded), channels).copy(),
         systems,
         risk.risk,
-        np.array([out]),
-        np.frombuffer(sides, dtype=bool).reshape(1, count, channels).copy(),
+        excluded,
+        np.frombuffer(sides, dtype=bool).reshape(len(excluded), count, channels).copy(),
         wrong_map=wrong_map,
     )
 

@@ -22,14 +22,14 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
 from itertools import combinations
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import comb
 
 from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings
-from railfix.integrity.protection.allocation import Allocation, allocate
+from railfix.integrity.protection.allocation import FEW, Allocation, allocate
 from railfix.integrity.protection.risk import MOST_TOGETHER, RiskBudget
 from railfix.integrity.protection.separation import all_in_view, without_group, without_map
 from railfix.integrity.protection.tails import lowered
@@ -194,9 +194,12 @@ def along_track_level(
         np.zeros((epochs, 2, 2)) if map_seen is None else map_seen[1],
     )
     located = np.isfinite(model.covariance_m2).all(axis=(1, 2)) & np.isfinite(scale)
+    if 0 < epochs <= FEW and located.all():
+        return ProtectionLevel(**_level_of_block(np.arange(epochs), model, plan, given))
     result = _empty(epochs, plan)
     for block in _blocks(model, plan, np.flatnonzero(located)):
-        _level_of_block(result, block, model.take(block), plan, given)
+        for name, values in _level_of_block(block, model.take(block), plan, given).items():
+            getattr(result, name)[block] = values
     return result
 
 
@@ -216,15 +219,15 @@ def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
         worst_one=np.full(epochs, -1, dtype=np.intp),
         worst_two=np.full((epochs, 2), -1, dtype=np.intp),
         worst_constellation=np.full(epochs, "", dtype="<U1"),
-        unchecked_risk=plan.beyond,
+        unchecked_risk=plan.beyond.copy(),
         cause=np.full(epochs, Cause.NO_POSITION, dtype=np.int8),
     )
 
 
 def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Indices]:
     """Epochs of like numbers of hypotheses together: no block is wider than it must be."""
-    if len(rows) < 2:
-        return iter([rows] * len(rows))
+    if len(rows) <= FEW:
+        return iter([rows] if len(rows) else [])
     used = np.count_nonzero(model.used[rows], axis=1)
     sizes = np.cumsum(comb(used[:, None], np.arange(MOST_TOGETHER + 1)), axis=1)
     sizes = np.concatenate([sizes, np.zeros((len(rows), 1))], axis=1)
@@ -259,33 +262,40 @@ class Asked(NamedTuple):
     bounds: Indices  # (5,) first place of no fault, one fault, two, more; their number
 
 
-def _level_of_block(
-    result: ProtectionLevel, rows: Indices, model: LinearModel, plan: Allocation, given: Errors
-) -> None:
-    """Levels of a block of epochs with positions; written into `result`."""
+def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: Errors) -> dict[str, NDArray[Any]]:
+    """Return the fields of `ProtectionLevel` of a block of epochs with positions."""
     of_block = Errors(*(np.ascontiguousarray(each[rows]) for each in given))
     n = int(np.count_nonzero(model.used, axis=1).max())
     channel, offset, sigma, weight, separation = hypotheses(model.arrays, of_block, asked := _asked(plan, rows, n))
     share = np.stack([each[rows] for each in (plan.fault_free, plan.one, plan.two, plan.more)], axis=1)
     level, spender, part, k, worst = lowered(offset, sigma, weight, asked.bounds, share, plan.reserved[rows])
 
-    result.level_m[rows], result.sigma_m[rows] = level, sigma[:, 0]
-    result.k_false_alarm[rows] = plan.k_false_alarm[rows]
-    result.fault_free_m[rows], result.one_fault_m[rows], result.two_fault_m[rows] = part.T[:3]
-    result.k_fault_free[rows], result.k_one_fault[rows], result.k_two_faults[rows] = k.T[:3]
-    result.separation[rows], result.consistent[rows] = separation, separation <= 1.0
     one, two = worst[:, 1], worst[:, 2]
-    result.worst_one[rows] = _channels(channel, np.where(one < n, one, -1)[:, None])[:, 0]
     # After the channels: constellations, then the sides, a wrong map, and none.
     letters = np.array([*plan.groups, *[""] * (len(plan.shared) + 1)])
-    result.worst_constellation[rows] = letters[np.where(one >= n, one - n, -1)]
     pairs = np.concatenate([_sets(n, 2).T if asked.first[0, 2] >= 0 else np.empty((0, 2), dtype=np.intp), [[-1, -1]]])
-    result.worst_two[rows] = _channels(channel, pairs[np.where(two < len(pairs), two, -1)])
     infinite = np.full(len(rows), Cause.BUDGET)
     if (unchecked := np.isinf(level) & (plan.fault_free[rows] > 0)).any():
         infinite[unchecked] = _unchecked(plan, asked, np.where(np.isinf(sigma), weight, 0.0), n)[unchecked]
     spent_on = np.where(spender == _OF_MORE, Cause.THREE_FAULTS, spender)
-    result.cause[rows] = np.where(np.isinf(level), infinite, spent_on)
+    return {
+        "level_m": level,
+        "fault_free_m": part[:, 0],
+        "one_fault_m": part[:, 1],
+        "two_fault_m": part[:, 2],
+        "sigma_m": sigma[:, 0],
+        "k_fault_free": k[:, 0],
+        "k_one_fault": k[:, 1],
+        "k_two_faults": k[:, 2],
+        "k_false_alarm": plan.k_false_alarm[rows],
+        "separation": separation,
+        "consistent": separation <= 1.0,
+        "worst_one": _channels(channel, np.where(one < n, one, -1)[:, None])[:, 0],
+        "worst_two": _channels(channel, pairs[np.where(two < len(pairs), two, -1)]),
+        "worst_constellation": letters[np.where(one >= n, one - n, -1)],
+        "unchecked_risk": plan.beyond[rows],
+        "cause": np.where(np.isinf(level), infinite, spent_on).astype(np.int8),
+    }
 
 
 def _unchecked(plan: Allocation, asked: Asked, open_to_faults: Floats, n: int) -> Codes:

@@ -23,6 +23,7 @@ from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
 from railfix.integrity.raim.model import Compact
 from railfix.kernels import compiled_by
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.section_search import SearchIndex
 
 #: Cosine of the angle off the tangent (6 deg) within which the linear model of the level holds.
@@ -64,7 +65,7 @@ class _Sections:
 
 
 def places_beyond_the_level(
-    index: SearchIndex,
+    antennas: AntennaRows,
     arc_m: Floats,
     model: LinearModel,
     level_m: Floats,
@@ -83,8 +84,7 @@ def places_beyond_the_level(
 
     Parameters
     ----------
-    index : SearchIndex
-        Of the trajectory.
+    antennas : AntennaRows
     arc_m : ndarray, shape (T,) [m]
         Positions.
     model : LinearModel
@@ -106,7 +106,10 @@ def places_beyond_the_level(
         return result
     channels = int(np.count_nonzero(model.used[rows], axis=1).max())
     size = max(1, _BOUND_SIZE // channels**2)
-    line, likely = index.trajectory, risk.prior(systems)
+    likely, sigmas = risk.prior(systems), (antennas.sigma_plan_m, antennas.sigma_height_m)
+    clear = np.full(len(arc_m), np.nan)
+    for index, own in antennas.split(rows):
+        clear[own] = _off_tangent_m(index, arc_m[own])
     for first in range(0, len(rows), size):
         block = rows[first : first + size]
         part, noise = model.take(block), np.maximum(scale[block], 1.0)
@@ -116,19 +119,18 @@ def places_beyond_the_level(
             likely,
             np.ascontiguousarray(sides[block]),
             risk.side_prior,
-            _off_tangent_m(index, arc_m[block]),
-            line.sigma_plan_m,
-            line.sigma_height_m,
+            clear[block],
+            *sigmas,
             risk.risk_per_sample,
         )
-        near = np.flatnonzero(bound > risk.risk_per_sample)
-        for some in np.array_split(near, 1 + 9 * len(near) // size) if len(near) else ():
-            rest = block[some]
-            parts, design, none = whitened(part.take(some), line.sigma_plan_m, line.sigma_height_m, noise[some])
-            prior = np.where(parts.used, likely[parts.channel], 0.0)
-            of_sides = without_sides(parts, design, none, sides[rest], risk.side_prior)
-            spent = _risk_of_block(index, arc_m[rest], level_m[rest], parts, design, none, prior, of_sides, risk)
-            result[rest] = spent > risk.risk_per_sample
+        near = block[bound > risk.risk_per_sample]
+        for index, own in antennas.split(near):
+            for some in np.array_split(own, 1 + 9 * len(own) // size):
+                parts, design, none = whitened(model.take(some), *sigmas, np.maximum(scale[some], 1.0))
+                prior = np.where(parts.used, likely[parts.channel], 0.0)
+                of_sides = without_sides(parts, design, none, sides[some], risk.side_prior)
+                spent = _risk_of_block(index, arc_m[some], level_m[some], parts, design, none, prior, of_sides, risk)
+                result[some] = spent > risk.risk_per_sample
     return result
 
 
@@ -202,14 +204,11 @@ def _risk_of_block(
     risk: RiskBudget,
 ) -> Floats:
     """Return the probability that the true place lies beyond the level off the tangent, shape (T,)."""
-    allowed = risk.risk_per_sample
-    forms = none.beside(_without_one(parts, design, none, prior), of_sides)
-    spent = _risk_beyond(forms, _around(index, arc_m, level_m, forms.radius_m(allowed)))
-    left = np.flatnonzero(spent <= allowed)
-    if len(left) and parts.channel.shape[1] > 1:
-        pairs = _without_two(parts.take(left), design[left], none.take(left), prior[left])
-        spent[left] += _risk_beyond(pairs, _around(index, arc_m[left], level_m[left], pairs.radius_m(allowed)))
-    return spent
+    without = [_without_one(parts, design, none, prior), of_sides]
+    if parts.channel.shape[1] > 1:
+        without.append(_without_two(parts, design, none, prior))
+    forms = none.beside(*without)
+    return _risk_beyond(forms, _around(index, arc_m, level_m, forms.radius_m(risk.risk_per_sample)))
 
 
 def _without_one(parts: Compact, design: Floats, none: Forms, prior: Floats) -> Forms:
@@ -254,7 +253,7 @@ def _around(index: SearchIndex, arc_m: Floats, level_m: Floats, radius_m: Floats
     """
     line = index.trajectory
     here, place = line.segment_at(arc_m)[0], line.at_arc(arc_m)
-    axes = np.stack([line.tangent[here], line.across[here], line.up[here]], axis=1)
+    axes = line.axes_of(here)
     lists = index.tree.query_ball_point(place, radius_m + line.length_m.max(), return_sorted=True)
     count = np.fromiter(map(len, lists), dtype=np.intp, count=len(lists))
     vertex = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=int(count.sum()))

@@ -256,9 +256,19 @@ def constrained_model(
         NaN in the epochs without a position.
     """
     at = trajectory.segment_at(arc_m)[0] if section is None else section
-    axes = np.stack([trajectory.tangent[at], trajectory.across[at], trajectory.up[at]], axis=1)
-    prior = np.diag([0.0, 1.0 / trajectory.sigma_plan_m**2, 1.0 / trajectory.sigma_height_m**2])
-    return _model(ranges, trajectory.at_arc(arc_m), axes, prior, unknowns=1)
+    place, axes = trajectory.at_arc(arc_m), trajectory.axes_of(at)
+    return model_on_line(ranges, place, axes, trajectory.sigma_plan_m, trajectory.sigma_height_m)
+
+
+def model_on_line(
+    ranges: Ranges, place_ecef_m: Floats, axes: Floats, sigma_plan_m: float, sigma_height_m: float
+) -> LinearModel:
+    """Return the same model from the places themselves, shape (T, 3) [m], and the axes there, shape (T, 3, 3).
+
+    The axes are unit vectors along, across and up (`Trajectory.axes_of`).
+    """
+    prior = np.diag([0.0, 1.0 / sigma_plan_m**2, 1.0 / sigma_height_m**2])
+    return _model(ranges, place_ecef_m, axes, prior, unknowns=1)
 
 
 def point_model(ranges: Ranges, ecef_m: Floats) -> LinearModel:

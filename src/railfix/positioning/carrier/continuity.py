@@ -179,7 +179,7 @@ def _around(sats: Floats, trajectory: Trajectory, arc: Floats) -> tuple[Floats, 
     section, along = trajectory.segment_at(safe)
     where = trajectory.ecef_m[section] + along[:, None] * trajectory.tangent[section]
     distance, los = range_with_rotation(sats, where[:, None, :])
-    axes = np.stack([trajectory.tangent[section], trajectory.across[section], trajectory.up[section]], axis=1)
+    axes = trajectory.axes_of(section)
     return distance, los, axes
 
 

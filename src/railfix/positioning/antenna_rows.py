@@ -1,0 +1,149 @@
+"""Epochs of several antennas as the rows of one set of arrays.
+
+A live epoch of two antennas is two rows. Stages that know neither the line nor earlier epochs (orbits, 3-D positions,
+robust fits, levels) take all rows in one call; those that do are called for the rows of each antenna, and what they
+return is joined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from typing import Any, Final, TypeVar, cast
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices
+from railfix.positioning.section_search import SearchIndex
+
+Value = TypeVar("Value")
+State = TypeVar("State")
+#: Members that are the same for all rows: of the channels alone.
+_OF_CHANNELS: Final = frozenset({"satellite", "signal", "frequency_hz", "channels", "columns", "header"})
+#: All rows.
+EVERY: Final = slice(None)
+
+
+@dataclass(frozen=True)
+class AntennaRows:
+    """Which rows are of which antenna.
+
+    Attributes
+    ----------
+    indices : tuple of SearchIndex
+        Of the trajectory of each antenna; their maps have the same sigmas.
+    parts : tuple of slice
+        Rows of each antenna, one after the other; `EVERY` of a single one.
+    """
+
+    indices: tuple[SearchIndex, ...]
+    parts: tuple[slice, ...]
+
+    @classmethod
+    def of(cls, index: SearchIndex) -> AntennaRows:
+        """Rows of one antenna."""
+        return cls((index,), (EVERY,))
+
+    @property
+    def sigma_plan_m(self) -> float:
+        """Standard deviation of the map across the line [m]."""
+        return self.indices[0].trajectory.sigma_plan_m
+
+    @property
+    def sigma_height_m(self) -> float:
+        """Standard deviation of the heights of the map [m]."""
+        return self.indices[0].trajectory.sigma_height_m
+
+    def apart(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> list[Value]:
+        """Return what a function returns for each antenna.
+
+        Parameters
+        ----------
+        function : callable
+            Takes the search index, the rows, and one item of each of `of_antennas`.
+        of_antennas : sequence
+            By antenna, for example states.
+        """
+        return [function(*each) for each in zip(self.indices, self.parts, *of_antennas, strict=True)]
+
+    def each(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> Value:
+        """Return the same, joined."""
+        return joined(self.apart(function, *of_antennas))
+
+    def each_with_state(
+        self, function: Callable[..., tuple[Value, State]], *of_antennas: Sequence[Any]
+    ) -> tuple[Value, list[State]]:
+        """Return the joined first results of a function for each antenna, and a list of its second ones."""
+        found = self.apart(function, *of_antennas)
+        return joined([rows for rows, _ in found]), [state for _, state in found]
+
+    def split(self, rows: Indices) -> Iterator[tuple[SearchIndex, Indices]]:
+        """Yield the search index and the rows of each antenna that has any of some rising ones."""
+        if len(self.parts) == 1:
+            if len(rows):
+                yield self.indices[0], rows
+            return
+        for index, part in zip(self.indices, self.parts, strict=True):
+            own = rows[(rows >= part.start) & (rows < part.stop)]
+            if len(own):
+                yield index, own
+
+    def at_arc(self, arc_m: Floats) -> Floats:
+        """Points of the lines at arc lengths, shape (T, 3) [m]; NaN for NaN."""
+        return self.each(lambda index, rows: index.trajectory.at_arc(arc_m[rows]))
+
+
+@cache
+def _members(kind: Any) -> tuple[str, ...]:
+    """Names of the members of a dataclass that have rows, or may have; none for other types."""
+    return tuple(f.name for f in fields(kind) if f.name not in _OF_CHANNELS) if is_dataclass(kind) else ()
+
+
+def joined(values: Sequence[Value]) -> Value:
+    """Join arrays row after row, or those of dataclasses or of tuples; what is neither is that of the first."""
+    first: Any = values[0]
+    if len(values) == 1:
+        return values[0]
+    if type(first) is tuple:
+        return cast(Value, tuple(_joined(column) for column in zip(*cast(Any, values), strict=True)))
+    return cast(Value, _joined(values))
+
+
+def _joined(values: Sequence[Any]) -> Any:
+    first = values[0]
+    if isinstance(first, np.ndarray):
+        return np.concatenate(values)
+    if not (names := _members(cast(Hashable, type(first)))):
+        return first
+    of_each = [vars(value) for value in values]
+    members = {name: item for name, item in of_each[0].items() if name in _OF_CHANNELS}
+    for name in names:
+        column = [own[name] for own in of_each]
+        members[name] = np.concatenate(column) if type(column[0]) is np.ndarray else _joined(column)
+    return _made(type(first), members)
+
+
+def rows_of(value: Value, rows: slice) -> Value:
+    """Return some rows of an array, or of the arrays of a dataclass and of those within it."""
+    return value if rows is EVERY else cast(Value, _rows_of(value, rows))
+
+
+def _rows_of(value: Any, rows: slice) -> Any:
+    if isinstance(value, np.ndarray):
+        return value[rows]
+    if not (names := _members(cast(Hashable, type(value)))):
+        return value
+    own = vars(value)
+    members = {name: item for name, item in own.items() if name in _OF_CHANNELS}
+    for name in names:
+        item = own[name]
+        members[name] = item[rows] if type(item) is np.ndarray else _rows_of(item, rows)
+    return _made(type(value), members)
+
+
+def _made(kind: Any, members: dict[str, Any]) -> Any:
+    """Return a dataclass with given members, which have been checked before."""
+    instance = object.__new__(kind)
+    vars(instance).update(members)
+    return instance

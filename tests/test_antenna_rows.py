@@ -1,0 +1,186 @@
+"""Few epochs of two antennas are rows of the same arrays: the same results as of each antenna alone."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline import antenna_chunk
+from railfix.pipeline.config import Config, parse_config
+from railfix.pipeline.results import AntennaResult, State
+from railfix.positioning.antenna_rows import EVERY, AntennaRows, joined, rows_of
+from railfix.positioning.section_search import SearchIndex
+from railfix.run.processor import processor_of
+from railfix.simulate.demonstration import demo_inputs
+from railfix.track import read_track
+from railfix.track.trajectory import Trajectory
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
+
+#: Results are held to this, in metres and in sigmas; sums over channels in another order differ by less.
+_SAME = 1e-7
+SETTINGS: dict[str, dict[str, Any]] = {
+    "all": {},
+    "filter": {"filter": "track"},
+    "few satellites": {"systems": ["G"], "elevation": {"mask_deg": 35.0}},
+}
+
+
+@cache
+def _inputs() -> tuple[dict[str, Observations], Navigation, dict[str, Trajectory]]:
+    inputs = demo_inputs()
+    assert inputs.vehicle is not None
+    track, vehicle = read_track(inputs.track), read_vehicle(inputs.vehicle)
+    logs = {name: read_observations(getattr(inputs, name))[600:719] for name in ("front", "rear")}
+    return logs, read_navigation(inputs.nav), {name: antenna_trajectory(track, vehicle, name) for name in logs}
+
+
+def _without(obs: Observations, satellites: tuple[str, ...]) -> Observations:
+    """The log of a receiver that does not have these satellites."""
+    kept = ~np.isin(obs.satellite, satellites)
+    arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
+    return replace(
+        obs,
+        satellite=obs.satellite[kept],
+        signal=obs.signal[kept],
+        **{name: np.ascontiguousarray(getattr(obs, name)[:, kept]) for name in arrays},
+    )
+
+
+def _faulty(obs: Observations, satellite: str, epochs: slice) -> Observations:
+    code = obs.code_m.copy()
+    code[epochs] += np.where(obs.satellite == satellite, 60.0, 0.0)
+    return replace(obs, code_m=code)
+
+
+def _logs(case: str) -> dict[str, Observations]:
+    logs = dict(_inputs()[0])
+    if case == "signals of its own":
+        rear = logs["rear"]
+        logs["rear"] = replace(rear, signal=np.where(rear.satellite == rear.satellite[0], "1W", rear.signal))
+    if case == "channels of its own":
+        logs["front"] = _without(logs["front"], tuple(s for s in logs["front"].satellite.tolist() if s[0] == "E")[:2])
+        other = tuple(s for s in logs["rear"].satellite.tolist() if s[0] in "JR")
+        logs["rear"] = _without(logs["rear"], (*other, str(logs["rear"].satellite[0])))
+    strong = str(logs["rear"].satellite[np.nan_to_num(logs["rear"].cn0_dbhz[0]).argmax()])
+    faulty = {"front": slice(50, 80), "rear": slice(30, 60)}
+    return {name: _faulty(log, strong, faulty[name]) for name, log in logs.items()}
+
+
+def _missing(obs: Observations, every: int) -> Observations:
+    """The log without every so manieth epoch."""
+    kept = np.arange(len(obs)) % every != every - 1
+    arrays = ("time", "code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock", "break_before")
+    return replace(obs, **{name: getattr(obs, name)[kept] for name in arrays})
+
+
+def _run(config: Config, logs: dict[str, Observations], ends: np.ndarray) -> dict[str, list[AntennaResult]]:
+    """Process the logs in chunks that end before some times."""
+    processor, state = processor_of(config, *_inputs()[1:]), State()
+    found: dict[str, list[AntennaResult]] = {name: [] for name in logs}
+    cuts = {name: [0, *np.searchsorted(log.time, ends).tolist()] for name, log in logs.items()}
+    for k in range(len(ends)):
+        parts = {name: log[cuts[name][k] : cuts[name][k + 1]] for name, log in logs.items()}
+        result, state = processor.process({name: part for name, part in parts.items() if len(part)}, state)
+        for name, of_antenna in result.antennas.items():
+            found[name].append(of_antenna)
+    return found
+
+
+def _values(result: AntennaResult, name: str, channels: list[tuple[str, str]]) -> np.ndarray:
+    """A member of a result, its channels in a given order; those that the result does not have are NaN, or 0."""
+    values = getattr(result, name)
+    if values.ndim < 2 or values.shape[1] != len(result.satellite) or name in ("ecef_m", "conventional_ecef_m"):
+        return np.asarray(values)
+    own = {key: i for i, key in enumerate(zip(result.satellite.tolist(), result.signal.tolist(), strict=True))}
+    return np.asarray(values[:, [own[key] for key in channels]])
+
+
+@pytest.mark.requirement("A8")
+@pytest.mark.parametrize("settings", SETTINGS)
+@pytest.mark.parametrize("channels", ["same channels", "signals of its own", "channels of its own"])
+def test_rows_of_two_antennas_give_the_results_of_each_alone(settings: str, channels: str) -> None:
+    config, logs = parse_config(SETTINGS[settings]), _logs(channels)
+    time = logs["front"].time
+    logs["rear"] = _missing(logs["rear"], every=11)
+    after = np.timedelta64(50, "ms")
+    whole = _run(config, logs, time[-1:] + after)
+    # One epoch, three, one, two; now and then the rear antenna has one less, or none.
+    cut = _run(config, logs, time[np.cumsum([1, 3, 1, 2] * (len(time) // 7)) - 1] + after)
+    for name, (expected,) in whole.items():
+        keys = list(zip(expected.satellite.tolist(), expected.signal.tolist(), strict=True))
+        for item in fields(AntennaResult):
+            values = getattr(expected, item.name)
+            if item.name in ("satellite", "signal", "columns", "clock_offset_m", "clock_offset_sigma_m"):
+                continue
+            if not isinstance(values, np.ndarray):
+                continue
+            got = np.concatenate([_values(part, item.name, keys) for part in cut[name]])
+            if values.dtype == np.float64:
+                np.testing.assert_allclose(got, values, rtol=1e-9, atol=_SAME, err_msg=item.name)
+            else:
+                np.testing.assert_array_equal(got, values, err_msg=item.name)
+        assert expected.protection is not None
+        level = np.concatenate([p.protection.level.level_m for p in cut[name] if p.protection is not None])
+        np.testing.assert_allclose(level, expected.protection.level.level_m, rtol=1e-7)
+        excluded = sum(int(part.raim.excluded.sum()) for part in cut[name])
+        assert excluded == int(expected.raim.excluded.sum())
+
+
+@pytest.mark.requirement("A8")
+def test_only_few_epochs_without_carrier_and_with_one_map_sigma_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
+    logs, navigation, paths = _inputs()
+    joined_to: list[int] = []
+    solve = antenna_chunk.solve
+
+    def counted(corrected: Any, antennas: AntennaRows, *rest: Any) -> Any:
+        joined_to.append(len(antennas.parts))
+        return solve(corrected, antennas, *rest)
+
+    monkeypatch.setattr(antenna_chunk, "solve", counted)
+
+    def parts(settings: dict[str, Any], epochs: int, own: dict[str, Trajectory] = paths) -> list[int]:
+        joined_to.clear()
+        processor_of(parse_config(settings), navigation, own).process({n: log[:epochs] for n, log in logs.items()})
+        return list(joined_to)
+
+    assert parts({}, 1) == [2]
+    assert parts({}, 8) == [2]
+    assert parts({}, 9) == [1, 1]
+    assert parts({"carrier": "smoothed"}, 1) == [1, 1]
+    other = paths | {"rear": replace(paths["rear"], sigma_plan_m=2.0 * paths["rear"].sigma_plan_m)}
+    assert parts({}, 1, other) == [1, 1]
+
+
+def test_joined_rows_are_taken_apart_again() -> None:
+    logs = _inputs()[0]
+    front, rear = logs["front"][:3], logs["rear"][:2]
+    both = joined([front, rear])
+    assert both.time.tolist() == [*front.time.tolist(), *rear.time.tolist()]
+    for part, rows in ((front, slice(0, 3)), (rear, slice(3, 5))):
+        again = rows_of(both, rows)
+        assert is_dataclass(again)
+        np.testing.assert_array_equal(again.code_m, part.code_m)
+        np.testing.assert_array_equal(again.satellite, part.satellite)
+    assert rows_of(both, EVERY) is both
+    assert joined([both]) is both
+
+
+def test_rows_are_split_by_antenna() -> None:
+    paths = _inputs()[2]
+    front, rear = SearchIndex(paths["front"]), SearchIndex(paths["rear"])
+    both = AntennaRows((front, rear), (slice(0, 2), slice(2, 5)))
+    split = [(index is front, rows.tolist()) for index, rows in both.split(np.array([1, 2, 4]))]
+    assert split == [(True, [1]), (False, [2, 4])]
+    assert [rows.tolist() for _, rows in both.split(np.array([3]))] == [[3]]
+    alone = AntennaRows.of(rear)
+    assert [rows.tolist() for _, rows in alone.split(np.array([3]))] == [[3]]
+    assert not list(alone.split(np.array([], dtype=np.intp)))
+    arc = np.array([10.0, np.nan, 20.0, 30.0, 40.0])
+    np.testing.assert_array_equal(both.at_arc(arc)[2:], paths["rear"].at_arc(arc[2:]))
