@@ -9,12 +9,10 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks
-from railfix.core.constants import CLOCK_GROUP, SPEED_OF_LIGHT
+from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
-from railfix.gnss.navigation import Navigation, glonass_channels
-from railfix.gnss.signals import carrier_frequency_hz
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
@@ -27,7 +25,7 @@ from railfix.screens import Screened
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, Tracked, TrackState, TrackStatus, track
 from railfix.tracking.levels import LevelState, with_levels
-from railfix.tracking.result import BOUNDED
+from railfix.tracking.result import is_bounded
 
 #: Reasons that a code is kept by: the filter weighs multipath and faults itself, with more than one epoch to judge by.
 _WEIGHED_BY_FILTER: Final = (
@@ -173,7 +171,6 @@ def along_track(
     ranges: CorrectedRanges,
     single: SingleEpochs,
     trajectory: Trajectory,
-    navigation: Navigation,
     config: Config,
     state: FilterState,
     *,
@@ -188,7 +185,6 @@ def along_track(
         After all screens and exclusions.
     single : SingleEpochs
     trajectory : Trajectory
-    navigation : Navigation
     config : Config
     state : FilterState
     samples : SensorSamples, optional
@@ -196,7 +192,7 @@ def along_track(
     surroundings : Surroundings, optional
         Features of the line and ground units that the sensors meet.
     """
-    epochs, slips = gnss_epochs(ranges, single.noise_scale, navigation, config, state.slips)
+    epochs, slips = gnss_epochs(ranges, single.noise_scale, config, state.slips)
     epochs = replace(epochs, off_map=single.off_map)
     line = Line.of(trajectory) if state.line is None else state.line
     tracked, sensed, replays, after = _tracked(
@@ -242,14 +238,14 @@ def checked(
     held = seconds(time - disagreed[1:]) <= held_s
     tracked = result.tracked
     if held.any():
-        tracked = _doubted(tracked, held & np.isin(tracked.status, BOUNDED), TrackStatus.ANTENNAS_DISAGREE)
+        tracked = _doubted(tracked, held & is_bounded(tracked.status), TrackStatus.ANTENNAS_DISAGREE)
     return replace(result, tracked=tracked, spacing_error_m=error), replace(state, disagreed=disagreed[-1])
 
 
 def _doubted(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:
     """Places with a status of doubt at some epochs; nothing bounds their error there."""
     told = np.where(doubtful, np.int8(status), tracked.status)
-    unbounded = np.isfinite(tracked.level_m) & ~np.isin(told, BOUNDED)
+    unbounded = np.isfinite(tracked.level_m) & ~is_bounded(told)
     level, amount = (np.where(unbounded, np.inf, values) for values in (tracked.level_m, tracked.amount_m))
     return replace(tracked, status=told, level_m=level, amount_m=amount)
 
@@ -392,7 +388,7 @@ def on_line_m(tracked: Tracked | SmoothedTrack, trajectory: Trajectory) -> Float
 
 
 def gnss_epochs(
-    ranges: CorrectedRanges, noise_scale: Floats, navigation: Navigation, config: Config, state: SlipState | None
+    ranges: CorrectedRanges, noise_scale: Floats, config: Config, state: SlipState | None
 ) -> tuple[GnssEpochs, SlipState | None]:
     """Return the measurements of the filter, and the state of the slip detection.
 
@@ -402,9 +398,7 @@ def gnss_epochs(
     obs, columns = ranges.observations, ranges.columns
     slips, after = ranges.slips, state
     if slips is None:
-        channels = {**glonass_channels(navigation), **obs.header.glonass_channel}
-        frequency = carrier_frequency_hz(obs.satellite, obs.signal, channels)
-        slips, after = find_slips(obs, state, frequency_hz=frequency, limits=config.slips)
+        slips, after = find_slips(obs, state, frequency_hz=ranges.channels.every_frequency_hz, limits=config.slips)
     healthy = (ranges.reason & ~int(_WEIGHED_BY_FILTER)) == 0
     phases, dopplers = ("phase" in config.filter_sources, "doppler" in config.filter_sources)
     no_delay = np.zeros(ranges.code_m.shape)
@@ -414,7 +408,7 @@ def gnss_epochs(
     epochs = GnssEpochs(
         time=obs.time,
         satellite=ranges.satellite,
-        clock=np.array([CLOCK_GROUP[str(name)[0]] for name in ranges.satellite], dtype="<U1"),
+        clock=ranges.channels.clock,
         sat_ecef_m=ranges.satellites.position_ecef_m,
         sat_velocity_mps=ranges.satellites.velocity_ecef_mps,
         code_m=np.where(healthy, ranges.corrected_code_m, np.nan),

@@ -18,7 +18,6 @@ from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.compared import PositionVerdict
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
-from railfix.pipeline.received import Received
 from railfix.pipeline.results import AntennaResult, AntennaState
 from railfix.pipeline.solution import Solution, solve
 from railfix.positioning.antenna_rows import EVERY, AntennaRows, joined, rows_of
@@ -122,7 +121,6 @@ class AntennaChunk:
         Its own.
     together : SolvedTogether
         Has its corrected ranges; the chunks of a `SolvedTogether` are made in the order of its rows.
-    received : Received
     state : AntennaState
     filter_state : FilterState
     sensors : SensorSamples or None
@@ -147,7 +145,6 @@ class AntennaChunk:
         name: str,
         observations: Observations,
         together: SolvedTogether,
-        received: Received,
         state: AntennaState,
         filter_state: FilterState,
         sensors: SensorSamples | None,
@@ -157,7 +154,7 @@ class AntennaChunk:
         self.tracked: AlongTrack | None = None
         curve = processor.setup.cn0_curve if "cn0" in self.config.screens else None
         self.notes = () if curve is None else tuple(f"{name}: {n}" for n in curve.notes_for(observations.header))
-        self._received, self._sensors, self._together = received, sensors, together
+        self._sensors, self._together = sensors, together
         corrected, index, self._rows = together.add(self)
         self._trajectory, self._surroundings = index.trajectory, processor.surroundings(name, sensors)
         self._ranges, self.state = self._screened(corrected, state, processor)
@@ -178,7 +175,7 @@ class AntennaChunk:
         state = replace(state, screens=states)
         if self.config.carrier != "off":
             before = state.carrier or CarrierState()
-            ranges, carrier = with_slips(ranges, self._received.navigation, self.config, before)
+            ranges, carrier = with_slips(ranges, self.config, before)
             if self.config.carrier == "smoothed":
                 ranges, carrier = smoothed(ranges, self.config, carrier)
             state = replace(state, carrier=carrier)
@@ -218,7 +215,6 @@ class AntennaChunk:
             self._ranges,
             self._single_epochs(result),
             self._trajectory,
-            self._received.navigation,
             self.config,
             self.filter_state,
             samples=self._sensors,

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from railfix.core.arrays import Floats
-from railfix.gnss.navigation import Navigation, glonass_channels
-from railfix.gnss.signals import carrier_frequency_hz
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.positioning.carrier import (
@@ -45,14 +43,10 @@ class CarrierState:
     phase: PhaseState | None = None
 
 
-def with_slips(
-    ranges: CorrectedRanges, navigation: Navigation, config: Config, state: CarrierState
-) -> tuple[CorrectedRanges, CarrierState]:
+def with_slips(ranges: CorrectedRanges, config: Config, state: CarrierState) -> tuple[CorrectedRanges, CarrierState]:
     """Return the ranges with the cycle slips of all channels of their log."""
-    obs = ranges.observations
-    channels = {**glonass_channels(navigation), **obs.header.glonass_channel}
-    frequency = carrier_frequency_hz(obs.satellite, obs.signal, channels)
-    slips, after = find_slips(obs, state.slips, frequency_hz=frequency, limits=config.slips)
+    frequency = ranges.channels.every_frequency_hz
+    slips, after = find_slips(ranges.observations, state.slips, frequency_hz=frequency, limits=config.slips)
     return replace(ranges, slips=slips), replace(state, slips=after)
 
 

@@ -38,7 +38,10 @@ class Channels:
         Channels of one receiver clock.
     clocks : tuple of str
         Letter of each receiver clock.
+    clock : ndarray of str, shape (K,)
+        Letter of the receiver clock of each channel.
     frequency_hz : ndarray, shape (K,) [Hz]
+    every_frequency_hz : ndarray, shape (M,) [Hz]
     left_out : ndarray of int64, shape (M,)
         Reason of the channels that settings leave out, 0 for the others.
     member : ndarray of int64, shape (M, S)
@@ -50,7 +53,9 @@ class Channels:
     signal: Strings
     groups: tuple[slice, ...]
     clocks: tuple[str, ...]
+    clock: Strings
     frequency_hz: Floats
+    every_frequency_hz: Floats
     left_out: Integers
     member: Integers
 
@@ -92,14 +97,17 @@ class ChannelBook:
         left_out = np.where(np.isin(obs.system, systems), Reason.OTHER_SIGNAL_TAKEN, Reason.SYSTEM_NOT_SELECTED)
         left_out[columns] = Reason.USED
         names, which = np.unique(obs.satellite, return_inverse=True)
-        frequency = carrier_frequency_hz(satellite, signal, glonass)
+        frequency = carrier_frequency_hz(obs.satellite, obs.signal, glonass)
+        letters = [CLOCK_GROUP[name[0]] for name in satellite.tolist()]
         return Channels(
             columns=read_only(columns),
             satellite=read_only(satellite),
             signal=read_only(signal),
             groups=groups,
-            clocks=tuple(CLOCK_GROUP[str(satellite[group.start])[0]] for group in groups),
-            frequency_hz=read_only(frequency),
+            clocks=tuple(letters[group.start] for group in groups),
+            clock=read_only(np.array(letters, dtype="<U1")),
+            frequency_hz=read_only(frequency[columns]),
+            every_frequency_hz=read_only(frequency),
             left_out=read_only(left_out.astype(np.int64)),
             member=read_only((which[:, None] == np.arange(len(names))).astype(np.int64)),
         )

@@ -237,7 +237,6 @@ class EpochProcessor:
                 name,
                 observations[name],
                 together,
-                received,
                 state.antennas.get(name) or AntennaState(),
                 state.fusion.get(name) or self._before_filter,
                 sensors,

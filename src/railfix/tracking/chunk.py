@@ -120,7 +120,7 @@ def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> C
         apart=apart,
         satellite=epochs.satellite,
         slot=slot,
-        offset=np.array([CLOCKS.index(str(letter)) for letter in epochs.clock], dtype=np.intp),
+        offset=np.array([CLOCKS.index(letter) for letter in epochs.clock.tolist()], dtype=np.intp),
         sat_ecef_m=epochs.sat_ecef_m,
         sat_velocity_mps=epochs.sat_velocity_mps,
         before_ecef_m=before,
@@ -174,6 +174,8 @@ def _previous(epochs: GnssEpochs, previous: Previous | None) -> tuple[Floats, Fl
     """Phase and satellites of the epoch before the first, in the order of the channels."""
     size = len(epochs.satellite)
     phase, sat = np.full(size, np.nan), np.full((size, 3), np.nan)
+    if previous is not None and np.array_equal(epochs.satellite, previous.satellite):
+        return previous.phase_m, previous.sat_ecef_m
     if previous is not None:
         _, here, there = np.intersect1d(epochs.satellite, previous.satellite, return_indices=True)
         phase[here], sat[here] = previous.phase_m[there], previous.sat_ecef_m[there]
@@ -182,9 +184,9 @@ def _previous(epochs: GnssEpochs, previous: Previous | None) -> tuple[Floats, Fl
 
 def _with_satellites(state: TrackState, epochs: GnssEpochs, measured: Masks) -> Indices:
     """Give the state a place for the error of each satellite measured; return the place of each channel's."""
-    place = {str(name): k for k, name in enumerate(state.satellite)}
-    names = [str(name) for name in epochs.satellite]
-    new = [name for name in dict.fromkeys(np.array(names)[measured].tolist()) if name not in place]
+    place = {name: k for k, name in enumerate(state.satellite.tolist())}
+    names = epochs.satellite.tolist()
+    new = [name for name in dict.fromkeys(epochs.satellite[measured].tolist()) if name not in place]
     if new:
         state.rearrange(np.arange(len(state.satellite)), tuple(new))
         place |= {name: len(place) + k for k, name in enumerate(new)}

@@ -23,7 +23,7 @@ from railfix.tracking.epochs import GnssEpochs, SensorEpochs
 from railfix.tracking.filter import track
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
-from railfix.tracking.result import BOUNDED, Tracked
+from railfix.tracking.result import Tracked, is_bounded
 from railfix.tracking.state import TrackState
 from railfix.tracking.thinned import Since, thinned
 
@@ -75,7 +75,7 @@ def with_levels(
     """
     taken, some, sensed, since = thinned(epochs, sensors, state.since, limits.level_period_s)
     place, after = track(some, line, state.track, limits=limits, sensors=sensed, levels=True)
-    bounded = np.isin(place.status, BOUNDED)
+    bounded = is_bounded(place.status)
     columns = np.stack([getattr(place, name) for name in _KEPT], axis=1)
     columns[:, _KEPT.index("level_m")] = np.where(bounded, place.level_m, np.inf)
     number = np.searchsorted(taken, np.arange(len(epochs)), side="right")

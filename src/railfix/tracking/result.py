@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Integers
+from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks
 from railfix.tracking.bank import SCALE_BOUND, level_m, speed_bound_mps
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.robust import mean_weight
@@ -52,6 +52,12 @@ class TrackStatus(IntEnum):
 #: Statuses whose level bounds the error: beside the map, on one of several branches or on a track in doubt, no
 #: sub-filter does.
 BOUNDED: Final = (TrackStatus.TRACKING, TrackStatus.COASTING)
+_IS_BOUNDED: Final = np.array([status in BOUNDED for status in TrackStatus])
+
+
+def is_bounded(status: Codes) -> Masks:
+    """Return whether a status is one of `BOUNDED`, element by element."""
+    return np.asarray(_IS_BOUNDED[status])
 
 
 @dataclass(frozen=True, kw_only=True)

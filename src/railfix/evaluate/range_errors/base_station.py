@@ -91,7 +91,7 @@ def base_station(
     errors: list[dict[str, Floats]] = []
     for obs in parts:
         corrected = correct_ranges(obs, book.of(obs, received.navigation), config, received, AntennaRows.of(index))
-        corrected, state = with_slips(corrected, received.navigation, config, state)
+        corrected, state = with_slips(corrected, config, state)
         corrected, state = smoothed(corrected, config, state)
         phases |= bool(np.isfinite(obs.phase_cycles).any())
         distance, _ = range_with_rotation(corrected.satellites.position_ecef_m, position_ecef_m)

@@ -26,6 +26,7 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz
+from railfix.kernels import compiled_by
 from railfix.positioning.carrier.arcs import ChannelKeys, channel_keys, rows_before
 
 #: One millisecond as a distance [m]: the step of receivers that keep their clock near GPS time.
@@ -142,16 +143,6 @@ class Slips:
     half_cycle: Masks
 
 
-@dataclass(frozen=True)
-class _Changes:
-    """Changes into each epoch, shapes (T, M); dt of shape (T,)."""
-
-    dt: Floats
-    code: Floats
-    phase: Floats
-    range_mps: Floats
-
-
 def median_or_zero(values: Floats) -> Floats:
     """Median over the channels of each epoch, 0 where fewer than three have one; shape (T,)."""
     count = np.count_nonzero(np.isfinite(values), axis=1)
@@ -213,14 +204,14 @@ def find_slips(
     wavelength = SPEED_OF_LIGHT / frequency_hz
     phase, doppler = observations.phase_cycles * wavelength, observations.doppler_hz * wavelength
     times = np.concatenate([np.asarray([state.time], dtype="datetime64[ns]"), observations.time])
-    changes = _Changes(
-        dt=seconds(np.diff(times)),
-        code=observations.code_m - _before(observations.code_m, last["code_m"]),
-        phase=phase - _before(phase, last["phase_m"]),
-        range_mps=-0.5 * (doppler + _before(doppler, last["doppler_mps"])),
+    since, moved = seconds(np.diff(times)), phase - _before(phase, last["phase_m"])
+    step, lag_ms, doppler_metric, code_metric = slip_metrics(
+        since,
+        observations.code_m - _before(observations.code_m, last["code_m"]),
+        moved,
+        -0.5 * (doppler + _before(doppler, last["doppler_mps"])),
     )
-    step, lag_ms, doppler_metric, code_metric = _metrics(changes)
-    dt = np.where(np.isnan(changes.dt), 0.0, changes.dt)
+    dt = np.where(np.isnan(since), 0.0, since)
     doppler_limit = limits.doppler_m + limits.doppler_mps * dt + limits.jerk_mps3 * dt**3 / 12.0
     half = (observations.loss_of_lock & 2) > 0
     half_before = _before(half.astype(np.float64), last["half_cycle"])
@@ -229,7 +220,7 @@ def find_slips(
     has = np.isfinite(phase)
     reason = np.zeros(phase.shape, dtype=np.int64)
     for mask, bit in (
-        (np.isnan(changes.phase), SlipReason.FIRST),
+        (np.isnan(moved), SlipReason.FIRST),
         ((observations.loss_of_lock & 1) > 0, SlipReason.LOSS_OF_LOCK),
         (half != (half_before > 0), SlipReason.HALF_CYCLE),
         ((dt > limits.max_gap_s)[:, None], SlipReason.GAP),
@@ -264,20 +255,32 @@ def find_slips(
     return slips, after
 
 
-def _metrics(changes: _Changes) -> tuple[Floats, Integers, Floats, Floats]:
-    """Clock step of the codes, its whole milliseconds that phases lack, and the metrics of both tests."""
-    dt = changes.dt[:, None]
-    moved = np.where(np.isnan(changes.range_mps), 0.0, changes.range_mps) * dt
-    step = median_or_zero(changes.code - moved)
+@compiled_by("carrier")
+def slip_metrics(
+    dt: Floats, code_m: Floats, phase_m: Floats, range_mps: Floats
+) -> tuple[Floats, Integers, Floats, Floats]:
+    """Clock step of the codes, its whole milliseconds that phases lack, and the metrics of both tests.
+
+    Parameters
+    ----------
+    dt : ndarray, shape (T,) [s]
+        Since the epoch before.
+    code_m, phase_m : ndarray, shape (T, M) [m]
+        Changes since then.
+    range_mps : ndarray, shape (T, M) [m/s]
+        Range rate by the Dopplers.
+
+    Returns
+    -------
+    step_m : ndarray, shape (T,) [m]
+    lag_ms : ndarray of int, shape (T,)
+    doppler_metric_m, code_metric_m : ndarray, shape (T, M) [m]
+    """
+    moved = np.where(np.isnan(range_mps), 0.0, range_mps) * dt[:, None]
+    step = median_or_zero(code_m - moved)
     step = np.where(np.abs(step) > _CLOCK_STEP_M, step, 0.0)
-    apart = changes.code - changes.phase
+    apart = code_m - phase_m
     lag_ms = np.rint(median_or_zero(apart) / MILLISECOND_M).astype(np.int64)
     apart = apart - (lag_ms * MILLISECOND_M)[:, None]
-    true_dt = dt - (step / SPEED_OF_LIGHT)[:, None]
-    doppler = changes.phase - changes.range_mps * true_dt
-    return (
-        step,
-        lag_ms,
-        doppler - median_or_zero(doppler)[:, None],
-        apart - median_or_zero(apart)[:, None],
-    )
+    doppler = phase_m - range_mps * (dt - step / SPEED_OF_LIGHT)[:, None]
+    return step, lag_ms, doppler - median_or_zero(doppler)[:, None], apart - median_or_zero(apart)[:, None]
