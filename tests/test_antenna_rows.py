@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+import integrity_tables
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline import antenna_chunk
 from railfix.pipeline.config import Config, parse_config
+from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult, State
 from railfix.positioning.antenna_rows import EVERY, AntennaRows, joined, rows_of
 from railfix.positioning.section_search import SearchIndex
@@ -102,6 +104,26 @@ def _values(result: AntennaResult, name: str, channels: list[tuple[str, str]]) -
     return np.asarray(values[:, [own[key] for key in channels]])
 
 
+def _assert_same(parts: list[AntennaResult], expected: AntennaResult) -> None:
+    """Results epoch by epoch are those of a whole log."""
+    keys = list(zip(expected.satellite.tolist(), expected.signal.tolist(), strict=True))
+    for item in fields(AntennaResult):
+        values = getattr(expected, item.name)
+        if item.name in ("satellite", "signal", "columns", "clock_offset_m", "clock_offset_sigma_m"):
+            continue
+        if not isinstance(values, np.ndarray):
+            continue
+        got = np.concatenate([_values(part, item.name, keys) for part in parts])
+        if values.dtype == np.float64:
+            np.testing.assert_allclose(got, values, rtol=1e-9, atol=_SAME, err_msg=item.name)
+        else:
+            np.testing.assert_array_equal(got, values, err_msg=item.name)
+    assert expected.protection is not None
+    level = np.concatenate([part.protection.level.level_m for part in parts if part.protection is not None])
+    np.testing.assert_allclose(level, expected.protection.level.level_m, rtol=1e-7)
+    assert sum(int(part.raim.excluded.sum()) for part in parts) == int(expected.raim.excluded.sum())
+
+
 @pytest.mark.requirement("A8")
 @pytest.mark.parametrize("settings", SETTINGS)
 @pytest.mark.parametrize("channels", ["same channels", "signals of its own", "channels of its own"])
@@ -114,23 +136,27 @@ def test_rows_of_two_antennas_give_the_results_of_each_alone(settings: str, chan
     # One epoch, three, one, two; now and then the rear antenna has one less, or none.
     cut = _run(config, logs, time[np.cumsum([1, 3, 1, 2] * (len(time) // 7)) - 1] + after)
     for name, (expected,) in whole.items():
-        keys = list(zip(expected.satellite.tolist(), expected.signal.tolist(), strict=True))
-        for item in fields(AntennaResult):
-            values = getattr(expected, item.name)
-            if item.name in ("satellite", "signal", "columns", "clock_offset_m", "clock_offset_sigma_m"):
-                continue
-            if not isinstance(values, np.ndarray):
-                continue
-            got = np.concatenate([_values(part, item.name, keys) for part in cut[name]])
-            if values.dtype == np.float64:
-                np.testing.assert_allclose(got, values, rtol=1e-9, atol=_SAME, err_msg=item.name)
-            else:
-                np.testing.assert_array_equal(got, values, err_msg=item.name)
-        assert expected.protection is not None
-        level = np.concatenate([p.protection.level.level_m for p in cut[name] if p.protection is not None])
-        np.testing.assert_allclose(level, expected.protection.level.level_m, rtol=1e-7)
-        excluded = sum(int(part.raim.excluded.sum()) for part in cut[name])
-        assert excluded == int(expected.raim.excluded.sum())
+        _assert_same(cut[name], expected)
+
+
+@pytest.mark.requirement("A8")
+@pytest.mark.usefixtures("recordings")
+def test_recordings_as_two_receivers_give_the_results_of_each_alone() -> None:
+    """Each recording beside itself without every fifth satellite, epoch by epoch; outages, faults, places left open."""
+    for name, case in integrity_tables.cases().items():
+        if name == "demo":  # two antennas of one train are compared with each other
+            continue
+        obs = case.observations[:400]
+        logs = {"front": obs, "rear": _without(obs, tuple(sorted(set(obs.satellite.tolist()))[::5]))}
+        paths = dict.fromkeys(logs, case.trajectory)
+        processor = EpochProcessor(integrity_tables.SETTINGS, paths, navigation=case.navigation)
+        state, parts = State(), {name: list[AntennaResult]() for name in logs}
+        for epoch in range(len(obs)):
+            result, state = processor.process({n: log[epoch : epoch + 1] for n, log in logs.items()}, state)
+            for antenna, of_antenna in result.antennas.items():
+                parts[antenna].append(of_antenna)
+        for antenna, log in logs.items():
+            _assert_same(parts[antenna], processor.process({antenna: log})[0].antennas[antenna])
 
 
 @pytest.mark.requirement("A8")
