@@ -93,7 +93,7 @@ def allocate(
     """
     used = model.used
     if len(used) <= FEW:  # live, where the same satellites are used epoch after epoch
-        given = (used.tobytes(), out.tobytes(), sides.tobytes())
+        given = (used.tobytes(), out.tobytes(), (sides & used[:, None]).tobytes())
         return _of_few_epochs(_Same(risk), tuple(systems), *given, sides.shape[1], wrong_map)
     return _allocated(used, systems, risk, out, sides, wrong_map=wrong_map)
 
