@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from typing import Any
@@ -210,3 +212,26 @@ def test_rows_are_split_by_antenna() -> None:
     assert not list(alone.split(np.array([], dtype=np.intp)))
     arc = np.array([10.0, np.nan, 20.0, 30.0, 40.0])
     np.testing.assert_array_equal(both.at_arc(arc)[2:], paths["rear"].at_arc(arc[2:]))
+
+
+@pytest.mark.requirement("A7")
+@pytest.mark.parametrize("epochs", [1, 40])
+def test_chunks_are_freed_as_soon_as_they_are_done(monkeypatch: pytest.MonkeyPatch, epochs: int) -> None:
+    """Without a search for garbage: the arrays of a chunk would wait for it, and memory grow."""
+    made: list[weakref.ref[antenna_chunk.AntennaChunk]] = []
+    begin = antenna_chunk.AntennaChunk.__init__
+
+    def noted(chunk: antenna_chunk.AntennaChunk, *arguments: Any) -> None:
+        made.append(weakref.ref(chunk))
+        begin(chunk, *arguments)
+
+    monkeypatch.setattr(antenna_chunk.AntennaChunk, "__init__", noted)
+    logs, navigation, paths = _inputs()
+    processor = processor_of(parse_config({"filter": "track"}), navigation, paths)
+    gc.disable()
+    try:
+        processor.process({name: log[:epochs] for name, log in logs.items()})
+        assert len(made) == 2
+        assert [chunk() for chunk in made] == [None, None]
+    finally:
+        gc.enable()

@@ -76,12 +76,19 @@ class SolvedTogether:
         self._solution: Solution | None = None
         self._results: list[AntennaResult] = []
 
-    def add(self, chunk: AntennaChunk) -> tuple[CorrectedRanges, SearchIndex, slice]:
-        """Add the chunk of the next antenna; return its corrected ranges, search index and rows."""
-        k = len(self._chunks)
+    def add(self, chunk: AntennaChunk) -> tuple[int, CorrectedRanges]:
+        """Add the chunk of the next antenna; return its number and its corrected ranges."""
+        number = len(self._chunks)
         self._chunks.append(chunk)
-        rows = self._antennas.parts[k]
-        return rows_of(self._corrected, rows), self._antennas.indices[k], rows
+        return number, rows_of(self._corrected, self._antennas.parts[number])
+
+    def index(self, number: int) -> SearchIndex:
+        """Return the search index of the trajectory of a chunk."""
+        return self._antennas.indices[number]
+
+    def rows(self, number: int) -> slice:
+        """Return the rows of a chunk."""
+        return self._antennas.parts[number]
 
     def solution(self) -> Solution:
         """Return the positions of all chunks, which then have their new states; after the screens of all."""
@@ -97,16 +104,15 @@ class SolvedTogether:
                 chunk.take(self._corrected.reason[rows], self._solution.status[rows], state)
         return self._solution
 
-    def result(self, chunk: AntennaChunk) -> AntennaResult:
+    def result(self, number: int) -> AntennaResult:
         """Return the result of a chunk; after the last verdict on the status of any."""
         if not self._results:
-            chunks = self._chunks
-            status = np.concatenate([each.status for each in chunks]) if len(chunks) > 1 else chunk.status
-            solution = changed(self.solution(), status=status)
+            solution = changed(self.solution(), status=joined([chunk.status for chunk in self._chunks]))
             results = antenna_results(self._corrected, self._antennas, solution, self._config)
-            of_each = zip(chunks, self._antennas.parts, strict=True)
+            of_each = zip(self._chunks, self._antennas.parts, strict=True)
             self._results = [changed(rows_of(results, rows), screens=c.screened().screens) for c, rows in of_each]
-        return self._results[self._chunks.index(chunk)]
+            self._chunks.clear()  # each of them has this: arrays are freed as soon as the last one is done
+        return self._results[number]
 
 
 class AntennaChunk:
@@ -155,8 +161,9 @@ class AntennaChunk:
         curve = processor.setup.cn0_curve if "cn0" in self.config.screens else None
         self.notes = () if curve is None else tuple(f"{name}: {n}" for n in curve.notes_for(observations.header))
         self._sensors, self._together = sensors, together
-        corrected, index, self._rows = together.add(self)
-        self._trajectory, self._surroundings = index.trajectory, processor.surroundings(name, sensors)
+        self._number, corrected = together.add(self)
+        self._rows, self._trajectory = together.rows(self._number), together.index(self._number).trajectory
+        self._surroundings = processor.surroundings(name, sensors)
         self._ranges, self.state = self._screened(corrected, state, processor)
         self.status = np.zeros(0, dtype=np.int8)
         self._result: AntennaResult | None = None
@@ -207,7 +214,7 @@ class AntennaChunk:
 
     def filtered(self) -> FilteredMotion:
         """Filter along the track and return its places; NaN where the filter is off."""
-        result = self._result = self._together.result(self)
+        result = self._result = self._together.result(self._number)
         if self.config.filter == "off":
             nowhere = np.full(len(result), np.nan)
             return FilteredMotion(nowhere, nowhere, nowhere, nowhere)

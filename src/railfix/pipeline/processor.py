@@ -230,20 +230,21 @@ class EpochProcessor:
         sensors : SensorSamples, optional
         """
         received = state.received or self.received
-        groups = [tuple(observations)] if self._joinable(observations) else [(name,) for name in observations]
+        if self._joinable(observations):
+            together = dict.fromkeys(observations, self._corrected(observations, received))
+        else:
+            together = {name: self._corrected({name: own}, received) for name, own in observations.items()}
         return {
             name: AntennaChunk(
                 self,
                 name,
-                observations[name],
-                together,
+                own,
+                together[name],
                 state.antennas.get(name) or AntennaState(),
                 state.fusion.get(name) or self._before_filter,
                 sensors,
             )
-            for names in groups
-            for together in (self._corrected({name: observations[name] for name in names}, received),)
-            for name in names
+            for name, own in observations.items()
         }
 
     def _joinable(self, observations: Mapping[str, Observations]) -> bool:
