@@ -321,7 +321,7 @@ def track_of(
     if len(thinned.turns):
         notes.append(
             f"the path turns back at {len(thinned.turns)} point(s): where it lies beside itself, positions are "
-            "ambiguous and the filter may follow the wrong leg; give positions of one way"
+            "ambiguous and the filter may follow the wrong leg, so give positions of one way"
         )
     return Track.from_ecef(
         ecef_m[thinned.kept],
