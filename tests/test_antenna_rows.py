@@ -21,17 +21,20 @@ from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult, State
 from railfix.positioning.antenna_rows import EVERY, AntennaRows, joined, rows_of
 from railfix.positioning.section_search import SearchIndex
+from railfix.ranges.error_model import ErrorModel
 from railfix.run.processor import processor_of
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
+from test_pipeline_couplings import error_model
 
 #: Results are held to this, in metres and in sigmas; sums over channels in another order differ by less.
 _SAME = 1e-7
 SETTINGS: dict[str, dict[str, Any]] = {
     "all": {},
     "filter": {"filter": "track"},
+    "error model": {"protection": "on"},
     "few satellites": {"systems": ["G"], "elevation": {"mask_deg": 35.0}},
 }
 
@@ -84,9 +87,12 @@ def _missing(obs: Observations, every: int) -> Observations:
     return replace(obs, **{name: getattr(obs, name)[kept] for name in arrays})
 
 
-def _run(config: Config, logs: dict[str, Observations], ends: np.ndarray) -> dict[str, list[AntennaResult]]:
+def _run(
+    config: Config, logs: dict[str, Observations], ends: np.ndarray, model: ErrorModel | None
+) -> dict[str, list[AntennaResult]]:
     """Process the logs in chunks that end before some times."""
-    processor, state = processor_of(config, *_inputs()[1:]), State()
+    navigation, paths = _inputs()[1:]
+    processor, state = EpochProcessor(config, paths, navigation=navigation, error_model=model), State()
     found: dict[str, list[AntennaResult]] = {name: [] for name in logs}
     cuts = {name: [0, *np.searchsorted(log.time, ends).tolist()] for name, log in logs.items()}
     for k in range(len(ends)):
@@ -133,10 +139,10 @@ def test_rows_of_two_antennas_give_the_results_of_each_alone(settings: str, chan
     config, logs = parse_config(SETTINGS[settings]), _logs(channels)
     time = logs["front"].time
     logs["rear"] = _missing(logs["rear"], every=11)
-    after = np.timedelta64(50, "ms")
-    whole = _run(config, logs, time[-1:] + after)
+    after, model = np.timedelta64(50, "ms"), error_model(0.3) if settings == "error model" else None
+    whole = _run(config, logs, time[-1:] + after, model)
     # One epoch, three, one, two; now and then the rear antenna has one less, or none.
-    cut = _run(config, logs, time[np.cumsum([1, 3, 1, 2] * (len(time) // 7)) - 1] + after)
+    cut = _run(config, logs, time[np.cumsum([1, 3, 1, 2] * (len(time) // 7)) - 1] + after, model)
     for name, (expected,) in whole.items():
         _assert_same(cut[name], expected)
 
