@@ -436,13 +436,10 @@ def test_observations_of_old_kinds_are_named(tmp_path: Path) -> None:
         railfix.read_observations(tmp_path / "old.log")
 
 
-def test_messages_whose_masks_do_not_fit_are_counted() -> None:
-    """An MSM7 of 30 bytes whose masks are empty, parity right: no measurement, one broken message."""
-    payload = bytes([1077 >> 4, (1077 & 15) << 4]) + bytes(28)
-    body = np.frombuffer(b"\xd3" + len(payload).to_bytes(2, "big") + payload, np.uint8)
-    parity = int(crc24q(body, np.array([0]), np.array([len(body)]))[0])
-    piece, _ = decode(
-        body.tobytes() + parity.to_bytes(3, "big"), StreamState(time=np.datetime64("2025-08-11", "ns")), at_end=True
-    )
-    assert piece.measurements.skipped == {"broken MSM": 1}
+@pytest.mark.parametrize(("satellites", "what"), [(0, "MSM without satellites"), (1 << 63, "broken MSM")])
+def test_messages_without_measurements_are_counted(satellites: int, what: str) -> None:
+    """An MSM7 that names no satellite, as casters send them, and one with a satellite and no signal."""
+    message = rtcm_message([(1077, 12), (0, 61), (satellites, 64), (0, 103)])
+    piece, _ = decode(message, StreamState(time=np.datetime64("2025-08-11", "ns")), at_end=True)
+    assert piece.measurements.skipped == {what: 1}
     assert len(piece.measurements.code_m) == 0

@@ -218,6 +218,7 @@ def test_glonass_strings(seed: int) -> None:
         assert values[f"{letter}_acceleration"][0] * 1e3 == pytest.approx(ephemeris.acc[axis], rel=1e-12)
     assert values["relative_frequency"][0] == pytest.approx(ephemeris.gamn, rel=1e-12)
     assert values["tau_s"][0] == pytest.approx(ephemeris.taun, rel=1e-12)
+    assert (values["ln"][0], int(values["health"][0]) >> 2) == (ephemeris.svh >> 3 & 1, ephemeris.svh & 1)
 
 
 def array(rtk: Any, values: list[float]) -> Any:

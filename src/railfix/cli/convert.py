@@ -36,8 +36,8 @@ def convert(
 
     The kind of a log is detected from its content. UBX needs RXM-RAWX for observations and RXM-SFRBX for
     ephemerides; SBF MeasEpoch and raw navigation pages; RTCM 3 MSM4 to MSM7 and 1019, 1020, 1042,
-    1044, 1046. Skipped items (damaged bytes, unknown
-    signals, messages of other kinds) are counted and printed.
+    1044 to 1046. Skipped items (damaged bytes, unknown signals, messages of other kinds) are
+    counted and printed.
 
     Example: `railfix convert drive.ubx --out drive.rnx --nav-out drive.nav`
 

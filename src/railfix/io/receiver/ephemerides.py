@@ -24,8 +24,10 @@ from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_
 
 #: Galileo data source: I/NAV with clock and group delay E5b/E1, received on E1-B or on E5b-I.
 _E1B_SOURCE, _E5B_SOURCE = 1 << 0 | 1 << 9, 1 << 2 | 1 << 9
-#: Constellation of RTCM ephemeris messages; others (Galileo F/NAV, 1045) are counted.
-_RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1046: "E", 1020: "R"}
+#: Galileo data source: F/NAV with clock and group delay E5a/E1.
+_E5A_SOURCE: Final = 1 << 1 | 1 << 8
+#: Constellation of RTCM ephemeris messages.
+_RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1045: "E", 1046: "E", 1020: "R"}
 _UBX_E5B: Final = (5, 6)
 _SAME_STRINGS_S: Final = 15.0
 
@@ -34,8 +36,8 @@ _SAME_STRINGS_S: Final = 15.0
 class Unfinished:
     """What the subframes so far left.
 
-    `latest` has the fields of the latest subframe by satellite and number, with the time it was received; `issued` what
-    tells the last record of a satellite from the next.
+    `latest` has the fields of the latest subframe by satellite and number, with the time it was received; `issued`,
+    by satellite and message, what tells its last record from the next.
     """
 
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
@@ -73,22 +75,18 @@ def assembled_rtcm(
 ) -> tuple[Assembled, Unfinished]:
     """Ephemerides of RTCM 3 messages (`rtcm.ephemeris_fields`) received at times, shape (N,), repeated ones once."""
     builder = _Builder(state or Unfinished())
-    counts = Counter[str]()
     for (_, kind, values), at in zip(messages, time, strict=True):
-        letter = _RTCM_SYSTEMS.get(kind, "")
-        if not letter:
-            counts[f"RTCM {kind}"] += 1
-            continue
-        satellite = f"{letter}{int(values['number']):02d}"
-        builder.issue(satellite, _rtcm_record(satellite, values, at), at)
-    return builder.result(counts)
+        satellite = f"{_RTCM_SYSTEMS[kind]}{int(values['number']):02d}"
+        builder.issue(_rtcm_record(satellite, values, at), at)
+    return builder.result(Counter())
 
 
 def _rtcm_record(satellite: str, values: Values, time: np.datetime64) -> Record | None:
     """Record of one RTCM 3 ephemeris message."""
     match satellite[0]:
         case "E":
-            return galileo_record(satellite, {**values, "source": float(_E1B_SOURCE | _E5B_SOURCE)})
+            source = _E5A_SOURCE if "e5a_health" in values else _E1B_SOURCE | _E5B_SOURCE
+            return galileo_record(satellite, {**values, "source": float(source)})
         case "C":
             return beidou_record(satellite, "", values)
         case "R":
@@ -221,20 +219,21 @@ class _Builder:
             return
         make = {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}.get(letter)
         record = (make or (self._d2 if number > 100 else self._d1))(satellite, time)
-        self.issue(satellite, record, time)
+        self.issue(record, time)
 
-    def issue(self, satellite: str, record: Record | None, time: np.datetime64) -> None:
-        """Append a record, unless it is the satellite's last one again or cannot be."""
+    def issue(self, record: Record | None, time: np.datetime64) -> None:
+        """Append a record, unless it is the satellite's last one of that message again or cannot be."""
         if record is None:
             return
         raw, issue = record
-        if self.issued.get(satellite) == issue:
+        of_message = f"{raw.satellite} {raw.message}".rstrip()
+        if self.issued.get(of_message) == issue:
             return
         fault = first_fault(raw)
         if fault is not None:
             self.rejected.append((raw, fault[1].split(" is ")[0]))
             return
-        self.issued[satellite] = issue
+        self.issued[of_message] = issue
         self.records.append(raw)
         self.times.append(time)
 

@@ -190,6 +190,6 @@ def read_receiver_navigation(paths: Iterable[FilePath], *, date: np.datetime64 |
     if not whole.records:
         raise InputFileError(
             ", ".join(names),
-            "holds no whole ephemeris (UBX RXM-SFRBX, SBF raw navigation pages, RTCM 3 1019, 1020, 1042, 1044, 1046)",
+            "holds no whole ephemeris (UBX RXM-SFRBX, SBF raw navigation pages, RTCM 3 1019, 1020, 1042, 1044 to 1046)",
         )
     return navigation_of(whole, sources=names)

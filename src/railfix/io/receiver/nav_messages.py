@@ -223,6 +223,7 @@ GLONASS: Final[dict[int, dict[str, Field]]] = {
     },
     3: {
         "relative_frequency": (6, 11, 2.0**-40, "m"),
+        "ln": (20, 1, 1.0, "u"),
         "z_velocity": (21, 24, 2.0**-20, "m"),
         "z_acceleration": (45, 5, 2.0**-30, "m"),
         "z": (50, 27, 2.0**-11, "m"),

@@ -44,11 +44,13 @@ def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record | 
 
 
 def galileo_record(satellite: str, values: Values) -> Record:
-    """Record of Galileo I/NAV from the fields of its words 1 to 5, or of RTCM 1046."""
+    """Record of Galileo: I/NAV from the fields of its words 1 to 5 or of RTCM 1046, F/NAV from those of RTCM 1045."""
     week = int(values["week"]) + _GALILEO_WEEK_MINUS_GPS
     epoch = nearest_week(values["toc_s"], from_week(week, values.get("tow_s", values["toe_sow_s"])))
-    health = int(values["e5b_health"]) << 7 | int(values["e5b_invalid"]) << 6
-    health |= int(values["e1b_health"]) << 1 | int(values["e1b_invalid"])
+    health = 0
+    for signal, bit in (("e5b", 6), ("e5a", 3), ("e1b", 0)):  # as RINEX packs them
+        if f"{signal}_health" in values:
+            health |= int(values[f"{signal}_health"]) << bit + 1 | int(values[f"{signal}_invalid"]) << bit
     numbers = {
         **values,
         "iode": values["iod"],
@@ -58,7 +60,8 @@ def galileo_record(satellite: str, values: Values) -> Record:
         "transmitted": values.get("tow_s", np.nan),
         "week": float(week),
     }
-    return _raw(satellite, "INAV", epoch, numbers), (*_issue(values, "iod", "toe_sow_s", "source"), float(health))
+    message = "FNAV" if "e5a_health" in values else "INAV"
+    return _raw(satellite, message, epoch, numbers), (*_issue(values, "iod", "toe_sow_s", "source"), float(health))
 
 
 def beidou_record(satellite: str, message: str, values: Values) -> Record | None:
@@ -89,11 +92,12 @@ def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Recor
     _, message_time = to_week(frame)
     numbers = {
         **values,
+        "health": float(bool(values["health"]) or bool(values["ln"])),  # either stops the use (ICD, 4.4, B_n and l_n)
         "clock_bias": -values["tau_s"],
         "message_time": float(message_time),
         "frequency_channel": values["channel"],
     }
-    issue = (*_issue(values, "tb_s", "health"), float(epoch.astype(np.int64)))
+    issue = (*_issue(values, "tb_s", "health", "ln"), float(epoch.astype(np.int64)))
     return _raw(satellite, "", epoch, numbers), issue
 
 

@@ -99,15 +99,15 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
     The messages carry the time of week only: `near` is a time within half a week of the log, GPS time; NaT gives none.
     Phases of GLONASS are in metres: without a channel in the message, or before it, they have no cycles.
     """
-    messages = len(frames.of("rtcm3", *MSM_NUMBERS))
+    messages = frames.of("rtcm3", *MSM_NUMBERS)
     parts = [
         (order, rows, np.full(len(order), SYSTEMS[number // 10] == "R"))
         for number in (() if np.isnat(near) else MSM_NUMBERS)
         for order, rows in _of_number(frames, number, near, channels)
     ]
     if not parts:
-        what = UNDATED if np.isnat(near) else "broken MSM"
-        return replace(_no_measurements(), skipped={what: messages} if messages else {})
+        undated = {UNDATED: len(messages)} if len(messages) else {}
+        return replace(_no_measurements(), skipped=undated if np.isnat(near) else _without_use(frames, messages, 0))
     order = np.concatenate([order for order, _, _ in parts])
     rows = joined([rows for _, rows, _ in parts])
     # Messages of one instant become one epoch; instants stay in the order of the stream.
@@ -116,14 +116,22 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
     starts = np.concatenate([[True], time[1:] != time[:-1]])
     epoch_of = np.empty(len(order), dtype=np.intp)
     epoch_of[by_stream] = np.cumsum(starts) - 1
-    broken = messages - len(order)  # masks or length that do not fit
     return Measurements(
         **{name: getattr(rows, name) for name in _ROW_NAMES},
         time=time[starts],
         epoch=epoch_of[rows.epoch],
         receiver="RTCM 3",
-        skipped={"broken MSM": broken} if broken else {},
+        skipped=_without_use(frames, messages, len(order)),
     )
+
+
+def _without_use(frames: Frames, messages: Indices, used: int) -> dict[str, int]:
+    """Counts of multiple signal messages that give nothing: empty ones, or of masks or a length that do not fit."""
+    if len(messages) == used:
+        return {}
+    empty = int(np.count_nonzero(~bits_of(frames, messages, 137)[:, 73:137].any(axis=1)))
+    counts = {"MSM without satellites": empty, "broken MSM": len(messages) - used - empty}
+    return {what: number for what, number in counts.items() if number}
 
 
 def _glonass_days(time: Datetimes, glonass: Masks) -> Datetimes:

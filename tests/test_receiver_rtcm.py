@@ -1,0 +1,132 @@
+"""Ephemeris messages of RTCM 3 with random contents, decoded here and by RTKLIB (pyrtklib5)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from railfix.gnss.navigation import Navigation
+from railfix.io.receiver.ephemerides import navigation_of
+from railfix.io.receiver.log import StreamState, decode
+from railfix.io.receiver.rtcm import EPHEMERIDES
+from test_receiver_logs import rtcm_message
+
+pytestmark = pytest.mark.requirement("A8")
+
+TIME = np.datetime64("2023-08-17T02:00", "ns")
+GPS_WEEK = 2275
+WEEK = np.datetime64("2023-08-13", "ns")
+#: Names of RTKLIB's ephemeris by the fields of records.
+NAMES = {
+    "af0_s": "f0", "af1": "f1", "af2": "f2", "eccentricity": "e", "m0": "M0", "delta_n": "deln", "omega0": "OMG0",
+    "i0": "i0", "omega": "omg", "omega_dot": "OMGd", "i_dot": "idot", "cuc": "cuc", "cus": "cus", "crc": "crc",
+    "crs": "crs", "cic": "cic", "cis": "cis", "toe_sow_s": "toes", "health": "svh", "iode": "iode",
+}  # fmt: skip
+#: Letter and name of the system, and message of the records, by the number of the message.
+KINDS = {
+    1019: ("G", "SYS_GPS", "LNAV"),
+    1044: ("J", "SYS_QZS", "LNAV"),
+    1042: ("C", "SYS_CMP", "D1"),
+    1045: ("E", "SYS_GAL", "FNAV"),
+    1046: ("E", "SYS_GAL", "INAV"),
+}
+WEEKS = {k: GPS_WEEK - {"G": 2048, "J": 2048, "C": 1356, "E": 1024}[letter] for k, (letter, _, _) in KINDS.items()}
+#: Bits of a message with fields behind those that are read.
+LENGTHS = {1020: 360}
+#: Units of toc and toe.
+UNIT_S = {1019: 16, 1044: 16, 1042: 8, 1045: 60, 1046: 60}
+
+
+def message(kind: int, seed: int, chosen: dict[str, int]) -> bytes:
+    """A message of random fields but for those that are chosen, and those that an orbit limits."""
+    rng = np.random.default_rng([kind, seed])
+    drift = int(rng.integers(-(2**21), 2**21)) % 2**24  # of the node: RINEX files have no faster one
+    chosen = {"eccentricity": 2**26 + seed, "sqrt_a": 5400 * 2**19 + seed, "omega_dot": drift, **chosen}
+    fields = [(kind, 12)]
+    for name, (_, length, _, _) in EPHEMERIDES[kind].items():
+        fields.append((chosen.get(name, int(rng.integers(0, 1 << length))), length))
+    missing = LENGTHS.get(kind, 0) - sum(length for _, length in fields)
+    return rtcm_message([*fields, (0, max(missing, 0))])
+
+
+def read_here(*messages: bytes) -> Navigation:
+    piece, _ = decode(b"".join(messages), StreamState(time=TIME), at_end=True)
+    return navigation_of(piece.ephemerides)
+
+
+def rtklib() -> tuple[Any, Any]:
+    rtk = pytest.importorskip("pyrtklib5", reason="the independent decoder is not installed")
+    rtcm = rtk.rtcm_t()
+    rtk.init_rtcm(rtcm)
+    day = rtk.Arr1Ddouble(6)
+    for k, value in enumerate([2023, 8, 17, 2, 0, 0]):
+        day[k] = value
+    rtcm.time = rtk.epoch2time(day)
+    return rtk, rtcm
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("number", list(KINDS))
+def test_ephemeris(number: int, seed: int) -> None:
+    letter, system, kind = KINDS[number]
+    slot = 7
+    tow = 4 * 86_400 // UNIT_S[number]
+    sent = message(number, seed, {"number": slot, "week": WEEKS[number], "toc_s": tow, "toe_sow_s": tow})
+    rtk, rtcm = rtklib()
+    results = [rtk.input_rtcm3(rtcm, octet) for octet in sent]
+    assert results[-1] == 2
+    prn = slot + 192 if letter == "J" else slot
+    satellite = rtk.satno(getattr(rtk, system), prn)
+    theirs = rtcm.nav.eph[satellite - 1 + (rtk.MAXSAT if kind == "FNAV" else 0)]
+    assert theirs.sat == satellite
+    records = read_here(sent).kepler
+    assert records.satellite.tolist() == [f"{letter}{slot:02d}"]
+    assert records.message.tolist() == [kind]
+    for name, other in NAMES.items():
+        assert float(getattr(records, name)[0]) == pytest.approx(float(getattr(theirs, other)), rel=1e-14), name
+    assert records.sqrt_a[0] ** 2 == pytest.approx(theirs.A, rel=1e-14)
+    assert records.group_delay_1_s[0] == pytest.approx(theirs.tgd[0], rel=1e-14)
+    if number in (1042, 1046):
+        assert records.group_delay_2_s[0] == pytest.approx(theirs.tgd[1], rel=1e-14)
+    elif letter in "GJ":
+        assert records.iodc[0] == theirs.iodc
+    else:
+        assert np.isnan(records.group_delay_2_s[0])
+    for name in ("toe", "toc"):
+        seconds = rtk.timediff(getattr(theirs, name), rtk.gpst2time(GPS_WEEK, 0.0))
+        since = (getattr(records, name)[0] - WEEK) / np.timedelta64(1, "s")
+        assert since == seconds == 4 * 86_400 + (14 if letter == "C" else 0), name
+
+
+def test_galileo_sends_both_messages_in_turn() -> None:
+    """F/NAV and I/NAV of one satellite are two records, each taken once."""
+    chosen = {"number": 7, "week": WEEKS[1045], "toc_s": 5760, "toe_sow_s": 5760}
+    both = [message(kind, 0, chosen) for kind in (1045, 1046)]
+    navigation = read_here(*both, *both, *both)
+    assert navigation.kepler.satellite.tolist() == ["E07", "E07"]
+    assert sorted(navigation.kepler.message.tolist()) == ["FNAV", "INAV"]
+    assert not navigation.skipped
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_glonass_ephemeris(seed: int) -> None:
+    place = {name: km * 2**11 + seed for name, km in (("x", 15_000), ("y", 12_000), ("z", 17_000))}
+    of_day = {"hour": 4, "minute": 15, "half_minute": 0, "tb_s": 18}
+    sent = message(1020, seed, {"number": 5, "channel": 4, "p": 0, **place, **of_day})
+    rtk, rtcm = rtklib()
+    assert [rtk.input_rtcm3(rtcm, octet) for octet in sent][-1] == 2
+    theirs = rtcm.nav.geph[4]
+    records = read_here(sent).glonass
+    assert records.satellite.tolist() == ["R05"]
+    for k in range(3):
+        assert records.position_ecef_m[0, k] == pytest.approx(theirs.pos[k], rel=1e-14)
+        assert records.velocity_ecef_mps[0, k] == pytest.approx(theirs.vel[k], rel=1e-14)
+        assert records.acceleration_ecef_mps2[0, k] == pytest.approx(theirs.acc[k], rel=1e-14, abs=1e-20)
+    assert records.clock_bias_s[0] == pytest.approx(-theirs.taun, rel=1e-14)  # a clock that is slow has tau > 0
+    assert records.relative_frequency[0] == pytest.approx(theirs.gamn, rel=1e-14)
+    assert records.frequency_channel[0] == theirs.frq == -3
+    assert records.health[0] == bool(theirs.svh & 0b1001)  # B_n and l_n; the others are of the almanac
+    seconds = rtk.timediff(theirs.toe, rtk.gpst2time(GPS_WEEK, 0.0))
+    assert (records.toe[0] - WEEK) / np.timedelta64(1, "s") == pytest.approx(seconds)
