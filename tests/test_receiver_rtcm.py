@@ -85,11 +85,13 @@ def test_ephemeris(number: int, seed: int) -> None:
     assert records.satellite.tolist() == [f"{letter}{slot:02d}"]
     assert records.message.tolist() == [kind]
     for name, other in NAMES.items():
-        assert float(getattr(records, name)[0]) == pytest.approx(float(getattr(theirs, other)), rel=1e-14), name
-    assert records.sqrt_a[0] ** 2 == pytest.approx(theirs.A, rel=1e-14)
-    assert records.group_delay_1_s[0] == pytest.approx(theirs.tgd[0], rel=1e-14)
+        assert float(getattr(records, name)[0]) == pytest.approx(float(getattr(theirs, other)), rel=1e-14, abs=0.0), (
+            name
+        )
+    assert records.sqrt_a[0] ** 2 == pytest.approx(theirs.A, rel=1e-14, abs=0.0)
+    assert records.group_delay_1_s[0] == pytest.approx(theirs.tgd[0], rel=1e-14, abs=0.0)
     if number in (1042, 1046):
-        assert records.group_delay_2_s[0] == pytest.approx(theirs.tgd[1], rel=1e-14)
+        assert records.group_delay_2_s[0] == pytest.approx(theirs.tgd[1], rel=1e-14, abs=0.0)
     elif letter in "GJ":
         assert records.iodc[0] == theirs.iodc
     else:
@@ -121,11 +123,11 @@ def test_glonass_ephemeris(seed: int) -> None:
     records = read_here(sent).glonass
     assert records.satellite.tolist() == ["R05"]
     for k in range(3):
-        assert records.position_ecef_m[0, k] == pytest.approx(theirs.pos[k], rel=1e-14)
-        assert records.velocity_ecef_mps[0, k] == pytest.approx(theirs.vel[k], rel=1e-14)
+        assert records.position_ecef_m[0, k] == pytest.approx(theirs.pos[k], rel=1e-14, abs=0.0)
+        assert records.velocity_ecef_mps[0, k] == pytest.approx(theirs.vel[k], rel=1e-14, abs=0.0)
         assert records.acceleration_ecef_mps2[0, k] == pytest.approx(theirs.acc[k], rel=1e-14, abs=1e-20)
-    assert records.clock_bias_s[0] == pytest.approx(-theirs.taun, rel=1e-14)  # a clock that is slow has tau > 0
-    assert records.relative_frequency[0] == pytest.approx(theirs.gamn, rel=1e-14)
+    assert records.clock_bias_s[0] == pytest.approx(-theirs.taun, rel=1e-14, abs=0.0)  # tau of a slow clock > 0
+    assert records.relative_frequency[0] == pytest.approx(theirs.gamn, rel=1e-14, abs=0.0)
     assert records.frequency_channel[0] == theirs.frq == -3
     assert records.health[0] == bool(theirs.svh & 0b1001)  # B_n and l_n; the others are of the almanac
     seconds = rtk.timediff(theirs.toe, rtk.gpst2time(GPS_WEEK, 0.0))
