@@ -11,7 +11,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.io.receiver.ephemerides import navigation_of
 from railfix.io.receiver.log import StreamState, decode
 from railfix.io.receiver.rtcm import EPHEMERIDES
-from test_receiver_logs import rtcm_message
+from test_receiver_logs import msm4, rtcm_message
 
 pytestmark = pytest.mark.requirement("A8")
 
@@ -132,3 +132,22 @@ def test_glonass_ephemeris(seed: int) -> None:
     assert records.health[0] == bool(theirs.svh & 0b1001)  # B_n and l_n; the others are of the almanac
     seconds = rtk.timediff(theirs.toe, rtk.gpst2time(GPS_WEEK, 0.0))
     assert (records.toe[0] - WEEK) / np.timedelta64(1, "s") == pytest.approx(seconds)
+
+
+def test_ten_days_in_one_piece() -> None:
+    """An epoch an hour over two ends of weeks, with a GLONASS ephemeris each day, of 1:15 UTC."""
+    hours = 4 * 24 + 2 + np.arange(240)  # TIME is 2:00 on a Thursday
+    parts, days = [], []
+    for hour in hours.tolist():
+        tow_ms = hour * 3_600_000
+        glonass = (hour // 24 % 7) << 27 | (tow_ms + 18_000_000 - 18_000 - 7_200_000) % 86_400_000
+        parts += [msm4(1074, tow_ms % 604_800_000), msm4(1084, glonass), msm4(1124, (tow_ms - 14_000) % 604_800_000)]
+        if hour % 24 == 1:
+            place = {"x": 15_000 * 2**11, "y": 12_000 * 2**11, "z": 17_000 * 2**11, "number": 5, "channel": 4}
+            parts.append(message(1020, 0, {**place, "hour": 4, "minute": 13, "half_minute": 0, "tb_s": 17}))
+            days.append(WEEK + np.timedelta64(hour // 24, "D"))
+    piece, _ = decode(b"".join(parts), StreamState(time=TIME), at_end=True)
+    assert piece.measurements.time.tolist() == (WEEK + hours * np.timedelta64(3600, "s")).astype("M8[ns]").tolist()
+    assert not piece.measurements.skipped
+    toe = navigation_of(piece.ephemerides).glonass.toe
+    assert toe.tolist() == (np.array(days) + np.timedelta64(75 * 60 + 18, "s")).astype("M8[ns]").tolist()

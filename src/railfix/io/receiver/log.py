@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes
+from railfix.core.arrays import Datetimes, Integers
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, open_stream
 from railfix.gnss.navigation import Navigation
@@ -65,11 +65,11 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
     raw = _raw_measurements(frames)
     time = raw.time[0] if np.isnat(state.time) and len(raw.time) else state.time
     channels = rtcm.glonass_channels(frames, state.glonass_channels)
-    msm = rtcm.msm_measurements(frames, time, channels)
+    msm, msm_at = rtcm.msm_measurements(frames, time, channels)
     parts = [part for part in (raw, msm) if len(part.time) or part.skipped]
     measurements = joined(parts) if parts else raw
     measurements = replace(measurements, skipped={**measurements.skipped, **_of_old_kinds(frames)})
-    records, sbas, subframes, messages = _navigation(frames, raw, state)
+    records, sbas, subframes, messages = _navigation(frames, raw, (msm.time, msm_at), state)
     last = measurements.time[-1] if len(measurements.time) else time
     piece = Piece(
         measurements=measurements,
@@ -103,9 +103,9 @@ def _raw_measurements(frames: Frames) -> Measurements:
 
 
 def _navigation(
-    frames: Frames, raw: Measurements, state: StreamState
+    frames: Frames, raw: Measurements, msm: tuple[Datetimes, Integers], state: StreamState
 ) -> tuple[Assembled, SbasFrames, Unfinished, Unfinished]:
-    """Ephemerides and SBAS messages of a block."""
+    """Ephemerides and SBAS messages of a block; `msm` has times and places of epochs of RTCM 3."""
     subframes = joined_subframes(ubx.sfrbx_subframes(frames), sbf.navigation_subframes(frames))
     blocks = frames.of("ubx", ubx.RXM_RAWX)
     epochs_at = frames.frame_start[blocks if len(blocks) else frames.of("sbf", sbf.MEAS_EPOCH)]
@@ -113,7 +113,8 @@ def _navigation(
     received = _time_at(subframes.order, epochs_at, raw.time, state.time)
     first, unfinished = assembled(subframes, received, state.subframes)
     messages = sorted(rtcm.ephemeris_fields(frames))
-    at = _time_at(np.array([m[0] for m in messages], dtype=np.int64), epochs_at, raw.time, state.time)
+    times, places = (raw.time, epochs_at) if len(raw.time) else msm
+    at = _time_at(np.array([m[0] for m in messages], dtype=np.int64), places, times, state.time)
     second, issued = assembled_rtcm(messages, at, state.messages)
     return merged([first, second]), sbas_frames(subframes, received), unfinished, issued
 

@@ -93,10 +93,11 @@ def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
     return ChannelNews(*(np.concatenate(parts) for parts in zip(known, new, strict=True)))
 
 
-def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews) -> Measurements:
-    """Measurements of all MSM4 to MSM7 messages; messages of one instant make one epoch.
+def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews) -> tuple[Measurements, Integers]:
+    """Measurements of all MSM4 to MSM7 messages, and where in the stream each epoch begins.
 
-    The messages carry the time of week only: `near` is a time within half a week of the log, GPS time; NaT gives none.
+    Messages of one instant make one epoch. They carry the time of week only: `near` is a time within half a week of the
+    first message, GPS time; NaT gives none. Every other message is within half a week of the one before it.
     Phases of GLONASS are in metres: without a channel in the message, or before it, they have no cycles.
     """
     messages = frames.of("rtcm3", *MSM_NUMBERS)
@@ -107,22 +108,25 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
     ]
     if not parts:
         undated = {UNDATED: len(messages)} if len(messages) else {}
-        return replace(_no_measurements(), skipped=undated if np.isnat(near) else _without_use(frames, messages, 0))
+        skipped = undated if np.isnat(near) else _without_use(frames, messages, 0)
+        return replace(_no_measurements(), skipped=skipped), np.zeros(0, dtype=np.int64)
     order = np.concatenate([order for order, _, _ in parts])
     rows = joined([rows for _, rows, _ in parts])
     # Messages of one instant become one epoch; instants stay in the order of the stream.
     by_stream = np.argsort(order, kind="stable")
-    time = _glonass_days(rows.time[by_stream], np.concatenate([g for _, _, g in parts])[by_stream])
+    glonass = np.concatenate([g for _, _, g in parts])[by_stream]
+    time = _glonass_days(_weeks(rows.time[by_stream], glonass), glonass)
     starts = np.concatenate([[True], time[1:] != time[:-1]])
     epoch_of = np.empty(len(order), dtype=np.intp)
     epoch_of[by_stream] = np.cumsum(starts) - 1
-    return Measurements(
+    measurements = Measurements(
         **{name: getattr(rows, name) for name in _ROW_NAMES},
         time=time[starts],
         epoch=epoch_of[rows.epoch],
         receiver="RTCM 3",
         skipped=_without_use(frames, messages, len(order)),
     )
+    return measurements, order[by_stream][starts]
 
 
 def _without_use(frames: Frames, messages: Indices, used: int) -> dict[str, int]:
@@ -132,6 +136,16 @@ def _without_use(frames: Frames, messages: Indices, used: int) -> dict[str, int]
     empty = int(np.count_nonzero(~bits_of(frames, messages, 137)[:, 73:137].any(axis=1)))
     counts = {"MSM without satellites": empty, "broken MSM": len(messages) - used - empty}
     return {what: number for what, number in counts.items() if number}
+
+
+def _weeks(time: Datetimes, glonass: Masks) -> Datetimes:
+    """Move times by whole weeks to within half a week of the message before; GLONASS counts where it is alone."""
+    counted = np.flatnonzero(~glonass) if not glonass.all() else np.arange(len(time))
+    week = np.timedelta64(7, "D").astype("timedelta64[ns]")
+    moved = time.copy()
+    steps = np.rint(np.diff(time[counted]) / week).astype(np.int64)
+    moved[counted[1:]] -= np.cumsum(steps) * week
+    return moved
 
 
 def _glonass_days(time: Datetimes, glonass: Masks) -> Datetimes:
