@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import railfix
+from railfix.core.errors import InputFileError
 from railfix.gnss.navigation import Navigation
 from railfix.io.receiver.ephemerides import navigation_of
 from railfix.io.receiver.log import StreamState, decode
@@ -51,19 +54,16 @@ def message(kind: int, seed: int, chosen: dict[str, int]) -> bytes:
     return rtcm_message([*fields, (0, max(missing, 0))])
 
 
-def read_here(*messages: bytes) -> Navigation:
-    piece, _ = decode(b"".join(messages), StreamState(time=TIME), at_end=True)
+def read_here(*messages: bytes, time: np.datetime64 = TIME) -> Navigation:
+    piece, _ = decode(b"".join(messages), StreamState(time=time), at_end=True)
     return navigation_of(piece.ephemerides)
 
 
-def rtklib() -> tuple[Any, Any]:
+def rtklib(time: np.datetime64 = TIME) -> tuple[Any, Any]:
     rtk = pytest.importorskip("pyrtklib5", reason="the independent decoder is not installed")
     rtcm = rtk.rtcm_t()
     rtk.init_rtcm(rtcm)
-    day = rtk.Arr1Ddouble(6)
-    for k, value in enumerate([2023, 8, 17, 2, 0, 0]):
-        day[k] = value
-    rtcm.time = rtk.epoch2time(day)
+    rtcm.time = rtk.gpst2time(GPS_WEEK, float((time - WEEK) / np.timedelta64(1, "s")))
     return rtk, rtcm
 
 
@@ -100,6 +100,41 @@ def test_ephemeris(number: int, seed: int) -> None:
         seconds = rtk.timediff(getattr(theirs, name), rtk.gpst2time(GPS_WEEK, 0.0))
         since = (getattr(records, name)[0] - WEEK) / np.timedelta64(1, "s")
         assert since == seconds == 4 * 86_400 + (14 if letter == "C" else 0), name
+
+
+@pytest.mark.parametrize("number", list(KINDS))
+@pytest.mark.parametrize(("received_s", "week", "toe_s"), [(604_200, 0, 0), (604_200, 0, 603_600), (900, 1, 603_600)])
+def test_ephemeris_at_the_end_of_a_week(number: int, received_s: int, week: int, toe_s: int) -> None:
+    """Messages name the week of their transmission, which is not that of toe: by hand, and by RTKLIB."""
+    time = WEEK + np.timedelta64(received_s + 604_800 * week, "s")
+    toe = toe_s // UNIT_S[number]
+    sent = message(number, 0, {"number": 7, "week": WEEKS[number] + week, "toc_s": toe, "toe_sow_s": toe})
+    letter, system, kind = KINDS[number]
+    expected = toe * UNIT_S[number] + (604_800 if toe_s == 0 else 0) + (14 if letter == "C" else 0)
+    records = read_here(sent, time=time).kepler
+    assert [(records.toe[0] - WEEK) / np.timedelta64(1, "s"), (records.toc[0] - WEEK) / np.timedelta64(1, "s")] == (
+        [expected] * 2
+    )
+    rtk, rtcm = rtklib(time)
+    assert [rtk.input_rtcm3(rtcm, octet) for octet in sent][-1] == 2
+    satellite = rtk.satno(getattr(rtk, system), 7 + (192 if letter == "J" else 0))
+    theirs = rtcm.nav.eph[satellite - 1 + (rtk.MAXSAT if kind == "FNAV" else 0)]
+    assert rtk.timediff(theirs.toe, rtk.gpst2time(GPS_WEEK, 0.0)) == expected
+
+
+def test_satellites_without_a_date_are_named(tmp_path: Path) -> None:
+    """GPS and GLONASS carry no full date; Galileo does."""
+    chosen = {"number": 7, "toc_s": 5400, "toe_sow_s": 5400}
+    gps, galileo = message(1019, 0, {**chosen, "week": WEEKS[1019]}), message(1046, 0, {**chosen, "week": WEEKS[1046]})
+    path = tmp_path / "caster.rtcm3"
+    path.write_bytes(gps + galileo)
+    navigation = railfix.read_navigation(path)
+    assert navigation.kepler.satellite.tolist() == ["E07"]
+    assert navigation.notes == (f"{path}: the ephemerides of G07 carry no full date; give one with --date: left out",)
+    assert railfix.read_navigation(path, date="2023-08-17").kepler.satellite.tolist() == ["G07", "E07"]
+    path.write_bytes(gps)
+    with pytest.raises(InputFileError, match="the ephemerides of G07 carry no full date; give one with --date"):
+        railfix.read_navigation(path)
 
 
 def test_galileo_sends_both_messages_in_turn() -> None:

@@ -49,6 +49,7 @@ class Assembled:
     """Records of a piece of a stream, in the order in which they became complete.
 
     `complete_at` is the receiver's time of the subframe that completed each; NaT before the receiver knew the time.
+    `undated` are the satellites with an ephemeris whose date was not known.
     """
 
     records: tuple[RawRecord, ...]
@@ -56,6 +57,7 @@ class Assembled:
     klobuchar: Mapping[str, np.ndarray]
     leap_seconds: int | None
     skipped: Mapping[str, int]
+    undated: frozenset[str] = frozenset()
 
 
 def assembled(subframes: Subframes, time: Datetimes, state: Unfinished | None = None) -> tuple[Assembled, Unfinished]:
@@ -77,7 +79,8 @@ def assembled_rtcm(
     builder = _Builder(state or Unfinished())
     for (_, kind, values), at in zip(messages, time, strict=True):
         satellite = f"{_RTCM_SYSTEMS[kind]}{int(values['number']):02d}"
-        builder.issue(_rtcm_record(satellite, values, at), at)
+        if not builder.needs_date(satellite, at):
+            builder.issue(_rtcm_record(satellite, values, at), at)
     return builder.result(Counter())
 
 
@@ -86,9 +89,9 @@ def _rtcm_record(satellite: str, values: Values, time: np.datetime64) -> Record 
     match satellite[0]:
         case "E":
             source = _E5A_SOURCE if "e5a_health" in values else _E1B_SOURCE | _E5B_SOURCE
-            return galileo_record(satellite, {**values, "source": float(source)})
+            return galileo_record(satellite, {**values, "source": float(source)}, time)
         case "C":
-            return beidou_record(satellite, "", values)
+            return beidou_record(satellite, "", values, time)
         case "R":
             return glonass_record(satellite, {**values, "channel": values["channel"] - 7}, time)
     return gps_record(satellite, values, time)
@@ -195,8 +198,16 @@ class _Builder:
         self.records: list[RawRecord] = []
         self.times: list[np.datetime64] = []
         self.rejected: list[tuple[RawRecord, str]] = []
+        self.undated: set[str] = set()
         self.klobuchar: dict[str, np.ndarray] = {}
         self.leap_seconds: int | None = None
+
+    def needs_date(self, satellite: str, time: np.datetime64) -> bool:
+        """Whether no date is known of a satellite that sends none (GPS, QZSS: a week of 10 bits; GLONASS: a time)."""
+        if satellite[0] in "GJR" and np.isnat(time):
+            self.undated.add(satellite)
+            return True
+        return False
 
     def result(self, counts: Counter[str]) -> tuple[Assembled, Unfinished]:
         """The records, with what is counted and what is left unfinished."""
@@ -207,6 +218,7 @@ class _Builder:
             klobuchar=self.klobuchar,
             leap_seconds=self.leap_seconds,
             skipped=_nonzero(counts),
+            undated=frozenset(self.undated),
         )
         return records, Unfinished(latest=self.latest, issued=self.issued)
 
@@ -251,34 +263,36 @@ class _Builder:
         parts = self._parts(satellite, (1, 2, 3))
         if parts is None or not int(parts[0]["iodc"]) & 255 == parts[1]["iode"] == parts[2]["iode"]:
             return None
+        if self.needs_date(satellite, time):
+            return None
         return gps_record(satellite, {**parts[1], **parts[2], **parts[0]}, time)
 
-    def _galileo(self, satellite: str, time: np.datetime64) -> Record | None:  # noqa: ARG002 (one signature for all)
+    def _galileo(self, satellite: str, time: np.datetime64) -> Record | None:
         parts = self._parts(satellite, (1, 2, 3, 4, 5))
         if parts is None or len({part["iod"] for part in parts[:4]}) != 1:
             return None
         values: dict[str, float] = {}
         for part in parts:
             values |= part
-        return galileo_record(satellite, values) if f"E{int(values['number']):02d}" == satellite else None
+        return galileo_record(satellite, values, time) if f"E{int(values['number']):02d}" == satellite else None
 
-    def _d1(self, satellite: str, time: np.datetime64) -> Record | None:  # noqa: ARG002 (one signature for all)
+    def _d1(self, satellite: str, time: np.datetime64) -> Record | None:
         parts = self._parts(satellite, (1, 2, 3))
         if parts is None or not parts[0]["tow_s"] + 12 == parts[1]["tow_s"] + 6 == parts[2]["tow_s"]:
             return None
         values = {**parts[1], **parts[2], **parts[0]}
         values["toe_sow_s"] = (int(values["toe_high"]) << 15 | int(values["toe_low"])) * 8.0
         self.klobuchar["C"] = np.array([values[f"ion{k}"] for k in range(8)])
-        return beidou_record(satellite, "D1", values)
+        return beidou_record(satellite, "D1", values, time)
 
-    def _d2(self, satellite: str, time: np.datetime64) -> Record | None:  # noqa: ARG002 (one signature for all)
+    def _d2(self, satellite: str, time: np.datetime64) -> Record | None:
         parts = self._parts(satellite, tuple(range(101, 111)))
         if parts is None or any(part["tow_s"] != parts[0]["tow_s"] + 3 * k for k, part in enumerate(parts)):
             return None
         text = "".join(f"{int(part['page']):0300b}" for part in parts)
         bits = (np.frombuffer(text.encode(), np.uint8) - ord("0"))[None]
         values = {name: float(value[0]) for name, value in fields(bits, nav_messages.D2).items()}
-        return beidou_record(satellite, "D2", {**values, "tow_s": parts[0]["tow_s"]})
+        return beidou_record(satellite, "D2", {**values, "tow_s": parts[0]["tow_s"]}, time)
 
     def _glonass(self, satellite: str, time: np.datetime64) -> Record | None:
         parts = self._parts(satellite, (1, 2, 3, 4))
@@ -286,6 +300,8 @@ class _Builder:
             return None
         received = [part["received"] for part in parts]
         if (max(received) - min(received)) * 1e-9 > _SAME_STRINGS_S:  # strings of one frame follow each other in 2 s
+            return None
+        if self.needs_date(satellite, time):
             return None
         values = {**parts[0], **parts[1], **parts[2], **parts[3]}
         return glonass_record(satellite, {**values, "health": float(int(values["health"]) >> 2)}, time)
@@ -304,4 +320,5 @@ def merged(parts: list[Assembled]) -> Assembled:
         klobuchar=klobuchar,
         leap_seconds=leap,
         skipped=dict(sum((Counter(part.skipped) for part in parts), Counter())),
+        undated=frozenset().union(*(part.undated for part in parts)),
     )

@@ -183,14 +183,16 @@ def scan_receiver_log(
 def read_receiver_navigation(paths: Iterable[FilePath], *, date: np.datetime64 | None = None) -> Navigation:
     """Navigation records of receiver logs; InputFileError where no log holds a whole ephemeris.
 
-    `date` is as in `scan_pieces`; without it the newest week that is not after today is taken for RTCM 3.
+    `date` is as in `scan_pieces`. Satellites whose ephemerides carry no full date (GPS, QZSS, GLONASS), in logs without
+    observations that do, are left out without it and named in a note.
     """
     names = tuple(str(Path(path)) for path in paths)
     parts = [piece.ephemerides for name in names for piece in scan_pieces(name, date=date)]
     whole = merged(parts)
+    undated = sorted(whole.undated - {record.satellite for record in whole.records})
+    why = f"the ephemerides of {', '.join(undated)} carry no full date; give one with --date" if undated else ""
     if not whole.records:
-        raise InputFileError(
-            ", ".join(names),
-            "holds no whole ephemeris (UBX RXM-SFRBX, SBF raw navigation pages, RTCM 3 1019, 1020, 1042, 1044 to 1046)",
-        )
-    return navigation_of(whole, sources=names)
+        kinds = "UBX RXM-SFRBX, SBF raw navigation pages, RTCM 3 1019, 1020, 1042, 1044 to 1046"
+        raise InputFileError(", ".join(names), why or f"holds no whole ephemeris ({kinds})")
+    navigation = navigation_of(whole, sources=names)
+    return replace(navigation, notes=(f"{', '.join(names)}: {why}: left out",)) if undated else navigation

@@ -21,16 +21,12 @@ _BDS_WEEK_MINUS_GPS: Final = 1356
 _MOSCOW_S: Final = 3 * 3600.0
 
 
-def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record | None:
-    """Record of GPS or QZSS from the fields of LNAV subframes 1 to 3, or of RTCM 1019 or 1044 (which have no
-    ``tow_s``).
+def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record:
+    """Record of GPS or QZSS from the fields of LNAV subframes 1 to 3, or of RTCM 1019 or 1044.
 
-    `time`, within some years, resolves the week.
+    `time`, when it was received to within some years, resolves the week.
     """
-    if np.isnat(time):
-        return None
-    week = _near_week(values["week"], 1024, time)
-    epoch = nearest_week(values["toc_s"], from_week(week, values.get("tow_s", values["toc_s"])))
+    week, epoch = _reference(values, _near_week(values["week"], 1024, time), time)
     numbers = {
         **values,
         "data_source": values["codes"],
@@ -43,10 +39,9 @@ def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record | 
     return _raw(satellite, "LNAV", epoch, numbers), _issue(values, "iodc", "toe_sow_s", "toc_s", "health")
 
 
-def galileo_record(satellite: str, values: Values) -> Record:
+def galileo_record(satellite: str, values: Values, time: np.datetime64) -> Record:
     """Record of Galileo: I/NAV from the fields of its words 1 to 5 or of RTCM 1046, F/NAV from those of RTCM 1045."""
-    week = int(values["week"]) + _GALILEO_WEEK_MINUS_GPS
-    epoch = nearest_week(values["toc_s"], from_week(week, values.get("tow_s", values["toe_sow_s"])))
+    week, epoch = _reference(values, int(values["week"]) + _GALILEO_WEEK_MINUS_GPS, time)
     health = 0
     for signal, bit in (("e5b", 6), ("e5a", 3), ("e1b", 0)):  # as RINEX packs them
         if f"{signal}_health" in values:
@@ -64,12 +59,11 @@ def galileo_record(satellite: str, values: Values) -> Record:
     return _raw(satellite, message, epoch, numbers), (*_issue(values, "iod", "toe_sow_s", "source"), float(health))
 
 
-def beidou_record(satellite: str, message: str, values: Values) -> Record | None:
+def beidou_record(satellite: str, message: str, values: Values, time: np.datetime64) -> Record | None:
     """Record of BeiDou from the fields of D1, D2 or RTCM 1042; None where the parts are of two issues."""
     if values["toc_s"] != values["toe_sow_s"]:  # one issue has one reference time (ICD, 5.2.4.9)
         return None
-    week = int(values["week"]) + _BDS_WEEK_MINUS_GPS
-    epoch = nearest_week(values["toc_s"], from_week(week, values.get("tow_s", values["toe_sow_s"])))
+    week, epoch = _reference(values, int(values["week"]) + _BDS_WEEK_MINUS_GPS, time)
     numbers = {
         **values,
         "iode": values["aode"],
@@ -77,15 +71,13 @@ def beidou_record(satellite: str, message: str, values: Values) -> Record | None
         "accuracy_m": nav_messages.URA_NOMINAL_M[int(values["accuracy"])],
         "transmitted": values.get("tow_s", np.nan),
         "fit": values["aodc"],
-        "week": values["week"],
+        "week": float(week - _BDS_WEEK_MINUS_GPS),
     }
     return _raw(satellite, message, epoch, numbers), _issue(values, "aode", "aodc", "toe_sow_s", "health")
 
 
-def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Record | None:
+def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Record:
     """Record of GLONASS from the fields of its strings 1 to 4, or of RTCM 1020; `time` resolves the day."""
-    if np.isnat(time):
-        return None
     utc = np.asarray(time - gpst_minus_utc(time).astype("timedelta64[s]"), dtype="datetime64[ns]")
     epoch = _near_day(values["tb_s"] - _MOSCOW_S, utc)
     frame = _near_day(values["hour"] + values["minute"] + values["half_minute"] - _MOSCOW_S, utc)
@@ -99,6 +91,18 @@ def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Recor
     }
     issue = (*_issue(values, "tb_s", "health", "ln"), float(epoch.astype(np.int64)))
     return _raw(satellite, "", epoch, numbers), issue
+
+
+def _reference(values: Values, week: int, time: np.datetime64) -> tuple[int, Datetimes]:
+    """Week of toe, and toc.
+
+    The week that satellites send is that of the transmission: as it ends, toe is in the next one. RTCM 3 has no time of
+    transmission; in its place stands the time of week of `time`, when the message was received.
+    """
+    sent_s = values.get("tow_s", values["toe_sow_s"] if np.isnat(time) else float(to_week(time)[1]))
+    sent = from_week(week, sent_s)
+    toe = nearest_week(values["toe_sow_s"], sent)
+    return int(to_week(toe)[0]), nearest_week(values["toc_s"], sent)
 
 
 def _issue(values: Values, *names: str) -> tuple[float, ...]:
