@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.bits import fields, sign_magnitude, signed, unsigned
+from railfix.io.receiver.log import StreamState, decode
+from test_receiver_logs import ubx_frame
 
 pytestmark = pytest.mark.requirement("A8")
 
@@ -226,3 +229,34 @@ def array(rtk: Any, values: list[float]) -> Any:
     for k, value in enumerate(values):
         values_of[k] = value
     return values_of
+
+
+@pytest.mark.parametrize(("began_s", "records"), [(0, 1), (-30, 0), (30, 0)])
+def test_glonass_strings_are_of_one_frame(began_s: int, records: int) -> None:
+    """String 1 comes before the receiver's first epoch: its t_k tells whether the others are of its frame."""
+    week, tow, moscow = 2081, 250_698.0, 3 * 3600
+    frame = int(tow - 18 + moscow) % 86_400 + began_s
+    bits = random_bits(1, 4 * 88).reshape(4, 88)
+    bits[:, 85:] = 0
+    for k in range(4):
+        put(bits[k], 0, 1, 0)
+        put(bits[k], 1, 4, k + 1)
+        put(bits[k], 50, 27, 14_700 * 2**11)
+        put(bits[k], 21, 24, 2**20)
+        put(bits[k], 45, 5, 1)
+    for first, length, value in ((9, 5, frame // 3600), (14, 6, frame // 60 % 60), (20, 1, frame // 30 % 2)):
+        put(bits[0], first, length, value)
+    put(bits[1], 9, 7, (frame + 900) // 900)
+    put(bits[3], 5, 22, 1000)
+    put(bits[3], 70, 5, 12)
+    stream = b""
+    for k in range(4):
+        codes = np.repeat(bits[k][None], 256, axis=0)
+        for code in range(256):
+            put(codes[code], 77, 8, code)
+        whole = np.concatenate([codes[nav_messages.glonass_hamming(codes[:, :85])][0], np.zeros(40, np.uint8)])
+        words = np.frombuffer(np.packbits(whole).tobytes()[:16], ">u4").astype("<u4").tobytes()
+        stream += ubx_frame(0x0213, bytes([6, 12, 0, 7, 4, 0, 2, 0]) + words)
+        stream += ubx_frame(0x0215, struct.pack("<dHbBBB2x", tow + 2.0 * k + 2.0, week, 18, 0, 1, 1))
+    piece, _ = decode(stream, StreamState(), at_end=True)
+    assert len(piece.ephemerides.records) == records

@@ -15,10 +15,19 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes
+from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.bits import Field, fields, unsigned
-from railfix.io.receiver.records import Record, Values, beidou_record, galileo_record, glonass_record, gps_record
+from railfix.io.receiver.records import (
+    Record,
+    Values,
+    beidou_record,
+    frame_time,
+    galileo_record,
+    glonass_record,
+    gps_record,
+)
 from railfix.io.receiver.subframes import Subframes, packed_words
 from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_records, kepler_records
 
@@ -29,7 +38,10 @@ _E5A_SOURCE: Final = 1 << 1 | 1 << 8
 #: Constellation of RTCM ephemeris messages.
 _RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1045: "E", 1046: "E", 1020: "R"}
 _UBX_E5B: Final = (5, 6)
-_SAME_STRINGS_S: Final = 15.0
+#: Time from the beginning of a GLONASS frame in which its strings 1 to 4 come.
+_STRINGS_S: Final = 15.0
+#: Longest time from the last epoch to the string that counts as received then.
+_EPOCH_BEFORE_S: Final = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,10 +310,14 @@ class _Builder:
         parts = self._parts(satellite, (1, 2, 3, 4))
         if parts is None or f"R{int(parts[3]['slot']):02d}" != satellite:
             return None
-        received = [part["received"] for part in parts]
-        if (max(received) - min(received)) * 1e-9 > _SAME_STRINGS_S:  # strings of one frame follow each other in 2 s
-            return None
         if self.needs_date(satellite, time):
+            return None
+        # Strings of one frame: that of string 1 begins at t_k, and another follows every 2 s. The first may have come
+        # before the receiver's first epoch.
+        began = frame_time(parts[0], time)
+        received = np.array([part["received"] for part in parts[1:]]).astype(np.int64).astype("datetime64[ns]")
+        after_s = seconds(received - began)
+        if not ((after_s > -_EPOCH_BEFORE_S) & (after_s < _STRINGS_S)).all():
             return None
         values = {**parts[0], **parts[1], **parts[2], **parts[3]}
         return glonass_record(satellite, {**values, "health": float(int(values["health"]) >> 2)}, time)

@@ -78,10 +78,8 @@ def beidou_record(satellite: str, message: str, values: Values, time: np.datetim
 
 def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Record:
     """Record of GLONASS from the fields of its strings 1 to 4, or of RTCM 1020; `time` resolves the day."""
-    utc = np.asarray(time - gpst_minus_utc(time).astype("timedelta64[s]"), dtype="datetime64[ns]")
-    epoch = _near_day(values["tb_s"] - _MOSCOW_S, utc)
-    frame = _near_day(values["hour"] + values["minute"] + values["half_minute"] - _MOSCOW_S, utc)
-    _, message_time = to_week(frame)
+    epoch = _near_day(values["tb_s"] - _MOSCOW_S, _utc(time))
+    _, message_time = to_week(_near_day(_frame_s(values), _utc(time)))
     numbers = {
         **values,
         "health": float(bool(values["health"]) or bool(values["ln"])),  # either stops the use (ICD, 4.4, B_n and l_n)
@@ -91,6 +89,21 @@ def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Recor
     }
     issue = (*_issue(values, "tb_s", "health", "ln"), float(epoch.astype(np.int64)))
     return _raw(satellite, "", epoch, numbers), issue
+
+
+def frame_time(values: Values, time: np.datetime64) -> np.datetime64:
+    """When the GLONASS frame of a string 1 began, GPS time."""
+    utc = _utc(time)
+    offset: np.timedelta64 = (_near_day(_frame_s(values), utc) - utc)[()]
+    return time + offset
+
+
+def _frame_s(values: Values) -> float:
+    return values["hour"] + values["minute"] + values["half_minute"] - _MOSCOW_S
+
+
+def _utc(time: np.datetime64) -> Datetimes:
+    return np.asarray(time - gpst_minus_utc(time).astype("timedelta64[s]"), dtype="datetime64[ns]")
 
 
 def _reference(values: Values, week: int, time: np.datetime64) -> tuple[int, Datetimes]:
