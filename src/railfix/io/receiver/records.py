@@ -91,11 +91,10 @@ def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Recor
     return _raw(satellite, "", epoch, numbers), issue
 
 
-def frame_time(values: Values, time: np.datetime64) -> np.datetime64:
+def frame_time(values: Values, time: np.datetime64) -> Datetimes:
     """When the GLONASS frame of a string 1 began, GPS time."""
     utc = _utc(time)
-    offset: np.timedelta64 = (_near_day(_frame_s(values), utc) - utc)[()]
-    return time + offset
+    return np.asarray(time + (_near_day(_frame_s(values), utc) - utc))
 
 
 def _frame_s(values: Values) -> float:
