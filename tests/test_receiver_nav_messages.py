@@ -231,9 +231,13 @@ def array(rtk: Any, values: list[float]) -> Any:
     return values_of
 
 
+@pytest.mark.parametrize("clock", ["RXM-RAWX", "NAV-PVT"])
 @pytest.mark.parametrize(("began_s", "records"), [(0, 1), (-30, 0), (30, 0)])
-def test_glonass_strings_are_of_one_frame(began_s: int, records: int) -> None:
-    """String 1 comes before the receiver's first epoch: its t_k tells whether the others are of its frame."""
+def test_glonass_strings_are_of_one_frame(began_s: int, records: int, clock: str) -> None:
+    """String 1 comes before the receiver's first epoch: its t_k tells whether the others are of its frame.
+
+    A log without observations has its time from NAV-PVT.
+    """
     week, tow, moscow = 2081, 250_698.0, 3 * 3600
     frame = int(tow - 18 + moscow) % 86_400 + began_s
     bits = random_bits(1, 4 * 88).reshape(4, 88)
@@ -257,6 +261,12 @@ def test_glonass_strings_are_of_one_frame(began_s: int, records: int) -> None:
         whole = np.concatenate([codes[nav_messages.glonass_hamming(codes[:, :85])][0], np.zeros(40, np.uint8)])
         words = np.frombuffer(np.packbits(whole).tobytes()[:16], ">u4").astype("<u4").tobytes()
         stream += ubx_frame(0x0213, bytes([6, 12, 0, 7, 4, 0, 2, 0]) + words)
-        stream += ubx_frame(0x0215, struct.pack("<dHbBBB2x", tow + 2.0 * k + 2.0, week, 18, 0, 1, 1))
+        now = tow + 2.0 * k + 2.0
+        if clock == "RXM-RAWX":
+            stream += ubx_frame(0x0215, struct.pack("<dHbBBB2x", now, week, 18, 0, 1, 1))
+        else:
+            stream += ubx_frame(0x0107, struct.pack("<IHBB3xB80x", round(now * 1000), 2019, 11, 26, 3))
     piece, _ = decode(stream, StreamState(), at_end=True)
     assert len(piece.ephemerides.records) == records
+    if records:
+        assert str(piece.ephemerides.records[0].epoch) == "2019-11-26T21:45:00.000000000"

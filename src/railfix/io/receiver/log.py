@@ -40,7 +40,8 @@ class Piece:
 class StreamState:
     """What the bytes so far left: the start of a frame, unfinished ephemerides, the last known time.
 
-    `glonass_channels` are the frequency channels by satellite number that 1020 messages gave.
+    `glonass_channels` are the frequency channels by satellite number that 1020 messages gave; `observed`: whether there
+    was an epoch of the receiver's own format.
     """
 
     rest: bytes = b""
@@ -48,6 +49,7 @@ class StreamState:
     messages: Unfinished = field(default_factory=Unfinished)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     glonass_channels: Mapping[int, int] = field(default_factory=dict)
+    observed: bool = False
 
 
 def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Piece, StreamState]:
@@ -81,7 +83,12 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
     )
     rest = buffer[frames.consumed :].tobytes()
     after = StreamState(
-        rest=rest, subframes=subframes, messages=messages, time=last, glonass_channels=channels.latest()
+        rest=rest,
+        subframes=subframes,
+        messages=messages,
+        time=last,
+        glonass_channels=channels.latest(),
+        observed=state.observed or len(raw.time) > 0,
     )
     return piece, after
 
@@ -109,14 +116,24 @@ def _navigation(
     subframes = joined_subframes(ubx.sfrbx_subframes(frames), sbf.navigation_subframes(frames))
     blocks = frames.of("ubx", ubx.RXM_RAWX)
     epochs_at = frames.frame_start[blocks if len(blocks) else frames.of("sbf", sbf.MEAS_EPOCH)]
-    epochs_at = epochs_at[len(epochs_at) - len(raw.time) :]
-    received = _time_at(subframes.order, epochs_at, raw.time, state.time)
+    epochs_at, epochs = epochs_at[len(epochs_at) - len(raw.time) :], raw.time
+    if not len(epochs) and not state.observed:
+        epochs_at, epochs = _clock_readings(frames)
+    received = _time_at(subframes.order, epochs_at, epochs, state.time)
     first, unfinished = assembled(subframes, received, state.subframes)
     messages = sorted(rtcm.ephemeris_fields(frames))
-    times, places = (raw.time, epochs_at) if len(raw.time) else msm
+    times, places = msm if len(msm[0]) and not len(raw.time) else (epochs, epochs_at)
     at = _time_at(np.array([m[0] for m in messages], dtype=np.int64), places, times, state.time)
     second, issued = assembled_rtcm(messages, at, state.messages)
     return merged([first, second]), sbas_frames(subframes, received), unfinished, issued
+
+
+def _clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
+    """Places and times of other messages with a date, which stand for epochs in a log without any."""
+    parts = [ubx.clock_readings(frames), sbf.clock_readings(frames)]
+    places, times = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+    order = np.argsort(places, kind="stable")
+    return places[order], times[order]
 
 
 def _time_at(places: np.ndarray, epochs_at: np.ndarray, epochs: Datetimes, before: np.datetime64) -> Datetimes:

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Indices, Integers, Strings
+from railfix.core.arrays import Bytes, Datetimes, Indices, Integers, Strings
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week
@@ -89,6 +89,9 @@ _PVT: Final = np.dtype(
 #: moving base fixed and float, PPP fixed and float.
 _QUALITY: Final = {1: 5, 2: 4, 3: 1, 4: 1, 5: 2, 6: 3, 7: 1, 8: 2, 10: 6}
 _NO_TIME: Final = 0xFFFFFFFF
+_NO_WEEK: Final = 0xFFFF
+#: Time of a block.
+_TIME: Final = np.dtype([("tow_ms", "<u4"), ("week", "<u2")])
 #: Flag of MeasEpoch: measurements are encrypted.
 _SCRAMBLED: Final = 0x80
 #: Signals whose C/N0 has no offset of 10 dB-Hz: GPS L1P(Y) and L2P(Y).
@@ -125,7 +128,7 @@ def meas_epoch_measurements(frames: Frames) -> Measurements:
     length = frames.end[chosen] - frames.start[chosen]
     head = gathered(frames.data, frames.start[chosen][length >= _HEAD.itemsize], _HEAD)
     chosen = chosen[length >= _HEAD.itemsize]
-    dated = (head["tow_ms"] != _NO_TIME) & (head["week"] != 0xFFFF) & (head["size1"] >= 20) & (head["size2"] >= 12)
+    dated = (head["tow_ms"] != _NO_TIME) & (head["week"] != _NO_WEEK) & (head["size1"] >= 20) & (head["size2"] >= 12)
     scrambled = dated & (head["flags"] & _SCRAMBLED != 0)
     dated &= ~scrambled
     epochs, places, kinds, masters, broken, before = [], [], [], [], 0, 0
@@ -283,6 +286,16 @@ def navigation_subframes(frames: Frames) -> Subframes:
         order=frames.frame_start[chosen],
         skipped={what: number for what, number in counts.items() if number},
     ).take(known & passed)
+
+
+def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
+    """Places in the stream of navigation pages with a time, and their times."""
+    chosen = frames.of("sbf", *_PAGES)
+    chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _TIME.itemsize]
+    rows = gathered(frames.data, frames.start[chosen], _TIME)
+    dated = (rows["tow_ms"] != _NO_TIME) & (rows["week"] != _NO_WEEK)
+    times = from_week(rows["week"][dated].astype(np.int64), rows["tow_ms"][dated] * 1e-3)
+    return frames.frame_start[chosen[dated]], times
 
 
 def _bits(words: Words) -> Bytes:

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Strings
+from railfix.core.arrays import Bytes, Datetimes, Integers, Strings
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week, nearest_week
 from railfix.io.receiver.framing import Frames
@@ -242,11 +242,27 @@ def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
 
 def date_of(frames: Frames) -> np.datetime64:
     """Day of the last NAV-PVT with a valid date (UTC, which is near enough to resolve weeks); NaT without one."""
+    days, _, _ = _dated(frames)
+    return days[-1] if len(days) else np.datetime64("NaT", "ns")
+
+
+def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
+    """Places in the stream of NAV-PVT with a valid date, and their times."""
+    days, rows, places = _dated(frames)
+    return places, nearest_week(rows["tow_ms"] * 1e-3, days)
+
+
+def _dated(frames: Frames) -> tuple[Datetimes, np.ndarray, Integers]:
+    """Days (UTC), rows and places of NAV-PVT with a valid date."""
     chosen = frames.of("ubx", NAV_PVT)
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _PVT.itemsize]
     rows = gathered(frames.data, frames.start[chosen], _PVT)
-    rows = rows[rows["valid"] & 3 == 3]
-    if not len(rows):
-        return np.datetime64("NaT", "ns")
-    last = rows[-1]
-    return np.datetime64(f"{int(last['year']):04d}-{int(last['month']):02d}-{int(last['day']):02d}", "ns")
+    valid = rows["valid"] & 3 == 3
+    rows = rows[valid]
+    year, month, day = (rows[name].astype(np.int64) for name in ("year", "month", "day"))
+    months = (12 * (year - 1970) + month - 1).astype("datetime64[M]")
+    return (
+        (months.astype("datetime64[D]") + (day - 1)).astype("datetime64[ns]"),
+        rows,
+        frames.frame_start[chosen[valid]],
+    )
