@@ -41,7 +41,7 @@ class StreamState:
     """What the bytes so far left: the start of a frame, unfinished ephemerides, the last known time.
 
     `glonass_channels` are the frequency channels by satellite number that 1020 messages gave; `observed`: whether there
-    was an epoch of the receiver's own format.
+    was an epoch of the receiver's own format; `clock`: the last time that it gave, of an epoch or another message.
     """
 
     rest: bytes = b""
@@ -50,6 +50,7 @@ class StreamState:
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     glonass_channels: Mapping[int, int] = field(default_factory=dict)
     observed: bool = False
+    clock: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
 
 
 def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Piece, StreamState]:
@@ -71,7 +72,8 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
     parts = [part for part in (raw, msm) if len(part.time) or part.skipped]
     measurements = joined(parts) if parts else raw
     measurements = replace(measurements, skipped={**measurements.skipped, **_of_old_kinds(frames)})
-    records, sbas, subframes, messages = _navigation(frames, raw, (msm.time, msm_at), state)
+    clock = _clock(frames, raw, observed=state.observed)
+    records, sbas, subframes, messages = _navigation(frames, clock, (msm.time, msm_at), state)
     last = measurements.time[-1] if len(measurements.time) else time
     piece = Piece(
         measurements=measurements,
@@ -89,6 +91,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
         time=last,
         glonass_channels=channels.latest(),
         observed=state.observed or len(raw.time) > 0,
+        clock=clock[1][-1] if len(clock[1]) else state.clock,
     )
     return piece, after
 
@@ -109,31 +112,32 @@ def _raw_measurements(frames: Frames) -> Measurements:
     )
 
 
-def _navigation(
-    frames: Frames, raw: Measurements, msm: tuple[Datetimes, Integers], state: StreamState
-) -> tuple[Assembled, SbasFrames, Unfinished, Unfinished]:
-    """Ephemerides and SBAS messages of a block; `msm` has times and places of epochs of RTCM 3."""
-    subframes = joined_subframes(ubx.sfrbx_subframes(frames), sbf.navigation_subframes(frames))
-    blocks = frames.of("ubx", ubx.RXM_RAWX)
-    epochs_at = frames.frame_start[blocks if len(blocks) else frames.of("sbf", sbf.MEAS_EPOCH)]
-    epochs_at, epochs = epochs_at[len(epochs_at) - len(raw.time) :], raw.time
-    if not len(epochs) and not state.observed:
-        epochs_at, epochs = _clock_readings(frames)
-    received = _time_at(subframes.order, epochs_at, epochs, state.time)
-    first, unfinished = assembled(subframes, received, state.subframes)
-    messages = sorted(rtcm.ephemeris_fields(frames))
-    times, places = msm if len(msm[0]) and not len(raw.time) else (epochs, epochs_at)
-    at = _time_at(np.array([m[0] for m in messages], dtype=np.int64), places, times, state.time)
-    second, issued = assembled_rtcm(messages, at, state.messages)
-    return merged([first, second]), sbas_frames(subframes, received), unfinished, issued
-
-
-def _clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
-    """Places and times of other messages with a date, which stand for epochs in a log without any."""
+def _clock(frames: Frames, raw: Measurements, *, observed: bool) -> tuple[Integers, Datetimes]:
+    """Places and times of the receiver's epochs; in a log without any, those of other messages with a date."""
+    if len(raw.time) or observed:
+        blocks = frames.of("ubx", ubx.RXM_RAWX)
+        places = frames.frame_start[blocks if len(blocks) else frames.of("sbf", sbf.MEAS_EPOCH)]
+        return places[len(places) - len(raw.time) :], raw.time
     parts = [ubx.clock_readings(frames), sbf.clock_readings(frames)]
     places, times = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
     order = np.argsort(places, kind="stable")
     return places[order], times[order]
+
+
+def _navigation(
+    frames: Frames, clock: tuple[Integers, Datetimes], msm: tuple[Datetimes, Integers], state: StreamState
+) -> tuple[Assembled, SbasFrames, Unfinished, Unfinished]:
+    """Ephemerides and SBAS messages of a block; `clock` as of `_clock`, `msm` times and places of epochs of RTCM 3."""
+    subframes = joined_subframes(ubx.sfrbx_subframes(frames), sbf.navigation_subframes(frames))
+    epochs_at, epochs = clock
+    received = _time_at(subframes.order, epochs_at, epochs, state.time if np.isnat(state.clock) else state.clock)
+    first, unfinished = assembled(subframes, received, state.subframes)
+    messages = sorted(rtcm.ephemeris_fields(frames))
+    times, places = msm if len(msm[0]) else (epochs, epochs_at)
+    before = state.clock if np.isnat(state.time) else state.time
+    at = _time_at(np.array([m[0] for m in messages], dtype=np.int64), places, times, before)
+    second, issued = assembled_rtcm(messages, at, state.messages)
+    return merged([first, second]), sbas_frames(subframes, received), unfinished, issued
 
 
 def _time_at(places: np.ndarray, epochs_at: np.ndarray, epochs: Datetimes, before: np.datetime64) -> Datetimes:
