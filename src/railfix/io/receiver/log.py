@@ -113,15 +113,18 @@ def _raw_measurements(frames: Frames) -> Measurements:
 
 
 def _clock(frames: Frames, raw: Measurements, *, observed: bool) -> tuple[Integers, Datetimes]:
-    """Places and times of the receiver's epochs; in a log without any, those of other messages with a date."""
-    if len(raw.time) or observed:
-        blocks = frames.of("ubx", ubx.RXM_RAWX)
-        places = frames.frame_start[blocks if len(blocks) else frames.of("sbf", sbf.MEAS_EPOCH)]
-        return places[len(places) - len(raw.time) :], raw.time
-    parts = [ubx.clock_readings(frames), sbf.clock_readings(frames)]
-    places, times = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+    """Places and times of the receiver's epochs; before the first one, of other messages with a date."""
+    blocks = frames.of("ubx", ubx.RXM_RAWX)
+    epochs_at = frames.frame_start[blocks if len(blocks) else frames.of("sbf", sbf.MEAS_EPOCH)]
+    epochs_at = epochs_at[len(epochs_at) - len(raw.time) :]
+    if observed:
+        return epochs_at, raw.time
+    readings = [ubx.clock_readings(frames), sbf.clock_readings(frames)]
+    places, times = (np.concatenate([part[k] for part in readings]) for k in (0, 1))
     order = np.argsort(places, kind="stable")
-    return places[order], times[order]
+    if len(epochs_at):
+        order = order[places[order] < epochs_at[0]]
+    return np.concatenate([places[order], epochs_at]), np.concatenate([times[order], raw.time])
 
 
 def _navigation(
