@@ -291,3 +291,27 @@ def test_results_can_be_moved_together_with_their_inputs(
 
 
 TO_FOLDER_RUN: Final = f"run {_LOG} --out {{out}}"
+
+
+@pytest.mark.parametrize("meanwhile", ["made", "removed"])
+def test_runs_of_a_campaign_share_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, meanwhile: str) -> None:
+    """The folder above a run's own is made, or made and removed, by another run at the same time."""
+    above, own = tmp_path / "train=B", tmp_path / "train=B" / "day=1"
+    mkdir, calls = Path.mkdir, []
+
+    def beside_another(path: Path) -> None:
+        calls.append(path)
+        if calls == [above] and meanwhile == "made":
+            mkdir(above)
+        if calls == [above, own] and meanwhile == "removed":
+            above.rmdir()
+        mkdir(path)
+
+    monkeypatch.setattr(Path, "mkdir", lambda path, *words, **named: (
+        beside_another(path) if path in (above, own) else mkdir(path, *words, **named)
+    ))  # fmt: skip
+    with OutputFolder(own) as folder:
+        folder.write_json("run.json", {})
+        folder.commit()
+    assert (own / "run.json").exists()
+    assert len(calls) == (2 if meanwhile == "made" else 4)

@@ -79,10 +79,17 @@ class OutputFolder:
                 raise
 
     def _make(self) -> None:
-        missing = [p for p in (self.path, *self.path.parents) if not p.exists()]
-        for folder in reversed(missing):
-            folder.mkdir()
-            self._made.append(folder)
+        """Make the folder and those above it, which other runs may make, or remove again, at the same time."""
+        while not self.path.exists():
+            try:
+                for folder in reversed([p for p in (self.path, *self.path.parents) if not p.exists()]):
+                    folder.mkdir()
+                    self._made.append(folder)
+            except FileNotFoundError:  # the folder above was removed
+                continue
+            except FileExistsError:
+                if folder == self.path or not folder.is_dir():
+                    raise
 
     def _unmake(self) -> None:
         for folder in reversed(self._made):
