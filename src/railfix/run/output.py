@@ -35,6 +35,9 @@ CSV_TIME: Final = "%Y-%m-%dT%H:%M:%S%.9f"
 #: Rows that `OutputFolder.change` reads at a time.
 _ROWS: Final = 50_000
 
+#: Times that a folder is tried to be made while other runs make and remove those above it.
+_ATTEMPTS: Final = 10
+
 
 class OutputFolder:
     """A folder that receives all files of a command at once, or none.
@@ -80,15 +83,17 @@ class OutputFolder:
 
     def _make(self) -> None:
         """Make the folder and those above it, which other runs may make, or remove again, at the same time."""
-        while not self.path.exists():
+        for left in reversed(range(_ATTEMPTS)):
             try:
                 for folder in reversed([p for p in (self.path, *self.path.parents) if not p.exists()]):
                     folder.mkdir()
                     self._made.append(folder)
-            except FileNotFoundError:  # the folder above was removed
-                continue
+                return
+            except FileNotFoundError:
+                if not left:
+                    raise
             except FileExistsError:
-                if folder == self.path or not folder.is_dir():
+                if not left or folder == self.path or not folder.is_dir():
                     raise
 
     def _unmake(self) -> None:
