@@ -130,10 +130,10 @@ def test_satellites_without_a_date_are_named(tmp_path: Path) -> None:
     path.write_bytes(gps + galileo)
     navigation = railfix.read_navigation(path)
     assert navigation.kepler.satellite.tolist() == ["E07"]
-    assert navigation.notes == (f"{path}: the ephemerides of G07 carry no full date; give one with --date: left out",)
+    assert navigation.notes == (f"{path}: left out: the ephemerides of G07 carry no full date (--date gives one)",)
     assert railfix.read_navigation(path, date="2023-08-17").kepler.satellite.tolist() == ["G07", "E07"]
     path.write_bytes(gps)
-    with pytest.raises(InputFileError, match="the ephemerides of G07 carry no full date; give one with --date"):
+    with pytest.raises(InputFileError, match=r"the ephemerides of G07 carry no full date \(--date gives one\)"):
         railfix.read_navigation(path)
 
 

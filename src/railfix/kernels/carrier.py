@@ -9,6 +9,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Integers
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.kernels.compiling import inner, kernel
+from railfix.kernels.sorting import insert
 
 #: `railfix.positioning.carrier.slips`: channels that a common step needs, least step of a clock, a light millisecond.
 _COMMON, _CLOCK_STEP_M, _MILLISECOND_M = 3, 1e4, 1e-3 * SPEED_OF_LIGHT
@@ -22,11 +23,7 @@ def _median_or_zero(values: Floats, ordered: Floats) -> float:
         value = values[m]
         if not math.isfinite(value):
             continue
-        at = count
-        while at > 0 and ordered[at - 1] > value:
-            ordered[at] = ordered[at - 1]
-            at -= 1
-        ordered[at] = value
+        insert(ordered, count, value)
         count += 1
     return 0.5 * (ordered[(count - 1) // 2] + ordered[count // 2]) if count >= _COMMON else 0.0
 

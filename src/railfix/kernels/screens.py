@@ -8,6 +8,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import kernel
+from railfix.kernels.sorting import insert
 
 
 @kernel
@@ -26,11 +27,7 @@ def medians_of_clocks(values: Floats, clock: Indices, satellite: Indices, least:
                 value = values[t, m]
                 if clock[m] != c or math.isnan(value):
                     continue
-                at = count
-                while at > 0 and ordered[at - 1] > value:
-                    ordered[at] = ordered[at - 1]
-                    at -= 1
-                ordered[at] = value
+                insert(ordered, count, value)
                 count += 1
                 if different < least and math.isfinite(value):
                     known = False

@@ -92,19 +92,20 @@ def assembled_rtcm(
     for (_, kind, values), at in zip(messages, time, strict=True):
         satellite = f"{_RTCM_SYSTEMS[kind]}{int(values['number']):02d}"
         if not builder.needs_date(satellite, at):
-            builder.issue(_rtcm_record(satellite, values, at), at)
+            builder.issue(_rtcm_record(kind, satellite, values, at), at)
     return builder.result(Counter())
 
 
-def _rtcm_record(satellite: str, values: Values, time: np.datetime64) -> Record | None:
+def _rtcm_record(kind: int, satellite: str, values: Values, time: np.datetime64) -> Record | None:
     """Record of one RTCM 3 ephemeris message."""
-    match satellite[0]:
-        case "E":
-            source = _E5A_SOURCE if "e5a_health" in values else _E1B_SOURCE | _E5B_SOURCE
-            return galileo_record(satellite, {**values, "source": float(source)}, time)
-        case "C":
+    match kind:
+        case 1045:
+            return galileo_record(satellite, {**values, "source": float(_E5A_SOURCE)}, time)
+        case 1046:
+            return galileo_record(satellite, {**values, "source": float(_E1B_SOURCE | _E5B_SOURCE)}, time)
+        case 1042:
             return beidou_record(satellite, "", values, time)
-        case "R":
+        case 1020:
             return glonass_record(satellite, {**values, "channel": values["channel"] - 7}, time)
     return gps_record(satellite, values, time)
 
@@ -312,8 +313,8 @@ class _Builder:
             return None
         if self.needs_date(satellite, time):
             return None
-        # Strings of one frame: that of string 1 begins at t_k, and another follows every 2 s. The first may have come
-        # before the receiver's first epoch.
+        # All of one frame, which begins at t_k of string 1; strings follow each other every 2 s. String 1 may have come
+        # before the receiver's first epoch, so that its time of reception is not known.
         began = frame_time(parts[0], time)
         received = np.array([part["received"] for part in parts[1:]]).astype(np.int64).astype("datetime64[ns]")
         after_s = seconds(received - began)

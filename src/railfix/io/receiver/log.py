@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -68,12 +68,12 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
     raw = _raw_measurements(frames)
     time = raw.time[0] if np.isnat(state.time) and len(raw.time) else state.time
     channels = rtcm.glonass_channels(frames, state.glonass_channels)
-    msm, msm_at = rtcm.msm_measurements(frames, time, channels)
+    msm, msm_places = rtcm.msm_measurements(frames, time, channels)
     parts = [part for part in (raw, msm) if len(part.time) or part.skipped]
     measurements = joined(parts) if parts else raw
     measurements = replace(measurements, skipped={**measurements.skipped, **_of_old_kinds(frames)})
-    clock = _clock(frames, raw, observed=state.observed)
-    records, sbas, subframes, messages = _navigation(frames, clock, (msm.time, msm_at), state)
+    dated = _dated(frames, raw, observed=state.observed)
+    records, sbas, subframes, messages = _navigation(frames, dated, _Dated(msm_places, msm.time), state)
     last = measurements.time[-1] if len(measurements.time) else time
     piece = Piece(
         measurements=measurements,
@@ -91,7 +91,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
         time=last,
         glonass_channels=channels.latest(),
         observed=state.observed or len(raw.time) > 0,
-        clock=clock[1][-1] if len(clock[1]) else state.clock,
+        clock=dated.times[-1] if len(dated.times) else state.clock,
     )
     return piece, after
 
@@ -112,43 +112,49 @@ def _raw_measurements(frames: Frames) -> Measurements:
     )
 
 
-def _clock(frames: Frames, raw: Measurements, *, observed: bool) -> tuple[Integers, Datetimes]:
-    """Places and times of the receiver's epochs; before the first one, of other messages with a date."""
+class _Dated(NamedTuple):
+    """Epochs, or other messages with a date, in the order of the stream."""
+
+    places: Integers
+    times: Datetimes
+
+    def last_before(self, places: Integers, before: np.datetime64) -> Datetimes:
+        """Time of the last one before each place of the stream; `before` for places before the first one here."""
+        if not len(self.times):
+            return np.full(len(places), before, dtype="datetime64[ns]")
+        index = np.searchsorted(self.places, places) - 1
+        return np.where(index < 0, before, self.times[np.maximum(index, 0)])
+
+
+def _dated(frames: Frames, raw: Measurements, *, observed: bool) -> _Dated:
+    """The receiver's epochs; before the first one, its other messages with a date."""
     blocks = frames.of("ubx", ubx.RXM_RAWX)
     epochs_at = frames.frame_start[blocks if len(blocks) else frames.of("sbf", sbf.MEAS_EPOCH)]
     epochs_at = epochs_at[len(epochs_at) - len(raw.time) :]
     if observed:
-        return epochs_at, raw.time
+        return _Dated(epochs_at, raw.time)
     readings = [ubx.clock_readings(frames), sbf.clock_readings(frames)]
     places, times = (np.concatenate([part[k] for part in readings]) for k in (0, 1))
     order = np.argsort(places, kind="stable")
     if len(epochs_at):
         order = order[places[order] < epochs_at[0]]
-    return np.concatenate([places[order], epochs_at]), np.concatenate([times[order], raw.time])
+    return _Dated(np.concatenate([places[order], epochs_at]), np.concatenate([times[order], raw.time]))
 
 
 def _navigation(
-    frames: Frames, clock: tuple[Integers, Datetimes], msm: tuple[Datetimes, Integers], state: StreamState
+    frames: Frames, dated: _Dated, msm: _Dated, state: StreamState
 ) -> tuple[Assembled, SbasFrames, Unfinished, Unfinished]:
-    """Ephemerides and SBAS messages of a block; `clock` as of `_clock`, `msm` times and places of epochs of RTCM 3."""
+    """Ephemerides and SBAS messages of a block; `msm` are the epochs of RTCM 3."""
     subframes = joined_subframes(ubx.sfrbx_subframes(frames), sbf.navigation_subframes(frames))
-    epochs_at, epochs = clock
-    received = _time_at(subframes.order, epochs_at, epochs, state.time if np.isnat(state.clock) else state.clock)
+    received = dated.last_before(subframes.order, state.time if np.isnat(state.clock) else state.clock)
     first, unfinished = assembled(subframes, received, state.subframes)
     messages = sorted(rtcm.ephemeris_fields(frames))
-    times, places = msm if len(msm[0]) else (epochs, epochs_at)
+    places = np.array([place for place, _, _ in messages], dtype=np.int64)
     before = state.clock if np.isnat(state.time) else state.time
-    at = _time_at(np.array([m[0] for m in messages], dtype=np.int64), places, times, before)
-    second, issued = assembled_rtcm(messages, at, state.messages)
+    second, issued = assembled_rtcm(
+        messages, (msm if len(msm.times) else dated).last_before(places, before), state.messages
+    )
     return merged([first, second]), sbas_frames(subframes, received), unfinished, issued
-
-
-def _time_at(places: np.ndarray, epochs_at: np.ndarray, epochs: Datetimes, before: np.datetime64) -> Datetimes:
-    """Time of the last epoch before each place of the stream; `before` for places before the first one here."""
-    if not len(epochs):
-        return np.full(len(places), before, dtype="datetime64[ns]")
-    index = np.searchsorted(epochs_at, places) - 1
-    return np.where(index < 0, before, epochs[np.maximum(index, 0)])
 
 
 def scan_pieces(
@@ -156,8 +162,8 @@ def scan_pieces(
 ) -> Iterator[Piece]:
     """Pieces of a receiver log, plain or packed, block by block.
 
-    `date` is some time within half a week of the log, for RTCM 3, whose observations carry no week; `progress` is
-    called with the part of the file that has been read.
+    `date` is some time within half a week of the log's beginning, for RTCM 3, whose observations carry no week;
+    `progress` is called with the part of the file that has been read.
     """
     state = StreamState() if date is None else StreamState(time=date.astype("datetime64[ns]"))
     with open_stream(path, content="bytes") as stream:
@@ -207,16 +213,16 @@ def scan_receiver_log(
 def read_receiver_navigation(paths: Iterable[FilePath], *, date: np.datetime64 | None = None) -> Navigation:
     """Navigation records of receiver logs; InputFileError where no log holds a whole ephemeris.
 
-    `date` is as in `scan_pieces`. Satellites whose ephemerides carry no full date (GPS, QZSS, GLONASS), in logs without
-    observations that do, are left out without it and named in a note.
+    `date` is as in `scan_pieces`, within half a day for GLONASS. Without it, and without other messages that are dated,
+    satellites whose ephemerides carry no full date (GPS, QZSS, GLONASS) are left out and named in a note.
     """
     names = tuple(str(Path(path)) for path in paths)
     parts = [piece.ephemerides for name in names for piece in scan_pieces(name, date=date)]
     whole = merged(parts)
     undated = sorted(whole.undated - {record.satellite for record in whole.records})
-    why = f"the ephemerides of {', '.join(undated)} carry no full date; give one with --date" if undated else ""
+    why = f"the ephemerides of {', '.join(undated)} carry no full date (--date gives one)" if undated else ""
     if not whole.records:
         kinds = "UBX RXM-SFRBX, SBF raw navigation pages, RTCM 3 1019, 1020, 1042, 1044 to 1046"
         raise InputFileError(", ".join(names), why or f"holds no whole ephemeris ({kinds})")
     navigation = navigation_of(whole, sources=names)
-    return replace(navigation, notes=(f"{', '.join(names)}: {why}: left out",)) if undated else navigation
+    return replace(navigation, notes=(f"{', '.join(names)}: left out: {why}",)) if undated else navigation

@@ -18,6 +18,8 @@ Record = tuple[RawRecord, tuple[float, ...]]
 
 _GALILEO_WEEK_MINUS_GPS: Final = 1024
 _BDS_WEEK_MINUS_GPS: Final = 1356
+#: Data source of Galileo: the clock is that of E5a and E1.
+_E5A_CLOCK: Final = 1 << 8
 _MOSCOW_S: Final = 3 * 3600.0
 
 
@@ -26,7 +28,7 @@ def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record:
 
     `time`, when it was received to within some years, resolves the week.
     """
-    week, epoch = _reference(values, _near_week(values["week"], 1024, time), time)
+    week, epoch = _week_and_toc(values, _near_week(values["week"], 1024, time), time)
     numbers = {
         **values,
         "data_source": values["codes"],
@@ -41,7 +43,7 @@ def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record:
 
 def galileo_record(satellite: str, values: Values, time: np.datetime64) -> Record:
     """Record of Galileo: I/NAV from the fields of its words 1 to 5 or of RTCM 1046, F/NAV from those of RTCM 1045."""
-    week, epoch = _reference(values, int(values["week"]) + _GALILEO_WEEK_MINUS_GPS, time)
+    week, epoch = _week_and_toc(values, int(values["week"]) + _GALILEO_WEEK_MINUS_GPS, time)
     health = 0
     for signal, bit in (("e5b", 6), ("e5a", 3), ("e1b", 0)):  # as RINEX packs them
         if f"{signal}_health" in values:
@@ -55,7 +57,7 @@ def galileo_record(satellite: str, values: Values, time: np.datetime64) -> Recor
         "transmitted": values.get("tow_s", np.nan),
         "week": float(week),
     }
-    message = "FNAV" if "e5a_health" in values else "INAV"
+    message = "FNAV" if int(values["source"]) & _E5A_CLOCK else "INAV"
     return _raw(satellite, message, epoch, numbers), (*_issue(values, "iod", "toe_sow_s", "source"), float(health))
 
 
@@ -63,7 +65,7 @@ def beidou_record(satellite: str, message: str, values: Values, time: np.datetim
     """Record of BeiDou from the fields of D1, D2 or RTCM 1042; None where the parts are of two issues."""
     if values["toc_s"] != values["toe_sow_s"]:  # one issue has one reference time (ICD, 5.2.4.9)
         return None
-    week, epoch = _reference(values, int(values["week"]) + _BDS_WEEK_MINUS_GPS, time)
+    week, epoch = _week_and_toc(values, int(values["week"]) + _BDS_WEEK_MINUS_GPS, time)
     numbers = {
         **values,
         "iode": values["aode"],
@@ -105,7 +107,7 @@ def _utc(time: np.datetime64) -> Datetimes:
     return np.asarray(time - gpst_minus_utc(time).astype("timedelta64[s]"), dtype="datetime64[ns]")
 
 
-def _reference(values: Values, week: int, time: np.datetime64) -> tuple[int, Datetimes]:
+def _week_and_toc(values: Values, week: int, time: np.datetime64) -> tuple[int, Datetimes]:
     """Week of toe, and toc.
 
     The week that satellites send is that of the transmission: as it ends, toe is in the next one. RTCM 3 has no time of

@@ -108,14 +108,14 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
     ]
     if not parts:
         undated = {UNDATED: len(messages)} if len(messages) else {}
-        skipped = undated if np.isnat(near) else _without_use(frames, messages, 0)
+        skipped = undated if np.isnat(near) else _unused_messages(frames, messages, 0)
         return replace(_no_measurements(), skipped=skipped), np.zeros(0, dtype=np.int64)
     order = np.concatenate([order for order, _, _ in parts])
     rows = joined([rows for _, rows, _ in parts])
     # Messages of one instant become one epoch; instants stay in the order of the stream.
     by_stream = np.argsort(order, kind="stable")
     glonass = np.concatenate([g for _, _, g in parts])[by_stream]
-    time = _glonass_days(_weeks(rows.time[by_stream], glonass), glonass)
+    time = _glonass_days(_in_rising_weeks(rows.time[by_stream], glonass), glonass)
     starts = np.concatenate([[True], time[1:] != time[:-1]])
     epoch_of = np.empty(len(order), dtype=np.intp)
     epoch_of[by_stream] = np.cumsum(starts) - 1
@@ -124,13 +124,13 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
         time=time[starts],
         epoch=epoch_of[rows.epoch],
         receiver="RTCM 3",
-        skipped=_without_use(frames, messages, len(order)),
+        skipped=_unused_messages(frames, messages, len(order)),
     )
     return measurements, order[by_stream][starts]
 
 
-def _without_use(frames: Frames, messages: Indices, used: int) -> dict[str, int]:
-    """Counts of multiple signal messages that give nothing: empty ones, or of masks or a length that do not fit."""
+def _unused_messages(frames: Frames, messages: Indices, used: int) -> dict[str, int]:
+    """Counts of multiple signal messages without measurements: empty, or with masks or a length that do not fit."""
     if len(messages) == used:
         return {}
     empty = int(np.count_nonzero(~bits_of(frames, messages, 137)[:, 73:137].any(axis=1)))
@@ -138,8 +138,11 @@ def _without_use(frames: Frames, messages: Indices, used: int) -> dict[str, int]
     return {what: number for what, number in counts.items() if number}
 
 
-def _weeks(time: Datetimes, glonass: Masks) -> Datetimes:
-    """Move times by whole weeks to within half a week of the message before; GLONASS counts where it is alone."""
+def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
+    """Move each time by whole weeks to within half a week of the message before.
+
+    GLONASS messages, which may lack the day, count only in a log without others.
+    """
     counted = np.flatnonzero(~glonass) if not glonass.all() else np.arange(len(time))
     week = np.timedelta64(7, "D").astype("timedelta64[ns]")
     moved = time.copy()
