@@ -78,6 +78,8 @@ class SingleEpochs:
         Noise of the receiver's codes against their sigmas.
     arc_m, sigma_m : ndarray [m]
         Position: after an outage codes count again when it agrees with the place that the sensors carried.
+    near_ecef_m : ndarray, shape (T, 3) [m]
+        3-D position without the line.
     off_map : ndarray of bool
         The train is away from the line: `railfix.pipeline.off_map`.
     map_offset : ndarray of bool
@@ -87,6 +89,7 @@ class SingleEpochs:
     noise_scale: Floats
     arc_m: Floats
     sigma_m: Floats
+    near_ecef_m: Floats
     off_map: Masks
     map_offset: Masks
 
@@ -193,7 +196,7 @@ def along_track(
         Features of the line and ground units that the sensors meet.
     """
     epochs, slips = gnss_epochs(ranges, single.noise_scale, config, state.slips)
-    epochs = replace(epochs, off_map=single.off_map)
+    epochs = replace(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m)
     line = Line.of(trajectory) if state.line is None else state.line
     tracked, sensed, replays, after = _tracked(
         epochs, trajectory, line, config, replace(state, slips=slips), samples, surroundings,
@@ -245,9 +248,10 @@ def checked(
 def _doubted(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:
     """Places with a status of doubt at some epochs; nothing bounds their error there."""
     told = np.where(doubtful, np.int8(status), tracked.status)
-    unbounded = np.isfinite(tracked.level_m) & ~is_bounded(told)
-    level, amount = (np.where(unbounded, np.inf, values) for values in (tracked.level_m, tracked.amount_m))
-    return replace(tracked, status=told, level_m=level, amount_m=amount)
+    unbounded = doubtful & ~np.isnan(tracked.level_m)
+    names = ("level_m", "ground_level_m", "amount_m")
+    levels = {name: np.where(unbounded, np.inf, getattr(tracked, name)) for name in names}
+    return replace(tracked, status=told, **levels)
 
 
 def _tracked(

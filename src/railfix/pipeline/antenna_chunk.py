@@ -247,6 +247,7 @@ class AntennaChunk:
             noise_scale=result.noise_scale,
             arc_m=result.arc_m,
             sigma_m=result.own_sigma_m,
+            near_ecef_m=result.conventional_ecef_m,
             off_map=self._together.solution().off_map[self._rows],
             map_offset=beyond_threshold(result.map_offset, self.config.map_offset),
         )

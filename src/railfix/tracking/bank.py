@@ -50,7 +50,7 @@ SPEED_SHARE: Final = 0.01
 JOINED: Final = 0.05
 #: Newton's steps for the level end when one is smaller than this [m].
 PRECISION_M: Final = 1e-7
-ROUNDS: Final = 20
+ROUNDS: Final = 60
 
 
 class SourceKind(IntEnum):
@@ -271,8 +271,54 @@ def _of(name: str, rows: Rows, satellite: Strings) -> Masks:
     return np.asarray(satellite == name)
 
 
-def level_m(bank: Bank, place_m: float, sigma_m: float, limits: TrackingLimits) -> tuple[float, float, float]:
-    """Level, what it is without faults, and the largest separation [m].
+@dataclass(frozen=True, kw_only=True)
+class Branches:
+    """Hypotheses beside the most probable one, B of them.
+
+    Attributes
+    ----------
+    probability : ndarray, shape (B,)
+    apart_m, ground_m : ndarray, shape (B,) [m]
+        Distance from its place along the line, and straight.
+    sigma_m : ndarray, shape (B,) [m]
+    """
+
+    probability: Floats
+    apart_m: Floats
+    ground_m: Floats
+    sigma_m: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """Bound of the error of a place [m].
+
+    Attributes
+    ----------
+    along_m : float
+        Along the line; infinite where another place of the line is more probable than the risk.
+    ground_m : float
+        Of the straight distance, all branches included.
+    noise_m : float
+        Without faults and branches.
+    separation_m : float
+        Largest of a sub-filter.
+    """
+
+    along_m: float
+    ground_m: float
+    noise_m: float
+    separation_m: float
+
+
+def uncovered(branches: Branches, limits: TrackingLimits) -> bool:
+    """Return whether another place of the line, further away than a bound may reach, is more probable than the risk."""
+    far = branches.apart_m > limits.start_separation_m
+    return bool(branches.probability[far].sum() > budget(limits).risk)
+
+
+def compute_level(bank: Bank, branches: Branches, place_m: float, sigma_m: float, limits: TrackingLimits) -> Level:
+    """Compute the level of a place.
 
     Infinite without a sub-filter, and where the measurements of one have contradicted it for longer than
     `TrackingLimits.level_doubt_s`: it has settled somewhere else, or began where the fault of its source had led the
@@ -281,33 +327,59 @@ def level_m(bank: Bank, place_m: float, sigma_m: float, limits: TrackingLimits) 
     Parameters
     ----------
     bank : Bank
+    branches : Branches
     place_m, sigma_m : float [m]
         Of the filter.
     limits : TrackingLimits
     """
     given = budget(limits)
-    noise = given.k * sigma_m
+    noise, infinite = given.k * sigma_m, float("inf")
     if not bank.without:
-        return float("inf"), noise, float("nan")
+        return Level(along_m=infinite, ground_m=infinite, noise_m=noise, separation_m=float("nan"))
     apart = np.abs(bank.mean[:, Unknown.PLACE] - place_m)
     sigma = np.sqrt(bank.covariance[:, Unknown.PLACE, Unknown.PLACE])
     which = [kind_of(name) for name in bank.without]
     prior, k = np.array(given.prior)[which], np.array(given.k_fault)[which]
-    # From the largest that one hypothesis alone asks for, where the risk of all is too large.
-    level = max(noise, float((apart + k * sigma).max()))
-    centre = np.concatenate([[0.0, 0.0], apart, -apart])
-    spread = np.concatenate([[sigma_m, sigma_m], sigma, sigma])
-    prior = np.concatenate([[1.0, 1.0], prior, prior])
+    # From the largest that one hypothesis alone asks for: Newton's steps must not begin where a branch makes it flat.
+    start = max(noise, float((apart + k * sigma).max()))
+    of_branch = np.sqrt(2.0 * np.log(np.maximum(branches.probability / (2.0 * given.risk), 1.0))) * branches.sigma_m
+    along = ground = infinite
+    if not (bank.weak_s > limits.level_doubt_s).any():
+        centre, spread, prior = np.append(apart, 0.0), np.append(sigma, sigma_m), np.append(prior, 1.0)
+
+        def level(distance_m: Floats) -> float:
+            return _solve_level(
+                float(np.max(distance_m + of_branch, initial=start)),
+                np.append(centre, distance_m),
+                np.append(spread, branches.sigma_m),
+                np.append(prior, branches.probability),
+                given.risk,
+            )
+
+        ground = level(branches.ground_m)
+        if not uncovered(branches, limits):
+            near = branches.apart_m <= limits.start_separation_m
+            along = level(np.where(near, branches.apart_m, 0.0))
+    return Level(along_m=along, ground_m=ground, noise_m=noise, separation_m=float(apart.max()))
+
+
+def _solve_level(start_m: float, centre: Floats, spread: Floats, prior: Floats, risk: float) -> float:
+    """Level at which the hypotheses together have the risk: Newton's steps of its logarithm within a bracket."""
+    level, low, high = start_m, 0.0, np.inf
     for _ in range(ROUNDS):
-        away = (level - centre) / spread
-        spent = float(prior @ ndtr(-away))
-        slope = float(prior @ (np.exp(-0.5 * away**2) / spread)) / np.sqrt(2.0 * np.pi)
-        step = spent / slope * np.log(spent / given.risk)
+        spent = slope = 0.0
+        for side in (-1.0, 1.0):
+            away = (level + side * centre) / spread
+            spent += float(prior @ ndtr(-away))
+            slope += float(prior @ (np.exp(-0.5 * np.minimum(away**2, 1e3)) / spread)) / np.sqrt(2.0 * np.pi)
+        low, high = (level, high) if spent > risk else (low, level)
+        step = spent / slope * np.log(spent / risk) if spent > 0.0 and slope > 0.0 else -np.inf
+        if not low <= level + step <= high:
+            step = (0.5 * (low + high) if high < np.inf else 2.0 * level) - level
         level += step
         if abs(step) < PRECISION_M:
             break
-    contradicted = (bank.weak_s > limits.level_doubt_s).any()
-    return float("inf") if contradicted else level, noise, float(apart.max())
+    return level
 
 
 def speed_bound_mps(bank: Bank, speed_mps: float, sigma_mps: float, limits: TrackingLimits) -> float:

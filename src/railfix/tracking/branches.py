@@ -31,6 +31,10 @@ RADAR_PRIOR: Final = 0.02
 SWITCH: Final = 3.0
 #: Logarithm of the odds that a difference of one `map_branch_m` can give: 1 / (2 s^2) with s^2 = 2 (1/3)^2.
 MOST_ODDS: Final = 2.25
+#: Largest logarithm of the odds that motion gives in a second: more is a reflection.
+MOST_MOTION: Final = 5.0
+#: Distance that is worth one of the logarithm of the odds by motion [m]: a map does not tell tangents at rest.
+MOTION_M: Final = 3.0
 #: Standard deviation of the speed beyond a bend [m/s], and the share of probability that places beside get.
 _BEND_SPEED_MPS: Final = 10.0
 _BESIDE_SHARE: Final = 0.01
@@ -184,31 +188,58 @@ def beside(mean: Floats, covariance: Floats, limits: TrackingLimits) -> tuple[Fl
     return means, covariances, np.full(len(steps), np.log(_BESIDE_SHARE / len(steps)))
 
 
-def judged(log_probability: Floats, log_evidence: Floats, ecef_m: Floats, limits: TrackingLimits) -> Floats:
-    """Probabilities after an epoch, up to a constant, where branches may lie within the error of the map, shape (H,).
+def judged(
+    log_probability: Floats,
+    log_code: Floats,
+    motion_evidence: Floats,
+    code_evidence: Floats,
+    ecef_m: Floats,
+    branch_s: float,
+    branch_m: float,
+    dt: float,
+    limits: TrackingLimits,
+) -> tuple[Floats, Floats]:
+    """Update the probabilities of branches, up to a constant, and the part of them that codes gave, shape (H,) each.
 
-    Two branches a few metres apart differ in their ranges by as much as the map may be wrong, at every epoch alike:
-    summed over epochs the difference would decide between them, and often wrongly. The difference to the most probable
-    hypothesis counts by ``d^2 / (d^2 + map_branch_m^2)`` with their distance d, and takes the logarithm of their odds
-    no further than ``d^2 / (2 s^2)``, all that a place known without noise could say with a map that is wrong by
-    map_branch_m / 3 at each branch (s^2 twice its square). What motion decided while they were apart stays.
+    With d the distance of a branch from the most probable one, the difference of the evidence counts by
+    ``d^2 / (d^2 + map_branch_m^2)``: branches within the error of the map differ in their ranges at every epoch alike.
+
+    Motion (Dopplers, phases, sensors) has errors of seconds: it counts in full, `MOST_MOTION` a second at most, and its
+    odds go no further than ``d^2 / (2 s^2)`` with s^2 = 2 (map_branch_m / 3)^2, nor than one for `MOTION_M` of travel.
+
+    Codes have errors in common to all satellites of one side of a street, for minutes. Their odds go no further than
+    ``n d^2 / (2 code_common_m^2)``, what n independent epochs with such an error can say, and between branches closer
+    than `branch_floor_m` never below the probability `branch_floor`.
 
     Parameters
     ----------
-    log_probability : ndarray, shape (H,)
+    log_probability, log_code : ndarray, shape (H,)
         Before the epoch.
-    log_evidence : ndarray, shape (H,)
-        Of this epoch.
+    motion_evidence, code_evidence : ndarray, shape (H,)
+        Of motion, and of codes given the motion.
     ecef_m : ndarray, shape (H, 3) [m]
-        Places of the hypotheses.
+        Positions of the branches.
+    branch_s, branch_m : float [s], [m]
+        Time and distance since the branches began: n is 1 and one more in `code_common_s` or `code_common_travel_m`.
+    dt : float [s]
     limits : TrackingLimits
     """
     best = int(np.argmax(log_probability))
     square = ((ecef_m - ecef_m[best]) ** 2).sum(axis=1)
-    before = log_probability - log_probability[best]
-    after = before + square / (square + limits.map_branch_m**2) * (log_evidence - log_evidence[best])
-    most = MOST_ODDS * square / limits.map_branch_m**2
-    return np.asarray(np.clip(after, np.minimum(before, -most), np.maximum(before, most)))
+    share = square / (square + limits.map_branch_m**2)
+    log_motion = log_probability - log_code
+    before = log_motion - log_motion[best]
+    most = MOST_MOTION * max(dt, 1.0)
+    motion = before + share * np.clip(motion_evidence - motion_evidence[best], -most, most)
+    reach = np.minimum(MOST_ODDS * square / limits.map_branch_m**2, branch_m / MOTION_M)
+    motion = np.clip(motion, np.minimum(before, -reach), np.maximum(before, reach))
+    before = log_code - log_code[best]
+    code = before + share * (code_evidence - code_evidence[best])
+    independent = 1.0 + branch_s / limits.code_common_s + branch_m / limits.code_common_travel_m
+    reach = independent * square / (2.0 * limits.code_common_m**2)
+    reach = np.where(square < limits.branch_floor_m**2, np.minimum(reach, -np.log(limits.branch_floor)), reach)
+    code = np.clip(code, np.minimum(before, -reach), np.maximum(before, reach))
+    return motion + code, code
 
 
 def on_the_line(mean: Floats, covariance: Floats, line: Line, limits: TrackingLimits) -> Floats:

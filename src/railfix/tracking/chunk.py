@@ -12,6 +12,7 @@ from railfix.core.timescale import seconds
 from railfix.tracking.epochs import GnssEpochs, Previous
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.state import CLOCKS, TrackState
+from railfix.tracking.velocity import compute_velocity
 
 #: Shortest interval between epochs [s].
 _SHORTEST_S: Final = 1e-3
@@ -57,6 +58,8 @@ class Chunk:
         The train is away from the line.
     remembered : ndarray of bool, shape (T, S)
         Satellites whose error lasts from before an epoch.
+    velocity_mps, velocity_covariance, velocity_age_s : ndarray, shape (T, 3), (T, 3, 3), (T,)
+        `velocity.Velocity`.
     """
 
     time: Datetimes
@@ -76,6 +79,9 @@ class Chunk:
     fresh: Masks
     off_map: Masks
     remembered: Masks
+    velocity_mps: Floats
+    velocity_covariance: Floats
+    velocity_age_s: Floats
 
 
 def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
@@ -114,6 +120,17 @@ def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> C
 
     cn0 = np.where(np.isnan(epochs.cn0_dbhz), 45.0, np.minimum(epochs.cn0_dbhz, 50.0))
     weak = 10.0 ** ((45.0 - cn0) / 10.0)
+    variance = np.stack(
+        [
+            (limits.code_white_share * epochs.code_sigma_m) ** 2,
+            limits.phase_floor_m**2 + limits.phase_zenith_m**2 * weak,
+            limits.doppler_floor_mps**2 + limits.doppler_zenith_mps**2 * weak,
+        ]
+    )
+    near = np.full((len(epochs), 3), np.nan) if epochs.near_ecef_m is None else epochs.near_ecef_m
+    velocity = compute_velocity(
+        near, epochs.sat_ecef_m, epochs.sat_velocity_mps, before, measured, has, variance, interval
+    )
     return Chunk(
         time=epochs.time,
         interval_s=interval,
@@ -126,18 +143,15 @@ def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> C
         before_ecef_m=before,
         measured=measured,
         has=has,
-        variance=np.stack(
-            [
-                (limits.code_white_share * epochs.code_sigma_m) ** 2,
-                limits.phase_floor_m**2 + limits.phase_zenith_m**2 * weak,
-                limits.doppler_floor_mps**2 + limits.doppler_zenith_mps**2 * weak,
-            ]
-        ),
+        variance=variance,
         motion_measured=np.asarray(np.count_nonzero(has[1:], axis=2).max(axis=0) >= _MOTION),
         code_sigma_m=epochs.code_sigma_m,
         fresh=fresh & ~kept,
         off_map=epochs.off_map,
         remembered=kept,
+        velocity_mps=velocity.velocity_mps,
+        velocity_covariance=velocity.covariance,
+        velocity_age_s=velocity.age_s,
     )
 
 

@@ -18,6 +18,9 @@ STEPPED: Final = 5.0
 SCALE_S: Final = 60.0
 #: The scales' variances stay within these logarithms.
 SCALE_RANGE: Final = (-1.5, 3.0)
+#: Shares of an interval by which the counters of doubt in motion and in codes fall at an epoch without doubt.
+MOTION_LEAK: Final = 0.5
+CODE_LEAK: Final = 1.0
 #: Standard deviation of the clock of phases and its drift after a step [m, m/s].
 UNKNOWN_CLOCK: Final = 100.0
 
@@ -88,7 +91,10 @@ def learn(
         scales.append(min(max(old, SCALE_RANGE[0]), SCALE_RANGE[1]))
     motion = mean_weight(update.weight, rows.motion)[best]
     code = mean_weight(update.weight, rows.codes)[best]
-    state.weak_motion_s = state.weak_motion_s + dt if motion < limits.lost_motion_weight else 0.0
+    # Leaky counters: weights that alternate about the limit are a contradiction as well.
+    weak = motion < limits.lost_motion_weight
+    state.weak_motion_s = state.weak_motion_s + dt if weak else max(state.weak_motion_s - MOTION_LEAK * dt, 0.0)
     if code_s > 0.0:
-        state.weak_code_s = state.weak_code_s + code_s if code < limits.lost_code_weight else 0.0
+        weak = code < limits.lost_code_weight
+        state.weak_code_s = state.weak_code_s + code_s if weak else max(state.weak_code_s - CODE_LEAK * code_s, 0.0)
     state.log_scale = (scales[0], scales[1])

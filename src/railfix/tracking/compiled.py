@@ -16,13 +16,13 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.timescale import seconds, timedelta
-from railfix.tracking import bank, branches, clocks, misfit, possible_speed, predict, rows
+from railfix.tracking import bank, branches, clocks, misfit, monitors, possible_speed, predict, rows
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.epochs import SensorEpochs
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.predict import singer
-from railfix.tracking.result import DECIDED, Tracked, TrackStatus
+from railfix.tracking.result import Tracked, TrackStatus
 from railfix.tracking.robust import DOUBTFUL, FREEDOM, MOVED_M, RELINEARISED, SENSOR_FLOOR
 from railfix.tracking.state import CLOCKS, OFFSETS, SATELLITES, Bank, TrackState, Unknown
 
@@ -106,9 +106,13 @@ class Compiled:
             or np.isnat(state.measured)
             or (state.bank is None and self.levels)
             or self.epochs.left[first]
-            or (state.weak_motion_s >= branches.BESIDE_AFTER_S and state.hypotheses <= limits.most_hypotheses // 2)
+            or (
+                max(state.weak_motion_s - branches.BESIDE_AFTER_S, state.across - monitors.ACROSS_DOUBT) >= 0.0
+                and state.hypotheses <= limits.most_hypotheses // 2
+            )
             or state.weak_motion_s >= limits.lost_motion_s
             or state.weak_code_s >= limits.lost_code_s
+            or state.across >= monitors.ACROSS_LOST
         ):
             return first
         last = min(first + _EPOCHS, len(self.chunk.time))
@@ -128,12 +132,14 @@ class Compiled:
         scalars = np.array([
             count, state.weak_motion_s, state.weak_code_s, *state.log_scale, state.unaided_m, state.direction,
             seconds(state.measured - origin), *state.code_shift, state.map_log_scale, *state.speed_range_mps,
-            np.nan_to_num(seconds(state.coded - origin), nan=-np.inf),
+            np.nan_to_num(seconds(state.coded - origin), nan=-np.inf), state.branch_s, state.branch_m,
+            state.across, state.step_s, state.withheld_s,
         ])  # fmt: skip
         memory = self.layout.Memory(
             mean=_own(state.mean[:, full]),
             covariance=_own(state.covariance[:, full[:, None], full]),
             log_probability=_own(state.log_probability),
+            log_code=_own(state.log_code),
             origin_m=_own(state.origin_m),
             offset_known=_own(state.offset_known),
             scalars=scalars,
@@ -241,6 +247,7 @@ class Compiled:
                 without=tuple(names[k] for k in running), mean=means, covariance=covariances, weak_s=sub.weak_s[running]
             )
         state.log_probability = memory.log_probability[:count].copy()
+        state.log_code = memory.log_code[:count].copy()
         state.origin_m = memory.origin_m[:count].copy()
         state.time = self.chunk.time[done - 1]
         _, motion, code, doppler, phase, unaided, direction, measured, *learnt = memory.scalars.tolist()
@@ -250,6 +257,8 @@ class Compiled:
         state.speed_range_mps = (learnt[3], learnt[4])
         state.measured = self.chunk.time[0] + timedelta(measured)
         state.coded = self.chunk.time[0] + timedelta(learnt[5])
+        state.branch_s, state.branch_m = learnt[6], learnt[7]
+        state.across, state.step_s, state.withheld_s = learnt[8], learnt[9], learnt[10]
 
 
 def _kernels() -> tuple[ModuleType, ModuleType]:
@@ -270,7 +279,7 @@ def _work_space(layout: ModuleType, channels: int, unknowns: int, hypotheses: in
         "information": (room, size, size), "after": (room, size, size), "change": (room, size),
         "weight": (room, most), "residual": (room, most), "fitted": (room, most), "new_mean": (room, unknowns + 1),
         "new_covariance": (room, unknowns, unknowns), "log_before": (room,), "log_after": (room,),
-        "evidence": (room,), "joined": (2, room), "variance": (most,), "masked": (most,),
+        "evidence": (room,), "code_evidence": (room,), "joined": (3, room), "branch": (room, 3), "pushed": (room,), "variance": (most,), "masked": (most,),
         "system": (room, size, size), "factor": (size, size), "lower": (size, size), "right": (max(size, room),),
         "diagonal": (size,), "with_clock": (size,),
         "ordered": (most,), "part": (4,), "gain": (size, unknowns + 1), "less": (size, unknowns),
@@ -351,6 +360,8 @@ def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
         "beside_after_s": branches.BESIDE_AFTER_S,
         "switch": branches.SWITCH,
         "most_odds": branches.MOST_ODDS,
+        "most_motion": branches.MOST_MOTION,
+        "motion_m": branches.MOTION_M,
         "level_risk": bank.budget(limits).risk,
         "level_k": bank.budget(limits).k,
         "level_k_speed": bank.budget(limits).k_speed,
@@ -358,11 +369,25 @@ def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
         "rounds": bank.ROUNDS,
         "scale_bound": bank.SCALE_BOUND,
         "joined": bank.JOINED,
-        "decided": DECIDED,
         "tracking": int(TrackStatus.TRACKING),
         "coasting": int(TrackStatus.COASTING),
         "several": int(TrackStatus.SEVERAL_BRANCHES),
         "expired": int(TrackStatus.EXPIRED),
+        "unsure": int(TrackStatus.DOUBTFUL),
+        "motion_leak": clocks.MOTION_LEAK,
+        "code_leak": clocks.CODE_LEAK,
+        "misfit_most": misfit.MOST_SIGMAS,
+        "reach_sigmas": monitors.REACH_SIGMAS,
+        "reach_m": monitors.REACH_M,
+        "velocity_floor_mps": monitors.VELOCITY_FLOOR_MPS,
+        "direction_share": monitors.DIRECTION_SHARE,
+        "largest_square": monitors.LARGEST_SQUARE,
+        "allowed_square": monitors.ALLOWED_SQUARE,
+        "across_doubt": monitors.ACROSS_DOUBT,
+        "across_lost": monitors.ACROSS_LOST,
+        "step_sigmas": monitors.STEP_SIGMAS,
+        "step_s": monitors.STEP_S,
+        "step_held_s": monitors.STEP_HELD_S,
     }
     return layout.Numbers(
         **{name: given[name] if name in given else getattr(limits, name) for name in layout.Numbers._fields}

@@ -31,6 +31,8 @@ class GnssEpochs:
     cn0_dbhz : ndarray, shape (T, K)
     off_map : ndarray of bool, shape (T,)
         Epochs at which the train is known to be away from the line: places are forgotten, nothing is used.
+    near_ecef_m : ndarray, shape (T, 3) [m], or None
+        Position without the line, right to some hundred metres, for the velocity across it; NaN or None: not looked at.
     """
 
     time: Datetimes
@@ -45,6 +47,7 @@ class GnssEpochs:
     rate_mps: Floats
     cn0_dbhz: Floats
     off_map: Masks
+    near_ecef_m: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -52,7 +55,8 @@ class GnssEpochs:
     def take(self, rows: Indices | slice) -> GnssEpochs:
         """Return some of the epochs; what belongs to channels stays whole."""
         of_channels = ("satellite", "clock")
-        values = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in of_channels}
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in of_channels}
+        values = {name: value[rows] for name, value in values.items() if value is not None}
         return replace(self, **values)
 
 

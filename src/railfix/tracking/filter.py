@@ -19,6 +19,7 @@ from railfix.tracking.epochs import GnssEpochs, SensorEpochs
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.misfit import code_shift, learn_map
+from railfix.tracking.monitors import contradiction, watch
 from railfix.tracking.possible_speed import possible, widen
 from railfix.tracking.predict import predicted
 from railfix.tracking.result import Tracked, TrackStatus, write_place, write_rows
@@ -31,6 +32,7 @@ from railfix.tracking.robust import (
     better_mode,
     first_weights,
     log_evidence,
+    motion_evidence,
     prior_of,
     robust_update,
 )
@@ -144,6 +146,8 @@ def _step(
     measured = len(rows.variance) > 0
     if measured:
         measured = _measure(chunk, epoch, rows, line, state, limits, sensors, result, code_s, lost, levels, step)
+    if not measured:
+        state.withheld_s = max(state.withheld_s - dt, 0.0)
     if not measured and state.bank is not None:
         means, covariances = predicted(state.bank.mean, state.bank.covariance, line, dt, limits, state.map_scale)
         state.bank = replace(state.bank, mean=means, covariance=covariances)
@@ -151,16 +155,17 @@ def _step(
     if abs(speed) > DIRECTION_MPS:
         state.direction = float(np.sign(speed))
     state.unaided_m = 0.0 if measured and rows.bounds[0] else state.unaided_m + abs(speed) * dt
+    state.branch_s, state.branch_m = state.branch_s + dt, state.branch_m + abs(speed) * dt
     if state.hypotheses > 1:
         chosen, probability = surviving(state.mean, state.covariance, state.log_probability, state.origin_m, limits)
         state.mean, state.covariance = state.mean[chosen], state.covariance[chosen]
         state.log_probability, state.origin_m = probability, state.origin_m[chosen]
-        state.parent = state.parent[chosen]
+        state.parent, state.log_code = state.parent[chosen], state.log_code[chosen]
         step.choose(chosen)
     if trace is not None:
         step.mean, step.covariance, step.parent = state.mean, state.covariance, state.parent
         trace.append(step)
-    write_place(result, epoch, state, measured=measured, lost=lost, limits=limits)
+    write_place(result, epoch, state, line, measured=measured, lost=lost, limits=limits)
 
 
 def _measure(
@@ -215,11 +220,17 @@ def _measure(
     state.offset_known = offset_known
     if state.hypotheses > 1:
         evidence = log_evidence(settled, prior, update, tails)
-        log_probability = judged(state.log_probability, evidence, line.at(after[0][:, Unknown.PLACE])[0], limits)
+        motion = motion_evidence(settled, prior, update, tails=tails, passes=passes)
+        places = line.at(after[0][:, Unknown.PLACE])[0]
+        log_probability, state.log_code = judged(
+            state.log_probability, state.log_code, motion, evidence - motion, places, state.branch_s, state.branch_m,
+            dt, limits,
+        )  # fmt: skip
         state.log_probability = log_probability - np.logaddexp.reduce(log_probability)
     step.cut |= np.diagonal(covariance, axis1=1, axis2=2) != np.diagonal(predicted_covariance, axis1=1, axis2=2)
     step.updated = (covariance, settled.combine / prior.root[:, :, None], prior.information, update)
     state.mean, state.covariance = on_the_line(*after, line, limits), after[1]
+    pushed = np.abs(state.mean[:, Unknown.PLACE] - after[0][:, Unknown.PLACE])
     state.measured = chunk.time[epoch]
     if rows.bounds[0]:
         state.coded = chunk.time[epoch]
@@ -236,6 +247,11 @@ def _measure(
         )
     learn(state, rows, update, best, dt, code_s, limits)
     learn_map(state, 0.0 if best else shift, code_s, limits)
+    velocity, spread, age_s = (
+        values[epoch] for values in (chunk.velocity_mps, chunk.velocity_covariance, chunk.velocity_age_s)
+    )
+    square = contradiction(velocity, spread, float(age_s), state.mean[best], state.covariance[best], line)
+    watch(state, square, 0.0 if best else shift, float(pushed[best]), dt, code_s, limits)
     write_rows(result, epoch, rows, rows.value[best], update.weight[best])
     return True
 

@@ -16,19 +16,19 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats
+from railfix.core.arrays import Codes, Datetimes, Floats
 from railfix.core.timescale import seconds
 from railfix.tracking.bank import SCALE_BOUND
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
 from railfix.tracking.filter import track
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
-from railfix.tracking.result import Tracked, is_bounded
+from railfix.tracking.result import Tracked, TrackStatus, is_bounded
 from railfix.tracking.state import TrackState
 from railfix.tracking.thinned import Since, thinned
 
 _KEPT: Final = (
-    "arc_m", "speed_mps", "level_m", "level_noise_m", "level_speed_mps", "separation_m", "amount_m",
+    "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m", "amount_m", "status",
 )  # fmt: skip
 
 
@@ -42,8 +42,8 @@ class LevelState:
     since : Since
     time : datetime64[ns]
         Of its last epoch.
-    values : ndarray, shape (7,)
-        Its place, speed, level with parts and amount there.
+    values : ndarray, shape (9,)
+        Its place, speed, levels with parts, amount and status there.
     """
 
     track: TrackState | None = None
@@ -75,28 +75,45 @@ def with_levels(
     """
     taken, some, sensed, since = thinned(epochs, sensors, state.since, limits.level_period_s)
     place, after = track(some, line, state.track, limits=limits, sensors=sensed, levels=True)
-    bounded = is_bounded(place.status)
-    columns = np.stack([getattr(place, name) for name in _KEPT], axis=1)
-    columns[:, _KEPT.index("level_m")] = np.where(bounded, place.level_m, np.inf)
+    columns = np.stack([getattr(place, name) for name in _KEPT], axis=1).astype(np.float64)
+    columns[:, _KEPT.index("level_m")] = np.where(is_bounded(place.status), place.level_m, np.inf)
     number = np.searchsorted(taken, np.arange(len(epochs)), side="right")
     times = np.concatenate([[state.time], place.time])
     values = np.concatenate([state.values[None], columns])
-    arc, speed, level, noise, of_speed, separation, amount = values[number].T
+    arc, speed, level, ground, noise, of_speed, separation, amount, status = values[number].T
     tau = _since(times[number], tracked.time)
-    change = tracked.arc_m - line.nearest_m(arc, tracked.arc_m) - speed * tau
-    widened = np.abs(change) + of_speed * tau + 0.5 * limits.level_acceleration_mps2 * tau**2
+    carried = line.nearest_m(arc, tracked.arc_m) + speed * tau
+    since_m = of_speed * tau + 0.5 * limits.level_acceleration_mps2 * tau**2
     known = np.isfinite(tracked.arc_m)
-    level = np.where(known, np.where(np.isfinite(level + widened), level + widened, np.inf), np.nan)
+
+    def widened(bound_m: Floats, change_m: Floats) -> Floats:
+        total = bound_m + change_m + since_m
+        return np.where(known, np.where(np.isfinite(total), total, np.inf), np.nan)
+
+    both = known & np.isfinite(carried)
+    points = [line.at(np.where(both, place_m, 0.0))[0] for place_m in (tracked.arc_m, carried)]
+    straight = np.where(both, np.linalg.norm(points[0] - points[1], axis=1), np.nan)
+    bounded = is_bounded(tracked.status)
+    level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
     amount = np.fmax(level, amount + SCALE_BOUND * np.abs(speed) * tau)
     tracked = replace(
         tracked,
+        status=_status(tracked.status, status, level),
         level_m=level,
+        ground_level_m=widened(ground, straight),
         level_noise_m=np.where(known, noise, np.nan),
         level_speed_mps=np.where(known, of_speed, np.nan),
         separation_m=np.where(known, separation, np.nan),
         amount_m=np.where(known, amount, np.nan),
     )
     return tracked, LevelState(track=after, since=since, time=times[-1], values=values[-1])
+
+
+def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:
+    """Statuses of places: one without a level is neither tracking nor coasting."""
+    reason = np.where(np.isfinite(of_level), of_level, TrackStatus.DOUBTFUL).astype(np.int8)
+    reason = np.where(is_bounded(reason), np.int8(TrackStatus.DOUBTFUL), reason)
+    return np.where(is_bounded(status) & ~np.isfinite(level_m), reason, status).astype(np.int8)
 
 
 def _since(last: Datetimes, time: Datetimes) -> Floats:

@@ -15,14 +15,17 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.tracking.limits import TrackingLimits
+from railfix.tracking.monitors import STEP_SIGMAS
 from railfix.tracking.robust import Prior
 from railfix.tracking.rows import Rows
 from railfix.tracking.state import TrackState, Unknown
 
 #: Fewer codes of an epoch do not tell a shift from clocks.
 CODES: Final = 4
-#: A single epoch counts with at most so many standard deviations.
+#: A single epoch counts with at most so many standard deviations; beyond `railfix.tracking.monitors.STEP_SIGMAS` it is
+#: a step of all codes and tells nothing of the map.
 CLIPPED: Final = 3.0
+MOST_SIGMAS: Final = 20.0
 #: Time constant of learning [s], and the largest logarithm: beyond 1.6 m in the square root of a metre nothing changes.
 LEARNT_S: Final = 5.0
 LARGEST: Final = 8.0
@@ -52,7 +55,7 @@ def code_shift(rows: Rows, prior: Prior, weight: Floats, best: int) -> float:
     along = rows.design[best, codes] @ rows.combine[best, :, Unknown.PLACE]
     solved = np.linalg.solve(spread, np.stack([rows.value[best, codes], along], axis=1))
     score, information = along @ solved
-    return float(np.clip(score / np.sqrt(information), -CLIPPED, CLIPPED)) if information > 0.0 else 0.0
+    return float(np.clip(score / np.sqrt(information), -MOST_SIGMAS, MOST_SIGMAS)) if information > 0.0 else 0.0
 
 
 def learn_map(state: TrackState, shift: float, dt: float, limits: TrackingLimits) -> None:
@@ -60,6 +63,7 @@ def learn_map(state: TrackState, shift: float, dt: float, limits: TrackingLimits
     dt = min(dt, 1.0)
     share = 1.0 - np.exp(-dt / limits.map_misfit_s)
     mean, variance = state.code_shift
+    shift = 0.0 if abs(shift) > STEP_SIGMAS else float(np.clip(shift, -CLIPPED, CLIPPED))
     mean, variance = (1.0 - share) * mean + share * shift, (1.0 - share) ** 2 * variance + share**2
     state.code_shift = (float(mean), float(variance))
     beyond = abs(mean) / (np.sqrt(variance) * limits.map_misfit_sigmas)

@@ -9,15 +9,12 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks
-from railfix.tracking.bank import SCALE_BOUND, level_m, speed_bound_mps
+from railfix.tracking.bank import SCALE_BOUND, Branches, compute_level, speed_bound_mps, uncovered
 from railfix.tracking.limits import TrackingLimits
+from railfix.tracking.line import Line
 from railfix.tracking.robust import mean_weight
 from railfix.tracking.rows import Kind, Rows
 from railfix.tracking.state import TrackState, Unknown
-
-#: A hypothesis this probable is the only one that counts.
-DECIDED: Final = 0.99
-
 
 class TrackStatus(IntEnum):
     """What the filter says of an epoch."""
@@ -42,6 +39,8 @@ class TrackStatus(IntEnum):
     #: One place, but not as far from that of the other antenna as the antennas are apart, or not as fast, within the
     #: last 20 s: one of the two is wrong.
     ANTENNAS_DISAGREE = 8
+    #: One place, but measurements contradict it or one of the sub-filters that bound it: nothing bounds its error.
+    DOUBTFUL = 9
 
     @property
     def text(self) -> str:
@@ -80,8 +79,8 @@ class Tracked:
     wheel_scale, force_offset_mps2, radar_scale : ndarray, shape (T,)
     map_scale : ndarray, shape (T,)
         Factor on the error of the map's lengths, 1 where codes do not contradict them (`misfit`).
-    level_m, level_noise_m, separation_m : ndarray, shape (T,) [m]
-        `bank.level_m`; NaN where levels are off.
+    level_m, ground_level_m, level_noise_m, separation_m : ndarray, shape (T,) [m]
+        `bank.Level`: of the error along the line, of the straight distance; NaN where levels are off.
     level_speed_mps : ndarray, shape (T,)
         `bank.speed_bound_mps`.
     amount_m : ndarray, shape (T,) [m]
@@ -112,6 +111,7 @@ class Tracked:
     radar_scale: Floats
     map_scale: Floats
     level_m: Floats
+    ground_level_m: Floats
     level_noise_m: Floats
     level_speed_mps: Floats
     separation_m: Floats
@@ -130,8 +130,8 @@ class Tracked:
         size = len(time)
         names = (
             "arc_m", "sigma_m", "speed_mps", "speed_sigma_mps", "acceleration_mps2", "probability", "code_weight",
-            "motion_weight", "wheel_scale", "force_offset_mps2", "radar_scale", "map_scale", "level_m", "level_noise_m",
-            "level_speed_mps", "separation_m", "amount_m",
+            "motion_weight", "wheel_scale", "force_offset_mps2", "radar_scale", "map_scale", "level_m", "ground_level_m",
+            "level_noise_m", "level_speed_mps", "separation_m", "amount_m",
         )  # fmt: skip
         return cls(
             time=time,
@@ -157,14 +157,13 @@ def write_rows(result: Tracked, epoch: int, rows: Rows, innovation: Floats, weig
 
 
 def write_place(
-    result: Tracked, epoch: int, state: TrackState, *, measured: bool, lost: bool, limits: TrackingLimits
+    result: Tracked, epoch: int, state: TrackState, line: Line, *, measured: bool, lost: bool, limits: TrackingLimits
 ) -> None:
     """Place, speed and status of the most probable hypothesis."""
     mean, covariance = state.mean[0], state.covariance[0]
     sigma = float(np.sqrt(covariance[Unknown.PLACE, Unknown.PLACE]))
-    probability = float(np.exp(state.log_probability[0]))
     result.hypotheses[epoch] = state.hypotheses
-    result.probability[epoch] = probability
+    result.probability[epoch] = np.exp(state.log_probability[0])
     if sigma > limits.expired_sigma_m:
         result.status[epoch] = TrackStatus.EXPIRED
         return
@@ -176,20 +175,34 @@ def write_place(
     result.force_offset_mps2[epoch] = mean[Unknown.FORCE_OFFSET]
     result.radar_scale[epoch] = mean[Unknown.RADAR]
     result.map_scale[epoch] = state.map_scale
+    branches = _branches(state, line)
     if state.bank is not None:
-        level, noise, apart = level_m(state.bank, float(mean[Unknown.PLACE]), sigma, limits)
-        # Contradicted by its measurements for long the track itself is in doubt, which no sub-filter beside it bounds.
-        doubtful = max(state.weak_code_s, state.weak_motion_s) > limits.level_doubt_s
-        level = float("inf") if doubtful else level
-        result.level_m[epoch], result.level_noise_m[epoch], result.separation_m[epoch] = level, noise, apart
-        result.amount_m[epoch] = max(level, SCALE_BOUND * state.unaided_m)
+        level = compute_level(state.bank, branches, float(mean[Unknown.PLACE]), sigma, limits)
+        along, ground = (float("inf") if state.withheld_s > 0.0 else value for value in (level.along_m, level.ground_m))
+        result.level_m[epoch], result.ground_level_m[epoch] = along, ground
+        result.level_noise_m[epoch], result.separation_m[epoch] = level.noise_m, level.separation_m
+        result.amount_m[epoch] = max(along, SCALE_BOUND * state.unaided_m)
         result.level_speed_mps[epoch] = speed_bound_mps(
             state.bank, float(mean[Unknown.SPEED]), float(result.speed_sigma_mps[epoch]), limits
         )
     if lost:
         status = TrackStatus.LOST
-    elif not measured:
-        status = TrackStatus.COASTING
+    elif uncovered(branches, limits):
+        status = TrackStatus.SEVERAL_BRANCHES
+    elif state.withheld_s > 0.0:
+        status = TrackStatus.DOUBTFUL
     else:
-        status = TrackStatus.TRACKING if probability >= DECIDED else TrackStatus.SEVERAL_BRANCHES
+        status = TrackStatus.TRACKING if measured else TrackStatus.COASTING
     result.status[epoch] = status
+
+
+def _branches(state: TrackState, line: Line) -> Branches:
+    """Hypotheses beside the most probable one."""
+    place = state.mean[:, Unknown.PLACE]
+    points, _ = line.at(place)
+    return Branches(
+        probability=np.exp(state.log_probability[1:]),
+        apart_m=np.abs(place[1:] - place[0]),
+        ground_m=np.asarray(np.linalg.norm(points[1:] - points[0], axis=1)),
+        sigma_m=np.sqrt(state.covariance[1:, Unknown.PLACE, Unknown.PLACE]),
+    )

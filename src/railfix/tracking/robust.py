@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -183,6 +183,15 @@ def log_evidence(rows: Rows, prior: Prior, update: Update, tails: Tails) -> Floa
     away = -0.5 * (change[:, None, :] @ prior.information @ change[:, :, None])[:, 0, 0]
     volume = 0.5 * (np.linalg.slogdet(update.covariance)[1] + np.linalg.slogdet(prior.information)[1])
     return np.asarray(fit + away + volume)
+
+
+def motion_evidence(rows: Rows, prior: Prior, update: Update, *, tails: Tails, passes: int) -> Floats:
+    """Logarithm of the evidence of all measurements but the codes, shape (H,); 0 without any."""
+    use = np.ones(rows.value.shape, dtype=np.bool_)
+    use[:, rows.codes] = False
+    alone = robust_update(rows, prior, update.weight, tails=tails, passes=passes, use=use)
+    residual = np.where(use, alone.residual, 0.0)
+    return log_evidence(rows, prior, replace(alone, residual=residual), tails)
 
 
 def applied(mean: Floats, covariance: Floats, prior: Prior, update: Update) -> tuple[Floats, Floats]:

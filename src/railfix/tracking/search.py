@@ -9,6 +9,7 @@ from railfix.tracking.branches import BESIDE_AFTER_S, begin, beside, places, spl
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
+from railfix.tracking.monitors import ACROSS_DOUBT, ACROSS_LOST
 from railfix.tracking.predict import predicted
 from railfix.tracking.state import ANY_SPEED, Narrowed, TrackState, Unknown
 
@@ -20,22 +21,24 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         arc, sigma = places(chunk, epoch, line, limits)
         state.mean, state.covariance = begin(arc, sigma, satellites, line, limits)
         state.log_probability, state.origin_m = np.full(len(arc), -np.log(max(len(arc), 1))), arc
+        state.log_code, state.branch_s, state.branch_m = np.zeros(len(arc)), 0.0, 0.0
         state.parent, state.narrowed = np.full(len(arc), -1), None
         return False
     mean, covariance = predicted(state.mean, state.covariance, line, chunk.interval_s[epoch], limits, state.map_scale)
     state.mean, state.covariance = mean, covariance
     state.parent, state.narrowed = np.arange(len(mean)), None
-    lost = state.weak_motion_s >= limits.lost_motion_s or state.weak_code_s >= limits.lost_code_s
+    weak = state.weak_motion_s >= limits.lost_motion_s or state.weak_code_s >= limits.lost_code_s
+    lost = weak or state.across >= ACROSS_LOST
     gap = bool(seconds(chunk.time[epoch] - state.measured) > limits.gap_s)
     wide = covariance[:, Unknown.PLACE, Unknown.PLACE] > limits.start_sigma_m**2
     if not (lost or (gap and wide.any())):
-        if state.weak_motion_s >= BESIDE_AFTER_S:
+        if state.weak_motion_s >= BESIDE_AFTER_S or state.across >= ACROSS_DOUBT:
             _try_beside(state, limits)
         return False
     arc, sigma = places(chunk, epoch, line, limits)
     if not len(arc):
         return lost
-    parts = [(mean, covariance, state.log_probability, state.origin_m)]
+    parts = [(mean, covariance, state.log_probability, state.origin_m, state.log_code)]
     narrowed: list[Narrowed | None] = [None] * len(mean)
     for one in np.flatnonzero(wide) if not lost else []:
         reach = 5.0 * np.sqrt(covariance[one, Unknown.PLACE, Unknown.PLACE])
@@ -43,7 +46,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         near = np.abs(there - mean[one, Unknown.PLACE]) < reach
         if near.any():
             new = split(mean[one], covariance[one], float(state.log_probability[one]), there[near], sigma[near])
-            parts.append((*new, there[near]))
+            parts.append((*new, there[near], np.full(int(near.sum()), state.log_code[one])))
             narrowed += [
                 Narrowed(parent=int(one), mean=mean[one], covariance=covariance[one], place_m=at, sigma_m=wide_m)
                 for at, wide_m in zip(there[near].tolist(), sigma[near].tolist(), strict=True)
@@ -52,20 +55,26 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         best = int(np.argmax(state.log_probability))
         there = line.nearest_m(arc, mean[best, Unknown.PLACE])
         away = np.abs(there - mean[best, Unknown.PLACE]) > limits.start_separation_m
-        # The old place goes on too, free to be pulled to where the codes are.
+        # The old place goes on too: free to be pulled to where the codes are where its own measurements contradict it,
+        # as it is, and as probable as all others, where the velocity alone does.
         arc = np.concatenate([mean[best : best + 1, Unknown.PLACE], arc[away]])
         sigma = np.full(len(arc), limits.start_sigma_m)
         fresh = begin(arc, sigma, satellites, line, limits, known=(mean[best], covariance[best]))
-        parts = [(*fresh, np.full(len(arc), -np.log(len(arc))), arc)]
+        share = np.full(len(arc), -np.log(len(arc)))
+        if not weak:
+            fresh[0][0], fresh[1][0] = mean[best], covariance[best]
+            share[0], share[1:] = np.log(0.5), np.log(0.5 / max(len(arc) - 1, 1))
+        parts = [(*fresh, share, arc, np.zeros(len(arc)))]
     together = [np.concatenate(items) for items in zip(*parts, strict=True)]
     state.mean, state.covariance, state.origin_m = together[0], together[1], together[3]
     state.log_probability = together[2] - np.logaddexp.reduce(together[2])
+    state.log_code, state.branch_s, state.branch_m = together[4], 0.0, 0.0
     state.parent = np.full(state.hypotheses, -1)
     if not lost:
         state.parent = np.array([k if item is None else item.parent for k, item in enumerate(narrowed)])
         state.narrowed = narrowed
     state.coded = np.datetime64("NaT", "ns")
-    state.weak_motion_s = state.weak_code_s = 0.0
+    state.weak_motion_s = state.weak_code_s = state.across = 0.0
     state.code_shift, state.speed_range_mps = (0.0, 0.0), ANY_SPEED
     return lost
 
@@ -80,5 +89,6 @@ def _try_beside(state: TrackState, limits: TrackingLimits) -> None:
     state.mean = np.concatenate([state.mean, mean])
     state.covariance = np.concatenate([state.covariance, covariance])
     state.log_probability = log_probability - np.logaddexp.reduce(log_probability)
+    state.log_code = np.concatenate([state.log_code, np.full(len(mean), state.log_code[best])])
     state.origin_m = np.concatenate([state.origin_m, mean[:, Unknown.PLACE]])
     state.parent = np.concatenate([state.parent, np.full(len(mean), -1)])

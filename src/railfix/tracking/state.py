@@ -119,6 +119,14 @@ class TrackState:
     mean : ndarray, shape (H, N)
     covariance : ndarray, shape (H, N, N)
     log_probability : ndarray, shape (H,)
+    log_code : ndarray, shape (H,)
+        Part of it that the codes gave (`railfix.tracking.branches.judged`).
+    across : float
+        Sum of the contradictions of the velocity (`railfix.tracking.monitors`).
+    step_s, withheld_s : float [s]
+        How long all codes have asked for another place, and how long the level is withheld still.
+    branch_s, branch_m : float [s], [m]
+        Time and distance since the hypotheses began.
     origin_m : ndarray, shape (H,) [m]
         Arc length at which each hypothesis began.
     satellite : ndarray of str, shape (N - SATELLITES,)
@@ -171,6 +179,12 @@ class TrackState:
     log_scale: tuple[float, float] = (0.0, 0.0)
     code_shift: tuple[float, float] = (0.0, 0.0)
     map_log_scale: float = 0.0
+    log_code: Floats = field(default_factory=lambda: np.empty(0))
+    across: float = 0.0
+    step_s: float = 0.0
+    withheld_s: float = 0.0
+    branch_s: float = 0.0
+    branch_m: float = 0.0
     bank: Bank | None = None
     parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
     narrowed: list[Narrowed | None] | None = None
@@ -220,7 +234,8 @@ class TrackState:
         """Begin anew: no hypothesis, no sub-filter, no clock known, nothing learnt of noise and map."""
         width = SATELLITES + len(self.satellite)
         self.mean, self.covariance = np.empty((0, width)), np.empty((0, width, width))
-        self.log_probability = self.origin_m = np.empty(0)
+        self.log_probability = self.log_code = self.origin_m = np.empty(0)
+        self.branch_s = self.branch_m = self.across = self.step_s = 0.0
         self.offset_known = np.zeros(len(CLOCKS), dtype=np.bool_)
         self.weak_motion_s = self.weak_code_s = self.unaided_m = self.direction = 0.0
         self.code_shift = self.log_scale = (0.0, 0.0)

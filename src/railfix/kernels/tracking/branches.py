@@ -7,31 +7,47 @@ import math
 from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.algebra import log_sum, most_probable
 from railfix.kernels.tracking.course import point_at
-from railfix.kernels.tracking.layout import PLACE, Course, Memory, Numbers, Rows, Work
-from railfix.kernels.tracking.update import evidence_of
+from railfix.kernels.tracking.layout import BRANCH_M, BRANCH_S, PLACE, Course, Memory, Numbers, Rows, Work
+from railfix.kernels.tracking.update import evidence_of, motion_evidence
 
 
 @borrowing
-def reweigh(course: Course, numbers: Numbers, rows: Rows, memory: Memory, work: Work, count: int) -> None:
-    """Update the probabilities of hypotheses by the evidence of an epoch (`railfix.tracking.branches`)."""
-    log_probability, places, after = memory.log_probability, work.places, work.right
-    best = 0
+def reweigh(
+    course: Course, numbers: Numbers, rows: Rows, memory: Memory, work: Work, count: int, dt: float
+) -> None:
+    """Update the probabilities of hypotheses by the evidence of an epoch (`railfix.tracking.branches.judged`)."""
+    log_probability, log_code, places, after = memory.log_probability, memory.log_code, work.places, work.right
+    travel = memory.scalars[BRANCH_M]
+    independent = 1.0 + memory.scalars[BRANCH_S] / numbers.code_common_s + travel / numbers.code_common_travel_m
+    best, other = 0, work.mean.shape[0] - 1
     for h in range(count):
         if log_probability[h] > log_probability[best]:
             best = h
-        work.evidence[h] = evidence_of(rows, numbers.degrees, work.log_after[h], work, h, h)
+        joint = evidence_of(rows, work.variance, numbers.degrees, work.log_after[h], work, h, h)
+        work.evidence[h] = motion_evidence(rows, numbers, work, h, other)
+        work.code_evidence[h] = joint - work.evidence[h]
         point_at(course, work.new_mean[h, PLACE], places, work.place_axes, h)
+    first, first_code = log_probability[best], log_code[best]
+    most = numbers.most_motion * max(dt, 1.0)
     for h in range(count):
         square = 0.0
         for c in range(3):
             square += (places[h, c] - places[best, c]) ** 2
         part = square / (square + numbers.map_branch_m**2)
-        odds = log_probability[h] - log_probability[best]
-        most = numbers.most_odds * square / numbers.map_branch_m**2
-        after[h] = min(max(odds + part * (work.evidence[h] - work.evidence[best]), min(odds, -most)), max(odds, most))
+        odds = log_probability[h] - log_code[h] - (first - first_code)
+        reach = min(numbers.most_odds * square / numbers.map_branch_m**2, travel / numbers.motion_m)
+        gained = min(max(work.evidence[h] - work.evidence[best], -most), most)
+        motion = min(max(odds + part * gained, min(odds, -reach)), max(odds, reach))
+        odds = log_code[h] - first_code
+        reach = independent * square / (2.0 * numbers.code_common_m**2)
+        if square < numbers.branch_floor_m**2:
+            reach = min(reach, -math.log(numbers.branch_floor))
+        gained = work.code_evidence[h] - work.code_evidence[best]
+        work.joined[0, h] = min(max(odds + part * gained, min(odds, -reach)), max(odds, reach))
+        after[h] = motion + work.joined[0, h]
     total = log_sum(after, count)
     for h in range(count):
-        log_probability[h] = after[h] - total
+        log_probability[h], log_code[h] = after[h] - total, work.joined[0, h]
 
 
 @borrowing
@@ -52,7 +68,7 @@ def keep_hypotheses(memory: Memory, numbers: Numbers, work: Work, count: int) ->
         ranked[j] = k
     size = 0
     for k in range(count):
-        joined[0, k], joined[1, k] = log_probability[k], origin[k]
+        joined[0, k], joined[1, k], joined[2, k] = log_probability[k], origin[k], memory.log_code[k]
     for r in range(count):
         k, twin = ranked[r], -1
         for j in range(size):
@@ -85,7 +101,7 @@ def keep_hypotheses(memory: Memory, numbers: Numbers, work: Work, count: int) ->
             log_probability[j] -= total
     for j in range(size):
         k = kept[j]
-        origin[j] = joined[1, k]
+        origin[j], memory.log_code[j] = joined[1, k], joined[2, k]
         for c in range(n):
             work.new_mean[j, c] = mean[k, c]
             for e in range(n):

@@ -46,6 +46,9 @@ class Epochs(NamedTuple):
     code_sigma_m: Floats
     fresh: Masks
     remembered: Masks
+    velocity_mps: Floats
+    velocity_covariance: Floats
+    velocity_age_s: Floats
     sensor: Floats
     sensor_sigma: Floats
     unsigned: bool
@@ -96,6 +99,13 @@ class Numbers(NamedTuple):
     misfit_largest: float
     map_absolute_m: float
     map_branch_m: float
+    code_common_m: float
+    code_common_s: float
+    code_common_travel_m: float
+    branch_floor: float
+    branch_floor_m: float
+    most_motion: float
+    motion_m: float
     decided_travel_m: float
     least_probability: float
     most_hypotheses: int
@@ -140,8 +150,26 @@ class Numbers(NamedTuple):
     rounds: int
     scale_bound: float
     joined: float
-    decided: float
+    motion_leak: float
+    code_leak: float
+    level_doubt_code_s: float
+    misfit_most: float
+    level_hold_s: float
+    end_doubt_s: float
+    start_separation_m: float
+    reach_sigmas: float
+    reach_m: float
+    velocity_floor_mps: float
+    direction_share: float
+    largest_square: float
+    allowed_square: float
+    across_doubt: float
+    across_lost: float
+    step_sigmas: float
+    step_s: float
+    step_held_s: float
     tracking: int
+    unsure: int
     several: int
     coasting: int
     expired: int
@@ -167,6 +195,7 @@ class Memory(NamedTuple):
     mean: Floats
     covariance: Floats
     log_probability: Floats
+    log_code: Floats
     origin_m: Floats
     offset_known: Masks
     scalars: Floats
@@ -229,6 +258,9 @@ class Work(NamedTuple):
     log_before: Floats
     log_after: Floats
     evidence: Floats
+    code_evidence: Floats
+    branch: Floats
+    pushed: Floats
     anew: Masks
     ranked: Indices
     kept: Indices
@@ -260,7 +292,8 @@ class Work(NamedTuple):
 
 
 HYPOTHESES, WEAK_MOTION, WEAK_CODE, SCALE_DOPPLER, SCALE_PHASE, UNAIDED, DIRECTION, MEASURED = range(8)
-SHIFT, SHIFT_VARIANCE, MAP_SCALE, LEAST_SPEED, MOST_SPEED, CODED = 8, 9, 10, 11, 12, 13
+SHIFT, SHIFT_VARIANCE, MAP_SCALE, LEAST_SPEED, MOST_SPEED, CODED, BRANCH_S, BRANCH_M = 8, 9, 10, 11, 12, 13, 14, 15
+ACROSS, STEP_TIME, WITHHELD = 16, 17, 18
 
 
 class Answers(NamedTuple):
@@ -281,6 +314,7 @@ class Answers(NamedTuple):
     radar_scale: Floats
     map_scale: Floats
     level_m: Floats
+    ground_level_m: Floats
     level_noise_m: Floats
     level_speed_mps: Floats
     separation_m: Floats

@@ -6,7 +6,7 @@ import math
 
 from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.algebra import invert, restart
-from railfix.kernels.tracking.course import find_ends, onto_line
+from railfix.kernels.tracking.course import find_ends, onto_line, point_at
 from railfix.kernels.tracking.equations import combine, move_sensor_equations, write_equations
 from railfix.kernels.tracking.layout import (
     CODE_CLOCK,
@@ -22,6 +22,7 @@ from railfix.kernels.tracking.layout import (
     Answers,
     Course,
     Epochs,
+    Memory,
     Numbers,
     Rows,
     Subfilters,
@@ -177,32 +178,96 @@ def advance_subfilters(
 
 
 @borrowing
-def level_of(place: float, sigma: float, bank: Subfilters, numbers: Numbers, answers: Answers, t: int) -> float:
-    """Return the level of a place, write its parts (`railfix.tracking.bank.level_m`)."""
+def write_branches(memory: Memory, course: Course, numbers: Numbers, work: Work, count: int) -> float:
+    """Write distance along the line, straight distance and sigma of other hypotheses than the first.
+
+    Returns the probability of those that are further along the line than a bound may reach.
+    """
+    far = 0.0
+    if count > 1:
+        point_at(course, memory.mean[0, PLACE], work.places, work.place_axes, 0)
+    for h in range(1, count):
+        point_at(course, memory.mean[h, PLACE], work.places, work.place_axes, h)
+        square = 0.0
+        for c in range(3):
+            square += (work.places[h, c] - work.places[0, c]) ** 2
+        apart = abs(memory.mean[h, PLACE] - memory.mean[0, PLACE])
+        work.branch[h, 0], work.branch[h, 1] = apart, math.sqrt(square)
+        work.branch[h, 2] = math.sqrt(memory.covariance[h, PLACE, PLACE])
+        if apart > numbers.start_separation_m:
+            far += math.exp(memory.log_probability[h])
+            work.branch[h, 0] = 0.0
+    return far
+
+
+@borrowing
+def write_level(
+    memory: Memory, count: int, far: float, bank: Subfilters, numbers: Numbers, work: Work, answers: Answers, t: int
+) -> None:
+    """Write the level of the first hypothesis and its parts (`railfix.tracking.bank.compute_level`)."""
+    place, sigma = memory.mean[0, PLACE], math.sqrt(memory.covariance[0, PLACE, PLACE])
     noise, apart = numbers.level_k * sigma, math.nan
-    level, contradicted = noise, False
+    start, contradicted = noise, False
     for b in range(len(bank.running)):
         if bank.running[b]:
             contradicted = contradicted or bank.weak_s[b] > numbers.level_doubt_s
             away = abs(bank.mean[b, PLACE] - place)
             apart = away if math.isnan(apart) else max(apart, away)
-            level = max(level, away + bank.k[b] * math.sqrt(bank.covariance[b, PLACE, PLACE]))
+            start = max(start, away + bank.k[b] * math.sqrt(bank.covariance[b, PLACE, PLACE]))
     answers.level_noise_m[t], answers.separation_m[t] = noise, apart
+    answers.level_m[t] = answers.ground_level_m[t] = math.inf
     if math.isnan(apart) or contradicted:
-        return math.inf
+        return
+    answers.ground_level_m[t] = _solve(memory, count, bank, numbers, work, 1, start, place, sigma)
+    if count == 1:
+        answers.level_m[t] = answers.ground_level_m[t]
+    elif far <= numbers.level_risk:
+        answers.level_m[t] = _solve(memory, count, bank, numbers, work, 0, start, place, sigma)
+
+
+@borrowing
+def _solve(
+    memory: Memory,
+    count: int,
+    bank: Subfilters,
+    numbers: Numbers,
+    work: Work,
+    which: int,
+    start: float,
+    place: float,
+    sigma: float,
+) -> float:
+    """Level at which all hypotheses together have the risk; `which` is the column of the branches' distances."""
+    level = start
+    for h in range(1, count):
+        excess = math.exp(memory.log_probability[h]) / (2.0 * numbers.level_risk)
+        k = math.sqrt(2.0 * math.log(excess)) if excess > 1.0 else 0.0
+        level = max(level, work.branch[h, which] + k * work.branch[h, 2])
+    low, high = 0.0, math.inf
     for _ in range(numbers.rounds):
         away = level / sigma
         spent = math.erfc(away / math.sqrt(2.0))
         slope = 2.0 * math.exp(-0.5 * away * away) / sigma
-        for b in range(len(bank.running)):
-            if bank.running[b]:
-                own = math.sqrt(bank.covariance[b, PLACE, PLACE])
-                for side in (-1.0, 1.0):
+        for side in (-1.0, 1.0):
+            for b in range(len(bank.running)):
+                if bank.running[b]:
+                    own = math.sqrt(bank.covariance[b, PLACE, PLACE])
                     away = (level + side * abs(bank.mean[b, PLACE] - place)) / own
                     spent += bank.prior[b] * 0.5 * math.erfc(away / math.sqrt(2.0))
                     slope += bank.prior[b] * math.exp(-0.5 * away * away) / own
+            for h in range(1, count):
+                prior, own = math.exp(memory.log_probability[h]), work.branch[h, 2]
+                away = (level + side * work.branch[h, which]) / own
+                spent += prior * 0.5 * math.erfc(away / math.sqrt(2.0))
+                slope += prior * math.exp(-0.5 * away * away) / own
         slope /= math.sqrt(2.0 * math.pi)
-        step = spent / slope * math.log(spent / numbers.level_risk)
+        if spent > numbers.level_risk:
+            low = level
+        else:
+            high = level
+        step = spent / slope * math.log(spent / numbers.level_risk) if spent > 0.0 and slope > 0.0 else -math.inf
+        if not low <= level + step <= high:
+            step = (0.5 * (low + high) if high < math.inf else 2.0 * level) - level
         level += step
         if abs(step) < numbers.precision_m:
             break

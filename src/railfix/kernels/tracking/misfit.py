@@ -11,7 +11,7 @@ from railfix.kernels.tracking.layout import MAP_SCALE, SHIFT, SHIFT_VARIANCE, Nu
 
 
 @borrowing
-def code_shift(rows: Rows, clipped: float, work: Work, h: int) -> float:
+def code_shift(rows: Rows, most: float, work: Work, h: int) -> float:
     """Shift of the place that the codes ask for over its standard deviation (`railfix.tracking.misfit`)."""
     nc, root, own, design, value = rows.counts[0], work.root, work.own, work.design, work.value
     system, factor, right = work.system, work.factor, work.right
@@ -39,7 +39,7 @@ def code_shift(rows: Rows, clipped: float, work: Work, h: int) -> float:
             work.ordered[j] -= factor[i, j] * other
     if not information > 0.0:
         return 0.0
-    return float(min(max(score / math.sqrt(information), -clipped), clipped))
+    return float(min(max(score / math.sqrt(information), -most), most))
 
 
 @borrowing
@@ -47,6 +47,7 @@ def learn_map(scalars: Floats, shift: float, dt: float, numbers: Numbers) -> Non
     """Take an epoch's shift into the running mean, and raise or lower the error of the map's lengths."""
     dt = min(dt, 1.0)
     share = 1.0 - math.exp(-dt / numbers.map_misfit_s)
+    shift = 0.0 if abs(shift) > numbers.step_sigmas else min(max(shift, -numbers.misfit_clipped), numbers.misfit_clipped)
     mean = (1.0 - share) * scalars[SHIFT] + share * shift
     variance = (1.0 - share) ** 2 * scalars[SHIFT_VARIANCE] + share**2
     scalars[SHIFT], scalars[SHIFT_VARIANCE] = mean, variance

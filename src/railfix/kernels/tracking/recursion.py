@@ -12,6 +12,9 @@ from railfix.kernels.tracking.course import onto_line
 from railfix.kernels.tracking.equations import combine, write_equations
 from railfix.kernels.tracking.layout import (
     ACCELERATION,
+    ACROSS,
+    BRANCH_M,
+    BRANCH_S,
     CODE_CLOCK,
     CODED,
     COMBINED,
@@ -32,6 +35,7 @@ from railfix.kernels.tracking.layout import (
     WEAK_CODE,
     WEAK_MOTION,
     WHEEL_ROW,
+    WITHHELD,
     Active,
     Answers,
     Course,
@@ -42,8 +46,9 @@ from railfix.kernels.tracking.layout import (
     Subfilters,
     Work,
 )
-from railfix.kernels.tracking.level import advance_subfilters, level_of, speed_bound
+from railfix.kernels.tracking.level import advance_subfilters, speed_bound, write_branches, write_level
 from railfix.kernels.tracking.misfit import code_shift, learn_map
+from railfix.kernels.tracking.monitors import contradiction, watch
 from railfix.kernels.tracking.possible_speed import possible
 from railfix.kernels.tracking.prediction import add_bend, predict
 from railfix.kernels.tracking.update import apply_update, first_weights, mean_weights, reweight, second_start
@@ -55,7 +60,9 @@ def _left_to_numpy(epochs: Epochs, t: int, course: Course, numbers: Numbers, mem
     scalars, count = memory.scalars, int(memory.scalars[HYPOTHESES])
     left = epochs.left[t]
     left = left or scalars[WEAK_MOTION] >= numbers.lost_motion_s or scalars[WEAK_CODE] >= numbers.lost_code_s
-    left = left or (scalars[WEAK_MOTION] >= numbers.beside_after_s and count <= numbers.most_hypotheses // 2)
+    left = left or scalars[ACROSS] >= numbers.across_lost
+    beside = scalars[WEAK_MOTION] >= numbers.beside_after_s or scalars[ACROSS] >= numbers.across_doubt
+    left = left or (beside and count <= numbers.most_hypotheses // 2)
     # Beyond an end of a closed line numpy lets places go on where it closes.
     for h in range(count):
         left = left or (memory.mean[h, PLACE] < course.arc_m[0] and course.start_m == -math.inf)
@@ -236,7 +243,7 @@ def _update(
             if turn == 0:
                 first_weights(rows, work.variance, numbers.degrees, 0.0, 0.0, work, h, h)
                 if h == going and nc >= numbers.misfit_codes:
-                    shift = code_shift(rows, numbers.misfit_clipped, work, h)
+                    shift = code_shift(rows, numbers.misfit_most, work, h)
             work.log_after[h] = reweight(rows, work.variance, numbers.degrees, numbers.passes, work, h, h, h)
             if turn == 0:
                 code, motion = mean_weights(rows, work.variance, work, h)
@@ -249,9 +256,9 @@ def _update(
         if furthest < numbers.moved_m:
             break
     if count > 1:
-        reweigh(course, numbers, rows, memory, work, count)
+        reweigh(course, numbers, rows, memory, work, count, epochs.interval_s[t])
     for h in range(count):
-        onto_line(course, numbers.start_sigma_m, work, h)
+        work.pushed[h] = onto_line(course, numbers.start_sigma_m, work, h)
     return shift
 
 
@@ -284,9 +291,12 @@ def _learn(
             scalars[scalar] += share * math.log(total / (end - begin))
         scalars[scalar] = min(max(scalars[scalar], numbers.least_scale), numbers.largest_scale)
     code, motion = mean_weights(rows, work.variance, work, best)
-    scalars[WEAK_MOTION] = scalars[WEAK_MOTION] + dt if motion < numbers.lost_motion_weight else 0.0
+    weak = motion < numbers.lost_motion_weight
+    scalars[WEAK_MOTION] = scalars[WEAK_MOTION] + dt if weak else max(scalars[WEAK_MOTION] - numbers.motion_leak * dt, 0.0)
     if code_s > 0.0:
-        scalars[WEAK_CODE] = scalars[WEAK_CODE] + code_s if code < numbers.lost_code_weight else 0.0
+        weak = code < numbers.lost_code_weight
+        gone = max(scalars[WEAK_CODE] - numbers.code_leak * code_s, 0.0)
+        scalars[WEAK_CODE] = scalars[WEAK_CODE] + code_s if weak else gone
     learn_map(scalars, 0.0 if best else shift, code_s, numbers)
     answers.code_weight[t], answers.motion_weight[t] = code, motion
     for i in range(gnss):
@@ -307,6 +317,7 @@ def _finish(
     aided: bool,
     measured: bool,
     dt: float,
+    course: Course,
     numbers: Numbers,
     active: Active,
     memory: Memory,
@@ -321,6 +332,8 @@ def _finish(
     if abs(speed) > numbers.direction_mps:
         scalars[DIRECTION] = math.copysign(1.0, speed)
     scalars[UNAIDED] = 0.0 if aided else scalars[UNAIDED] + abs(speed) * dt
+    scalars[BRANCH_S] += dt
+    scalars[BRANCH_M] += abs(speed) * dt
     if count > 1:
         count = keep_hypotheses(memory, numbers, work, count)
         scalars[HYPOTHESES] = count
@@ -341,18 +354,19 @@ def _finish(
     if active.radar >= 0:
         answers.radar_scale[t] = memory.mean[0, active.radar]
     answers.map_scale[t] = math.exp(0.5 * scalars[MAP_SCALE])
+    far = write_branches(memory, course, numbers, work, count)
     if len(bank.running):
-        level = level_of(memory.mean[0, PLACE], sigma, bank, numbers, answers, t)
-        # Contradicted by its measurements for long the track itself is in doubt, which no sub-filter beside it bounds.
-        if max(scalars[WEAK_CODE], scalars[WEAK_MOTION]) > numbers.level_doubt_s:
-            level = math.inf
-        answers.level_m[t] = level
-        answers.amount_m[t] = max(level, numbers.scale_bound * scalars[UNAIDED])
+        write_level(memory, count, far, bank, numbers, work, answers, t)
+        if scalars[WITHHELD] > 0.0:
+            answers.level_m[t] = answers.ground_level_m[t] = math.inf
+        answers.amount_m[t] = max(answers.level_m[t], numbers.scale_bound * scalars[UNAIDED])
         answers.level_speed_mps[t] = speed_bound(memory.mean[0, SPEED], answers.speed_sigma_mps[t], bank, numbers)
-    if measured:
-        answers.status[t] = numbers.tracking if probability >= numbers.decided else numbers.several
+    if far > numbers.level_risk:
+        answers.status[t] = numbers.several
+    elif scalars[WITHHELD] > 0.0:
+        answers.status[t] = numbers.unsure
     else:
-        answers.status[t] = numbers.coasting
+        answers.status[t] = numbers.tracking if measured else numbers.coasting
 
 
 @kernel
@@ -403,5 +417,10 @@ def advance(
             if len(bank.running):
                 advance_subfilters(epochs, t, course, numbers, active, bank, rows, best, map_scale, work, room)
         aided = rows.counts[0] > 0
-        _finish(t, best, aided, measured, dt, numbers, active, memory, bank, answers, work)
+        if measured:
+            square = contradiction(epochs, t, course, numbers, memory, work, best)
+            watch(numbers, memory, bank, square, 0.0 if best else shift, work.pushed[best], dt, code_s)
+        else:
+            scalars[WITHHELD] = max(scalars[WITHHELD] - dt, 0.0)
+        _finish(t, best, aided, measured, dt, course, numbers, active, memory, bank, answers, work)
     return last

@@ -153,9 +153,11 @@ def reweight(
 
 
 @borrowing
-def evidence_of(rows: Rows, degrees: tuple[float, float], log_after: float, work: Work, h: int, to: int) -> float:
-    """Logarithm of the evidence of the measurements, for the fit in row `to`."""
-    residual, variance, change, information = work.residual, work.variance, work.change, work.information
+def evidence_of(
+    rows: Rows, variance: Floats, degrees: tuple[float, float], log_after: float, work: Work, h: int, to: int
+) -> float:
+    """Logarithm of the evidence of the measurements of finite variance, for the fit in row `to`."""
+    residual, change, information = work.residual, work.change, work.information
     nc, gnss = rows.counts[0], rows.counts[0] + rows.counts[1] + rows.counts[2]
     size = nc + COMBINED + rows.counts[3]
     usual, late = degrees
@@ -170,6 +172,17 @@ def evidence_of(rows: Rows, degrees: tuple[float, float], log_after: float, work
             total += information[h, i, j] * change[to, j]
         away += change[to, i] * total
     return float(-0.5 * (usual + 1.0) / usual * fit - 0.5 * away + 0.5 * (log_after - work.log_before[h]))
+
+
+@borrowing
+def motion_evidence(rows: Rows, numbers: Numbers, work: Work, h: int, other: int) -> float:
+    """Logarithm of the evidence of all measurements but the codes (`railfix.tracking.robust.motion_evidence`)."""
+    nc, count = rows.counts[0], rows.counts[0] + rows.counts[1] + rows.counts[2] + rows.counts[3]
+    for i in range(count):
+        work.masked[i] = math.inf if i < nc else work.variance[i]
+        work.weight[other, i] = work.weight[h, i]
+    log_after = reweight(rows, work.masked, numbers.degrees, numbers.passes, work, h, h, other)
+    return evidence_of(rows, work.masked, numbers.degrees, log_after, work, h, other)
 
 
 @borrowing
@@ -216,8 +229,8 @@ def second_start(numbers: Numbers, rows: Rows, work: Work, h: int, other: int) -
     log_after = 0.0
     for by in (other, h):
         log_after = reweight(rows, work.variance, numbers.degrees, numbers.passes, work, h, by, other)
-    first = evidence_of(rows, numbers.degrees, work.log_after[h], work, h, h)
-    if evidence_of(rows, numbers.degrees, log_after, work, h, other) > first:
+    first = evidence_of(rows, work.variance, numbers.degrees, work.log_after[h], work, h, h)
+    if evidence_of(rows, work.variance, numbers.degrees, log_after, work, h, other) > first:
         work.log_after[h] = log_after
         for i in range(size):
             work.change[h, i] = work.change[other, i]

@@ -1,0 +1,286 @@
+"""Cold starts and faults: what the filter states against what is true.
+
+``python tests/belief_campaign.py`` runs the recordings beside the checkout; ``python tests/belief_campaign.py FOLDER ...``
+runs folders with a ``case.toml`` that names ``log``, ``nav``, ``track`` and ``truth`` (a track map and a reference as
+``railfix evaluate`` reads them). Every trial is the pipeline with its defaults (``--mask`` changes the elevation mask)
+from a cold start.
+
+``--starts`` (default): a cold start every ``--every`` seconds, ``--length`` seconds each. ``--faults``: faults of one satellite, one
+constellation, all Dopplers, all phases, a step of all codes, the map, and pairs.
+
+An epoch is *exceeded* where its level is finite and the error is larger: by straight distance on the ground, and by
+chainage, where another lap of the same road counts as wrong. *Sure and wrong* are epochs with the status `tracking`
+and an error of more than four standard deviations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+import recordings_score
+import recordings_truth
+from posterior_score import arc_of, bounds
+from railfix.core.timescale import seconds
+from railfix.evaluate import interpolate_reference, straight_distance
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.io.reference_log import read_reference
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.along_track import on_line_m
+from railfix.pipeline.config import parse_config
+from railfix.run.processor import processor_of
+from railfix.track import read_track
+from railfix.track.trajectory import Trajectory
+from railfix.tracking import Tracked, TrackStatus
+
+DATA: Final = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A log, its navigation records, the line and the reference at every epoch of the log."""
+
+    name: str
+    observations: Observations
+    navigation: Navigation
+    trajectory: Trajectory
+    reference_ecef_m: np.ndarray
+    reference_arc_m: np.ndarray
+
+    def part(self, first: int, end: int) -> Case:
+        """Some epochs of it."""
+        return replace(
+            self,
+            observations=self.observations[first:end],
+            reference_ecef_m=self.reference_ecef_m[first:end],
+            reference_arc_m=self.reference_arc_m[first:end],
+        )
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What one trial stated and what was true, at the epochs with a reference."""
+
+    time_s: np.ndarray
+    status: np.ndarray
+    probability: np.ndarray
+    sigma_m: np.ndarray
+    level_m: np.ndarray
+    ground_level_m: np.ndarray
+    straight_m: np.ndarray
+    chainage_m: np.ndarray
+
+    @property
+    def bounded(self) -> np.ndarray:
+        return np.isfinite(self.level_m)
+
+    @property
+    def over(self) -> np.ndarray:
+        """Exceeded by straight distance: the level along the line, or that of the straight distance."""
+        either = np.where(self.bounded, self.level_m, self.ground_level_m)
+        return np.isfinite(either) & (self.straight_m > either)
+
+    @property
+    def over_chainage(self) -> np.ndarray:
+        return self.bounded & (self.chainage_m > self.level_m)
+
+    @property
+    def tracking(self) -> np.ndarray:
+        return self.status == TrackStatus.TRACKING
+
+    @property
+    def sure_and_wrong(self) -> np.ndarray:
+        return self.tracking & (self.straight_m > 4.0 * self.sigma_m)
+
+
+def joined(parts: list[Judged]) -> Judged:
+    return Judged(*(np.concatenate([getattr(p, n) for p in parts]) for n in Judged.__dataclass_fields__))
+
+
+def made(name: str, log: Path, nav: list[Path], truth: recordings_truth.Truth, trajectory: Trajectory | None) -> Case:
+    """A case; without a line it is made from the reference."""
+    time, ecef = truth
+    trajectory = recordings_score.trajectory_of(time, ecef) if trajectory is None else trajectory
+    observations = read_observations(log)
+    reference = interpolate_reference(observations.time, time, ecef)
+    # The vehicle's own lap and strand: followed through the whole reference, which may begin before the log.
+    whole = arc_of(ecef, seconds(time - time[0]), trajectory)
+    since = seconds(observations.time - time[0])
+    arc = np.where(np.isfinite(reference[:, 0]), np.interp(since, seconds(time - time[0]), whole), np.nan)
+    return Case(name, observations, read_navigation(nav), trajectory, reference, arc)
+
+
+def smartloc_rinex_truth(folder: Path) -> recordings_truth.Truth:
+    """The drive at Potsdamer Platz as recorded: seconds since the first epoch, ECEF."""
+    lines = (folder / "Berlin_Potsdamer_Platz_RTK_GT.txt").read_text(encoding="ascii").splitlines()
+    rows = np.array([line.split()[1:5] for line in lines if line.strip()], dtype=np.float64)
+    start = np.datetime64("2016-06-06T11:10:41.700", "ns")
+    return start + (np.round(rows[:, 0], 3) * 1e9).astype("timedelta64[ns]"), rows[:, 1:]
+
+
+def _recordings(data: Path) -> dict[str, Callable[[], Case]]:
+    road = data / "kinematic"
+    tst, pixel, japan = road / "urbannav_tst", road / "gsdc_pixel5_a", next(iter(road.glob("japan_mosaic*")))
+    berlin = road / "smartloc_berlin_rinex"
+    urban = recordings_truth.urbannav_truth
+    return {
+        "m8t": lambda: made(
+            "m8t", tst / "20210517.light-urban.tste.ublox.m8t.GC.obs", [tst / "hksc137c.nav"], urban(tst), None
+        ),
+        "f9p": lambda: made(
+            "f9p", tst / "20210517.light-urban.tste.ublox.f9p.obs", [tst / "hksc137c.nav"], urban(tst), None
+        ),
+        "pixel": lambda: made(
+            "pixel", pixel / "Pixel5_a.21o", [pixel / "hour1180.21n"], recordings_truth.gsdc_truth(pixel), None
+        ),
+        "japan": lambda: made(
+            "japan", japan / "SEPT265G.21O", [japan / "SEPT2650.21P"], recordings_truth.japan_truth(japan), None
+        ),
+        "berlin": lambda: made(
+            "berlin",
+            berlin / "Berlin_Potsdamer_Platz.obs.gz",
+            [berlin / "brdc1580.16n.gz", berlin / "brdc1580.16g.gz"],
+            smartloc_rinex_truth(berlin),
+            None,
+        ),
+    }
+
+
+def case_of_folder(folder: Path) -> Case:
+    """The case that a folder's ``case.toml`` names."""
+    given = tomllib.loads((folder / "case.toml").read_text(encoding="utf-8"))
+    missing = sorted({"log", "nav", "track", "truth"} - set(given))
+    if missing:
+        raise SystemExit(f"{folder / 'case.toml'}: {', '.join(missing)} missing; expected log, nav, track and truth")
+    nav = [given["nav"]] if isinstance(given["nav"], str) else given["nav"]
+    reference = read_reference(folder / given["truth"])
+    trajectory = Trajectory.from_track(read_track(folder / given["track"]))
+    truth = (reference.front.time, reference.front.ecef_m)
+    return made(folder.name, folder / given["log"], [folder / n for n in nav], truth, trajectory)
+
+
+def run(case: Case, settings: dict[str, Any], *, first: int = 0) -> Judged:
+    """Judge the pipeline on a case from a cold start, epochs from `first` on."""
+    config = parse_config({"filter": "track", **settings})
+    processor = processor_of(config, case.navigation, {"front": case.trajectory})
+    result, _ = processor.process({"front": case.observations})
+    return judged(case, result.fusion["front"].tracked, first)
+
+
+def judged(case: Case, found: Tracked, first: int = 0) -> Judged:
+    """Compare what was found with the reference."""
+    place = on_line_m(found, case.trajectory)
+    straight = straight_distance(place, case.reference_ecef_m, case.trajectory)
+    chainage = np.abs(found.arc_m - case.reference_arc_m)
+    known = np.isfinite(case.reference_ecef_m[:, 0])
+    known[:first] = False
+    # A place off the map has no straight distance: it is as wrong as its arc length.
+    straight = np.where(np.isfinite(straight), straight, chainage)
+    time = seconds(case.observations.time - case.observations.time[0])
+    columns = (time, found.status, found.probability, found.sigma_m, found.level_m, found.ground_level_m, straight, chainage)
+    return Judged(*(np.asarray(column)[known] for column in columns))
+
+
+def starts(case: Case, every_s: float, length_s: float) -> Iterator[tuple[float, Case]]:
+    """Cold starts: seconds after the first epoch with a reference, and the part of the case."""
+    t = seconds(case.observations.time - case.observations.time[0])
+    known = np.flatnonzero(np.isfinite(case.reference_ecef_m[:, 0]))
+    for begin in np.arange(t[known[0]], t[known[-1]] - 60.0, every_s):
+        first, end = (int(k) for k in np.searchsorted(t, [begin, begin + length_s]))
+        if end - first >= 30:
+            yield float(begin), case.part(first, end)
+
+
+def counts(label: str, found: Judged, *, trials: int, wrong_trials: int) -> str:
+    """A row of the table of cold starts."""
+    n = len(found.status)
+    tracking = int(found.tracking.sum())
+    error = found.straight_m
+    level = np.median(found.level_m[found.bounded]) if found.bounded.any() else np.nan
+    on_ground = np.isfinite(found.ground_level_m)
+    ground = np.median(found.ground_level_m[on_ground]) if on_ground.any() else np.nan
+    return (
+        f"{label:18s} {trials:4d} trials {n:6d} ep  tracking {100 * tracking / n:5.1f} %  level {100 * found.bounded.mean():5.1f} %"
+        f" p50 {level:5.1f} ground {100 * on_ground.mean():5.1f} % {ground:5.1f}  over: straight {int(found.over.sum()):4d} chainage {int(found.over_chainage.sum()):4d}"
+        f" (trials {wrong_trials:3d})  sure&wrong {100 * found.sure_and_wrong.sum() / max(tracking, 1):5.2f} %"
+        f"  tracking >10 m {int((found.tracking & (error > 10.0)).sum()):4d}"
+        f"  p50/p95/max {np.nanmedian(error):.2f}/{np.nanpercentile(error, 95):.2f}/{np.nanmax(error):.1f}"
+        f"  e/s p95 {np.nanpercentile((error / found.sigma_m)[found.tracking], 95) if tracking else np.nan:.2f}"
+    )
+
+
+def calibration(found: Judged) -> list[str]:
+    """Stated probability of the branch against the share that is right by chainage."""
+    right = found.chainage_m < np.fmax(10.0, 4.0 * found.sigma_m)
+    lines = []
+    for low, high in ((0.0, 0.5), (0.5, 0.9), (0.9, 0.99), (0.99, 0.999), (0.999, 1.1)):
+        mine = (found.probability >= low) & (found.probability < high) & np.isfinite(found.chainage_m)
+        if mine.any():
+            count, hits = int(mine.sum()), int(right[mine].sum())
+            least, most = bounds(hits, count)
+            lines.append(f"  stated {low:.3f} to {min(high, 1.0):.3f}: right {hits}/{count} = {hits / count:.4f} ({least:.4f} to {most:.4f})")
+    return lines
+
+
+def show_starts(case: Case, args: argparse.Namespace) -> None:
+    for mask in args.mask:
+        settings = {"elevation": {"mask_deg": mask}, **args.settings}
+        parts, wrong = [], 0
+        for begin, part in starts(case, args.every, args.length):
+            found = run(part, settings)
+            parts.append(found)
+            bad = int((found.over | found.over_chainage).sum())
+            wrong += bad > 0
+            if args.verbose and (bad or found.sure_and_wrong.any()):
+                k = np.flatnonzero(found.over | found.over_chainage | found.sure_and_wrong)[0]
+                print(
+                    f"    start {begin:6.1f}: over straight {int(found.over.sum())} chainage {int(found.over_chainage.sum())} "
+                    f"sure&wrong {int(found.sure_and_wrong.sum())}; first at {found.time_s[k]:.0f} s: error "
+                    f"{found.straight_m[k]:.1f}/{found.chainage_m[k]:.0f} m, sigma {found.sigma_m[k]:.1f}, level {found.level_m[k]:.1f} ground {found.ground_level_m[k]:.1f}, p {found.probability[k]:.4f}; max {np.nanmax(found.straight_m):.0f}",
+                    flush=True,
+                )
+        print(counts(f"{case.name} mask {mask:g}", joined(parts), trials=len(parts), wrong_trials=wrong), flush=True)
+        print("\n".join(calibration(joined(parts))), flush=True)
+
+
+def show_whole(case: Case, args: argparse.Namespace) -> None:
+    """The recording as a whole, from its first epoch."""
+    for mask in args.mask:
+        found = run(case, {"elevation": {"mask_deg": mask}, **args.settings})
+        print(counts(f"{case.name} whole {mask:g}", found, trials=1, wrong_trials=0), flush=True)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="*", help="folders with a case.toml, or names of recordings")
+    parser.add_argument("--every", type=float, default=10.0)
+    parser.add_argument("--length", type=float, default=150.0)
+    parser.add_argument("--mask", type=float, nargs="*", default=[20.0])
+    parser.add_argument("--set", dest="sets", nargs="*", default=[], help="tracking settings, name=value")
+    parser.add_argument("--whole", action="store_true")
+    parser.add_argument("--no-starts", action="store_true")
+    parser.add_argument("--verbose", action="store_true")
+    args = parser.parse_args()
+    args.settings = {}
+    if args.sets:
+        args.settings["tracking"] = {k: float(v) if v.replace(".", "").replace("e-", "").isdigit() else v for k, v in (s.split("=") for s in args.sets)}
+    known = _recordings(DATA) if DATA.is_dir() else {}
+    for name in args.folders or list(known):
+        case = known[name]() if name in known else case_of_folder(Path(name))
+        if args.whole:
+            show_whole(case, args)
+        if not args.no_starts:
+            show_starts(case, args)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
