@@ -28,18 +28,20 @@ import numpy as np
 import recordings_score
 import recordings_truth
 from posterior_score import arc_of, bounds
+from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference, straight_distance
-from railfix.gnss.navigation import Navigation
+from railfix.gnss.navigation import Navigation, glonass_channels
 from railfix.gnss.observations import Observations
+from railfix.gnss.signals import carrier_frequency_hz
 from railfix.io.reference_log import read_reference
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import parse_config
 from railfix.run.processor import processor_of
-from railfix.track import read_track
+from railfix.track import Track, read_track
 from railfix.track.trajectory import Trajectory
-from railfix.tracking import Tracked, TrackStatus
+from railfix.tracking import Line, Tracked, TrackStatus
 
 DATA: Final = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -199,6 +201,168 @@ def starts(case: Case, every_s: float, length_s: float) -> Iterator[tuple[float,
             yield float(begin), case.part(first, end)
 
 
+@dataclass(frozen=True)
+class Fault:
+    """A fault as it is added to a case: what it changes a range by [m] and the rate of change [m/s], T epochs by M."""
+
+    name: str
+    code_m: np.ndarray
+    phase_m: np.ndarray
+    rate_mps: np.ndarray
+
+
+def with_fault(case: Case, fault: Fault) -> Case:
+    """A case with ranges, phases and range rates changed."""
+    obs = case.observations
+    channel = {**glonass_channels(case.navigation), **obs.header.glonass_channel}
+    wavelength = SPEED_OF_LIGHT / carrier_frequency_hz(obs.satellite, obs.signal, channel)
+    changed = replace(
+        obs,
+        code_m=obs.code_m + fault.code_m,
+        phase_cycles=obs.phase_cycles + fault.phase_m / wavelength,
+        doppler_hz=obs.doppler_hz - fault.rate_mps / wavelength,
+    )
+    return replace(case, observations=changed)
+
+
+def moved(case: Case, metres: float) -> Case:
+    """A case whose map lies so far to the right of the true line."""
+    at = case.trajectory
+    points = np.asarray(at.ecef_m)
+    tangent = np.gradient(points, axis=0)
+    up = points / np.linalg.norm(points, axis=1, keepdims=True)
+    right = np.cross(tangent, up)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return on_line(case, points + metres * right)
+
+
+def stretched(case: Case, share: float) -> Case:
+    """A case whose map is too long by a share, right where the run begins."""
+    points = np.asarray(case.trajectory.ecef_m)
+    known = np.flatnonzero(np.isfinite(case.reference_ecef_m[:, 0]))
+    centre = case.reference_ecef_m[known[0]]
+    return on_line(case, centre + (1.0 + share) * (points - centre))
+
+
+def on_line(case: Case, ecef_m: np.ndarray) -> Case:
+    """The case on another line with the same vertices."""
+    other = Trajectory.from_track(Track.from_ecef(ecef_m))
+    arc = np.interp(case.reference_arc_m, np.asarray(case.trajectory.arc_m), np.asarray(other.arc_m))
+    return replace(case, trajectory=other, reference_arc_m=np.where(np.isfinite(case.reference_arc_m), arc, np.nan))
+
+
+def sights(case: Case) -> tuple[np.ndarray, np.ndarray]:
+    """Change of each range by a metre along the line at the reference, shape (T, M), 0 where unknown; and the speed."""
+    processor = processor_of(parse_config({"filter": "off"}), case.navigation, {"front": case.trajectory})
+    found = processor.process({"front": case.observations})[0].antennas["front"]
+    known = np.isfinite(case.reference_arc_m)
+    arc = np.where(known, case.reference_arc_m, 0.0)
+    tangent = Line.of(case.trajectory).at(arc)[1][:, 0]
+    sat = found.satellites.position_ecef_m
+    sight = sat - np.where(known[:, None], case.reference_ecef_m, 0.0)[:, None, :]
+    sight /= np.linalg.norm(sight, axis=2, keepdims=True)
+    along = np.zeros(case.observations.code_m.shape)
+    # Every signal of a satellite has the sight of its channel that the pipeline used.
+    names = case.observations.satellite
+    for k, column in enumerate(found.columns):
+        change = np.where(known & np.isfinite(sat[:, k, 0]), -(sight[:, k] * tangent).sum(axis=1), 0.0)
+        along[:, names == names[column]] = change[:, None]
+    return along, np.gradient(arc)
+
+
+def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterator[tuple[str, Case]]:
+    """Every kind of fault once, of random satellites and sizes; from the first epoch or from 45 s on."""
+    obs = case.observations
+    t = seconds(obs.time - obs.time[0])
+    nothing = np.zeros(obs.code_m.shape)
+    names = np.unique(obs.satellite[np.isfinite(obs.code_m).sum(axis=0) > 0.5 * len(t)])
+    if not len(names):
+        return
+
+    def of(*satellites: str) -> np.ndarray:
+        return np.isin(obs.satellite, satellites)[None, :]
+
+    def since(start: float) -> np.ndarray:
+        return np.maximum(t - start, 0.0)[:, None], (t >= start)[:, None]
+
+    one, other = (str(x) for x in random.choice(names, 2, replace=len(names) < 2))
+    letters = sorted({str(name)[0] for name in names})
+    letter = str(random.choice(letters))
+    start = 45.0 if random.random() < 0.6 else 0.0
+    after, on = since(start)
+    listed: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = []
+    for size in (20.0, -50.0, 100.0):
+        listed.append((f"code {size:+.0f} m", size * (of(one) & on), nothing, nothing))
+    for rate in (0.1, 1.0):
+        listed.append((f"code {rate:g} m/s", rate * after * of(one), nothing, nothing))
+    whole = -100.0 * (of(one) & on)
+    listed.append(("clock -100 m", whole, whole, nothing))
+    drift = -1.0 * after * of(one)
+    listed.append(("clock -1 m/s", drift, drift, -1.0 * (of(one) & on)))
+    if len(letters) > 1:
+        own = np.char.startswith(obs.satellite.astype(str), letter)[None, :]
+        tilt = np.where(own & on, 30.0 * along, 0.0)
+        listed.append(("constellation 30 m along", tilt, nothing, nothing))
+    _, short = since(45.0)
+    short = short & (t < 65.0)[:, None]
+    listed.append(("Dopplers +5 m/s", nothing, nothing, 5.0 * along * short))
+    listed.append(("Dopplers common +5 m/s", nothing, nothing, 5.0 * short))
+    slide = np.clip(t - 45.0, 0.0, 20.0)[:, None]
+    listed.append(("phases +2 m/s", nothing, 2.0 * along * slide, nothing))
+    listed.append(("all codes +30 m along", 30.0 * along * on, nothing, nothing))
+    listed.append(("pull 0.5 m/s, all", *(x * along for x in (0.5 * after, 0.5 * after, 0.5 * on))))
+    pair = of(one, other)
+    listed.append(("pair +30 m", 30.0 * (pair & on), nothing, nothing))
+    listed.append(("pair +20, -20 m", 20.0 * ((of(one) & on).astype(float) - (of(other) & on)), nothing, nothing))
+    for name, code, phase, rate in listed:
+        label = name if start or name.startswith(("Dopp", "phases")) else f"{name}, from the start"
+        yield label, with_fault(case, Fault(name, code, phase, rate))
+    few = [str(x) for x in random.choice(names, min(3, len(names)), replace=False)]
+    for count in (3, 2):
+        left = {f: np.where(of(*few[:count]), getattr(obs, f), np.nan) for f in ("code_m", "phase_cycles", "doppler_hz")}
+        full = t[:, None] < 45.0
+        some = {name: np.where(full, getattr(obs, name), values) for name, values in left.items()}
+        yield f"{count} satellites", replace(case, observations=replace(obs, **left))
+        yield f"{count} satellites after 45 s", replace(case, observations=replace(obs, **some))
+    yield "map 20 m aside", moved(case, 20.0)
+    yield "map 5 m aside", moved(case, 5.0)
+    yield "map 2 % long", stretched(case, 0.02)
+
+
+def show_faults(case: Case, args: argparse.Namespace) -> None:
+    """Faults put in; epochs over the level, by kind."""
+    random = np.random.default_rng(args.seed)
+    settings = {"elevation": {"mask_deg": args.mask[0]}, **args.settings}
+    along, _ = sights(case)
+    found: dict[str, list[Judged]] = {}
+    t = seconds(case.observations.time - case.observations.time[0])
+    known = np.flatnonzero(np.isfinite(case.reference_ecef_m[:, 0]))
+    for begin in np.arange(t[known[0]], t[known[-1]] - 90.0, args.fault_every):
+        first, end = (int(k) for k in np.searchsorted(t, [begin, begin + args.length]))
+        for label, faulty in faults(case.part(first, end), along[first:end], random):
+            judged_run = run(faulty, settings)
+            if args.verbose and (judged_run.over | judged_run.over_chainage).any():
+                bad = judged_run.over | (judged_run.over_chainage & (not label.startswith("map")))
+                if not bad.any():
+                    continue
+                k = np.flatnonzero(bad)[0]
+                print(f"    start {begin:.0f} {label}: {bad.sum()} over, first {judged_run.time_s[k]:.0f} s error {judged_run.straight_m[k]:.1f} level {judged_run.level_m[k]:.1f} ground {judged_run.ground_level_m[k]:.1f} sigma {judged_run.sigma_m[k]:.1f}; worst {np.nanmax(judged_run.straight_m):.0f}", flush=True)
+            found.setdefault(label, []).append(judged_run)
+    total = 0
+    for label, parts in found.items():
+        whole = joined(parts)
+        # On a wrong map the chainage of a place is not defined.
+        over = whole.over | (whole.over_chainage & (not label.startswith("map")))
+        total += int(over.sum())
+        print(
+            f"{case.name:7s} {label:38s} {len(parts):3d} trials  over {int(over.sum()):4d} in {sum((p.over | (p.over_chainage & (not label.startswith('map')))).any() for p in parts):2d}"
+            f"  level {100 * whole.bounded.mean():5.1f} %  ground {100 * np.isfinite(whole.ground_level_m).mean():5.1f} %"
+            f"  p95 {np.nanpercentile(whole.straight_m, 95):6.1f}  max {np.nanmax(whole.straight_m):6.0f}",
+            flush=True,
+        )
+    print(f"{case.name}: {sum(map(len, found.values()))} faults, {total} epochs over")
+
+
 def counts(label: str, found: Judged, *, trials: int, wrong_trials: int) -> str:
     """A row of the table of cold starts."""
     n = len(found.status)
@@ -265,6 +429,9 @@ def main() -> int:
     parser.add_argument("--length", type=float, default=150.0)
     parser.add_argument("--mask", type=float, nargs="*", default=[20.0])
     parser.add_argument("--set", dest="sets", nargs="*", default=[], help="tracking settings, name=value")
+    parser.add_argument("--faults", action="store_true")
+    parser.add_argument("--fault-every", type=float, default=90.0)
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--whole", action="store_true")
     parser.add_argument("--no-starts", action="store_true")
     parser.add_argument("--verbose", action="store_true")
@@ -277,7 +444,9 @@ def main() -> int:
         case = known[name]() if name in known else case_of_folder(Path(name))
         if args.whole:
             show_whole(case, args)
-        if not args.no_starts:
+        if args.faults:
+            show_faults(case, args)
+        elif not args.no_starts:
             show_starts(case, args)
     return 0
 

@@ -59,6 +59,12 @@ class SourceKind(IntEnum):
     SATELLITE = 0
     CONSTELLATION = 1
     SENSOR = 2
+    MOTION = 3
+    MAP = 4
+
+
+#: Sources beside satellites, constellations and sensors: all Dopplers, all phases, the map.
+OTHERS: Final = ("doppler", "phase", "map")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +77,7 @@ class Budget:
     k : float
         Sigmas that noise without a fault exceeds with the risk, on either side.
     prior : tuple of float
-        Probability that a satellite, a constellation, a sensor is faulty or still remembered; 0 needs no sub-filter.
+        Probability that a source of each `SourceKind` is faulty or still remembered; 0 needs no sub-filter.
     k_fault : tuple of float
         Sigmas that noise exceeds on one side with the risk over that probability: what a sub-filter asks for at least.
     k_speed : float
@@ -81,10 +87,10 @@ class Budget:
 
     risk: float
     k: float
-    prior: tuple[float, float, float]
-    k_fault: tuple[float, float, float]
+    prior: tuple[float, ...]
+    k_fault: tuple[float, ...]
     k_speed: float
-    k_speed_fault: tuple[float, float, float]
+    k_speed_fault: tuple[float, ...]
 
 
 @lru_cache(maxsize=8)
@@ -101,19 +107,20 @@ def budget(limits: TrackingLimits) -> Budget:
         min(local * limits.level_fault_prior, 1.0),
         min((1.0 + remembered_s / CONSTELLATION_FAULT_S) * limits.level_constellation_prior, 1.0),
         min(local * limits.level_sensor_prior, 1.0),
+        min(local * limits.level_motion_prior, 1.0),
+        min(local * limits.level_map_prior, 1.0),
     ]
     kept = [prior if MOST_SOURCES * prior > SPARED * risk else 0.0 for prior in exposed]
     risk -= MOST_SOURCES * sum(prior for prior, monitored in zip(exposed, kept, strict=True) if not monitored)
     of_speed = SPEED_SHARE * risk / (MOST_SOURCES + 1)
 
-    def sigmas(share: float) -> tuple[float, float, float]:
-        found = [float(-ndtri(min(share / prior, 0.5))) if prior else 0.0 for prior in kept]
-        return found[0], found[1], found[2]
+    def sigmas(share: float) -> tuple[float, ...]:
+        return tuple(float(-ndtri(min(share / prior, 0.5))) if prior else 0.0 for prior in kept)
 
     return Budget(
         risk=risk,
         k=float(-ndtri(0.5 * risk)),
-        prior=(kept[0], kept[1], kept[2]),
+        prior=tuple(kept),
         k_fault=sigmas(risk),
         k_speed=float(-ndtri(0.5 * of_speed)),
         k_speed_fault=sigmas(of_speed),
@@ -165,7 +172,7 @@ def levelled(
     dt = float(chunk.interval_s[epoch])
     mean, covariance = before
     if len(bank.without):
-        means, covariances = predicted(bank.mean, bank.covariance, line, dt, limits, map_scale)
+        means, covariances = predict_bank(bank, line, dt, limits, map_scale)
     else:
         means, covariances = bank.mean, bank.covariance
     names = _sources(rows, satellite, limits)
@@ -197,6 +204,8 @@ def levelled(
     for k, copy in enumerate(copies):
         if copy:
             fresh[0][k], fresh[1][k] = mean, covariance
+        if added[k] == "map":
+            fresh[1][k][[Unknown.MAP_RIGHT, Unknown.MAP_UP], [Unknown.MAP_RIGHT, Unknown.MAP_UP]] += limits.level_map_m**2
     means = np.concatenate([means[kept], fresh[0]])
     covariances = np.concatenate([covariances[kept], fresh[1]])
     without = (*(bank.without[k] for k in kept), *added)
@@ -216,6 +225,14 @@ def levelled(
     means, covariances = applied(means, covariances, prior, update)
     means = on_the_line(means, covariances, line, limits)
     return Bank(without=without, mean=means, covariance=covariances, weak_s=weak_s)
+
+
+def predict_bank(
+    bank: Bank, line: Line, dt: float, limits: TrackingLimits, map_scale: float
+) -> tuple[Floats, Floats]:
+    """Predict all sub-filters; that of the map lets it be wrong by `TrackingLimits.level_map_m`."""
+    wrong = np.array([limits.level_map_m if name == "map" else 0.0 for name in bank.without])
+    return predicted(bank.mean, bank.covariance, line, dt, limits, map_scale, map_sigma_m=wrong)
 
 
 def _sensor_rows(rows: Rows, best: int, change: Floats) -> SensorRows | None:
@@ -239,7 +256,7 @@ def _contradicted(rows: Rows, weight: Floats, use: Masks, limits: TrackingLimits
 
 def _sources(rows: Rows, satellite: Strings, limits: TrackingLimits) -> list[str]:
     """Sources of an epoch that need a sub-filter: satellites, constellations of several, sensors."""
-    of_satellite, of_constellation, of_sensor = budget(limits).prior
+    of_satellite, of_constellation, of_sensor, of_motion, of_map = budget(limits).prior
     names = [str(name) for name in dict.fromkeys(satellite[: rows.bounds[2]].tolist())]
     letters = [letter for letter in CLOCKS if any(clock_of(name) == letter for name in satellite[rows.codes].tolist())]
     sensors = [name for kind, name in SENSORS.items() if (rows.kind == kind).any()]
@@ -247,6 +264,9 @@ def _sources(rows: Rows, satellite: Strings, limits: TrackingLimits) -> list[str
         *(names if of_satellite else []),
         *(letters if of_constellation and len(letters) > 1 else []),
         *(sensors if of_sensor else []),
+        *(("doppler",) if of_motion and rows.bounds[2] > rows.bounds[1] else ()),
+        *(("phase",) if of_motion and rows.bounds[1] > rows.bounds[0] else ()),
+        *(("map",) if of_map and rows.bounds[0] else ()),
     ]
 
 
@@ -254,6 +274,8 @@ def kind_of(name: str) -> SourceKind:
     """Kind of a source: `G12` is a satellite, `G` a constellation, `wheel` a sensor."""
     if name in CLOCKS:
         return SourceKind.CONSTELLATION
+    if name in OTHERS:
+        return SourceKind.MAP if name == "map" else SourceKind.MOTION
     return SourceKind.SENSOR if name in SENSORS.values() else SourceKind.SATELLITE
 
 
@@ -263,7 +285,10 @@ def clock_of(satellite: str) -> str:
 
 
 def _of(name: str, rows: Rows, satellite: Strings) -> Masks:
-    """Rows of a source."""
+    """Rows of a source; none of the map."""
+    if name in OTHERS:
+        kind = {"doppler": Kind.DOPPLER, "phase": Kind.PHASE, "map": -1}[name]
+        return np.asarray(rows.kind == kind)
     if kind_of(name) is SourceKind.SENSOR:
         return np.asarray(rows.kind == next(kind for kind, text in SENSORS.items() if text == name))
     if kind_of(name) is SourceKind.CONSTELLATION:

@@ -17,6 +17,8 @@ from railfix.tracking.state import CLOCKS, OFFSETS, SATELLITES, Unknown
 #: The line is searched at points this far apart; a Gaussian of `start_sigma_m` covers what lies between, and codes
 #: count with the error that a place between two points makes [m].
 _SPACING_M: Final = 15.0
+#: Codes beyond place and clocks that places are sought with: with one alone a wrong place fits as well.
+REDUNDANT: Final = 2
 #: Places whose logarithm of likelihood is this far below the best are not begun with.
 _WORSE: Final = 12.0
 #: Standard deviation of an unknown speed: no train is faster than twice this [m/s].
@@ -50,14 +52,15 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
     Returns
     -------
     arc_m : ndarray, shape (C,) [m]
-        Local maxima of the likelihood with Student's t errors, the best first; empty without redundant codes.
+        Local maxima of the likelihood with Student's t errors, the best first; empty with fewer than `REDUNDANT`
+        codes beyond the unknowns, or with more places than `most_hypotheses`.
     sigma_m : ndarray, shape (C,) [m]
         Half of the stretch that is about as likely, at least `start_sigma_m`.
     """
     has = chunk.has[0, epoch]
     groups = [has & (chunk.offset == g) for g in range(len(CLOCKS))]
     groups = [group for group in groups if group.sum() > 1]
-    if sum(int(group.sum()) - 1 for group in groups) < 1:
+    if sum(int(group.sum()) - 1 for group in groups) < 1 + REDUNDANT:
         return np.empty(0), np.empty(0)
     keep = _thinned(line)
     arc, points = line.arc_m[keep], line.ecef_m[keep]
@@ -81,8 +84,8 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
         apart = np.abs(line.nearest_m(arc[chosen], arc[candidate]) - arc[candidate])
         if (apart > limits.start_separation_m).all():
             chosen.append(candidate)
-        if len(chosen) == limits.most_hypotheses:
-            break
+        if len(chosen) > limits.most_hypotheses:
+            return np.empty(0), np.empty(0)
     sigma = np.full(len(chosen), limits.start_sigma_m)
     return arc[chosen], sigma
 

@@ -301,7 +301,7 @@ def _work_space(layout: ModuleType, channels: int, unknowns: int, hypotheses: in
 
 def _sources(state: TrackState) -> list[str]:
     """Sources of sub-filters in the order of the kernel."""
-    return [*state.satellite.tolist(), *CLOCKS, *bank.SENSORS.values()]
+    return [*state.satellite.tolist(), *CLOCKS, *bank.SENSORS.values(), *bank.OTHERS]
 
 
 def _own(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:

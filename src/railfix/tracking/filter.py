@@ -10,7 +10,7 @@ import numpy as np
 
 from railfix import kernels
 from railfix.core.arrays import Floats
-from railfix.tracking.bank import levelled
+from railfix.tracking.bank import levelled, predict_bank
 from railfix.tracking.branches import judged, most_probable, on_the_line, surviving
 from railfix.tracking.chunk import Chunk, code_interval_s, leave, prepared
 from railfix.tracking.clocks import clocks_of_epoch, learn
@@ -21,7 +21,6 @@ from railfix.tracking.line import Line
 from railfix.tracking.misfit import code_shift, learn_map
 from railfix.tracking.monitors import contradiction, watch
 from railfix.tracking.possible_speed import possible, widen
-from railfix.tracking.predict import predicted
 from railfix.tracking.result import Tracked, TrackStatus, write_place, write_rows
 from railfix.tracking.robust import (
     DOUBTFUL,
@@ -149,7 +148,7 @@ def _step(
     if not measured:
         state.withheld_s = max(state.withheld_s - dt, 0.0)
     if not measured and state.bank is not None:
-        means, covariances = predicted(state.bank.mean, state.bank.covariance, line, dt, limits, state.map_scale)
+        means, covariances = predict_bank(state.bank, line, dt, limits, state.map_scale)
         state.bank = replace(state.bank, mean=means, covariance=covariances)
     speed = float(state.mean[most_probable(state.log_probability), Unknown.SPEED])
     if abs(speed) > DIRECTION_MPS:

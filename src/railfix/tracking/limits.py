@@ -106,6 +106,11 @@ class TrackingLimits(Settings):
         Probability that a fault is common to a constellation: 1e-4, that of the ARAIM milestone 3 report for Galileo.
     level_sensor_prior : float
         Probability that a sensor on board is faulty at such a sample. An assumption.
+    level_motion_prior : float
+        Probability that all Dopplers, or all phases, are wrong together at such a sample. An assumption.
+    level_map_prior, level_map_m : float, float [m]
+        Probability that the map is wrong by more than its standard deviation there, and by how much it may be, across
+        and up. An assumption.
     level_passes : int
         Rounds of reweighting of the sub-filters.
     level_doubt_s : float
@@ -154,7 +159,7 @@ class TrackingLimits(Settings):
     branch_floor_m: float = Field(default=30.0, gt=0)
     decided_travel_m: float = Field(default=60.0, ge=0)
     least_probability: float = Field(default=1e-11, gt=0, lt=0.5)
-    most_hypotheses: int = Field(default=16, ge=1)
+    most_hypotheses: int = Field(default=24, ge=1)
     start_sigma_m: float = Field(default=30.0, gt=0)
     start_separation_m: float = Field(default=60.0, gt=0)
     gap_s: float = Field(default=5.0, gt=0)
@@ -171,6 +176,9 @@ class TrackingLimits(Settings):
     level_fault_prior: float = Field(default=1e-3, ge=0, lt=1)
     level_constellation_prior: float = Field(default=1e-4, ge=0, lt=1)
     level_sensor_prior: float = Field(default=1e-3, ge=0, lt=1)
+    level_motion_prior: float = Field(default=1e-5, ge=0, lt=1)
+    level_map_prior: float = Field(default=1e-5, ge=0, lt=1)
+    level_map_m: float = Field(default=30.0, gt=0)
     level_passes: int = Field(default=3, ge=1)
     level_doubt_s: float = Field(default=3.0, ge=0)
     level_doubt_code_s: float = Field(default=8.0, ge=0)

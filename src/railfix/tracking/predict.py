@@ -34,12 +34,20 @@ singer = lru_cache(maxsize=64)(singer_step)
 
 
 def predicted(
-    mean: Floats, covariance: Floats, line: Line, dt: float, limits: TrackingLimits, map_scale: float
+    mean: Floats,
+    covariance: Floats,
+    line: Line,
+    dt: float,
+    limits: TrackingLimits,
+    map_scale: float,
+    *,
+    map_sigma_m: Floats | float = 0.0,
 ) -> tuple[Floats, Floats]:
     """Mean and covariance after an interval, shapes (H, N) and (H, N, N).
 
     The clones `Unknown.BEFORE` and `Unknown.SPEED_BEFORE` take place and speed, what begins anew at an epoch gets its
-    prior. `map_scale` is the factor on `TrackingLimits.map_scale_m`.
+    prior. `map_scale` is the factor on `TrackingLimits.map_scale_m`; `map_sigma_m`, shape (H,), an error of the map
+    beside its own.
     """
     step, noise = singer(dt, limits.acceleration_mps2, limits.acceleration_s)
     speed = np.abs(mean[:, Unknown.SPEED])
@@ -57,8 +65,8 @@ def predicted(
     added[:, Unknown.PLACE] = added[:, Unknown.SPEED] = LEAST_STEP_M2
     added[:, Unknown.DRIFT] = walk * dt
     added[:, Unknown.PHASE_CLOCK] = walk * dt**3 / 3.0 + 1e-6
-    added[:, Unknown.MAP_RIGHT] = line.sigma_plan_m**2 * (1.0 - map_kept**2)
-    added[:, Unknown.MAP_UP] = line.sigma_height_m**2 * (1.0 - map_kept**2)
+    added[:, Unknown.MAP_RIGHT] = (line.sigma_plan_m**2 + map_sigma_m**2) * (1.0 - map_kept**2)
+    added[:, Unknown.MAP_UP] = (line.sigma_height_m**2 + map_sigma_m**2) * (1.0 - map_kept**2)
     added[:, Unknown.CODE_PLACE] = limits.slow_code_m**2 * (1.0 - slow_kept**2)
     added[:, Unknown.DOPPLER_SPEED] = lasting**2 * (1.0 - doppler_kept**2)
     added[:, Unknown.WHEEL] = WHEEL_WALK**2 * dt

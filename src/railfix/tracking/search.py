@@ -9,7 +9,7 @@ from railfix.tracking.branches import BESIDE_AFTER_S, begin, beside, places, spl
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
-from railfix.tracking.monitors import ACROSS_DOUBT, ACROSS_LOST
+from railfix.tracking.monitors import ACROSS_DOUBT, ACROSS_LOST, STEP_HELD_S
 from railfix.tracking.predict import predicted
 from railfix.tracking.state import ANY_SPEED, Narrowed, TrackState, Unknown
 
@@ -74,6 +74,9 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         state.parent = np.array([k if item is None else item.parent for k, item in enumerate(narrowed)])
         state.narrowed = narrowed
     state.coded = np.datetime64("NaT", "ns")
+    if lost and state.weak_code_s >= limits.lost_code_s:
+        # Codes have contradicted the place that motion carried: the next place is theirs alone.
+        state.withheld_s = max(state.withheld_s, STEP_HELD_S)
     state.weak_motion_s = state.weak_code_s = state.across = 0.0
     state.code_shift, state.speed_range_mps = (0.0, 0.0), ANY_SPEED
     return lost

@@ -17,6 +17,8 @@ OF_EPOCH = 7
 C_WAY, C_CLOCK, C_RIGHT, C_UP, C_SPEED, C_DRIFT = 1, 2, 3, 4, 5, 6
 COMBINED = 7
 SENSORS = 5
+#: Sources of sub-filters after the sensors: all Dopplers, all phases, the map.
+OTHERS = 3
 WHEEL_ROW, RADAR_ROW, FORCE_ROW, PLACE_ROW = 0, 1, 2, 3
 
 
@@ -143,6 +145,7 @@ class Numbers(NamedTuple):
     switch: float
     most_odds: float
     level_passes: int
+    level_map_m: float
     level_risk: float
     level_k: float
     level_k_speed: float
@@ -202,7 +205,7 @@ class Memory(NamedTuple):
 
 
 class Subfilters(NamedTuple):
-    """Sub-filters of the level by their source (`railfix.tracking.bank`): satellites by slot, clocks, sensors.
+    """Sub-filters of the level by their source (`railfix.tracking.bank`): satellites by slot, clocks, sensors, others.
 
     None of them where levels are off. `running` marks those that there are; `prior` is the probability of a fault of
     each source, 0 where it needs no sub-filter, `k` and `k_speed` the sigmas that follow from it; `begun` has the

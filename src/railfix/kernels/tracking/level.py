@@ -14,10 +14,13 @@ from railfix.kernels.tracking.layout import (
     DRIFT,
     OF_EPOCH,
     OLD_PLACE,
+    OTHERS,
     PHASE_CLOCK,
     PLACE,
+    RIGHT,
     SENSORS,
     SPEED,
+    UP,
     Active,
     Answers,
     Course,
@@ -35,7 +38,7 @@ from railfix.kernels.tracking.update import apply_update, first_weights, mean_we
 @borrowing
 def _sources(epochs: Epochs, t: int, rows: Rows, bank: Subfilters, slots: int, best: int, work: Work) -> None:
     """Mark the sources that an epoch needs a sub-filter for, and as `met` the clocks of all satellites in view."""
-    clocks = len(bank.running) - SENSORS - slots
+    clocks = len(bank.running) - OTHERS - SENSORS - slots
     source, met = work.source, work.met
     for b in range(len(bank.running)):
         source[b] = met[b] = False
@@ -51,6 +54,8 @@ def _sources(epochs: Epochs, t: int, rows: Rows, bank: Subfilters, slots: int, b
             source[epochs.slot[k]] = True
     for j in range(rows.counts[3]):
         source[slots + clocks + rows.sensors[j]] = True
+    first = slots + clocks + SENSORS
+    source[first], source[first + 1], source[first + 2] = rows.counts[2] > 0, rows.counts[1] > 0, rows.counts[0] > 0
     for k in range(slots):
         if epochs.remembered[t, k]:
             met[slots + bank.clock[k]] = True
@@ -58,7 +63,9 @@ def _sources(epochs: Epochs, t: int, rows: Rows, bank: Subfilters, slots: int, b
 
 
 @borrowing
-def _begin(bank: Subfilters, b: int, copied: bool, best: int, work: Work, h: int) -> None:
+def _begin(
+    bank: Subfilters, b: int, copied: bool, best: int, numbers: Numbers, work: Work, h: int
+) -> None:
     """Begin a sub-filter with the state of the filter, or with what is known of nothing but the place."""
     mean, spread = work.mean, work.spread
     width = mean.shape[1]
@@ -71,6 +78,9 @@ def _begin(bank: Subfilters, b: int, copied: bool, best: int, work: Work, h: int
             spread[h, c, c] = bank.begun[c]
     if not copied:
         mean[h, PLACE] = mean[h, width - OF_EPOCH + OLD_PLACE] = mean[best, PLACE]
+    if b == len(bank.running) - 1:
+        spread[h, RIGHT, RIGHT] += numbers.level_map_m**2
+        spread[h, UP, UP] += numbers.level_map_m**2
 
 
 @borrowing
@@ -132,7 +142,8 @@ def advance_subfilters(
     nc, nph = rows.counts[0], rows.counts[1]
     gnss = nc + nph + rows.counts[2]
     slots = len(active.satellite)
-    clocks = len(bank.running) - SENSORS - slots
+    clocks = len(bank.running) - OTHERS - SENSORS - slots
+    others = slots + clocks + SENSORS
     _sources(epochs, t, rows, bank, slots, best, work)
     source, met = work.source, work.met
     before = False
@@ -146,7 +157,8 @@ def advance_subfilters(
         if bank.running[b] and bank.weak_s[b] >= numbers.lost_motion_s:
             bank.running[b], met[b] = False, True
         if bank.running[b]:
-            predict(epochs, t, course, numbers, active, bank.mean, bank.covariance, b, map_log_scale, work, h)
+            wrong_m = numbers.level_map_m if b == len(bank.running) - 1 else 0.0
+            predict(epochs, t, course, numbers, active, bank.mean, bank.covariance, b, map_log_scale, wrong_m, work, h)
             find_ends(course, mean[h, PLACE], mean[h, n + OLD_PLACE], work)
             add_bend(numbers, work, h)
             sigma = math.sqrt(spread[h, PLACE, PLACE])
@@ -156,13 +168,15 @@ def advance_subfilters(
                 bank.running[b] = False
                 continue
         elif source[b] and bank.prior[b] > 0.0:
-            _begin(bank, b, before and not met[b], best, work, h)
+            _begin(bank, b, before and not met[b], best, numbers, work, h)
         else:
             continue
         for i in range(gnss):
             k = rows.codes[i] if i < nc else (rows.phases[i - nc] if i < nc + nph else rows.dopplers[i - nc - nph])
             own = epochs.slot[k] if satellite else slots + epochs.offset[k]
             work.masked[i] = math.inf if own == b else work.variance[i]
+            if (b == others and i >= nc + nph) or (b == others + 1 and nc <= i < nc + nph):
+                work.masked[i] = math.inf
         for j in range(rows.counts[3]):
             own = slots + clocks + rows.sensors[j]
             work.masked[gnss + j] = math.inf if own == b else work.variance[gnss + j]

@@ -41,6 +41,7 @@ def predict(
     covariance: Floats,
     h: int,
     map_log_scale: float,
+    map_sigma_m: float,
     work: Work,
     to: int,
 ) -> None:
@@ -97,8 +98,8 @@ def predict(
     spread[to, n + PHASE_CLOCK, n + PHASE_CLOCK] += walk * dt**3 / 3.0 + 1e-6
     spread[to, n + PHASE_CLOCK, DRIFT] += walk * dt**2 / 2.0
     spread[to, DRIFT, n + PHASE_CLOCK] += walk * dt**2 / 2.0
-    spread[to, RIGHT, RIGHT] += course.sigma_plan_m**2 * (1.0 - map_kept**2)
-    spread[to, UP, UP] += course.sigma_height_m**2 * (1.0 - map_kept**2)
+    spread[to, RIGHT, RIGHT] += (course.sigma_plan_m**2 + map_sigma_m**2) * (1.0 - map_kept**2)
+    spread[to, UP, UP] += (course.sigma_height_m**2 + map_sigma_m**2) * (1.0 - map_kept**2)
     spread[to, CODE_PLACE, CODE_PLACE] += numbers.slow_code_m**2 * (1.0 - slow_kept**2)
     lasting = numbers.doppler_error_mps + numbers.doppler_error_share * speed
     spread[to, DOPPLER_SPEED, DOPPLER_SPEED] += lasting**2 * (1.0 - doppler_kept**2)

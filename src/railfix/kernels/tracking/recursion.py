@@ -165,7 +165,8 @@ def _coast(
     for b in range(len(bank.running)):
         if bank.running[b]:
             scale = memory.scalars[MAP_SCALE]
-            predict(epochs, t, course, numbers, active, bank.mean, bank.covariance, b, scale, work, h)
+            wrong_m = numbers.level_map_m if b == len(bank.running) - 1 else 0.0
+            predict(epochs, t, course, numbers, active, bank.mean, bank.covariance, b, scale, wrong_m, work, h)
             _take(bank.mean, bank.covariance, b, work.mean, work.spread, h)
 
 
@@ -394,7 +395,7 @@ def advance(
         count, dt, map_scale = int(scalars[HYPOTHESES]), epochs.interval_s[t], scalars[MAP_SCALE]
         _forget(epochs, t, active, memory, bank)
         for h in range(count):
-            predict(epochs, t, course, numbers, active, memory.mean, memory.covariance, h, map_scale, work, h)
+            predict(epochs, t, course, numbers, active, memory.mean, memory.covariance, h, map_scale, 0.0, work, h)
         _choose_sensors(epochs, t, numbers, memory, rows, work)
         measured = rows.counts[0] + rows.counts[1] + rows.counts[2] + rows.counts[3] > 0
         shift = 0.0
