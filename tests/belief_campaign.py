@@ -286,7 +286,8 @@ def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterat
         return np.maximum(t - start, 0.0)[:, None], (t >= start)[:, None]
 
     one, other = (str(x) for x in random.choice(names, 2, replace=len(names) < 2))
-    letters = sorted({str(name)[0] for name in names})
+    seen = np.abs(along).max(axis=0) > 0.0
+    letters = sorted({str(name)[0] for name in obs.satellite[seen]})
     letter = str(random.choice(letters))
     start = 45.0 if random.random() < 0.6 else 0.0
     after, on = since(start)
@@ -309,13 +310,13 @@ def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterat
     listed.append(("Dopplers common +5 m/s", nothing, nothing, 5.0 * short))
     slide = np.clip(t - 45.0, 0.0, 20.0)[:, None]
     listed.append(("phases +2 m/s", nothing, 2.0 * along * slide, nothing))
-    listed.append(("all codes +30 m along", 30.0 * along * on, nothing, nothing))
+    listed.append(("step of all codes 30 m", 30.0 * along * (t >= 45.0)[:, None], nothing, nothing))
     listed.append(("pull 0.5 m/s, all", *(x * along for x in (0.5 * after, 0.5 * after, 0.5 * on))))
     pair = of(one, other)
     listed.append(("pair +30 m", 30.0 * (pair & on), nothing, nothing))
     listed.append(("pair +20, -20 m", 20.0 * ((of(one) & on).astype(float) - (of(other) & on)), nothing, nothing))
     for name, code, phase, rate in listed:
-        label = name if start or name.startswith(("Dopp", "phases")) else f"{name}, from the start"
+        label = name if start or name.startswith(("Dopp", "phases", "step")) else f"{name}, from the start"
         yield label, with_fault(case, Fault(name, code, phase, rate))
     few = [str(x) for x in random.choice(names, min(3, len(names)), replace=False)]
     for count in (3, 2):

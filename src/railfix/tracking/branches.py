@@ -35,6 +35,8 @@ SWITCH: Final = 3.0
 MOST_ODDS: Final = 2.25
 #: Largest logarithm of the odds that motion gives in a second: more is a reflection.
 MOST_MOTION: Final = 5.0
+#: Satellites with a phase or a Doppler, or codes, that an epoch's evidence needs: fewer fit any speed and place.
+MOTION_SATELLITES: Final = 4
 #: Distance that is worth one of the logarithm of the odds by motion [m]: a map does not tell tangents at rest.
 MOTION_M: Final = 3.0
 #: Standard deviation of the speed beyond a bend [m/s], and the share of probability that places beside get.

@@ -133,7 +133,7 @@ class Compiled:
             count, state.weak_motion_s, state.weak_code_s, *state.log_scale, state.unaided_m, state.direction,
             seconds(state.measured - origin), *state.code_shift, state.map_log_scale, *state.speed_range_mps,
             np.nan_to_num(seconds(state.coded - origin), nan=-np.inf), state.branch_s, state.branch_m,
-            state.across, state.step_s, state.withheld_s,
+            state.across, state.step_s, state.withheld_s, state.open_s,
         ])  # fmt: skip
         memory = self.layout.Memory(
             mean=_own(state.mean[:, full]),
@@ -258,7 +258,7 @@ class Compiled:
         state.measured = self.chunk.time[0] + timedelta(measured)
         state.coded = self.chunk.time[0] + timedelta(learnt[5])
         state.branch_s, state.branch_m = learnt[6], learnt[7]
-        state.across, state.step_s, state.withheld_s = learnt[8], learnt[9], learnt[10]
+        state.across, state.step_s, state.withheld_s, state.open_s = learnt[8:12]
 
 
 def _kernels() -> tuple[ModuleType, ModuleType]:
@@ -385,6 +385,9 @@ def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
         "allowed_square": monitors.ALLOWED_SQUARE,
         "across_doubt": monitors.ACROSS_DOUBT,
         "across_lost": monitors.ACROSS_LOST,
+        "drift_sigmas": monitors.DRIFT_SIGMAS,
+        "drift_log": 2.0 * float(np.log(monitors.DRIFT_SCALE)),
+        "motion_satellites": branches.MOTION_SATELLITES,
         "step_sigmas": monitors.STEP_SIGMAS,
         "step_s": monitors.STEP_S,
         "step_held_s": monitors.STEP_HELD_S,

@@ -11,7 +11,7 @@ import numpy as np
 from railfix import kernels
 from railfix.core.arrays import Floats
 from railfix.tracking.bank import levelled, predict_bank
-from railfix.tracking.branches import judged, most_probable, on_the_line, surviving
+from railfix.tracking.branches import MOTION_SATELLITES, judged, most_probable, on_the_line, surviving
 from railfix.tracking.chunk import Chunk, code_interval_s, leave, prepared
 from railfix.tracking.clocks import clocks_of_epoch, learn
 from railfix.tracking.compiled import Compiled
@@ -164,7 +164,7 @@ def _step(
     if trace is not None:
         step.mean, step.covariance, step.parent = state.mean, state.covariance, state.parent
         trace.append(step)
-    write_place(result, epoch, state, line, measured=measured, lost=lost, limits=limits)
+    write_place(result, epoch, state, line, dt, measured=measured, lost=lost, limits=limits)
 
 
 def _measure(
@@ -220,9 +220,14 @@ def _measure(
     if state.hypotheses > 1:
         evidence = log_evidence(settled, prior, update, tails)
         motion = motion_evidence(settled, prior, update, tails=tails, passes=passes)
+        code = evidence - motion
+        if not tells_motion(rows):
+            motion = np.zeros_like(motion)
+        if rows.bounds[0] < MOTION_SATELLITES:
+            code = np.zeros_like(code)
         places = line.at(after[0][:, Unknown.PLACE])[0]
         log_probability, state.log_code = judged(
-            state.log_probability, state.log_code, motion, evidence - motion, places, state.branch_s, state.branch_m,
+            state.log_probability, state.log_code, motion, code, places, state.branch_s, state.branch_m,
             dt, limits,
         )  # fmt: skip
         state.log_probability = log_probability - np.logaddexp.reduce(log_probability)
@@ -253,6 +258,12 @@ def _measure(
     watch(state, square, 0.0 if best else shift, float(pushed[best]), dt, code_s, limits)
     write_rows(result, epoch, rows, rows.value[best], update.weight[best])
     return True
+
+
+def tells_motion(rows: Rows) -> bool:
+    """Whether an epoch's motion tells branches apart: enough satellites, or a sensor."""
+    satellites = max(part.stop - part.start for part in rows.common[1:])
+    return satellites >= MOTION_SATELLITES or len(rows.variance) > rows.bounds[2]
 
 
 def _least(weight: Floats) -> float:

@@ -177,7 +177,7 @@ class TrackingLimits(Settings):
     level_constellation_prior: float = Field(default=1e-4, ge=0, lt=1)
     level_sensor_prior: float = Field(default=1e-3, ge=0, lt=1)
     level_motion_prior: float = Field(default=1e-5, ge=0, lt=1)
-    level_map_prior: float = Field(default=1e-5, ge=0, lt=1)
+    level_map_prior: float = Field(default=1e-4, ge=0, lt=1)
     level_map_m: float = Field(default=30.0, gt=0)
     level_passes: int = Field(default=3, ge=1)
     level_doubt_s: float = Field(default=3.0, ge=0)

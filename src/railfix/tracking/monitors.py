@@ -27,6 +27,10 @@ ALLOWED_SQUARE: Final = 4.0
 #: Sums from which on the level is withheld, and the track is lost.
 ACROSS_DOUBT: Final = 12.0
 ACROSS_LOST: Final = 30.0
+#: Mean of the places that codes ask for, over its standard deviation, and factor on the error of the map's lengths, from
+#: on which codes contradict motion: a step of all codes, a pull, or a map that is wrong.
+DRIFT_SIGMAS: Final = 5.0
+DRIFT_SCALE: Final = 6.0
 #: Codes that ask for another place by more than so many standard deviations for so long [s] have stepped together.
 STEP_SIGMAS: Final = 6.0
 STEP_S: Final = 3.0
@@ -93,6 +97,9 @@ def watch(
     withheld = 0.0
     doubtful = state.weak_code_s > limits.level_doubt_code_s or state.weak_motion_s > limits.level_doubt_s
     if doubtful or state.across > ACROSS_DOUBT:
+        withheld = limits.level_hold_s
+    mean, variance = state.code_shift
+    if mean**2 > DRIFT_SIGMAS**2 * variance or state.map_scale > DRIFT_SCALE:
         withheld = limits.level_hold_s
     if state.bank is not None and (state.bank.weak_s > limits.level_doubt_s).any():
         withheld = limits.level_hold_s

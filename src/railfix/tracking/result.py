@@ -157,9 +157,17 @@ def write_rows(result: Tracked, epoch: int, rows: Rows, innovation: Floats, weig
 
 
 def write_place(
-    result: Tracked, epoch: int, state: TrackState, line: Line, *, measured: bool, lost: bool, limits: TrackingLimits
+    result: Tracked,
+    epoch: int,
+    state: TrackState,
+    line: Line,
+    dt: float,
+    *,
+    measured: bool,
+    lost: bool,
+    limits: TrackingLimits,
 ) -> None:
-    """Place, speed and status of the most probable hypothesis."""
+    """Write place, speed and status of the most probable hypothesis, and count how long branches have been open."""
     mean, covariance = state.mean[0], state.covariance[0]
     sigma = float(np.sqrt(covariance[Unknown.PLACE, Unknown.PLACE]))
     result.hypotheses[epoch] = state.hypotheses
@@ -176,9 +184,12 @@ def write_place(
     result.radar_scale[epoch] = mean[Unknown.RADAR]
     result.map_scale[epoch] = state.map_scale
     branches = _branches(state, line)
+    open_s = limits.level_hold_s if uncovered(branches, limits) else state.open_s - dt
+    state.open_s = max(open_s, 0.0)
     if state.bank is not None:
         level = compute_level(state.bank, branches, float(mean[Unknown.PLACE]), sigma, limits)
-        along, ground = (float("inf") if state.withheld_s > 0.0 else value for value in (level.along_m, level.ground_m))
+        ground = float("inf") if state.withheld_s > 0.0 else level.ground_m
+        along = float("inf") if max(state.withheld_s, state.open_s) > 0.0 else level.along_m
         result.level_m[epoch], result.ground_level_m[epoch] = along, ground
         result.level_noise_m[epoch], result.separation_m[epoch] = level.noise_m, level.separation_m
         result.amount_m[epoch] = max(along, SCALE_BOUND * state.unaided_m)
@@ -187,7 +198,7 @@ def write_place(
         )
     if lost:
         status = TrackStatus.LOST
-    elif uncovered(branches, limits):
+    elif state.open_s > 0.0:
         status = TrackStatus.SEVERAL_BRANCHES
     elif state.withheld_s > 0.0:
         status = TrackStatus.DOUBTFUL

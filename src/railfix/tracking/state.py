@@ -123,8 +123,9 @@ class TrackState:
         Part of it that the codes gave (`railfix.tracking.branches.judged`).
     across : float
         Sum of the contradictions of the velocity (`railfix.tracking.monitors`).
-    step_s, withheld_s : float [s]
-        How long all codes have asked for another place, and how long the level is withheld still.
+    step_s, withheld_s, open_s : float [s]
+        How long all codes have asked for another place, how long the level is withheld still, and how long that along
+        the line, as other places of it were more probable than the risk.
     branch_s, branch_m : float [s], [m]
         Time and distance since the hypotheses began.
     origin_m : ndarray, shape (H,) [m]
@@ -183,6 +184,7 @@ class TrackState:
     across: float = 0.0
     step_s: float = 0.0
     withheld_s: float = 0.0
+    open_s: float = 0.0
     branch_s: float = 0.0
     branch_m: float = 0.0
     bank: Bank | None = None

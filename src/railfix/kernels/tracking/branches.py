@@ -17,7 +17,7 @@ def reweigh(
 ) -> None:
     """Update the probabilities of hypotheses by the evidence of an epoch (`railfix.tracking.branches.judged`)."""
     log_probability, log_code, places, after = memory.log_probability, memory.log_code, work.places, work.right
-    travel = memory.scalars[BRANCH_M]
+    travel, counts = memory.scalars[BRANCH_M], rows.counts
     independent = 1.0 + memory.scalars[BRANCH_S] / numbers.code_common_s + travel / numbers.code_common_travel_m
     best, other = 0, work.mean.shape[0] - 1
     for h in range(count):
@@ -25,7 +25,9 @@ def reweigh(
             best = h
         joint = evidence_of(rows, work.variance, numbers.degrees, work.log_after[h], work, h, h)
         work.evidence[h] = motion_evidence(rows, numbers, work, h, other)
-        work.code_evidence[h] = joint - work.evidence[h]
+        work.code_evidence[h] = joint - work.evidence[h] if counts[0] >= numbers.motion_satellites else 0.0
+        if max(counts[1], counts[2]) < numbers.motion_satellites and counts[3] == 0:
+            work.evidence[h] = 0.0
         point_at(course, work.new_mean[h, PLACE], places, work.place_axes, h)
     first, first_code = log_probability[best], log_code[best]
     most = numbers.most_motion * max(dt, 1.0)

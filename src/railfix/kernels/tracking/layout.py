@@ -168,6 +168,9 @@ class Numbers(NamedTuple):
     allowed_square: float
     across_doubt: float
     across_lost: float
+    drift_sigmas: float
+    drift_log: float
+    motion_satellites: int
     step_sigmas: float
     step_s: float
     step_held_s: float
@@ -296,7 +299,7 @@ class Work(NamedTuple):
 
 HYPOTHESES, WEAK_MOTION, WEAK_CODE, SCALE_DOPPLER, SCALE_PHASE, UNAIDED, DIRECTION, MEASURED = range(8)
 SHIFT, SHIFT_VARIANCE, MAP_SCALE, LEAST_SPEED, MOST_SPEED, CODED, BRANCH_S, BRANCH_M = 8, 9, 10, 11, 12, 13, 14, 15
-ACROSS, STEP_TIME, WITHHELD = 16, 17, 18
+ACROSS, STEP_TIME, WITHHELD, OPEN = 16, 17, 18, 19
 
 
 class Answers(NamedTuple):

@@ -9,7 +9,10 @@ from railfix.kernels.tracking.course import point_at
 from railfix.kernels.tracking.layout import (
     ACCELERATION,
     ACROSS,
+    MAP_SCALE,
     PLACE,
+    SHIFT,
+    SHIFT_VARIANCE,
     SPEED,
     STEP_TIME,
     WEAK_CODE,
@@ -71,6 +74,8 @@ def watch(
     withheld = 0.0
     doubtful = scalars[WEAK_CODE] > numbers.level_doubt_code_s or scalars[WEAK_MOTION] > numbers.level_doubt_s
     if doubtful or scalars[ACROSS] > numbers.across_doubt:
+        withheld = numbers.level_hold_s
+    if scalars[SHIFT] ** 2 > numbers.drift_sigmas**2 * scalars[SHIFT_VARIANCE] or scalars[MAP_SCALE] > numbers.drift_log:
         withheld = numbers.level_hold_s
     for b in range(len(bank.running)):
         if bank.running[b] and bank.weak_s[b] > numbers.level_doubt_s:

@@ -25,6 +25,7 @@ from railfix.kernels.tracking.layout import (
     MEASURED,
     OF_EPOCH,
     OLD_PLACE,
+    OPEN,
     PHASE_CLOCK,
     PLACE,
     SCALE_DOPPLER,
@@ -356,13 +357,16 @@ def _finish(
         answers.radar_scale[t] = memory.mean[0, active.radar]
     answers.map_scale[t] = math.exp(0.5 * scalars[MAP_SCALE])
     far = write_branches(memory, course, numbers, work, count)
+    scalars[OPEN] = numbers.level_hold_s if far > numbers.level_risk else max(scalars[OPEN] - dt, 0.0)
     if len(bank.running):
         write_level(memory, count, far, bank, numbers, work, answers, t)
         if scalars[WITHHELD] > 0.0:
-            answers.level_m[t] = answers.ground_level_m[t] = math.inf
+            answers.ground_level_m[t] = math.inf
+        if scalars[WITHHELD] > 0.0 or scalars[OPEN] > 0.0:
+            answers.level_m[t] = math.inf
         answers.amount_m[t] = max(answers.level_m[t], numbers.scale_bound * scalars[UNAIDED])
         answers.level_speed_mps[t] = speed_bound(memory.mean[0, SPEED], answers.speed_sigma_mps[t], bank, numbers)
-    if far > numbers.level_risk:
+    if scalars[OPEN] > 0.0:
         answers.status[t] = numbers.several
     elif scalars[WITHHELD] > 0.0:
         answers.status[t] = numbers.unsure
