@@ -378,7 +378,7 @@ def counts(label: str, found: Judged, *, trials: int, wrong_trials: int) -> str:
         f" (trials {wrong_trials:3d})  sure&wrong {100 * found.sure_and_wrong.sum() / max(tracking, 1):5.2f} %"
         f"  tracking >10 m {int((found.tracking & (error > 10.0)).sum()):4d}"
         f"  p50/p95/max {np.nanmedian(error):.2f}/{np.nanpercentile(error, 95):.2f}/{np.nanmax(error):.1f}"
-        f"  e/s p95 {np.nanpercentile((error / found.sigma_m)[found.tracking], 95) if tracking else np.nan:.2f}"
+        f"  e/s p95 {np.nanpercentile(error / found.sigma_m, 95):.2f}"
     )
 
 

@@ -381,11 +381,19 @@ def compute_level(bank: Bank, branches: Branches, place_m: float, sigma_m: float
                 given.risk,
             )
 
-        ground = level(branches.ground_m)
+        ground = level(branches.ground_m) + _beside_m(bank)
         if not uncovered(branches, limits):
             near = branches.apart_m <= limits.start_separation_m
             along = level(np.where(near, branches.apart_m, 0.0))
     return Level(along_m=along, ground_m=ground, noise_m=noise, separation_m=float(apart.max()))
+
+
+def _beside_m(bank: Bank) -> float:
+    """Displacement of the map across beyond two standard deviations, by the sub-filter that lets it be wrong [m]."""
+    if "map" not in bank.without:
+        return 0.0
+    k, right = bank.without.index("map"), Unknown.MAP_RIGHT
+    return max(abs(float(bank.mean[k, right])) - 2.0 * float(np.sqrt(bank.covariance[k, right, right])), 0.0)
 
 
 def _solve_level(start_m: float, centre: Floats, spread: Floats, prior: Floats, risk: float) -> float:

@@ -20,7 +20,7 @@ _SPACING_M: Final = 15.0
 #: Codes beyond place and clocks that places are sought with: with one alone a wrong place fits as well.
 REDUNDANT: Final = 2
 #: Places whose logarithm of likelihood is this far below the best are not begun with.
-_WORSE: Final = 12.0
+_WORSE: Final = 25.0
 #: Standard deviation of an unknown speed: no train is faster than twice this [m/s].
 _ANY_SPEED_MPS: Final = 50.0
 _ANY_DRIFT_MPS: Final = 1e3
@@ -35,6 +35,12 @@ SWITCH: Final = 3.0
 MOST_ODDS: Final = 2.25
 #: Largest logarithm of the odds that motion gives in a second: more is a reflection.
 MOST_MOTION: Final = 5.0
+#: A hypothesis that leads although its probability was below this within the last seconds (its least logarithm rises
+#: by `LEAST_RISE` a second) has taken over from others that all failed: places are sought again. Not within the first
+#: seconds, when all are young.
+TAKEOVER: Final = -6.0
+LEAST_RISE: Final = 0.3
+TAKEOVER_AFTER_S: Final = 15.0
 #: Satellites with a phase or a Doppler, or codes, that an epoch's evidence needs: fewer fit any speed and place.
 MOTION_SATELLITES: Final = 4
 #: Distance that is worth one of the logarithm of the odds by motion [m]: a map does not tell tangents at rest.
@@ -213,8 +219,8 @@ def judged(
     odds go no further than ``d^2 / (2 s^2)`` with s^2 = 2 (map_branch_m / 3)^2, nor than one for `MOTION_M` of travel.
 
     Codes have errors in common to all satellites of one side of a street, for minutes. Their odds go no further than
-    ``n d^2 / (2 code_common_m^2)``, what n independent epochs with such an error can say, and between branches closer
-    than `branch_floor_m` never below the probability `branch_floor`.
+    ``n d^2 / (2 code_common_m^2)``, what n independent epochs with such an error can say, and between branches that are
+    closer than `branch_floor_m` now never below `branch_floor`, whatever was gained while they were apart.
 
     Parameters
     ----------
@@ -242,8 +248,9 @@ def judged(
     code = before + share * (code_evidence - code_evidence[best])
     independent = 1.0 + branch_s / limits.code_common_s + branch_m / limits.code_common_travel_m
     reach = independent * square / (2.0 * limits.code_common_m**2)
-    reach = np.where(square < limits.branch_floor_m**2, np.minimum(reach, -np.log(limits.branch_floor)), reach)
     code = np.clip(code, np.minimum(before, -reach), np.maximum(before, reach))
+    near, most = square < limits.branch_floor_m**2, -np.log(limits.branch_floor)
+    code = np.where(near, np.clip(code, -most, most), code)
     return motion + code, code
 
 

@@ -140,6 +140,7 @@ class Compiled:
             covariance=_own(state.covariance[:, full[:, None], full]),
             log_probability=_own(state.log_probability),
             log_code=_own(state.log_code),
+            log_least=_own(state.log_least),
             origin_m=_own(state.origin_m),
             offset_known=_own(state.offset_known),
             scalars=scalars,
@@ -248,6 +249,7 @@ class Compiled:
             )
         state.log_probability = memory.log_probability[:count].copy()
         state.log_code = memory.log_code[:count].copy()
+        state.log_least = memory.log_least[:count].copy()
         state.origin_m = memory.origin_m[:count].copy()
         state.time = self.chunk.time[done - 1]
         _, motion, code, doppler, phase, unaided, direction, measured, *learnt = memory.scalars.tolist()
@@ -279,7 +281,7 @@ def _work_space(layout: ModuleType, channels: int, unknowns: int, hypotheses: in
         "information": (room, size, size), "after": (room, size, size), "change": (room, size),
         "weight": (room, most), "residual": (room, most), "fitted": (room, most), "new_mean": (room, unknowns + 1),
         "new_covariance": (room, unknowns, unknowns), "log_before": (room,), "log_after": (room,),
-        "evidence": (room,), "code_evidence": (room,), "joined": (3, room), "branch": (room, 3), "pushed": (room,), "variance": (most,), "masked": (most,),
+        "evidence": (room,), "code_evidence": (room,), "joined": (4, room), "branch": (room, 3), "pushed": (room,), "variance": (most,), "masked": (most,),
         "system": (room, size, size), "factor": (size, size), "lower": (size, size), "right": (max(size, room),),
         "diagonal": (size,), "with_clock": (size,),
         "ordered": (most,), "part": (4,), "gain": (size, unknowns + 1), "less": (size, unknowns),
@@ -362,6 +364,9 @@ def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
         "most_odds": branches.MOST_ODDS,
         "most_motion": branches.MOST_MOTION,
         "motion_m": branches.MOTION_M,
+        "least_rise": branches.LEAST_RISE,
+        "takeover": branches.TAKEOVER,
+        "takeover_after_s": branches.TAKEOVER_AFTER_S,
         "level_risk": bank.budget(limits).risk,
         "level_k": bank.budget(limits).k,
         "level_k_speed": bank.budget(limits).k_speed,
@@ -387,6 +392,8 @@ def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
         "across_lost": monitors.ACROSS_LOST,
         "drift_sigmas": monitors.DRIFT_SIGMAS,
         "drift_log": 2.0 * float(np.log(monitors.DRIFT_SCALE)),
+        "beside_sigmas": monitors.BESIDE_SIGMAS,
+        "beside_m": monitors.BESIDE_M,
         "motion_satellites": branches.MOTION_SATELLITES,
         "step_sigmas": monitors.STEP_SIGMAS,
         "step_s": monitors.STEP_S,

@@ -11,7 +11,16 @@ import numpy as np
 from railfix import kernels
 from railfix.core.arrays import Floats
 from railfix.tracking.bank import levelled, predict_bank
-from railfix.tracking.branches import MOTION_SATELLITES, judged, most_probable, on_the_line, surviving
+from railfix.tracking.branches import (
+    LEAST_RISE,
+    MOTION_SATELLITES,
+    TAKEOVER,
+    TAKEOVER_AFTER_S,
+    judged,
+    most_probable,
+    on_the_line,
+    surviving,
+)
 from railfix.tracking.chunk import Chunk, code_interval_s, leave, prepared
 from railfix.tracking.clocks import clocks_of_epoch, learn
 from railfix.tracking.compiled import Compiled
@@ -19,7 +28,7 @@ from railfix.tracking.epochs import GnssEpochs, SensorEpochs
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.misfit import code_shift, learn_map
-from railfix.tracking.monitors import contradiction, watch
+from railfix.tracking.monitors import ACROSS_LOST, contradiction, watch
 from railfix.tracking.possible_speed import possible, widen
 from railfix.tracking.result import Tracked, TrackStatus, write_place, write_rows
 from railfix.tracking.robust import (
@@ -155,12 +164,17 @@ def _step(
         state.direction = float(np.sign(speed))
     state.unaided_m = 0.0 if measured and rows.bounds[0] else state.unaided_m + abs(speed) * dt
     state.branch_s, state.branch_m = state.branch_s + dt, state.branch_m + abs(speed) * dt
+    state.log_least = np.minimum(state.log_least + LEAST_RISE * dt, state.log_probability)
     if state.hypotheses > 1:
         chosen, probability = surviving(state.mean, state.covariance, state.log_probability, state.origin_m, limits)
         state.mean, state.covariance = state.mean[chosen], state.covariance[chosen]
         state.log_probability, state.origin_m = probability, state.origin_m[chosen]
-        state.parent, state.log_code = state.parent[chosen], state.log_code[chosen]
+        state.parent, state.log_code, state.log_least = (
+            values[chosen] for values in (state.parent, state.log_code, state.log_least)
+        )
         step.choose(chosen)
+    if state.branch_s > TAKEOVER_AFTER_S and state.log_least[0] < TAKEOVER:
+        state.across = ACROSS_LOST
     if trace is not None:
         step.mean, step.covariance, step.parent = state.mean, state.covariance, state.parent
         trace.append(step)

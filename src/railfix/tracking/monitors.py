@@ -31,6 +31,10 @@ ACROSS_LOST: Final = 30.0
 #: on which codes contradict motion: a step of all codes, a pull, or a map that is wrong.
 DRIFT_SIGMAS: Final = 5.0
 DRIFT_SCALE: Final = 6.0
+#: A displacement of the map across, by the sub-filter that lets it be wrong, is real beyond so many of its standard
+#: deviations and metres.
+BESIDE_SIGMAS: Final = 4.5
+BESIDE_M: Final = 8.0
 #: Codes that ask for another place by more than so many standard deviations for so long [s] have stepped together.
 STEP_SIGMAS: Final = 6.0
 STEP_S: Final = 3.0
@@ -101,6 +105,11 @@ def watch(
     mean, variance = state.code_shift
     if mean**2 > DRIFT_SIGMAS**2 * variance or state.map_scale > DRIFT_SCALE:
         withheld = limits.level_hold_s
+    if state.bank is not None and "map" in state.bank.without:
+        k = state.bank.without.index("map")
+        aside, variance = state.bank.mean[k, Unknown.MAP_RIGHT], state.bank.covariance[k, Unknown.MAP_RIGHT, Unknown.MAP_RIGHT]
+        if abs(aside) > max(BESIDE_M, BESIDE_SIGMAS * float(np.sqrt(variance))):
+            withheld = limits.level_hold_s
     if state.bank is not None and (state.bank.weak_s > limits.level_doubt_s).any():
         withheld = limits.level_hold_s
     if state.step_s >= STEP_S:

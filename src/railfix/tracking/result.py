@@ -69,7 +69,7 @@ class Tracked:
     status : ndarray of int8, shape (T,)
         `TrackStatus`.
     arc_m, sigma_m : ndarray, shape (T,) [m]
-        Of the most probable hypothesis.
+        Of the most probable hypothesis; the standard deviation has the straight distance to the others in it.
     speed_mps, speed_sigma_mps, acceleration_mps2 : ndarray, shape (T,)
     probability : ndarray, shape (T,)
         Of the hypothesis given.
@@ -175,7 +175,10 @@ def write_place(
     if sigma > limits.expired_sigma_m:
         result.status[epoch] = TrackStatus.EXPIRED
         return
-    result.arc_m[epoch], result.sigma_m[epoch] = mean[Unknown.PLACE], sigma
+    branches = _branches(state, line)
+    spread = float(branches.probability @ (branches.sigma_m**2 + branches.ground_m**2))
+    result.arc_m[epoch] = mean[Unknown.PLACE]
+    result.sigma_m[epoch] = np.sqrt((1.0 - branches.probability.sum()) * sigma**2 + spread)
     result.speed_mps[epoch] = mean[Unknown.SPEED]
     result.speed_sigma_mps[epoch] = np.sqrt(covariance[Unknown.SPEED, Unknown.SPEED])
     result.acceleration_mps2[epoch] = mean[Unknown.ACCELERATION]
@@ -183,7 +186,6 @@ def write_place(
     result.force_offset_mps2[epoch] = mean[Unknown.FORCE_OFFSET]
     result.radar_scale[epoch] = mean[Unknown.RADAR]
     result.map_scale[epoch] = state.map_scale
-    branches = _branches(state, line)
     open_s = limits.level_hold_s if uncovered(branches, limits) else state.open_s - dt
     state.open_s = max(open_s, 0.0)
     if state.bank is not None:

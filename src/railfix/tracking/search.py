@@ -22,6 +22,8 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         state.mean, state.covariance = begin(arc, sigma, satellites, line, limits)
         state.log_probability, state.origin_m = np.full(len(arc), -np.log(max(len(arc), 1))), arc
         state.log_code, state.branch_s, state.branch_m = np.zeros(len(arc)), 0.0, 0.0
+        state.log_least = state.log_probability
+        state.withheld_s = max(state.withheld_s, limits.level_start_s)
         state.parent, state.narrowed = np.full(len(arc), -1), None
         return False
     mean, covariance = predicted(state.mean, state.covariance, line, chunk.interval_s[epoch], limits, state.map_scale)
@@ -53,22 +55,22 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
             ]
     if lost:
         best = int(np.argmax(state.log_probability))
-        there = line.nearest_m(arc, mean[best, Unknown.PLACE])
-        away = np.abs(there - mean[best, Unknown.PLACE]) > limits.start_separation_m
-        # The old place goes on too: free to be pulled to where the codes are where its own measurements contradict it,
-        # as it is, and as probable as all others, where the velocity alone does.
-        arc = np.concatenate([mean[best : best + 1, Unknown.PLACE], arc[away]])
+        going = mean[best : best + 1, Unknown.PLACE] if weak else mean[:, Unknown.PLACE]
+        there = line.nearest_m(arc[:, None], going)
+        arc = arc[(np.abs(there - going) > limits.start_separation_m).all(axis=1)]
+        # The old place goes on too, free to be pulled to where the codes are; where the velocity alone contradicts it,
+        # the hypotheses go on as they are, together as probable as all others.
+        arc = np.concatenate([going, arc]) if weak else arc
         sigma = np.full(len(arc), limits.start_sigma_m)
         fresh = begin(arc, sigma, satellites, line, limits, known=(mean[best], covariance[best]))
-        share = np.full(len(arc), -np.log(len(arc)))
-        if not weak:
-            fresh[0][0], fresh[1][0] = mean[best], covariance[best]
-            share[0], share[1:] = np.log(0.5), np.log(0.5 / max(len(arc) - 1, 1))
-        parts = [(*fresh, share, arc, np.zeros(len(arc)))]
+        share = np.full(len(arc), -np.log(max(len(arc), 1)))
+        parts = [] if weak else parts
+        parts.append((*fresh, share, arc, np.zeros(len(arc))))
     together = [np.concatenate(items) for items in zip(*parts, strict=True)]
     state.mean, state.covariance, state.origin_m = together[0], together[1], together[3]
     state.log_probability = together[2] - np.logaddexp.reduce(together[2])
     state.log_code, state.branch_s, state.branch_m = together[4], 0.0, 0.0
+    state.log_least = state.log_probability
     state.parent = np.full(state.hypotheses, -1)
     if not lost:
         state.parent = np.array([k if item is None else item.parent for k, item in enumerate(narrowed)])
@@ -77,6 +79,8 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
     if lost and state.weak_code_s >= limits.lost_code_s:
         # Codes have contradicted the place that motion carried: the next place is theirs alone.
         state.withheld_s = max(state.withheld_s, STEP_HELD_S)
+    if weak:
+        state.withheld_s = max(state.withheld_s, limits.level_start_s)
     state.weak_motion_s = state.weak_code_s = state.across = 0.0
     state.code_shift, state.speed_range_mps = (0.0, 0.0), ANY_SPEED
     return lost
@@ -92,6 +96,7 @@ def _try_beside(state: TrackState, limits: TrackingLimits) -> None:
     state.mean = np.concatenate([state.mean, mean])
     state.covariance = np.concatenate([state.covariance, covariance])
     state.log_probability = log_probability - np.logaddexp.reduce(log_probability)
+    state.log_least = np.concatenate([state.log_least, np.zeros(len(mean))])
     state.log_code = np.concatenate([state.log_code, np.full(len(mean), state.log_code[best])])
     state.origin_m = np.concatenate([state.origin_m, mean[:, Unknown.PLACE]])
     state.parent = np.concatenate([state.parent, np.full(len(mean), -1)])

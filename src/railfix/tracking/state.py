@@ -126,6 +126,8 @@ class TrackState:
     step_s, withheld_s, open_s : float [s]
         How long all codes have asked for another place, how long the level is withheld still, and how long that along
         the line, as other places of it were more probable than the risk.
+    log_least : ndarray, shape (H,)
+        Least logarithm of the probability lately: it rises with time (`railfix.tracking.branches.LEAST_RISE`).
     branch_s, branch_m : float [s], [m]
         Time and distance since the hypotheses began.
     origin_m : ndarray, shape (H,) [m]
@@ -181,6 +183,7 @@ class TrackState:
     code_shift: tuple[float, float] = (0.0, 0.0)
     map_log_scale: float = 0.0
     log_code: Floats = field(default_factory=lambda: np.empty(0))
+    log_least: Floats = field(default_factory=lambda: np.empty(0))
     across: float = 0.0
     step_s: float = 0.0
     withheld_s: float = 0.0
@@ -236,7 +239,7 @@ class TrackState:
         """Begin anew: no hypothesis, no sub-filter, no clock known, nothing learnt of noise and map."""
         width = SATELLITES + len(self.satellite)
         self.mean, self.covariance = np.empty((0, width)), np.empty((0, width, width))
-        self.log_probability = self.log_code = self.origin_m = np.empty(0)
+        self.log_probability = self.log_code = self.log_least = self.origin_m = np.empty(0)
         self.branch_s = self.branch_m = self.across = self.step_s = 0.0
         self.offset_known = np.zeros(len(CLOCKS), dtype=np.bool_)
         self.weak_motion_s = self.weak_code_s = self.unaided_m = self.direction = 0.0

@@ -42,10 +42,11 @@ def reweigh(
         motion = min(max(odds + part * gained, min(odds, -reach)), max(odds, reach))
         odds = log_code[h] - first_code
         reach = independent * square / (2.0 * numbers.code_common_m**2)
-        if square < numbers.branch_floor_m**2:
-            reach = min(reach, -math.log(numbers.branch_floor))
         gained = work.code_evidence[h] - work.code_evidence[best]
-        work.joined[0, h] = min(max(odds + part * gained, min(odds, -reach)), max(odds, reach))
+        code = min(max(odds + part * gained, min(odds, -reach)), max(odds, reach))
+        if square < numbers.branch_floor_m**2:
+            code = min(max(code, math.log(numbers.branch_floor)), -math.log(numbers.branch_floor))
+        work.joined[0, h] = code
         after[h] = motion + work.joined[0, h]
     total = log_sum(after, count)
     for h in range(count):
@@ -70,7 +71,8 @@ def keep_hypotheses(memory: Memory, numbers: Numbers, work: Work, count: int) ->
         ranked[j] = k
     size = 0
     for k in range(count):
-        joined[0, k], joined[1, k], joined[2, k] = log_probability[k], origin[k], memory.log_code[k]
+        joined[0, k], joined[1, k] = log_probability[k], origin[k]
+        joined[2, k], joined[3, k] = memory.log_code[k], memory.log_least[k]
     for r in range(count):
         k, twin = ranked[r], -1
         for j in range(size):
@@ -103,7 +105,7 @@ def keep_hypotheses(memory: Memory, numbers: Numbers, work: Work, count: int) ->
             log_probability[j] -= total
     for j in range(size):
         k = kept[j]
-        origin[j], memory.log_code[j] = joined[1, k], joined[2, k]
+        origin[j], memory.log_code[j], memory.log_least[j] = joined[1, k], joined[2, k], joined[3, k]
         for c in range(n):
             work.new_mean[j, c] = mean[k, c]
             for e in range(n):

@@ -108,6 +108,9 @@ class Numbers(NamedTuple):
     branch_floor_m: float
     most_motion: float
     motion_m: float
+    least_rise: float
+    takeover: float
+    takeover_after_s: float
     decided_travel_m: float
     least_probability: float
     most_hypotheses: int
@@ -170,6 +173,8 @@ class Numbers(NamedTuple):
     across_lost: float
     drift_sigmas: float
     drift_log: float
+    beside_sigmas: float
+    beside_m: float
     motion_satellites: int
     step_sigmas: float
     step_s: float
@@ -202,6 +207,7 @@ class Memory(NamedTuple):
     covariance: Floats
     log_probability: Floats
     log_code: Floats
+    log_least: Floats
     origin_m: Floats
     offset_known: Masks
     scalars: Floats

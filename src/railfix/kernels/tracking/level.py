@@ -237,6 +237,10 @@ def write_level(
         answers.level_m[t] = answers.ground_level_m[t]
     elif far <= numbers.level_risk:
         answers.level_m[t] = _solve(memory, count, bank, numbers, work, 0, start, place, sigma)
+    wrong = len(bank.running) - 1
+    if bank.running[wrong]:
+        aside = abs(bank.mean[wrong, RIGHT]) - 2.0 * math.sqrt(bank.covariance[wrong, RIGHT, RIGHT])
+        answers.ground_level_m[t] += max(aside, 0.0)
 
 
 @borrowing

@@ -11,6 +11,7 @@ from railfix.kernels.tracking.layout import (
     ACROSS,
     MAP_SCALE,
     PLACE,
+    RIGHT,
     SHIFT,
     SHIFT_VARIANCE,
     SPEED,
@@ -79,6 +80,11 @@ def watch(
         withheld = numbers.level_hold_s
     for b in range(len(bank.running)):
         if bank.running[b] and bank.weak_s[b] > numbers.level_doubt_s:
+            withheld = numbers.level_hold_s
+    wrong = len(bank.running) - 1
+    if wrong >= 0 and bank.running[wrong]:
+        reach = numbers.beside_sigmas * math.sqrt(bank.covariance[wrong, RIGHT, RIGHT])
+        if abs(bank.mean[wrong, RIGHT]) > max(numbers.beside_m, reach):
             withheld = numbers.level_hold_s
     if scalars[STEP_TIME] >= numbers.step_s:
         withheld = numbers.step_held_s

@@ -336,16 +336,25 @@ def _finish(
     scalars[UNAIDED] = 0.0 if aided else scalars[UNAIDED] + abs(speed) * dt
     scalars[BRANCH_S] += dt
     scalars[BRANCH_M] += abs(speed) * dt
+    for h in range(count):
+        memory.log_least[h] = min(memory.log_least[h] + numbers.least_rise * dt, memory.log_probability[h])
     if count > 1:
         count = keep_hypotheses(memory, numbers, work, count)
         scalars[HYPOTHESES] = count
+    if scalars[BRANCH_S] > numbers.takeover_after_s and memory.log_least[0] < numbers.takeover:
+        scalars[ACROSS] = numbers.across_lost
     probability = math.exp(memory.log_probability[0])
     sigma = math.sqrt(memory.covariance[0, PLACE, PLACE])
     answers.hypotheses[t], answers.probability[t] = count, probability
     if sigma > numbers.expired_sigma_m:
         answers.status[t] = numbers.expired
         return
-    answers.arc_m[t], answers.sigma_m[t] = memory.mean[0, PLACE], sigma
+    far = write_branches(memory, course, numbers, work, count)
+    spread = sigma * sigma
+    for h in range(1, count):
+        own = work.branch[h, 1] ** 2 + work.branch[h, 2] ** 2
+        spread += math.exp(memory.log_probability[h]) * (own - sigma * sigma)
+    answers.arc_m[t], answers.sigma_m[t] = memory.mean[0, PLACE], math.sqrt(spread)
     answers.speed_mps[t] = memory.mean[0, SPEED]
     answers.speed_sigma_mps[t] = math.sqrt(memory.covariance[0, SPEED, SPEED])
     answers.acceleration_mps2[t] = memory.mean[0, ACCELERATION]
@@ -356,7 +365,6 @@ def _finish(
     if active.radar >= 0:
         answers.radar_scale[t] = memory.mean[0, active.radar]
     answers.map_scale[t] = math.exp(0.5 * scalars[MAP_SCALE])
-    far = write_branches(memory, course, numbers, work, count)
     scalars[OPEN] = numbers.level_hold_s if far > numbers.level_risk else max(scalars[OPEN] - dt, 0.0)
     if len(bank.running):
         write_level(memory, count, far, bank, numbers, work, answers, t)
