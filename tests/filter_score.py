@@ -69,14 +69,10 @@ class Case:
 
     def part(self, first: int, end: int) -> Case:
         """Some epochs of it."""
-        per_epoch = (
-            "time", "sat_ecef_m", "sat_velocity_mps", "code_m", "code_sigma_m", "phase_m", "phase_joined", "rate_mps",
-            "cn0_dbhz", "off_map",
-        )  # fmt: skip
         rows = slice(first, end)
         return replace(
             self,
-            epochs=replace(self.epochs, **{name: getattr(self.epochs, name)[rows] for name in per_epoch}),
+            epochs=self.epochs.take(rows),
             reference=self.reference[rows],
             observed=self.observed[rows],
             single_arc_m=self.single_arc_m[rows],
@@ -89,14 +85,13 @@ class Case:
 
 def rinex_case(name: str, run: Callable[..., recordings_score.Outcome], data: Path) -> Case:
     kept: list[GnssEpochs] = []
-    make = along_track.gnss_epochs
+    tracked = along_track._tracked
 
-    def keeping(*args: object, **words: object) -> object:
-        made = make(*args, **words)  # type: ignore[arg-type]
-        kept.append(made[0])
-        return made
+    def keeping(epochs: GnssEpochs, *args: object) -> object:
+        kept.append(epochs)
+        return tracked(epochs, *args)  # type: ignore[arg-type]
 
-    with mock.patch.object(along_track, "gnss_epochs", keeping):
+    with mock.patch.object(along_track, "_tracked", keeping):
         outcome = run(data, CONFIG)
     assert outcome.result is not None
     reading = {"m8t": "urbannav", "f9p": "urbannav", "pixel": "gsdc", "japan": "japan"}[name]

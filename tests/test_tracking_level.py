@@ -9,11 +9,12 @@ import pytest
 from scipy.stats import norm
 
 from railfix.tracking import TrackingLimits, track
-from railfix.tracking.bank import budget, level_m
+from railfix.tracking.bank import OTHERS, Branches, budget, compute_level
 from railfix.tracking.state import Bank
 from tracking_cases import bent_line, part, ride, wheel, without_epochs
 
 LIMITS = TrackingLimits()
+NO_BRANCH = Branches(probability=np.empty(0), apart_m=np.empty(0), ground_m=np.empty(0), sigma_m=np.empty(0))
 
 
 @pytest.mark.requirement("C2")
@@ -27,7 +28,9 @@ def test_the_level_spends_the_risk_over_all_hypotheses() -> None:
     mean = np.zeros((4, 30))
     mean[:, 0] = 100.0 + place
     bank = Bank(without=("G01", "E", "G", "wheel"), mean=mean, covariance=covariance, weak_s=np.zeros(4))
-    level, noise, apart = level_m(bank, 100.0, 1.0, LIMITS)
+    found = compute_level(bank, NO_BRANCH, 100.0, 1.0, LIMITS)
+    level, noise, apart = found.along_m, found.noise_m, found.separation_m
+    assert found.ground_m == level
     prior = np.array([given.prior[kind] for kind in (0, 1, 1, 2)])
     spent = 2.0 * norm.sf(level) + prior @ (norm.sf((level - place) / sigma) + norm.sf((level + place) / sigma))
     assert spent == pytest.approx(given.risk, rel=1e-6)
@@ -35,12 +38,39 @@ def test_the_level_spends_the_risk_over_all_hypotheses() -> None:
     assert noise == pytest.approx(norm.isf(0.5 * given.risk))
 
 
+@pytest.mark.requirement("C6")
+@pytest.mark.parametrize("probability", [1e-12, 1e-9, 1e-6, 1e-3, 0.4])
+def test_other_branches_are_hypotheses_of_the_level(probability: float) -> None:
+    """Against the equation: near along the line, or at another place of it that is near on the ground."""
+    given = budget(LIMITS)
+    covariance, mean = np.zeros((1, 30, 30)), np.zeros((1, 30))
+    covariance[:, 0, 0], mean[:, 0] = 4.0, 101.0
+    bank = Bank(without=("G01",), mean=mean, covariance=covariance, weak_s=np.zeros(1))
+    for apart, ground in ((40.0, 35.0), (1815.0, 3.0), (900.0, 18.0)):
+        branch = Branches(
+            probability=np.array([probability]), apart_m=np.array([apart]), ground_m=np.array([ground]), sigma_m=np.array([2.0])
+        )
+        found = compute_level(bank, branch, 100.0, 1.0, LIMITS)
+
+        def spent(level: float, distance: float) -> float:
+            own = given.prior[0] * (norm.sf((level - 1.0) / 2.0) + norm.sf((level + 1.0) / 2.0))
+            other = probability * (norm.sf((level - distance) / 2.0) + norm.sf((level + distance) / 2.0))
+            return float(2.0 * norm.sf(level) + own + other)
+
+        assert spent(found.ground_m, ground) == pytest.approx(given.risk, rel=1e-5)
+        if apart > LIMITS.start_separation_m and probability > given.risk:
+            assert found.along_m == np.inf
+        else:
+            distance = apart if apart <= LIMITS.start_separation_m else 0.0
+            assert spent(found.along_m, distance) == pytest.approx(given.risk, rel=1e-5)
+
+
 @pytest.mark.requirement("C2")
 def test_only_a_contradiction_that_lasts_takes_the_level_away() -> None:
     mean, covariance = np.zeros((1, 30)), np.ones((1, 30, 30))
     for weak_s, told in ((0.0, True), (1.0, True), (LIMITS.level_doubt_s, True), (LIMITS.level_doubt_s + 0.1, False)):
         bank = Bank(without=("G01",), mean=mean, covariance=covariance, weak_s=np.array([weak_s]))
-        assert np.isfinite(level_m(bank, 0.0, 1.0, LIMITS)[0]) == told
+        assert np.isfinite(compute_level(bank, NO_BRANCH, 0.0, 1.0, LIMITS).along_m) == told
     # half of the codes 60 m late: the filter's own weights are those of a lost track, for 2 s and for 5 s
     case = ride(60, noise=1.0, seed=5)
     code = case.epochs.code_m.copy()
@@ -60,7 +90,7 @@ def test_a_source_that_is_never_faulty_needs_no_sub_filter() -> None:
     limits = TrackingLimits(level_constellation_prior=0.0)
     _, state = track(case.epochs, case.line, limits=limits, levels=True)
     assert state.bank is not None
-    assert set(state.bank.without) == set(case.epochs.satellite)
+    assert set(state.bank.without) == {*case.epochs.satellite, *OTHERS}
     rare = budget(TrackingLimits(level_constellation_prior=1e-13, level_fault_prior=1e-3))
     assert rare.prior[1] == 0.0
     assert rare.risk < budget(LIMITS).risk
@@ -151,7 +181,8 @@ def test_off_there_is_no_level() -> None:
 def test_a_sub_filter_follows_the_line_where_a_fault_has_led_the_filter_away() -> None:
     """Four codes on a line that bends: a ramp in one takes the filter more than 100 m off, and its tangent with it."""
     case = ride(110, trajectory=bent_line(1500.0, turn_deg=170.0), noise=1.0, code_sigma_m=3.0, seed=4)
-    code = np.where(np.isin(np.arange(10), (0, 2, 5, 8)), case.epochs.code_m, np.nan)
+    few = np.isin(np.arange(10), (0, 2, 5, 8)) | (np.arange(110) < 5)[:, None]
+    code = np.where(few, case.epochs.code_m, np.nan)
     code[30:, 2] += 1.5 * np.arange(80.0)
     nothing = np.full(code.shape, np.nan)
     epochs = replace(case.epochs, code_m=code, phase_m=nothing, rate_mps=nothing)

@@ -129,16 +129,19 @@ def test_thinned_epochs_have_what_was_measured_between() -> None:
 def test_the_bound_of_an_epoch_between_by_hand() -> None:
     case = ride(1, rate_hz=10.0)
     epochs = part(case.epochs, slice(2, 5))
-    found = replace(Tracked.empty(epochs.time, 10), arc_m=np.array([102.0, 104.5, np.nan]))
+    arc, status = np.array([102.0, 104.5, np.nan]), np.array([0, 0, 5], dtype=np.int8)
+    found = replace(Tracked.empty(epochs.time, 10), arc_m=arc, status=status)
     # 0.2 s before the first: place 100 m, 10 m/s, level 5 m with 3 m and 2 m, bound of the speed 0.5 m/s, amount 7 m
     state = LevelState(
         since=Since(start=case.epochs.time[0], number=0),
         time=case.epochs.time[0],
-        values=np.array([100.0, 10.0, 5.0, 3.0, 0.5, 2.0, 7.0]),
+        values=np.array([100.0, 10.0, 5.0, 6.0, 3.0, 0.5, 2.0, 7.0, 0.0]),
     )
     levels, after = with_levels(found, epochs, case.line, state, LIMITS, SensorEpochs())
     # 102 = 100 + 10 * 0.2: 5 + 0.5 * 0.2 + 3 * 0.2^2 / 2; then 1.5 m ahead of 103 m
     np.testing.assert_allclose(levels.level_m, [5.16, 5.0 + 1.5 + 0.15 + 0.135, np.nan], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(levels.ground_level_m, levels.level_m + 1.0, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(levels.status, status)
     np.testing.assert_allclose(levels.amount_m, [7.0 + 0.02 * 2.0, 7.0 + 0.02 * 3.0, np.nan], rtol=0, atol=1e-9)
     np.testing.assert_array_equal(levels.level_noise_m, [3.0, 3.0, np.nan])
     assert after.time == state.time

@@ -69,14 +69,50 @@ def test_every_lap_is_a_hypothesis_at_the_start() -> None:
         assert len(state.mean) == 3
 
 
-@pytest.mark.requirement("E5")
+PLACES = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [18.0, 0.0, 0.0], [300.0, 0.0, 0.0]])
+
+
+def _after(seconds_: int, motion: float, code: float, *, speed_mps: float = 10.0) -> np.ndarray:
+    """Logarithms of the odds of four branches after so many seconds of the same evidence against all but the first."""
+    limits, probability, of_code = TrackingLimits(), np.log(np.full(4, 0.25)), np.zeros(4)
+    against = np.array([0.0, 1.0, 1.0, 1.0])
+    for k in range(seconds_):
+        probability, of_code = judged(
+            probability, of_code, motion * against, code * against, PLACES, float(k), k * speed_mps, 1.0, limits
+        )
+    return np.asarray(probability - probability[0])
+
+
+@pytest.mark.requirement("C6")
 def test_evidence_within_the_error_of_the_map_saturates() -> None:
     limits = TrackingLimits()
-    place = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [300.0, 0.0, 0.0]])
-    probability = np.log(np.full(3, 1.0 / 3.0))
-    for _ in range(200):
-        probability = judged(probability, np.array([0.0, -2.0, -2.0]), place, limits)
-    assert probability[1] - probability[0] == pytest.approx(-0.25)
-    assert probability[2] - probability[0] < -300.0
-    apart = np.array([0.0, -9.0, 0.0])
-    assert judged(apart, np.array([0.0, -2.0, 0.0]), place, limits)[1] == pytest.approx(-9.0)
+    odds = _after(200, -2.0, 0.0)
+    assert odds[1] == pytest.approx(-2.25 / limits.map_branch_m**2)
+    assert odds[3] < -300.0
+
+
+@pytest.mark.requirement("C6")
+def test_codes_alone_leave_a_near_branch_its_floor_and_decide_against_a_far_one() -> None:
+    limits = TrackingLimits()
+    odds = _after(900, 0.0, -2.0)
+    assert odds[2] == pytest.approx(np.log(limits.branch_floor))
+    assert odds[3] < -100.0
+    # one independent epoch: d^2 / (2 code_common_m^2)
+    first = _after(1, 0.0, -1e3)
+    assert first[2] == pytest.approx(-(18.0**2) / (2.0 * limits.code_common_m**2))
+
+
+@pytest.mark.requirement("C6")
+def test_motion_decides_by_the_distance_travelled_and_a_burst_of_it_counts_little() -> None:
+    assert _after(900, -2.0, 0.0, speed_mps=0.0)[3] == 0.0
+    assert _after(2, -1e3, 0.0, speed_mps=100.0)[3] == pytest.approx(-5.0, abs=0.01)
+    assert _after(60, -2.0, 0.0)[2] < -15.0
+
+
+@pytest.mark.requirement("C6")
+def test_what_codes_said_of_a_branch_far_away_does_not_hold_once_it_is_near() -> None:
+    limits = TrackingLimits()
+    probability, code = np.array([0.0, -60.0]), np.array([0.0, -60.0])
+    near = np.array([[0.0, 0.0, 0.0], [18.0, 0.0, 0.0]])
+    after, _ = judged(probability, code, np.zeros(2), np.zeros(2), near, 60.0, 600.0, 1.0, limits)
+    assert after[1] - after[0] == pytest.approx(np.log(limits.branch_floor))

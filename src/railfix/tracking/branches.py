@@ -61,7 +61,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
     -------
     arc_m : ndarray, shape (C,) [m]
         Local maxima of the likelihood with Student's t errors, the best first; empty with fewer than `REDUNDANT`
-        codes beyond the unknowns, or with more places than `most_hypotheses`.
+        codes beyond the unknowns.
     sigma_m : ndarray, shape (C,) [m]
         Half of the stretch that is about as likely, at least `start_sigma_m`.
     """
@@ -92,8 +92,8 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
         apart = np.abs(line.nearest_m(arc[chosen], arc[candidate]) - arc[candidate])
         if (apart > limits.start_separation_m).all():
             chosen.append(candidate)
-        if len(chosen) > limits.most_hypotheses:
-            return np.empty(0), np.empty(0)
+        if len(chosen) == limits.most_hypotheses:
+            break
     sigma = np.full(len(chosen), limits.start_sigma_m)
     return arc[chosen], sigma
 

@@ -392,6 +392,8 @@ def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
         "across_lost": monitors.ACROSS_LOST,
         "drift_sigmas": monitors.DRIFT_SIGMAS,
         "drift_log": 2.0 * float(np.log(monitors.DRIFT_SCALE)),
+        "young": monitors.YOUNG,
+        "young_held_s": monitors.YOUNG_HELD_S,
         "beside_sigmas": monitors.BESIDE_SIGMAS,
         "beside_m": monitors.BESIDE_M,
         "motion_satellites": branches.MOTION_SATELLITES,

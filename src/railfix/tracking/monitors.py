@@ -35,6 +35,9 @@ DRIFT_SCALE: Final = 6.0
 #: deviations and metres.
 BESIDE_SIGMAS: Final = 4.5
 BESIDE_M: Final = 8.0
+#: Young hypotheses bound nothing before one of them is this probable: the right place may not be among them yet.
+YOUNG: Final = 0.99
+YOUNG_HELD_S: Final = 1.0
 #: Codes that ask for another place by more than so many standard deviations for so long [s] have stepped together.
 STEP_SIGMAS: Final = 6.0
 STEP_S: Final = 3.0
@@ -102,6 +105,8 @@ def watch(
     doubtful = state.weak_code_s > limits.level_doubt_code_s or state.weak_motion_s > limits.level_doubt_s
     if doubtful or state.across > ACROSS_DOUBT:
         withheld = limits.level_hold_s
+    if state.branch_s < limits.level_start_s and state.log_probability.max() < np.log(YOUNG):
+        withheld = YOUNG_HELD_S
     mean, variance = state.code_shift
     if mean**2 > DRIFT_SIGMAS**2 * variance or state.map_scale > DRIFT_SCALE:
         withheld = limits.level_hold_s

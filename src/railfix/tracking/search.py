@@ -23,7 +23,6 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         state.log_probability, state.origin_m = np.full(len(arc), -np.log(max(len(arc), 1))), arc
         state.log_code, state.branch_s, state.branch_m = np.zeros(len(arc)), 0.0, 0.0
         state.log_least = state.log_probability
-        state.withheld_s = max(state.withheld_s, limits.level_start_s)
         state.parent, state.narrowed = np.full(len(arc), -1), None
         return False
     mean, covariance = predicted(state.mean, state.covariance, line, chunk.interval_s[epoch], limits, state.map_scale)

@@ -173,6 +173,9 @@ class Numbers(NamedTuple):
     across_lost: float
     drift_sigmas: float
     drift_log: float
+    level_start_s: float
+    young: float
+    young_held_s: float
     beside_sigmas: float
     beside_m: float
     motion_satellites: int

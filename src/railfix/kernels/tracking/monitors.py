@@ -9,6 +9,8 @@ from railfix.kernels.tracking.course import point_at
 from railfix.kernels.tracking.layout import (
     ACCELERATION,
     ACROSS,
+    BRANCH_S,
+    HYPOTHESES,
     MAP_SCALE,
     PLACE,
     RIGHT,
@@ -76,6 +78,12 @@ def watch(
     doubtful = scalars[WEAK_CODE] > numbers.level_doubt_code_s or scalars[WEAK_MOTION] > numbers.level_doubt_s
     if doubtful or scalars[ACROSS] > numbers.across_doubt:
         withheld = numbers.level_hold_s
+    if scalars[BRANCH_S] < numbers.level_start_s:
+        largest = -math.inf
+        for h in range(int(scalars[HYPOTHESES])):
+            largest = max(largest, memory.log_probability[h])
+        if largest < math.log(numbers.young):
+            withheld = numbers.young_held_s
     if scalars[SHIFT] ** 2 > numbers.drift_sigmas**2 * scalars[SHIFT_VARIANCE] or scalars[MAP_SCALE] > numbers.drift_log:
         withheld = numbers.level_hold_s
     for b in range(len(bank.running)):
