@@ -390,6 +390,7 @@ def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
         "allowed_square": monitors.ALLOWED_SQUARE,
         "across_doubt": monitors.ACROSS_DOUBT,
         "across_lost": monitors.ACROSS_LOST,
+        "across_taken": monitors.ACROSS_TAKEN,
         "drift_sigmas": monitors.DRIFT_SIGMAS,
         "drift_log": 2.0 * float(np.log(monitors.DRIFT_SCALE)),
         "young": monitors.YOUNG,

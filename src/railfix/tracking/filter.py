@@ -28,7 +28,7 @@ from railfix.tracking.epochs import GnssEpochs, SensorEpochs
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.misfit import code_shift, learn_map
-from railfix.tracking.monitors import ACROSS_LOST, contradiction, watch
+from railfix.tracking.monitors import ACROSS_TAKEN, contradiction, watch
 from railfix.tracking.possible_speed import possible, widen
 from railfix.tracking.result import Tracked, TrackStatus, write_place, write_rows
 from railfix.tracking.robust import (
@@ -174,7 +174,7 @@ def _step(
         )
         step.choose(chosen)
     if state.branch_s > TAKEOVER_AFTER_S and state.log_least[0] < TAKEOVER:
-        state.across = ACROSS_LOST
+        state.across = ACROSS_TAKEN
     if trace is not None:
         step.mean, step.covariance, step.parent = state.mean, state.covariance, state.parent
         trace.append(step)

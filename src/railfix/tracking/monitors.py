@@ -27,6 +27,10 @@ ALLOWED_SQUARE: Final = 4.0
 #: Sums from which on the level is withheld, and the track is lost.
 ACROSS_DOUBT: Final = 12.0
 ACROSS_LOST: Final = 30.0
+#: The sum after a takeover (`railfix.tracking.branches.TAKEOVER`): more than a velocity across the line gives.
+ACROSS_TAKEN: Final = 60.0
+#: Probability of other places where the velocity contradicts the one that was sure: the map may be wrong just here.
+ELSEWHERE: Final = 0.01
 #: Mean of the places that codes ask for, over its standard deviation, and factor on the error of the map's lengths, from
 #: on which codes contradict motion: a step of all codes, a pull, or a map that is wrong.
 DRIFT_SIGMAS: Final = 5.0

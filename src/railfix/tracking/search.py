@@ -9,7 +9,7 @@ from railfix.tracking.branches import BESIDE_AFTER_S, begin, beside, places, spl
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
-from railfix.tracking.monitors import ACROSS_DOUBT, ACROSS_LOST, STEP_HELD_S
+from railfix.tracking.monitors import ACROSS_DOUBT, ACROSS_LOST, ACROSS_TAKEN, ELSEWHERE, STEP_HELD_S
 from railfix.tracking.predict import predicted
 from railfix.tracking.state import ANY_SPEED, Narrowed, TrackState, Unknown
 
@@ -58,11 +58,12 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         there = line.nearest_m(arc[:, None], going)
         arc = arc[(np.abs(there - going) > limits.start_separation_m).all(axis=1)]
         # The old place goes on too, free to be pulled to where the codes are; where the velocity alone contradicts it,
-        # the hypotheses go on as they are, together as probable as all others.
+        # the hypotheses go on as they are.
         arc = np.concatenate([going, arc]) if weak else arc
         sigma = np.full(len(arc), limits.start_sigma_m)
         fresh = begin(arc, sigma, satellites, line, limits, known=(mean[best], covariance[best]))
-        share = np.full(len(arc), -np.log(max(len(arc), 1)))
+        elsewhere = 1.0 if weak or state.across >= ACROSS_TAKEN else ELSEWHERE
+        share = np.full(len(arc), np.log(elsewhere / max(len(arc), 1)))
         parts = [] if weak else parts
         parts.append((*fresh, share, arc, np.zeros(len(arc))))
     together = [np.concatenate(items) for items in zip(*parts, strict=True)]

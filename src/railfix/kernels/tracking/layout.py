@@ -171,6 +171,7 @@ class Numbers(NamedTuple):
     allowed_square: float
     across_doubt: float
     across_lost: float
+    across_taken: float
     drift_sigmas: float
     drift_log: float
     level_start_s: float

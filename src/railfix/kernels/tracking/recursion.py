@@ -342,7 +342,7 @@ def _finish(
         count = keep_hypotheses(memory, numbers, work, count)
         scalars[HYPOTHESES] = count
     if scalars[BRANCH_S] > numbers.takeover_after_s and memory.log_least[0] < numbers.takeover:
-        scalars[ACROSS] = numbers.across_lost
+        scalars[ACROSS] = numbers.across_taken
     probability = math.exp(memory.log_probability[0])
     sigma = math.sqrt(memory.covariance[0, PLACE, PLACE])
     answers.hypotheses[t], answers.probability[t] = count, probability
