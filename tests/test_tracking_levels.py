@@ -15,7 +15,7 @@ from railfix.cli import app
 from railfix.simulate.demo_data import demo_files
 from railfix.tracking import GnssEpochs, SensorEpochs, Tracked, TrackingLimits, TrackState, TrackStatus, track
 from railfix.tracking import levels as levels_of
-from railfix.tracking.levels import LevelState, with_levels
+from railfix.tracking.levels import LevelState, carried_levels, track_with_levels
 from railfix.tracking.thinned import Since, thinned
 from tracking_cases import Ride, part, ride, wheel
 
@@ -30,8 +30,7 @@ def _levels(
     state, level, parts = None, LevelState(), []
     for piece in pieces:
         some, sensed = part(epochs, piece), _part(sensors, piece)
-        found, state = track(some, case.line, state, limits=LIMITS, sensors=sensed)
-        found, level = with_levels(found, some, case.line, level, LIMITS, sensed)
+        found, state, level = track_with_levels(some, case.line, state, level, LIMITS, sensed)
         parts.append(found)
     return Tracked(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Tracked)}), level
 
@@ -137,7 +136,8 @@ def test_the_bound_of_an_epoch_between_by_hand() -> None:
         time=case.epochs.time[0],
         values=np.array([100.0, 10.0, 5.0, 6.0, 3.0, 0.5, 2.0, 7.0, 0.0]),
     )
-    levels, after = with_levels(found, epochs, case.line, state, LIMITS, SensorEpochs())
+    none = np.empty(0, dtype=np.intp)
+    levels, after = carried_levels(found, epochs, none, Tracked.empty(epochs.time[:0], 10), case.line, state, LIMITS)
     # 102 = 100 + 10 * 0.2: 5 + 0.5 * 0.2 + 3 * 0.2^2 / 2; then 1.5 m ahead of 103 m
     np.testing.assert_allclose(levels.level_m, [5.16, 5.0 + 1.5 + 0.15 + 0.135, np.nan], rtol=0, atol=1e-9)
     np.testing.assert_allclose(levels.ground_level_m, levels.level_m + 1.0, rtol=0, atol=1e-6)
@@ -153,14 +153,13 @@ def test_a_filter_with_sub_filters_that_is_in_doubt_bounds_nothing(
     monkeypatch: pytest.MonkeyPatch, status: TrackStatus, bounded: bool
 ) -> None:
     case = ride(5)
-    found, _ = track(case.epochs, case.line)
 
     def doubtful(*inputs: object, **named: object) -> tuple[Tracked, TrackState]:
         place, after = track(*inputs, **named)  # type: ignore[arg-type]
         return replace(place, status=np.full(5, status, dtype=np.int8)), after
 
     monkeypatch.setattr(levels_of, "track", doubtful)
-    levels, _ = with_levels(found, case.epochs, case.line, LevelState(), LIMITS, SensorEpochs())
+    levels, _, _ = track_with_levels(case.epochs, case.line, None, LevelState(), LIMITS, SensorEpochs())
     assert np.isfinite(levels.level_m[1:]).all() == bounded
     assert not np.isnan(levels.level_m).any()
 

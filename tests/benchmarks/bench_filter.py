@@ -26,7 +26,7 @@ from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 from railfix.tracking import GnssEpochs, Line, SensorEpochs, TrackingLimits, track
-from railfix.tracking.levels import LevelState, with_levels
+from railfix.tracking.levels import LevelState, track_with_levels
 
 EPOCHS = 2000
 
@@ -42,8 +42,7 @@ def median_us(action: object, epochs: int, rounds: int) -> float:
 
 
 def once_a_second(epochs: GnssEpochs, line: Line) -> None:
-    tracked, _ = track(epochs, line)
-    with_levels(tracked, epochs, line, LevelState(), TrackingLimits(), SensorEpochs())
+    track_with_levels(epochs, line, None, LevelState(), TrackingLimits(), SensorEpochs())
 
 
 def filter_alone(rounds: int) -> None:

@@ -24,7 +24,7 @@ from railfix.positioning.carrier import SlipState, corrected_phase_m, find_slips
 from railfix.screens import Screened
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, Tracked, TrackState, TrackStatus, track
-from railfix.tracking.levels import LevelState, with_levels
+from railfix.tracking.levels import LevelState, track_with_levels
 from railfix.tracking.result import is_bounded
 
 #: Reasons that a code is kept by: the filter weighs multipath and faults itself, with more than one epoch to judge by.
@@ -296,11 +296,13 @@ def _tracked(
             part, gate = _gated(part, sensors, alone[0][first:last], alone[1][first:last], line, state, config)
             state = replace(state, gate=gate)
         replays.append(Replay(epochs=part, sensors=sensors, before=state.track))
-        tracked, after = track(part, line, state.track, limits=config.tracking, sensors=sensors)
-        state = replace(state, track=after, sensors=kept, fixed=_fixed(tracked) if len(part) else state.fixed)
+        level = state.level
         if config.tracking.level == "on":
-            tracked, level = with_levels(tracked, part, line, state.level, config.tracking, sensors)
-            state = replace(state, level=level)
+            tracked, after, level = track_with_levels(part, line, state.track, level, config.tracking, sensors)
+        else:
+            tracked, after = track(part, line, state.track, limits=config.tracking, sensors=sensors)
+        fixed = _fixed(tracked) if len(part) else state.fixed
+        state = replace(state, track=after, level=level, sensors=kept, fixed=fixed)
         parts.append(tracked)
         motions.append(sensed)
     return _joined(parts), SensedMotion.joined(motions), tuple(replays), state

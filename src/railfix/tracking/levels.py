@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats
+from railfix.core.arrays import Codes, Datetimes, Floats, Indices
 from railfix.core.timescale import seconds
 from railfix.tracking.bank import SCALE_BOUND
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
@@ -44,37 +44,66 @@ class LevelState:
         Of its last epoch.
     values : ndarray, shape (9,)
         Its place, speed, levels with parts, amount and status there.
+    every : bool
+        It has taken every epoch so far: it is the filter itself.
     """
 
     track: TrackState | None = None
+    every: bool = True
     since: Since = field(default_factory=Since)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     values: Floats = field(default_factory=lambda: np.full(len(_KEPT), np.nan))
 
 
-def with_levels(
-    tracked: Tracked,
+def track_with_levels(
     epochs: GnssEpochs,
     line: Line,
+    track_state: TrackState | None,
     state: LevelState,
     limits: TrackingLimits,
     sensors: SensorEpochs,
+) -> tuple[Tracked, TrackState, LevelState]:
+    """Return the places of the filter with their levels, its state, and that of the filter with sub-filters.
+
+    Where the filter with sub-filters takes every epoch its places are those of the filter, which then does not run.
+    """
+    taken, some, sensed, since = thinned(epochs, sensors, state.since, limits.level_period_s)
+    place, after = track(some, line, state.track, limits=limits, sensors=sensed, levels=True)
+    every = state.every and len(taken) == len(epochs)
+    if every:
+        tracked, track_state = place, replace(after, bank=None)
+    else:
+        tracked, track_state = track(epochs, line, track_state, limits=limits, sensors=sensors)
+    state = replace(state, track=after, since=since, every=every)
+    tracked, state = carried_levels(tracked, epochs, taken, place, line, state, limits)
+    return tracked, track_state, state
+
+
+def carried_levels(
+    tracked: Tracked,
+    epochs: GnssEpochs,
+    taken: Indices,
+    place: Tracked,
+    line: Line,
+    state: LevelState,
+    limits: TrackingLimits,
 ) -> tuple[Tracked, LevelState]:
-    """Return the places with their levels, and the state for the next epochs.
+    """Return places with the levels of the epochs that the filter with sub-filters took, carried to all epochs.
 
     Parameters
     ----------
     tracked : Tracked
-        By the filter without sub-filters, T epochs.
+        By the filter, T epochs.
     epochs : GnssEpochs
+    taken : ndarray of int
+        Epochs that the filter with sub-filters took.
+    place : Tracked
+        Its places there.
     line : Line
     state : LevelState
-        Left by the epochs before.
+        Its last epoch before these.
     limits : TrackingLimits
-    sensors : SensorEpochs
     """
-    taken, some, sensed, since = thinned(epochs, sensors, state.since, limits.level_period_s)
-    place, after = track(some, line, state.track, limits=limits, sensors=sensed, levels=True)
     columns = np.stack([getattr(place, name) for name in _KEPT], axis=1).astype(np.float64)
     columns[:, _KEPT.index("level_m")] = np.where(is_bounded(place.status), place.level_m, np.inf)
     number = np.searchsorted(taken, np.arange(len(epochs)), side="right")
@@ -106,7 +135,7 @@ def with_levels(
         separation_m=np.where(known, separation, np.nan),
         amount_m=np.where(known, amount, np.nan),
     )
-    return tracked, LevelState(track=after, since=since, time=times[-1], values=values[-1])
+    return tracked, replace(state, time=times[-1], values=values[-1])
 
 
 def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:
