@@ -206,7 +206,7 @@ def test_the_noise_of_the_motion_is_that_of_many_short_steps() -> None:
         total = step @ total @ step.T + noise
         product = step @ product
     np.testing.assert_allclose(product, whole_step, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(total, whole_noise, rtol=2e-2)
+    np.testing.assert_allclose(total, whole_noise, rtol=1e-9)
 
 
 @pytest.mark.requirement("E5")
