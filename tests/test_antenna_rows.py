@@ -241,3 +241,15 @@ def test_chunks_are_freed_as_soon_as_they_are_done(monkeypatch: pytest.MonkeyPat
         assert [chunk() for chunk in made] == [None, None]
     finally:
         gc.enable()
+
+
+@pytest.mark.requirement("A7")
+def test_frequencies_of_glonass_that_one_log_alone_states_count_for_both() -> None:
+    """Two logs with the same channels, of which the second names the frequencies: they are not taken for the same."""
+    front = _inputs()[0]["front"][:2]
+    stated = replace(front, header=replace(front.header, glonass_channel={"R05": 1, "R06": -4}))
+    silent = replace(front, header=replace(front.header, glonass_channel={}))
+    for logs in ((silent, stated), (stated, silent)):
+        rows, parts = antenna_chunk.one_after_the_other(logs)
+        assert [part.stop for part in parts] == [2, 4]
+        assert rows.header.glonass_channel == {"R05": 1, "R06": -4}

@@ -339,3 +339,19 @@ def test_a_vehicle_file_with_a_byte_order_mark(tmp_path: Path) -> None:
     path = tmp_path / "car.toml"
     path.write_text("\ufeffbogie_distance_m = 13.8\n[antennas.front]\nalong_m = 9.1\nup_m = 4.1\n", encoding="utf-8")
     assert read_vehicle(path).antennas["front"].along_m == 9.1
+
+
+@pytest.mark.requirement("A2")
+@pytest.mark.parametrize("facing", ["rising", "falling"])
+def test_the_kilometrage_is_that_of_the_lines_point_abeam_the_antenna(facing: str) -> None:
+    """A level straight line marked backwards from 12 km: the antenna is 9.1 m ahead of the body's middle."""
+    east = np.arange(0.0, 201.0, 5.0)
+    line = Track.from_ecef(
+        to_ecef(np.stack([east, 0.0 * east, 0.0 * east], axis=1)), kilometrage_m=12_000.0 - 1.01 * east
+    )
+    found = antenna_trajectory(line, vehicle(facing=facing), "front")
+    assert found.body_chainage_m is not None
+    ahead = 9.1 if facing == "rising" else -9.1
+    np.testing.assert_allclose(found.chainage_m, found.body_chainage_m + ahead, atol=0.01)
+    inside = (found.chainage_m > 0.0) & (found.chainage_m < 200.0)
+    np.testing.assert_allclose(found.kilometrage_m[inside], 12_000.0 - 1.01 * found.chainage_m[inside], atol=0.01)

@@ -300,6 +300,17 @@ def test_the_reference_that_is_missing_in_the_tunnel_is_not_the_run_s_fault(tmp_
     assert row["interval_max_m"] == pytest.approx(20.0, abs=1e-6)
 
 
+def test_gaps_outside_the_reference_do_not_count(tmp_path: Path):
+    """Positions before the reference begins and after it ends, some of them 7 s apart."""
+    time = np.concatenate([[0.0, 7.0], np.arange(8.0, 20.0), [27.0, 34.0]])
+    known = np.arange(8.0, 20.0)
+    found = evaluate_run(write_run(tmp_path / "run", time, 20.0 * time), reference(known, 20.0 * known))
+    rows = found.epochs.filter(pl.col("gap_s").is_not_null())
+    assert rows["gap_s"].to_list() == pytest.approx([1.0] * 11)
+    assert rows["time_gpst"].to_numpy().tolist() == (START + timedelta(known[1:])).tolist()
+    assert found.intervals.filter(position="constrained")["gap_max_s"].item() == pytest.approx(1.0)
+
+
 def test_standing_is_no_interval_and_turning_is_one(tmp_path: Path):
     """Runs 5 s up at 10 m/s, stands 10 s with a reference that trembles, runs back without a position at the turn."""
     time = np.arange(21.0)

@@ -125,6 +125,23 @@ def test_unhealthy_newest_record_is_not_beaten_by_an_older_healthy_one() -> None
     assert np.isfinite(found.clock_m).all(), "states are given; who refuses them is not decided here"
 
 
+@pytest.mark.requirement("B0")
+def test_the_newest_record_decides_on_health_where_corrections_refer_to_an_older_one() -> None:
+    nav = navigation(record("G05", 0.0, -2.0), record("G05", 2.0, 0.0, health=63), record("G05", 4.0, 2.0))
+    found = look(nav, [0.5, 1.9, 2.1], "G05", record=np.array([[0], [0], [1]]))
+    assert found.record[:, 0].tolist() == [0, 0, 1]
+    assert found.unhealthy[:, 0].tolist() == [True, True, True]
+    assert not look(nav, [-0.5], "G05", record=np.array([[0]])).unhealthy.any()
+
+
+@pytest.mark.requirement("B0")
+def test_a_past_record_of_galileos_other_message_comes_before_one_of_the_future() -> None:
+    inav, fnav = (record("E11", 1.0, sent, message=name) for name, sent in (("INAV", 0.9), ("FNAV", 0.2)))
+    found = look(navigation(inav, fnav), [0.1, 0.5, 1.0], "E11")
+    assert found.record[:, 0].tolist() == [0, 1, 0]
+    assert found.future_record[:, 0].tolist() == [True, False, False]
+
+
 def test_records_of_another_year_do_no_harm() -> None:
     """Ten years before, eight after: beside the right one, before a later one, and alone."""
     other = [record("G05", -87_660.0, -87_661.5), record("G05", 70_000.0, 69_999.0)]

@@ -8,6 +8,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import polars as pl
 import pytest
 
 from pipeline_cases import (
@@ -24,6 +25,7 @@ from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.tables import observations_table
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -316,3 +318,27 @@ def test_reasons_gather():
     settings = MASK_ONLY | {"elevation": {"mask_deg": 89.0}}
     found = front_alone(front(), settings, navigation=changed_records(top(), health=1))
     assert np.all(found.reason[:, top_channel()] == Reason.UNHEALTHY | Reason.ELEVATION_MASK)
+
+
+@pytest.mark.requirement("B0")
+@pytest.mark.requirement("E5")
+def test_the_filter_uses_no_measurement_of_an_unhealthy_satellite() -> None:
+    """Screens that judge single codes leave the filter its say; health does not."""
+    broken, low = highest("G", 2)
+    records = clean_navigation()
+    sick = np.where(records.kepler.satellite == broken, 63, records.kepler.health)
+    navigation = replace(records, kepler=replace(records.kepler, health=sick))
+    weak = np.where(front().satellite == low, 20.0, front().cn0_dbhz)
+    observations = replace(front(), cn0_dbhz=weak)
+    result, _ = processor({"filter": "track"}, navigation=navigation).process({"front": observations})
+    table = observations_table(result)
+    measured = ("innovation_code_m", "innovation_phase_m", "innovation_doppler_mps", "weight_code")
+    unhealthy = table.filter(satellite=broken)
+    assert unhealthy["reason_text"].str.contains("unhealthy").all()
+    assert len(unhealthy) == 40
+    assert all(unhealthy[name].null_count() == 40 for name in measured)
+    others = table.filter(pl.col("satellite") != broken, pl.col("reason") == 0)
+    assert all(others[name].null_count() < len(others) for name in measured)
+    refused = table.filter(pl.col("satellite") == low)
+    assert (refused["reason_text"] != "used").all()
+    assert refused["weight_code"].null_count() < 40

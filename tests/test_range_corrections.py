@@ -12,8 +12,8 @@ import pytest
 from pydantic import ValidationError
 
 import pipeline_cases as cases
-from railfix.core.constants import FREQUENCY_L1
-from railfix.core.geodesy import ecef_from_geodetic, range_with_rotation
+from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotation
 from railfix.core.reasons import Reason
 from railfix.gnss.orbits import SatelliteStates
 from railfix.io.rinex import read_navigation, read_observations
@@ -288,6 +288,78 @@ def test_a_model_of_local_errors_is_widened_by_the_nominal_errors_and_another_is
         used = result.reason == 0
         nominal = NominalErrors().sigma_m(result.elevation_deg)
         assert result.bound_sigma_m[used] == pytest.approx(np.sqrt(9.0 + extra * nominal[used] ** 2))
+
+
+def test_sigmas_of_the_error_model_are_by_the_direction_from_the_front_of_the_car() -> None:
+    """Sectors of 90 degrees with sigmas of their own; the heading is that of the line's points on the map."""
+    bins = ErrorBins(elevation_deg=(0.0, 90.0), sectors=4, cn0_dbhz=(0.0, 60.0))
+    number, zero = np.full(bins.shape, 100), np.zeros(bins.shape)
+    sigma = np.array([10.0, 20.0, 30.0, 40.0]).reshape(bins.shape)
+    statistics = BinStatistics(
+        count=number, blocks=number, pooled=number * 0, bias_m=zero, sigma_m=sigma, bound_bias_m=zero,
+        bound_sigma_m=sigma,
+    )  # fmt: skip
+    model = ErrorModel(bins=bins, before=statistics, after=statistics, covers="satellite_and_atmosphere")
+    trajectory = cases.clean_trajectories()["front"]
+    processor = EpochProcessor(
+        parse_config({"error_model": "line.toml", "screens": []}),
+        cases.clean_trajectories(),
+        navigation=cases.clean_navigation(),
+        error_model=model,
+    )
+    result = processor.process({"front": cases.clean_observations()["front"][::100]})[0].antennas["front"]
+    vertex = np.clip(np.searchsorted(trajectory.arc_m, result.arc_m), 1, len(trajectory.arc_m) - 1)
+    step = trajectory.ecef_m[vertex] - trajectory.ecef_m[vertex - 1]
+    east, north = np.einsum("tij,tj->it", enu_axes(result.latitude_deg, result.longitude_deg)[:, :2], step)
+    turned = (result.azimuth_deg - np.degrees(np.arctan2(east, north))[:, None]) % 360.0
+    clear = (result.reason == 0) & (np.abs(turned % 90.0 - 45.0) > 5.0)
+    assert clear.sum() > 100
+    expected = 10.0 * (1.0 + np.round(turned / 90.0) % 4.0)
+    np.testing.assert_allclose(result.bound_sigma_m[clear], expected[clear])
+    assert set(expected[clear]) == {10.0, 20.0, 30.0, 40.0}
+
+
+def test_the_accuracy_that_records_state_is_in_the_sigmas() -> None:
+    """20 m of GPS, 3 m of the others (no worse than usual): sigmas and bounds grow by the former alone."""
+    observations, navigation = {"front": cases.clean_observations()["front"][:5]}, cases.clean_navigation()
+    gps = np.char.startswith(navigation.kepler.satellite, "G")
+    stated = replace(navigation, kepler=replace(navigation.kepler, accuracy_m=np.where(gps, 20.0, 3.0)))
+    usual = replace(navigation, kepler=replace(navigation.kepler, accuracy_m=np.full(len(gps), 2.0)))
+    found = [
+        cases.processor({"screens": []}, navigation=records).process(observations)[0].antennas["front"]
+        for records in (usual, stated)
+    ]
+    before, after = (result.sigma_m for result in found)
+    known = np.isfinite(before)
+    of_gps = known & np.char.startswith(found[0].satellite, "G")
+    assert of_gps.any()
+    assert (known & ~of_gps).any()
+    np.testing.assert_allclose(after[of_gps], np.hypot(before[of_gps], 20.0))
+    np.testing.assert_array_equal(after[known & ~of_gps], before[known & ~of_gps])
+
+
+def test_the_phase_of_the_filter_is_without_clock_and_troposphere() -> None:
+    """Changes of wavelength x phase with those of the satellite clock and the troposphere, against the codes'."""
+    observations = cases.clean_observations()["front"]
+    settings = {"screens": [], "systems": ["G"], "ionosphere": "off", "filter": "track", "protection": "off"}
+    state, found = None, []
+    processor = cases.processor(settings)
+    for first in (0, 1500):
+        result, state = processor.process({"front": observations[first : first + 1500]}, state)
+        found.append(result)
+    front = [result.antennas["front"] for result in found]
+    columns = front[0].columns
+    phase = np.concatenate([r.fusion["front"].replay[0].epochs.phase_m for r in found])
+    corrected = np.concatenate([r.corrected_code_m[:, columns] for r in front])
+    size = len(phase)
+    correction = corrected - observations.code_m[:size, columns]  # clock less troposphere, group delay
+    turns = observations.phase_cycles[:size, columns] * SPEED_OF_LIGHT / FREQUENCY_L1
+    change, expected = phase - phase[0], (turns + correction) - (turns + correction)[0]
+    known = np.isfinite(change)
+    assert known.any(axis=0).sum() >= 6
+    np.testing.assert_allclose(change[known], expected[known], atol=1e-6)
+    moved = np.abs(np.diff(correction[[0, -1]], axis=0))
+    assert np.nanmax(moved) > 1e-2
 
 
 def test_a_corrected_code_is_without_clock_ionosphere_and_troposphere() -> None:

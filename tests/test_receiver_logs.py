@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import railfix
+from pipeline_cases import demo_observations
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.gnss.observations import Observations, concatenate
@@ -21,6 +22,7 @@ from railfix.io import rinex
 from railfix.io.receiver.framing import crc24q, find_frames
 from railfix.io.receiver.log import StreamState, decode
 from railfix.io.receiver.measurements import Tracking, observations_of
+from ubx_made import log_of
 
 pytestmark = pytest.mark.requirement("A8")
 
@@ -306,6 +308,19 @@ def test_pieces_are_the_whole(ubx: Path) -> None:
     some = railfix.read_observations(ubx, systems="G", start=whole.time[10], end=whole.time[20])
     assert len(some) == 10
     assert set(some.system.tolist()) == {"G"}
+
+
+@pytest.mark.requirement("A7")
+def test_overlapping_logs_of_one_receiver_give_each_epoch_once(tmp_path: Path) -> None:
+    whole = demo_observations()["front"][:30]
+    for name, part in (("one", slice(0, 20)), ("two", slice(10, 30)), ("all", slice(0, 30))):
+        (tmp_path / name).write_bytes(log_of(whole[part]))
+    single = railfix.read_observations(tmp_path / "all")
+    both = railfix.read_observations([tmp_path / "two", tmp_path / "one"])
+    assert both.time.tolist() == single.time.tolist()
+    assert len(both) == 30
+    for name in NUMBERS:
+        np.testing.assert_array_equal(getattr(both, name), getattr(single, name))
 
 
 def test_messages_of_what_cannot_be_read(recordings: Path, tmp_path: Path) -> None:

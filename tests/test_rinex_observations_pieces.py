@@ -112,6 +112,36 @@ def test_where_blocks_of_text_end_does_not_matter(tmp_path: Path, log: type, blo
     assert sum(run.problem_count for run in runs) == whole.problem_count
 
 
+@pytest.mark.requirement("A7")
+@pytest.mark.parametrize("flag", [2, 3])
+@pytest.mark.parametrize("types", [["C1C", "C1C"], ["C1C", "C1W"]], ids=["same types", "other types"])
+def test_a_break_is_kept_where_a_block_ends_after_the_event(tmp_path: Path, flag: int, types: list[str]) -> None:
+    """Antenna moving, or another place: no epoch after it is differenced with one before it, nor where types change."""
+    lines = header_3({"G": ("C1C",)})
+    for k in range(8):
+        lines += epoch_3(f"02 33 {k:2d}.0000000", {"G01": [field(2e7 + k)], "G02": [field(2.1e7)]})
+        lines += (
+            [f"> {'':28} {flag}  1", record(f"G    1 {types[k // 2 % 2 - 1]}", "SYS / # / OBS TYPES")] if k % 2 else []
+        )
+    path = write(tmp_path / "log", lines)
+    expected = [False, False, True, False, True, False, True, False]
+    assert read_observations(path).break_before.tolist() == expected
+    for block_bytes in range(60, 160, 7):
+        runs = observations_blocks.BlockReader(path, observations_blocks.Selection(), block_bytes=block_bytes).blocks()
+        found = [bool(broken) for run in runs for broken in run.break_before]
+        assert found == expected, block_bytes
+
+
+@pytest.mark.requirement("A7")
+def test_fields_of_an_unusual_form_are_scaled_like_the_others(tmp_path: Path) -> None:
+    lines = header_3({"G": ("C1C", "L1C")}, extra=[record("G  100   1 C1C", "SYS / SCALE FACTOR")])
+    lines += epoch_3("02 33 13.0000000", {"G01": [field(2345678912.0), field(1.5)]})
+    lines += epoch_3("02 33 14.0000000", {"G01": [field(" 2345678912.50"), field("         1.5e0")]})
+    found = read_observations(write(tmp_path / "log", lines))
+    assert found.code_m[:, 0].tolist() == [23456789.12, 23456789.125]
+    assert found.phase_cycles[:, 0].tolist() == [1.5, 1.5]
+
+
 @pytest.mark.parametrize(
     "pack",
     {

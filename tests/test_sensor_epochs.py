@@ -11,7 +11,7 @@ import pytest
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.timescale import timedelta
 from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
-from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, sensor_epochs
+from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, ranging_lever_m, sensor_epochs
 from railfix.run.sensors import read_sensors, read_units, units_of_ranges
 from tracking_cases import START, bent_line
 
@@ -62,6 +62,24 @@ def test_the_front_toward_falling_chainage_turns_the_signs() -> None:
     assert found.radar_m is not None
     assert (found.wheel_m[1:] < 0).all()
     assert (found.radar_m[1:] < 0).all()
+
+
+@pytest.mark.requirement("E5")
+def test_the_force_and_the_place_of_the_ranging_unit_turn_with_the_front() -> None:
+    falling = replace(bent_line(), facing="falling")
+    both = [
+        sensor_epochs(_samples(), EPOCHS, line, SensorState.empty(), limits=LIMITS, sources=("force",))[0].force_mps2
+        for line in (bent_line(), falling)
+    ]
+    assert both[0] is not None
+    assert both[1] is not None
+    assert np.abs(both[0][1:]).max() > 0.02
+    np.testing.assert_array_equal(both[1], -both[0])
+    limits = SensorLimits(range_ahead_m=9.0, range_right_m=1.2, range_above_m=-1.0)
+    np.testing.assert_allclose(ranging_lever_m(bent_line(), limits), [9.0, 1.2, -1.0])
+    np.testing.assert_allclose(ranging_lever_m(falling, limits), [-9.0, -1.2, -1.0])
+    behind = replace(falling, body_chainage_m=falling.chainage_m + 7.0)
+    np.testing.assert_allclose(ranging_lever_m(behind, limits), [-2.0, -1.2, -1.0])
 
 
 @pytest.mark.requirement("E2")

@@ -137,3 +137,26 @@ def test_the_other_way_gives_the_same_flags() -> None:
     mirrored = Motion(case.time_s, -case.speed, -case.wheel, -case.force + 0.04, -case.sine)
     a, b = np.isin(case.run().state, SLIPPING), np.isin(mirrored.run().state, SLIPPING)
     assert np.mean(a == b) > 0.98
+
+
+@pytest.mark.requirement("E1")
+def test_the_bias_of_the_gyro_is_learnt_from_the_line() -> None:
+    case, bias = motion(3000.0, []), 2e-4
+    pitch_rate = np.gradient(np.arcsin(case.sine), case.time_s)
+    body = np.column_stack([np.zeros(len(case.time_s)), pitch_rate + bias, np.zeros(len(case.time_s))])
+    acceleration = np.gradient(case.wheel, case.time_s)
+    found, _ = find_slips(case.time_s, case.wheel, acceleration, case.force, case.sine, body=body)
+    assert found.gyro_bias_radps[0] == pytest.approx(0.0, abs=1e-6)
+    assert found.gyro_bias_radps[-1] == pytest.approx(bias, rel=0.03)
+    np.testing.assert_allclose(found.pitch[-1000:], case.sine[-1000:], atol=2e-4)
+
+
+@pytest.mark.requirement("E1")
+def test_the_papers_rule_finds_a_slip_as_it_begins_and_lets_go_at_its_top() -> None:
+    """P2's rule: the wheel's acceleration beyond 45 permille of gravity, 0.44 m/s2."""
+    case = motion(100.0, [(75.0, 4.0, 0.5)])
+    found = case.run(rule="p2")
+    rising = (case.time_s > 75.3) & (case.time_s < 76.5)
+    assert (found.state[rising] == MotionState.INERTIAL_SPIN).all()
+    before, after = (case.time_s > 10.0) & (case.time_s < 74.9), case.time_s > 80.0
+    assert (found.state[before | after] == MotionState.NORMAL).all()

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
@@ -16,6 +17,8 @@ from typer.testing import CliRunner
 
 from railfix.cli import app
 from railfix.core.errors import SettingsError
+from railfix.core.timescale import seconds, timedelta
+from railfix.motion.tachometer import TachometerLimits
 from railfix.pipeline.config import Config
 from railfix.pipeline.tables import OBSERVATION_COLUMNS
 from railfix.pipeline.train_table import SMOOTHED_COLUMNS, TRAIN_COLUMNS
@@ -23,6 +26,7 @@ from railfix.run import RunInputs, RunOptions, RunSummary, run_files
 from railfix.simulate import demo_files
 from railfix.simulate.demonstration import demo_inputs
 
+START = np.datetime64("2024-03-05T03:10:00", "us")
 SPAN = {"start": datetime(2024, 3, 5, 3, 10, 5), "end": datetime(2024, 3, 5, 3, 10, 13)}
 
 
@@ -70,6 +74,31 @@ def test_smoothed_columns_stand_beside_those_of_the_filter(tracked: RunSummary, 
     assert 1e-3 < away.max() < 4.0
     last = train.group_by("antenna", maintain_order=True).last()
     assert (last["smoothed_chainage_m"] - last["chainage_m"]).abs().to_numpy().max() < 1e-6
+
+
+@pytest.mark.requirement("E5")
+def test_samples_of_sensors_count_once_however_the_log_is_cut(tmp_path: Path) -> None:
+    truth = pl.read_csv(demo_files()["truth"], schema_overrides={"time_gpst": pl.Datetime("ns")})
+    truth = truth.filter(pl.col("antenna") == "front").slice(0, 400)
+    way, pulse_m = truth["chainage_m"].to_numpy() - truth["chainage_m"][0], TachometerLimits().pulse_m
+    moving = slice(int(np.flatnonzero(way > 0.0)[0]) - 1, None)
+    turned = np.arange(1, int(way[-1] / pulse_m))
+    instants = np.interp(turned * pulse_m, way[moving], seconds(truth["time_gpst"].to_numpy() - START)[moving])
+    pulses = {"time_gpst": START + timedelta(instants), "pulse": turned, "direction": 0 * turned + 1}
+    path = tmp_path / "pulses.csv"
+    pl.DataFrame(pulses).write_csv(path)
+    tables = {}
+    for chunk in (1000, 30):
+        options = RunOptions(
+            chunk_epochs=chunk, start=datetime(2024, 3, 5, 3, 10, 12), end=datetime(2024, 3, 5, 3, 10, 32)
+        )
+        inputs = _inputs().replaced(tachometer=path)
+        files = run_files(inputs, Config(filter="track"), out=tmp_path / str(chunk), options=options).files
+        tables[chunk] = pl.read_parquet(files["train.parquet"])
+    assert_frame_equal(tables[30], tables[1000], abs_tol=1e-6)
+    measured = tables[30]["innovation_wheel_m"].drop_nulls().abs()
+    assert len(measured) > 200
+    assert measured.max() < 0.3  # type: ignore[operator]
 
 
 @pytest.mark.requirement("E5")

@@ -1,0 +1,212 @@
+"""Every column and figure comes from the quantity that it names: results with a number of its own in every place."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from datetime import datetime
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import polars as pl
+import pytest
+
+from railfix.core.reasons import Reason, Status
+from railfix.pipeline.config import Config
+from railfix.pipeline.results import Result
+from railfix.pipeline.tables import observations_table, positions_table
+from railfix.pipeline.train_table import train_table
+from railfix.report.runs import ReportedRun
+from railfix.report.tables import budget, summary
+from railfix.run import RunOptions, RunSummary, run_files
+from railfix.run.processor import processor_of
+from railfix.run.tally import AntennaTally
+from railfix.simulate.demonstration import demo_inputs
+from railfix.tracking import Kind
+from test_budget import result_of
+from test_carrier_stage import demo
+
+#: Columns by the place of their values in `AntennaResult`: an attribute path, a column of an array after a colon.
+POSITION_PATHS = {
+    **{name: name for name in ("chainage_m", "kilometrage_m", "along_sigma_m", "own_sigma_m", "latitude_deg")},
+    **{name: name for name in ("longitude_deg", "height_m", "n_used", "n_rejected", "noise_scale")},
+    **{f"{axis}_m": f"ecef_m:{i}" for i, axis in enumerate("xyz")},
+    **{f"conventional_{axis}_m": f"conventional_ecef_m:{i}" for i, axis in enumerate("xyz")},
+    "conventional_chainage_m": "conventional_chainage_m",
+    "conventional_offset_m": "conventional_offset_m",
+    "raim_statistic": "raim.statistic",
+    "raim_threshold": "raim.threshold",
+    "raim_level_m": "raim.protection_level_m",
+    "protection_level_m": "protection.level.level_m",
+    "protection_fault_free_m": "protection.level.fault_free_m",
+    "protection_one_fault_m": "protection.level.one_fault_m",
+    "protection_two_faults_m": "protection.level.two_fault_m",
+    "protection_k_fault_free": "protection.level.k_fault_free",
+    "protection_k_one_fault": "protection.level.k_one_fault",
+    "protection_k_two_faults": "protection.level.k_two_faults",
+    "protection_separation": "protection.level.separation",
+    "map_offset_across_m": "map_offset.across_m",
+    "map_offset_up_m": "map_offset.up_m",
+    "map_detectable_across_m": "map_offset.detectable_m:0",
+    "map_detectable_up_m": "map_offset.detectable_m:1",
+    "map_offset_statistic": "map_offset.statistic",
+}
+#: The same of `AlongTrack`; a factor after an asterisk.
+TRAIN_PATHS = {
+    **{name: name for name in ("chainage_m", "kilometrage_m", "latitude_deg", "longitude_deg", "height_m")},
+    **{f"{axis}_m": f"ecef_m:{i}" for i, axis in enumerate("xyz")},
+    "along_sigma_m": "tracked.sigma_m",
+    "branch_probability": "tracked.probability",
+    "protection_level_m": "tracked.level_m",
+    "protection_noise_m": "tracked.level_noise_m",
+    "protection_separation_m": "tracked.separation_m",
+    "over_reading_m": "tracked.amount_m",
+    "under_reading_m": "tracked.amount_m",
+    "measured_chainage_m": "sensed.under_m",
+    "measured_gradient_permille": "sensed.gradient*1000",
+    "measured_curvature_1pm": "sensed.curvature_1pm",
+    "measured_cant_mm": "sensed.cant_m*1000",
+    "metric_antenna_spacing_m": "spacing_error_m",
+    "innovation_wheel_m": f"tracked.sensed:{Kind.WHEEL - 3}",
+    "innovation_radar_m": f"tracked.sensed:{Kind.RADAR - 3}",
+    "innovation_force_mps2": f"tracked.sensed:{Kind.FORCE - 3}",
+    "innovation_place_m": f"tracked.sensed:{Kind.PLACE - 3}",
+    "innovation_range_m": f"tracked.sensed:{Kind.RANGE - 3}",
+    **{
+        name: f"tracked.{name}"
+        for name in ("speed_mps", "speed_sigma_mps", "acceleration_mps2", "hypotheses", "code_weight", "motion_weight")
+    },
+    **{name: f"tracked.{name}" for name in ("wheel_scale", "radar_scale", "force_offset_mps2", "map_scale")},
+}
+
+
+def marked(value: Any, random: np.random.Generator) -> Any:
+    """A result with another number in every place of its arrays of numbers."""
+    if isinstance(value, np.ndarray) and value.dtype == np.float64:
+        return random.uniform(1.0, 2.0, value.shape)
+    if isinstance(value, np.ndarray) and value.dtype.kind == "i" and value.dtype.itemsize > 1:
+        return random.integers(1, 1000, value.shape).astype(value.dtype)
+    if is_dataclass(value) and not isinstance(value, type):
+        keep = {"columns", "reason", "satellites", "time", "used", "replay"}
+        new = {f.name: marked(getattr(value, f.name), random) for f in fields(value) if f.name not in keep}
+        return replace(value, **{name: item for name, item in new.items() if item is not getattr(value, name)})
+    return value
+
+
+def at_path(result: Any, path: str) -> np.ndarray:
+    path, _, factor = path.partition("*")
+    path, _, column = path.partition(":")
+    for name in path.split("."):
+        result = getattr(result, name)
+    values = result[:, int(column)] if column else result
+    return np.asarray(values * float(factor or 1.0))
+
+
+@pytest.fixture(scope="module")
+def result() -> Result:
+    """Thirty epochs of the demonstration, a number of its own in every place of the result."""
+    observations, navigation, trajectory, _ = demo()
+    processor = processor_of(Config(filter="track"), navigation, {"front": trajectory})
+    whole, _ = processor.process({"front": observations[:30]})
+    random = np.random.default_rng(11)
+    return replace(
+        whole,
+        antennas={name: marked(each, random) for name, each in whole.antennas.items()},
+        fusion={name: marked(each, random) for name, each in whole.fusion.items()},
+    )
+
+
+@pytest.mark.requirement("B6")
+@pytest.mark.parametrize("column", POSITION_PATHS)
+def test_a_column_of_positions_is_the_quantity_that_it_names(result: Result, column: str) -> None:
+    expected = at_path(result.antennas["front"], POSITION_PATHS[column])
+    np.testing.assert_array_equal(positions_table(result)[column].to_numpy(), expected)
+
+
+@pytest.mark.requirement("E5")
+@pytest.mark.parametrize("column", TRAIN_PATHS)
+def test_a_column_of_the_filter_is_the_quantity_that_it_names(result: Result, column: str) -> None:
+    expected = at_path(result.fusion["front"], TRAIN_PATHS[column])
+    np.testing.assert_array_equal(train_table(result)[column].to_numpy(), expected)
+
+
+@pytest.mark.requirement("B7")
+def test_a_column_of_observations_is_the_quantity_that_it_names(result: Result) -> None:
+    front, tracked = result.antennas["front"], result.fusion["front"].tracked
+    table = observations_table(result)
+    epoch, channel = np.nonzero((front.reason & Reason.NOT_OBSERVED) == 0)
+    for name in ("residual_m", "elevation_deg", "azimuth_deg", "cn0_dbhz", "sigma_m", "corrected_code_m"):
+        np.testing.assert_array_equal(table[name].to_numpy(), getattr(front, name)[epoch, channel])
+    inner = np.searchsorted(front.columns, channel)
+    judged = np.isin(channel, front.columns)
+    columns = {
+        "innovation_code_m": tracked.innovation[:, Kind.CODE],
+        "innovation_phase_m": tracked.innovation[:, Kind.PHASE],
+        "innovation_doppler_mps": tracked.innovation[:, Kind.DOPPLER],
+        "weight_code": tracked.weight[:, Kind.CODE],
+        "raim_own_error_m": front.raim.own_error_m,
+    }
+    order = np.argsort(front.columns)
+    for name, values in columns.items():
+        found = table[name].fill_null(np.nan).to_numpy()
+        np.testing.assert_array_equal(found[judged], values[epoch, order[np.minimum(inner, len(order) - 1)]][judged])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
+    options = RunOptions(start=datetime(2024, 3, 5, 3, 10, 5), end=datetime(2024, 3, 5, 3, 10, 25))
+    return run_files(demo_inputs(), Config(filter="track"), out=tmp_path_factory.mktemp("run") / "run", options=options)
+
+
+@pytest.mark.requirement("B6")
+def test_percentiles_of_the_record_are_those_of_the_rows(run: RunSummary) -> None:
+    record = json.loads(run.files["run.json"].read_text())["antennas"]
+    for table, facts in (("positions", lambda a: a), ("train", lambda a: a["filter"])):
+        rows = pl.read_parquet(run.files[f"{table}.parquet"])
+        for antenna in ("front", "rear"):
+            mine = rows.filter(antenna=antenna)
+            told = facts(record[antenna])
+            level = told["protection_level" if table == "positions" else "level"]
+            sigma = mine["along_sigma_m"].drop_nulls().to_numpy()
+            levels = mine["protection_level_m"].drop_nulls().to_numpy()
+            levels = levels[np.isfinite(levels)]
+            assert np.percentile(levels, 94.0) > np.percentile(levels, 52.0)
+            for told_of, values in ((told["along_sigma_m"], sigma), (level, levels)):
+                for percent in (50.0, 95.0):
+                    low, high = (np.percentile(values, percent, method=m) for m in ("lower", "higher"))
+                    assert low <= told_of[f"p{percent:.0f}_m"] <= high
+            assert told["along_sigma_m"]["max_m"] == sigma.max()
+
+
+@pytest.mark.requirement("B7")
+def test_a_reason_alone_is_counted_apart_from_one_among_others() -> None:
+    low, weak = int(Reason.ELEVATION_MASK), int(Reason.CN0_FLOOR)
+    tally = AntennaTally()
+    reasons = [[low, low | weak, weak, 0], [low | weak, weak, 0, 0]]
+    tally.add(result_of(reasons, ["G01", "G02", "G03", "G04"], [Status.OK] * 2))
+    assert dict(tally.first_reason) == {"elevation_mask": 3, "cn0_floor": 2}
+    assert dict(tally.only_reason) == {"elevation_mask": 1, "cn0_floor": 2}
+
+
+@pytest.mark.requirement("D2")
+def test_the_report_states_both_rates() -> None:
+    facts: Mapping[str, Any] = {
+        "epochs": 200, "epochs_with_observations": 100, "epochs_with_position": 90, "status": {"ok": 60},
+        "positioning_rate": 0.9, "ok_rate": 0.6, "along_sigma_m": {"p50_m": 1.25, "p95_m": 2.75, "max_m": 3.5},
+    }  # fmt: skip
+    run = cast(
+        "ReportedRun",
+        SimpleNamespace(
+            name="a",
+            record={"antennas": {"front": facts}},
+            config=Config(),
+            folder=SimpleNamespace(antennas=("front",)),
+        ),
+    )
+    (row,) = summary([run], None).rows
+    assert [str(cell) for cell in row[3:]] == ["200", "90.00 %", "60.00 %", "2.75"]
+    epochs = {str(row[0]).strip(): str(row[1]) for row in budget(run)[0].rows}  # type: ignore[union-attr]
+    assert epochs["positioning rate"] == "90.00 %"
+    assert epochs["rate of ok"] == "60.00 %"
