@@ -15,6 +15,11 @@ from railfix.tracking import GnssEpochs, Line, SensorEpochs
 
 START = np.datetime64("2026-03-01T06:00:00", "ns")
 LATITUDE, LONGITUDE = 35.68, 139.77
+#: A point of the lines, and the direction of their beginning there.
+ORIGIN_M = (
+    ecef_from_geodetic(LATITUDE, LONGITUDE, 40.0),
+    np.array([0.5, np.sqrt(0.75), 0.0]) @ enu_axes(np.array(LATITUDE), np.array(LONGITUDE)),
+)
 #: Azimuth and elevation of the satellites [deg], by name.
 SKY = {
     "G01": (10.0, 70.0), "G02": (75.0, 30.0), "G03": (130.0, 45.0), "G04": (200.0, 25.0), "G05": (265.0, 55.0),
