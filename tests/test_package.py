@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import railfix
 import railfix.core
 import railfix.ground
 import railfix.motion
+from railfix.core.errors import InputFileError, MismatchError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.simulate.demo_data import demo_files
@@ -145,6 +147,30 @@ def test_georinex_loads_the_same_observations(tmp_path: Path) -> None:
     for name in ours.data_vars:
         if name[0] in "CLDS" and not name.endswith("lli"):
             np.testing.assert_array_equal(ours[name].values, theirs[name].sel(sv=ours.sv).values, err_msg=name)
+
+
+@pytest.mark.requirement("A7")
+def test_observations_are_read_through_georinex_beside_our_own_reader(tmp_path: Path) -> None:
+    whole = railfix.read_observations(demo_files()["front"])
+    paths = [tmp_path / "two.rnx", tmp_path / "one.rnx"]
+    for path, part in zip(paths, (slice(8, 16), slice(0, 12)), strict=True):
+        railfix.write_observations(whole[part], path)
+    half = np.timedelta64(50, "ms")  # georinex cuts time tags to 1 us
+    span = {"systems": "GE", "start": whole.time[2] - half, "end": whole.time[14] - half}
+    ours = railfix.read_observations(paths[::-1], broken_lines="count", **span)
+    theirs = railfix.read_observations(paths, reader="georinex", **span)
+    assert len(theirs) == 12
+    assert theirs.system.tolist() == ours.system.tolist()
+    assert (abs(theirs.time - ours.time) <= np.timedelta64(1, "us")).all()
+    same_observations(replace(theirs, time=ours.time), ours)
+    with pytest.raises(MismatchError, match="no epoch lies in the time span"):
+        railfix.read_observations(paths, reader="georinex", start="2030-01-01")
+    (tmp_path / "log.ubx").write_bytes(b"\xb5\x62" + bytes(200))
+    with pytest.raises(MismatchError, match=r"log.ubx is a receiver's log"):
+        railfix.read_observations(tmp_path / "log.ubx", reader="georinex")
+    (tmp_path / "text").write_text("no log")
+    with pytest.raises(InputFileError, match=r"text: georinex cannot read it"):
+        railfix.read_observations(tmp_path / "text", reader="georinex")
 
 
 def test_georinex_loads_the_same_recorded_observations(recordings: Path, tmp_path: Path) -> None:

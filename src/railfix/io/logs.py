@@ -6,13 +6,16 @@ functions here have the arguments of `railfix.io.rinex` and hand each file to it
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from railfix.core.errors import MismatchError
+from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import BrokenLines, Paths, listed
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import Observations, concatenate
@@ -37,8 +40,9 @@ def read_observations(
     start: Time = None,
     end: Time = None,
     date: Time = None,
+    reader: Literal["railfix", "georinex"] = "railfix",
 ) -> Observations:
-    """Observations of one receiver from RINEX files or receiver logs.
+    """Read the observations of one receiver from RINEX files or receiver logs.
 
     Parameters
     ----------
@@ -49,18 +53,60 @@ def read_observations(
         As `railfix.io.rinex.read_observations`. What is broken in a receiver log is always counted.
     date : datetime64 or str, optional
         Some time within half a week of the log: needed for RTCM 3, whose observations carry no week.
+    reader : {"railfix", "georinex"}
+        "georinex" reads RINEX files by georinex, an independent reader, to compare with: slower, without events,
+        scale factors, counts of broken lines and indicators of bands other than 1 and 2.
 
     Raises
     ------
     InputFileError
         A file cannot be read, or holds no observations that can be dated.
     MismatchError
-        No epoch lies between `start` and `end`; receiver logs and RINEX files are mixed.
+        No epoch lies between `start` and `end`; receiver logs and RINEX files are mixed, or are to be read by georinex.
+    ModuleNotFoundError
+        georinex is not installed (``pip install railfix[notebook]``).
     """
+    if reader == "georinex":
+        return _by_georinex(listed(path), systems, _instant(start), _instant(end))
     pieces = scan_observations(
         path, broken_lines=broken_lines, systems=systems, start=start, end=end, date=date, epochs=1 << 62
     )
     return concatenate(list(pieces))
+
+
+def _by_georinex(
+    paths: list[str], systems: Iterable[str] | None, start: np.datetime64 | None, end: np.datetime64 | None
+) -> Observations:
+    """Read RINEX files by georinex, in order of time."""
+    try:
+        import georinex
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("georinex is not installed; pip install 'railfix[notebook]'") from error
+    from railfix.io.georinex_layout import observations_from_xarray
+
+    letters = None if systems is None else list(systems)
+    parts: list[Observations] = []
+    for name in paths:
+        if is_receiver_log(head_of(name)):
+            raise MismatchError(f"{name} is a receiver's log, and georinex reads RINEX; leave out reader")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # a default of xarray that georinex relies on
+            try:
+                part = observations_from_xarray(georinex.load(Path(name), useindicators=True))
+            except (ValueError, LookupError, OSError) as error:
+                raise InputFileError(name, f"georinex cannot read it: {error or type(error).__name__}") from error
+        part = part if letters is None else _of_systems(part, letters)
+        first = 0 if start is None else int(np.searchsorted(part.time, start))
+        stop = len(part) if end is None else int(np.searchsorted(part.time, end))
+        parts.append(part[first:stop])
+    parts = sorted((part for part in parts if len(part)), key=lambda part: part.time[0])
+    if not parts:
+        raise MismatchError(f"{', '.join(paths)}: no epoch lies in the time span asked for")
+    joined = [parts[0]]
+    for part in parts[1:]:
+        rest = part[int(np.searchsorted(part.time, joined[-1].time[-1], side="right")) :]
+        joined += [with_break_at_gap(joined[-1], rest)] if len(rest) else []
+    return concatenate(joined)
 
 
 def scan_observations(
