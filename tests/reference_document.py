@@ -7,13 +7,15 @@ import importlib
 import inspect
 import re
 import sys
+from collections.abc import Mapping
 from enum import IntEnum, IntFlag
 from pathlib import Path
 from typing import Any, Final
 
 from railfix.core import errors, reasons
+from railfix.pipeline.columns import UNITS, Column
 from railfix.pipeline.config import Config
-from railfix.pipeline.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS
+from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
 from railfix.pipeline.train_table import SMOOTHED_COLUMNS, TRAIN_COLUMNS
 from railfix.run.route import ON_TRACK_COLUMNS, TRACK_COLUMNS
 from railfix.tracking import TrackStatus
@@ -37,6 +39,7 @@ MODULES: Final = (
     "railfix.evaluate.range_errors",
     "railfix.ranges.sbas",
     "railfix.ranges.cn0_curve",
+    "railfix.pipeline.columns",
     "railfix.pipeline.tables",
     "railfix.pipeline.train_table",
     "railfix.tracking",
@@ -93,9 +96,16 @@ def _exit_codes() -> list[str]:
     return lines + [f"| {c} | {text} | {f'`{raised[c]}`' if c in raised else ''} |" for c, text in rows]
 
 
-def _columns(heading: str, columns: dict[str, str]) -> list[str]:
-    lines = ["", f"## {heading}", "", "| column | meaning |", "|---|---|"]
-    return lines + [f"| `{name}` | {_cell(text)} |" for name, text in columns.items()]
+def _columns(heading: str, columns: Mapping[str, Column[Any] | str]) -> list[str]:
+    lines = ["", f"## {heading}", "", "| column | unit | meaning |", "|---|---|---|"]
+    for name, column in columns.items():
+        unit, text = (
+            (UNITS.get(name.rsplit("_", 1)[-1], ""), column)
+            if isinstance(column, str)
+            else (column.unit, column.meaning)
+        )
+        lines.append(f"| `{name}` | {unit} | {_cell(text)} |")
+    return lines
 
 
 def _members(heading: str, kind: type[IntEnum] | type[IntFlag], head: str) -> list[str]:

@@ -20,13 +20,8 @@ from railfix.evaluate import evaluate_run
 from railfix.io.rinex import read_navigation, read_observations, scan_observations
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import Result
-from railfix.pipeline.tables import (
-    OBSERVATION_COLUMNS,
-    POSITION_COLUMNS,
-    observations_table,
-    positions_table,
-    to_xarray,
-)
+from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
+from railfix.pipeline.tables import observations_table, positions_table, to_xarray
 from railfix.run import RunInputs, RunOptions, RunSummary, run_files
 from railfix.run.processor import processor_of
 from railfix.simulate.demonstration import demo_inputs, demo_truth
@@ -305,6 +300,27 @@ def test_xarray_has_named_axes(result: Result) -> None:
     assert data.attrs == {"antenna": "front"}
     used = data.reason.where(data.satellite == "G02", drop=True)
     assert (used.values == float(Reason.UNHEALTHY)).all()
+
+
+def test_xarray_has_every_column_with_unit_and_meaning(result: Result) -> None:
+    pytest.importorskip("xarray")
+    front = result.antennas["front"]
+    data, table = to_xarray(front), positions_table(result).filter(antenna="front")
+    for name, column in POSITION_COLUMNS.items():
+        if name in ("time_gpst", "antenna"):
+            continue
+        assert data[name].attrs == {"units": column.unit, "long_name": column.meaning}
+        expected = table[name]
+        if not expected.dtype.is_integer():
+            expected = expected.fill_null(np.nan if expected.dtype == pl.Float64 else "")
+        np.testing.assert_array_equal(data[name].values, expected.to_numpy(), err_msg=name)
+    rows = observations_table(result).filter(pl.col("antenna") == "front", pl.col("satellite") == "G01")
+    (channel,) = np.flatnonzero(front.satellite == "G01")
+    for name in ("reason", "metric_doppler_m", "raim_own_error_m", "sigma_m", "weight_code"):
+        values = rows[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
+        np.testing.assert_array_equal(data[name].values[:, channel], values, err_msg=name)
+    assert data.protection_level_m.attrs["units"] == "m"
+    assert data.elevation_deg.attrs["units"] == "deg"
 
 
 def test_the_demo_is_as_good_as_its_errors_allow(whole: RunSummary) -> None:

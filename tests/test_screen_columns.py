@@ -13,7 +13,8 @@ from railfix.integrity.raim import Outcome, threshold
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import Result
-from railfix.pipeline.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS, observations_table, positions_table
+from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
+from railfix.pipeline.tables import observations_table, positions_table
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.run.processor import processor_of
 from railfix.run.sources import TrackReading, open_line

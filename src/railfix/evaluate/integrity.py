@@ -191,7 +191,7 @@ def positions_diagram(
 ) -> Stanford:
     """Stanford diagram of a run without a reference: availability and continuity only.
 
-    Of one antenna, columns of `railfix.pipeline.tables.POSITION_COLUMNS`, in order of time.
+    Of one antenna, columns of `railfix.pipeline.result_columns.POSITION_COLUMNS`, in order of time.
     """
     level = counted_levels(
         floats(positions, "protection_level_m"),

@@ -48,8 +48,8 @@ class RunFolder(RunRecord):
     positions_path : Path
         The Parquet file of the table, or its CSV file where that is absent.
     positions : polars.DataFrame
-        One row per epoch and antenna, see `railfix.pipeline.tables.POSITION_COLUMNS`; ``observed`` tells whether the
-        antenna has observations.
+        One row per epoch and antenna, see `railfix.pipeline.result_columns.POSITION_COLUMNS`; ``observed`` tells
+        whether the antenna has observations.
     table : str
         Name of the table: "positions" for the single-epoch positions.
     """

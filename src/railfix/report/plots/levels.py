@@ -98,7 +98,7 @@ def levels_over_time(positions: pl.DataFrame, alarm_limit_m: float, *, title: st
     Parameters
     ----------
     positions : polars.DataFrame
-        Of one antenna, columns of `railfix.pipeline.tables.POSITION_COLUMNS`.
+        Of one antenna, columns of `railfix.pipeline.result_columns.POSITION_COLUMNS`.
     alarm_limit_m : float [m]
     title : str
     """

@@ -57,7 +57,7 @@ def plan(
     Parameters
     ----------
     positions : polars.DataFrame
-        Of one antenna, columns of `railfix.pipeline.tables.POSITION_COLUMNS`.
+        Of one antenna, columns of `railfix.pipeline.result_columns.POSITION_COLUMNS`.
     error_m, level_m : ndarray, shape (rows,), optional [m]
         Errors along the line, or protection levels: the positions are coloured by the size of the first that is
         given, and by their status without either.
@@ -248,7 +248,7 @@ def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
     ----------
     table : polars.DataFrame
         Of one antenna, in order of time: of an evaluation (`railfix.evaluate.EPOCH_COLUMNS`), with distances of the
-        reference; or positions alone (`railfix.pipeline.tables.POSITION_COLUMNS`), with their own distances.
+        reference; or positions alone (`railfix.pipeline.result_columns.POSITION_COLUMNS`), with their own distances.
     prefix : {"", "conventional_"}
         Start of the names of the columns.
 

@@ -41,7 +41,7 @@ def cn0_over_elevation(
     Parameters
     ----------
     observations : polars.DataFrame or polars.LazyFrame
-        Of one antenna, columns of `railfix.pipeline.tables.OBSERVATION_COLUMNS`.
+        Of one antenna, columns of `railfix.pipeline.result_columns.OBSERVATION_COLUMNS`.
     limits : Cn0Limits, optional
         Thresholds that were in force; none are drawn without.
     curve : Cn0Curve, optional
@@ -167,7 +167,7 @@ def sky_epochs(
     Parameters
     ----------
     observations : polars.DataFrame or polars.LazyFrame
-        Of one antenna, columns of `railfix.pipeline.tables.OBSERVATION_COLUMNS`.
+        Of one antenna, columns of `railfix.pipeline.result_columns.OBSERVATION_COLUMNS`.
     wanted : ndarray of datetime64[ns], optional
         Epochs to include, up to half of `epochs`.
     epochs : int

@@ -1,0 +1,273 @@
+"""Columns of the tables of positions and observations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+import polars as pl
+
+from railfix.core.arrays import Floats
+from railfix.core.reasons import Status
+from railfix.integrity.protection import Cause, LevelStatus
+from railfix.integrity.raim import Outcome
+from railfix.pipeline.along_track import AlongTrack, innovations
+from railfix.pipeline.columns import Column, by_name
+from railfix.pipeline.level_stage import BASES, KINDS
+from railfix.pipeline.results import AntennaResult
+from railfix.screens import SCREENS, ScreenColumn
+
+
+def _screened(result: AntennaResult, column: ScreenColumn) -> Floats | None:
+    """Return the array of a column that a screen fills; None where the screen is off."""
+    return getattr(result.screens[column.verdict], column.field) if column.verdict in result.screens else None
+
+
+def _position_column(column: ScreenColumn) -> Column[AntennaResult]:
+    return Column(column.name, column.meaning, lambda r: _screened(r, column))
+
+
+def _observation_column(column: ScreenColumn) -> Column[Observed]:
+    return Column(column.name, column.meaning, lambda o: o.on_all_channels(_screened(o.result, column)))
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Results of one antenna by channel, with those of the filter along the track where it is on."""
+
+    result: AntennaResult
+    tracked: AlongTrack | None = None
+
+    def on_all_channels(self, values: Floats | None) -> Floats:
+        """Return values of the channels that were positioned with, on all channels: shape (T, M), NaN elsewhere."""
+        full = np.full(self.result.reason.shape, np.nan)
+        if values is not None:
+            full[:, self.result.columns] = values
+        return full
+
+    @cached_property
+    def innovations(self) -> Mapping[str, Floats]:
+        """Innovations of the filter and weights of codes, by column."""
+        return innovations(self.tracked, self.result.columns, self.result.reason.shape)
+
+
+#: Columns of the table of positions.
+POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
+    (
+        Column("time_gpst", "time tag of the receiver, GPS time", lambda r: r.time, dtype=pl.Datetime("ns")),
+        Column("antenna", "`front` or `rear`", lambda _: None, dtype=pl.String()),
+        Column("status", "see `railfix.core.reasons.Status`", lambda r: r.status, words=tuple(s.text for s in Status)),
+        Column("chainage_m", "distance along the line from the first point of the track", lambda r: r.chainage_m),
+        Column("kilometrage_m", "the line's own marking, where the track has one", lambda r: r.kilometrage_m),
+        Column(
+            "along_sigma_m",
+            "standard deviation along the line; with the other place of an ambiguous epoch by its probability",
+            lambda r: r.along_sigma_m,
+        ),
+        Column(
+            "own_sigma_m",
+            "single-epoch sigma: standard deviation from the codes of the epoch alone; `uncertain` above its limit",
+            lambda r: r.own_sigma_m,
+        ),
+        Column("latitude_deg", "antenna, WGS 84", lambda r: r.latitude_deg),
+        Column("longitude_deg", "antenna, WGS 84", lambda r: r.longitude_deg),
+        Column("height_m", "antenna, above the ellipsoid", lambda r: r.height_m),
+        Column("x_m", "antenna, ECEF", lambda r: r.ecef_m[:, 0]),
+        Column("y_m", "antenna, ECEF", lambda r: r.ecef_m[:, 1]),
+        Column("z_m", "antenna, ECEF", lambda r: r.ecef_m[:, 2]),
+        Column("n_used", "satellites used", lambda r: r.n_used, dtype=pl.Int16()),
+        Column(
+            "n_rejected", "satellites with a pseudorange that were not used", lambda r: r.n_rejected, dtype=pl.Int16()
+        ),
+        Column(
+            "noise_scale", "noise of this receiver over that of the weights, estimated so far", lambda r: r.noise_scale
+        ),
+        Column(
+            "raim_outcome",
+            "result of RAIM: `passed`, `excluded_one`, `excluded_two`, `inseparable`, `unresolved`, `untestable`",
+            lambda r: r.raim.outcome,
+            words=tuple(o.name.lower() for o in Outcome),
+        ),
+        Column(
+            "raim_statistic",
+            "sum of squared residuals before any exclusion, in noise variances (m^2 with the fixed limit)",
+            lambda r: r.raim.statistic,
+        ),
+        Column(
+            "raim_threshold", "threshold of the statistic, above which a fault is detected", lambda r: r.raim.threshold
+        ),
+        Column(
+            "raim_level_m",
+            "P4's level: error by a fault that RAIM misses, and by noise; infinite where a satellite is "
+            "unchecked, empty where a fault is left or `raim_protection` is off",
+            lambda r: r.raim.protection_level_m,
+        ),
+        Column(
+            "protection_level_m",
+            "along the line: the error exceeds it with the stated risk, all hypotheses together; "
+            "infinite where `protection_cause` says why, empty where a fault is left",
+            lambda r: None if r.protection is None else r.protection.level.level_m,
+        ),
+        Column(
+            "protection_fault_free_m",
+            "what noise without a fault asks for by itself, of its share of the risk; "
+            "`protection_level_m` spends the whole risk on the sum of all and may be smaller than a part",
+            lambda r: None if r.protection is None else r.protection.level.fault_free_m,
+        ),
+        Column(
+            "protection_one_fault_m",
+            "the same for a fault of one satellite; 0 where that is less likely than its share",
+            lambda r: None if r.protection is None else r.protection.level.one_fault_m,
+        ),
+        Column(
+            "protection_two_faults_m",
+            "the same for faults of two satellites; 0 where that is less likely than its share",
+            lambda r: None if r.protection is None else r.protection.level.two_fault_m,
+        ),
+        Column(
+            "protection_k_fault_free",
+            "K of the first part",
+            lambda r: None if r.protection is None else r.protection.level.k_fault_free,
+        ),
+        Column(
+            "protection_k_one_fault",
+            "K of the second part, beside its threshold",
+            lambda r: None if r.protection is None else r.protection.level.k_one_fault,
+        ),
+        Column(
+            "protection_k_two_faults",
+            "K of the third part, beside its threshold",
+            lambda r: None if r.protection is None else r.protection.level.k_two_faults,
+        ),
+        Column(
+            "protection_separation",
+            "largest distance of the position without the satellites of a hypothesis, over its threshold",
+            lambda r: None if r.protection is None else r.protection.level.separation,
+        ),
+        Column(
+            "protection_kind",
+            "basis: `sbas`, its integrity and hypotheses of local faults; or `separation`, "
+            "hypotheses of satellites' own faults as well",
+            lambda r: None if r.protection is None else r.protection.kind,
+            words=KINDS,
+        ),
+        Column(
+            "protection_basis",
+            "`measured`: the priors of faults were measured on the line; `indicative`: they are assumed, "
+            "the one of a side of the track without support by data, and the level carries no risk an hour",
+            lambda r: None if r.protection is None else r.protection.basis,
+            words=BASES,
+        ),
+        Column(
+            "protection_cause",
+            "what sets the level: `fault_free`, `one_fault`, `two_faults`, `three_faults` or more; or why "
+            "there is none: `unchecked`, `unchecked_constellation`, `unchecked_side`, `unchecked_map`, "
+            "`unchecked_together` (faults that nothing checks, by what they share), `budget`, `unbounded`, "
+            "`no_position`",
+            lambda r: None if r.protection is None else r.protection.level.cause,
+            words=tuple(c.name.lower() for c in Cause),
+        ),
+        Column(
+            "protection_status",
+            "`available` within the alarm limit; `unavailable`, also where the status has a doubt about "
+            "the place; `alarm`: the ranges contradict the level, or a check has failed",
+            lambda r: None if r.protection is None else r.protection.status,
+            words=tuple(s.name.lower() for s in LevelStatus),
+        ),
+        *(_position_column(c) for screen in SCREENS for c in screen.columns if c.table == "positions"),
+        Column(
+            "conventional_chainage_m",
+            "3-D single point, moved to the nearest point of the trajectory",
+            lambda r: r.conventional_chainage_m,
+        ),
+        Column(
+            "conventional_offset_m",
+            "distance of the 3-D single point from that point",
+            lambda r: r.conventional_offset_m,
+        ),
+        Column(
+            "map_offset_across_m",
+            "mean of the 3-D positions of the last minutes, right of the line in the direction of "
+            "rising chainage; empty for the first minute",
+            lambda r: r.map_offset.across_m,
+        ),
+        Column("map_offset_up_m", "the same, above the line", lambda r: r.map_offset.up_m),
+        Column(
+            "map_detectable_across_m",
+            "smallest offset of the map across the line that the status `map_offset` names (99 %)",
+            lambda r: r.map_offset.detectable_m[:, 0],
+        ),
+        Column("map_detectable_up_m", "the same, in height", lambda r: r.map_offset.detectable_m[:, 1]),
+        Column(
+            "map_offset_statistic",
+            "square of that offset in its own sigmas (noise, satellites, atmosphere, stated error of "
+            "the map); status `map_offset` from 13.8 on",
+            lambda r: r.map_offset.statistic,
+        ),
+        Column("conventional_x_m", "3-D single point, ECEF", lambda r: r.conventional_ecef_m[:, 0]),
+        Column("conventional_y_m", "3-D single point, ECEF", lambda r: r.conventional_ecef_m[:, 1]),
+        Column("conventional_z_m", "3-D single point, ECEF", lambda r: r.conventional_ecef_m[:, 2]),
+    )
+)
+
+#: Columns of the table of observations that have a value for each epoch and channel.
+CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
+    (
+        Column(
+            "reason", "bits of `railfix.core.reasons.Reason`, 0 = used", lambda o: o.result.reason, dtype=pl.Int32()
+        ),
+        Column(
+            "residual_m",
+            "corrected pseudorange minus what the position on the line and the clock explain",
+            lambda o: o.result.residual_m,
+        ),
+        Column("elevation_deg", "elevation of the satellite", lambda o: o.result.elevation_deg),
+        Column("azimuth_deg", "azimuth of the satellite, from north over east", lambda o: o.result.azimuth_deg),
+        Column("cn0_dbhz", "carrier-to-noise density", lambda o: o.result.cn0_dbhz),
+        Column("sigma_m", "standard deviation that the weights assume", lambda o: o.result.sigma_m),
+        Column(
+            "corrected_code_m",
+            "pseudorange, satellite clock, group delay and atmosphere applied",
+            lambda o: o.result.corrected_code_m,
+        ),
+        *(_observation_column(c) for screen in SCREENS for c in screen.columns if c.table == "observations"),
+        Column(
+            "raim_own_error_m",
+            "screen `raim`: error against all other ranges, of satellites named as faulty; empty where the "
+            "robust fit rejected them",
+            lambda o: o.on_all_channels(o.result.raim.own_error_m),
+        ),
+        Column(
+            "innovation_code_m",
+            "filter along the track: code less what earlier epochs predict, where codes count (once a second)",
+            lambda o: o.innovations["innovation_code_m"],
+        ),
+        Column(
+            "innovation_phase_m",
+            "the same of the change of the carrier phase since the epoch before",
+            lambda o: o.innovations["innovation_phase_m"],
+        ),
+        Column("innovation_doppler_mps", "the same of the Doppler", lambda o: o.innovations["innovation_doppler_mps"]),
+        Column(
+            "weight_code",
+            "weight of the code in the filter; 1 is that of an error of one standard deviation",
+            lambda o: o.innovations["weight_code"],
+        ),
+    )
+)
+_REASON: Final = CHANNEL_COLUMNS["reason"]
+#: Columns of the table of observations.
+OBSERVATION_COLUMNS: Final[Mapping[str, Column[Any]]] = by_name(
+    (
+        POSITION_COLUMNS["time_gpst"],
+        POSITION_COLUMNS["antenna"],
+        Column("satellite", "`G01`, `J02`", lambda _: None, dtype=pl.String()),
+        Column("signal", "RINEX 3 code without its type letter, `1C`", lambda _: None, dtype=pl.String()),
+        _REASON,
+        Column("reason_text", "their names joined by `+`, `used` for 0", lambda _: None, dtype=pl.String()),
+        *(column for column in CHANNEL_COLUMNS.values() if column is not _REASON),
+    )
+)
