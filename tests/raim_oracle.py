@@ -11,7 +11,8 @@ from scipy.stats import chi2
 
 import synthetic
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
-from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, constrained_model, point_model
+from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, constrained_model
+from railfix.integrity.raim.model import _model
 from railfix.positioning.constrained import Constrained, constrained_position
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, clock_groups
 from railfix.positioning.single_point import single_point
@@ -20,6 +21,12 @@ from railfix.track.trajectory import Trajectory
 
 #: Offsets of the clocks that made cases have [m].
 CLOCK_OFFSET_M = (0.0, 12.0, -30.0, 5.0)
+
+
+def point_model(ranges: Ranges, ecef_m: np.ndarray) -> LinearModel:
+    """3-D positions: east, north and up unknown, the horizontal ones wanted (P4's horizontal form)."""
+    latitude, longitude, _ = geodetic_from_ecef(ecef_m)
+    return _model(ranges, ecef_m, enu_axes(latitude, longitude), np.zeros((3, 3)), unknowns=3)
 
 
 def straight(length_m: float = 2000.0) -> Trajectory:

@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Floats
 from railfix.integrity.protection.risk import K_H_PA, K_V
-from railfix.integrity.raim import LinearModel, point_model
+from railfix.integrity.raim import LinearModel
 from railfix.positioning.normal_equations import Ranges
+from raim_oracle import point_model
 
 
 def sbas_level(model: LinearModel, *, k: float, scale: ArrayLike = 1.0) -> Floats:

@@ -37,7 +37,7 @@ from railfix.evaluate.epochs import travelled, with_missing
 from railfix.evaluate.outages import OUTAGE_COLUMNS
 from railfix.evaluate.run_folder import tables_of
 from railfix.evaluate.sections import read_sections
-from railfix.io.reference_log import AntennaReference, write_reference
+from railfix.io.reference_log import AntennaReference, reference_table
 from railfix.run import run_files
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import Track, read_track, write_track_csv
@@ -72,6 +72,10 @@ def reference(time_s: np.ndarray, chainage: np.ndarray, **columns: object) -> di
         "environment": np.full(len(time_s), ""),
     }
     return {"front": AntennaReference(**whole | columns)}  # type: ignore[arg-type]
+
+
+def write_reference(path: Path, references: dict[str, AntennaReference]) -> None:
+    reference_table(references).write_csv(path, float_precision=4, datetime_format="%Y-%m-%dT%H:%M:%S%.9f")
 
 
 def write_run(

@@ -22,8 +22,9 @@ from railfix.integrity.protection import (
     along_track_level,
     availability,
 )
-from railfix.integrity.raim import LinearModel, constrained_model, point_model
+from railfix.integrity.raim import LinearModel, constrained_model
 from railfix.positioning.normal_equations import UNTIED_M
+from raim_oracle import point_model
 
 pytestmark = pytest.mark.requirement("C2")
 

@@ -19,7 +19,6 @@ from railfix.integrity.raim import (
     detect,
     exclude,
     noncentrality,
-    point_model,
     reliability,
 )
 from railfix.integrity.raim.model import compact
@@ -27,6 +26,7 @@ from railfix.io.rinex import read_observations
 from railfix.positioning.constrained import Constrained, constrained_position
 from railfix.positioning.normal_equations import Ranges, clock_groups
 from railfix.track.trajectory import Trajectory
+from raim_oracle import point_model
 from recordings_score import geonet
 
 pytestmark = pytest.mark.requirement("B6")

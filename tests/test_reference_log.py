@@ -9,8 +9,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from railfix.core.errors import InputFileError, OutputError
-from railfix.io.reference_log import AntennaReference, read_reference, write_reference
+from railfix.core.errors import InputFileError
+from railfix.io.reference_log import AntennaReference, read_reference, reference_table
 from railfix.simulate.demonstration import demo_inputs
 
 pytestmark = pytest.mark.requirement("D1")
@@ -38,7 +38,8 @@ def assert_same(one: AntennaReference, other: AntennaReference) -> None:
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     references = {"front": made(0.0), "rear": made(0.5)}
-    write_reference(tmp_path / "reference.csv", references)
+    table = reference_table(references)
+    table.write_csv(tmp_path / "reference.csv", float_precision=4, datetime_format="%Y-%m-%dT%H:%M:%S%.9f")
     found = read_reference(tmp_path / "reference.csv", ["front", "rear"])
     for name, reference in references.items():
         assert_same(found[name], reference)
@@ -47,12 +48,6 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert first == (
         "2024-03-05T01:00:00.000000000,front,100.0000,-3957000.0000,3310001.0000,3737002.0000,-1.5000,0.0200,rtk,open"
     )
-    assert [p.name for p in tmp_path.iterdir()] == ["reference.csv"]
-
-
-def test_a_reference_that_cannot_be_written_is_told(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"nowhere/reference\.csv: the file cannot be written"):
-        write_reference(tmp_path / "nowhere" / "reference.csv", {"front": made(0.0)})
 
 
 @pytest.mark.parametrize("packed", ["csv.gz", "csv"])

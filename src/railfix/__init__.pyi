@@ -27,7 +27,6 @@ from .core import (
     Reason,
     SettingsError,
     Status,
-    reason_texts,
 )
 from .evaluate import Evaluation, EvaluationOptions, RunAndReference, evaluate_run, evaluate_runs, write_evaluation
 from .gnss import Navigation, Observations, PreciseEphemeris, concatenate
@@ -134,7 +133,6 @@ __all__ = [
     "read_sp3",
     "read_track",
     "read_vehicle",
-    "reason_texts",
     "reference",
     "report",
     "run",

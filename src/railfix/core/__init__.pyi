@@ -10,7 +10,7 @@ from .errors import (
     SettingsError,
 )
 from .files import FilePath, file_sha256, write_whole
-from .reasons import Reason, Status, reason_text, reason_texts
+from .reasons import Reason, Status, reason_text
 from .settings import Settings, load_settings, read_toml, write_toml
 
 __all__ = [
@@ -29,7 +29,6 @@ __all__ = [
     "load_settings",
     "read_toml",
     "reason_text",
-    "reason_texts",
     "write_toml",
     "write_whole",
 ]

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Integers, Strings
+from railfix.core.arrays import Integers
 
 
 class Reason(IntFlag):
@@ -141,12 +141,6 @@ def reason_text(reason: int) -> str:
     if reason == 0:
         return "used"
     return "+".join(name for bit, name in reason_names().items() if bit & reason)
-
-
-def reason_texts(reasons: ArrayLike) -> Strings:
-    """Apply `reason_text` to every element of an array."""
-    values, inverse = np.unique(np.asarray(reasons), return_inverse=True)
-    return np.array([reason_text(int(v)) for v in values])[inverse.reshape(np.shape(reasons))]
 
 
 def first_reason(reasons: ArrayLike) -> Integers:

@@ -9,7 +9,7 @@ from .georinex_layout import (
 from .logs import read_navigation, read_observations, scan_observations
 from .nmea import read_any_positions, read_nmea
 from .position_log import PositionLog, read_positions
-from .reference_log import AntennaReference, read_reference, write_reference
+from .reference_log import AntennaReference, read_reference
 from .rinex import write_navigation, write_observations
 from .sp3 import read_sp3
 
@@ -30,5 +30,4 @@ __all__ = [
     "scan_observations",
     "write_navigation",
     "write_observations",
-    "write_reference",
 ]

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_arrays
 from railfix.core.errors import InputFileError
-from railfix.core.files import ending, write_whole
+from railfix.core.files import ending
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog, positions_of_table, qualities_in_words
@@ -181,24 +181,6 @@ def _of_antenna(
     if len(first) < 2:
         raise InputFileError(path, f"fewer than two positions for the antenna {name} with a time{what}")
     return AntennaReference(**{key: values[rows[first]] for key, values in columns.items()})  # type: ignore[arg-type]
-
-
-def write_reference(path: str | PathLike[str], references: Mapping[str, AntennaReference]) -> None:
-    """Write references as CSV (`COLUMNS`), sorted by time; a failed write leaves no file.
-
-    Parameters
-    ----------
-    path : path
-    references : mapping of str to AntennaReference
-        By antenna.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
-    table = reference_table(references)
-    write_whole(path, table.write_csv(float_precision=4, datetime_format="%Y-%m-%dT%H:%M:%S%.9f"))
 
 
 def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:

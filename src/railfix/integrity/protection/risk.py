@@ -196,22 +196,6 @@ class RiskBudget(Settings):
         left = np.maximum(self.risk_per_sample - np.asarray(beyond, dtype=np.float64), 0.0)
         return np.asarray(left * np.select([out == e for e in range(len(each))], each, 0.0))
 
-    def require(self, systems: Sequence[str]) -> None:
-        """Raise where more than four faults among these satellites already exceed the risk.
-
-        Raises
-        ------
-        ValueError
-            Says what is over what.
-        """
-        spent = float(set_sums(self.prior(systems)[None], MOST_TOGETHER + 1)[0, -1])
-        if spent >= self.risk_per_sample:
-            raise ValueError(
-                f"more than four of {len(systems)} satellites are faulty with probability {spent:.2g} a sample, "
-                f"all that the risk allows is {self.risk_per_sample:.2g}: lower samples_per_hour or the priors, "
-                "or allow more risk"
-            )
-
 
 def pair_sum(prior: Floats) -> Floats:
     """Sum over pairs of the product of their priors, shape (T, M) to (T,)."""

@@ -2,7 +2,7 @@
 
 from .detection import Detection, RaimLimits, detect, threshold
 from .exclusion import Exclusion, Outcome, exclude, worst_channel
-from .model import LinearModel, constrained_model, point_model
+from .model import LinearModel, constrained_model
 from .reliability import Reliability, noncentrality, reliability
 
 __all__ = [
@@ -16,7 +16,6 @@ __all__ = [
     "detect",
     "exclude",
     "noncentrality",
-    "point_model",
     "reliability",
     "threshold",
     "worst_channel",

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
+from railfix.core.geodesy import range_with_rotation
 from railfix.kernels import compiled_by
 from railfix.positioning.normal_equations import RangeArrays, Ranges, inverse_3x3
 from railfix.track.trajectory import Trajectory
@@ -269,25 +269,6 @@ def model_on_line(
     """
     prior = np.diag([0.0, 1.0 / sigma_plan_m**2, 1.0 / sigma_height_m**2])
     return _model(ranges, place_ecef_m, axes, prior, unknowns=1)
-
-
-def point_model(ranges: Ranges, ecef_m: Floats) -> LinearModel:
-    """Model of 3-D positions: east, north and up unknown, the horizontal ones wanted (P4's horizontal form).
-
-    Parameters
-    ----------
-    ranges : Ranges
-        T epochs.
-    ecef_m : ndarray, shape (T, 3) [m]
-        Positions, as `single_point` gives them; NaN where there is none.
-
-    Returns
-    -------
-    LinearModel
-        NaN in the epochs without a position.
-    """
-    latitude, longitude, _ = geodetic_from_ecef(ecef_m)
-    return _model(ranges, ecef_m, enu_axes(latitude, longitude), np.zeros((3, 3)), unknowns=3)
 
 
 def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *, unknowns: int) -> LinearModel:

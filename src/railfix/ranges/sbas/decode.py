@@ -64,19 +64,6 @@ LAYOUTS: Final[dict[str, Layout]] = {
         "iodp": BitField(18, 2),
         "indicator": BitField(22, 4, number=SLOTS),
     },
-    "type 9": {
-        "time_of_day_s": BitField(22, 13, 16.0),
-        "accuracy": BitField(35, 4),
-        "position_ecef_m": (_signed(39, 30, 0.08), _signed(69, 30, 0.08), _signed(99, 25, 0.4)),
-        "velocity_ecef_mps": (_signed(124, 17, 0.000625), _signed(141, 17, 0.000625), _signed(158, 18, 0.004)),
-        "acceleration_ecef_mps2": (
-            _signed(176, 10, 0.0000125),
-            _signed(186, 10, 0.0000125),
-            _signed(196, 10, 0.0000625),
-        ),
-        "clock_s": _signed(206, 12, 2.0**-31),
-        "clock_rate": _signed(218, 8, 2.0**-40),
-    },
     # How errors grow (table A-9).
     "type 10": {
         "range_rate_m": BitField(14, 10, 0.002),
@@ -109,7 +96,6 @@ LAYOUTS: Final[dict[str, Layout]] = {
         "time_of_week_s": BitField(121, 20, 1.0),
         "week": BitField(141, 10),
     },
-    "type 17": {"time_of_day_s": BitField(215, 11, 64.0)},
     "type 18": {
         "bands": BitField(14, 4),
         "band": BitField(18, 4),
@@ -145,12 +131,6 @@ LAYOUTS: Final[dict[str, Layout]] = {
         "square": BitField(70, 1, number=_REGIONS, step=35),
     },
     "type 28": {"iodp": BitField(14, 2)},
-    "almanac of type 17": {
-        "prn": BitField(2, 8),
-        "health": BitField(10, 8),
-        "position_ecef_m": (_signed(18, 15, 2600.0), _signed(33, 15, 2600.0), _signed(48, 9, 26_000.0)),
-        "velocity_ecef_mps": (_signed(57, 3, 10.0), _signed(60, 3, 10.0), _signed(63, 4, 60.0)),
-    },
     # Half of type 25 with velocity code 0: two satellites; their issue of the mask follows both.
     "half of type 25": {"velocity_code": BitField(0, 1), "iodp": BitField(103, 2)},
     "satellite of type 25": {
@@ -350,24 +330,3 @@ def service(messages: SbasMessages) -> Decoded:
         "message": decoded["message"] + 1,
         "regions": np.minimum(decoded["regions"], _REGIONS),
     }
-
-
-def geo_navigation(messages: SbasMessages) -> Decoded:
-    """Type 9: motion (n, 3) and clock (n,) of the sender at `reference`; `accuracy` is the URA index, 15 unusable."""
-    decoded = decode(messages, 9)
-    row = decoded["row"]
-    reference = time_near(decoded.pop("time_of_day_s"), messages.time[row])
-    return {**decoded, "prn": messages.prn[row], "reference": reference}
-
-
-def geo_almanacs(messages: SbasMessages) -> Decoded:
-    """Type 17, one row a satellite: `prn`, `health`, `reference` (n,), position and velocity (n, 3)."""
-    decoded = decode(messages, 17)
-    row = decoded["row"]
-    reference = time_near(decoded["time_of_day_s"], messages.time[row])
-    parts = []
-    for start in (14, 81, 148):
-        part = read_fields(messages.bits[row], LAYOUTS["almanac of type 17"], start)
-        used = part["prn"] != 0
-        parts.append({name: values[used] for name, values in {"row": row, "reference": reference, **part}.items()})
-    return _joined(parts, slot="")

@@ -9,7 +9,7 @@ from pydantic import Field
 from railfix.core.settings import Settings
 
 #: Types decoded into corrections or into records.
-DECODED: Final = (0, 1, 2, 3, 4, 5, 6, 7, 9, 10, 12, 17, 18, 24, 25, 26, 27, 28)
+DECODED: Final = (0, 1, 2, 3, 4, 5, 6, 7, 10, 12, 18, 24, 25, 26, 27, 28)
 
 #: Message types of L1 (DO-229D, table A-3).
 TYPE_NAMES: Final = {
