@@ -38,22 +38,13 @@ from railfix.positioning.robust_fit import RobustFitLimits
 from railfix.positioning.section_search import SectionLimits
 from railfix.positioning.single_point import SinglePointLimits
 from railfix.ranges.sbas import SbasLimits
-from railfix.ranges.weights import CodeNoise, NominalErrors
+from railfix.ranges.weights import DEFAULT_SIGNALS, CodeNoise, NominalErrors
 from railfix.screens import SCREENS
 from railfix.tracking.limits import TrackingLimits
 
 if TYPE_CHECKING:
     from railfix.integrity.raim import RaimLimits
     from railfix.screens import AntennaPairLimits, AntennaSpacingLimits, Cn0Limits, DopplerLimits, ElevationLimits
-
-#: Signals near L1 in order of preference, RINEX 3 codes without the type letter.
-DEFAULT_SIGNALS: dict[str, tuple[str, ...]] = {
-    "G": ("1C", "1W", "1P", "1X", "1L", "1S"),
-    "J": ("1C", "1X", "1L", "1S", "1Z"),
-    "E": ("1C", "1X", "1B", "1Z", "1A"),
-    "C": ("2I", "2X", "2Q"),
-    "R": ("1C", "1P"),
-}
 
 
 #: Measurements that the filter along the track can use, as its column `sources` names them.

@@ -1,1 +1,5 @@
 """Positions from corrected pseudoranges: normal equations without clocks, section search, constrained fix."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,5 @@
 """Corrected pseudoranges: atmospheric delays, SBAS corrections, weights, error models, C/N0 curves."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -21,6 +21,16 @@ from railfix.ranges.atmosphere import thin_shell_obliquity
 PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
 
 
+#: Signals near L1 in order of preference, RINEX 3 codes without the type letter.
+DEFAULT_SIGNALS: Final[Mapping[str, tuple[str, ...]]] = {
+    "G": ("1C", "1W", "1P", "1X", "1L", "1S"),
+    "J": ("1C", "1X", "1L", "1S", "1Z"),
+    "E": ("1C", "1X", "1B", "1Z", "1A"),
+    "C": ("2I", "2X", "2Q"),
+    "R": ("1C", "1P"),
+}
+
+
 class CodeNoise(Settings):
     """Standard deviation of a corrected pseudorange from C/N0 and elevation.
 

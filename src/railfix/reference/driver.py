@@ -21,8 +21,8 @@ from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog
 from railfix.io.reference_log import reference_table
 from railfix.io.sensor_log import read_acceleration, read_pulses
-from railfix.pipeline.config import DEFAULT_SIGNALS
 from railfix.positioning.doppler_speed import Dopplers, dopplers_of_log
+from railfix.ranges.weights import DEFAULT_SIGNALS
 from railfix.reference.assemble import Built
 from railfix.reference.build import ReferenceData, build_references
 from railfix.reference.inputs import ReferenceInputs, ReferenceOptions
