@@ -20,7 +20,6 @@ import pytest
 
 import raim_oracle
 from railfix import kernels
-from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.errors import SettingsError
 from railfix.integrity.protection import RiskBudget, along_track_level
 from railfix.integrity.raim import constrained_model
@@ -166,26 +165,6 @@ def test_levels_of_every_kind_of_hypothesis_are_the_same(
             np.testing.assert_allclose(given, expected, rtol=1e-7, atol=TOLERANCE_M, err_msg=name)
         else:
             np.testing.assert_array_equal(given, expected, err_msg=name)
-
-
-@with_numba
-@pytest.mark.requirement("A7", "A9")
-def test_slips_are_told_by_the_same_numbers_compiled() -> None:
-    """Steps of the receiver's clock by milliseconds, absent values, and epochs with fewer than three channels."""
-    rng = np.random.default_rng(5)
-    dt, rate = rng.choice([0.1, 1.0, 30.0, np.nan], 300), rng.normal(0.0, 500.0, (300, 9))
-    step = rng.choice([0.0, 0.0, 1.0, -2.0], (300, 1)) * 1e-3 * SPEED_OF_LIGHT
-    code, phase = (np.nan_to_num(dt)[:, None] * rate + rng.normal(0.0, 3.0, rate.shape) for _ in range(2))
-    arrays = (code + step, phase + step * rng.choice([0.0, 1.0], (300, 1)), rate)
-    for array in arrays:
-        array[rng.random(array.shape) < 0.15] = np.nan
-        array[::7, 2:] = np.nan
-    reference = kernels.REGISTERED["slip_metrics"][0](dt, *arrays)
-    compiled = kernels.compiled("slip_metrics")(dt, *arrays)
-    assert np.count_nonzero(reference[0]) > 50
-    assert np.count_nonzero(reference[1]) > 50
-    for one, other in zip(compiled, reference, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-7)
 
 
 @with_numba

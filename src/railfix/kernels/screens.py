@@ -7,8 +7,17 @@ import math
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
-from railfix.kernels.compiling import kernel
-from railfix.kernels.sorting import insert
+from railfix.kernels.compiling import inner, kernel
+
+
+@inner
+def insert(ordered: Floats, count: int, value: float) -> None:
+    """Put a value in its place among the first `count` of a rising array."""
+    at = count
+    while at > 0 and ordered[at - 1] > value:
+        ordered[at] = ordered[at - 1]
+        at -= 1
+    ordered[at] = value
 
 
 @kernel

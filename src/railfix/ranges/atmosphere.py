@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.timescale import SECONDS_PER_DAY, to_week
-from railfix.kernels import compiled_by
 
 #: Latitudes of its tables [deg].
 _RTCA_LATITUDE: Final = np.array([15.0, 30.0, 45.0, 60.0, 75.0])
@@ -80,29 +79,7 @@ def klobuchar_delay_m(
         NaN where an angle, a coordinate or a frequency is NaN, and at or below the horizon.
     """
     _, seconds_of_week = to_week(time)
-    return klobuchar(
-        seconds_of_week,
-        latitude_deg,
-        longitude_deg,
-        np.ascontiguousarray(elevation_deg),
-        np.ascontiguousarray(azimuth_deg),
-        np.array(coefficients, dtype=np.float64).reshape(2, 4),
-        frequency_hz,
-    )
-
-
-@compiled_by("atmosphere")
-def klobuchar(
-    seconds_of_week: Floats,
-    latitude_deg: Floats,
-    longitude_deg: Floats,
-    elevation_deg: Floats,
-    azimuth_deg: Floats,
-    coefficients: Floats,
-    frequency_hz: Floats,
-) -> Floats:
-    """Compute `klobuchar_delay_m`; `coefficients` are of shape (2, 4), alpha and beta."""
-    alpha, beta = coefficients
+    alpha, beta = np.array(coefficients, dtype=np.float64).reshape(2, 4)
     elevation = np.where(elevation_deg > 0.0, elevation_deg, np.nan) / 180.0
     azimuth = np.radians(azimuth_deg)
     earth_angle = 0.0137 / (elevation + 0.11) - 0.022

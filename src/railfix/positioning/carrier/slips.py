@@ -26,7 +26,6 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz
-from railfix.kernels import compiled_by
 from railfix.positioning.carrier.arcs import ChannelKeys, channel_keys, rows_before
 
 #: One millisecond as a distance [m]: the step of receivers that keep their clock near GPS time.
@@ -255,7 +254,6 @@ def find_slips(
     return slips, after
 
 
-@compiled_by("carrier")
 def slip_metrics(
     dt: Floats, code_m: Floats, phase_m: Floats, range_mps: Floats
 ) -> tuple[Floats, Integers, Floats, Floats]:
