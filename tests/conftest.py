@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Modules whose tests need hardly any of the compiled kernels, the long check of types first.
-FEW_KERNELS = ("test_gate", "test_ground", "test_navigation", "test_rinex", "test_simulate")
+#: Modules whose tests need hardly any of the compiled kernels.
+FEW_KERNELS = ("test_ground", "test_navigation", "test_rinex", "test_simulate")
 
 
 @pytest.hookimpl(trylast=True)
