@@ -1,8 +1,7 @@
-"""P1's experiments on simulated lines print what docs/p1-results.md shows, and hold what it says."""
+"""P1's experiments on simulated lines print what docs/p1-results.md is taken from, and hold what it says."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +15,12 @@ from p1_static import STARTS, Subsets, joined, subsets
 from railfix.core.reasons import Status
 from test_p4_experiment import assert_same
 
-DOCUMENT = ROOT / "docs" / "p1-results.md"
+RESULTS = ROOT / "tests" / "references" / "results"
 
 
 def shown(part: str) -> list[str]:
-    """The block of the document under the command of a part."""
-    pattern = rf"^\$ python tests/p1_experiment\.py {part}\n(.*?)^```$"
-    (block,) = re.findall(pattern, DOCUMENT.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-    return block.rstrip().splitlines()
+    """The output of a part that docs/p1-results.md is taken from."""
+    return (RESULTS / f"p1-{part}.txt").read_text(encoding="utf-8").rstrip().splitlines()
 
 
 def printed(part: str, folder: Path) -> list[str]:
@@ -31,7 +28,7 @@ def printed(part: str, folder: Path) -> list[str]:
 
 
 @pytest.mark.requirement("D2")
-def test_the_first_minutes_are_as_the_document_shows(tmp_path: Path) -> None:
+def test_the_first_minutes_are_as_they_were(tmp_path: Path) -> None:
     assert_same(printed("short", tmp_path), shown("short"))
 
 
@@ -39,13 +36,13 @@ def test_the_first_minutes_are_as_the_document_shows(tmp_path: Path) -> None:
 @pytest.mark.requirement("D2")
 @pytest.mark.requirement("D4")
 @pytest.mark.parametrize("part", ["commercial", "others", "corrected", "test-line"])
-def test_a_whole_part_is_as_the_document_shows(part: str, tmp_path: Path) -> None:
+def test_a_whole_part_is_as_they_were(part: str, tmp_path: Path) -> None:
     assert_same(printed(part, tmp_path), shown(part))
 
 
 @pytest.mark.slow
 @pytest.mark.requirement("A3")
-def test_the_standing_experiments_are_as_the_document_shows(tmp_path: Path) -> None:
+def test_the_standing_experiments_are_as_they_were(tmp_path: Path) -> None:
     assert_same(printed("static", tmp_path), shown("static"))
 
 
