@@ -1,7 +1,7 @@
 """Faults of known size put into clean recorded ranges: what RAIM detects, and whom it blames.
 
 Run ``python tests/fault_injection.py`` with the recordings beside the checkout for the tables of
-docs/fault-injection.md.
+tests/references/results/fault-injection.txt.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
-"""What each screen buys and costs: the commands, and the tables they print, for ``docs/screens.md``.
+"""What each screen buys and costs: the commands, and the tables they print, that docs/screens.md is taken from.
 
 ``python tests/recordings_ablate.py FOLDER`` with the recordings beside the checkout writes references, maps and
-results to the folder, and the tables into the document.
+results to the folder, and the tables to tests/references/results/screens.md.
 """
 
 from __future__ import annotations
 
-import re
 import sys
 from pathlib import Path
 from typing import Final
@@ -19,8 +18,7 @@ from conftest import ROOT
 from railfix.cli import app
 from railfix.core.files import read_bytes
 
-DOCUMENT: Final = ROOT / "docs" / "screens.md"
-BLOCK: Final = re.compile(r"(<!-- tables -->\n).*?(<!-- end of tables -->\n)", re.DOTALL)
+DOCUMENT: Final = ROOT / "tests" / "references" / "results" / "screens.md"
 
 #: Recording: log, navigation, reference.
 RECORDINGS: Final = {
@@ -131,8 +129,7 @@ def main() -> int:
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
     made = tables(data, folder)
-    text = DOCUMENT.read_text(encoding="utf-8")
-    DOCUMENT.write_text(BLOCK.sub(lambda m: f"{m[1]}\n{made}\n{m[2]}", text), encoding="utf-8")
+    DOCUMENT.write_text(made, encoding="utf-8")
     return 0
 
 

@@ -256,7 +256,7 @@ def test_only_fixed_positions_are_truth(truth: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_document_shows_what_the_recordings_give(recordings: Path, tmp_path: Path) -> None:
-    """Figures of docs/screens.md, to the last digit or two; `python tests/recordings_ablate.py` writes them."""
+    """Figures that docs/screens.md is taken from, to the last digit or two (`python tests/recordings_ablate.py`)."""
     document = recordings_ablate.DOCUMENT.read_text(encoding="utf-8")
     recordings_ablate.prepared(recordings, tmp_path)
     for recording in ("urbannav_f9p", "gsdc"):
