@@ -330,7 +330,8 @@ def test_the_filter_uses_no_measurement_of_an_unhealthy_satellite() -> None:
     navigation = replace(records, kepler=replace(records.kepler, health=sick))
     weak = np.where(front().satellite == low, 20.0, front().cn0_dbhz)
     observations = replace(front(), cn0_dbhz=weak)
-    result, _ = processor({"filter": "track"}, navigation=navigation).process({"front": observations})
+    settings = {"filter": "track", "screens": ["elevation", "cn0"], "cn0": {"floor_dbhz": 30.0}}
+    result, _ = processor(settings, navigation=navigation).process({"front": observations})
     table = observations_table(result)
     measured = ("innovation_code_m", "innovation_phase_m", "innovation_doppler_mps", "weight_code")
     unhealthy = table.filter(satellite=broken)
@@ -340,5 +341,5 @@ def test_the_filter_uses_no_measurement_of_an_unhealthy_satellite() -> None:
     others = table.filter(pl.col("satellite") != broken, pl.col("reason") == 0)
     assert all(others[name].null_count() < len(others) for name in measured)
     refused = table.filter(pl.col("satellite") == low)
-    assert (refused["reason_text"] != "used").all()
+    assert (refused["reason_text"] == "cn0_floor").all()
     assert refused["weight_code"].null_count() < 40
