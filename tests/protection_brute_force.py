@@ -1,6 +1,7 @@
 """Errors drawn against the protection level: noise alone, and one and two faults of the size that hurts most.
 
-Run ``python tests/protection_brute_force.py`` for tests/references/results/protection-brute-force.txt (several minutes).
+Run ``python tests/protection_brute_force.py`` for the tables of tests/references/results/protection-brute-force.txt
+(several minutes).
 
 Geometries are drawn (satellites, constellations, heading of the track, map error); their levels come from
 the code under test. The errors do not: every position, with all satellites and without each subset, is an

@@ -1,28 +1,31 @@
-"""A screen is added by one file and one line: the two blocks of docs/screens.md, put into a copy of the package."""
+"""A screen of one's own is one module and one entry point: the blocks of docs/screens.md, installed beside railfix."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
+import tomllib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
 
 from conftest import ROOT
-from pipeline_cases import clean_observations, processor
+from pipeline_cases import clean_navigation, clean_observations, clean_trajectories, processor
 from railfix.core.errors import NoPositionError
 from railfix.core.reasons import Reason, Status, reason_names, reason_text, screen_reason
+from railfix.core.settings import Settings
 from railfix.io.rinex import read_observations, write_observations
 from railfix.pipeline.config import SCREEN_NAMES, Config, parse_config
+from railfix.pipeline.processor import EpochProcessor
 from railfix.run import RunInputs, run_files
-from railfix.screens import SCREENS
+from railfix.screens import SCREENS, AntennaRanges, ObservationScreen, Screened, ScreenSetup, Verdict
 
 DEMO = ROOT / "data" / "demo"
 
@@ -43,18 +46,27 @@ def test_reasons_of_added_screens_have_bits_of_their_own() -> None:
     assert reason_text(added | Reason.DOPPLER) == "doppler+test_of_reasons"
 
 
-@pytest.mark.requirement("B7")
-def test_a_screen_is_one_file_and_one_line(tmp_path: Path) -> None:
+def example(folder: Path) -> Path:
+    """The screen of docs/screens.md as an installed package: its module, and its entry point."""
     text = (ROOT / "docs" / "screens.md").read_text(encoding="utf-8").split("## Adding a screen")[1]
-    file, line = re.findall(r"```(?:python|text)\n(.*?)```", text, flags=re.DOTALL)[:2]
-    assert line.count("\n") == 1
-    package = tmp_path / "src" / "railfix"
-    shutil.copytree(ROOT / "src" / "railfix", package, ignore=shutil.ignore_patterns("*.nbi", "*.nbc"))
-    (package / "screens" / "large_sigma.py").write_text(file, encoding="utf-8")
-    registry = package / "screens" / "registry.py"
-    registry.write_text(registry.read_text().replace('    "raim",\n', f'{line}    "raim",\n'), encoding="utf-8")
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "src"), "COLUMNS": "120"}
-    environment["RAILFIX_KERNELS"] = "numpy"  # compiled code belongs to its files: a copy would be compiled again
+    module, project = re.findall(r"```(?:python|toml)\n(.*?)```", text, flags=re.DOTALL)[:2]
+    (group, names), *others = tomllib.loads(project)["project"]["entry-points"].items()
+    assert not others
+    (folder / "my_package").mkdir(parents=True)
+    (folder / "my_package" / "__init__.py").touch()
+    (folder / "my_package" / "large_sigma.py").write_text(module, encoding="utf-8")
+    info = folder / "my_package-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n")
+    lines = [f"[{group}]", *(f"{name} = {place}" for name, place in names.items())]
+    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+@pytest.mark.requirement("B7")
+def test_a_screen_of_ones_own_is_one_module_and_one_entry_point(tmp_path: Path) -> None:
+    path = os.pathsep.join([str(example(tmp_path / "site")), *sys.path])
+    environment = {**os.environ, "PYTHONPATH": path, "COLUMNS": "120"}
 
     def railfix(*words: object) -> None:
         command = [sys.executable, "-m", "railfix", *map(str, words)]
@@ -67,7 +79,7 @@ def test_a_screen_is_one_file_and_one_line(tmp_path: Path) -> None:
     )  # fmt: skip
     record = json.loads((tmp_path / "out" / "run.json").read_text())
     assert record["settings_used"]["large_sigma"] == {"limit_m": 3.0}
-    assert record["settings_used"]["screens"][3:5] == ["antenna_pair", "large_sigma"]
+    assert record["settings_used"]["screens"][2:5] == ["doppler", "large_sigma", "antenna_pair"]
     rows = pl.read_parquet(tmp_path / "out" / "observations.parquet")
     judged = rows.filter(pl.col("metric_large_sigma_m").is_not_null())
     rejected = judged["reason_text"].str.contains("large_sigma")
@@ -77,6 +89,62 @@ def test_a_screen_is_one_file_and_one_line(tmp_path: Path) -> None:
     assert counts["large_sigma"] > 0
     railfix("plot-screens", tmp_path / "out", "--out", tmp_path / "pictures")
     assert (tmp_path / "pictures" / "front_large_sigma.png").stat().st_size > 1000
+
+
+@pytest.mark.requirement("B7")
+def test_a_package_with_a_wrong_screen_is_named(tmp_path: Path) -> None:
+    site = example(tmp_path / "site")
+    entry = site / "my_package-1.0.dist-info" / "entry_points.txt"
+    module = site / "my_package" / "large_sigma.py"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), *sys.path])}
+
+    def said() -> str:
+        command = [sys.executable, "-c", "import railfix.screens"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+        assert done.returncode == 1
+        return done.stderr.splitlines()[-1]
+
+    entry.write_text(entry.read_text().replace(":SCREEN", ":REASON"))
+    assert "the entry point large_sigma of the package my-package (group railfix.screens) is Reason, expected" in said()
+    entry.write_text(entry.read_text().replace(":REASON", ":SCREEN"))
+    module.write_text(module.read_text().replace('name = "large_sigma"', 'name = "doppler"'))
+    assert "the package my-package has a screen doppler, a name that is taken" in said()
+
+
+@pytest.mark.requirement("B7")
+def test_a_screen_may_be_given_to_the_processor() -> None:
+    """Every range of every third epoch is rejected, as if the receiver had named them."""
+
+    class Limits(Settings):
+        every: int = 3
+
+    class EveryThird(ObservationScreen[Limits]):
+        name = "every_third"
+        limits = Limits()
+        needs = "epochs"
+
+        def judge(
+            self, antenna: AntennaRanges, limits: Limits, setup: ScreenSetup, state: Any
+        ) -> tuple[tuple[Verdict, ...], Any]:
+            assert setup.antennas == 1
+            metric = np.full(antenna.code_m.shape, 1.0)
+            hit = (np.arange(len(metric)) % limits.every == 0)[:, None] & np.isfinite(antenna.code_m)
+            return (
+                Verdict(name=self.name, reason=Reason.DOPPLER, screened=Screened(metric=metric, reject=hit)),
+            ), state
+
+    log = clean_observations()["front"][400:412]
+    trajectories = {"front": clean_trajectories()["front"]}
+    live = EpochProcessor(Config(), trajectories, navigation=clean_navigation(), screens=(EveryThird(),))
+    names = [screen.name for screen, _ in live.screens]
+    assert names[:5] == ["elevation", "cn0", "doppler", "every_third", "antenna_pair"]
+    found = live.process({"front": log})[0].antennas["front"]
+    assert (found.n_used == 0).tolist() == [k % 3 == 0 for k in range(12)]
+    assert found.screens["every_third"].reject[0].any()
+    taken = EveryThird()
+    type(taken).name = "raim"
+    with pytest.raises(ValueError, match="there is a screen raim already"):
+        EpochProcessor(Config(), trajectories, navigation=clean_navigation(), screens=(taken,))
 
 
 @pytest.mark.requirement("B7")

@@ -8,8 +8,9 @@ any cutting gives the same results.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from railfix.pipeline.compared import (
     pair_verdicts,
     position_verdicts,
 )
-from railfix.pipeline.config import Config
+from railfix.pipeline.config import SCREEN_NAMES, Config
 from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
 from railfix.pipeline.received import Received, known_from_start, receive
@@ -41,7 +42,9 @@ from railfix.screens import (
     SCREENS,
     AntennaRanges,
     PairedEpochs,
+    Screen,
     ScreenSetup,
+    in_order,
 )
 from railfix.screens.pairs import pair_antennas
 from railfix.track import Track
@@ -71,6 +74,9 @@ class EpochProcessor:
         The line itself, for places by its changes of gradient and curvature in the filter along the track.
     units : GroundUnits, optional
         Surveyed stations of two-way ranges, for the filter along the track.
+    screens : sequence of Screen, optional
+        Screens of one's own, used with their limits beside those of `config`; their verdicts are in
+        `AntennaResult.screens`, without columns of the tables (those of installed packages have them).
 
     Attributes
     ----------
@@ -102,6 +108,7 @@ class EpochProcessor:
         cn0_curve: Cn0Curve | None = None,
         track: Track | None = None,
         units: GroundUnits | None = None,
+        screens: Sequence[Screen[Any]] = (),
     ) -> None:
         if not trajectories:
             raise ValueError("at least one antenna's trajectory is needed")
@@ -119,7 +126,10 @@ class EpochProcessor:
         self._channels = ChannelBook(config)
         self.indices = {name: SearchIndex(t) for name, t in self.trajectories.items()}
         self._error_model = error_model
-        self.screens = tuple((s, getattr(config, s.name)) for s in SCREENS if s.name in config.screens)
+        if taken := [s.name for s in screens if s.name in SCREEN_NAMES]:
+            raise ValueError(f"there is a screen {taken[0]} already; give it another name")
+        chosen = (*(s for s in SCREENS if s.name in config.screens), *screens)
+        self.screens = tuple((s, getattr(config, s.name, s.limits)) for s in in_order(chosen))
         self.setup = ScreenSetup(
             antennas=len(self.trajectories),
             spacing_known=all(t.body_chainage_m is not None for t in self.trajectories.values()),

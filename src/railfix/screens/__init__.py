@@ -36,7 +36,7 @@ from railfix.screens.doppler import DopplerScreened, DopplerState, doppler_scree
 from railfix.screens.doppler_limits import DopplerLimits, doppler_limit_m
 from railfix.screens.elevation import ElevationLimits, elevation_screen
 from railfix.screens.pairs import pair_channels, pair_epochs
-from railfix.screens.registry import SCREENS
+from railfix.screens.registry import SCREENS, in_order
 
 __all__ = [
     "SCREENS",
@@ -70,6 +70,7 @@ __all__ = [
     "doppler_screen",
     "elevation_screen",
     "expected_difference_m",
+    "in_order",
     "pair_channels",
     "pair_epochs",
     "spacing_direction",

@@ -1,8 +1,9 @@
 """Base classes of the screens: what a screen receives, what it returns, and the hooks that a screen may override.
 
-A screen is one file with one subclass of `ObservationScreen`, `PairScreen` or `PositionScreen`, and one line in
-`railfix.screens.registry`. The name of the screen, its group of settings, the columns of the tables, the reasons in the
-reports and its pictures follow from the class (docs/screens.md shows an example).
+A screen is one subclass of `ObservationScreen`, `PairScreen` or `PositionScreen`, and one line in
+`railfix.screens.registry` or one entry point of an installed package. The name of the screen, its group of settings,
+the columns of the tables, the reasons in the reports and its pictures follow from the class (docs/screens.md shows an
+example).
 """
 
 from __future__ import annotations

@@ -1,12 +1,20 @@
-"""Registry of the screens: one line each, the name of the screen and of its file, in the order in which they judge."""
+"""Registry of the screens: those of railfix, one line each, and those of installed packages.
+
+A package names its screens as entry points of the group ``railfix.screens``, each a `Screen` object.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from importlib import import_module
+from importlib.metadata import entry_points
 from typing import Any, Final
 
-from railfix.screens.base import Screen
+from railfix.core.errors import SettingsError
+from railfix.screens.base import ObservationScreen, PairScreen, PositionScreen, Screen
 
+#: Group of entry points.
+GROUP: Final = "railfix.screens"
 _NAMES: Final = (
     "elevation",
     "cn0",
@@ -16,5 +24,43 @@ _NAMES: Final = (
     "antenna_spacing",
 )
 
-#: All screens. Those of single antennas judge first, then those of two, then RAIM, then those of positions.
-SCREENS: Final[tuple[Screen[Any], ...]] = tuple(import_module(f"railfix.screens.{name}").SCREEN for name in _NAMES)
+
+def in_order(screens: Iterable[Screen[Any]]) -> tuple[Screen[Any], ...]:
+    """Return screens in the order in which they judge: of one antenna, of two, RAIM, of positions."""
+    return tuple(sorted(screens, key=_rank))
+
+
+def _rank(screen: Screen[Any]) -> int:
+    kinds = ((ObservationScreen, 0), (PairScreen, 1), (PositionScreen, 3))
+    return next((rank for kind, rank in kinds if isinstance(screen, kind)), 2)
+
+
+def _installed() -> list[Screen[Any]]:
+    """Load the screens of installed packages.
+
+    Raises
+    ------
+    SettingsError
+        An entry point is no screen, or has the name of another one.
+    """
+    found: list[Screen[Any]] = []
+    for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
+        package = entry.dist.name if entry.dist else "?"
+        screen = entry.load()
+        if not isinstance(screen, Screen):
+            raise SettingsError(
+                f"the entry point {entry.name} of the package {package} (group {GROUP}) is {type(screen).__name__}, "
+                "expected a railfix.screens.Screen; correct or uninstall the package"
+            )
+        if screen.name in (*_NAMES, *(other.name for other in found)):
+            raise SettingsError(
+                f"the package {package} has a screen {screen.name}, a name that is taken; rename it or uninstall it"
+            )
+        found.append(screen)
+    return found
+
+
+#: All screens, in the order in which they judge.
+SCREENS: Final[tuple[Screen[Any], ...]] = in_order(
+    (*(import_module(f"railfix.screens.{name}").SCREEN for name in _NAMES), *_installed())
+)
