@@ -1,12 +1,13 @@
 """Cold starts and faults: what the filter states against what is true.
 
-``python tests/belief_campaign.py`` runs the recordings beside the checkout; ``python tests/belief_campaign.py FOLDER ...``
-runs folders with a ``case.toml`` that names ``log``, ``nav``, ``track`` and ``truth`` (a track map and a reference as
-``railfix evaluate`` reads them). Every trial is the pipeline with its defaults (``--mask`` changes the elevation mask)
-from a cold start.
+``python tests/belief_campaign.py`` runs the recordings beside the checkout; ``python tests/belief_campaign.py FOLDER
+...`` runs folders with a ``case.toml`` that names ``log``, ``nav``, ``track`` and ``truth`` (a track map and a
+reference as ``railfix evaluate`` reads them). Every trial is the pipeline with its defaults from a cold start; ``--mask`` changes
+the elevation mask, ``--set`` a setting of the filter.
 
-``--starts`` (default): a cold start every ``--every`` seconds, ``--length`` seconds each. ``--faults``: faults of one satellite, one
-constellation, all Dopplers, all phases, a step of all codes, the map, and pairs.
+Whole recordings first (``--whole``), then a cold start every ``--every`` seconds, ``--length`` seconds each; with
+``--faults`` instead faults of one satellite, one constellation, all Dopplers, all phases, a step of all codes, the map,
+pairs, and few satellites, in windows ``--fault-every`` seconds apart. ``--verbose`` lists the trials that fail.
 
 An epoch is *exceeded* where its level is finite and the error is larger: by straight distance on the ground, and by
 chainage, where another lap of the same road counts as wrong. *Sure and wrong* are epochs with the status `tracking`
@@ -43,6 +44,8 @@ from railfix.track import Track, read_track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line, Tracked, TrackStatus
 
+#: Faults that no measurement of this receiver contradicts: codes, phases and Dopplers agree on another motion.
+UNDETECTED: Final = ("pull 0.5 m/s, all", "pull 0.5 m/s, all, from the start")
 DATA: Final = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
@@ -187,7 +190,16 @@ def judged(case: Case, found: Tracked, first: int = 0) -> Judged:
     # A place off the map has no straight distance: it is as wrong as its arc length.
     straight = np.where(np.isfinite(straight), straight, chainage)
     time = seconds(case.observations.time - case.observations.time[0])
-    columns = (time, found.status, found.probability, found.sigma_m, found.level_m, found.ground_level_m, straight, chainage)
+    columns = (
+        time,
+        found.status,
+        found.probability,
+        found.sigma_m,
+        found.level_m,
+        found.ground_level_m,
+        straight,
+        chainage,
+    )
     return Judged(*(np.asarray(column)[known] for column in columns))
 
 
@@ -320,7 +332,9 @@ def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterat
         yield label, with_fault(case, Fault(name, code, phase, rate))
     few = [str(x) for x in random.choice(names, min(3, len(names)), replace=False)]
     for count in (3, 2):
-        left = {f: np.where(of(*few[:count]), getattr(obs, f), np.nan) for f in ("code_m", "phase_cycles", "doppler_hz")}
+        left = {
+            f: np.where(of(*few[:count]), getattr(obs, f), np.nan) for f in ("code_m", "phase_cycles", "doppler_hz")
+        }
         full = t[:, None] < 45.0
         some = {name: np.where(full, getattr(obs, name), values) for name, values in left.items()}
         yield f"{count} satellites", replace(case, observations=replace(obs, **left))
@@ -330,8 +344,24 @@ def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterat
     yield "map 2 % long", stretched(case, 0.02)
 
 
+def over(label: str, found: Judged) -> np.ndarray:
+    """Epochs over their level; on a wrong map the chainage of a place is not defined."""
+    return found.over if label.startswith("map") else found.over | found.over_chainage
+
+
+def first_of(found: Judged, bad: np.ndarray) -> str:
+    """The first epoch of some, in words."""
+    k = int(np.flatnonzero(bad)[0])
+    return (
+        f"{int(bad.sum())} epochs, first at {found.time_s[k]:.0f} s: error {found.straight_m[k]:.1f} m "
+        f"({found.chainage_m[k]:.0f} m by chainage), sigma {found.sigma_m[k]:.1f} m, level {found.level_m[k]:.1f} m, "
+        f"on the ground {found.ground_level_m[k]:.1f} m, probability {found.probability[k]:.4f}; largest error "
+        f"{np.nanmax(found.straight_m):.0f} m"
+    )
+
+
 def show_faults(case: Case, args: argparse.Namespace) -> None:
-    """Faults put in; epochs over the level, by kind."""
+    """Print faults by kind: trials, epochs over the level and trials with any, availability, errors."""
     random = np.random.default_rng(args.seed)
     settings = {"elevation": {"mask_deg": args.mask[0]}, **args.settings}
     along, _ = sights(case)
@@ -341,49 +371,54 @@ def show_faults(case: Case, args: argparse.Namespace) -> None:
     for begin in np.arange(t[known[0]], t[known[-1]] - 90.0, args.fault_every):
         first, end = (int(k) for k in np.searchsorted(t, [begin, begin + args.length]))
         for label, faulty in faults(case.part(first, end), along[first:end], random):
-            judged_run = run(faulty, settings)
-            if args.verbose and (judged_run.over | judged_run.over_chainage).any():
-                bad = judged_run.over | (judged_run.over_chainage & (not label.startswith("map")))
-                if not bad.any():
-                    continue
-                k = np.flatnonzero(bad)[0]
-                print(f"    start {begin:.0f} {label}: {bad.sum()} over, first {judged_run.time_s[k]:.0f} s error {judged_run.straight_m[k]:.1f} level {judged_run.level_m[k]:.1f} ground {judged_run.ground_level_m[k]:.1f} sigma {judged_run.sigma_m[k]:.1f}; worst {np.nanmax(judged_run.straight_m):.0f}", flush=True)
-            found.setdefault(label, []).append(judged_run)
+            trial = run(faulty, settings)
+            bad = over(label, trial)
+            if args.verbose and bad.any():
+                print(f"    start {begin:.0f} s, {label}: {first_of(trial, bad)}", flush=True)
+            found.setdefault(label, []).append(trial)
+    print(f"| {case.name}: fault | trials | epochs over the level | level, on the ground, % | p95, largest error |")
+    print("|---|---:|---:|---|---|")
     total = 0
     for label, parts in found.items():
-        whole = joined(parts)
-        # On a wrong map the chainage of a place is not defined.
-        over = whole.over | (whole.over_chainage & (not label.startswith("map")))
-        total += int(over.sum())
+        whole, failed = joined(parts), sum(bool(over(label, part).any()) for part in parts)
+        count = int(over(label, whole).sum())
+        total += count if label not in UNDETECTED else 0
+        error = whole.straight_m[np.isfinite(whole.straight_m)]
+        size = f"{np.percentile(error, 95):.1f}, {error.max():.0f}" if len(error) else "no place"
         print(
-            f"{case.name:7s} {label:38s} {len(parts):3d} trials  over {int(over.sum()):4d} in {sum((p.over | (p.over_chainage & (not label.startswith('map')))).any() for p in parts):2d}"
-            f"  level {100 * whole.bounded.mean():5.1f} %  ground {100 * np.isfinite(whole.ground_level_m).mean():5.1f} %"
-            f"  p95 {np.nanpercentile(whole.straight_m, 95):6.1f}  max {np.nanmax(whole.straight_m):6.0f}",
-            flush=True,
+            f"| {label} | {len(parts)} | {count} in {failed} | {100 * whole.bounded.mean():.0f}, "
+            f"{100 * np.isfinite(whole.ground_level_m).mean():.0f} | {size} |"
         )
-    print(f"{case.name}: {sum(map(len, found.values()))} faults, {total} epochs over")
+    print(f"{case.name}: {sum(map(len, found.values()))} faults, {total} epochs over their level", flush=True)
 
 
-def counts(label: str, found: Judged, *, trials: int, wrong_trials: int) -> str:
-    """A row of the table of cold starts."""
-    n = len(found.status)
-    tracking = int(found.tracking.sum())
-    error = found.straight_m
-    level = np.median(found.level_m[found.bounded]) if found.bounded.any() else np.nan
-    on_ground = np.isfinite(found.ground_level_m)
-    ground = np.median(found.ground_level_m[on_ground]) if on_ground.any() else np.nan
+def counts(label: str, found: Judged, *, trials: int, failed: int) -> str:
+    """Return a row of the table of cold starts."""
+    tracking, on_ground = found.tracking, np.isfinite(found.ground_level_m)
+    error = found.straight_m[np.isfinite(found.straight_m)]
+    ratio = (found.straight_m / found.sigma_m)[np.isfinite(found.straight_m)]
+    medians = [
+        f"{100 * mask.mean():.0f} % {np.median(level[mask]):.1f} m" if mask.any() else "none"
+        for mask, level in ((found.bounded, found.level_m), (on_ground, found.ground_level_m))
+    ]
     return (
-        f"{label:18s} {trials:4d} trials {n:6d} ep  tracking {100 * tracking / n:5.1f} %  level {100 * found.bounded.mean():5.1f} %"
-        f" p50 {level:5.1f} ground {100 * on_ground.mean():5.1f} % {ground:5.1f}  over: straight {int(found.over.sum()):4d} chainage {int(found.over_chainage.sum()):4d}"
-        f" (trials {wrong_trials:3d})  sure&wrong {100 * found.sure_and_wrong.sum() / max(tracking, 1):5.2f} %"
-        f"  tracking >10 m {int((found.tracking & (error > 10.0)).sum()):4d}"
-        f"  p50/p95/max {np.nanmedian(error):.2f}/{np.nanpercentile(error, 95):.2f}/{np.nanmax(error):.1f}"
-        f"  e/s p95 {np.nanpercentile(error / found.sigma_m, 95):.2f}"
+        f"| {label} | {trials} | {len(found.status)} | {100 * tracking.mean():.0f} | {medians[0]} | {medians[1]} | "
+        f"{int(found.over.sum())} | {int(found.over_chainage.sum())} | {failed} | "
+        f"{100 * found.sure_and_wrong.sum() / max(int(tracking.sum()), 1):.2f} | "
+        f"{np.median(error):.2f} / {np.percentile(error, 95):.2f} / {error.max():.1f} | "
+        f"{np.percentile(ratio, 95):.2f} |"
     )
 
 
+HEAD: Final = (
+    "| recording, mask | trials | epochs | tracking % | level along | level on the ground | over it | by chainage | "
+    "trials with any | sure and wrong % | p50 / p95 / largest | error over sigma p95 |\n"
+    "|---|---:|---:|---:|---|---|---:|---:|---:|---:|---|---:|"
+)
+
+
 def calibration(found: Judged) -> list[str]:
-    """Stated probability of the branch against the share that is right by chainage."""
+    """Return the stated probability of the branch against the share that is right by chainage."""
     right = found.chainage_m < np.fmax(10.0, 4.0 * found.sigma_m)
     lines = []
     for low, high in ((0.0, 0.5), (0.5, 0.9), (0.9, 0.99), (0.99, 0.999), (0.999, 1.1)):
@@ -391,36 +426,36 @@ def calibration(found: Judged) -> list[str]:
         if mine.any():
             count, hits = int(mine.sum()), int(right[mine].sum())
             least, most = bounds(hits, count)
-            lines.append(f"  stated {low:.3f} to {min(high, 1.0):.3f}: right {hits}/{count} = {hits / count:.4f} ({least:.4f} to {most:.4f})")
+            lines.append(
+                f"    stated {low:.3f} to {min(high, 1.0):.3f}: right {hits} of {count}, {hits / count:.4f} "
+                f"({least:.4f} to {most:.4f})"
+            )
     return lines
 
 
 def show_starts(case: Case, args: argparse.Namespace) -> None:
+    """Print a row for each mask, and the calibration of the branches."""
     for mask in args.mask:
         settings = {"elevation": {"mask_deg": mask}, **args.settings}
-        parts, wrong = [], 0
+        parts, failed = [], 0
         for begin, part in starts(case, args.every, args.length):
             found = run(part, settings)
             parts.append(found)
-            bad = int((found.over | found.over_chainage).sum())
-            wrong += bad > 0
-            if args.verbose and (bad or found.sure_and_wrong.any()):
-                k = np.flatnonzero(found.over | found.over_chainage | found.sure_and_wrong)[0]
-                print(
-                    f"    start {begin:6.1f}: over straight {int(found.over.sum())} chainage {int(found.over_chainage.sum())} "
-                    f"sure&wrong {int(found.sure_and_wrong.sum())}; first at {found.time_s[k]:.0f} s: error "
-                    f"{found.straight_m[k]:.1f}/{found.chainage_m[k]:.0f} m, sigma {found.sigma_m[k]:.1f}, level {found.level_m[k]:.1f} ground {found.ground_level_m[k]:.1f}, p {found.probability[k]:.4f}; max {np.nanmax(found.straight_m):.0f}",
-                    flush=True,
-                )
-        print(counts(f"{case.name} mask {mask:g}", joined(parts), trials=len(parts), wrong_trials=wrong), flush=True)
-        print("\n".join(calibration(joined(parts))), flush=True)
+            bad = found.over | found.over_chainage
+            failed += bool(bad.any())
+            if args.verbose and (bad | found.sure_and_wrong).any():
+                print(f"    start {begin:.0f} s: {first_of(found, bad | found.sure_and_wrong)}", flush=True)
+        print(counts(f"{case.name} {mask:g}", joined(parts), trials=len(parts), failed=failed), flush=True)
+        if args.calibration:
+            print("\n".join(calibration(joined(parts))), flush=True)
 
 
 def show_whole(case: Case, args: argparse.Namespace) -> None:
-    """The recording as a whole, from its first epoch."""
+    """Print a row for the recording as a whole, from its first epoch."""
     for mask in args.mask:
         found = run(case, {"elevation": {"mask_deg": mask}, **args.settings})
-        print(counts(f"{case.name} whole {mask:g}", found, trials=1, wrong_trials=0), flush=True)
+        bad = bool((found.over | found.over_chainage).any())
+        print(counts(f"{case.name} {mask:g}, whole", found, trials=1, failed=int(bad)), flush=True)
 
 
 def main() -> int:
@@ -429,18 +464,20 @@ def main() -> int:
     parser.add_argument("--every", type=float, default=10.0)
     parser.add_argument("--length", type=float, default=150.0)
     parser.add_argument("--mask", type=float, nargs="*", default=[20.0])
-    parser.add_argument("--set", dest="sets", nargs="*", default=[], help="tracking settings, name=value")
+    parser.add_argument("--set", dest="sets", nargs="*", default=[], help="settings of the filter, name=value")
     parser.add_argument("--faults", action="store_true")
     parser.add_argument("--fault-every", type=float, default=90.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--whole", action="store_true")
     parser.add_argument("--no-starts", action="store_true")
+    parser.add_argument("--calibration", action="store_true")
     parser.add_argument("--verbose", action="store_true")
     args = parser.parse_args()
-    args.settings = {}
-    if args.sets:
-        args.settings["tracking"] = {k: float(v) if v.replace(".", "").replace("e-", "").isdigit() else v for k, v in (s.split("=") for s in args.sets)}
+    given = "\n".join(args.sets)
+    args.settings = {"tracking": tomllib.loads(given)} if given else {}
     known = _recordings(DATA) if DATA.is_dir() else {}
+    if not args.faults:
+        print(HEAD)
     for name in args.folders or list(known):
         case = known[name]() if name in known else case_of_folder(Path(name))
         if args.whole:

@@ -137,7 +137,9 @@ def test_emergency_braking_is_followed() -> None:
     few = replace(
         case.epochs,
         **{
-            n: np.where((np.arange(10) < 3) | (np.arange(len(case.epochs)) < 20)[:, None], getattr(case.epochs, n), np.nan)
+            n: np.where(
+                (np.arange(10) < 3) | (np.arange(len(case.epochs)) < 20)[:, None], getattr(case.epochs, n), np.nan
+            )
             for n in ("code_m", "phase_m", "rate_mps")
         },
     )

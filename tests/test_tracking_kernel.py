@@ -35,7 +35,7 @@ def _assert_equal(given: Tracked, expected: Tracked, tolerance: float) -> None:
     for field in fields(Tracked):
         one, other = getattr(given, field.name), getattr(expected, field.name)
         if other.dtype.kind == "f":
-            # The bound of the speed in a sub-filter's first seconds, begun with hundreds of metres, is worse conditioned.
+            # The bound of the speed in a sub-filter's first seconds, begun with hundreds of metres, is ill-conditioned.
             loose = 50.0 * tolerance if field.name == "level_speed_mps" else tolerance
             np.testing.assert_allclose(one, other, rtol=loose, atol=loose, err_msg=field.name)
         else:

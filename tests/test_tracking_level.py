@@ -48,7 +48,10 @@ def test_other_branches_are_hypotheses_of_the_level(probability: float) -> None:
     bank = Bank(without=("G01",), mean=mean, covariance=covariance, weak_s=np.zeros(1))
     for apart, ground in ((40.0, 35.0), (1815.0, 3.0), (900.0, 18.0)):
         branch = Branches(
-            probability=np.array([probability]), apart_m=np.array([apart]), ground_m=np.array([ground]), sigma_m=np.array([2.0])
+            probability=np.array([probability]),
+            apart_m=np.array([apart]),
+            ground_m=np.array([ground]),
+            sigma_m=np.array([2.0]),
         )
         found = compute_level(bank, branch, 100.0, 1.0, LIMITS)
 

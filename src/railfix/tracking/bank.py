@@ -205,7 +205,9 @@ def levelled(
         if copy:
             fresh[0][k], fresh[1][k] = mean, covariance
         if added[k] == "map":
-            fresh[1][k][[Unknown.MAP_RIGHT, Unknown.MAP_UP], [Unknown.MAP_RIGHT, Unknown.MAP_UP]] += limits.level_map_m**2
+            fresh[1][k][[Unknown.MAP_RIGHT, Unknown.MAP_UP], [Unknown.MAP_RIGHT, Unknown.MAP_UP]] += (
+                limits.level_map_m**2
+            )
     means = np.concatenate([means[kept], fresh[0]])
     covariances = np.concatenate([covariances[kept], fresh[1]])
     without = (*(bank.without[k] for k in kept), *added)
@@ -227,9 +229,7 @@ def levelled(
     return Bank(without=without, mean=means, covariance=covariances, weak_s=weak_s)
 
 
-def predict_bank(
-    bank: Bank, line: Line, dt: float, limits: TrackingLimits, map_scale: float
-) -> tuple[Floats, Floats]:
+def predict_bank(bank: Bank, line: Line, dt: float, limits: TrackingLimits, map_scale: float) -> tuple[Floats, Floats]:
     """Predict all sub-filters; that of the map lets it be wrong by `TrackingLimits.level_map_m`."""
     wrong = np.array([limits.level_map_m if name == "map" else 0.0 for name in bank.without])
     return predicted(bank.mean, bank.covariance, line, dt, limits, map_scale, map_sigma_m=wrong)

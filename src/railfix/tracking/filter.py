@@ -169,9 +169,8 @@ def _step(
         chosen, probability = surviving(state.mean, state.covariance, state.log_probability, state.origin_m, limits)
         state.mean, state.covariance = state.mean[chosen], state.covariance[chosen]
         state.log_probability, state.origin_m = probability, state.origin_m[chosen]
-        state.parent, state.log_code, state.log_least = (
-            values[chosen] for values in (state.parent, state.log_code, state.log_least)
-        )
+        state.parent, state.log_code = state.parent[chosen], state.log_code[chosen]
+        state.log_least = state.log_least[chosen]
         step.choose(chosen)
     if state.branch_s > TAKEOVER_AFTER_S and state.log_least[0] < TAKEOVER:
         state.across = ACROSS_TAKEN

@@ -28,7 +28,8 @@ from railfix.tracking.state import TrackState
 from railfix.tracking.thinned import Since, thinned
 
 _KEPT: Final = (
-    "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m", "amount_m", "status",
+    "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m", "amount_m",
+    "status",
 )  # fmt: skip
 
 

@@ -31,8 +31,8 @@ ACROSS_LOST: Final = 30.0
 ACROSS_TAKEN: Final = 60.0
 #: Probability of other places where the velocity contradicts the one that was sure: the map may be wrong just here.
 ELSEWHERE: Final = 0.01
-#: Mean of the places that codes ask for, over its standard deviation, and factor on the error of the map's lengths, from
-#: on which codes contradict motion: a step of all codes, a pull, or a map that is wrong.
+#: Mean of the places that codes ask for, over its standard deviation, and factor on the error of the map's lengths:
+#: beyond them codes contradict motion, by a step of all codes, a pull, or a map that is wrong.
 DRIFT_SIGMAS: Final = 5.0
 DRIFT_SCALE: Final = 6.0
 #: A displacement of the map across, by the sub-filter that lets it be wrong, is real beyond so many of its standard
@@ -116,7 +116,10 @@ def watch(
         withheld = limits.level_hold_s
     if state.bank is not None and "map" in state.bank.without:
         k = state.bank.without.index("map")
-        aside, variance = state.bank.mean[k, Unknown.MAP_RIGHT], state.bank.covariance[k, Unknown.MAP_RIGHT, Unknown.MAP_RIGHT]
+        aside, variance = (
+            state.bank.mean[k, Unknown.MAP_RIGHT],
+            state.bank.covariance[k, Unknown.MAP_RIGHT, Unknown.MAP_RIGHT],
+        )
         if abs(aside) > max(BESIDE_M, BESIDE_SIGMAS * float(np.sqrt(variance))):
             withheld = limits.level_hold_s
     if state.bank is not None and (state.bank.weak_s > limits.level_doubt_s).any():

@@ -16,6 +16,7 @@ from railfix.tracking.robust import mean_weight
 from railfix.tracking.rows import Kind, Rows
 from railfix.tracking.state import TrackState, Unknown
 
+
 class TrackStatus(IntEnum):
     """What the filter says of an epoch."""
 
@@ -130,8 +131,8 @@ class Tracked:
         size = len(time)
         names = (
             "arc_m", "sigma_m", "speed_mps", "speed_sigma_mps", "acceleration_mps2", "probability", "code_weight",
-            "motion_weight", "wheel_scale", "force_offset_mps2", "radar_scale", "map_scale", "level_m", "ground_level_m",
-            "level_noise_m", "level_speed_mps", "separation_m", "amount_m",
+            "motion_weight", "wheel_scale", "force_offset_mps2", "radar_scale", "map_scale", "level_m",
+            "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m", "amount_m",
         )  # fmt: skip
         return cls(
             time=time,

@@ -70,7 +70,7 @@ def compute_velocity(
     has : ndarray of bool, shape (3, T, K)
     interval_s : ndarray, shape (T,)
     """
-    known = np.isfinite(near_ecef_m).all(axis=1)
+    known = np.asarray(np.isfinite(near_ecef_m).all(axis=1))
     near = np.where(known[:, None], near_ecef_m, 1e6)
     receiver = near[:, None, :]
     sat = np.where(np.isfinite(sat_ecef_m), sat_ecef_m, 2.6e7)
@@ -88,7 +88,7 @@ def compute_velocity(
     by_phase = _solve(-sight, (measured[1] - distance + previous) / dt, variance[1] / dt**2, has[1], up)
     rate = measured[2] - moving / stretch
     by_doppler = _solve(gradient / stretch[..., None], rate, variance[2], has[2], up)
-    phase = np.isfinite(by_phase[0][:, 0])
+    phase = np.asarray(np.isfinite(by_phase[0][:, 0]))
     velocity = np.where(phase[:, None], by_phase[0], by_doppler[0])
     return Velocity(
         velocity_mps=np.where(known[:, None], velocity, np.nan),
@@ -104,7 +104,7 @@ def _solve(gradient: Floats, value: Floats, variance: Floats, has: Masks, up: Fl
         return np.full((epochs, 3), np.nan), np.full((epochs, 3, 3), np.nan)
     value = np.where(has, value, np.nan)
     count = has.sum(axis=1)
-    some = count > 0
+    some = np.asarray(count > 0)
     clock = np.zeros(epochs)
     clock[some] = np.nanmedian(value[some], axis=1)
     value = np.where(has, value - clock[:, None], 0.0)
@@ -123,6 +123,6 @@ def _solve(gradient: Floats, value: Floats, variance: Floats, has: Masks, up: Fl
     freedom = count - 3
     size = (weight * square).sum(axis=1) / np.maximum(freedom, 1)
     agreeing = np.where(has, weight, 0.0).sum(axis=1) >= _AGREEING * count
-    enough = (freedom >= _REDUNDANT) & agreeing
+    enough = np.asarray((freedom >= _REDUNDANT) & agreeing)
     spread = covariance[:, :3, :3] * np.maximum(size, 1.0)[:, None, None]
     return np.where(enough[:, None], solved[:, :3], np.nan), np.where(enough[:, None, None], spread, np.nan)

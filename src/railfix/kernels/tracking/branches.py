@@ -12,9 +12,7 @@ from railfix.kernels.tracking.update import evidence_of, motion_evidence
 
 
 @borrowing
-def reweigh(
-    course: Course, numbers: Numbers, rows: Rows, memory: Memory, work: Work, count: int, dt: float
-) -> None:
+def reweigh(course: Course, numbers: Numbers, rows: Rows, memory: Memory, work: Work, count: int, dt: float) -> None:
     """Update the probabilities of hypotheses by the evidence of an epoch (`railfix.tracking.branches.judged`)."""
     log_probability, log_code, places, after = memory.log_probability, memory.log_code, work.places, work.right
     travel, counts = memory.scalars[BRANCH_M], rows.counts

@@ -79,12 +79,12 @@ def gradient_at(course: Course, arc: float) -> float:
 
 @borrowing
 def onto_line(course: Course, reach_m: float, work: Work, h: int) -> float:
-    """Put a place a little beyond an end of the line on it (`railfix.tracking.branches.on_the_line`); return how far."""
+    """Put a place a little beyond an end on the line (`railfix.tracking.branches.on_the_line`); return how far."""
     mean, covariance = work.new_mean, work.new_covariance
     excess = min(max(mean[h, PLACE], course.start_m), course.end_m) - mean[h, PLACE]
     variance = covariance[h, PLACE, PLACE]
     if abs(excess) > 2.0 * math.sqrt(variance) and abs(excess) <= reach_m:
         for c in range(covariance.shape[1]):
             mean[h, c] += covariance[h, c, PLACE] / variance * excess
-        return abs(excess)
+        return float(abs(excess))
     return 0.0

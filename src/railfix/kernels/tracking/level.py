@@ -63,9 +63,7 @@ def _sources(epochs: Epochs, t: int, rows: Rows, bank: Subfilters, slots: int, b
 
 
 @borrowing
-def _begin(
-    bank: Subfilters, b: int, copied: bool, best: int, numbers: Numbers, work: Work, h: int
-) -> None:
+def _begin(bank: Subfilters, b: int, copied: bool, best: int, numbers: Numbers, work: Work, h: int) -> None:
     """Begin a sub-filter with the state of the filter, or with what is known of nothing but the place."""
     mean, spread = work.mean, work.spread
     width = mean.shape[1]

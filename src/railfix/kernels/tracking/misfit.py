@@ -47,7 +47,9 @@ def learn_map(scalars: Floats, shift: float, dt: float, numbers: Numbers) -> Non
     """Take an epoch's shift into the running mean, and raise or lower the error of the map's lengths."""
     dt = min(dt, 1.0)
     share = 1.0 - math.exp(-dt / numbers.map_misfit_s)
-    shift = 0.0 if abs(shift) > numbers.step_sigmas else min(max(shift, -numbers.misfit_clipped), numbers.misfit_clipped)
+    shift = (
+        0.0 if abs(shift) > numbers.step_sigmas else min(max(shift, -numbers.misfit_clipped), numbers.misfit_clipped)
+    )
     mean = (1.0 - share) * scalars[SHIFT] + share * shift
     variance = (1.0 - share) ** 2 * scalars[SHIFT_VARIANCE] + share**2
     scalars[SHIFT], scalars[SHIFT_VARIANCE] = mean, variance

@@ -31,7 +31,9 @@ from railfix.kernels.tracking.layout import (
 
 
 @borrowing
-def contradiction(epochs: Epochs, t: int, course: Course, numbers: Numbers, memory: Memory, work: Work, h: int) -> float:
+def contradiction(
+    epochs: Epochs, t: int, course: Course, numbers: Numbers, memory: Memory, work: Work, h: int
+) -> float:
     """Square of the velocity against that of the place over its variance; NaN without a velocity."""
     velocity, covariance, axes = epochs.velocity_mps, epochs.velocity_covariance, work.axes
     if not math.isfinite(velocity[t, 0]):
@@ -84,7 +86,10 @@ def watch(
             largest = max(largest, memory.log_probability[h])
         if largest < math.log(numbers.young):
             withheld = numbers.young_held_s
-    if scalars[SHIFT] ** 2 > numbers.drift_sigmas**2 * scalars[SHIFT_VARIANCE] or scalars[MAP_SCALE] > numbers.drift_log:
+    if (
+        scalars[SHIFT] ** 2 > numbers.drift_sigmas**2 * scalars[SHIFT_VARIANCE]
+        or scalars[MAP_SCALE] > numbers.drift_log
+    ):
         withheld = numbers.level_hold_s
     for b in range(len(bank.running)):
         if bank.running[b] and bank.weak_s[b] > numbers.level_doubt_s:

@@ -294,7 +294,9 @@ def _learn(
         scalars[scalar] = min(max(scalars[scalar], numbers.least_scale), numbers.largest_scale)
     code, motion = mean_weights(rows, work.variance, work, best)
     weak = motion < numbers.lost_motion_weight
-    scalars[WEAK_MOTION] = scalars[WEAK_MOTION] + dt if weak else max(scalars[WEAK_MOTION] - numbers.motion_leak * dt, 0.0)
+    scalars[WEAK_MOTION] = (
+        scalars[WEAK_MOTION] + dt if weak else max(scalars[WEAK_MOTION] - numbers.motion_leak * dt, 0.0)
+    )
     if code_s > 0.0:
         weak = code < numbers.lost_code_weight
         gone = max(scalars[WEAK_CODE] - numbers.code_leak * code_s, 0.0)
