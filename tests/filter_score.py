@@ -32,7 +32,7 @@ from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.bank import budget, kind_of
 
-CONFIG = parse_config({"filter": "track", "elevation": {"mask_deg": 15.0}})
+CONFIG = parse_config({"filter": "track"})
 #: Noise of the smartLoc receiver's codes against the weights, as a variance (docs/recordings: about 8).
 SMARTLOC_SCALE = float(np.sqrt(8.0))
 

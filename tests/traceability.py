@@ -45,6 +45,7 @@ ROWS: Final[dict[str, dict[str, str]]] = {
         "C2": "protection level along the track with a railway error model",
         "C3": "model of the residual multipath and receiver noise from recorded runs",
         "C4": "Stanford diagram on the along-track axis",
+        "C6": "level of the filter on every branch, and under a wrong map, wrong Dopplers, phases and codes",
     },
     "Truth and evaluation": {
         "D1": "reference position from RTK, axle pulses, Doppler and acceleration",
@@ -66,6 +67,7 @@ ROWS: Final[dict[str, dict[str, str]]] = {
         "F3": "redundant encrypted links with fail-over",
         "F4": "running intervals: no two occupied ones ever overlap",
         "F5": "routes: position reports set and lock points and signals",
+        "F6": "train integrity, length and plausibility of reports; stop of one train and its neighbours",
     },
     "Scale and use": {
         "G1": "campaigns: hundreds of logs on many cores or machines, resumable, one table of results",

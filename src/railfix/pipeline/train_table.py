@@ -48,13 +48,19 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             "predicted too far; `not_started`; `off_map`, no place, the satellites put the train away from the line; "
             "`map_offset`, a place on a line that 3-D positions of the last minutes lie beside or above; "
             "`antennas_disagree`, the places of the two antennas are not as far apart as the antennas, or their "
-            "speeds differ, now or within the last 20 s",
+            "speeds differ, now or within the last 20 s; `doubtful`, a place that measurements or a sub-filter "
+            "contradict. `tracking` and `coasting` have a finite level along the line, no other status has (where levels "
+            "are on)",
             lambda r: r.tracked.status,
             words=tuple(s.text for s in TrackStatus),
         ),
         Column("chainage_m", "distance along the line from the first point of the track", lambda r: r.chainage_m),
         Column("kilometrage_m", "the line's own marking, where the track has one", lambda r: r.kilometrage_m),
-        Column("along_sigma_m", "standard deviation along the line", lambda r: r.tracked.sigma_m),
+        Column(
+            "along_sigma_m",
+            "standard deviation of the place, with the straight distance to other branches in it",
+            lambda r: r.tracked.sigma_m,
+        ),
         Column("speed_mps", "along the line, + toward rising chainage", lambda r: r.tracked.speed_mps),
         Column("speed_sigma_mps", "its standard deviation", lambda r: r.tracked.speed_sigma_mps),
         Column("acceleration_mps2", "along the line", lambda r: r.tracked.acceleration_mps2),
@@ -73,14 +79,22 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("hypotheses", "places that are possible", lambda r: r.tracked.hypotheses, dtype=pl.Int16()),
         Column(
             "protection_level_m",
-            "the error exceeds it with the stated risk, a fault of one source included; infinite without "
-            "a sub-filter and where the weights contradict the track, empty with `tracking.level` off",
+            "the error along the line exceeds it with the stated risk, a fault of one source, a wrong map and other "
+            "branches included; infinite where another place of the line is more probable than the risk or "
+            "measurements contradict the place; empty with `tracking.level` off",
             lambda r: r.tracked.level_m,
+        ),
+        Column(
+            "protection_level_ground_m",
+            "the same of the straight distance on the ground: on another lap or strand of the same street the place is "
+            "right within it though the chainage is not",
+            lambda r: r.tracked.ground_level_m,
         ),
         Column("protection_noise_m", "its part by noise without a fault", lambda r: r.tracked.level_noise_m),
         Column(
             "protection_separation_m",
-            "largest distance of a sub-filter without one satellite, constellation or sensor",
+            "largest distance of a sub-filter without one satellite, constellation, sensor, all Dopplers or phases, or "
+            "with a map that may be wrong",
             lambda r: r.tracked.separation_m,
         ),
         Column(

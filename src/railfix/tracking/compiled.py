@@ -16,7 +16,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.timescale import seconds, timedelta
-from railfix.tracking import bank, branches, clocks, misfit, monitors, possible_speed, predict, rows
+from railfix.tracking import bank, branches, clocks, faulty, misfit, monitors, possible_speed, predict, rows
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.epochs import SensorEpochs
 from railfix.tracking.limits import TrackingLimits
@@ -141,6 +141,7 @@ class Compiled:
             log_probability=_own(state.log_probability),
             log_code=_own(state.log_code),
             log_least=_own(state.log_least),
+            code_bias=_own(state.code_bias),
             origin_m=_own(state.origin_m),
             offset_known=_own(state.offset_known),
             scalars=scalars,
@@ -250,6 +251,7 @@ class Compiled:
         state.log_probability = memory.log_probability[:count].copy()
         state.log_code = memory.log_code[:count].copy()
         state.log_least = memory.log_least[:count].copy()
+        state.code_bias = memory.code_bias.copy()
         state.origin_m = memory.origin_m[:count].copy()
         state.time = self.chunk.time[done - 1]
         _, motion, code, doppler, phase, unaided, direction, measured, *learnt = memory.scalars.tolist()
@@ -381,6 +383,11 @@ def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
         "expired": int(TrackStatus.EXPIRED),
         "unsure": int(TrackStatus.DOUBTFUL),
         "motion_leak": clocks.MOTION_LEAK,
+        "bias_memory_s": faulty.MEMORY_S,
+        "bias_most": faulty.MOST,
+        "bias_faulty": faulty.FAULTY,
+        "bias_inflated": faulty.INFLATED,
+        "freed_m": faulty.FREED_M,
         "code_leak": clocks.CODE_LEAK,
         "misfit_most": misfit.MOST_SIGMAS,
         "reach_sigmas": monitors.REACH_SIGMAS,

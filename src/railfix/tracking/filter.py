@@ -25,6 +25,7 @@ from railfix.tracking.chunk import Chunk, code_interval_s, leave, prepared
 from railfix.tracking.clocks import clocks_of_epoch, learn
 from railfix.tracking.compiled import Compiled
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
+from railfix.tracking.faulty import FREED_M, INFLATED, is_faulty, update_bias
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.misfit import code_shift, learn_map
@@ -128,6 +129,7 @@ def _step(
         return
     if anew:
         fresh = np.flatnonzero(chunk.fresh[epoch])
+        state.code_bias = np.where(chunk.fresh[epoch], 0.0, state.code_bias)
         state.mean, state.covariance = begun_anew(state.mean, state.covariance, SATELLITES + fresh)
         if state.bank is not None:
             means, covariances = begun_anew(state.bank.mean, state.bank.covariance, SATELLITES + fresh)
@@ -144,7 +146,9 @@ def _step(
         return
     code_s = code_interval_s(chunk, epoch, state.coded, limits)
     if code_s > 0.0:
-        chunk.variance[0, epoch] /= min(code_s, 1.0)
+        faulty = is_faulty(state.code_bias, chunk.slot) & chunk.has[0, epoch]
+        chunk.variance[0, epoch] *= np.where(faulty, INFLATED, 1.0) / min(code_s, 1.0)
+        result.faulty[epoch] = faulty
     else:
         chunk.has[0, epoch] = False
     mean = state.mean
@@ -269,8 +273,24 @@ def _measure(
     )
     square = contradiction(velocity, spread, float(age_s), state.mean[best], state.covariance[best], line)
     watch(state, square, 0.0 if best else shift, float(pushed[best]), dt, code_s, limits)
+    if rows.bounds[0]:
+        channel = rows.column[rows.codes]
+        sigma = chunk.code_sigma_m[epoch, channel] * np.sqrt(1.0 + limits.code_white_share**2)
+        value = rows.value[best, rows.codes]
+        state.code_bias, found = update_bias(state.code_bias, chunk.slot[channel], value, sigma, code_s)
+        if found:
+            state.covariance = _freed(state.covariance)
+            if state.bank is not None:
+                state.bank = replace(state.bank, covariance=_freed(state.bank.covariance))
     write_rows(result, epoch, rows, rows.value[best], update.weight[best])
     return True
+
+
+def _freed(covariance: Floats) -> Floats:
+    """Covariances with a place that a faulty satellite may have led away, shape (H, N, N)."""
+    freed = covariance.copy()
+    freed[:, Unknown.PLACE, Unknown.PLACE] += FREED_M**2
+    return freed
 
 
 def tells_motion(rows: Rows) -> bool:

@@ -71,13 +71,20 @@ class TrackingLimits(Settings):
     map_absolute_m : float
         Length over which the absolute error of the map changes (sigmas are those of the trajectory).
     map_branch_m : float
-        Distance of two branches at which half of their difference is the map's: three times an error of 1 m, that of
-        a track surveyed by car or train.
+        Distance of two branches at which half of their difference is the map's: three times an error of 2 m.
+    code_common_m : float
+        Standard deviation of an error that the codes have in common across the line: reflections off one side of a
+        street.
+    code_common_s, code_common_travel_m : float
+        Time and distance over which that error lasts.
+    branch_floor, branch_floor_m : float
+        Codes alone leave a branch within this distance of the most probable one at least this probability.
     decided_travel_m : float
         Hypotheses are dropped only after this much travel: before, motion does not separate branches.
     least_probability : float
-        Hypotheses below it are dropped.
+        Hypotheses below it are dropped: a hundredth of the risk of an independent error.
     most_hypotheses : int
+        Of more places at a start the most probable ones are taken.
     start_sigma_m : float
         Standard deviation of a hypothesis about its place when it begins.
     start_separation_m : float
@@ -85,8 +92,8 @@ class TrackingLimits(Settings):
     gap_s : float
         Time without measurements after which places are sought again beside the predicted one.
     lost_motion_weight, lost_motion_s, lost_code_weight, lost_code_s : float
-        The track is lost when the mean weight of Dopplers and phases, or of codes, stays below these for so long
-        (1 is the weight of an error of one standard deviation).
+        The track is lost when the mean weight of Dopplers and phases, or of codes, has been below these for so long
+        (1 is the weight of an error of one standard deviation); epochs above them count down.
     bend_m : float
         Where motion contradicts the track at an epoch, places so far before and behind (and twice as far) are tried.
     level : {"on", "off"}
@@ -113,9 +120,16 @@ class TrackingLimits(Settings):
         and up. An assumption.
     level_passes : int
         Rounds of reweighting of the sub-filters.
-    level_doubt_s : float
-        A filter that its own measurements contradict (mean weights as of a lost track) for longer bounds nothing. A
-        contradiction of single epochs is noise, which the weights have in the standard deviation.
+    level_doubt_s, level_doubt_code_s : float
+        A filter that its own Dopplers and phases, or its codes, contradict (mean weights as of a lost track) for longer
+        bounds nothing. A contradiction of single epochs is noise, which the weights have in the standard deviation.
+    level_start_s : float
+        After a start no level before one place has a probability of 0.99, for at most so long; none for so long after
+        the track was lost.
+    level_hold_s : float
+        A level that is withheld comes back so long after the last contradiction.
+    end_doubt_s : float
+        At an open end of the line, pushed beyond it with motion in doubt for so long, the track is lost.
     expired_sigma_m : float
         Standard deviation from which on a predicted place is no position.
     """

@@ -94,6 +94,9 @@ class Tracked:
     sensed : ndarray, shape (T, len(Kind) - 3)
         The same of the sensors, in the order of `Kind`; of several ranges the last.
     weight : ndarray, shape (T, 3, K)
+        0 for codes that are left out.
+    faulty : ndarray of bool, shape (T, K)
+        Codes that are left out (`railfix.tracking.faulty`).
     """
 
     time: Datetimes
@@ -121,6 +124,7 @@ class Tracked:
     innovation: Floats
     sensed: Floats
     weight: Floats
+    faulty: Masks
 
     def __len__(self) -> int:
         return len(self.time)
@@ -142,6 +146,7 @@ class Tracked:
             innovation=np.full((size, 3, channels), np.nan),
             sensed=np.full((size, len(Kind) - 3), np.nan),
             weight=np.full((size, 3, channels), np.nan),
+            faulty=np.zeros((size, channels), dtype=np.bool_),
             **{name: np.full(size, np.nan) for name in names},
         )
 
@@ -149,6 +154,8 @@ class Tracked:
 def write_rows(result: Tracked, epoch: int, rows: Rows, innovation: Floats, weight: Floats) -> None:
     """Innovations and weights of the best hypothesis."""
     end = rows.bounds[2]
+    weight = weight.copy()
+    weight[rows.codes][result.faulty[epoch, rows.column[rows.codes]]] = 0.0
     result.innovation[epoch, rows.kind[:end], rows.column[:end]] = innovation[:end]
     result.weight[epoch, rows.kind[:end], rows.column[:end]] = weight[:end]
     result.sensed[epoch, rows.kind[end:] - 3] = innovation[end:]

@@ -126,6 +126,8 @@ class TrackState:
     step_s, withheld_s, open_s : float [s]
         How long all codes have asked for another place, how long the level is withheld still, and how long that along
         the line, as other places of it were more probable than the risk.
+    code_bias : ndarray, shape (N - SATELLITES,)
+        Mean innovation of each satellite's codes (`railfix.tracking.faulty`).
     log_least : ndarray, shape (H,)
         Least logarithm of the probability lately: it rises with time (`railfix.tracking.branches.LEAST_RISE`).
     branch_s, branch_m : float [s], [m]
@@ -183,6 +185,7 @@ class TrackState:
     code_shift: tuple[float, float] = (0.0, 0.0)
     map_log_scale: float = 0.0
     log_code: Floats = field(default_factory=lambda: np.empty(0))
+    code_bias: Floats = field(default_factory=lambda: np.empty(0))
     log_least: Floats = field(default_factory=lambda: np.empty(0))
     across: float = 0.0
     step_s: float = 0.0
@@ -242,6 +245,7 @@ class TrackState:
         self.log_probability = self.log_code = self.log_least = self.origin_m = np.empty(0)
         self.branch_s = self.branch_m = self.across = self.step_s = 0.0
         self.offset_known = np.zeros(len(CLOCKS), dtype=np.bool_)
+        self.code_bias = np.zeros(len(self.satellite))
         self.weak_motion_s = self.weak_code_s = self.unaided_m = self.direction = 0.0
         self.code_shift = self.log_scale = (0.0, 0.0)
         self.map_log_scale = 0.0
@@ -264,6 +268,7 @@ class TrackState:
             mean, covariance = _rearranged(self.bank.mean, self.bank.covariance, index, len(new))
             self.bank = replace(self.bank, mean=mean, covariance=covariance)
         self.satellite = np.array([*self.satellite[kept].tolist(), *new], dtype=np.str_)
+        self.code_bias = np.concatenate([self.code_bias[kept], np.zeros(len(new))])
         unseen = np.full(len(new), np.datetime64("NaT", "ns"), dtype="datetime64[ns]")
         self.seen = np.concatenate([self.seen[kept], unseen])
 

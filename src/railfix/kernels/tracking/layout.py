@@ -157,6 +157,12 @@ class Numbers(NamedTuple):
     scale_bound: float
     joined: float
     motion_leak: float
+    code_white_share: float
+    bias_memory_s: float
+    bias_most: float
+    bias_faulty: float
+    bias_inflated: float
+    freed_m: float
     code_leak: float
     level_doubt_code_s: float
     misfit_most: float
@@ -212,6 +218,7 @@ class Memory(NamedTuple):
     log_probability: Floats
     log_code: Floats
     log_least: Floats
+    code_bias: Floats
     origin_m: Floats
     offset_known: Masks
     scalars: Floats
@@ -339,3 +346,4 @@ class Answers(NamedTuple):
     innovation: Floats
     sensed: Floats
     weight: Floats
+    faulty: Masks

@@ -72,7 +72,7 @@ def _left_to_numpy(epochs: Epochs, t: int, course: Course, numbers: Numbers, mem
 
 
 @borrowing
-def _code_interval_s(epochs: Epochs, t: int, numbers: Numbers, memory: Memory) -> float:
+def _code_interval_s(epochs: Epochs, t: int, numbers: Numbers, memory: Memory, answers: Answers) -> float:
     """Time that the codes of an epoch stand for (`railfix.tracking.chunk.code_interval_s`), in force from here on."""
     dt, since, coded = epochs.interval_s[t], epochs.time_s[t] - memory.scalars[CODED], False
     for k in range(epochs.has.shape[2]):
@@ -84,8 +84,13 @@ def _code_interval_s(epochs: Epochs, t: int, numbers: Numbers, memory: Memory) -
     for k in range(epochs.has.shape[2]):
         if recent:
             epochs.has[0, t, k] = False
-        else:
-            epochs.variance[0, t, k] /= min(code_s, 1.0)
+            continue
+        epochs.variance[0, t, k] /= min(code_s, 1.0)
+        slot = epochs.slot[k]
+        if slot >= 0 and epochs.has[0, t, k] and not epochs.fresh[t, slot]:
+            answers.faulty[t, k] = abs(memory.code_bias[slot]) > numbers.bias_faulty
+            if answers.faulty[t, k]:
+                epochs.variance[0, t, k] *= numbers.bias_inflated
     return float(code_s)
 
 
@@ -130,6 +135,7 @@ def _forget(epochs: Epochs, t: int, active: Active, memory: Memory, bank: Subfil
     for i in range(epochs.fresh.shape[1]):
         if epochs.fresh[t, i]:
             k = active.satellite[i]
+            memory.code_bias[i] = 0.0
             for h in range(int(memory.scalars[HYPOTHESES])):
                 memory.mean[h, k] = 0.0
                 restart(memory.covariance, k, 1.0, h)
@@ -266,6 +272,7 @@ def _update(
 
 @borrowing
 def _learn(
+    epochs: Epochs,
     numbers: Numbers,
     memory: Memory,
     answers: Answers,
@@ -276,8 +283,12 @@ def _learn(
     shift: float,
     dt: float,
     code_s: float,
-) -> None:
-    """Learn the noise of phases and Dopplers and the error of the map; write weights and innovations."""
+) -> bool:
+    """Learn the noise of phases and Dopplers and the error of the map; write weights and innovations.
+
+    Returns whether another satellite's codes are left out from here on.
+    """
+    found = False
     scalars, weight, innovation = memory.scalars, work.weight, work.innovation
     nc, nph, nd = rows.counts[0], rows.counts[1], rows.counts[2]
     gnss = nc + nph + nd
@@ -307,11 +318,20 @@ def _learn(
         kind = 0 if i < nc else (1 if i < nc + nph else 2)
         k = rows.codes[i] if kind == 0 else (rows.phases[i - nc] if kind == 1 else rows.dopplers[i - nc - nph])
         answers.innovation[t, kind, k] = innovation[best, i]
-        answers.weight[t, kind, k] = weight[best, i]
-        answers.used[t, kind] += weight[best, i] > 0.5
+        left_out = kind == 0 and answers.faulty[t, k]
+        answers.weight[t, kind, k] = 0.0 if left_out else weight[best, i]
+        answers.used[t, kind] += weight[best, i] > 0.5 and not left_out
+        if kind == 0:
+            slot, sigma = epochs.slot[k], epochs.code_sigma_m[t, k] * math.sqrt(1.0 + numbers.code_white_share**2)
+            away = min(max(innovation[best, i] / sigma, -numbers.bias_most), numbers.bias_most)
+            share = 1.0 - math.exp(-min(code_s, 1.0) / numbers.bias_memory_s)
+            before = abs(memory.code_bias[slot])
+            memory.code_bias[slot] += share * (away - memory.code_bias[slot])
+            found = found or before <= numbers.bias_faulty < abs(memory.code_bias[slot])
     for j in range(rows.counts[3]):
         answers.used[t, 3 + rows.sensors[j]] += weight[best, gnss + j] > 0.5
         answers.sensed[t, rows.sensors[j]] = innovation[best, gnss + j]
+    return found
 
 
 @borrowing
@@ -403,7 +423,7 @@ def advance(
     for t in range(first, last):
         if _left_to_numpy(epochs, t, course, numbers, memory):
             return t
-        code_s = _code_interval_s(epochs, t, numbers, memory)
+        code_s = _code_interval_s(epochs, t, numbers, memory, answers)
         if not _choose_rows(epochs, t, numbers, memory, rows):
             return t
         count, dt, map_scale = int(scalars[HYPOTHESES]), epochs.interval_s[t], scalars[MAP_SCALE]
@@ -428,9 +448,14 @@ def advance(
             _coast(epochs, t, course, numbers, active, memory, bank, work, room)
         best = most_probable(memory.log_probability, count, numbers.switch)
         if measured:
-            _learn(numbers, memory, answers, rows, work, t, best, shift, dt, code_s)
+            found = _learn(epochs, numbers, memory, answers, rows, work, t, best, shift, dt, code_s)
             if len(bank.running):
                 advance_subfilters(epochs, t, course, numbers, active, bank, rows, best, map_scale, work, room)
+            if found:
+                for h in range(count):
+                    memory.covariance[h, PLACE, PLACE] += numbers.freed_m**2
+                for b in range(len(bank.running)):
+                    bank.covariance[b, PLACE, PLACE] += numbers.freed_m**2
         aided = rows.counts[0] > 0
         if measured:
             square = contradiction(epochs, t, course, numbers, memory, work, best)
