@@ -2,8 +2,8 @@
 
 ``python tests/belief_campaign.py`` runs the recordings beside the checkout; ``python tests/belief_campaign.py FOLDER
 ...`` runs folders with a ``case.toml`` that names ``log``, ``nav``, ``track`` and ``truth`` (a track map and a
-reference as ``railfix evaluate`` reads them). Every trial is the pipeline with its defaults from a cold start; ``--mask`` changes
-the elevation mask, ``--set`` a setting of the filter.
+reference as ``railfix evaluate`` reads them). Every trial is the pipeline with its defaults from a cold start;
+``--mask`` changes the elevation mask, ``--set`` a setting of the filter.
 
 Whole recordings first (``--whole``), then a cold start every ``--every`` seconds, ``--length`` seconds each; with
 ``--faults`` instead faults of one satellite, one constellation, all Dopplers, all phases, a step of all codes, the map,

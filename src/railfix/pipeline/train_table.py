@@ -49,8 +49,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             "`map_offset`, a place on a line that 3-D positions of the last minutes lie beside or above; "
             "`antennas_disagree`, the places of the two antennas are not as far apart as the antennas, or their "
             "speeds differ, now or within the last 20 s; `doubtful`, a place that measurements or a sub-filter "
-            "contradict. `tracking` and `coasting` have a finite level along the line, no other status has (where levels "
-            "are on)",
+            "contradict. With levels, `tracking` and `coasting` have a finite one along the line, no other status has",
             lambda r: r.tracked.status,
             words=tuple(s.text for s in TrackStatus),
         ),

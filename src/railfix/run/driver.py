@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
@@ -312,6 +312,10 @@ def _position(
     return tally
 
 
+#: Satellites left out by the filter that notes name.
+_NAMED: Final = 3
+
+
 def notes_of(
     line: Line, navigation: Navigation, tally: Tally, logs: Mapping[Antenna, Log], *, note_statistic: float
 ) -> tuple[str, ...]:
@@ -326,6 +330,11 @@ def notes_of(
         if antenna.never_recorded:
             seen = ", ".join(antenna.never_recorded)
             notes.append(f"{name}: satellites seen without any usable navigation record: {seen}")
+        for satellite, (count, first) in sorted(antenna.left_out.items(), key=lambda item: -item[1][0])[:_NAMED]:
+            notes.append(
+                f"{name}: the filter left out the codes of {satellite} at {count} epochs from {str(first)[:19]} on: "
+                "over a minute they contradict all others"
+            )
         offset = antenna.map_offset
         if offset is not None and offset.statistic > note_statistic:
             doubt = "contradicts the positions" if antenna.status["map_offset"] else "may be wrong"

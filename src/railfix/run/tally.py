@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings
 from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.integrity.protection import Cause, LevelStatus
+from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.processor import AntennaResult, Result
 
@@ -84,6 +85,8 @@ class AntennaTally:
         Epochs without a level because more faults than can be left out are likelier than the risk allows.
     map_offset : MapOffsetFound or None
         Where the 3-D positions contradicted the map most; None before there were enough.
+    left_out : dict of str to (int, datetime64[ns])
+        Epochs at which the filter left a satellite's codes out, and the first of them.
     """
 
     min_satellites: int = 3
@@ -108,6 +111,7 @@ class AntennaTally:
     level_status: Counter[str] = field(default_factory=Counter)
     without_budget: int = 0
     map_offset: MapOffsetFound | None = None
+    left_out: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
     map_detectable_m: Floats = field(default_factory=lambda: np.full((2, 2), np.nan))
 
     def add(self, result: AntennaResult) -> None:
@@ -137,6 +141,14 @@ class AntennaTally:
             levels = np.bincount(result.protection.status, minlength=len(LevelStatus))
             self.level_status.update({s.name.lower(): int(levels[s]) for s in LevelStatus})
             self.without_budget += int(np.count_nonzero(result.protection.level.cause == Cause.BUDGET))
+
+    def add_filter(self, filtered: AlongTrack, satellite: Strings) -> None:
+        """Count the satellites, by channel of the filter, whose codes it left out in one more chunk."""
+        faulty = filtered.tracked.faulty
+        for k in np.flatnonzero(faulty.any(axis=0)).tolist():
+            name, first = str(satellite[k]), filtered.time[int(np.argmax(faulty[:, k]))]
+            before = self.left_out.get(name, (0, first))
+            self.left_out[name] = (before[0] + int(faulty[:, k].sum()), before[1])
 
     def _add_map_offset(self, result: AntennaResult) -> None:
         """Keep the window that contradicts the map most."""
@@ -226,6 +238,7 @@ class AntennaTally:
             "observations_rejected_by_one_reason_alone": dict(self.only_reason),
             "satellites_seen": dict(sorted(self.satellites.items())),
             "satellites_without_any_record": self.never_recorded,
+            "satellites_left_out_by_the_filter": {s: n for s, (n, _) in sorted(self.left_out.items())},
         }
 
 
@@ -259,7 +272,10 @@ class Tally:
     def add(self, result: Result) -> None:
         """Count one more chunk."""
         for name, antenna in result.antennas.items():
-            self.antennas.setdefault(name, AntennaTally(min_satellites=self.min_satellites)).add(antenna)
+            tally = self.antennas.setdefault(name, AntennaTally(min_satellites=self.min_satellites))
+            tally.add(antenna)
+            if name in result.fusion:
+                tally.add_filter(result.fusion[name], antenna.satellite[antenna.columns])
         self.notes.update(dict.fromkeys(result.notes))
 
     def compare(self, positions: Mapping[str, pl.DataFrame]) -> None:

@@ -1,0 +1,74 @@
+"""Satellites whose codes are wrong for long: found, left out, and named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import belief_campaign
+from railfix.core.timescale import seconds
+from railfix.pipeline.config import Config
+from railfix.run.processor import processor_of
+from railfix.run.tally import Tally
+from railfix.tracking import Kind, TrackState, track
+from railfix.tracking.faulty import FAULTY, is_faulty, update_bias
+from tracking_cases import part, ride
+
+
+@pytest.mark.requirement("E5")
+def test_the_mean_of_clipped_innovations_by_hand() -> None:
+    bias, found = update_bias(
+        np.array([0.0, 0.34, 0.5]), np.array([0, 1]), np.array([-40.0, 30.0]), np.full(2, 10.0), 1.0
+    )
+    share = 1.0 - np.exp(-1.0 / 60.0)
+    np.testing.assert_allclose(bias, [-share, 0.34 + share * 0.66, 0.5])
+    assert found == (bias[1] > FAULTY)
+    np.testing.assert_array_equal(
+        is_faulty(bias, np.array([2, 0, -1, 1])), [True, False, False, bool(bias[1] > FAULTY)]
+    )
+
+
+@pytest.mark.requirement("E5", "C6")
+@pytest.mark.parametrize("size_m", [-40.0, 25.0])
+def test_a_code_that_stays_wrong_is_left_out_and_comes_back(size_m: float) -> None:
+    case = ride(400, noise=1.0, seed=3, code_sigma_m=4.0, speed_mps=lambda t: np.clip(0.5 * (t - 10.0), 0.0, 5.0))
+    code = case.epochs.code_m.copy()
+    code[30:230, 4] += size_m
+    epochs = replace(case.epochs, code_m=code)
+    found, _ = track(epochs, case.line)
+    left_out = found.faulty[:, 4]
+    assert 30 < np.argmax(left_out) < 130
+    assert left_out[200:230].all()
+    assert not left_out[330:].any()
+    assert not np.delete(found.faulty, 4, axis=1).any()
+    assert (found.weight[left_out, Kind.CODE, 4] == 0.0).all()
+    assert np.abs(found.arc_m - case.arc_m)[150:].max() < 4.0
+    # cut anywhere, the same
+    state: TrackState | None = None
+    pieces = []
+    for begin, end in ((0, 70), (70, 71), (71, 400)):
+        some, state = track(part(epochs, slice(begin, end)), case.line, state)
+        pieces.append(some.faulty)
+    np.testing.assert_array_equal(np.concatenate(pieces), found.faulty)
+
+
+@pytest.mark.requirement("E5", "C6")
+@pytest.mark.parametrize(("satellite", "size_m"), [("C27", 20.0), ("G21", 20.0)])
+def test_a_faulty_satellite_of_a_recording_is_named_within_150_s(
+    recordings: Path, satellite: str, size_m: float
+) -> None:
+    case = belief_campaign._recordings(recordings)["f9p"]().part(0, 200)
+    obs = case.observations
+    obs = replace(obs, code_m=obs.code_m + size_m * (obs.satellite == satellite))
+    processor = processor_of(Config(filter="track"), case.navigation, {"front": case.trajectory})
+    result, _ = processor.process({"front": obs})
+    tally = Tally()
+    tally.add(result)
+    count, first = tally.antennas["front"].left_out[satellite]
+    assert count > 40
+    assert float(seconds(first - obs.time[0])) <= 150.0
+    judged = belief_campaign.judged(replace(case, observations=obs), result.fusion["front"].tracked)
+    assert not (judged.over | judged.over_chainage).any()
