@@ -36,7 +36,7 @@ def test_five_stages_by_hand_are_the_pipeline_to_a_millimetre(names: dict[str, A
     used = np.isfinite(names["sight"][1]) & (found.reason[:, found.columns] == 0)
     assert used.sum() > 10_000
     np.testing.assert_allclose(names["codes"].code_m[used], code[used], rtol=0.0, atol=3e-3)
-    np.testing.assert_allclose(names["codes"].sigma_m[used], sigma[used], rtol=1e-4)
+    np.testing.assert_allclose(names["codes"].sigma_m[used], sigma[used], rtol=1e-3)
 
 
 @pytest.mark.requirement("A3")
