@@ -213,6 +213,58 @@ def test_another_table_of_the_same_run_stands_beside_the_positions(tmp_path: Pat
     assert result.exit_code == 3  # no log to look for a reference beside; both tables were asked for
 
 
+def test_an_outage_by_hand(tmp_path: Path):
+    """Six epochs without a satellite from 04 on; the reference is too bad at 06, the last has no position."""
+    time, place = np.arange(14.0), 100.0 + 10.0 * np.arange(14.0)
+    tunnel = (time >= 4) & (time < 10)
+    error = np.array([0.0] * 4 + [1.0, -2.0, 50.0, 3.0, -4.0, np.nan] + [0.0] * 4)
+    sigma = np.array([0.5] * 4 + [1.0, 1.5, 2.0, 2.5, 3.0, 3.5] + [0.5] * 4)
+    answer = np.where(tunnel, np.nan, place)
+    status = np.where(tunnel, "no_observation", "ok").tolist()
+    run = write_run(tmp_path / "run", time, answer, status=status)
+    places = at(place + error)
+    pl.read_parquet(run / "positions.parquet").select("time_gpst", "antenna").with_columns(
+        status=pl.Series(np.where(tunnel, "coasting", "tracking")),
+        chainage_m=pl.Series(place + error, nan_to_null=True),
+        along_sigma_m=pl.Series(sigma),
+        branch_probability=pl.Series(np.full(14, 0.9995)),
+        sources=pl.Series(np.where(tunnel, "wheel", "code")),
+        **{f"{axis}_m": pl.Series(places[:, i], nan_to_null=True) for i, axis in enumerate("xyz")},
+    ).write_parquet(run / "train.parquet")
+    truth = reference(time, place, sigma_m=np.where(time == 6.0, 5.0, 0.1))
+    found = evaluate_runs([RunAndReference(run=run, reference=truth, table=name) for name in ("positions", "train")])
+    assert found.outages is not None
+    (outage,) = found.outages.to_dicts()
+    assert outage["begin_gpst"] == (START + np.timedelta64(4, "s")).astype("datetime64[us]").item()
+    assert (outage["duration_s"], outage["epochs"], outage["positions"]) == (6.0, 6, 5)
+    expected = {"p50": 2.5, "p95": np.percentile([1.0, 2.0, 3.0, 4.0], 95.0), "max": 4.0}
+    assert {name: outage[f"outage_{name}_m"] for name in expected} == pytest.approx(expected, abs=1e-6)
+    assert outage["end_error_m"] == pytest.approx(-4.0, abs=1e-6)
+    assert outage["end_sigma_m"] == 3.0
+    assert outage["largest_normalised"] == pytest.approx(4.0 / 3.0, abs=1e-6)
+
+
+def test_percentiles_of_gaps_and_levels_by_hand(tmp_path: Path):
+    """Positions at 20 of 101 epochs with ever longer gaps; levels of 1 to 20 m."""
+    time, place = np.arange(101.0), 100.0 + 10.0 * np.arange(101.0)
+    has = np.zeros(101, dtype=bool)
+    instants = np.cumsum([0, *range(1, 13)])
+    has[instants] = True
+    level = np.full(101, np.nan)
+    level[instants] = np.arange(1.0, 14.0)
+    run = write_run(tmp_path / "run", time, np.where(has, place, np.nan), along_protection_level_m=level)
+    found = evaluate_run(run, reference(time, place))
+    row = found.intervals.filter(position="constrained").row(0, named=True)
+    gaps = np.arange(1.0, 13.0)
+    for name, scale in (("gap_{}_s", 1.0), ("interval_{}_m", 10.0)):
+        for percent in (50, 95):
+            expected = scale * np.percentile(gaps, percent)
+            assert row[name.format(f"p{percent}")] == pytest.approx(expected, abs=1e-6), (name, percent)
+    assert found.levels is not None
+    levels = found.levels.filter(position="constrained").row(0, named=True)
+    assert (levels["level_p50_m"], levels["level_p95_m"]) == pytest.approx((7.0, 12.4))
+
+
 def test_the_conventional_position_of_another_run_on_the_same_log(tmp_path: Path):
     time, place = np.arange(6.0), np.arange(100.0, 160.0, 10.0)
     run = write_run(tmp_path / "run", time, place + 1.0, conventional=np.where(time < 2, np.nan, place + 2.0))

@@ -19,6 +19,7 @@ from railfix.pipeline.results import Result
 from railfix.pipeline.tables import observations_table, positions_table
 from railfix.pipeline.train_table import train_table
 from railfix.report.runs import ReportedRun
+from railfix.report.tables import _merit as merit_row
 from railfix.report.tables import budget, summary
 from railfix.run import RunOptions, RunSummary, run_files
 from railfix.run.processor import processor_of
@@ -188,6 +189,9 @@ def test_a_reason_alone_is_counted_apart_from_one_among_others() -> None:
     tally.add(result_of(reasons, ["G01", "G02", "G03", "G04"], [Status.OK] * 2))
     assert dict(tally.first_reason) == {"elevation_mask": 3, "cn0_floor": 2}
     assert dict(tally.only_reason) == {"elevation_mask": 1, "cn0_floor": 2}
+    told = tally.as_dict()
+    assert told["observations_rejected_by_first_reason"] == {"elevation_mask": 3, "cn0_floor": 2}
+    assert told["observations_rejected_by_one_reason_alone"] == {"elevation_mask": 1, "cn0_floor": 2}
 
 
 @pytest.mark.requirement("D2")
@@ -210,3 +214,15 @@ def test_the_report_states_both_rates() -> None:
     epochs = {str(row[0]).strip(): str(row[1]) for row in budget(run)[0].rows}  # type: ignore[union-attr]
     assert epochs["positioning rate"] == "90.00 %"
     assert epochs["rate of ok"] == "60.00 %"
+    assert [epochs[name] for name in ("epochs", "with observations", "with position")] == ["200", "100", "90"]
+
+
+@pytest.mark.requirement("D2")
+def test_a_row_of_merits_has_each_figure_once() -> None:
+    names = ["errors", "rate", "mean_m", "std_m", "p50_m", "p95_m", "p99_m", "max_m", "wrong_places"]
+    figures = {name: float(k + 1) for k, name in enumerate([*names, "normalised_rms", "normalised_p95"])}
+    limits = {f"{name}_{end}": None for name in ("rate", "mean", "p95") for end in ("low", "high")}
+    limits |= {f"{name}_{end}_m": None for name in ("mean", "p95") for end in ("low", "high")}
+    row = {**figures, **limits, "rate": 0.5, "position": "constrained", "antenna": "front"}
+    expected = ["front", "on the map", "1", "50.00 %", *(f"{k:.2f}" for k in range(3, 9)), "9", "10.00", "11.00"]
+    assert merit_row(row, "antenna") == expected
