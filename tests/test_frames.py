@@ -15,7 +15,8 @@ from railfix.cli import app
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.track import Track, read_track
-from railfix.track.frames import WORKING_FRAME, decimal_year, frame_degrees, kind_of_frame, track_at
+from railfix.track.crs import WORKING_FRAME, frame_degrees, kind_of_frame
+from railfix.track.frames import decimal_year, track_at
 from railfix.track.track import Provenance
 
 pytestmark = pytest.mark.requirement("A9")

@@ -13,7 +13,7 @@ from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.spelling import misspelt
 from railfix.io.named_columns import NamedColumns, read_named_columns
-from railfix.track.frames import frame_degrees, known_crs, older_datum_note
+from railfix.track.crs import frame_degrees, known_crs, older_datum_note
 from railfix.track.heights import check_height_datum, ellipsoidal_heights
 from railfix.track.segment import MapReading, Segment
 from railfix.track.track import UNNAMED, Track

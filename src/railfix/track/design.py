@@ -10,8 +10,8 @@ from pyproj import CRS, Transformer
 
 from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import InputFileError
+from railfix.track.crs import frame_degrees, older_datum_note
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, alignment_points
-from railfix.track.frames import frame_degrees, older_datum_note
 from railfix.track.heights import stated_heights
 from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
 

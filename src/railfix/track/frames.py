@@ -9,43 +9,23 @@ coordinate epoch; where PROJ has none the motion of the plate is used (ITRF2020 
 
 from __future__ import annotations
 
-import warnings
+import re
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from os import PathLike
-from typing import Any, Final, Literal, TypedDict, Unpack
+from typing import Any, Final, TypedDict, Unpack
 
 import numpy as np
 from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError, ProjError
-from pyproj.transformer import TransformerGroup
 
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import read_text
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.track.crs import REGIONAL, WORKING_FRAME, geodetic_of, is_in_area, kind_of_frame, operation_of
+from railfix.track.frame_table import HELD, REALISATIONS, SAME, HeldFrame
 from railfix.track.track import UNNAMED, Track
 
-#: ITRF2020, three-dimensional geographic: the frame in which positions are computed.
-WORKING_FRAME: Final = "EPSG:9989"
-#: Frames that maps of a region are usually in: name, three-dimensional code.
-REGIONAL: Final = {
-    "ETRS89": "EPSG:4937",
-    "NAD83(2011)": "EPSG:6319",
-    "GDA2020": "EPSG:7843",
-    "JGD2011": "EPSG:6667",
-}
-#: Frames without a transformation in PROJ that are an ITRF held at an epoch: plate, epoch [year], and a sentence on
-#: what that leaves. JGD2011 is ITRF94 at 1997.0 in the west of Japan, ITRF2008 at 2011.4 in the east.
-_HELD: Final = {
-    "JGD2011": ("EURA", 2011.4, "deformation since then, and the epoch 1997.0 of western Japan, are left out"),
-    "JGD2000": ("EURA", 1997.0, "deformation since then, the earthquake of 2011 included, is left out"),
-}
 PLATES: Final = tuple("AMUR ANTA ARAB AUST CARB EURA INDI NAZC NOAM NUBI PCFC SOAM SOMA".split())
-#: Accuracy [m] worse than which a transformation of PROJ is between datums of another age.
-_MODERN_M: Final = 0.5
-
-Kind = Literal["wgs84", "moves with its plate", "dynamic", "older datum"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,113 +72,6 @@ def decimal_year(time: np.datetime64 | Datetimes) -> float:
     return float(year.astype(np.int64) + 1970 + part)
 
 
-@lru_cache(maxsize=32)
-def kind_of_frame(crs: str) -> Kind:
-    """How a CRS is tied to the Earth; SettingsError when it is unknown."""
-    geodetic = _geodetic(crs)
-    name = geodetic.name
-    if name.startswith("WGS 84"):
-        return "wgs84"
-    if name.split(" (")[0] in _HELD:
-        return "moves with its plate"
-    if name.startswith("ITRF") or "IGS" in name[:4]:
-        return "dynamic"
-    return "older datum" if _operation(crs) is None else "moves with its plate"
-
-
-def known_crs(crs: str, *, path: str | PathLike[str] = "") -> CRS:
-    """The system of a name, asked for in a file; SettingsError when PROJ does not know it."""
-    try:
-        return CRS.from_user_input(crs)
-    except CRSError:
-        where = f"{path}: " if path else ""
-        raise SettingsError(
-            f"{where}the CRS {crs!r} is unknown; give for example EPSG:4326 (WGS 84), EPSG:4258 (ETRS89) or EPSG:6677"
-        ) from None
-
-
-def used_crs(path: str | PathLike[str], given: str | None, named: str | None) -> str | None:
-    """The CRS given for a file, or the one that it names itself; SettingsError when they contradict each other."""
-    if given is not None and named is not None and known_crs(given, path=path) != known_crs(named, path=path):
-        raise SettingsError(f"{path}: --crs {given} contradicts the file's own CRS {named}")
-    return given or named
-
-
-def _geodetic(crs: str) -> CRS:
-    geodetic = known_crs(crs).geodetic_crs
-    if geodetic is None:
-        raise SettingsError(f"the CRS {crs!r} has no geodetic frame; give for example EPSG:4258 (ETRS89)")
-    return geodetic
-
-
-@lru_cache(maxsize=32)
-def _operation(crs: str) -> Transformer | None:
-    """PROJ's best transformation of a frame to the working frame; None where it has none between modern frames."""
-    source = _geodetic(crs).to_3d()
-    try:
-        group = TransformerGroup(source, WORKING_FRAME, always_xy=True, allow_ballpark=False)
-    except ProjError:
-        return None
-    usable = [t for t in group.transformers if 0.0 <= t.accuracy <= _MODERN_M]
-    return usable[0] if usable else None
-
-
-def frame_degrees(crs: str, x: Floats, y: Floats) -> tuple[Floats, Floats, str]:
-    """Latitude and longitude of map coordinates (longitude and latitude, or easting and northing), and their frame's
-    code.
-
-    Projected coordinates are turned into degrees of the frame they are based on; nothing is shifted between modern
-    frames. Coordinates of an older datum (Tokyo, Belgian Datum 72) are transformed by PROJ to the modern frame of
-    their region, with the accuracy that PROJ has for it.
-    """
-    kind = kind_of_frame(crs)
-    frame = _modern_frame(crs)[0] if kind == "older datum" else _frame_of(crs)
-    longitude, latitude = _in_plan(crs, frame).transform(x, y)
-    return np.asarray(latitude, np.float64), np.asarray(longitude, np.float64), frame
-
-
-@lru_cache(maxsize=32)
-def _in_plan(crs: str, frame: str) -> Transformer:
-    source, target = (CRS.from_user_input(name).to_2d() for name in (crs, frame))
-    return Transformer.from_crs(source, target, always_xy=True)
-
-
-@lru_cache(maxsize=32)
-def _frame_of(crs: str) -> str:
-    geodetic = _geodetic(crs)
-    authority = geodetic.to_authority()
-    return geodetic.to_wkt() if authority is None else ":".join(authority)
-
-
-@lru_cache(maxsize=32)
-def _modern_frame(crs: str) -> tuple[str, float, bool]:
-    """The modern frame to which PROJ transforms an older datum best, how well [m], and whether a grid is missing.
-
-    WGS 84 and NaN where PROJ has no transformation.
-    """
-    source, best = _geodetic(crs).to_2d(), ("EPSG:4326", np.inf, False)
-    for code in REGIONAL.values():
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # about missing grids: reported by `older_datum_note`
-            group = TransformerGroup(source, CRS.from_user_input(code).to_2d(), always_xy=True, allow_ballpark=False)
-        for transformer in group.transformers:
-            if 0.0 <= transformer.accuracy < best[1]:
-                best = (code, transformer.accuracy, bool(group.unavailable_operations))
-    return best
-
-
-@lru_cache(maxsize=32)
-def older_datum_note(crs: str | None) -> tuple[str, ...]:
-    """A note on the transformation of a map in an older datum; none for other maps."""
-    if crs is None or kind_of_frame(crs) != "older datum":
-        return ()
-    code, accuracy, missing = _modern_frame(crs)
-    name, to = _geodetic(crs).name, CRS.from_user_input(code).name
-    size = f"with an accuracy of {accuracy:g} m" if np.isfinite(accuracy) else "with unknown accuracy"
-    grid = "; a grid that PROJ knows of would be better and is not installed (projsync)" if missing else ""
-    return (f"map: {name} is an older datum, transformed to {to} by PROJ {size}{grid}",)
-
-
 class MapMotion(TypedDict, total=False):
     """What moves coordinates of a map to the frame of the satellites, beside PROJ.
 
@@ -242,11 +115,11 @@ def points_at(
     unknown, or an epoch or plate is given for a frame that does not need it.
     """
     epoch, plate, parameters = motion.get("epoch"), motion.get("plate"), motion.get("parameters")
-    kind, frame, year = kind_of_frame(crs), _geodetic(crs), decimal_year(time)
+    kind, frame, year = kind_of_frame(crs), geodetic_of(crs), decimal_year(time)
     used = f"ITRF2020 at {year:.2f}"
     if plate is not None and plate not in PLATES:
         raise SettingsError(f"plate {plate!r} is unknown; expected one of {', '.join(PLATES)}")
-    held = _HELD.get(frame.name.split(" (")[0])
+    held = HELD.get(frame.name)
     if (epoch is not None or plate is not None) and not (kind == "dynamic" or held):
         raise SettingsError(f"the map's frame is {frame.name}, which takes no epoch and no plate of its own")
     if parameters is not None and not frame.name.startswith("JGD2011"):
@@ -254,20 +127,19 @@ def points_at(
     middle = ecef_m[len(ecef_m) // 2]
     if kind in ("wgs84", "older datum"):
         notes = () if named else _doubt(middle, time)
-        return ecef_m, FrameShift(frame=frame.name, used=used, method="used as it is", notes=notes)
+        method = "used as it is" + ", taken as its latest realisation, which is ITRF2020" * (kind == "wgs84")
+        return ecef_m, FrameShift(frame=frame.name, used=used, method=method, notes=notes)
+    operation = operation_of(crs)
     if parameters is not None:
         moved, method, notes = _by_parameters(ecef_m, parameters, year, epoch, plate or "EURA")
-    elif held is not None:
-        moved_by, since, rest = held
-        plate, epoch = plate or moved_by, epoch or since
-        moved, method = _by_plate(ecef_m, plate, year - epoch), f"motion of the plate {plate} since {epoch:g}; {rest}"
-        notes = (f"map: {frame.name} moved to {used} by the {method}",)
     elif kind == "dynamic":
         moved, method, notes = _from_dynamic(ecef_m, crs, year, epoch, plate)
+    elif operation is not None and not (held and (epoch or plate)):
+        moved, method = _transformed(operation, ecef_m, year), f"PROJ: {operation.description}"
+        notes = _realisation_note(frame, operation)
     else:
-        operation = _operation(crs)
-        assert operation is not None
-        moved, method, notes = _transformed(operation, ecef_m, year), f"PROJ: {operation.description}", ()
+        assert held is not None
+        moved, method, notes = _from_held(ecef_m, frame.name, held, year, epoch, plate)
     at = geodetic_from_ecef(middle)
     east, north, up_m = (float(v) for v in enu_axes(float(at[0]), float(at[1])) @ (moved[len(ecef_m) // 2] - middle))
     shift = FrameShift(
@@ -303,9 +175,8 @@ def _from_dynamic(
     ecef_m: Floats, crs: str, year: float, epoch: float | None, plate: str | None
 ) -> tuple[Floats, str, tuple[str, ...]]:
     """Coordinates of an ITRF at an epoch, in the working frame at the log's."""
-    name = _geodetic(crs).name
-    operation = Transformer.from_crs(_geodetic(crs).to_3d(), WORKING_FRAME, always_xy=True)
-    moved = _transformed(operation, ecef_m, year if epoch is None else epoch)
+    name = geodetic_of(crs).name
+    moved = _in_itrf2020(ecef_m, REALISATIONS[name], year if epoch is None else epoch)
     if epoch is None:
         note = (
             f"map: coordinates in {name} move 1 to 8 cm a year; no epoch is named, that of the log ({year:.2f}) is used"
@@ -315,6 +186,38 @@ def _from_dynamic(
         note = f"map: {name} at {epoch:g} is not moved to {year:.2f}, for no plate is named (1 to 8 cm a year)"
         return moved, f"{name} at {epoch:g}, not moved", (note,)
     return _by_plate(moved, plate, year - epoch), f"{name} at {epoch:g}, motion of the plate {plate}", ()
+
+
+def _in_itrf2020(ecef_m: Floats, code: str, year: float) -> Floats:
+    """Coordinates of a realisation of the ITRF in ITRF2020, both at an epoch."""
+    return _transformed(Transformer.from_crs(code, WORKING_FRAME, always_xy=True), ecef_m, year)
+
+
+def _from_held(
+    ecef_m: Floats, name: str, held: HeldFrame, year: float, epoch: float | None, plate: str | None
+) -> tuple[Floats, str, tuple[str, ...]]:
+    """Coordinates of a frame that is the ITRF at an epoch, moved by the plate that carries its middle since then."""
+    since = epoch or held.epoch
+    latitude, longitude, _ = geodetic_from_ecef(ecef_m[len(ecef_m) // 2])
+    plate = plate or held.plate_at(float(latitude), float(longitude))
+    moved = _by_plate(_in_itrf2020(ecef_m, held.code, since), plate, year - since)
+    method = f"{held.itrf} at {since:g}, motion of the plate {plate}"
+    return moved, method, (f"map: {name} is {method} to {year:.2f} in ITRF2020; {held.left_out(year - since)}",)
+
+
+def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
+    """A note on the realisation that is taken for an ensemble, or for a frame that has the coordinates of another."""
+    if frame.name in SAME and not operation.description.startswith(frame.name):
+        code, how_well = SAME[frame.name]
+        return (f"map: {frame.name} is taken as {CRS.from_user_input(code).name}; {how_well}",)
+    datum = frame.datum.to_json_dict() if frame.datum is not None else {}
+    if "members" not in datum:
+        return ()
+    taken = re.search(rf"{re.escape(frame.name)} to (\S+)", operation.description)
+    return (
+        f"map: {frame.name} is an ensemble of {len(datum['members'])} realisations, alike within "
+        f"{datum['accuracy']} m; taken as {taken[1] if taken else operation.description}",
+    )
 
 
 def _by_parameters(
@@ -357,19 +260,15 @@ def _by_plate(ecef_m: Floats, plate: str, years: float) -> Floats:
 def _doubt(ecef_m: Floats, time: np.datetime64) -> tuple[str, ...]:
     """A note on how far a map without a named frame may be off at a point of it."""
     latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(ecef_m))
+    found = []
     for name, code in REGIONAL.items():
-        area = CRS.from_user_input(code).area_of_use
-        if area is None or not (area.south <= latitude <= area.north and _between(longitude, area.west, area.east)):
+        if not is_in_area(CRS.from_user_input(code), np.array([latitude]), np.array([longitude]), margin_deg=0.0)[0]:
             continue
         _, shift = points_at(ecef_m[None], code, time)
         size = float(np.hypot(np.hypot(shift.east_m, shift.north_m), shift.up_m))
-        return (
-            f"map: no reference frame is named, WGS 84 is assumed; if the map is in {name}, as is usual there, "
-            f"it is {size:.2f} m off (east {shift.east_m:+.2f}, north {shift.north_m:+.2f}, up {shift.up_m:+.2f} m); "
-            f"give --crs {code}",
-        )
+        parts = f"east {shift.east_m:+.2f}, north {shift.north_m:+.2f}, up {shift.up_m:+.2f} m"
+        found.append(f"in {name}, it is {size:.2f} m off ({parts}); give --crs {code}")
+    if found:
+        choices = "; if ".join(found)
+        return (f"map: no reference frame is named, WGS 84 is assumed; if the map is, as is usual there, {choices}",)
     return ("map: no reference frame is named, WGS 84 is assumed; national frames differ from it by up to 2 m",)
-
-
-def _between(longitude: float, west: float, east: float) -> bool:
-    return west <= longitude <= east if west <= east else longitude >= west or longitude <= east

@@ -24,7 +24,8 @@ from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.io.named_columns import read_named_columns
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import positions_times, renamed
-from railfix.track.frames import FrameShift, MapMotion, in_map_frame, kind_of_frame
+from railfix.track.crs import kind_of_frame
+from railfix.track.frames import FrameShift, MapMotion, in_map_frame
 from railfix.track.network import Candidates, Network
 from railfix.track.track import SIGMA_PLAN_M
 

@@ -17,7 +17,7 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import ending
-from railfix.track.frames import frame_degrees, older_datum_note, used_crs
+from railfix.track.crs import frame_degrees, older_datum_note, used_crs
 from railfix.track.heights import check_height_datum, stated_heights
 from railfix.track.segment import ATTRIBUTES, NO_HEIGHTS, MapReading, Segment
 from railfix.track.track import UNNAMED

@@ -1,0 +1,203 @@
+"""Coordinate reference systems of maps: how each is tied to the Earth, and coordinates in degrees of its frame."""
+
+from __future__ import annotations
+
+import warnings
+from functools import lru_cache
+from os import PathLike
+from typing import Any, Final, Literal
+
+import numpy as np
+from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
+from pyproj.exceptions import CRSError, ProjError
+from pyproj.transformer import TransformerGroup
+
+from railfix.core.arrays import Floats, Masks
+from railfix.core.errors import SettingsError
+from railfix.track.frame_table import HELD, REALISATIONS, SAME
+
+#: ITRF2020, three-dimensional geographic: the frame in which positions are computed.
+WORKING_FRAME: Final = "EPSG:9989"
+#: Frames that maps of a region are usually in: name, three-dimensional code. The first of a place is the likelier one.
+REGIONAL: Final = {
+    "ETRS89": "EPSG:4937",
+    "NAD83(2011)": "EPSG:6319",
+    "NAD83(CSRS)": "EPSG:8254",
+    "GDA2020": "EPSG:7843",
+    "JGD2011": "EPSG:6667",
+    "KGD2002": "EPSG:4927",
+    "TWD97": "EPSG:3823",
+    "CGCS2000": "EPSG:4480",
+    "NZGD2000": "EPSG:4959",
+    "SIRGAS 2000": "EPSG:4989",
+    "Hartebeesthoek94": "EPSG:4941",
+}
+#: Share of the area of use of an older datum that a modern frame of its region covers.
+_COVERED: Final = 0.5
+#: Accuracy [m] worse than which a transformation of PROJ is between datums of another age.
+MODERN_M: Final = 0.5
+
+Kind = Literal["wgs84", "moves with its plate", "dynamic", "older datum"]
+
+
+@lru_cache(maxsize=32)
+def kind_of_frame(crs: str) -> Kind:
+    """How a CRS is tied to the Earth; SettingsError when it is unknown."""
+    geodetic = geodetic_of(crs)
+    name = geodetic.name
+    if name in REALISATIONS:
+        return "dynamic"
+    if name.startswith("WGS 84"):
+        return "wgs84"
+    if name in HELD:
+        return "moves with its plate"
+    return "older datum" if operation_of(crs) is None else "moves with its plate"
+
+
+def known_crs(crs: str, *, path: str | PathLike[str] = "") -> CRS:
+    """The system of a name, asked for in a file; SettingsError when PROJ does not know it."""
+    try:
+        return CRS.from_user_input(crs)
+    except CRSError:
+        where = f"{path}: " if path else ""
+        raise SettingsError(
+            f"{where}the CRS {crs!r} is unknown; give for example EPSG:4326 (WGS 84), EPSG:4258 (ETRS89) or EPSG:6677"
+        ) from None
+
+
+def used_crs(path: str | PathLike[str], given: str | None, named: str | None) -> str | None:
+    """The CRS given for a file, or the one that it names itself; SettingsError when they contradict each other."""
+    if given is not None and named is not None and known_crs(given, path=path) != known_crs(named, path=path):
+        raise SettingsError(f"{path}: --crs {given} contradicts the file's own CRS {named}")
+    return given or named
+
+
+def geodetic_of(crs: str) -> CRS:
+    """The geodetic frame that a CRS is based on."""
+    geodetic = known_crs(crs).geodetic_crs
+    if geodetic is None:
+        raise SettingsError(f"the CRS {crs!r} has no geodetic frame; give for example EPSG:4258 (ETRS89)")
+    return geodetic
+
+
+@lru_cache(maxsize=32)
+def operation_of(crs: str) -> Transformer | None:
+    """PROJ's best transformation to the working frame, of a frame or of the one whose coordinates it has.
+
+    None where PROJ has none between modern frames.
+    """
+    source = geodetic_of(crs)
+    sources = [source] if source.name not in SAME else [source, CRS.from_user_input(SAME[source.name][0])]
+    for frame in sources:
+        usable = [t for t in _operations(frame.to_3d(), CRS.from_user_input(WORKING_FRAME)) if t.accuracy <= MODERN_M]
+        if usable:
+            return usable[0]
+    return None
+
+
+def _operations(source: CRS, target: CRS, *, over: CRS | None = None) -> list[Transformer]:
+    """Transformations of known accuracy that PROJ has between two frames, over the area of use of a third CRS."""
+    area = None if over is None else over.area_of_use
+    within: Any = None if area is None else AreaOfInterest(*area.bounds)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # about missing grids: reported by `older_datum_note`
+            group = TransformerGroup(
+                source,
+                target,
+                always_xy=True,
+                allow_ballpark=False,
+                area_of_interest=within,
+            )
+    except (ProjError, IndexError):  # IndexError: pyproj cannot make an operation that is known at one epoch alone
+        return []
+    return [t for t in group.transformers if t.accuracy >= 0.0]
+
+
+def frame_degrees(crs: str, x: Floats, y: Floats) -> tuple[Floats, Floats, str]:
+    """Latitude and longitude of map coordinates (longitude and latitude, or easting and northing), and their frame's
+    code.
+
+    Projected coordinates are turned into degrees of the frame they are based on; nothing is shifted between modern
+    frames. Coordinates of an older datum (Tokyo, Belgian Datum 72) are transformed by PROJ to the modern frame of
+    their region, with the accuracy that PROJ has for it.
+    """
+    kind = kind_of_frame(crs)
+    frame = _modern_frame(crs)[0] if kind == "older datum" else _frame_of(crs)
+    longitude, latitude = _in_plan(crs, frame).transform(x, y)
+    return np.asarray(latitude, np.float64), np.asarray(longitude, np.float64), frame
+
+
+@lru_cache(maxsize=32)
+def _in_plan(crs: str, frame: str) -> Transformer:
+    source, target = (CRS.from_user_input(name).to_2d() for name in (crs, frame))
+    return Transformer.from_crs(source, target, always_xy=True)
+
+
+@lru_cache(maxsize=32)
+def _frame_of(crs: str) -> str:
+    geodetic = geodetic_of(crs)
+    authority = geodetic.to_authority()
+    return geodetic.to_wkt() if authority is None else ":".join(authority)
+
+
+@lru_cache(maxsize=32)
+def _modern_frame(crs: str) -> tuple[str, float]:
+    """The modern frame of its region to which PROJ transforms an older datum best, and how well [m].
+
+    WGS 84 where there is none, and NaN where PROJ has no transformation at all.
+    """
+    whole, source = CRS.from_user_input(crs), geodetic_of(crs).to_2d()
+    found = []
+    for code in REGIONAL.values():
+        target = CRS.from_user_input(code)
+        if _share_covered(whole, target) >= _COVERED:
+            found += [(code, t.accuracy) for t in _operations(source, target.to_2d(), over=whole)[:1]]
+    world = [("EPSG:4326", t.accuracy) for t in _operations(source, CRS.from_user_input(4326), over=whole)[:1]]
+    return min(found + world, key=lambda item: item[1], default=("EPSG:4326", np.nan))
+
+
+def _share_covered(crs: CRS, other: CRS) -> float:
+    """Share of the area of use of a CRS, in degrees, that that of another covers; 0 where either is unknown."""
+    area, by = crs.area_of_use, other.area_of_use
+    if area is None or by is None:
+        return 0.0
+    width, span = (area.east - area.west) % 360.0, (by.east - by.west) % 360.0
+    start = (by.west - area.west) % 360.0
+    common = max(0.0, min(width, start + span) - start) + max(0.0, min(width, start + span - 360.0))
+    high = max(0.0, min(area.north, by.north) - max(area.south, by.south))
+    return (common * high) / max(width * (area.north - area.south), 1e-9)
+
+
+@lru_cache(maxsize=32)
+def older_datum_note(crs: str | None) -> tuple[str, ...]:
+    """A note on the transformation of a map in an older datum; none for other maps."""
+    if crs is None or kind_of_frame(crs) != "older datum":
+        return ()
+    code, accuracy = _modern_frame(crs)
+    name, to = geodetic_of(crs).name, CRS.from_user_input(code).name
+    size = f"with an accuracy of {accuracy:g} m" if np.isfinite(accuracy) else "with unknown accuracy"
+    older = "is an older datum, transformed" if not accuracy <= MODERN_M else "is transformed"
+    grid = ""
+    if not accuracy <= MODERN_M and _has_missing_grids(crs, code):
+        grid = "; a grid that PROJ knows of would be better and is not installed (projsync)"
+    return (f"map: {name} {older} to {to} by PROJ {size}{grid}",)
+
+
+def _has_missing_grids(crs: str, code: str) -> bool:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        group = TransformerGroup(geodetic_of(crs).to_2d(), CRS.from_user_input(code).to_2d(), allow_ballpark=False)
+    return bool(group.unavailable_operations)
+
+
+def is_in_area(crs: CRS, latitude_deg: Floats, longitude_deg: Floats, *, margin_deg: float) -> Masks:
+    """Which points lie in the area of use of a CRS, with a margin; all where it has none."""
+    area = crs.area_of_use
+    if area is None:
+        return np.ones(len(latitude_deg), dtype=bool)
+    inside = (latitude_deg >= area.south - margin_deg) & (latitude_deg <= area.north + margin_deg)
+    width = (area.east - area.west) % 360.0 if area.east - area.west < 360.0 else 360.0
+    from_west = (longitude_deg - area.west + margin_deg) % 360.0
+    return np.asarray(inside & (from_west <= width + 2.0 * margin_deg))
