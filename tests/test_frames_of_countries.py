@@ -72,7 +72,7 @@ def test_a_frame_is_moved_as_proj_or_its_definition_has_it(name: str) -> None:
     x, y = (np.array([v]) for v in (longitude, latitude))
     if grid.is_projected:
         x, y = Transformer.from_crs(grid.geodetic_crs, grid, always_xy=True).transform(x, y)
-    lat, lon, frame = frame_degrees(code, x, y)
+    lat, lon, frame = frame_degrees(code, x, y, path="map")
     place = ecef_from_geodetic(lat, lon, np.array([100.0]))
     moved, shift = points_at(place, frame, TIME)
     if isinstance(definition, int):
@@ -113,10 +113,11 @@ def test_an_ensemble_and_a_frame_of_another_name_say_what_they_are_taken_for() -
 def test_an_older_datum_goes_to_the_modern_frame_of_its_region(crs: str, frame: str) -> None:
     area = CRS(crs).area_of_use
     assert area is not None
-    x, y = np.array([(area.west + area.east) / 2.0]), np.array([(area.south + area.north) / 2.0])
+    x = np.array([(area.west + (area.east - area.west) % 360.0 / 2.0 + 180.0) % 360.0 - 180.0])
+    y = np.array([(area.south + area.north) / 2.0])
     if CRS(crs).is_projected:
         x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(x, y)
-    assert frame_degrees(crs, x, y)[2] == frame
+    assert frame_degrees(crs, x, y, path="map")[2] == frame
     assert "transformed to" in older_datum_note(crs)[0]
 
 

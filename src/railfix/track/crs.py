@@ -14,7 +14,7 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
 from railfix.core.arrays import Floats, Masks
-from railfix.core.errors import SettingsError
+from railfix.core.errors import InputFileError, SettingsError
 from railfix.track.frame_table import HELD, REALISATIONS, SAME
 
 #: ITRF2020, three-dimensional geographic: the frame in which positions are computed.
@@ -33,6 +33,17 @@ REGIONAL: Final = {
     "SIRGAS 2000": "EPSG:4989",
     "Hartebeesthoek94": "EPSG:4941",
 }
+#: Margin about the area of use of a CRS [deg].
+MARGIN_DEG: Final = 0.5
+#: Largest scale of a grid that is the one of a line, less 1: grids of countries have up to 0.005.
+LARGEST_SCALE: Final = 0.01
+#: Projections of web maps and of the world, whose scale is none of a survey.
+_UNEVEN: Final = (
+    "Popular Visualisation Pseudo Mercator",
+    "Mercator (variant A)",
+    "Mercator (variant B)",
+    "Equidistant Cylindrical",
+)
 #: Share of the area of use of an older datum that a modern frame of its region covers.
 _COVERED: Final = 0.5
 #: Accuracy [m] worse than which a transformation of PROJ is between datums of another age.
@@ -68,9 +79,18 @@ def known_crs(crs: str, *, path: str | PathLike[str] = "") -> CRS:
 
 def used_crs(path: str | PathLike[str], given: str | None, named: str | None) -> str | None:
     """The CRS given for a file, or the one that it names itself; SettingsError when they contradict each other."""
-    if given is not None and named is not None and known_crs(given, path=path) != known_crs(named, path=path):
+    if given is None or named is None:
+        return given or named
+    one, other = (known_crs(name, path=path).to_2d() for name in (given, named))
+    if not one.equals(other, ignore_axis_order=True):
         raise SettingsError(f"{path}: --crs {given} contradicts the file's own CRS {named}")
-    return given or named
+    return given if known_crs(given).is_compound else named  # with its height datum, where it has one
+
+
+def vertical_of(crs: str | None) -> CRS | None:
+    """The height datum of a compound CRS, None for others."""
+    system = None if crs is None else known_crs(crs)
+    return system.sub_crs_list[1] if system is not None and system.is_compound else None
 
 
 def geodetic_of(crs: str) -> CRS:
@@ -115,18 +135,58 @@ def _operations(source: CRS, target: CRS, *, over: CRS | None = None) -> list[Tr
     return [t for t in group.transformers if t.accuracy >= 0.0]
 
 
-def frame_degrees(crs: str, x: Floats, y: Floats) -> tuple[Floats, Floats, str]:
+def frame_degrees(crs: str, x: Floats, y: Floats, *, path: str) -> tuple[Floats, Floats, str]:
     """Latitude and longitude of map coordinates (longitude and latitude, or easting and northing), and their frame's
     code.
 
     Projected coordinates are turned into degrees of the frame they are based on; nothing is shifted between modern
     frames. Coordinates of an older datum (Tokyo, Belgian Datum 72) are transformed by PROJ to the modern frame of
-    their region, with the accuracy that PROJ has for it.
+    their region, with the accuracy that PROJ has for it. InputFileError: when the CRS does not reach there.
     """
     kind = kind_of_frame(crs)
     frame = _modern_frame(crs)[0] if kind == "older datum" else _frame_of(crs)
-    longitude, latitude = _in_plan(crs, frame).transform(x, y)
-    return np.asarray(latitude, np.float64), np.asarray(longitude, np.float64), frame
+    longitude, latitude = (np.asarray(v, np.float64) for v in _in_plan(crs, frame).transform(x, y))
+    _check_area(crs, latitude, longitude, path=path)
+    if known_crs(crs).is_projected:
+        _check_scale(crs, frame, np.stack([x, y], axis=-1), latitude, longitude, path=path)
+    return latitude, longitude, frame
+
+
+def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> None:
+    """Reject points outside the area of use of a CRS's frame, of which a projection may be used beyond its own."""
+    finite = np.isfinite(latitude_deg) & np.isfinite(longitude_deg) & (np.abs(latitude_deg) <= 90.0)
+    if not finite.all():
+        raise InputFileError(path, f"some coordinates lie outside the CRS {crs}; is it the right one?")
+    geodetic = geodetic_of(crs)
+    outside, area = ~is_in_area(geodetic, latitude_deg, longitude_deg, margin_deg=MARGIN_DEG), geodetic.area_of_use
+    if area is None or not outside.any():
+        return
+    lat, lon = latitude_deg[outside][:1], longitude_deg[outside][:1]
+    swapped = known_crs(crs).is_geographic and is_in_area(geodetic, lon, lat, margin_deg=MARGIN_DEG).all()
+    raise InputFileError(
+        path,
+        f"latitude {lat[0]:.4f}, longitude {lon[0]:.4f} is outside the area of use of {geodetic.name} (latitude "
+        f"{area.south:g} to {area.north:g}, longitude {area.west:g} to {area.east:g}); "
+        + ("latitude and longitude are swapped" if swapped else f"is {crs} the right CRS?"),
+    )
+
+
+def _check_scale(crs: str, frame: str, xy: Floats, latitude: Floats, longitude: Floats, *, path: str) -> None:
+    """Reject points of a grid whose unit of length there is not that of the ground: they are of another grid."""
+    system = known_crs(crs)
+    method = "" if system.coordinate_operation is None else system.coordinate_operation.method_name
+    if len(xy) < 2 or method in _UNEVEN:
+        return
+    unit = system.axis_info[0].unit_conversion_factor
+    grid = float(np.hypot(*np.diff(xy, axis=0).T).sum()) * unit
+    ellipsoid = CRS.from_user_input(frame).get_geod()
+    ground = float(ellipsoid.line_length(longitude, latitude)) if ellipsoid is not None else grid
+    if ground > 0.0 and abs(grid / ground - 1.0) > LARGEST_SCALE:
+        raise InputFileError(
+            path,
+            f"the line is {grid:.0f} m long in {system.name}, on the ground there {ground:.0f} m; the "
+            "coordinates are of another grid (--crs)",
+        )
 
 
 @lru_cache(maxsize=32)

@@ -13,7 +13,7 @@ from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.spelling import misspelt
 from railfix.io.named_columns import NamedColumns, read_named_columns
-from railfix.track.crs import frame_degrees, known_crs, older_datum_note
+from railfix.track.crs import frame_degrees, known_crs, older_datum_note, used_crs
 from railfix.track.heights import check_height_datum, ellipsoidal_heights
 from railfix.track.segment import MapReading, Segment
 from railfix.track.track import UNNAMED, Track
@@ -61,7 +61,7 @@ def read_csv_segment(path: str | PathLike[str], reading: MapReading) -> Segment:
         raise InputFileError(path, f"{len(table)} point(s); a track needs at least two")
     if reading.duplicates == "reject":
         _reject_duplicates(table, latitude, longitude, heights)
-    crs = reading.crs if reading.crs is not None else table.metadata.get("crs")
+    crs = used_crs(path, reading.crs, table.metadata.get("crs"))
     latitude, longitude, frame = _in_frame(crs, latitude, longitude, path=table.path)
     geoid = reading.geoid
     if geoid is None and datum == "orthometric" and "geoid_m" not in table:
@@ -157,7 +157,7 @@ def _in_frame(crs: str | None, latitude: Floats, longitude: Floats, *, path: str
             f"{path}: {crs} is {system.name}, but the columns are latitude and longitude; "
             "projected coordinates are read from GeoJSON"
         )
-    return frame_degrees(crs, longitude, latitude)
+    return frame_degrees(crs, longitude, latitude, path=path)
 
 
 def write_track_csv(track: Track, path: str | PathLike[str]) -> None:

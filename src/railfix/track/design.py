@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 from pyproj import CRS, Transformer
 
 from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import InputFileError
-from railfix.track.crs import frame_degrees, older_datum_note
+from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, frame_degrees, is_in_area, older_datum_note
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, alignment_points
 from railfix.track.heights import stated_heights
 from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
-
-#: Margin about the area of use of a CRS [deg].
-_MARGIN_DEG: Final = 0.5
 
 
 def segment_of_design(
@@ -52,9 +48,8 @@ def segment_of_design(
         # northing before easting turns the plane over, so a curve to the left in the file is one to the right
         xy, curvature = xy[:, ::-1], -curvature
         joints = (*joints, f"{name}: the file has northing before easting")
-    latitude, longitude, frame = frame_degrees(crs, xy[:, 0], xy[:, 1])
-    if not (np.isfinite(latitude).all() and np.isfinite(longitude).all()):
-        raise InputFileError(path, f"alignment {name!r}: coordinates lie outside the CRS {crs}; give the right --crs")
+    latitude, longitude, frame = frame_degrees(crs, xy[:, 0], xy[:, 1], path=f"{path} ({name})")
+    _check_length(plan, frame, latitude, longitude, path=f"{path} ({name})")
     height, model, datum = np.full(len(latitude), np.nan), "", NO_HEIGHTS
     if profile:
         height, model, datum = stated_heights(points.height_m + up, latitude, longitude, reading, path=path)
@@ -80,6 +75,19 @@ def segment_of_design(
     )
 
 
+def _check_length(plan: Sequence[PlanElement], frame: str, latitude: Floats, longitude: Floats, *, path: str) -> None:
+    """Reject an alignment whose length on the map is not that of its design: its grid is another one."""
+    designed = sum(element.length_m for element in plan)
+    geod = CRS.from_user_input(frame).get_geod()
+    found = float(geod.line_length(longitude, latitude)) if geod is not None else designed
+    if abs(found - designed) > LARGEST_SCALE * designed + 0.5:
+        raise InputFileError(
+            path,
+            f"the design is {designed:.0f} m long, on the map {found:.0f} m; give the right --crs, or mend the "
+            "elements that do not meet",
+        )
+
+
 def _side_of_curve(curvature: Floats, bent: Masks) -> Floats:
     """Side of the curve at each point, and of the nearest curve where the line is straight: at the foot of a ramp."""
     if not bent.any():
@@ -94,11 +102,8 @@ def _side_of_curve(curvature: Floats, bent: Masks) -> Floats:
 def _within(crs: str, xy: Floats) -> bool:
     """Whether coordinates lie in the area of use of a CRS; True where it has none."""
     system = CRS.from_user_input(crs)
-    area = system.area_of_use
-    if area is None:
+    if system.area_of_use is None:
         return True
     transformer = Transformer.from_crs(system.to_2d(), "EPSG:4326", always_xy=True)
     longitude, latitude = (np.asarray(v) for v in transformer.transform(xy[:, 0], xy[:, 1]))
-    inside = (latitude > area.south - _MARGIN_DEG) & (latitude < area.north + _MARGIN_DEG)
-    inside &= (longitude > area.west - _MARGIN_DEG) & (longitude < area.east + _MARGIN_DEG)
-    return bool(inside.all())
+    return bool(is_in_area(system, latitude, longitude, margin_deg=MARGIN_DEG).all())

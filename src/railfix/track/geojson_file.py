@@ -1,9 +1,11 @@
-"""GeoJSON track maps: 3-D LineString, MultiLineString, or features of them (RFC 7946)."""
+"""GeoJSON track maps: LineString, MultiLineString, or features of them (RFC 7946)."""
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from os import PathLike
 from typing import Any, Final
 
@@ -15,8 +17,9 @@ from railfix.core.files import read_text
 from railfix.core.spelling import misspelt
 from railfix.track.crs import frame_degrees, known_crs, older_datum_note, used_crs
 from railfix.track.csv_file import OPTIONAL_COLUMNS, attributes
-from railfix.track.heights import HEIGHT_DATUMS, ellipsoidal_heights
-from railfix.track.segment import MapReading, Segment
+from railfix.track.heights import HEIGHT_DATUMS, ellipsoidal_heights, own_height_datum
+from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
+from railfix.track.vector_file import is_of_openstreetmap, left_out_note, no_track
 
 #: RFC 7946, section 4: longitude and latitude on WGS 84 where the file names no CRS.
 RFC_CRS: Final = "OGC:CRS84"
@@ -39,15 +42,18 @@ def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any
         for number, feature in enumerate(features, start=1):
             if not isinstance(feature, dict):
                 raise InputFileError(path, f"feature {number} is not an object")
+            if len(features) > 1 and _is_no_line(feature):
+                continue
             identity = _identity(feature) if len(features) > 1 else {}
             yield from _lines(path, feature, f"feature {number}", inherited | own | identity)
     elif kind == "Feature":
         properties = node.get("properties") or {}
         geometry = node.get("geometry")
+        if isinstance(properties, dict) and RELATION in properties:
+            return
         if not isinstance(properties, dict) or not isinstance(geometry, dict):
             raise InputFileError(path, f"{label or 'the feature'} has no geometry")
-        if RELATION not in properties:
-            yield from _lines(path, geometry, label, inherited | own | properties)
+        yield from _lines(path, geometry, label, inherited | own | properties)
     elif kind == "LineString":
         yield _Line(path, label, node.get("coordinates"), inherited | own, -1)
     elif kind == "MultiLineString":
@@ -62,6 +68,12 @@ def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any
         raise InputFileError(
             path, f"{where}type {kind!r}; LineString or MultiLineString (or features of them) expected"
         )
+
+
+def _is_no_line(feature: dict[str, Any]) -> bool:
+    """Whether one of several features is a point or an area, such as a station."""
+    geometry = feature.get("geometry")
+    return isinstance(geometry, dict) and geometry.get("type") in ("Point", "MultiPoint", "Polygon", "MultiPolygon")
 
 
 def _identity(feature: dict[str, Any]) -> dict[str, str]:
@@ -89,12 +101,8 @@ class _Line:
         if not isinstance(coordinates, list) or len(coordinates) < 2:
             raise self.error("a track needs at least two points")
         sizes = {len(point) if isinstance(point, list) else 0 for point in coordinates}
-        if sizes == {2}:
-            raise self.error(
-                "the coordinates have no height; a 3-D track map needs [longitude, latitude, height] at every point"
-            )
-        if not sizes <= {3, 4}:
-            raise self.error("every point must be [longitude, latitude, height]")
+        if sizes != {2} and not sizes <= {3, 4}:
+            raise self.error("every point must be [longitude, latitude, height], or every one without a height")
         try:
             values = np.array([point[:3] for point in coordinates], dtype=np.float64)
         except (TypeError, ValueError):
@@ -148,10 +156,7 @@ def _in_frame(path: str, crs: str, values: Floats) -> tuple[Floats, Floats, str]
                 f"{crs}: [{point[0]:g}, {point[1]:g}] is not [longitude, latitude]; are they swapped, or is the CRS a "
                 "projected one (give --crs)?",
             )
-    lat, lon, frame = frame_degrees(crs, values[:, 0], values[:, 1])
-    if not (np.isfinite(lon).all() and np.isfinite(lat).all()):
-        raise InputFileError(path, f"some coordinates lie outside the CRS {crs}; is it the right one?")
-    return lat, lon, frame
+    return frame_degrees(crs, values[:, 0], values[:, 1], path=path)
 
 
 def read_geojson_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
@@ -170,19 +175,18 @@ def read_geojson_segments(path: str | PathLike[str], reading: MapReading) -> lis
     if not isinstance(document, dict):
         raise InputFileError(path, "this is JSON, but not a GeoJSON object")
     used = used_crs(path, reading.crs, _crs_member(str(path), document)) or RFC_CRS
-    return [_segment(line, used, reading) for line in _lines(str(path), document, "", {})]
+    lines = list(_lines(str(path), document, "", {}))
+    of_openstreetmap = any(is_of_openstreetmap(line.properties) for line in lines)
+    reasons = [no_track(line.properties, of_openstreetmap=of_openstreetmap) for line in lines]
+    notes = left_out_note(path, Counter(why for why in reasons if why))
+    segments = [_segment(line, used, reading) for line, why in zip(lines, reasons, strict=True) if not why]
+    if not segments:
+        raise InputFileError(path, "there is no track in this file" + "".join(f" ({note})" for note in notes))
+    segments[0] = replace(segments[0], notes=(*segments[0].notes, *notes))
+    return segments
 
 
 def _segment(line: _Line, crs: str, reading: MapReading) -> Segment:
-    height_datum, geoid = reading.height_datum, reading.geoid
-    stated = line.text("height_datum")
-    if stated is not None and stated not in HEIGHT_DATUMS:
-        raise line.error(f"height_datum is {stated!r}; expected 'ellipsoidal' or 'orthometric'")
-    if height_datum is not None and stated is not None and height_datum != stated:
-        raise SettingsError(f"{line.source}: height_datum {height_datum!r} contradicts the file's own {stated!r}")
-    datum = height_datum or stated
-    if datum is None:
-        raise line.error(f"the height datum is missing; {_DATUM_HELP}")
     for wrong, right in misspelt(line.properties, (*OPTIONAL_COLUMNS, "geoid_m", *_MEMBERS)).items():
         if right not in line.properties:
             raise line.error(f"property {wrong!r} is unknown; is {right!r} meant?")
@@ -193,12 +197,9 @@ def _segment(line: _Line, crs: str, reading: MapReading) -> Segment:
             "'railfix map check' lists them all"
         )
     latitude, longitude, frame = _in_frame(line.source, crs, line.coordinates)
-    geoid_m = line.array("geoid_m", np.nan) if datum == "orthometric" else None
-    if geoid is None and datum == "orthometric" and geoid_m is None:
-        geoid = line.text("geoid")
-    height, model = ellipsoidal_heights(
-        line.coordinates[:, 2], latitude, longitude, datum=datum, geoid=geoid, geoid_m=geoid_m, path=line.source
-    )
+    height, model, datum = np.full(len(latitude), np.nan), "", NO_HEIGHTS
+    if line.coordinates.shape[1] > 2:
+        height, model, datum = _heights(line, crs, latitude, longitude, reading)
     return Segment(
         source=line.source,
         file=line.path,
@@ -213,3 +214,28 @@ def _segment(line: _Line, crs: str, reading: MapReading) -> Segment:
         metadata={key: str(line.properties[key]) for key in _MEMBERS if key in line.properties},
         **attributes(len(latitude), line.array),
     )
+
+
+def _heights(
+    line: _Line, crs: str, latitude: Floats, longitude: Floats, reading: MapReading
+) -> tuple[Floats, str, str]:
+    """Ellipsoidal heights of a line, the geoid used, and the datum of the file."""
+    stated = line.text("height_datum")
+    if stated is not None and stated not in HEIGHT_DATUMS:
+        raise line.error(f"height_datum is {stated!r}; expected 'ellipsoidal' or 'orthometric'")
+    if None not in (reading.height_datum, stated) and reading.height_datum != stated:
+        raise SettingsError(
+            f"{line.source}: height_datum {reading.height_datum!r} contradicts the file's own {stated!r}"
+        )
+    datum, geoid = own_height_datum(crs, reading.height_datum or stated, reading.geoid, path=line.source)
+    if datum is None:
+        raise line.error(f"the height datum is missing; {_DATUM_HELP}")
+    geoid_m = line.array("geoid_m", np.nan) if datum == "orthometric" else None
+    if geoid_m is not None and geoid == crs:
+        geoid = None  # of the compound CRS, in place of which the map has its own
+    if geoid is None and datum == "orthometric" and geoid_m is None:
+        geoid = line.text("geoid")
+    height, model = ellipsoidal_heights(
+        line.coordinates[:, 2], latitude, longitude, datum=datum, geoid=geoid, geoid_m=geoid_m, path=line.source
+    )
+    return height, model, datum

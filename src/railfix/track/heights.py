@@ -12,10 +12,12 @@ from typing import Final
 import japan_geoid
 import numpy as np
 from pyproj import CRS, Transformer
+from pyproj.crs import CompoundCRS
 from pyproj.exceptions import CRSError, ProjError
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
+from railfix.track.crs import vertical_of
 from railfix.track.segment import MapReading
 
 #: Geoid models of the Geospatial Information Authority of Japan that japan-geoid ships. Heights levelled
@@ -83,7 +85,11 @@ def _proj_transformer(geoid: str) -> tuple[str, Transformer]:
         crs = CRS.from_user_input(geoid)
         if not (crs.is_vertical or crs.is_compound):
             raise SettingsError(f"geoid {geoid!r} is {crs.name}, which has no height datum; {GEOID_HELP}")
-        source = CRS.from_user_input(f"EPSG:4326+{geoid.split(':')[-1]}") if crs.is_vertical else crs
+        plan, vertical = CRS.from_user_input(4326), crs
+        if crs.is_compound:
+            geodetic, vertical = crs.sub_crs_list[0].geodetic_crs, crs.sub_crs_list[1]
+            plan = plan if geodetic is None else geodetic.to_2d()
+        source = CompoundCRS(vertical.name, [plan, vertical])
         transformer = Transformer.from_crs(source, "EPSG:4979", always_xy=True, allow_ballpark=False, only_best=True)
         return crs.name, transformer
     except CRSError:
@@ -103,14 +109,28 @@ def stated_heights(
     path: str,
 ) -> tuple[Floats, str, str]:
     """Ellipsoidal heights of a file without a datum of its own, the geoid used, and the datum, which must be given."""
-    datum = reading.height_datum
-    check_height_datum(datum)
+    check_height_datum(reading.height_datum)
+    datum, geoid = own_height_datum(reading.crs, reading.height_datum, reading.geoid, path=path)
     if datum is None:
         raise SettingsError(f"{path}: the height datum is missing; give --height-datum ellipsoidal or orthometric")
     height, model = ellipsoidal_heights(
-        heights_m, latitude_deg, longitude_deg, datum=datum, geoid=reading.geoid, geoid_m=None, path=path
+        heights_m, latitude_deg, longitude_deg, datum=datum, geoid=geoid, geoid_m=None, path=path
     )
     return height, model, datum
+
+
+def own_height_datum(
+    crs: str | None, height_datum: str | None, geoid: str | None, *, path: str
+) -> tuple[str | None, str | None]:
+    """Height datum and geoid asked for, or those of a compound CRS; SettingsError when they contradict each other."""
+    vertical = vertical_of(crs)
+    if vertical is None:
+        return height_datum, geoid
+    if height_datum == "ellipsoidal":
+        raise SettingsError(
+            f"{path}: height_datum 'ellipsoidal' contradicts the file's own CRS, whose heights are {vertical.name}"
+        )
+    return "orthometric", geoid or crs
 
 
 def ellipsoidal_heights(

@@ -11,6 +11,7 @@ import numpy as np
 
 from railfix.core.errors import InputFileError
 from railfix.core.files import read_text
+from railfix.track.crs import LARGEST_SCALE, used_crs
 from railfix.track.design import segment_of_design
 from railfix.track.elements import CantElement, PlanElement, ProfileElement
 from railfix.track.segment import MapReading, Segment
@@ -36,6 +37,26 @@ _PREFIX: Final = {"MILLI": 1e-3, "CENTI": 1e-2, "DECI": 0.1, "KILO": 1e3}
 class _Entity:
     kind: str
     values: list[Any]
+
+
+@dataclass(frozen=True)
+class _Placement:
+    """Place and direction of axes in the project."""
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    z_m: float = 0.0
+    turn_rad: float = 0.0
+
+    def then(self, x: float, y: float, z: float, turn: float) -> _Placement:
+        """Axes that lie so in these."""
+        cosine, sine = np.cos(self.turn_rad), np.sin(self.turn_rad)
+        return _Placement(
+            float(self.x_m + cosine * x - sine * y),
+            float(self.y_m + sine * x + cosine * y),
+            self.z_m + z,
+            self.turn_rad + turn,
+        )
 
 
 class _Step:
@@ -115,7 +136,9 @@ def read_ifc_segments(path: str | PathLike[str], reading: MapReading) -> list[Se
             if uneven
             else ()
         )
-        xy, system = _map_conversion(step)
+        xy, system = _map_conversion(step, scale)
+        placement = _placed(step, alignment, step.at(layouts["IFCALIGNMENTHORIZONTAL"], what="a layout"), scale)
+        plan, profile = _moved(plan, profile, placement)
         segments.append(
             segment_of_design(
                 path=str(path),
@@ -123,7 +146,7 @@ def read_ifc_segments(path: str | PathLike[str], reading: MapReading) -> list[Se
                 plan=[p for p in plan if p.length_m > 0.0],
                 profile=[p for p in profile if p.length_m > 0.0],
                 cant=[c for c in cant if c.length_m > 0.0],
-                reading=replace(reading, crs=reading.crs or system),
+                reading=replace(reading, crs=used_crs(path, reading.crs, system)),
                 grid=xy,
                 notes=notes,
             )
@@ -155,8 +178,13 @@ def _units(step: _Step) -> tuple[float, float]:
     return length, angle
 
 
-def _map_conversion(step: _Step) -> tuple[tuple[float, float, float, float, float, float] | None, str | None]:
-    """Easting, northing, height, cosine, sine and scale of the IfcMapConversion, and the CRS it names."""
+def _map_conversion(
+    step: _Step, unit: float
+) -> tuple[tuple[float, float, float, float, float, float] | None, str | None]:
+    """Easting, northing, height, cosine, sine and scale of the IfcMapConversion, and the CRS it names.
+
+    Its scale is of the file's unit of length, in some files of metres.
+    """
     found = step.of_kind("IFCMAPCONVERSION")
     if not found:
         return None, None
@@ -165,8 +193,59 @@ def _map_conversion(step: _Step) -> tuple[tuple[float, float, float, float, floa
     east, north, up = (float(v) for v in values[2:5])
     a, b = (1.0 if values[5] is None else values[5]), (0.0 if values[6] is None else values[6])
     scale = values[7] if len(values) > 7 and values[7] is not None else 1.0
+    if abs(scale / unit - 1.0) < LARGEST_SCALE:
+        scale /= unit
+    elif not abs(scale - 1.0) < LARGEST_SCALE:
+        raise InputFileError(
+            step.path, f"the scale {scale:g} of IfcMapConversion is not that of its units ({unit:g} m)"
+        )
     norm = float(np.hypot(a, b))
     return (east, north, up, a / norm, b / norm, float(scale)), str(system)
+
+
+def _placed(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _Placement:
+    """Placement of an alignment; that of its layout in plan where it is relative to the alignment's."""
+    own, relative = alignment.values[5], layout.values[5]
+    if relative is not None and own is not None and own in _chain(step, relative):
+        own = relative
+    at = _Placement()
+    for reference in reversed(_chain(step, own or relative)):
+        axes = step.at(step.at(reference, what="ObjectPlacement").values[1], what="a placement")
+        x, y, z = [*step.at(axes.values[0], what="a placement").values[0], 0.0][:3]
+        directions = [None if r is None else step.at(r, what="a placement").values[0] for r in axes.values[1:3]]
+        if axes.kind == "IFCAXIS2PLACEMENT2D":
+            directions = [None, directions[0]]
+        axis, towards = directions
+        if axis is not None and not np.allclose(axis[:2], 0.0, atol=1e-9):
+            raise InputFileError(step.path, "an alignment is placed on axes that are not vertical, which is not read")
+        turn = 0.0 if towards is None else float(np.arctan2(towards[1], towards[0]))
+        at = at.then(x * scale, y * scale, z * scale, turn)
+    return at
+
+
+def _chain(step: _Step, reference: Any) -> list[Any]:
+    """Placements from an object to the world; InputFileError where one is not local."""
+    found: list[Any] = []
+    while reference is not None and reference not in found:
+        entity = step.at(reference, what="ObjectPlacement")
+        if entity.kind != "IFCLOCALPLACEMENT":
+            raise InputFileError(
+                step.path, f"an alignment is placed by {entity.kind}, which is not read; IfcLocalPlacement is"
+            )
+        found.append(reference)
+        reference = entity.values[0]
+    return found
+
+
+def _moved(
+    plan: list[PlanElement], profile: list[ProfileElement], at: _Placement
+) -> tuple[list[PlanElement], list[ProfileElement]]:
+    """Elements in the coordinates of the project."""
+    moved = []
+    for element in plan:
+        placed = at.then(element.x_m, element.y_m, 0.0, element.direction_rad)
+        moved.append(replace(element, x_m=placed.x_m, y_m=placed.y_m, direction_rad=placed.turn_rad))
+    return moved, [replace(element, height_m=element.height_m + at.z_m) for element in profile]
 
 
 def _law(step: _Step, entity: _Entity, kinds: dict[str, str]) -> str:

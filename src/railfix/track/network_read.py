@@ -66,19 +66,23 @@ def _relations(path: str | PathLike[str]) -> list[Relation]:
     if ending(path) not in (".geojson", ".json", ".gpkg", ".fgb"):
         return []
     relations = []
-    for _, rows, _ in read_layers(path, geometry="Point"):
+    for _, rows, _ in read_layers(path, geometry="none"):
         for row in rows:
-            if {RELATION, "netelementB", "positionOnA", "positionOnB"} <= set(row):
-                relations.append(
-                    Relation(
-                        name=str(row.get("id", "")),
-                        first=str(row[RELATION]),
-                        second=str(row["netelementB"]),
-                        first_end=int(row["positionOnA"]),
-                        second_end=int(row["positionOnB"]),
-                        navigable=str(row.get("navigability") or "both").lower() != "none",
-                    )
+            stated = {key: value for key, value in row.items() if value is not None and value == value}
+            if RELATION not in stated:
+                continue
+            if missing := [key for key in ("netelementB", "positionOnA", "positionOnB") if key not in stated]:
+                raise InputFileError(path, f"net relation {stated.get('id', '')!r} has no {', '.join(missing)}")
+            relations.append(
+                Relation(
+                    name=str(stated.get("id", "")),
+                    first=str(stated[RELATION]),
+                    second=str(stated["netelementB"]),
+                    first_end=int(stated["positionOnA"]),
+                    second_end=int(stated["positionOnB"]),
+                    navigable=str(stated.get("navigability") or "both").lower() != "none",
                 )
+            )
     return relations
 
 

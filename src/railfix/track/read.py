@@ -9,7 +9,7 @@ from os import PathLike
 import numpy as np
 
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import ending, read_text
+from railfix.core.files import ending
 from railfix.track.csv_file import read_csv_segment
 from railfix.track.geojson_file import read_geojson_segments
 from railfix.track.heights import check_height_datum
@@ -17,7 +17,7 @@ from railfix.track.route import MAX_GAP_M, join
 from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
 from railfix.track.track import Track
 from railfix.track.vector_file import ENDINGS as VECTOR_ENDINGS
-from railfix.track.vector_file import geojson_has_heights, read_vector_segments
+from railfix.track.vector_file import read_vector_segments
 
 
 def read_track(
@@ -138,9 +138,7 @@ def read_segments(file: str | PathLike[str], reading: MapReading) -> list[Segmen
     if kind == ".csv":
         return [read_csv_segment(file, reading)]
     if kind in (".geojson", ".json"):
-        if geojson_has_heights(read_text(file)):
-            return read_geojson_segments(file, reading)
-        return read_vector_segments(file, reading)
+        return read_geojson_segments(file, reading)
     if kind in VECTOR_ENDINGS:
         return read_vector_segments(file, reading)
     if kind == ".ifc":

@@ -1,13 +1,14 @@
 """Lines of map files of geographic information systems, read through GDAL by `pyogrio`.
 
-GeoPackage, Shapefile, FlatGeobuf, GML, GPX, KML, DXF, OpenStreetMap and GeoJSON; each line of each layer is a
+GeoPackage, Shapefile, FlatGeobuf, GML, GPX, KML, DXF and OpenStreetMap; each line of each layer is a
 segment, without heights where its coordinates have none.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import replace
 from os import PathLike
 from typing import Any, Final
@@ -26,13 +27,19 @@ from railfix.track.track import UNNAMED
 ENDINGS: Final = (".gpkg", ".shp", ".fgb", ".gml", ".gpx", ".kml", ".dxf", ".osm", ".pbf")
 INSTALL: Final = "install it with: pip install 'railfix[maps]'"
 #: Columns that name a line, in this order.
-_NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "fid")
+_NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")
 #: Values of OpenStreetMap's tag railway that are tracks on which trains run.
 _OSM_RAILWAYS: Final = ("rail", "light_rail", "subway", "tram", "narrow_gauge", "preserved", "monorail")
+#: Values of that tag that are no such tracks, by which a feature of OpenStreetMap is known.
+_OSM_OTHERS: Final = (
+    "abandoned", "construction", "disused", "dismantled", "demolished", "funicular", "historic", "loading_ramp",
+    "miniature", "planned", "platform", "platform_edge", "proposed", "razed", "removed", "station", "traverser",
+    "turntable", "yard",
+)  # fmt: skip
 
 
 def read_layers(path: str | PathLike[str], *, geometry: str) -> list[tuple[str | None, list[dict[str, Any]], Any]]:
-    """Read all features of a kind of geometry ("LineString", "Point"); multi-part lines are taken apart.
+    """Read all features of a kind of geometry ("LineString"), or whatever their geometry ("none").
 
     One entry a layer: CRS or None, properties of each feature, shapely geometries. InputFileError: when pyogrio is
     missing, or GDAL cannot read the file.
@@ -46,10 +53,11 @@ def read_layers(path: str | PathLike[str], *, geometry: str) -> list[tuple[str |
     try:
         for layer, _ in pyogrio.list_layers(path):
             meta, _, blob, values = pyogrio.raw.read(path, layer=layer)
-            if blob is None:
+            if blob is None and geometry != "none":
                 continue
-            shapes = np.asarray(shapely.from_wkb(blob), dtype=object)
-            usable = [k for k, s in enumerate(shapes) if s is not None and s.geom_type.endswith(geometry)]
+            size = len(values[0]) if len(values) else 0
+            shapes = np.full(size, None) if blob is None else np.asarray(shapely.from_wkb(blob), dtype=object)
+            usable = [k for k, s in enumerate(shapes) if geometry == "none" or (s and s.geom_type.endswith(geometry))]
             fields = [str(name) for name in meta["fields"]]
             rows = [{name: column[k] for name, column in zip(fields, values, strict=True)} for k in usable]
             if usable:
@@ -67,22 +75,38 @@ def read_vector_segments(path: str | PathLike[str], reading: MapReading) -> list
     """
     check_height_datum(reading.height_datum)
     segments: list[Segment] = []
+    left_out: Counter[str] = Counter()
     for named, rows, shapes in read_layers(path, geometry="LineString"):
         of_layer = replace(reading, crs=used_crs(path, reading.crs, named))
         for row, shape in zip(rows, shapes, strict=True):
-            if not _is_track(row):
+            if why := no_track(row, of_openstreetmap=is_of_openstreetmap(row)):
+                left_out[why] += 1
                 continue
             for k, part in enumerate(shape.geoms if shape.geom_type.startswith("Multi") else [shape]):
                 name = _name(row, fallback=f"line {len(segments) + 1}") + (f", part {k + 1}" if k else "")
                 points = np.array(part.coords, dtype=np.float64)
-                segments.append(plan_segment(points, of_layer, path=str(path), name=name))
+                segments.append(plan_segment(points, of_layer, path=str(path), name=name, stated=_accuracy(row)))
+    notes = left_out_note(path, left_out)
+    segments[:1] = [replace(s, notes=(*s.notes, *notes)) for s in segments[:1]]
     if not segments:
-        raise InputFileError(path, "there is no line in this file; a track map needs LineStrings")
+        why = "".join(f" ({note})" for note in notes)
+        raise InputFileError(path, f"there is no line in this file; a track map needs LineStrings{why}")
     return segments
 
 
-def plan_segment(coordinates: Floats, reading: MapReading, *, path: str, name: str) -> Segment:
-    """A segment of coordinates in map order, shape (n, 2 or 3); points repeated in plan are left out."""
+def _accuracy(row: Mapping[str, Any]) -> dict[str, str]:
+    """Accuracy that a feature states."""
+    keys = ("sigma_plan_m", "sigma_height_m")
+    return {key: str(row[key]) for key in keys if row.get(key) is not None and row[key] == row[key]}
+
+
+def plan_segment(
+    coordinates: Floats, reading: MapReading, *, path: str, name: str, stated: Mapping[str, str] | None = None
+) -> Segment:
+    """A segment of coordinates in map order, shape (n, 2 or 3); points repeated in plan are left out.
+
+    `stated` is the accuracy that the file states.
+    """
     source = f"{path} ({name})"
     if not np.isfinite(coordinates[:, :2]).all():
         raise InputFileError(source, "a coordinate is not finite")
@@ -92,9 +116,7 @@ def plan_segment(coordinates: Floats, reading: MapReading, *, path: str, name: s
         raise InputFileError(source, "a track needs at least two different points")
     crs = reading.crs
     used = crs or "EPSG:4326"
-    latitude, longitude, frame = frame_degrees(used, values[:, 0], values[:, 1])
-    if not (np.isfinite(latitude).all() and np.isfinite(longitude).all() and (np.abs(latitude) <= 90.0).all()):
-        raise InputFileError(source, f"some coordinates lie outside the CRS {used}; is it the right one?")
+    latitude, longitude, frame = frame_degrees(used, values[:, 0], values[:, 1], path=source)
     height, model, datum = np.full(len(values), np.nan), "", NO_HEIGHTS
     if values.shape[1] == 3 and np.isfinite(values[:, 2]).all() and values[:, 2].any():
         height, model, datum = stated_heights(values[:, 2], latitude, longitude, reading, path=source)
@@ -108,7 +130,7 @@ def plan_segment(coordinates: Floats, reading: MapReading, *, path: str, name: s
         frame=frame if crs else "EPSG:4979",
         height_datum=datum,
         geoid=model,
-        metadata={"name": name},
+        metadata={"name": name, **(stated or {})},
         notes=older_datum_note(crs),
         **{key: np.full(len(values), np.nan) for key in ATTRIBUTES},
     )
@@ -123,32 +145,31 @@ def _name(row: Mapping[str, Any], *, fallback: str) -> str:
     return fallback
 
 
-def _is_track(row: Mapping[str, Any]) -> bool:
-    """Whether a feature is a track: of OpenStreetMap those tagged as railways, else all lines."""
-    if "osm_id" not in row:
-        return True
-    tags = str(row.get("other_tags") or "")
-    railway = row.get("railway")
-    if railway is None and '"railway"=>"' in tags:
+def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
+    """Why a feature is no track: of OpenStreetMap those not tagged as railways that run; empty for tracks."""
+    railway = _railway(row)
+    if railway in _OSM_RAILWAYS or not (of_openstreetmap or railway in _OSM_OTHERS):
+        return ""
+    return f"railway={railway}" if railway else "no railway"
+
+
+def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
+    """Whether a feature is one of OpenStreetMap, as GDAL, osmtogeojson and Overpass write them."""
+    names = (str(row.get(key) or "") for key in ("@id", "id"))
+    return "osm_id" in row or any(re.fullmatch(r"(way|relation|node)/\d+", name) for name in names)
+
+
+def _railway(row: Mapping[str, Any]) -> str | None:
+    tags, railway = row.get("other_tags"), row.get("railway")
+    if railway is None and isinstance(row.get("tags"), dict):
+        railway = row["tags"].get("railway")
+    if railway is None and isinstance(tags, str) and '"railway"=>"' in tags:
         railway = tags.split('"railway"=>"', 1)[1].split('"', 1)[0]
-    return railway in _OSM_RAILWAYS
+    return railway if isinstance(railway, str) and railway else None
 
 
-def geojson_has_heights(text: str) -> bool:
-    """Whether the coordinates of a GeoJSON document have three numbers; True for what is no GeoJSON."""
-    try:
-        node = json.loads(text)
-    except (json.JSONDecodeError, RecursionError):
-        return True
-    return any(len(point) > 2 for point in _points(node)) or not _points(node)
-
-
-def _points(node: Any) -> Sequence[Sequence[float]]:
-    if isinstance(node, dict):
-        if node.get("type") == "LineString" and isinstance(node.get("coordinates"), list):
-            return [p for p in node["coordinates"] if isinstance(p, list)]
-        parts = [*(node.get("features") or []), node.get("geometry")]
-        if node.get("type") == "MultiLineString":
-            return [p for line in node.get("coordinates") or [] for p in line if isinstance(p, list)]
-        return [point for part in parts for point in _points(part)]
-    return []
+def left_out_note(path: str | PathLike[str], reasons: Counter[str]) -> tuple[str, ...]:
+    """A note on the lines of a file that are no tracks."""
+    if not reasons:
+        return ()
+    return (f"{path}: lines left out that are no tracks: " + ", ".join(f"{n} {why}" for why, n in reasons.items()),)

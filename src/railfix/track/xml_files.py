@@ -11,6 +11,7 @@ import numpy as np
 
 from railfix.core.errors import InputFileError
 from railfix.core.files import read_bytes
+from railfix.track.crs import used_crs
 from railfix.track.design import segment_of_design
 from railfix.track.elements import CantElement, PlanElement, ProfileElement
 from railfix.track.segment import MapReading, Segment
@@ -106,7 +107,7 @@ def _landxml(path: str, root: Any, reading: MapReading) -> list[Segment]:
                 plan=plan,
                 profile=profile,
                 cant=cant,
-                reading=replace(reading, crs=reading.crs or named),
+                reading=replace(reading, crs=used_crs(path, reading.crs, named)),
                 notes=notes,
             )
         )
@@ -248,7 +249,7 @@ def _railml(path: str, root: Any, reading: MapReading) -> list[Segment]:
     system = root.find(".//{*}geometricPositioningSystem")
     definition = system.get("crsDefinition") if system is not None else None
     named = definition.replace("urn:ogc:def:crs:", "").replace("::", ":") if definition else None
-    reading = replace(reading, crs=reading.crs or named)
+    reading = replace(reading, crs=used_crs(path, reading.crs, named))
     segments = []
     for element in root.iterfind(".//{*}netElement"):
         points: list[tuple[float, list[float]]] = []
