@@ -121,6 +121,7 @@ def test_an_older_datum_goes_to_the_modern_frame_of_its_region(crs: str, frame: 
     assert "transformed to" in older_datum_note(crs)[0]
 
 
+@pytest.mark.slow
 def test_no_frame_of_the_table_stops_with_an_error() -> None:
     """Each name is one that PROJ knows, at its own area of use."""
     import pyproj
