@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Column as TableColumn
 from rich.table import Table
 
 from railfix.core.reasons import Status
@@ -26,9 +28,54 @@ if TYPE_CHECKING:
 _FILE_WIDTH: Final = 500
 
 
+class TableConsole(Console):
+    """The standard output; a table that is wider than it is printed in parts, and no number is cut or folded."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print as `rich` does, tables in parts that fit."""
+        for item in objects or ("",):
+            if isinstance(item, Table):
+                for part in split_table(item, self):
+                    super().print(part, crop=False, **options)
+            else:
+                super().print(item, **options)
+
+
+def split_table(table: Table, console: Console) -> list[Table]:
+    """Split a table by its columns into tables that fit the console; each begins with the columns of text.
+
+    Text may fold, numbers do not: a part with a single number may be wider than the console.
+    """
+    options = console.options.update(width=_FILE_WIDTH)
+    if console.measure(table, options=options).maximum <= console.width:
+        return [table]
+    count_text = next((k for k, column in enumerate(table.columns) if column.justify == "right"), 1)
+    text, numbers = table.columns[:count_text], table.columns[count_text:]
+    text = [replace(column, no_wrap=False, overflow="fold") for column in text]
+    numbers = [replace(column, no_wrap=column.justify == "right") for column in numbers]
+    fitting: list[TableColumn] = []
+    parts: list[list[TableColumn]] = []
+    for column in numbers:
+        trial = _with_columns(table, [*text, *fitting, column])
+        if fitting and console.measure(trial, options=options).maximum > console.width:
+            parts.append(fitting)
+            fitting = []
+        fitting = [*fitting, column]
+    return [_with_columns(table, [*text, *part]) for part in [*parts, fitting]]
+
+
+def _with_columns(table: Table, columns: Sequence[TableColumn]) -> Table:
+    """Return a table of some columns, with the same rows and frame."""
+    part = Table(*(column.copy() for column in columns), box=table.box, show_edge=table.show_edge)
+    part.padding, part.pad_edge = table.padding, table.pad_edge
+    for cells in zip(*(column.cells for column in columns), strict=True):
+        part.add_row(*cells)
+    return part
+
+
 def console_of_tables() -> Console:
     """Return the standard output for tables, wide enough for whole rows in a log file."""
-    console = Console(highlight=False)
+    console = TableConsole(highlight=False)
     if not console.is_terminal:
         console.width = max(console.width, _FILE_WIDTH)
     return console
