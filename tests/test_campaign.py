@@ -257,3 +257,31 @@ def test_a_killed_campaign_is_continued(folder: Path, tmp_path: Path) -> None:
         shutil.rmtree(out)
     subprocess.run(words, capture_output=True, text=True, check=True)
     check_whole()
+
+
+def test_an_absolute_pattern_and_a_field_that_is_named_twice_find_the_logs(folder: Path, tmp_path: Path) -> None:
+    patterns = {"front": f"{folder}/logs/{{train}}/{{day}}/front.obs", "nav": "nav/{day}.nav", "track": ["line.csv"]}
+    (folder / "absolute.toml").write_text("\n".join(f"{name} = {json.dumps(text)}" for name, text in patterns.items()))
+    runs = read_campaign(folder / "absolute.toml", tmp_path)
+    assert dict(runs[0].fields) == {"train": "A", "day": "2024-03-05"}
+    assert len(runs) == 4
+    (tmp_path / "A" / "x").mkdir(parents=True)
+    for name in ("A/A.obs", "A/B.obs", "n.nav", "t.csv"):
+        (tmp_path / name).write_text("")
+    (tmp_path / "c.toml").write_text('front = "{train}/{train}.obs"\nnav = "n.nav"\ntrack = ["t.csv"]\n')
+    assert [dict(run.fields) for run in read_campaign(tmp_path / "c.toml", tmp_path)] == [{"train": "A"}]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "words"),
+    [
+        ("in/{a}{b}.obs", "put a character between the two fields"),
+        ("in/**{run}", r"\*\* is not known; write a \* for each folder"),
+        ("in/{1}.obs", r"the field \{1\} has to begin with a letter"),
+    ],
+)
+def test_a_pattern_that_cannot_be_read_is_named(tmp_path: Path, pattern: str, words: str) -> None:
+    path = tmp_path / "c.toml"
+    path.write_text(f'front = "{pattern}"\nnav = "n.nav"\ntrack = ["t.csv"]\n')
+    with pytest.raises(SettingsError, match=words):
+        read_campaign(path, tmp_path)

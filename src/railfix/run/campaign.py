@@ -117,6 +117,7 @@ def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
     if not fields:
         raise SettingsError(f"{path}: front = {campaign.front!r} has no field such as {{day}} that names a run")
     for name, pattern in patterns.items():
+        _check_pattern(path, name, pattern)
         if other := sorted(set(_FIELD.findall(pattern)) - set(fields)):
             raise SettingsError(f"{path}: {name} has the field {other[0]}, which front has not")
     found = {name: _found(folder, pattern) for name, pattern in patterns.items()}
@@ -232,21 +233,43 @@ def _found(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
         return []
     if not _FIELD.search(pattern) and "*" not in pattern:
         return [(folder / pattern, {})]
-    escaped = "".join(_regex(part) for part in re.split(r"(\{\w+\}|\*)", pattern))
-    expression = re.compile(escaped)
+    given = Path(pattern)
+    root = Path(given.anchor) if given.is_absolute() else folder
+    relative = given.relative_to(root).as_posix() if given.is_absolute() else pattern
+    seen: set[str] = set()
+    parts = re.split(r"(\{\w+\}|\*)", relative)
+    expression = re.compile("".join(_regex(part, seen) for part in parts))
     found = []
-    for path in sorted(folder.glob(_FIELD.sub("*", pattern))):
-        match = expression.fullmatch(path.relative_to(folder).as_posix())
+    for path in sorted(root.glob(re.sub(r"\*+", "*", _FIELD.sub("*", relative)))):
+        match = expression.fullmatch(path.relative_to(root).as_posix())
         if match:
             found.append((path, match.groupdict()))
     return found
 
 
-def _regex(part: str) -> str:
+def _regex(part: str, seen: set[str]) -> str:
+    """Return the expression of a part of a pattern; a field that was `seen` before has the same value again."""
     if part == "*":
         return "[^/]*"
     field = _FIELD.fullmatch(part)
-    return f"(?P<{field[1]}>[^/]+)" if field else re.escape(part)
+    if field is None:
+        return re.escape(part)
+    again = field[1] in seen
+    seen.add(field[1])
+    return f"(?P={field[1]})" if again else f"(?P<{field[1]}>[^/]+)"
+
+
+def _check_pattern(path: Path, name: str, pattern: str) -> None:
+    """Raise SettingsError where a pattern does not say where the value of each field ends."""
+    if re.search(r"\}\{", pattern):
+        raise SettingsError(
+            f"{path}: {name} = {pattern!r}: put a character between the two fields: {{a}}_{{b}}"
+        )
+    if "**" in pattern:
+        raise SettingsError(f"{path}: {name} = {pattern!r}: ** is not known; write a * for each folder, such as */*")
+    for field in _FIELD.findall(pattern):
+        if not field.isidentifier():
+            raise SettingsError(f"{path}: {name}: the field {{{field}}} has to begin with a letter")
 
 
 def _matching(found: list[tuple[Path, dict[str, str]]], values: Mapping[str, str]) -> Iterator[Path]:
