@@ -128,6 +128,27 @@ def test_a_run_into_the_folder_of_its_inputs_leaves_them(desk: Desk) -> None:
     assert "is an input, which is never overwritten" in " ".join(output.split())
 
 
+@pytest.mark.requirement("G1")
+def test_inputs_of_a_run_and_two_outputs_of_one_name_are_left(good: Desk, desk: Desk) -> None:
+    """The error model over the run's own inputs; observations and ephemerides in one file; a log over a map."""
+    record = desk.folder / "results" / "run.json"
+    record.write_text(record.read_text().replace(str(good.folder), str(desk.folder)))
+    before = contents(desk.folder)
+    for name in ("front.obs", "line.csv", "train.toml"):
+        words = "error-model {desk}/results --reference {desk}/truth.csv --out {out}"
+        code, output = call(desk, words, desk.folder / name, "--overwrite")
+        assert (code, contents(desk.folder)) == (8, before), output
+        assert "is an input, which is never overwritten" in " ".join(output.split())
+    out = desk.folder / "one.rnx"
+    code, output = call(desk, "convert {desk}/front.obs --out {out} --nav-out {out}", out, "--overwrite")
+    assert (code, contents(desk.folder)) == (8, before), output
+    assert "is named by --out and by --nav-out" in " ".join(output.split())
+    words = "live --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --log {out}"
+    code, output = call(desk, words, desk.folder / "truth.csv")
+    assert (code, contents(desk.folder)) == (8, before), output
+    assert "is no log of railfix live" in " ".join(output.split())
+
+
 # -- leftovers ----------------------------------------------------------------------------------------------
 
 

@@ -25,6 +25,7 @@ from railfix.ranges.error_model import (
     summary,
     write_error_model,
 )
+from railfix.run import read_record
 
 
 def error_model(
@@ -82,7 +83,8 @@ def error_model(
     if len(reference) != len(runs):
         raise SettingsError(f"{len(runs)} runs and {len(reference)} references: give --reference once for each run")
     in_runs = [path for run in runs if run.is_dir() for path in run.iterdir()]
-    check_outputs((out, "any"), overwrite=overwrite, inputs=[*reference, *(base or ()), *in_runs])
+    read = [path for run in runs if (run / "run.json").is_file() for path in read_record(run).inputs.paths]
+    check_outputs((out, "any"), overwrite=overwrite, inputs=[*reference, *(base or ()), *in_runs, *read])
     edges = {"elevation_deg": _edges("--elevations", elevations), "cn0_dbhz": _edges("--cn0", cn0)}
     bins = validated(ErrorBins, {**edges, "sectors": sectors}, source="bins of the model")
     fit = validated(ErrorModelFit, {"bins": bins, "least_blocks": least_blocks}, source="--least-blocks")

@@ -18,7 +18,7 @@ from railfix.core.errors import OutputError, SettingsError
 from railfix.core.settings import Settings, validated
 from railfix.io.logs import read_navigation
 from railfix.live.channels import TwoChannels
-from railfix.live.console import SessionLog
+from railfix.live.console import SessionLog, check_log_file
 from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.metrics import Metrics, serve_metrics
 from railfix.live.outlets import Outlet
@@ -98,6 +98,8 @@ class LiveInputs(Settings):
             check_not_input(path, self.read)
             if path.resolve() in [other.resolve() for other in written[:k]]:
                 raise OutputError(f"{path}: is named for two outputs; name another file for one of them")
+        if self.log is not None:
+            check_log_file(self.log)
 
 
 async def run_live(inputs: LiveInputs) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import logging.handlers
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,6 +81,23 @@ class _Rotating(logging.handlers.RotatingFileHandler):
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802, ARG002 (the name and form of logging)
         """Raise the error that is being handled."""
         raise
+
+
+#: Beginning of a line of a log of a session.
+_LINE: Final = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3} ")
+
+
+def check_log_file(path: Path) -> None:
+    """Raise OutputError where a file is there that is no log of a session: nothing is appended to it."""
+    try:
+        with path.open("rb") as file:
+            begin = file.read(64)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be opened as a log file ({error.strerror or error})") from None
+    if begin and not _LINE.match(begin):
+        raise OutputError(f"{path}: is no log of railfix live, and is not appended to; name another file")
 
 
 class SessionLog:

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from railfix.core.errors import OutputError
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.logs import read_navigation, scan_observations
 from railfix.io.rinex import write_navigation, write_observations
@@ -29,6 +30,8 @@ def convert_logs(
     InputFileError: a log cannot be read or holds nothing of what is asked for. OutputError: a file exists already, is
     an input, or cannot be written.
     """
+    if out is not None and nav_out is not None and out.resolve() == nav_out.resolve():
+        raise OutputError(f"{out}: is named by --out and by --nav-out; name another file for one of them")
     for target in (out, nav_out):
         if target is not None:
             check_output_file(target, overwrite=overwrite, inputs=logs)
