@@ -444,3 +444,18 @@ def test_sources_and_chunks_by_hand() -> None:
     chunks = _Chunks()
     body: Any = b"".join(chunks.take(bytes([value])) for value in b"4\r\nWiki\r\n5;x=1\r\npedia\r\n0\r\n\r\n")
     assert body == b"Wikipedia"
+
+
+def test_a_track_of_another_country_is_named_once(tmp_path: Path) -> None:
+    """`railfix run` ends with this sentence; a session goes on, and its log has it."""
+    files = demo_files()
+    track = tmp_path / "far.csv"
+    rows = "".join(f"47.{k:02d},8.5,500\n" for k in range(10, 20))
+    track.write_text("latitude_deg,longitude_deg,height_m\n" + rows)
+    front = tmp_path / "front.rnx"
+    railfix.write_observations(railfix.read_observations(files["front"])[:15], front)
+    words = ["live", "--front", str(front), "--nav", str(files["nav"]), "--track", str(track), "--log"]
+    result = RUNNER.invoke(app, [*words, str(tmp_path / "live.log")])
+    assert result.exit_code == 0, result.output
+    log = (tmp_path / "live.log").read_text()
+    assert log.count("km from where the front log was recorded; give the track of that line") == 1

@@ -22,6 +22,7 @@ from railfix.live.console import SessionLog, check_log_file
 from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.metrics import Metrics, serve_metrics
 from railfix.live.outlets import Outlet
+from railfix.live.place_watch import PlaceWatch
 from railfix.live.record import ResultTables
 from railfix.live.sensor_lines import FOREVER, Sensed
 from railfix.live.sensor_watch import SensorWatch
@@ -184,7 +185,7 @@ def _hooks(
     full: str,
 ) -> tuple[Hooks, Mapping[str, Any]]:
     """Tables of results, state file, status line and watch of sensors; and streams' states where the file is used."""
-    observers: list[Callable[[LiveOutput], None]] = []
+    observers: list[Callable[[LiveOutput], None]] = [PlaceWatch(log.say).take]
     sensed, save, streams = None, None, {}
     if inputs.out is not None:
         tables = held.enter_context(ResultTables(inputs.out, overwrite=inputs.overwrite, inputs=inputs.read))
