@@ -196,6 +196,25 @@ FAULTS: Final[dict[str, Fault]] = {
 _RUN: Final = f"run {_LOG} --track {{desk}}/line.csv --out {{out}}"
 #: Files that are written, a command with a mistake in it, its exit code, and words of its sentence.
 MISTAKES: Final[dict[str, tuple[dict[str, str], str, int, str]]] = {
+    "semicolons": (
+        {"s.csv": "latitude_deg;longitude_deg;height_m\n47,1;8,5;400\n"}, "map check {desk}/s.csv", 3,
+        "s.csv, line 1: has ';' between its columns; expected commas, and points in numbers",
+    ),
+    "header_misspelt": (
+        {"s.csv": "# sigma_plan: 3\nlatitude_deg,longitude_deg,height_m\n47,8,400\n47.1,8,400\n"},
+        "map check {desk}/s.csv", 3, "the line '# sigma_plan: 3': is '# sigma_plan_m' meant?",
+    ),
+    "base_off_the_earth": (
+        {},
+        "which-track --front {desk}/front.obs --base {desk}/rear.obs --base-place 95,8,400 --nav {desk}/brdc.nav "
+        "--map {desk}/line.geojson", 4, "expected a latitude to 90",
+    ),
+    "rover_as_base": (
+        {},
+        "which-track --front {desk}/front.obs --base {desk}/front.obs --base-place 35,139,4 --nav {desk}/brdc.nav "
+        "--map {desk}/line.geojson", 4, "is the log of the train; give that of the base station",
+    ),
+    "alarm_limit_of_the_universe": ({}, _RUN + " --set alarm_limit_m=1e12", 4, "setting alarm_limit_m"),
     "pulses_of_letters": (
         {"s.csv": "time_gpst,pulse\n2024-03-05T03:10:00,abc\n2024-03-05T03:10:01,5\n"},
         _RUN + " --tachometer {desk}/s.csv", 3, "s.csv: row 2: pulse is 'abc', a number was expected; correct the row",

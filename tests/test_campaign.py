@@ -106,7 +106,7 @@ def test_a_failed_run_is_a_row_and_a_campaign_goes_on_where_it_was(folder: Path,
 def test_the_command_and_what_reads_its_runs(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     result = RUNNER.invoke(app, ["campaign", str(folder / "campaign.toml"), "--out", str(out), "--workers", "2"])
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == 5, result.output
     assert "4 of 4 runs, 1 failed, 0 min 00 s left" in result.stderr
     truth = str(tmp_path.parent / "none.csv")
     words = ["report", str(out / "runs/train=A/day=2024-03-05"), "--out", str(tmp_path / "page.html")]
@@ -219,9 +219,9 @@ def test_two_workers_of_a_cluster_give_the_same_data_set(folder: Path, tmp_path:
             [*words, str(tmp_path / "cluster"), "--scheduler", address], capture_output=True, text=True, check=False
         )
         cluster.communicate()
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 5, done.stderr
     assert "4 of 4 runs, 1 failed" in done.stderr
-    subprocess.run([*words, str(tmp_path / "here")], capture_output=True, check=True)
+    subprocess.run([*words, str(tmp_path / "here")], capture_output=True, check=False)
     assert same_but_for_times(tmp_path / "cluster", tmp_path / "here") == 3
     tables = [pl.read_csv(tmp_path / name / "campaign.csv").drop("wall_s") for name in ("cluster", "here")]
     assert tables[0].equals(tables[1], null_equal=True)

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from railfix.cli.console import console_of_tables, show_files
 from railfix.cli.options import OutOption
-from railfix.core.errors import NoPositionError, SettingsError
+from railfix.core.errors import MismatchError, NoPositionError, SettingsError
 from railfix.run.campaign import run_campaign
 
 
@@ -55,7 +55,7 @@ def campaign(
 
         railfix campaign line.toml --out results --workers 8
 
-    Exit codes as `railfix --help` says; 7 where every run has failed.
+    Exit codes as `railfix --help` says; 5 where some runs have failed, 7 where every one has.
     """
 
     def progress(*, done: int, failed: int, total: int, left_s: float) -> None:
@@ -77,6 +77,8 @@ def campaign(
     show_files(console, [out / "campaign.csv"])
     if len(failed) == len(table):
         raise NoPositionError(f"every run has failed; the first: {failed['error'][0]}")
+    if len(failed):
+        raise MismatchError(f"{len(failed)} of {len(table)} runs failed; the first: {failed['error'][0]}")
 
 
 @contextmanager

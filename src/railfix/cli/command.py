@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import errno
 import gc
 import os
@@ -113,7 +114,12 @@ class LazyCommands(Commands):
         return super().get_command(ctx, cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the command that is called, imported."""
+        """Return the command that is called, imported; of an unknown one the nearest is named."""
+        known = self.list_commands(ctx)
+        word = args[0] if args else ""
+        near = [] if word in known or word.startswith("-") else difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+        if near:
+            ctx.fail(f"there is no command {word!r}; is {near[0]!r} meant?")
         name, command, rest = super().resolve_command(ctx, args)
         return name, loaded(str(name)) if name in self.summaries else command, rest
 

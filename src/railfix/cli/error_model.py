@@ -85,6 +85,8 @@ def error_model(
     in_runs = [path for run in runs if run.is_dir() for path in run.iterdir()]
     read = [path for run in runs if (run / "run.json").is_file() for path in read_record(run).inputs.paths]
     check_outputs((out, "any"), overwrite=overwrite, inputs=[*reference, *(base or ()), *in_runs, *read])
+    if own := [file for file in base or () if file.resolve() in [path.resolve() for path in read]]:
+        raise SettingsError(f"--base {own[0]}: is a log of the run itself; give that of a reference station")
     edges = {"elevation_deg": _edges("--elevations", elevations), "cn0_dbhz": _edges("--cn0", cn0)}
     bins = validated(ErrorBins, {**edges, "sectors": sectors}, source="bins of the model")
     fit = validated(ErrorModelFit, {"bins": bins, "least_blocks": least_blocks}, source="--least-blocks")

@@ -122,6 +122,7 @@ def parse_named_columns(lines: Iterable[str], path: FilePath) -> NamedColumns:
             header, header_line = cells, number
             continue
         if len(cells) != len(header):
+            _check_header(path, header, header_line)
             message = f"{len(cells)} cells where the header (line {header_line}) has {len(header)} columns"
             raise InputFileError(path, message, line=number)
         rows.append(cells)
@@ -148,6 +149,11 @@ def _compact(rows: list[list[str]], width: int) -> pl.DataFrame:
 def _check_header(path: FilePath, header: list[str], line: int) -> None:
     if not header:
         raise InputFileError(path, "there is no header line with the names of the columns")
+    if len(header) == 1 and (other := next((mark for mark in ";\t|" if mark in header[0]), None)) is not None:
+        shown = "tabs" if other == "\t" else f"'{other}'"
+        raise InputFileError(
+            path, f"has {shown} between its columns; expected commas, and points in numbers", line=line
+        )
     if all(_is_number(cell) for cell in header):
         raise InputFileError(path, "numbers where a header line with the names of the columns was expected", line=line)
     repeated = sorted({name for name in header if header.count(name) > 1})

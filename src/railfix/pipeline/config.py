@@ -219,7 +219,7 @@ class Config(ScreenSettings):
     nominal: NominalErrors = NominalErrors()
     protection: Literal["on", "off"] = "on"
     risk: RiskBudget = RiskBudget()
-    alarm_limit_m: float = Field(default=20.0, gt=0)
+    alarm_limit_m: float = Field(default=20.0, gt=0, le=1e5)
     no_level_m: tuple[tuple[float, float], ...] = ()
     raim_protection: Literal["on", "off"] = "off"
     carrier: Literal["off", "smoothed", "float"] = "off"

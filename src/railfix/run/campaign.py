@@ -262,9 +262,7 @@ def _regex(part: str, seen: set[str]) -> str:
 def _check_pattern(path: Path, name: str, pattern: str) -> None:
     """Raise SettingsError where a pattern does not say where the value of each field ends."""
     if re.search(r"\}\{", pattern):
-        raise SettingsError(
-            f"{path}: {name} = {pattern!r}: put a character between the two fields: {{a}}_{{b}}"
-        )
+        raise SettingsError(f"{path}: {name} = {pattern!r}: put a character between the two fields: {{a}}_{{b}}")
     if "**" in pattern:
         raise SettingsError(f"{path}: {name} = {pattern!r}: ** is not known; write a * for each folder, such as */*")
     for field in _FIELD.findall(pattern):

@@ -172,6 +172,8 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     inputs.check_files()
     if (not inputs.base) != (options.base_place is None):
         raise SettingsError("a base station needs both --base and --base-place")
+    if any(base.samefile(log) for base in inputs.base for log in (*inputs.front, *inputs.rear)):
+        raise SettingsError(f"--base {inputs.base[0]}: is the log of the train; give that of the base station")
     if inputs.rear and not options.spacing > 0.0:
         raise SettingsError("two antennas need --spacing, the distance from the rear to the front one")
     if (inputs.last is None) != (options.moved is None):
@@ -234,6 +236,10 @@ def _place(text: str) -> Floats:
         latitude, longitude, height = (float(v) for v in text.split(","))
     except ValueError:
         raise SettingsError(f"--base-place {text!r}: expected LATITUDE,LONGITUDE,HEIGHT (ellipsoidal)") from None
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0 and abs(height) < 1e4):
+        raise SettingsError(
+            f"--base-place {text!r}: expected a latitude to 90, a longitude to 360 and a height in metres"
+        )
     return ecef_from_geodetic(latitude, longitude, height)
 
 

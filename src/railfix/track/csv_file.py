@@ -98,6 +98,9 @@ def _check_columns(table: NamedColumns) -> tuple[str, ...]:
         if right not in table:
             message = f"column {wrong!r} is unknown; is {right!r} meant?"
             raise InputFileError(table.path, message, line=table.header_line)
+    for wrong, right in misspelt(table.metadata, KNOWN_METADATA).items():
+        if right not in table.metadata:
+            raise InputFileError(table.path, f"the line '# {wrong}: {table.metadata[wrong]}': is '# {right}' meant?")
     for name in ("latitude_deg", "longitude_deg"):
         if name not in table:
             message = f"there is no column {name!r}; the columns are {', '.join(table.cells)}"
