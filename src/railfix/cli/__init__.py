@@ -19,6 +19,7 @@ class _Program(LazyCommands):
 
     summaries: ClassVar[Mapping[str, str]] = {
         "run": "Position receiver logs along the line.",
+        "doctor": "Examine files: what they are, whether they fit, the command to run.",
         "campaign": "Position many logs side by side, resumable.",
         "demo": "Position the demonstration log and compare it with its ground truth.",
         "ablate": "Compare choices of screens on a log: all, none, each alone, all but each.",

@@ -1,0 +1,46 @@
+"""``railfix doctor``: kinds of files, what does not fit, and a command that runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from bad_inputs import desk_in
+from railfix.cli import app
+from railfix.run.doctor import examine_files
+
+RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
+pytestmark = pytest.mark.requirement("G1")
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return desk_in(tmp_path_factory.mktemp("desk")).folder
+
+
+def test_each_file_is_known_by_its_content(desk: Path) -> None:
+    names = {
+        "rear.obs": "observations", "front.obs": "observations", "brdc.nav": "navigation", "line.csv": "track",
+        "train.toml": "vehicle", "settings.toml": "settings", "rtk.csv": "positions",
+    }  # fmt: skip
+    found = examine_files([desk / name for name in names])
+    assert {finding.path.name: finding.kind for finding in found.findings} == names
+    assert found.problems == ()
+    assert "200 epochs, one every 0.1 s" in found.findings[0].facts[0]
+    front, rear = found.command.split().index("--front"), found.command.split().index("--rear")
+    assert found.command.split()[front + 1].endswith("front.obs")
+    assert found.command.split()[rear + 1].endswith("rear.obs")
+
+
+def test_what_is_missing_or_does_not_fit_is_named(desk: Path, tmp_path: Path) -> None:
+    (tmp_path / "notes.md").write_text("notes\n")
+    far = tmp_path / "far.csv"
+    far.write_text("latitude_deg,longitude_deg,height_m\n47,8,400\n47.001,8,400\n")
+    result = RUNNER.invoke(app, ["doctor", *(str(path) for path in (desk / "front.obs", far, tmp_path / "notes.md"))])
+    assert result.exit_code == 5, result.output
+    for words in ("notes.md: is of no kind", "there is no navigation file", "km from the place in the header"):
+        assert words in result.output
+    assert "run: railfix" not in result.output
+    assert RUNNER.invoke(app, ["doctor", str(tmp_path / "none.obs")]).exit_code == 3
