@@ -200,6 +200,10 @@ MISTAKES: Final[dict[str, tuple[dict[str, str], str, int, str]]] = {
         {"s.csv": "latitude_deg;longitude_deg;height_m\n47,1;8,5;400\n"}, "map check {desk}/s.csv", 3,
         "s.csv, line 1: has ';' between its columns; expected commas, and points in numbers",
     ),
+    "height_sigma": (
+        {}, "run --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --height-sigma 1e9 "
+        "--out {desk}/o", 4, "--height-sigma: Input should be less than or equal to 1000",
+    ),
     "header_misspelt": (
         {"s.csv": "# sigma_plan: 3\nlatitude_deg,longitude_deg,height_m\n47,8,400\n47.1,8,400\n"},
         "map check {desk}/s.csv", 3, "the line '# sigma_plan: 3': is '# sigma_plan_m' meant?",

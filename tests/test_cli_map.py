@@ -60,6 +60,10 @@ def test_duplicates_are_shown_by_the_check_that_the_reader_names(tmp_path: Path)
     code, printed = call("check", path)
     assert code == 6
     assert "duplicate" in printed
+    path.write_text("latitude_deg,longitude_deg,height_m\n" + 5 * "50.0,10.0,300\n")
+    code, printed = call("check", path)
+    assert code == 6
+    assert "no mid-chord deviation" in printed
 
 
 def test_the_limit_of_the_mid_chord_deviation_is_an_option(tmp_path: Path) -> None:

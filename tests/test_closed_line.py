@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 
 import synthetic
 from railfix import kernels
+from railfix.core.files import fingerprint
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.core.timescale import timedelta
+from railfix.evaluate import evaluate_run
+from railfix.io.reference_log import AntennaReference
 from railfix.pipeline.return_gate import ReturnState, refused_codes
 from railfix.pipeline.smoothing import Replay, smooth
 from railfix.positioning.constrained import constrained_position
 from railfix.positioning.section_search import SearchIndex, SectionLimits, search
 from railfix.positioning.single_point import single_point
+from railfix.run.options import TrackReading
+from railfix.run.sources import open_line
 from railfix.simulate.scenario_file import load_recipe
-from railfix.track import Track
+from railfix.track import Track, write_track_csv
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import Vehicle, antenna_trajectory
 from railfix.tracking import Kind, Line, SensorEpochs, TrackingLimits, TrackStatus, track
@@ -244,3 +252,38 @@ def test_sensors_carry_round_the_join_of_a_ring(sensors: tuple[str, ...], ring_r
     # codes count again 1.5 s after the tunnel
     after = np.flatnonzero(known & (ring_ride.time_s > ring_ride.time_s[inside][-1] + 2.0))
     assert (found.tracked.used[after, Kind.CODE] > 0).all()
+
+
+@pytest.mark.requirement("D2")
+def test_errors_across_the_join_are_the_short_way_round_by_both_methods(tmp_path: Path) -> None:
+    """The train is 3 m behind the join, the run says 4 m after it, and the other way about; then 700 m wrong."""
+    closed = ring(1.0)
+    length = float(closed.arc_m[-1])
+    true = np.array([length - 3.0, 2.0, 500.0, 100.0])
+    answer = np.array([4.0, length - 5.0, 501.0, 800.0])
+    table = {
+        "time_gpst": START + np.arange(4) * np.timedelta64(1, "s"), "antenna": ["front"] * 4, "status": ["ok"] * 4,
+        "along_sigma_m": np.ones(4), "n_used": [8] * 4, "chainage_m": answer, "conventional_chainage_m": answer,
+    }  # fmt: skip
+    for prefix in ("", "conventional_"):
+        table |= {f"{prefix}{axis}_m": closed.at_arc(answer)[:, k] for k, axis in enumerate("xyz")}
+    pl.DataFrame(table).write_parquet(tmp_path / "positions.parquet")
+    track_file = tmp_path / "ring.csv"
+    write_track_csv(Track.from_ecef(closed.ecef_m), track_file)
+    opened = open_line((track_file,), None, antennas=("front",), reading=TrackReading(cache="skip"))
+    assert any(note.startswith("the line is closed: after 2513") for note in opened.notes)
+    assert opened.turns_m["front"] == pytest.approx(length, abs=0.01)
+    record = {"inputs": [fingerprint("track", track_file)], "settings_used": {}, "line": opened.facts}
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    for chainage, method in ((true, "chainage"), (true * np.nan, "trajectory")):
+        reference = AntennaReference(
+            time=np.asarray(table["time_gpst"]), ecef_m=closed.at_arc(true), chainage_m=chainage,
+            speed_mps=np.ones(4), sigma_m=np.full(4, 0.1), environment=np.full(4, ""), source=np.full(4, ""),
+        )  # fmt: skip
+        found = evaluate_run(tmp_path, {"front": reference})
+        assert found.runs[0].method["front"] == method
+        error = found.epochs["error_m"].to_numpy()
+        assert error[:3] == pytest.approx([7.0, -7.0, 1.0], abs=0.05)
+        assert error[3] > 500.0
+        told = "short way round" if method == "chainage" else "2 of 4 errors are to the pass nearest to the position"
+        assert any(told in note for note in found.runs[0].notes), found.runs[0].notes

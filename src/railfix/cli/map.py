@@ -277,9 +277,10 @@ def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
         + (f" + geoid {track.provenance.geoid}" if track.provenance.geoid else ""),
         markup=False,
     )
+    deviation = np.abs(geometry.mid_chord_m[np.isfinite(geometry.mid_chord_m)])
     console.print(
         f"spacing {spacing.min():.2f} / {np.median(spacing):.2f} / {spacing.max():.2f} m (least, median, largest); "
-        f"mid-chord deviation up to {np.nanmax(np.abs(geometry.mid_chord_m)):.3f} m",
+        + (f"mid-chord deviation up to {deviation.max():.3f} m" if len(deviation) else "no mid-chord deviation"),
         markup=False,
     )
     show_notes(console, track.provenance.notes)

@@ -81,16 +81,28 @@ def along_track_error(
     # A pass is a local minimum of the distance along the line: no neighbouring section comes nearer.
     joined = (which[1:] == which[:-1]) & (section[1:] == section[:-1] + 1)
     passing = away <= same_place_m
+    if np.isfinite(trajectory.turn_m):  # the ends of a closed line are no passes: it goes on there
+        passing &= ~((section == 0) & (along <= 0.0))
+        passing &= ~((section == len(length) - 1) & (along >= length[-1]))
     passing[1:] &= ~joined | (away[1:] <= away[:-1])
     passing[:-1] &= ~joined | (away[:-1] <= away[1:])
     signed = np.concatenate([arc_m[at] - nearest_arc, (arc_m[at][which] - trajectory.arc_m[section] - foot)[passing]])
     owner = np.concatenate([np.arange(len(at)), which[passing]])
+    signed = short_way_m(signed, trajectory.turn_m)
     order = np.lexsort((np.abs(signed), owner))
     first = order[np.flatnonzero(np.r_[True, owner[order][1:] != owner[order][:-1]])]
     error[at[owner[first]]] = signed[first]
     straight = np.linalg.norm(trajectory.at_arc(arc_m[at]) - trajectory.at_arc(nearest_arc), axis=1)
     error[at] = np.copysign(np.minimum(np.abs(error[at]), straight), error[at])
     return error
+
+
+def short_way_m(difference_m: Floats, turn_m: float) -> Floats:
+    """Difference of places the short way round a closed line of the length `turn_m`; as it is where that is infinite.
+
+    NaN stay NaN.
+    """
+    return difference_m - turn_m * np.round(difference_m / turn_m) if np.isfinite(turn_m) else difference_m
 
 
 def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory) -> Floats:

@@ -14,7 +14,7 @@ from pydantic import Field
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, RailfixError
 from railfix.core.settings import Settings, option
-from railfix.evaluate.along_track import along_track_error, straight_distance
+from railfix.evaluate.along_track import along_track_error, short_way_m, straight_distance
 from railfix.evaluate.options import Method
 from railfix.evaluate.run_folder import RunFolder
 from railfix.run.inputs import INPUTS
@@ -29,6 +29,8 @@ SAME_MAP_M: Final = 1.0
 SAME_TRAJECTORY_M: Final = 0.01
 #: Largest distance between two points of a vehicle along the line [m].
 _WITHIN_VEHICLE_M: Final = 45.0
+#: A way along the line this much longer than twice the error is to another pass of it, no chord of a curve [m].
+_ANOTHER_PASS_M: Final = 50.0
 #: Rounding of chainages at the ends of the line [m].
 _ROUNDING_M: Final = 1e-3
 
@@ -113,14 +115,16 @@ def errors_of(
         The track or the vehicle cannot be read.
     """
     against, trusted = _against_chainage(run, antenna, answers)
+    turn = run.turn_m(antenna)
     if method != "trajectory":
         if against is None:
             return Errors(
                 method="chainage",
-                error_m=answers.chainage_m - answers.reference_chainage_m,
-                conventional_error_m=answers.conventional_chainage_m - answers.reference_chainage_m,
+                error_m=short_way_m(answers.chainage_m - answers.reference_chainage_m, turn),
+                conventional_error_m=short_way_m(answers.conventional_chainage_m - answers.reference_chainage_m, turn),
                 distance_m=np.linalg.norm(answers.ecef_m - answers.reference_ecef_m, axis=1),
                 reference_chainage_m=answers.reference_chainage_m,
+                notes=(f"{antenna}: the line is closed, errors are the short way round",) if np.isfinite(turn) else (),
             )
         if method == "chainage":
             raise MismatchError(f"{run.path}: {against}; take the trajectory instead (--method trajectory)")
@@ -132,14 +136,30 @@ def errors_of(
     place = answers.reference_chainage_m
     if not trusted:
         place = trajectory.chainage_at(trajectory.nearest(answers.reference_ecef_m)[0])
+    error = along_track_error(arc, answers.reference_ecef_m, trajectory)
     return Errors(
         method="trajectory",
-        error_m=along_track_error(arc, answers.reference_ecef_m, trajectory),
+        error_m=error,
         conventional_error_m=along_track_error(other, answers.reference_ecef_m, trajectory),
         distance_m=straight_distance(arc, answers.reference_ecef_m, trajectory),
         reference_chainage_m=place,
         files=used,
-        notes=(*notes, *more),
+        notes=(*notes, *_note_of_passes(antenna, arc, error, answers, trajectory), *more),
+    )
+
+
+def _note_of_passes(
+    antenna: str, arc_m: Floats, error_m: Floats, answers: Answers, trajectory: Trajectory
+) -> tuple[str, ...]:
+    """Say how many errors are those to another pass of the line than the reference's own nearest point."""
+    known = np.isfinite(error_m)
+    nearest, _ = trajectory.nearest(answers.reference_ecef_m[known])
+    others = int((np.abs(arc_m[known] - nearest) > 2.0 * np.abs(error_m[known]) + _ANOTHER_PASS_M).sum())
+    if not others:
+        return ()
+    return (
+        f"{antenna}: the line comes by the same place several times; {others} of {int(known.sum())} errors are to the "
+        "pass nearest to the position, which may not be the one that the train was on",
     )
 
 
@@ -153,7 +173,7 @@ def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> tuple[s
         count = int((known & ~with_chainage).sum())
         return f"the reference has no chainage at {count} of {int(known.sum())} epochs", False
     point = run.chainage_of.get(antenna, "antenna")
-    difference = np.abs(answers.chainage_m - answers.reference_chainage_m)
+    difference = np.abs(short_way_m(answers.chainage_m - answers.reference_chainage_m, run.turn_m(antenna)))
     apart = np.linalg.norm(answers.ecef_m - answers.reference_ecef_m, axis=1)
     both = np.isfinite(difference) & np.isfinite(apart)
     off = float(np.median(np.abs(difference - apart)[both])) if both.any() else 0.0

@@ -68,6 +68,11 @@ class RunFolder(RunRecord):
         """Reference point of the chainage, by antenna."""
         return dict(self._line.get("chainage_of") or {})
 
+    def turn_m(self, antenna: str) -> float:
+        """Once round a closed line by the chainage of an antenna [m]; infinite for others, and where no run says it."""
+        turn = (self._line.get("turn_m") or {}).get(antenna)
+        return float("inf") if turn is None else float(turn)
+
     @property
     def line_name(self) -> str:
         """Name of the track."""

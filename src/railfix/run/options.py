@@ -30,7 +30,11 @@ class TrackReading(Settings):
         metavar="MODEL",
     )
     height_sigma: float | None = option(
-        "Standard deviation of the track's heights, in place of its own; of a raster needed.", None, metavar="M", gt=0
+        "Standard deviation of the track's heights, in place of its own; of a raster needed.",
+        None,
+        metavar="M",
+        gt=0,
+        le=1000.0,
     )
     map_epoch: float | None = option(
         "Epoch of the track's coordinates, where its frame is an ITRF or held at an epoch (JGD2011).",

@@ -63,7 +63,22 @@ class Line:
         """Notes on the map, the vehicle and the trajectories, each once."""
         notes = [note for trajectory in self.trajectories.values() for note in trajectory.notes]
         notes += [*self.track.provenance.notes, *(self.frame.notes if self.frame else ()), *self.preparing]
+        if turns := [turn for turn in self.turns_m.values() if np.isfinite(turn)]:
+            notes.append(
+                f"the line is closed: after {turns[0]:.1f} m it comes back to itself, chainages that differ by this "
+                "are one place"
+            )
         return tuple(dict.fromkeys([*(self.route.notes if self.route else ()), *notes]))
+
+    @property
+    def turns_m(self) -> dict[str, float]:
+        """Once round a closed line by the chainage of each antenna [m]; infinite for others."""
+        turns = {}
+        for name, path in self.trajectories.items():
+            before, after = path.chainage_at(np.array(path.joins_m))
+            turn = np.fmin(path.chainage_m[-1] - after, before - path.chainage_m[0])
+            turns[name] = float(np.nan_to_num(turn, nan=np.inf))
+        return turns
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -86,6 +101,7 @@ class Line:
             },
             "route": None if self.route is None else self.route.facts,
             "vehicle": None if self.vehicle is None else self.vehicle.model_dump(mode="json"),
+            "turn_m": {name: turn for name, turn in self.turns_m.items() if np.isfinite(turn)},
             "chainage_of": {name: trajectory.reference for name, trajectory in self.trajectories.items()},
         }
 
