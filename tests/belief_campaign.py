@@ -166,9 +166,9 @@ def case_of_folder(folder: Path) -> Case:
     if missing:
         raise SystemExit(f"{folder / 'case.toml'}: {', '.join(missing)} missing; expected log, nav, track and truth")
     nav = [given["nav"]] if isinstance(given["nav"], str) else given["nav"]
-    reference = read_reference(folder / given["truth"])
+    reference = read_reference(folder / given["truth"], ["front"])["front"]
     trajectory = Trajectory.from_track(read_track(folder / given["track"]))
-    truth = (reference.front.time, reference.front.ecef_m)
+    truth = (reference.time, reference.ecef_m)
     return made(folder.name, folder / given["log"], [folder / n for n in nav], truth, trajectory)
 
 
