@@ -31,6 +31,7 @@ from railfix.ground.interlocking_text import from_json, to_json
 from railfix.ground.layout import Layout, LoopStation, overlap
 from railfix.ground.layout_network import layout_of
 from railfix.ground.on_board import OnBoard, OnBoardLimits
+from railfix.ground.plausibility import compute_contradiction
 from railfix.ground.supervision import Supervision
 from railfix.ground.traffic import SimulatedTrain
 from railfix.io.train_message import MessageError, MessageStatus, TrainMessage
@@ -48,11 +49,15 @@ LIMITS = InterlockingLimits(margin_m=20.0, release_s=3.0)
 #: Functions that keep a rule, with the text of each and what stands there without the rule.
 RULES: dict[str, dict[Callable[..., Any], dict[str, str]]] = {
     "train ahead": {_limit_m: {"mine == lane and low < last and first < high": "False"}},
-    "safe rear": {report_received: {"(over_cm + message.length_cm) / 100.0": "0.0"}},
+    "safe rear": {report_received: {"(over_cm / 100.0 + known.length_m)": "0.0"}},
     "sequence": {
         report_received: {
             "message.sequence <= known.sequence": "False",
-            "facing * max(facing * rear, facing * known.rear_m)": "rear",
+            "facing * max(both, facing * before.rear_m)": "facing * both",
+        },
+        compute_contradiction: {
+            "elapsed < 0.0": "False",
+            "direction * front + under < direction * known.rear_m + known.length_m": "False",
         },
         Supervision.report: {"reason is None": "True"},
     },
@@ -88,15 +93,24 @@ def take_out(monkeypatch: pytest.MonkeyPatch, *rules: str) -> None:
 def interval(train: int, direction: int, front: float, track: int, station: int) -> TrainInterval:
     return TrainInterval(
         train=train, direction=direction, rear_m=front - direction * 110.0, front_m=front + direction * 5.0,
-        end_m=front + direction * 5.0, sequence=0, tracks={station: track}, station=station,
+        end_m=front + direction * 5.0, sequence=0, tracks={station: track}, station=station, length_m=100.0,
     )  # fmt: skip
 
 
-def message(train: int, sequence: int, front_m: float, facing: int = 1) -> TrainMessage:
-    return TrainMessage(
-        train=train, sequence=sequence, time_ns=1, sent_ns=1, line=1, chainage_cm=round(front_m * 100), over_cm=1000,
-        under_cm=500, facing=facing, standstill=True, status=MessageStatus.POSITION, length_cm=10_000,
+def message(train: int, sequence: int, front_m: float, facing: int = 1, **changes: Any) -> TrainMessage:
+    time_ns = sequence * 10_000_000_000
+    whole = TrainMessage(
+        train=train, sequence=sequence, time_ns=time_ns, sent_ns=time_ns, line=1, chainage_cm=round(front_m * 100),
+        over_cm=1000, under_cm=500, facing=facing, standstill=True, status=MessageStatus.POSITION, length_cm=10_000,
+        complete=True,
     )  # fmt: skip
+    return whole.replaced(**changes) if changes else whole
+
+
+def twice(state: Interlocking, whole: TrainMessage) -> Interlocking:
+    """The state after a report and one more that confirms it."""
+    state = report_received(state, whole, LAYOUT)
+    return report_received(state, whole.replaced(sequence=whole.sequence + 1), LAYOUT)
 
 
 @pytest.fixture
@@ -155,7 +169,8 @@ def test_a_follower_ends_before_the_safe_rear_of_the_train_ahead(state: Interloc
     points = {name: PointState(locked={1: None, 3: None}) for name in LAYOUT.points()}
     both = replace(routed, trains={1: follower, 3: ahead}, points=points)
     assert extended(both, LAYOUT, limits=LIMITS).trains[1].end_m == pytest.approx(1390.0 - 20.0)
-    later = report_received(both, message(3, 1, 1600.0), LAYOUT)
+    both = replace(both, trains={1: follower, 3: replace(ahead, end_m=1800.0)})
+    later = twice(both, message(3, 1, 1600.0))
     assert later.trains[3].rear_m == pytest.approx(1600.0 - 110.0)
     assert extended(later, LAYOUT, limits=LIMITS).trains[1].end_m == pytest.approx(1490.0 - 20.0)
 
@@ -163,7 +178,8 @@ def test_a_follower_ends_before_the_safe_rear_of_the_train_ahead(state: Interloc
 def test_points_are_released_after_the_rear_end_and_the_time(state: Interlocking) -> None:
     routed, _, _ = route_requested(state, 1, LAYOUT)
     assert 1 in released(routed, 10.0, LAYOUT, limits=LIMITS).points[0, 1].locked
-    passed = report_received(routed, message(1, 1, 520.0), LAYOUT)  # safe rear 410 m, points end at 400 m
+    granted = extended(routed, LAYOUT, limits=LIMITS)
+    passed = twice(granted, message(1, 1, 520.0))  # safe rear 410 m, points end at 400 m
     waiting = released(passed, 20.0, LAYOUT, limits=LIMITS)
     assert 1 in released(waiting, 22.9, LAYOUT, limits=LIMITS).points[0, 1].locked
     done = released(waiting, 23.0, LAYOUT, limits=LIMITS)
@@ -180,8 +196,8 @@ def test_reports_that_change_nothing(state: Interlocking) -> None:
     assert report_received(state, lost, LAYOUT) == state
     # changed ends: only inside the station
     assert report_received(state, message(1, 6, 345.0, facing=-1), LAYOUT).trains[1].direction == 1
-    turned = report_received(state, message(1, 6, 200.0, facing=-1), LAYOUT).trains[1]
-    assert (turned.direction, turned.rear_m, turned.end_m) == (-1, 310.0, 195.0)
+    turned = report_received(state, message(1, 6, 230.0, facing=-1), LAYOUT).trains[1]
+    assert (turned.direction, turned.rear_m, turned.end_m) == (-1, 340.0, 225.0)
 
 
 def test_stored_text_gives_the_same_state(state: Interlocking) -> None:

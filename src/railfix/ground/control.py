@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from railfix.ground.centre import CentreLimits, TrainRecord, TrainState, time_passed
-from railfix.ground.interlocking import interval_of
+from railfix.ground.interlocking import interval_of, release_train, stop_trains, stopped_trains
 from railfix.ground.interlocking_text import from_json, to_json
 from railfix.ground.layout import PointName
 from railfix.ground.monitor import MonitorLimits, MonitorState, advance, release
@@ -20,12 +20,19 @@ from railfix.ground.monitor import Order as MonitorOrder
 from railfix.ground.reference_curve import ReferenceCurve
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision
-from railfix.ground.triangle import Verdict
+from railfix.ground.triangle import STOPPING, Verdict
 from railfix.ground.web import Order
 from railfix.io.train_message import MessageError, decode
 
 #: Names of the stored documents.
-_INTERLOCKING, _CAUSE = "interlocking", "cause of the stop"
+INTERLOCKING, _CAUSE = "interlocking", "cause of the stop"
+
+
+def _severity(verdict: Verdict) -> int:
+    """Return the rank of a verdict: of those between two steps the one with the highest counts."""
+    if verdict in STOPPING:
+        return 3
+    return {Verdict.HEALTHY: 0, Verdict.RECEIVER_DRIFTING: 1}.get(verdict, 2)
 
 
 @dataclass(kw_only=True)
@@ -76,7 +83,7 @@ class ControlCentre:
         Trains are unknown until they are heard, and points that were moving are moved again. Where a triangle judges
         satellite positioning, the first start is a stop, to be released by hand.
         """
-        text, monitor = store.document(_INTERLOCKING), MonitorState() if judged else None
+        text, monitor = store.document(INTERLOCKING), MonitorState() if judged else None
         if text is not None:
             state = from_json(text)
             supervision.state = state
@@ -110,11 +117,16 @@ class ControlCentre:
         if message.train != number:
             self.rejected["of another train"] += 1
             return
+        stop = None if (train := self.supervision.state.trains.get(number)) is None else train.stop
         before = self.supervision.records.get(number, TrainRecord(train=number))
         reason = self.supervision.report(message, self.clock())
         if reason is not None:
             self.rejected[reason.value] += 1
             return
+        after_stop = self.supervision.state.trains[number].stop
+        if after_stop is not None and after_stop != stop:
+            self.rejected["contradicts what is known of the train"] += 1
+            self.log(f"train {number}: stopped, {after_stop}", train=number)
         self.reports += 1
         after = self.supervision.records[number]
         if before.state in (TrainState.SIMULATED, TrainState.ERROR):
@@ -122,9 +134,16 @@ class ControlCentre:
         elif before.state is TrainState.UNKNOWN:
             self.log(f"train {number}: heard", train=number)
 
-    def judge(self, verdict: Verdict, receiver: int = -1) -> None:
-        """Take the newest verdict on satellite positioning."""
-        self._verdict = verdict, receiver
+    def judge(self, verdict: Verdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
+        """Take a verdict on satellite positioning, of fixes of an age; of those between two steps the worst counts.
+
+        Fixes older than `MonitorLimits.late_s`, or from the future by as much, are no verdict.
+        """
+        if abs(age_s) > self.times.late_s:
+            self.rejected["fixes of the triangle with a wrong age"] += 1
+            return
+        if self._verdict is None or _severity(verdict) >= _severity(self._verdict[0]):
+            self._verdict = verdict, receiver
 
     def step(self) -> None:
         """Judge, release, route, extend; commit; then send. To be called every second."""
@@ -146,7 +165,7 @@ class ControlCentre:
             self.supervision.records[number] = after
         cause = None if self.monitor is None or self.monitor.cause is None else self.monitor.cause.name
         self.store.save(
-            *self.supervision.records.values(), documents={_INTERLOCKING: to_json(state), _CAUSE: cause or ""}
+            *self.supervision.records.values(), documents={INTERLOCKING: to_json(state), _CAUSE: cause or ""}
         )
         for authority in authorities:
             self.send(authority.train, authority.encode())
@@ -164,6 +183,21 @@ class ControlCentre:
         if orders:
             self.supervision.state = replace(self.supervision.state, stopped=False)
             self.log("stop released by hand")
+        return reason
+
+    def stop(self, train: int | None) -> str | None:
+        """Stop a train, or every train with None, by hand; return the reason of a refusal."""
+        state = self.supervision.state
+        if train is not None and train not in state.trains:
+            return f"there is no train {train}"
+        self.supervision.state = stop_trains(state, state.trains if train is None else (train,), "stopped by hand")
+        self.log("every train stopped by hand" if train is None else f"train {train}: stopped by hand", train=train)
+        return None
+
+    def release_train(self, train: int) -> str | None:
+        """Release the stop of a train by hand; return the reason of a refusal."""
+        self.supervision.state, reason = release_train(self.supervision.state, train, self.supervision.layout)
+        self.log(f"train {train}: release asked for by hand{'' if reason is None else f', refused: {reason}'}")
         return reason
 
     def set_route(self, train: int) -> str | None:
@@ -189,7 +223,7 @@ class ControlCentre:
     def snapshot(self) -> dict[str, Any]:
         """Return plain values of trains, points, monitor and log for the page."""
         layout, state = self.supervision.layout, self.supervision.state
-        trains = []
+        trains, stopped = [], stopped_trains(state)
         for number, train in state.trains.items():
             record = self.supervision.records.get(number, TrainRecord(train=number))
             rear, front = interval_of(train)
@@ -198,6 +232,7 @@ class ControlCentre:
             trains.append({
                 "number": number, "state": record.state.value, "shown": record.shown_m, "speed": abs(speed) / 100.0,
                 "direction": train.direction, "rear": rear, "front": front, "end": train.end_m, "jump": record.jump_m,
+                "stop": stopped.get(number),
                 "pieces": [[0 if lane == 0 else 2 - lane % 2, low, high] for lane, low, high in pieces],
             })  # fmt: skip
         points = [
@@ -227,10 +262,19 @@ class ControlCentre:
 
 
 def orders_of(centre: ControlCentre) -> dict[str, Order]:
-    """Return the orders of the page: release of a stop, and routes."""
+    """Return the orders of the page: stops of one train and of all, their release, and routes."""
 
-    def route(values: dict[str, Any]) -> str | None:
-        train = values.get("train")
-        return centre.set_route(train) if type(train) is int else "train: a number was expected"
+    def of_train(order: Callable[[int], str | None]) -> Order:
+        def given(values: dict[str, Any]) -> str | None:
+            train = values.get("train")
+            return order(train) if type(train) is int else "train: a number was expected"
 
-    return {"release": lambda _: centre.release(), "route": route}
+        return given
+
+    return {
+        "release": lambda _: centre.release(),
+        "route": of_train(centre.set_route),
+        "stop": of_train(centre.stop),
+        "stop-all": lambda _: centre.stop(None),
+        "release-train": of_train(centre.release_train),
+    }

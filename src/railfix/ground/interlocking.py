@@ -2,19 +2,21 @@
 
 A pure state machine. Occupied by a train is the interval from its last safe rear end to the end of its authority.
 Authorities are only ever extended, up to the nearest of: another train's interval, points that are not locked and
-detected for the train, the end of its route; less a margin. It is not a national rule book: no shunting, no overlaps
-behind signals, no level crossings, no degraded working by hand.
+detected for the train, the end of its route; less a margin. A report that contradicts what is known of its train
+(`railfix.ground.plausibility`) stops that train and its neighbours. It is not a national rule book: no shunting, no
+overlaps behind signals, no level crossings, no degraded working by hand.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from pydantic import Field
 
 from railfix.core.settings import Settings
 from railfix.ground.layout import Layout, PointName, overlap
+from railfix.ground.plausibility import compute_contradiction, confirms_rear
 from railfix.io.train_message import MessageStatus, TrainMessage
 
 
@@ -27,10 +29,22 @@ class InterlockingLimits(Settings):
         Kept between the end of an authority and what limits it.
     release_s : float [s]
         Points are released this long after the safe rear end has passed them.
+    speed_mps : float [m/s]
+        Highest speed of a train.
+    acceleration_mps2 : float [m/s^2]
+        Highest acceleration and deceleration, between two reports with speeds.
+    speed_error_mps : float [m/s]
+        Largest error of a reported speed.
+    widest_m : float [m]
+        Largest sum of over- and under-reading amount of a report that is taken.
     """
 
     margin_m: float = Field(default=20.0, ge=0)
     release_s: float = Field(default=3.0, ge=0)
+    speed_mps: float = Field(default=60.0, gt=0)
+    acceleration_mps2: float = Field(default=2.0, gt=0)
+    speed_error_mps: float = Field(default=1.0, ge=0)
+    widest_m: float = Field(default=1000.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +65,20 @@ class TrainInterval:
         Track in each station of the route.
     station : int
         Station where the route ends.
+    length_m : float [m]
+        Length of the train as configured.
     standstill : bool
+    claimed_m : float or None [m]
+        Safe rear end of the newest report; the interval begins there once the next one confirms it. None where the
+        newest report does not confirm the train's integrity and length.
+    line : int or None
+        Line of the train's reports; None before the first.
+    measured_ns : int or None [ns]
+        Instant of the newest place, on the train's clock; None before the first.
+    speed_mps : float or None [m/s]
+        Newest speed.
+    stop : str or None
+        Why the train is stopped, until it is released by hand.
     """
 
     train: int
@@ -62,7 +89,13 @@ class TrainInterval:
     sequence: int
     tracks: Mapping[int, int]
     station: int
+    length_m: float
     standstill: bool = True
+    claimed_m: float | None = None
+    line: int | None = None
+    measured_ns: int | None = None
+    speed_mps: float | None = None
+    stop: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,11 +142,14 @@ def interval_of(train: TrainInterval) -> tuple[float, float]:
     return train.rear_m, max(train.end_m * train.direction, train.front_m * train.direction) * train.direction
 
 
-def report_received(state: Interlocking, message: TrainMessage, layout: Layout) -> Interlocking:
+def report_received(
+    state: Interlocking, message: TrainMessage, layout: Layout, *, limits: InterlockingLimits | None = None
+) -> Interlocking:
     """Return the state after a position report.
 
-    A train that looks the other way than before has changed ends; that counts only at a standstill with its interval
-    inside a station.
+    The safe rear end moves to what two reports in a row confirm, of a complete train of its configured length. A train
+    that looks the other way than before has changed ends; that counts only at a standstill with its interval inside a
+    station. A report that contradicts what is known stops the train and moves its interval outward alone.
     """
     known = state.trains.get(message.train)
     placed = message.status in (MessageStatus.POSITION, MessageStatus.COASTING) and message.facing != 0
@@ -125,25 +161,116 @@ def report_received(state: Interlocking, message: TrainMessage, layout: Layout) 
     if message.sequence <= known.sequence:
         return state
     front, facing = chainage_cm / 100.0, message.facing
-    behind = (over_cm + message.length_cm) / 100.0
-    rear, ahead = front - facing * behind, front + facing * under_cm / 100.0
-    if facing == known.direction:
-        rear = facing * max(facing * rear, facing * known.rear_m)  # a wider bound moves no rear end back either
-        train = replace(known, rear_m=rear, front_m=ahead, sequence=message.sequence, standstill=message.standstill)
-    else:
-        if not message.standstill or layout.station_at(*sorted((rear, ahead))) != known.station:
-            return state
-        train = replace(
-            known,
-            direction=facing,
-            rear_m=rear,
-            front_m=ahead,
-            end_m=ahead,
-            sequence=message.sequence,
-            standstill=True,
-            tracks={known.station: known.tracks[known.station]},
-        )
+    rear = front - facing * (over_cm / 100.0 + known.length_m)
+    ahead = front + facing * under_cm / 100.0
+    turns = facing != known.direction
+    if turns and not (message.standstill and layout.station_at(*sorted((rear, ahead))) == known.station):
+        return state
+    contradiction = compute_contradiction(known, message, layout, limits=limits or InterlockingLimits())
+    if contradiction is not None:
+        return _with(state, _contradicted(known, contradiction, rear, ahead, message.sequence))
+    confirmed = confirms_rear(known, message)
+    known = replace(
+        known,
+        sequence=message.sequence,
+        standstill=message.standstill,
+        line=message.line,
+        measured_ns=message.time_ns,
+        speed_mps=None if message.speed_cmps is None else abs(message.speed_cmps) / 100.0,
+        claimed_m=rear if confirmed else None,
+    ) if not turns or confirmed else known  # fmt: skip
+    before = state.trains[message.train]
+    if not turns:
+        if confirmed and before.claimed_m is not None:
+            # one wrong report alone moves no rear end, and a wider bound moves none back
+            both = min(facing * rear, facing * before.claimed_m)
+            known = replace(known, rear_m=facing * max(both, facing * before.rear_m))
+        return _with(state, replace(known, front_m=ahead))
+    if not confirmed:
+        return state
+    turned = replace(
+        known,
+        direction=facing,
+        rear_m=facing * min(facing * rear, facing * before.front_m),
+        front_m=ahead,
+        end_m=ahead,
+        tracks={known.station: known.tracks[known.station]},
+    )
+    return _with(state, turned)
+
+
+def _with(state: Interlocking, train: TrainInterval) -> Interlocking:
     return replace(state, trains={**state.trains, train.train: train})
+
+
+def _contradicted(known: TrainInterval, reason: str, rear: float, ahead: float, sequence: int) -> TrainInterval:
+    """Return a train that is stopped; where it may really be outside its interval, the interval grows."""
+    stopped = replace(known, stop=known.stop or reason, sequence=sequence, claimed_m=None)
+    direction = known.direction
+    if reason in ("the train has rolled back", "the train runs backward"):
+        return replace(stopped, rear_m=direction * min(direction * rear, direction * known.rear_m))
+    if reason == "the train is beyond its authority":
+        return replace(stopped, front_m=direction * max(direction * ahead, direction * known.front_m))
+    return stopped
+
+
+def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
+    """Return the state with the trains stopped whose intervals overlap: of trains at rest whose bounds have grown."""
+    spans = sorted((*sorted(interval_of(train)), number) for number, train in state.trains.items())
+    for k, (_, high, number) in enumerate(spans):
+        for low, _, other in spans[k + 1 :]:
+            if low >= high:
+                break
+            first, second = state.trains[number], state.trains[other]
+            if first.stop and second.stop:
+                continue
+            one, two = (layout.pieces(*interval_of(train), train.tracks) for train in (first, second))
+            if overlap(one, two):
+                state = _with(state, replace(first, stop=first.stop or f"its interval meets that of train {other}"))
+                state = _with(state, replace(second, stop=second.stop or f"its interval meets that of train {number}"))
+    return state
+
+
+def stopped_trains(state: Interlocking) -> dict[int, str]:
+    """Return the trains that are ordered to stop, and why: those stopped themselves, and the nearest on either side."""
+    stopped = {number: train.stop for number, train in state.trains.items() if train.stop is not None}
+    if not stopped:
+        return {}
+    span = {number: tuple(sorted(interval_of(train))) for number, train in state.trains.items()}
+    found = dict(stopped)
+    for number in stopped:
+        low, high = span[number]
+        others = [(n, *span[n]) for n in span if n != number]
+        above = min((first for _, first, _ in others if first >= high), default=None)
+        below = max((last for _, _, last in others if last <= low), default=None)
+        # those beside it, the nearest on either side, and those beside the nearest: on other tracks of its station
+        reach_high = max((last for _, first, last in others if first == above), default=high)
+        reach_low = min((first for _, first, last in others if last == below), default=low)
+        for other, first, last in others:
+            if first <= reach_high and last >= reach_low:
+                found.setdefault(other, f"train {number} is stopped beside it")
+    return found
+
+
+def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Interlocking, str | None]:
+    """Return the state with the stop of one train released by hand, and the reason of a refusal."""
+    known = state.trains.get(train)
+    if known is None or known.stop is None:
+        return state, f"train {train} is not stopped"
+    if not known.standstill:
+        return state, f"train {train} does not stand still"
+    released_state = _with(state, replace(known, stop=None))
+    if overlaps_stopped(released_state, layout) != released_state:
+        return state, f"the interval of train {train} meets another one"
+    return released_state, None
+
+
+def stop_trains(state: Interlocking, trains: Iterable[int], reason: str) -> Interlocking:
+    """Return the state with trains stopped by order."""
+    for number in trains:
+        known = state.trains[number]
+        state = _with(state, replace(known, stop=known.stop or reason))
+    return state
 
 
 def points_reported(state: Interlocking, point: PointName, detected: int | None) -> Interlocking:
@@ -160,6 +287,8 @@ def route_requested(
     target = begin + direction
     if state.stopped:
         return state, (), "satellite positioning is suspended"
+    if train in (stops := stopped_trains(state)):
+        return state, (), f"the train is stopped: {stops[train]}"
     if not 0 <= target < len(layout.stations):
         return state, (), "there is no station ahead"
     track = 1 if direction > 0 else 2
@@ -204,8 +333,13 @@ def _uses_section(train: TrainInterval, section: int, layout: Layout) -> bool:
 
 def _under_interval(state: Interlocking, point: PointName, layout: Layout) -> bool:
     """Return whether points lie under a train's interval."""
-    zone = [(0, *layout.zone_m(point))]
-    return any(overlap(layout.pieces(*interval_of(t), t.tracks), zone) for t in state.trains.values())
+    low, high = layout.zone_m(point)
+    return any(
+        min(interval_of(t)) < high
+        and low < max(interval_of(t))
+        and overlap(layout.pieces(*interval_of(t), t.tracks), [(0, low, high)])
+        for t in state.trains.values()
+    )
 
 
 def released(state: Interlocking, now_s: float, layout: Layout, *, limits: InterlockingLimits) -> Interlocking:
@@ -231,7 +365,10 @@ def extended(state: Interlocking, layout: Layout, *, limits: InterlockingLimits)
     """Return the state with every authority extended as far as it may be."""
     if state.stopped:
         return state
+    stopped = stopped_trains(state)
     for number in state.trains:
+        if number in stopped:
+            continue
         train = state.trains[number]
         end = _limit_m(state, train, layout, limits=limits)
         if train.direction * (end - train.end_m) > 0.0:
@@ -244,7 +381,8 @@ def _limit_m(state: Interlocking, train: TrainInterval, layout: Layout, *, limit
     direction = train.direction
     inner = layout.stations[train.station].inner_m
     end = direction * (inner[1] if direction > 0 else inner[0])
-    for name, point in state.points.items():
+    for name in layout.points_between(*sorted((train.rear_m, direction * end))):
+        point = state.points[name]
         low, high = layout.zone_m(name)
         near, far = (low, high) if direction > 0 else (-high, -low)
         if far <= direction * train.rear_m or near >= end:
@@ -254,8 +392,10 @@ def _limit_m(state: Interlocking, train: TrainInterval, layout: Layout, *, limit
         if not (train.train in point.locked and point.wanted == wanted == point.detected):
             end = min(end, near)
     path = layout.pieces(train.rear_m, direction * end, train.tracks)
+    first_m, last_m = sorted((train.rear_m, direction * end))
     for other in state.trains.values():
-        if other.train == train.train:
+        low, high = sorted(interval_of(other))
+        if other.train == train.train or low >= last_m or high <= first_m:
             continue
         for lane, low, high in layout.pieces(*interval_of(other), other.tracks):
             for mine, first, last in path:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping
+from functools import cached_property
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -56,6 +58,24 @@ class Layout(Settings):
                 raise ValueError(f"{other.name} begins at {other.begin_m} m, before the end of {one.name}")
         return self
 
+    @cached_property
+    def _begins_m(self) -> list[float]:
+        return [station.begin_m for station in self.stations]
+
+    @cached_property
+    def _ends_m(self) -> list[float]:
+        return [station.end_m for station in self.stations]
+
+    def stations_between(self, low_m: float, high_m: float) -> range:
+        """Return the numbers of the stations that share some chainage with an interval."""
+        return range(bisect_right(self._ends_m, low_m), bisect_left(self._begins_m, high_m))
+
+    def points_between(self, low_m: float, high_m: float) -> Iterator[PointName]:
+        """Return the points of the stations that share some chainage with an interval."""
+        last = len(self.stations) - 1
+        between = self.stations_between(low_m, high_m)
+        return ((k, side) for k in between for side in (-1, 1) if (k, side) not in ((0, -1), (last, 1)))
+
     def zone_m(self, point: PointName) -> tuple[float, float]:
         """Chainages of points, lower first [m]."""
         station = self.stations[point[0]]
@@ -72,7 +92,8 @@ class Layout(Settings):
         """Return the pieces of an interval, given the track in each station (1 where none is given)."""
         low, high = min(from_m, to_m), max(from_m, to_m)
         pieces, at = [], low
-        for k, station in enumerate(self.stations):
+        for k in self.stations_between(low, high):
+            station = self.stations[k]
             first, last = station.inner_m
             if last <= low or first >= high:
                 continue
@@ -86,7 +107,8 @@ class Layout(Settings):
 
     def station_at(self, low_m: float, high_m: float) -> int | None:
         """Return the station whose tracks hold a whole interval, None where there is none."""
-        for k, station in enumerate(self.stations):
+        for k in self.stations_between(low_m, high_m):
+            station = self.stations[k]
             if station.inner_m[0] <= low_m and high_m <= station.inner_m[1]:
                 return k
         return None

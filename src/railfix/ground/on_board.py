@@ -53,17 +53,26 @@ class OnBoard:
     number: int = -1
     stopped: bool = False
     answered_s: float | None = None
+    _before_turn: int = -1
+    _newest: int = -1
     _sent: OrderedDict[int, float] = field(default_factory=OrderedDict)
 
     def reported(self, sequence: int, now_s: float) -> None:
         """Note a report that is sent."""
         self._sent[sequence] = now_s
+        self._newest = sequence
         if len(self._sent) > REMEMBERED:
             self._sent.popitem(last=False)
 
     def receive(self, authority: Authority) -> bool:
-        """Take an authority; return whether it counts: it is newer, and for this direction."""
+        """Take an authority; return whether it counts: it is newer, for this direction, and of this side of a turn.
+
+        One that answers a report from before the last change of ends may have been granted for the direction of now
+        two changes ago.
+        """
         if authority.number <= self.number or authority.direction != self.direction:
+            return False
+        if authority.report <= self._before_turn:
             return False
         self.number, self.stopped = authority.number, authority.stopped
         self.end_m = self.direction * max(self.direction * authority.end_cm / 100.0, self.direction * self.end_m)
@@ -87,4 +96,4 @@ class OnBoard:
 
     def turned(self, direction: int, front_m: float) -> None:
         """Begin in the other direction, with no authority beyond the front."""
-        self.direction, self.end_m = direction, front_m
+        self.direction, self.end_m, self._before_turn = direction, front_m, self._newest

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ipaddress
+import json
 import signal
 import time
 from collections.abc import Callable
@@ -19,8 +20,9 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import Settings, load_settings
+from railfix.core.timescale import utc_to_gpst
 from railfix.ground.centre import CentreLimits
-from railfix.ground.control import ControlCentre, orders_of
+from railfix.ground.control import INTERLOCKING, ControlCentre, orders_of
 from railfix.ground.interlocking import InterlockingLimits, TrainInterval
 from railfix.ground.keys import check_keys
 from railfix.ground.layout import Layout, LoopStation, PointName
@@ -39,6 +41,8 @@ from railfix.track.network_read import read_network
 
 #: Period of the centre's work [s].
 STEP_S = 1.0
+#: Document with the stations and trains that the database is of.
+_BELONGS_TO = "stations and trains"
 
 
 def parse_address(text: object) -> tuple[str, int]:
@@ -277,8 +281,9 @@ async def run_centre(
         loop.add_signal_handler(number, end.set)
     with Store(database) as store:
         field_points = SimulatedPoints(move_s=settings.points_s, clock=time.monotonic)
+        store.take_charge()
+        _check_line(settings, store, path)
         control, links = _centre(settings, keys, store, field_points)
-        _check_line(control, path)
         done = False
 
         def snapshot() -> dict[str, Any]:
@@ -383,19 +388,30 @@ async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> No
             result = compare_triangle(
                 fixes.points_m, fixes.fixes_m, limits=triangle.limits, cn0_fallen=fixes.cn0_fallen
             )
-            control.judge(Verdict(int(result.verdict[0])), int(result.receiver[0]))
+            age_s = float((utc_to_gpst(np.datetime64(time.time_ns(), "ns")) - fixes.time[0]) / np.timedelta64(1, "s"))
+            control.judge(Verdict(int(result.verdict[0])), int(result.receiver[0]), age_s=age_s)
         control.log("triangle: every stream has ended")
     except (RailfixError, ValueError) as error:
         control.log(f"triangle: {' '.join(str(error).split())}")
 
 
-def _check_line(control: ControlCentre, path: Path) -> None:
-    """Raise where the database is of another line than the file."""
-    layout, state = control.supervision.layout, control.supervision.state
-    if set(state.points) != set(layout.points()) or any(
-        train.station >= len(layout.stations) for train in state.trains.values()
-    ):
-        raise InputFileError(path, "the database is of a line with other stations; name another database")
+def _check_line(settings: CentreFile, store: Store, path: Path) -> None:
+    """Note at the first start what the database belongs to; raise where the file is of something else later."""
+    under = {f"station {s.name}": s.model_dump_json() for s in settings.stations}
+    under |= {f"train {t.number}": f"{t.length_m:g} m" for t in settings.trains}
+    under |= {"order of the stations": ", ".join(s.name for s in settings.stations)}
+    text = store.document(_BELONGS_TO)
+    if text is None and store.document(INTERLOCKING) is not None:
+        raise InputFileError(path, "the database is of an older version of railfix; name another database")
+    before: dict[str, str] = under if text is None else json.loads(text)
+    for name in sorted(before.keys() | under.keys()):
+        if before.get(name) != under.get(name):
+            was, is_now = before.get(name, "absent"), under.get(name, "absent")
+            raise InputFileError(
+                path, f"{name} is {is_now}, in the database {was}; restore the file, or name another database"
+            )
+    if text is None:
+        store.save(documents={_BELONGS_TO: json.dumps(under)})
 
 
 def _is_loopback(host: str) -> bool:

@@ -67,6 +67,10 @@ class StationStreams:
         tag_ns = int(tag.astype(np.int64))
         if tag_ns % self._period or tag <= self._done:
             return None
+        for later, epochs in list(self._waiting.items()):
+            # the receiver's tags were in the future: they would push out those of the others
+            if later > tag and epochs.pop(receiver, None) is not None and not epochs:
+                del self._waiting[later]
         together = self._waiting.setdefault(tag, {})
         together[receiver] = epoch
         if len(together) < len(self._points):

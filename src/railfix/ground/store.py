@@ -5,9 +5,12 @@ Everything that is acknowledged or granted is committed before: a centre that is
 
 from __future__ import annotations
 
+import fcntl
+import uuid
 from collections.abc import Mapping
+from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import IO, Any, Final, Self
 
 import sqlalchemy as sql
 from sqlalchemy import event
@@ -17,6 +20,8 @@ from railfix.ground.centre import TrainRecord, after_restart
 from railfix.io.train_message import decode, encode
 
 _META: Final = sql.MetaData()
+#: Document that names the process in charge.
+_IN_CHARGE: Final = "centre in charge"
 TRAINS: Final = sql.Table(
     "trains",
     _META,
@@ -55,6 +60,26 @@ class Store:
         except (sql.exc.SQLAlchemyError, ImportError) as error:
             raise InputFileError(url, f"cannot be opened as the centre's database ({error})") from None
         self._connection = self._engine.connect()
+        self._url = url
+        self._token: str | None = None
+        self._lock: IO[str] | None = None
+
+    def take_charge(self) -> None:
+        """Make this process the only one that writes: a centre in charge before cannot commit any more.
+
+        InputFileError: when another process on this machine has the database of SQLite.
+        """
+        database = self._engine.url.database
+        if self._engine.dialect.name == "sqlite" and database:
+            self._lock = Path(f"{database}.lock").open("a")  # noqa: SIM115 (kept until the store is closed)
+            try:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise InputFileError(database, "is in use by another centre; end that one first") from None
+        token = uuid.uuid4().hex
+        with self._connection.begin():
+            self._put(DOCUMENTS, {"name": _IN_CHARGE}, {"text": token})
+        self._token = token
 
     def __enter__(self) -> Self:
         return self
@@ -66,12 +91,22 @@ class Store:
 
     def close(self) -> None:
         """Close the database."""
+        if self._lock is not None:
+            self._lock.close()
         self._connection.close()
         self._engine.dispose()
 
     def save(self, *records: TrainRecord, documents: Mapping[str, str] | None = None) -> None:
-        """Commit the newest reports of trains and named texts together; afterwards they may be acknowledged."""
+        """Commit the newest reports of trains and named texts together; afterwards they may be acknowledged.
+
+        InputFileError: when another centre has taken charge of the database since `take_charge`.
+        """
         with self._connection.begin():
+            if self._token is not None:
+                # written before it is read, so that the row stays locked until the commit
+                mine = (DOCUMENTS.c.name == _IN_CHARGE) & (DOCUMENTS.c.text == self._token)
+                if self._connection.execute(DOCUMENTS.update().where(mine).values(text=self._token)).rowcount != 1:
+                    raise InputFileError(self._url, "another centre has taken charge of this database; this one ends")
             for record in records:
                 message = None if record.message is None else encode(record.message)
                 self._put(TRAINS, {"train": record.train}, {"sequence": record.sequence, "message": message})

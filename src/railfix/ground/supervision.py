@@ -20,10 +20,12 @@ from railfix.ground.interlocking import (
     PointState,
     TrainInterval,
     extended,
+    overlaps_stopped,
     points_reported,
     released,
     report_received,
     route_requested,
+    stopped_trains,
 )
 from railfix.ground.layout import Layout, PointName
 from railfix.io.train_message import TrainMessage
@@ -66,7 +68,7 @@ class Supervision:
         record = self.records.get(message.train, TrainRecord(train=message.train))
         self.records[message.train], reason = record_received(record, message, now_s, limits=self.centre)
         if reason is None:
-            self.state = report_received(self.state, message, self.layout)
+            self.state = report_received(self.state, message, self.layout, limits=self.limits)
         return reason
 
     def detected(self, point: PointName) -> None:
@@ -88,6 +90,7 @@ class Supervision:
 
     def advance(self, now_s: float) -> list[Authority]:
         """Release points, set routes, extend authorities; return what is sent once the state is stored."""
+        self.state = overlaps_stopped(self.state, self.layout)
         self.state = released(self.state, now_s, self.layout, limits=self.limits)
         if self.routes == "automatic":
             for number, train in self.state.trains.items():
@@ -95,6 +98,7 @@ class Supervision:
                     self.set_route(number)
         self.state = extended(self.state, self.layout, limits=self.limits)
         self.state = replace(self.state, granted=self.state.granted + 1)
+        stopped = stopped_trains(self.state)
         return [
             Authority(
                 train=number,
@@ -102,7 +106,7 @@ class Supervision:
                 report=max(self.records[number].sequence, 0) if number in self.records else 0,
                 end_cm=train.direction * int(train.direction * train.end_m * 100.0 // 1.0),
                 direction=1 if train.direction > 0 else -1,
-                stopped=self.state.stopped,
+                stopped=self.state.stopped or number in stopped,
             )
             for number, train in self.state.trains.items()
         ]
@@ -130,6 +134,7 @@ def standing_train(
         sequence=0,
         tracks={station: track},
         station=station,
+        length_m=length_m,
     )
 
 

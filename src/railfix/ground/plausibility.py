@@ -1,0 +1,81 @@
+"""Checks of a position report against what the interlocking knows of its train.
+
+Nothing here proves a report right: it finds reports that cannot be right together with those before. What stays
+unseen (errors inside the train's own bounds) is assumed away in ``docs/ground.md``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from railfix.ground.layout import Layout
+from railfix.io.train_message import TrainMessage
+
+if TYPE_CHECKING:
+    from railfix.ground.interlocking import InterlockingLimits, TrainInterval
+
+#: Difference of a reported length from the configured one that is rounding [m].
+LENGTH_ROUNDING_M: Final = 0.02
+#: Speed against the facing from which a train that does not stand rolls back [m/s].
+ROLLING_MPS: Final = 0.5
+
+
+def confirms_rear(known: TrainInterval, message: TrainMessage) -> bool:
+    """Whether the safe rear end may follow a report: the train is complete and has its configured length."""
+    return message.complete and abs(message.length_cm / 100.0 - known.length_m) <= LENGTH_ROUNDING_M
+
+
+def compute_contradiction(
+    known: TrainInterval, message: TrainMessage, layout: Layout, *, limits: InterlockingLimits
+) -> str | None:
+    """Return what a placed report contradicts, None where it may be right."""
+    assert message.chainage_cm is not None
+    assert message.over_cm is not None
+    assert message.under_cm is not None
+    front, over, under = message.chainage_cm / 100.0, message.over_cm / 100.0, message.under_cm / 100.0
+    if message.length_cm == 0:
+        return "the report has no train length"
+    if known.line is not None and message.line != known.line:
+        return f"the report is of line {message.line}, the train is on line {known.line}"
+    if over + under > limits.widest_m:
+        return f"the bounds of the place are wider than {limits.widest_m:g} m"
+    if not layout.stations[0].begin_m - over <= front <= layout.stations[-1].end_m + under:
+        return f"the place {front:.0f} m is not on the line"
+    if message.facing != known.direction:
+        return _turn_contradiction(known, message.facing, front, over, under)
+    direction = known.direction
+    speed = None if message.speed_cmps is None else abs(message.speed_cmps) / 100.0
+    if speed is not None and speed > limits.speed_mps:
+        return f"the speed {speed:.0f} m/s is above {limits.speed_mps:g} m/s"
+    if known.measured_ns is not None:
+        elapsed = (message.time_ns - known.measured_ns) / 1e9
+        if elapsed < 0.0:
+            return "the place is older than that of the report before"
+        way = direction * (front - known.front_m) - over
+        if way > _longest_way_m(known.speed_mps, speed, elapsed, limits):
+            return f"the train has moved {way:.0f} m or more in {elapsed:.1f} s"
+    if direction * front - over > max(direction * known.end_m, direction * known.front_m):
+        return "the train is beyond its authority"
+    if direction * front + under < direction * known.rear_m + known.length_m:
+        return "the train has rolled back"
+    backward = message.direction == -direction and (speed is None or speed > ROLLING_MPS)
+    return "the train runs backward" if backward and not message.standstill else None
+
+
+def _turn_contradiction(known: TrainInterval, facing: int, front: float, over: float, under: float) -> str | None:
+    """Return what a change of ends contradicts: the train stands where it stood, its rear end is now the front."""
+    end = max(known.end_m * known.direction, known.front_m * known.direction) * known.direction
+    if facing * front - over > facing * known.rear_m:
+        return "the train has changed ends and is behind its interval"
+    if facing * front + under - known.length_m < facing * end:
+        return "the train has changed ends and is beyond its interval"
+    return None
+
+
+def _longest_way_m(before: float | None, now: float | None, elapsed: float, limits: InterlockingLimits) -> float:
+    """Return how far a train can have run, between reports of its speed where it has given both [m]."""
+    top = limits.speed_mps
+    if before is not None and now is not None:
+        # speeds in between are at most so much above both ends
+        top = min(top, max(before, now) + limits.speed_error_mps + 0.5 * limits.acceleration_mps2 * elapsed)
+    return top * elapsed
