@@ -197,7 +197,7 @@ def test_reports_that_change_nothing(state: Interlocking) -> None:
     # changed ends: only inside the station
     assert report_received(state, message(1, 6, 345.0, facing=-1), LAYOUT).trains[1].direction == 1
     turned = report_received(state, message(1, 6, 230.0, facing=-1), LAYOUT).trains[1]
-    assert (turned.direction, turned.rear_m, turned.end_m) == (-1, 340.0, 225.0)
+    assert (turned.direction, turned.rear_m, turned.end_m) == (-1, 340.0, 220.0)
 
 
 def test_stored_text_gives_the_same_state(state: Interlocking) -> None:

@@ -149,7 +149,7 @@ def report_received(
 
     The safe rear end moves to what two reports in a row confirm, of a complete train of its configured length. A train
     that looks the other way than before has changed ends; that counts only at a standstill with its interval inside a
-    station. A report that contradicts what is known stops the train and moves its interval outward alone.
+    station, and the interval still covers where the train stood. A report that contradicts what is known stops the train and moves its interval outward alone.
     """
     known = state.trains.get(message.train)
     placed = message.status in (MessageStatus.POSITION, MessageStatus.COASTING) and message.facing != 0
@@ -181,7 +181,7 @@ def report_received(
     ) if not turns or confirmed else known  # fmt: skip
     before = state.trains[message.train]
     if not turns:
-        if confirmed and before.claimed_m is not None:
+        if confirmed and before.claimed_m is not None and before.stop is None:
             # one wrong report alone moves no rear end, and a wider bound moves none back
             both = min(facing * rear, facing * before.claimed_m)
             known = replace(known, rear_m=facing * max(both, facing * before.rear_m))
@@ -192,8 +192,8 @@ def report_received(
         known,
         direction=facing,
         rear_m=facing * min(facing * rear, facing * before.front_m),
-        front_m=ahead,
-        end_m=ahead,
+        front_m=facing * max(facing * ahead, facing * before.rear_m),
+        end_m=facing * max(facing * ahead, facing * before.rear_m),
         tracks={known.station: known.tracks[known.station]},
     )
     return _with(state, turned)
@@ -216,7 +216,7 @@ def _contradicted(known: TrainInterval, reason: str, rear: float, ahead: float, 
 
 def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
     """Return the state with the trains stopped whose intervals overlap: of trains at rest whose bounds have grown."""
-    spans = sorted((*sorted(interval_of(train)), number) for number, train in state.trains.items())
+    spans = sorted((min(interval_of(t)), max(interval_of(t)), number) for number, t in state.trains.items())
     for k, (_, high, number) in enumerate(spans):
         for low, _, other in spans[k + 1 :]:
             if low >= high:
@@ -236,11 +236,11 @@ def stopped_trains(state: Interlocking) -> dict[int, str]:
     stopped = {number: train.stop for number, train in state.trains.items() if train.stop is not None}
     if not stopped:
         return {}
-    span = {number: tuple(sorted(interval_of(train))) for number, train in state.trains.items()}
+    span = {n: (min(interval_of(train)), max(interval_of(train))) for n, train in state.trains.items()}
     found = dict(stopped)
     for number in stopped:
         low, high = span[number]
-        others = [(n, *span[n]) for n in span if n != number]
+        others = [(n, first, last) for n, (first, last) in span.items() if n != number]
         above = min((first for _, first, _ in others if first >= high), default=None)
         below = max((last for _, _, last in others if last <= low), default=None)
         # those beside it, the nearest on either side, and those beside the nearest: on other tracks of its station

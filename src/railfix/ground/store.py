@@ -75,6 +75,8 @@ class Store:
             try:
                 fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
+                self._lock.close()
+                self._lock = None
                 raise InputFileError(database, "is in use by another centre; end that one first") from None
         token = uuid.uuid4().hex
         with self._connection.begin():

@@ -1,0 +1,286 @@
+"""Reports that are wrong, trains that split, roll back or turn: each is stopped, and each rule is needed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from attacked_line import run_sequence
+from railfix.core.errors import InputFileError
+from railfix.ground import interlocking, plausibility
+from railfix.ground.authority import Authority
+from railfix.ground.control import ControlCentre, orders_of
+from railfix.ground.interlocking import (
+    Interlocking,
+    InterlockingLimits,
+    extended,
+    interval_of,
+    overlaps_stopped,
+    release_train,
+    report_received,
+    stopped_trains,
+)
+from railfix.ground.layout import Layout, LoopStation
+from railfix.ground.on_board import OnBoard
+from railfix.ground.store import Store
+from railfix.ground.supervision import Supervision, at_start, standing_train
+from railfix.ground.triangle import Verdict
+from railfix.io.train_message import MessageStatus, TrainMessage
+from test_ground_interlocking import RULES, take_out
+
+pytestmark = pytest.mark.requirement("F4")
+
+#: A 0 to 400 m, B 6000 to 6400 m.
+LINE = Layout(stations=tuple(LoopStation(name=n, begin_m=m, end_m=m + 400.0) for n, m in (("A", 0.0), ("B", 6000.0))))
+LIMITS = InterlockingLimits()
+LENGTH_M = 200.0
+RULES["integrity"] = {plausibility.confirms_rear: {"message.complete and ": ""}}
+RULES["length"] = {
+    plausibility.confirms_rear: {"abs(message.length_cm / 100.0 - known.length_m) <= LENGTH_ROUNDING_M": "True"},
+    interlocking.report_received: {
+        "(over_cm / 100.0 + known.length_m)": "(over_cm / 100.0 + message.length_cm / 100.0)"
+    },
+    plausibility.compute_contradiction: {"message.length_cm == 0": "False"},
+}
+RULES["two reports"] = {
+    interlocking.report_received: {"min(facing * rear, facing * before.claimed_m)": "facing * rear"}
+}
+RULES["way"] = {
+    plausibility.compute_contradiction: {
+        "way > _longest_way_m(known.speed_mps, speed, elapsed, limits)": "False",
+    }
+}
+RULES["roll-back"] = {
+    plausibility.compute_contradiction: {
+        "direction * front + under < direction * known.rear_m + known.length_m": "False"
+    }
+}
+RULES["turns"] = {OnBoard.receive: {"authority.report <= self._before_turn": "False"}}
+
+
+@pytest.fixture
+def state() -> Interlocking:
+    """Train 1 at 3000 m, train 2 behind it at 1000 m; both have a route to B and authority to 4000 and 2000 m."""
+    trains = {}
+    for number, front, end in ((1, 3000.0, 4000.0), (2, 1000.0, 2000.0)):
+        train = standing_train(
+            number, direction=1, front_m=front, length_m=LENGTH_M, bound_m=5.0, station=0, track=1
+        )  # fmt: skip
+        trains[number] = replace(train, end_m=end, tracks={0: 1, 1: 1}, station=1)
+    return at_start(LINE, list(trains.values()))
+
+
+def report(sequence: int, front_m: float, **changes: Any) -> TrainMessage:
+    """Of train 1, one a second, at 40 m/s."""
+    time_ns = sequence * 1_000_000_000
+    values: dict[str, Any] = {
+        "train": 1, "sequence": sequence, "time_ns": time_ns, "sent_ns": time_ns, "line": 1, "over_cm": 500,
+        "chainage_cm": round(front_m * 100), "under_cm": 500, "speed_cmps": 4000, "direction": 1, "facing": 1,
+        "status": MessageStatus.POSITION, "length_cm": 20_000, "complete": True,
+    }  # fmt: skip
+    return TrainMessage(**{**values, **changes})
+
+
+def after(state: Interlocking, *messages: TrainMessage) -> Interlocking:
+    for message in messages:
+        state = report_received(state, message, LINE, limits=LIMITS)
+    return state
+
+
+def follower_end_m(state: Interlocking) -> float:
+    return extended(state, LINE, limits=LIMITS).trains[2].end_m
+
+
+def test_reports_that_agree_move_the_rear_end(state: Interlocking) -> None:
+    """Front 3010 m, 5 m of over-reading, 200 m: 2805 m of the two in a row, less the margin of 20 m."""
+    moved = after(state, report(1, 3010.0), report(2, 3050.0), report(3, 3090.0))
+    assert moved.trains[1].rear_m == pytest.approx(3050.0 - 205.0)
+    assert stopped_trains(moved) == {}
+    assert follower_end_m(moved) == pytest.approx(3050.0 - 205.0 - 20.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "rule"),
+    [({"complete": False}, "integrity"), ({"length_cm": 10_000}, "length"), ({"length_cm": 19_990}, "length")],
+)
+def test_the_rear_end_stays_without_integrity_or_with_another_length(
+    state: Interlocking, changes: dict[str, Any], rule: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The wagons of a split train stand at 2795 m; a length that falls while running shows none."""
+    messages = [report(k, 3000.0 + 40.0 * k, **changes) for k in range(1, 24)]
+    assert after(state, *messages).trains[1].rear_m == state.trains[1].rear_m == 2795.0
+    assert follower_end_m(after(state, *messages)) == 2795.0 - 20.0
+    take_out(monkeypatch, rule)
+    assert after(state, *messages).trains[1].rear_m > 2795.0
+
+
+def test_a_length_of_nothing_stops_the_train(state: Interlocking) -> None:
+    found = after(state, report(1, 3010.0, length_cm=0), report(2, 3050.0, length_cm=0))
+    assert found.trains[1].rear_m == 2795.0
+    assert found.trains[1].stop == "the report has no train length"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        ({"front_m": 4900.0}, "the train has moved"),
+        ({"front_m": 2000.0, "speed_cmps": 0, "standstill": True}, "the train has rolled back"),
+        ({"front_m": 3050.0, "direction": -1}, "the train runs backward"),
+        ({"front_m": 9e6}, "is not on the line"),
+        ({"front_m": 4.6e16}, "is not on the line"),
+        ({"front_m": 3050.0, "line": 2}, "line 2, the train is on line 1"),
+        ({"front_m": 3050.0, "speed_cmps": 190_000}, "speed"),
+        ({"front_m": 3050.0, "over_cm": 90_000_000}, "bounds"),
+        ({"front_m": 3050.0, "time_ns": 1}, "older than that"),
+    ],
+)  # fmt: skip
+def test_a_contradiction_stops_the_train_and_its_neighbours(
+    state: Interlocking, wrong: dict[str, Any], reason: str
+) -> None:
+    """Whatever comes after, the rear end does not move on until the stop is released by hand."""
+    far = replace(standing_train(3, direction=-1, front_m=6150.0, length_m=80.0, bound_m=5.0, station=1, track=2))
+    state = replace(state, trains={**state.trains, 3: far})
+    begun = after(state, report(1, 3010.0))
+    found = after(begun, report(2, **wrong))
+    assert reason in (found.trains[1].stop or "")
+    assert found.trains[1].rear_m <= begun.trains[1].rear_m
+    assert set(stopped_trains(found)) == {1, 2, 3}
+    later = after(found, *(report(k, 3000.0 + 40.0 * k) for k in range(3, 9)))
+    assert later.trains[1].stop == found.trains[1].stop
+    assert later.trains[1].rear_m == found.trains[1].rear_m
+    assert extended(later, LINE, limits=LIMITS) == later
+    sent = Supervision(layout=LINE, state=found).advance(0.0)
+    assert [authority.stopped for authority in sent] == [True, True, True]
+
+
+def test_a_train_beyond_its_authority_occupies_where_it_is(state: Interlocking) -> None:
+    state = replace(state, trains={**state.trains, 1: replace(state.trains[1], end_m=3020.0)})
+    found = after(state, report(1, 3060.0))
+    assert found.trains[1].stop == "the train is beyond its authority"
+    assert interval_of(found.trains[1]) == (2795.0, 3065.0)
+
+
+def test_one_wrong_report_alone_moves_no_rear_end(state: Interlocking, monkeypatch: pytest.MonkeyPatch) -> None:
+    """40 m ahead is no contradiction at 40 m/s after an outage of 2 s; the right report after it shows it."""
+    messages = report(1, 3000.0), report(3, 3080.0), report(4, 3000.0), report(5, 3000.0)
+    assert after(state, *messages).trains[1].rear_m == 2795.0
+    take_out(monkeypatch, "two reports")
+    assert after(state, *messages[:2]).trains[1].rear_m == 3080.0 - 205.0
+
+
+def test_a_train_that_rolls_back_takes_its_interval_with_it(state: Interlocking) -> None:
+    """590 m: the follower had authority to 2000 m and gets no more; the train is at 2205 m and more."""
+    found = after(state, report(1, 2410.0, speed_cmps=0, standstill=True))
+    assert found.trains[1].rear_m == pytest.approx(2410.0 - 205.0)
+    assert extended(found, LINE, limits=LIMITS).trains[2].end_m == 2000.0
+
+
+def test_an_authority_from_before_the_last_change_of_ends_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two changes of ends while it was under way: the direction is right again, the authority is not."""
+    late = Authority(train=1, number=7, report=3, end_cm=200_000, direction=1, stopped=False)
+
+    def turned_twice() -> OnBoard:
+        train = OnBoard(direction=1, end_m=1000.0)
+        for sequence in (1, 2, 3):
+            train.reported(sequence, float(sequence))
+        train.turned(-1, 800.0)
+        train.reported(4, 4.0)
+        train.turned(1, 1000.0)
+        return train
+
+    train = turned_twice()
+    assert not train.receive(late)
+    assert (train.end_m, train.number) == (1000.0, -1)
+    train.reported(5, 5.0)
+    assert train.receive(late.replaced(number=8, report=5, end_cm=110_000))
+    assert train.end_m == 1100.0
+    take_out(monkeypatch, "turns")
+    assert turned_twice().receive(late)
+
+
+def test_intervals_that_grow_into_each_other_stop_both(state: Interlocking) -> None:
+    """Train 2 stands behind train 1, and its bound grows to 900 m."""
+    state = replace(state, trains={**state.trains, 2: replace(state.trains[2], end_m=2000.0)})
+    wide = report(1, 1990.0, train=2, under_cm=90_000, over_cm=500, speed_cmps=0, standstill=True)
+    found = overlaps_stopped(after(state, wide), LINE)
+    assert found.trains[2].stop == "its interval meets that of train 1"
+    assert found.trains[1].stop == "its interval meets that of train 2"
+    assert release_train(found, 2, LINE)[1] == "the interval of train 2 meets another one"
+
+
+def centre(store: Store, **values: Any) -> ControlCentre:
+    trains = [standing_train(1, direction=1, front_m=300.0, length_m=80.0, bound_m=5.0, station=0, track=1)]
+    supervision = Supervision(layout=LINE, state=at_start(LINE, trains))
+    return ControlCentre.restored(
+        supervision, store, curves={}, send=lambda *_: None, clock=lambda: 10.0, wall_ns=lambda: 0, **values
+    )
+
+
+def test_a_train_is_stopped_and_released_from_the_page(tmp_path: Path) -> None:
+    with Store(f"sqlite:///{tmp_path / 'centre.db'}") as store:
+        control = centre(store, judged=False)
+        orders = orders_of(control)
+        assert orders["stop"]({"train": 9}) == "there is no train 9"
+        assert orders["stop"]({"train": 1}) is None
+        assert control.snapshot()["trains"][0]["stop"] == "stopped by hand"
+        control.step()
+        assert centre(store, judged=False).snapshot()["trains"][0]["stop"] == "stopped by hand"
+        assert orders["release-train"]({"train": 1}) is None
+        assert orders["release-train"]({"train": 1}) == "train 1 is not stopped"
+        assert orders["stop-all"]({}) is None
+        assert stopped_trains(control.supervision.state) == {1: "stopped by hand"}
+
+
+def test_the_worst_verdict_between_two_steps_counts_and_old_ones_do_not(tmp_path: Path) -> None:
+    with Store(f"sqlite:///{tmp_path / 'centre.db'}") as store:
+        control = centre(store, judged=True)
+        assert control.monitor is not None
+        control.monitor = replace(control.monitor, stopped=False)
+        control.judge(Verdict.SPOOFING, age_s=60.0)
+        control.judge(Verdict.HEALTHY)
+        control.step()
+        assert not control.supervision.state.stopped
+        control.judge(Verdict.SPOOFING)
+        control.judge(Verdict.HEALTHY)
+        control.step()
+        assert control.supervision.state.stopped
+        assert control.monitor.cause is Verdict.SPOOFING
+
+
+def test_one_centre_has_a_database(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'centre.db'}"
+    with Store(url) as first, Store(url) as second:
+        first.take_charge()
+        with pytest.raises(InputFileError, match="in use by another centre"):
+            second.take_charge()
+        first._lock.close()  # type: ignore[union-attr] # as on another machine
+        second.take_charge()
+        with pytest.raises(InputFileError, match="another centre has taken charge"):
+            first.save(documents={"interlocking": "older"})
+        assert second.document("interlocking") is None
+
+
+@pytest.mark.parametrize(
+    "seeds",
+    [range(150), pytest.param(range(100_000), marks=pytest.mark.slow)],
+    ids=["150 sequences", "100,000 sequences"],
+)
+def test_no_sequence_leads_to_an_authority_into_a_train(seeds: range) -> None:
+    violations, seen = Counter[str](), Counter[str]()
+    for seed in seeds:
+        line = run_sequence(seed)
+        violations += line.violations
+        seen += line.seen
+    assert violations == Counter()
+    assert min(seen[kind] for kind in ("split", "roll-back", "turn", "restart", "jump", "length", "other line")) > 50
+    assert seen["extension"] > 3 * len(seeds)
+
+
+@pytest.mark.parametrize(("rule", "seed"), [("integrity", 4), ("length", 27), ("way", 102), ("roll-back", 45)])
+def test_without_a_rule_a_sequence_leads_into_a_train(rule: str, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    take_out(monkeypatch, rule)
+    assert run_sequence(seed).violations["authority into another train"] > 0
