@@ -81,7 +81,7 @@ class AttackedLine:
                     bound_m=BOUND_M,
                     station=station,
                     track=track,
-                )  # fmt: skip
+                )
             )
             self.trains[number] = AttackedTrain(
                 number=number, front_m=front, on_board=OnBoard(direction=direction, end_m=front)

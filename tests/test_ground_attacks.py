@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +13,7 @@ import pytest
 
 from attacked_line import run_sequence
 from railfix.core.errors import InputFileError
+from railfix.core.settings import load_settings
 from railfix.ground import interlocking, plausibility
 from railfix.ground.authority import Authority
 from railfix.ground.control import ControlCentre, orders_of
@@ -26,8 +29,10 @@ from railfix.ground.interlocking import (
 )
 from railfix.ground.layout import Layout, LoopStation
 from railfix.ground.on_board import OnBoard
+from railfix.ground.serve import CentreFile, _check_line
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
+from railfix.ground.train import is_complete
 from railfix.ground.triangle import Verdict
 from railfix.io.train_message import MessageStatus, TrainMessage
 from test_ground_interlocking import RULES, take_out
@@ -249,6 +254,45 @@ def test_the_worst_verdict_between_two_steps_counts_and_old_ones_do_not(tmp_path
         control.step()
         assert control.supervision.state.stopped
         assert control.monitor.cause is Verdict.SPOOFING
+
+
+def test_only_a_fresh_word_of_the_integrity_device_confirms(tmp_path: Path) -> None:
+    file = tmp_path / "integrity"
+    assert not is_complete(file)
+    file.write_text("complete\n")
+    assert is_complete(file)
+    for age_s in (3.0, -3.0):
+        os.utime(file, (time.time() - age_s,) * 2)
+        assert not is_complete(file)
+    file.write_text("incomplete\n")
+    assert not is_complete(file)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("end_m = 400", "end_m = 500", "station A"),
+        ("length_m = 80", "length_m = 40", "train 1 is 40 m, in the database 80 m"),
+        ("number = 1", "number = 2", "train 1 is absent"),
+    ],
+)
+def test_a_database_of_another_file_is_refused_with_the_difference(
+    tmp_path: Path, old: str, new: str, named: str
+) -> None:
+    path = tmp_path / "line.toml"
+    text = """keys = "keys"
+listen = { A = "127.0.0.1:1", B = "127.0.0.1:2" }
+stations = [{ name = "A", begin_m = 0, end_m = 400 }, { name = "B", begin_m = 900, end_m = 1300 }]
+trains = [{ number = 1, station = "A", track = 1, direction = 1, front_m = 300, length_m = 80 }]
+"""
+    with Store(f"sqlite:///{tmp_path / 'centre.db'}") as store:
+        for content in (text, text):
+            path.write_text(content)
+            _check_line(load_settings(CentreFile, path, what="a file of a centre"), store, path)
+        assert text.count(old) == 1
+        path.write_text(text.replace(old, new))
+        with pytest.raises(InputFileError, match=named):
+            _check_line(load_settings(CentreFile, path, what="a file of a centre"), store, path)
 
 
 def test_one_centre_has_a_database(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from railfix.ground.interlocking import (
     TrainInterval,
     _limit_m,
     extended,
+    interval_of,
     points_reported,
     released,
     report_received,
@@ -198,6 +199,15 @@ def test_reports_that_change_nothing(state: Interlocking) -> None:
     assert report_received(state, message(1, 6, 345.0, facing=-1), LAYOUT).trains[1].direction == 1
     turned = report_received(state, message(1, 6, 230.0, facing=-1), LAYOUT).trains[1]
     assert (turned.direction, turned.rear_m, turned.end_m) == (-1, 340.0, 220.0)
+
+
+def test_an_interval_reaches_to_the_front_where_that_is_beyond_the_authority() -> None:
+    train = interval(1, 1, 330.0, 1, 0)
+    assert interval_of(replace(train, end_m=300.0)) == (220.0, 335.0)
+    assert interval_of(replace(train, end_m=360.0)) == (220.0, 360.0)
+    down = interval(1, -1, 330.0, 1, 0)
+    assert interval_of(replace(down, end_m=360.0)) == (440.0, 325.0)
+    assert interval_of(replace(down, end_m=300.0)) == (440.0, 300.0)
 
 
 def test_stored_text_gives_the_same_state(state: Interlocking) -> None:

@@ -361,6 +361,10 @@ def train(
     fresh: Annotated[
         float, typer.Option(metavar="S", min=1.0, help="Time limit of authorities: older ones brake the train.")
     ] = 15.0,
+    integrity: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help='The train\'s integrity device writes "complete" here at least every 2 s.'),
+    ] = None,
     for_seconds: Annotated[
         float | None, typer.Option("--for", metavar="S", min=0.0, help="End after this time.")
     ] = None,
@@ -395,6 +399,7 @@ def train(
         dict(zip(BEARERS, hosts, strict=True)),
         write=lambda line: print(line, flush=True),
         limits=OnBoardLimits(fresh_s=fresh),
+        integrity=integrity,
         for_s=for_seconds,
     )
     asyncio.run(work)

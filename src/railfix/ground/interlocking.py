@@ -149,7 +149,8 @@ def report_received(
 
     The safe rear end moves to what two reports in a row confirm, of a complete train of its configured length. A train
     that looks the other way than before has changed ends; that counts only at a standstill with its interval inside a
-    station, and the interval still covers where the train stood. A report that contradicts what is known stops the train and moves its interval outward alone.
+    station, and the interval still covers where the train stood. A report that contradicts what is known stops the
+    train and moves its interval outward alone.
     """
     known = state.trains.get(message.train)
     placed = message.status in (MessageStatus.POSITION, MessageStatus.COASTING) and message.facing != 0

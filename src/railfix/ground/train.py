@@ -19,6 +19,8 @@ from railfix.io.train_message import MessageError, TrainMessage, encode, from_js
 
 #: Time between two reports, and between two looks at the age of the authority [s].
 REPORT_S, LOOK_S = 1.0, 0.1
+#: Largest age of what the integrity device has written [s].
+INTEGRITY_S = 2.0
 
 
 async def run_train(
@@ -30,16 +32,18 @@ async def run_train(
     lines: AsyncIterator[str] | None = None,
     write: Callable[[str], None],
     limits: OnBoardLimits | None = None,
+    integrity: Path | None = None,
     for_s: float | None = None,
 ) -> None:
     """Send the newest position every second, and write authorities and braking as lines of JSON.
 
     With the train's own two files and ``authority.pem`` of the folder `keys`, to the centre's address on each bearer
     from its local address. The positions are messages as `railfix.io.train_message.to_json` writes them, from the
-    standard input by default. InputFileError: when a key is not there, or a line is no position message.
+    standard input by default. With `integrity`, a file of the train's integrity device, `is_complete` of it takes the
+    place of what the messages say. InputFileError: when a key is not there, or a line is no position message.
     """
     check_keys(keys, f"train-{train}")
-    desk = _Desk(train=train, write=write, limits=limits or OnBoardLimits())
+    desk = _Desk(train=train, write=write, limits=limits or OnBoardLimits(), integrity=integrity)
     links = TrainLinks(train, keys, addresses, local, received=desk.received)
     await links.start()
     reading = asyncio.create_task(desk.read(_standard_input() if lines is None else lines))
@@ -54,11 +58,25 @@ async def run_train(
         await links.stop()
 
 
+def is_complete(path: Path) -> bool:
+    """Whether the train's integrity device has written "complete" in the last `INTEGRITY_S`.
+
+    A file that is absent, unreadable, older, from the future or says anything else is no confirmation.
+    """
+    try:
+        age_s = time.time() - path.stat().st_mtime
+        return abs(age_s) <= INTEGRITY_S and path.read_bytes()[:64].strip() == b"complete"
+    except OSError:
+        return False
+
+
 class _Desk:
     """Newest position, newest authority, and whether the train brakes."""
 
-    def __init__(self, *, train: int, write: Callable[[str], None], limits: OnBoardLimits) -> None:
-        self._train, self._write, self._limits = train, write, limits
+    def __init__(
+        self, *, train: int, write: Callable[[str], None], limits: OnBoardLimits, integrity: Path | None
+    ) -> None:
+        self._train, self._write, self._limits, self._integrity = train, write, limits, integrity
         self._newest: TrainMessage | None = None
         self._sequence = first_sequence()
         self._on_board: OnBoard | None = None
@@ -84,7 +102,8 @@ class _Desk:
     def _report(self, links: TrainLinks, message: TrainMessage, now_s: float) -> None:
         # numbers go on rising where the source of the positions is started again
         self._sequence += 1
-        message = message.replaced(train=self._train, sequence=self._sequence)
+        complete = message.complete if self._integrity is None else is_complete(self._integrity)
+        message = message.replaced(train=self._train, sequence=self._sequence, complete=complete)
         if message.facing != 0 and message.chainage_cm is not None:
             front = message.chainage_cm / 100.0
             if self._on_board is None:
