@@ -146,7 +146,7 @@ class AttackedLine:
             front = train.rear_m
             train.on_board.turned(-train.direction, front)
             train.front_m, train.held_m = front, None
-        elif event < 0.9 and not train.on_board.stopped:
+        elif event < 0.9 and not train.on_board.stopped and train.on_board.answered_s is not None:
             room = train.direction * (train.on_board.end_m - train.front_m) - BOUND_M - 1.0
             way = min(max(room, 0.0), SPEED_MPS * STEP_S)
             train.front_m += train.direction * way

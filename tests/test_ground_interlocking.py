@@ -95,6 +95,7 @@ def interval(train: int, direction: int, front: float, track: int, station: int)
     return TrainInterval(
         train=train, direction=direction, rear_m=front - direction * 110.0, front_m=front + direction * 5.0,
         end_m=front + direction * 5.0, sequence=0, tracks={station: track}, station=station, length_m=100.0,
+        measured_ns=0,
     )  # fmt: skip
 
 

@@ -47,13 +47,13 @@ def compute_contradiction(
     speed = None if message.speed_cmps is None else abs(message.speed_cmps) / 100.0
     if speed is not None and speed > limits.speed_mps:
         return f"the speed {speed:.0f} m/s is above {limits.speed_mps:g} m/s"
-    if known.measured_ns is not None:
-        elapsed = (message.time_ns - known.measured_ns) / 1e9
-        if elapsed < 0.0:
-            return "the place is older than that of the report before"
-        way = direction * (front - known.front_m) - over
-        if way > _longest_way_m(known.speed_mps, speed, elapsed, limits):
-            return f"the train has moved {way:.0f} m or more in {elapsed:.1f} s"
+    # before its first report has been answered a train has no fresh authority, and stands
+    elapsed = 0.0 if known.measured_ns is None else (message.time_ns - known.measured_ns) / 1e9
+    if elapsed < 0.0:
+        return "the place is older than that of the report before"
+    way = direction * (front - known.front_m) - over
+    if way > _longest_way_m(known.speed_mps, speed, elapsed, limits):
+        return f"the train has moved {way:.0f} m or more in {elapsed:.1f} s"
     if direction * front - over > max(direction * known.end_m, direction * known.front_m):
         return "the train is beyond its authority"
     if direction * front + under < direction * known.rear_m + known.length_m:
