@@ -388,6 +388,7 @@ def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
         "bias_faulty": faulty.FAULTY,
         "bias_inflated": faulty.INFLATED,
         "freed_m": faulty.FREED_M,
+        "freed_sigmas": faulty.FREED_SIGMAS,
         "code_leak": clocks.CODE_LEAK,
         "misfit_most": misfit.MOST_SIGMAS,
         "reach_sigmas": monitors.REACH_SIGMAS,

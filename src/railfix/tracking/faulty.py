@@ -21,6 +21,9 @@ FAULTY: Final = 0.35
 INFLATED: Final = 1e6
 #: Standard deviation added to the place when a satellite is left out from here on: its codes have led it so far [m].
 FREED_M: Final = 15.0
+#: Not where all codes ask for another place by more standard deviations (`railfix.tracking.misfit.code_shift`): they
+#: may have stepped together.
+FREED_SIGMAS: Final = 3.0
 
 
 def is_faulty(code_bias: Floats, slot: Indices) -> Masks:

@@ -25,7 +25,7 @@ from railfix.tracking.chunk import Chunk, code_interval_s, leave, prepared
 from railfix.tracking.clocks import clocks_of_epoch, learn
 from railfix.tracking.compiled import Compiled
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
-from railfix.tracking.faulty import FREED_M, INFLATED, is_faulty, update_bias
+from railfix.tracking.faulty import FREED_M, FREED_SIGMAS, INFLATED, is_faulty, update_bias
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.misfit import code_shift, learn_map
@@ -278,7 +278,7 @@ def _measure(
         sigma = chunk.code_sigma_m[epoch, channel] * np.sqrt(1.0 + limits.code_white_share**2)
         value = rows.value[best, rows.codes]
         state.code_bias, found = update_bias(state.code_bias, chunk.slot[channel], value, sigma, code_s)
-        if found:
+        if found and abs(shift) < FREED_SIGMAS:
             state.covariance = _freed(state.covariance)
             if state.bank is not None:
                 state.bank = replace(state.bank, covariance=_freed(state.bank.covariance))

@@ -163,6 +163,7 @@ class Numbers(NamedTuple):
     bias_faulty: float
     bias_inflated: float
     freed_m: float
+    freed_sigmas: float
     code_leak: float
     level_doubt_code_s: float
     misfit_most: float

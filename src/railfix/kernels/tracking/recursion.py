@@ -388,7 +388,7 @@ def advance(
             found = learn(epochs, numbers, memory, answers, rows, work, t, best, shift, dt, code_s)
             if len(bank.running):
                 advance_subfilters(epochs, t, course, numbers, active, bank, rows, best, map_scale, work, room)
-            if found:
+            if found and abs(shift) < numbers.freed_sigmas:
                 for h in range(count):
                     memory.covariance[h, PLACE, PLACE] += numbers.freed_m**2
                 for b in range(len(bank.running)):
