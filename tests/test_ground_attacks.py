@@ -28,13 +28,13 @@ from railfix.ground.interlocking import (
     stopped_trains,
 )
 from railfix.ground.layout import Layout, LoopStation
-from railfix.ground.on_board import OnBoard
+from railfix.ground.on_board import OnBoard, OnBoardLimits
 from railfix.ground.serve import CentreFile, _check_line
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
-from railfix.ground.train import is_complete
+from railfix.ground.train import _Desk, is_complete
 from railfix.ground.triangle import Verdict
-from railfix.io.train_message import MessageStatus, TrainMessage
+from railfix.io.train_message import MessageStatus, TrainMessage, decode
 from test_ground_interlocking import RULES, take_out
 
 pytestmark = pytest.mark.requirement("F4")
@@ -64,7 +64,7 @@ RULES["roll-back"] = {
         "direction * front + under < direction * known.rear_m + known.length_m": "False"
     }
 }
-RULES["turns"] = {OnBoard.receive: {"authority.report <= self._before_turn": "False"}}
+RULES["turns"] = {OnBoard.receive: {"authority.report <= self.before_turn": "False"}}
 
 
 @pytest.fixture
@@ -261,6 +261,50 @@ def test_the_worst_verdict_between_two_steps_counts_and_old_ones_do_not(tmp_path
         control.step()
         assert control.supervision.state.stopped
         assert control.monitor.cause is Verdict.SPOOFING
+
+
+@pytest.mark.parametrize("later", [Verdict.HEALTHY, Verdict.MONITOR_LOST, Verdict.JAMMING])
+def test_spoofing_is_not_lost_behind_an_absent_fix(tmp_path: Path, later: Verdict) -> None:
+    with Store(f"sqlite:///{tmp_path / 'centre.db'}") as store:
+        control = centre(store, judged=True)
+        assert control.monitor is not None
+        control.monitor = replace(control.monitor, stopped=False)
+        for verdict in (Verdict.SPOOFING, later):
+            control.judge(verdict)
+        control.step()
+        assert control.supervision.state.stopped
+        assert control.monitor.cause is Verdict.SPOOFING
+
+
+def test_an_authority_from_before_a_start_on_board_is_refused() -> None:
+    """The train ran up, turned twice and was started again; an authority of the first time up comes late."""
+    sent: list[bytes] = []
+
+    class Links:
+        def send(self, payload: bytes, **_: Any) -> None:
+            sent.append(payload)
+
+    written: list[str] = []
+    desk = _Desk(train=1, write=written.append, limits=OnBoardLimits(), integrity=None)
+    desk._report(Links(), report(1, 300.0), 10.0)  # type: ignore[arg-type]
+    first = decode(sent[0]).sequence
+    for number, answered, taken in ((5, first - 1, False), (6, 0, False), (7, first, True)):
+        late = Authority(train=1, number=number, report=answered, end_cm=90_000, direction=1, stopped=False)
+        written.clear()
+        desk.received(late.encode())
+        assert bool(written) is taken
+
+
+def test_settings_of_a_centre_can_be_replaced() -> None:
+    """As for the stations of a network: addresses that were read are checked again."""
+    values: dict[str, Any] = {
+        "keys": "keys",
+        "listen": {"A": "127.0.0.1:1", "B": "[::1]:2"},
+        "stations": LINE.stations,
+        "trains": [{"number": 1, "station": "A", "track": 1, "direction": 1, "front_m": 300, "length_m": 80}],
+    }
+    settings = CentreFile.model_validate(values)
+    assert settings.replaced(speed_mps=10.0).listen == settings.listen
 
 
 def test_only_a_fresh_word_of_the_integrity_device_confirms(tmp_path: Path) -> None:

@@ -30,9 +30,9 @@ INTERLOCKING, _CAUSE = "interlocking", "cause of the stop"
 
 def _severity(verdict: Verdict) -> int:
     """Return the rank of a verdict: of those between two steps the one with the highest counts."""
-    if verdict in STOPPING:
-        return 3
-    return {Verdict.HEALTHY: 0, Verdict.RECEIVER_DRIFTING: 1}.get(verdict, 2)
+    if verdict in (Verdict.MONITOR_LOST, Verdict.JAMMING):
+        return 2  # a fix is absent: that stops only once it is late
+    return 3 if verdict in STOPPING else int(verdict is not Verdict.HEALTHY)
 
 
 @dataclass(kw_only=True)

@@ -43,6 +43,9 @@ class OnBoard:
         Of the newest authority, -1 before the first.
     stopped : bool
         The newest authority is an order to stop.
+    before_turn : int
+        Newest report from before the last turn, or from before this start: what answers
+        it or an older one is refused.
     answered_s : float or None [s]
         When the newest report was sent that an authority has answered; None before the first.
     """
@@ -53,7 +56,7 @@ class OnBoard:
     number: int = -1
     stopped: bool = False
     answered_s: float | None = None
-    _before_turn: int = -1
+    before_turn: int = -1
     _newest: int = -1
     _sent: OrderedDict[int, float] = field(default_factory=OrderedDict)
 
@@ -72,7 +75,7 @@ class OnBoard:
         """
         if authority.number <= self.number or authority.direction != self.direction:
             return False
-        if authority.report <= self._before_turn:
+        if authority.report <= self.before_turn:
             return False
         self.number, self.stopped = authority.number, authority.stopped
         self.end_m = self.direction * max(self.direction * authority.end_cm / 100.0, self.direction * self.end_m)
@@ -96,4 +99,4 @@ class OnBoard:
 
     def turned(self, direction: int, front_m: float) -> None:
         """Begin in the other direction, with no authority beyond the front."""
-        self.direction, self.end_m, self._before_turn = direction, front_m, self._newest
+        self.direction, self.end_m, self.before_turn = direction, front_m, self._newest

@@ -47,6 +47,8 @@ _BELONGS_TO = "stations and trains"
 
 def parse_address(text: object) -> tuple[str, int]:
     """Return host and port of ``HOST:PORT``; ValueError when the text has another form."""
+    if isinstance(text, tuple):  # read before: settings that are replaced are checked again
+        text = ":".join(map(str, text))
     host, _, port = str(text).rpartition(":")
     if not host or not port.isdigit() or int(port) > 65_535:
         raise ValueError("HOST:PORT was expected, for example 127.0.0.1:4433")

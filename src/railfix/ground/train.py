@@ -107,7 +107,9 @@ class _Desk:
         if message.facing != 0 and message.chainage_cm is not None:
             front = message.chainage_cm / 100.0
             if self._on_board is None:
-                self._on_board = OnBoard(direction=message.facing, end_m=front, limits=self._limits)
+                # what answers reports of a process before may be of an earlier time in this direction
+                before = self._sequence - 1
+                self._on_board = OnBoard(direction=message.facing, end_m=front, limits=self._limits, before_turn=before)
             elif self._on_board.direction != message.facing and message.standstill:
                 self._on_board.turned(message.facing, front)
         if self._on_board is not None:
