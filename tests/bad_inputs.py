@@ -204,6 +204,19 @@ MISTAKES: Final[dict[str, tuple[dict[str, str], str, int, str]]] = {
         {}, "run --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --height-sigma 1e9 "
         "--out {desk}/o", 4, "--height-sigma: Input should be less than or equal to 1000",
     ),
+    "heights_in_millimetres": (
+        {"mm.csv": "latitude_deg,longitude_deg,height_m\n" + "".join(f"35.0{k},135.45,162000\n" for k in range(9))},
+        "run --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/mm.csv --out {desk}/o", 5,
+        "expected metres between -1,000 and 9,000: are they in millimetres?",
+    ),
+    "span_after_the_log": (
+        {}, "run --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --start 2030-01-01 "
+        "--out {desk}/o", 5, "the log is of 2024-03-05T03:10:00 to 2024-03-05T03:10",
+    ),
+    "span_before_the_log": (
+        {}, "run --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --end 2020-01-01 "
+        "--out {desk}/o", 5, "the log begins at 2024-03-05T03:10:00 (GPS time)",
+    ),
     "header_misspelt": (
         {"s.csv": "# sigma_plan: 3\nlatitude_deg,longitude_deg,height_m\n47,8,400\n47.1,8,400\n"},
         "map check {desk}/s.csv", 3, "the line '# sigma_plan: 3': is '# sigma_plan_m' meant?",

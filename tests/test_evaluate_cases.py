@@ -492,6 +492,8 @@ def test_another_track_is_refused(tmp_path: Path):
     known = reference(time, place)
     with pytest.raises(MismatchError, match=r"other\.csv: is not the track of .* up to 4\.0"):
         evaluate_run(run, known, options=along, files=TrackFiles(track=(other,)))
+    with pytest.raises(MismatchError, match=r"other\.csv: is not the track"):
+        evaluate_run(run, known, files=TrackFiles(track=(other,)))
     moved = tmp_path / "moved.csv"
     track.rename(moved)
     with pytest.raises(InputFileError, match="no longer there; give it with --track"):

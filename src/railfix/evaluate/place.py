@@ -118,6 +118,8 @@ def errors_of(
     turn = run.turn_m(antenna)
     if method != "trajectory":
         if against is None:
+            if files.track or files.vehicle is not None:
+                find_trajectory(run, antenna, answers, files)  # what was given is that of the run
             return Errors(
                 method="chainage",
                 error_m=short_way_m(answers.chainage_m - answers.reference_chainage_m, turn),

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from railfix.run.route import RouteOfLog
     from railfix.track.network import Network
 
+#: Ellipsoidal heights of railways, tunnels below the sea included [m].
+_HEIGHTS_M: Final = (-1000.0, 9000.0)
 #: Track of a run that is not that of its files as they are, in the folder of results.
 TRACK_FILE: Final = "track.csv"
 
@@ -134,6 +136,7 @@ def open_line(
         centreline, route = _read_line(track, reading, heights=heights, find=find)
         if route is None:
             prepared.keep_track(key, centreline)
+    _check_heights(track, centreline)
     shift, moved = None, centreline
     if at is not None:
         moved, shift = track_at(centreline, at, **reading.motion)
@@ -147,6 +150,16 @@ def open_line(
         from_file=route is None and heights is None and moved is centreline,
         preparing=tuple(prepared.notes),
     )
+
+
+def _check_heights(files: tuple[Path, ...], track: Track) -> None:
+    """Raise MismatchError where no place on Earth has the heights of a track."""
+    low, high = float(np.nanmin(track.height_m)), float(np.nanmax(track.height_m))
+    if low < _HEIGHTS_M[0] or high > _HEIGHTS_M[1]:
+        raise MismatchError(
+            f"{', '.join(map(str, files))}: has heights from {low:,.0f} to {high:,.0f} m; expected metres between "
+            f"{_HEIGHTS_M[0]:,.0f} and {_HEIGHTS_M[1]:,.0f}: are they in millimetres?"
+        )
 
 
 def _read_line(

@@ -170,16 +170,25 @@ def _runs(
     if reader is not None and not epochs:
         if not reader.epochs:
             raise InputFileError(reader.path, "has no usable epoch; broken_lines='stop' shows the first fault")
-        raise MismatchError(f"{', '.join(paths)}: no epoch lies in the time span from start to end")
+        begin, end = _first_time(paths[0], selection), np.datetime64(reader.last_ns, "ns")
+        what = f"is of {str(begin)[:19]} to {str(end)[:19]}"
+        if begin > end or reader.last_ns >= selection.end_ns:
+            what = f"begins at {str(begin)[:19]}"
+        raise MismatchError(
+            f"{', '.join(paths)}: no epoch lies in the time span from start to end; the log {what} (GPS time)"
+        )
 
 
 def _in_order_of_time(paths: list[str], selection: Selection) -> list[str]:
-    peek = replace(selection, broken_lines="count", systems=None, start_ns=Selection.start_ns, end_ns=Selection.end_ns)
-    firsts = []
-    for path in paths:
-        with closing(BlockReader(path, peek, block_bytes=_PEEK_BYTES).blocks()) as runs:
-            firsts.append(next((run.time[0] for run in runs if len(run)), np.datetime64("NaT", "ns")))
+    firsts = [_first_time(path, selection) for path in paths]
     return [paths[k] for k in np.argsort(np.array(firsts), kind="stable")]
+
+
+def _first_time(path: str, selection: Selection) -> np.datetime64:
+    """Time of the first epoch of a file whatever the selected span, NaT without any."""
+    peek = replace(selection, broken_lines="count", systems=None, start_ns=Selection.start_ns, end_ns=Selection.end_ns)
+    with closing(BlockReader(path, peek, block_bytes=_PEEK_BYTES).blocks()) as runs:
+        return next((run.time[0] for run in runs if len(run)), np.datetime64("NaT", "ns"))
 
 
 def with_break_at_gap(last: Observations | None, run: Observations) -> Observations:
