@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column as TableColumn
 from rich.table import Table
 
+from railfix.cli.verdict import verdict_of_run
 from railfix.core.reasons import Status
 
 if TYPE_CHECKING:
@@ -116,6 +117,13 @@ def metres(value: float | None, *, sign: str = "") -> str:
     return "-" if value is None else f"{value:{sign}.2f}"
 
 
+def show_verdict(console: Console, lines: Iterable[str]) -> None:
+    """Print the first lines of a command, and a blank one."""
+    for line in lines:
+        console.print(line, markup=False, soft_wrap=True)
+    console.print()
+
+
 def show_notes(console: Console, notes: Iterable[str]) -> None:
     """Print notes, one per line."""
     for note in notes:
@@ -158,6 +166,7 @@ def show_summary(summary: RunSummary) -> None:
     """Epochs, positions, statuses, the budget of reasons, and where the results are."""
     console = console_of_tables()
     names = list(summary.tally.antennas)
+    show_verdict(console, verdict_of_run(summary))
     if summary.tracks:
         console.print("Each epoch by itself (positions.csv)")
     console.print(_positions(summary, names))

@@ -21,8 +21,10 @@ from railfix.cli.console import (
     plain_table,
     show_files,
     show_notes,
+    show_verdict,
 )
 from railfix.cli.evaluate_levels import RUN_OR_CONFIGURATION, show_integrity
+from railfix.cli.verdict import verdict_of_evaluation
 from railfix.evaluate.figures import WITH_SATELLITES
 from railfix.evaluate.output import P1_COMMERCIAL, P1_TABLE_4
 from railfix.evaluate.scores import WRONG_PLACE_M
@@ -52,6 +54,7 @@ _MOST_SECTIONS: Final = 20
 def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: Literal["nothing", "p1"]) -> None:
     """Figures of each run, then by groups, then where the files are."""
     console = console_of_tables()
+    show_verdict(console, verdict_of_evaluation(evaluation))
     for run in evaluation.runs:
         console.print(f"{run.name}: {run.configuration}; line {run.line}", markup=False, soft_wrap=True)
         for antenna, method in run.method.items():
