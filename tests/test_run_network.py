@@ -147,7 +147,7 @@ def test_without_a_log_a_network_is_a_sentence(tmp_path: Path) -> None:
 def test_a_network_elsewhere_is_a_sentence(tmp_path: Path, recordings: Path) -> None:
     folder = recordings / "rail" / "infrabel"
     inputs = demo_inputs().replaced(track=(folder / "network_airport.geojson",))
-    with pytest.raises(MismatchError, match="no position lies near a track of the network"):
+    with pytest.raises(MismatchError, match=r"the map lies \d+ km from where the log was recorded"):
         run_files(inputs, Config(), out=tmp_path / "results")
 
 
@@ -209,7 +209,13 @@ def test_positions_are_matched_in_the_frame_of_the_map() -> None:
     timeless = replace(received, time=np.full(len(on), np.datetime64("NaT", "ns")))
     with pytest.raises(MismatchError, match=r"has no times.*--same-frame"):
         timeless.in_frame_of(net)
-    assert timeless.in_frame_of(made)[1].method == "used as it is"
+    assert timeless.in_frame_of(made)[1].method.startswith("used as it is")
+    swapped = replace(log, latitude_deg=log.longitude_deg, longitude_deg=log.latitude_deg)
+    with pytest.raises(MismatchError, match=r"the map lies \d+ km from where the log .* swapped in one of them"):
+        swapped.in_frame_of(made)
+    elsewhere = replace(log, longitude_deg=log.longitude_deg + 6.0)
+    with pytest.raises(MismatchError, match=r"the map lies \d\d\d km from .* its CRS right"):
+        elsewhere.in_frame_of(made)
 
 
 @pytest.mark.slow

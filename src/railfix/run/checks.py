@@ -11,9 +11,8 @@ from railfix.gnss.navigation import Navigation
 from railfix.motion.samples import SensorSamples
 from railfix.ranges.sbas import SbasCorrections
 from railfix.run.tally import AntennaTally, Tally
+from railfix.track.track import ANOTHER_PLACE_M
 
-#: A conventional position further from the trajectory than this belongs to another place [m].
-ANOTHER_PLACE_M: Final = 100_000.0
 #: Conventional positions that must all be so far before a run is stopped early.
 ENOUGH_TO_STOP: Final = 10
 #: Navigation records further from the log than this are of another day.

@@ -16,6 +16,7 @@ from os import PathLike
 from typing import Any, Final, Unpack
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Datetimes, Floats, Indices
 from railfix.core.errors import InputFileError, MismatchError
@@ -27,7 +28,7 @@ from railfix.io.position_log import positions_times, renamed
 from railfix.track.crs import kind_of_frame
 from railfix.track.frames import FrameShift, MapMotion, in_map_frame
 from railfix.track.network import Candidates, Network
-from railfix.track.track import SIGMA_PLAN_M
+from railfix.track.track import ANOTHER_PLACE_M, SIGMA_PLAN_M
 
 #: Negative logarithm of the likelihood of a position on a track that the map does not have, beside one at distance 0.
 _UNMAPPED_COST: Final = 12.0
@@ -66,9 +67,10 @@ class PlanLog:
     def in_frame_of(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
         """The positions, which are in the frame of the satellites, in that of the network.
 
-        MismatchError: when there is no position, or no time of the log in a network whose frame moves. SettingsError:
-        as for `railfix.track.frames.points_at`.
+        MismatchError: when there is no position, no time of the log in a network whose frame moves, or the network is
+        of another region. SettingsError: as for `railfix.track.frames.points_at`.
         """
+        _check_region(network, self)
         times = self.time[~np.isnat(self.time)]
         if not len(times) and kind_of_frame(network.frame) not in ("wgs84", "older datum"):
             raise MismatchError(
@@ -80,6 +82,24 @@ class PlanLog:
         moved, shift = in_map_frame(ecef, network.frame, time, named=network.named, **motion)
         latitude, longitude, _ = geodetic_from_ecef(moved)
         return replace(self, latitude_deg=latitude, longitude_deg=longitude), shift
+
+
+def _check_region(network: Network, log: PlanLog) -> None:
+    """Raise MismatchError where every position lies further than `ANOTHER_PLACE_M` from the network."""
+    known = np.isfinite(log.latitude_deg) & np.isfinite(log.longitude_deg)
+    if not known.any():
+        return
+    latitude, longitude, tree = log.latitude_deg[known], log.longitude_deg[known], cKDTree(network.points_m)
+    zeros = np.zeros(len(latitude))
+    apart = float(np.min(tree.query(ecef_from_geodetic(latitude, longitude, zeros))[0]))
+    if apart <= ANOTHER_PLACE_M:
+        return
+    turned = ecef_from_geodetic(np.clip(longitude, -90.0, 90.0), latitude, zeros)
+    swapped = float(np.min(tree.query(turned)[0])) <= ANOTHER_PLACE_M
+    what = (
+        "latitude and longitude are swapped in one of them" if swapped else "is it the map of that line, its CRS right?"
+    )
+    raise MismatchError(f"{log.path}: the map lies {apart / 1000.0:.0f} km from where the log was recorded; {what}")
 
 
 @dataclass(frozen=True, kw_only=True)
