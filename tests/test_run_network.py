@@ -181,6 +181,23 @@ def test_a_train_that_runs_back_over_another_track_has_a_route_and_says_so() -> 
     assert left_out[0] in (1, 2)
 
 
+@pytest.mark.parametrize("jump", [(30, 10, 5), (2, 3, 3), (60, 4, 0)])
+def test_a_jump_to_a_track_beside_cuts_no_connected_route(jump: tuple[int, int, int]) -> None:
+    """The loop, nothing and the main track again: no way leads from the loop back, but one over all main tracks."""
+    net = made_network(10.0)
+    log, on = made_run(net, [0, 1, 3, 4, 6], rng=np.random.default_rng(5), sigma_m=0.05)
+    matched = match(net, log, sigma_m=0.3)
+    assert route_of(net, matched) == ([0, 1, 3, 4, 6], [])
+    start, beside, unmapped = jump
+    track, first = matched.track.copy(), int(np.argmax(on == 1)) + start
+    track[first : first + beside] = 2
+    track[first + beside : first + beside + unmapped] = -1
+    for turn in (slice(None), slice(None, None, -1)):
+        found = replace(matched, track=track[turn])
+        route, left_out = route_of(net, found)
+        assert (route, left_out) == ([0, 1, 3, 4, 6][turn], [2])
+
+
 def test_a_gap_in_the_map_ends_the_route_and_is_said() -> None:
     """Of tracks without a connection those before or behind it are the route, and the others are left out."""
     made = made_network(10.0)
