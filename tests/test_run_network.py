@@ -26,7 +26,8 @@ from railfix.run.sources import open_line
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from railfix.track import read_track
 from railfix.track.frames import points_at
-from railfix.track.network_match import match, route_of
+from railfix.track.network import Network
+from railfix.track.network_match import Matched, match, route_of
 
 pytestmark = pytest.mark.requirement("A10")
 LOOP_M = (250.0, 550.0)
@@ -96,6 +97,26 @@ def test_results_are_those_on_the_route_given_as_a_map(near: tuple[RunInputs, Ru
     # the map has the points 250 and 550 m besides, which bend nothing
     assert apart.max() < 1e-3  # type: ignore[operator]
     assert "route" not in " ".join(plain.notes)
+
+
+def test_beside_the_route_no_position_is_ok_and_nothing_bounds_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The route is the loop, 20 m beside the track on which the demo drove: the probability of the route says so."""
+
+    def wrong(network: Network, _: Matched) -> tuple[list[int], list[int]]:
+        return [network.index_of(name) for name in ("line 0", "loop 0", "line 1")], []
+
+    monkeypatch.setattr("railfix.run.route.route_of", wrong)
+    inputs = _demo_on(tmp_path, aside_m=20.0)
+    summary = run_files(inputs, Config(filter="track"), out=tmp_path / "results", options=ELLIPSOIDAL)
+    for table, passed in (("positions", "ok"), ("train", "tracking")):
+        rows = pl.read_parquet(summary.files[f"{table}.parquet"])
+        beside = rows.filter(pl.col("track_probability") < 0.5)
+        assert len(beside) > 20
+        assert passed not in beside["status"].to_list()
+        assert not beside["protection_level_m"].is_finite().any()
+        assert (rows.filter(pl.col("track_probability") > 0.99)["status"] == passed).any()
 
 
 def test_evaluation_reads_the_track_that_the_run_wrote(near: tuple[RunInputs, RunSummary]) -> None:

@@ -203,7 +203,7 @@ def along_track(
         (single.arc_m, single.sigma_m),
     )  # fmt: skip
     beside = (tracked.status == TrackStatus.TRACKING) & single.map_offset
-    tracked = _doubted(tracked, beside, TrackStatus.MAP_OFFSET)
+    tracked = doubted(tracked, beside, TrackStatus.MAP_OFFSET)
     inside = on_line_m(tracked, trajectory)
     ecef = trajectory.at_arc(inside)
     latitude, longitude, height = geodetic_from_ecef(ecef)
@@ -241,12 +241,12 @@ def checked(
     held = seconds(time - disagreed[1:]) <= held_s
     tracked = result.tracked
     if held.any():
-        tracked = _doubted(tracked, held & is_bounded(tracked.status), TrackStatus.ANTENNAS_DISAGREE)
+        tracked = doubted(tracked, held & is_bounded(tracked.status), TrackStatus.ANTENNAS_DISAGREE)
     return replace(result, tracked=tracked, spacing_error_m=error), replace(state, disagreed=disagreed[-1])
 
 
-def _doubted(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:
-    """Places with a status of doubt at some epochs; nothing bounds their error there."""
+def doubted(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:
+    """Return places with a status of doubt at some epochs; nothing bounds their error there."""
     told = np.where(doubtful, np.int8(status), tracked.status)
     unbounded = doubtful & ~np.isnan(tracked.level_m)
     names = ("level_m", "ground_level_m", "amount_m")

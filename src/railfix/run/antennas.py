@@ -32,9 +32,11 @@ from railfix.pipeline.smoothing import Replay, smooth
 from railfix.pipeline.tables import in_time_order, observations_table, positions_table, rounded
 from railfix.pipeline.train_table import smoothed_table, train_table
 from railfix.run import sources
+from railfix.run.beside import without_beside
 from railfix.run.chunks import Pieces
 from railfix.run.inputs import Antenna
 from railfix.run.output import OutputFolder
+from railfix.run.route import RouteOfLog
 from railfix.run.sources import Log
 from railfix.run.tally import AntennaTally
 from railfix.screens import AntennaRanges, FilteredMotion, Screened, Verdict
@@ -75,7 +77,7 @@ class AntennaRun:
     """The run of one antenna in this process: `ChunkSteps` of one chunk after the other.
 
     `sensors` are of the whole run; `observations`: whether rows of observations are wanted; `smooth`: whether what the
-    filter was given is kept, for `smoothed`.
+    filter was given is kept, for `smoothed`; `route` is the one through a network, None without.
     """
 
     def __init__(
@@ -87,8 +89,9 @@ class AntennaRun:
         *,
         observations: bool,
         smooth: bool = False,
+        route: RouteOfLog | None = None,
     ) -> None:
-        self.name, self.log = name, log
+        self.name, self.log, self._route = name, log, route
         self._processor, self._sensors, self._observations = processor, sensors, observations
         self._pieces = Pieces(log.parts())
         self._tally = AntennaTally(min_satellites=processor.config.min_satellites)
@@ -143,6 +146,8 @@ class AntennaRun:
     def finished(self) -> Rows:
         """Return what the chunk gives to the results."""
         result, self._state = self._processor.gathered({self.name: self.chunk}, self._state)
+        if self._route is not None:
+            result = without_beside(result, self._route, self._processor.config)
         self._tally.add(result.antennas[self.name])
         if self._replays is not None:
             self._replays.keep(result.fusion[self.name].replay)

@@ -17,8 +17,9 @@ from railfix.gnss.observations import Observations
 from railfix.io import read_any_positions
 from railfix.io.logs import read_navigation, scan_observations
 from railfix.pipeline.config import Config
-from railfix.run.checks import ANOTHER_PLACE_M, RECORD_REACH, navigation_span
+from railfix.run.checks import RECORD_REACH, navigation_span
 from railfix.track.read import read_track
+from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.vehicle import read_vehicle
 
 Kind = Literal["observations", "navigation", "track", "vehicle", "settings", "positions", "unknown"]

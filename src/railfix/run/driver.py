@@ -133,7 +133,7 @@ def run_files(
         processor = processor_of(config, navigation, line.trajectories, track=line.track, units=units)
         write, smooth = options.observations == "write", options.smooth == "on"
         runs: dict[str, AntennaRun | OtherProcess] = {
-            name: AntennaRun(name, processor, log, sensors, observations=write, smooth=smooth)
+            name: AntennaRun(name, processor, log, sensors, observations=write, smooth=smooth, route=line.route)
             for name, log in logs.items()
             if name not in {other.name for other in others}
         }
@@ -249,6 +249,7 @@ def _antenna_run(name: Antenna, inputs: RunInputs, config: Config, options: RunO
         sensors,
         observations=options.observations == "write",
         smooth=options.smooth == "on",
+        route=line.route,
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Indices, Integers, Strings
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.navigation import Navigation
@@ -31,6 +31,8 @@ from railfix.track.network_match import Matched, PlanLog, match, route_of
 
 #: Interval of the positions that are matched [s].
 _INTERVAL_S: Final = 1.0
+#: Probability of the route below which another track, or none of the map, is likelier.
+LEAST_OF_ROUTE: Final = 0.5
 #: Least probability of a track beside the route that is written and named.
 _LEAST_WRITTEN: Final = 1e-4
 _LEAST_NAMED: Final = 0.01
@@ -118,6 +120,10 @@ class RouteOfLog:
     def probability(self) -> Floats:
         """Probability of the route at each matched position, shape (n,)."""
         return np.asarray((self.matched.probabilities * self._on_route).sum(axis=1))
+
+    def is_beside(self, time: Datetimes) -> Masks:
+        """Whether the log was on another track than the route's, or on none of the map, rather than on it."""
+        return np.asarray(self.probability[self._nearest_epoch(time)] < LEAST_OF_ROUTE)
 
     @cached_property
     def unmapped(self) -> Floats:
