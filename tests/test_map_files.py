@@ -67,6 +67,16 @@ def test_platforms_and_lifted_tracks_of_openstreetmap_are_no_tracks(
     assert "1 railway=platform, 1 railway=abandoned, 1 railway=construction" in segments[0].notes[-1]
 
 
+@pytest.mark.parametrize("key", ["osm_id", "track_id", "@id"])
+def test_a_flat_geojson_names_its_lines_as_other_vector_files_do(tmp_path: Path, key: str) -> None:
+    path = tmp_path / "a.geojson"
+    rows = [{"name": None, key: f"way/{k}", "railway": "rail"} for k in (5, 6)]
+    lines = [{"type": "LineString", "coordinates": [[11.0, 48.0 + k], [11.1, 48.0 + k]]} for k in (0, 1)]
+    features = [{"type": "Feature", "properties": r, "geometry": g} for r, g in zip(rows, lines, strict=True)]
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    assert [s.metadata["name"] for s in read_segments(path, MapReading())] == ["way/5", "way/6"]
+
+
 def test_a_column_railway_of_another_meaning_leaves_nothing_out(tmp_path: Path) -> None:
     path = geojson(tmp_path / "a.geojson", {"1": {"railway": "Northern"}, "2": {"railway": "Southern"}})
     assert len(read_segments(path, MapReading())) == 2

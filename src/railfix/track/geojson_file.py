@@ -19,7 +19,7 @@ from railfix.track.crs import frame_degrees, known_crs, older_datum_note, used_c
 from railfix.track.csv_file import OPTIONAL_COLUMNS, attributes
 from railfix.track.heights import HEIGHT_DATUMS, ellipsoidal_heights, own_height_datum
 from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
-from railfix.track.vector_file import is_of_openstreetmap, left_out_note, no_track
+from railfix.track.vector_file import is_of_openstreetmap, left_out_note, name_of, no_track
 
 #: RFC 7946, section 4: longitude and latitude on WGS 84 where the file names no CRS.
 RFC_CRS: Final = "OGC:CRS84"
@@ -53,7 +53,8 @@ def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any
             return
         if not isinstance(properties, dict) or not isinstance(geometry, dict):
             raise InputFileError(path, f"{label or 'the feature'} has no geometry")
-        yield from _lines(path, geometry, label, inherited | own | properties)
+        stated = {key: value for key, value in properties.items() if value is not None}
+        yield from _lines(path, geometry, label, inherited | own | stated)
     elif kind == "LineString":
         yield _Line(path, label, node.get("coordinates"), inherited | own, -1)
     elif kind == "MultiLineString":
@@ -78,10 +79,11 @@ def _is_no_line(feature: dict[str, Any]) -> bool:
 
 def _identity(feature: dict[str, Any]) -> dict[str, str]:
     """Name of one of several features: its id, where it has no name of its own."""
-    properties = feature.get("properties")
-    own = properties.get("id") if isinstance(properties, dict) else None
-    identity = feature.get("id") if own is None else own
-    return {} if identity is None else {"name": str(identity)}
+    properties, identity = feature.get("properties"), feature.get("id")
+    name = name_of(
+        properties if isinstance(properties, dict) else {}, fallback="" if identity is None else str(identity)
+    )
+    return {"name": name} if name else {}
 
 
 class _Line:

@@ -83,7 +83,7 @@ def read_vector_segments(path: str | PathLike[str], reading: MapReading) -> list
                 left_out[why] += 1
                 continue
             for k, part in enumerate(shape.geoms if shape.geom_type.startswith("Multi") else [shape]):
-                name = _name(row, fallback=f"line {len(segments) + 1}") + (f", part {k + 1}" if k else "")
+                name = name_of(row, fallback=f"line {len(segments) + 1}") + (f", part {k + 1}" if k else "")
                 points = np.array(part.coords, dtype=np.float64)
                 segments.append(plan_segment(points, of_layer, path=str(path), name=name, stated=_accuracy(row)))
     notes = left_out_note(path, left_out)
@@ -136,7 +136,8 @@ def plan_segment(
     )
 
 
-def _name(row: Mapping[str, Any], *, fallback: str) -> str:
+def name_of(row: Mapping[str, Any], *, fallback: str) -> str:
+    """Name of a feature by the first of `_NAMES` that it has."""
     lower = {key.lower(): value for key, value in row.items()}
     for key in _NAMES:
         value = lower.get(key)
