@@ -23,7 +23,10 @@ SMARTLOC_START: Final = np.datetime64("2016-01-03T00:00:00", "ns")
 
 def _folder(recordings: Path, name: str) -> Path:
     """The folder itself, or the one below it whose name begins so."""
-    return recordings if recordings.name.startswith(name) else next((recordings / "kinematic").glob(f"{name}*"))
+    if recordings.name.startswith(name):
+        return recordings
+    exact = recordings / "kinematic" / name
+    return exact if exact.is_dir() else next((recordings / "kinematic").glob(f"{name}*"))
 
 
 def urbannav_truth(recordings: Path) -> Truth:

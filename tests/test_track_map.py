@@ -192,7 +192,7 @@ def test_heights_are_never_guessed(
         ("# height_datum: orthometric\n" + GOOD, "'# height_datum' is 'orthometric'"),
         ("# sigma_plan_m: small\n" + GOOD, "a number in metres"),
         ("# sigma_plan_m: -1\n" + GOOD, "a positive number"),
-        (GOOD.replace(",", ";"), "no column"),
+        (GOOD.replace(",", ";"), "expected commas"),
     ],
 )
 def test_broken_csv_is_refused_in_one_sentence(tmp_path: Path, text: str | bytes, said: str) -> None:
