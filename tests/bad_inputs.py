@@ -308,7 +308,7 @@ MISTAKES: Final[dict[str, tuple[dict[str, str], str, int, str]]] = {
     ),
     "positions_far_from_the_map": (
         {"s.csv": "latitude_deg,longitude_deg,height_m\n50.0,14.0,300\n50.1,14.0,300\n"},
-        "map match {desk}/line.geojson --log {desk}/s.csv --out {out}.csv", 5, "is it the map of this region?",
+        "map match {desk}/line.geojson --log {desk}/s.csv --out {out}.csv", 5, "is it the map of that line",
     ),
     "heights_would_be_overwritten": (
         {"s.csv": "chainage_m,height_m\n0,1\n"},

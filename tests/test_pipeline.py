@@ -271,3 +271,12 @@ def test_reasons_of_a_recording_add_up(m8t):
     assert np.array_equal(found.n_used + found.n_rejected, seen)
     assert np.isin(found.status, [s.value for s in Status]).all()
     flat(found)
+
+
+@pytest.mark.parametrize("step", [0, -1], ids=["repeated", "back"])
+def test_epochs_out_of_order_are_refused(step: int) -> None:
+    front = clean_observations()["front"]
+    time = front.time.copy()
+    time[2] = time[1] + step * np.timedelta64(1, "ms")
+    with pytest.raises(ValueError, match=r"front: epoch 2 \(.*\) is not after .*; give epochs in order of time"):
+        processor().process({"front": replace(front, time=time)})

@@ -461,7 +461,7 @@ def test_places_are_doubtful_for_a_while_after_the_antennas_have_disagreed(cuts:
         result, state = one.process(parts, state)
         status.append(result.fusion["front"].tracked.status)
     found = np.concatenate(status)
-    assert (found[10:40] == TrackStatus.ANTENNAS_DISAGREE).all()
+    assert (found[15:40] == TrackStatus.ANTENNAS_DISAGREE).all()
     assert (found[40:] == TrackStatus.TRACKING).all()
 
 
@@ -476,11 +476,11 @@ def test_filtered_places_that_are_not_apart_as_the_antennas_are_doubtful(screens
     judged = "antenna_spacing" in screens
     for name in ("front", "rear"):
         clear, doubtful = good.fusion[name], wrong.fusion[name]
-        assert (clear.tracked.status[10:] == TrackStatus.TRACKING).all()
-        assert np.isfinite(clear.tracked.level_m[5:]).all()
+        assert (clear.tracked.status[15:] == TrackStatus.TRACKING).all()
+        assert np.isfinite(clear.tracked.level_m[15:]).all()
         expected = TrackStatus.ANTENNAS_DISAGREE if judged else TrackStatus.TRACKING
-        assert (doubtful.tracked.status[10:] == expected).all()
-        assert (np.isinf(doubtful.tracked.level_m[5:]) == judged).all()
+        assert (doubtful.tracked.status[15:] == expected).all()
+        assert (np.isinf(doubtful.tracked.level_m[15:]) == judged).all()
         if judged:
-            assert np.abs(clear.spacing_error_m[5:]).max() < 3.0
-            np.testing.assert_allclose(doubtful.spacing_error_m[5:], -18.0, atol=1.0)
+            assert np.abs(clear.spacing_error_m[15:]).max() < 3.0
+            np.testing.assert_allclose(doubtful.spacing_error_m[15:], -18.0, atol=1.0)

@@ -197,13 +197,15 @@ class EpochProcessor:
         Raises
         ------
         ValueError
-            An antenna has no trajectory.
+            An antenna has no trajectory, or its epochs do not rise in time.
         SettingsError
             As the class.
         """
         unknown = sorted(set(observations) - set(self.trajectories))
         if unknown:
             raise ValueError(f"no trajectory for antenna {', '.join(unknown)}")
+        for name, part in observations.items():
+            _check_rising(name, part)
         state = state or State()
         received = receive(
             state.received or self.received,
@@ -348,3 +350,11 @@ def conditions_of(config: Config) -> Conditions:
         ionosphere="sbas" if config.sbas else config.ionosphere,
         troposphere="sbas" if config.sbas else config.troposphere,
     )
+
+
+def _check_rising(name: str, observations: Observations) -> None:
+    """Raise ValueError where an epoch is not after the one before it."""
+    time = observations.time
+    if (back := np.flatnonzero(time[1:] <= time[:-1])).size:
+        earlier, later = time[back[0] : back[0] + 2]
+        raise ValueError(f"{name}: epoch {back[0] + 1} ({later}) is not after {earlier}; give epochs in order of time")
