@@ -11,7 +11,6 @@ import polars as pl
 import pytest
 
 import synthetic
-from railfix import kernels
 from railfix.core.files import fingerprint
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.core.timescale import timedelta
@@ -65,12 +64,8 @@ def test_open_lines_do_not_close(line: Trajectory) -> None:
 
 
 @pytest.mark.requirement("E5")
-@pytest.mark.parametrize("kernel", ["numpy", "numba"])
 @pytest.mark.parametrize("backward", [False, True], ids=["rising", "falling"])
-def test_the_filter_goes_round(kernel: str, backward: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    if kernel == "numba":
-        pytest.importorskip("numba", reason="railfix[fast] is not installed")
-    monkeypatch.setattr(kernels, "CHOSEN", kernel)
+def test_the_filter_goes_round(backward: bool) -> None:
     closed, laps = ring(1.0), ring(3.0, backward=backward)
     length = closed.arc_m[-1]
     case = ride(300, trajectory=laps, start_m=100.0, noise=1.0)
@@ -105,13 +100,9 @@ def test_beyond_the_end_the_ring_goes_on() -> None:
 
 
 @pytest.mark.requirement("E5")
-@pytest.mark.parametrize("kernel", ["numpy", "numba"])
 @pytest.mark.parametrize("kind", ["no sensor", "wheel", "nothing logged"])
-def test_an_outage_across_the_join_changes_nothing(kind: str, kernel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_outage_across_the_join_changes_nothing(kind: str) -> None:
     """The places are those on a map of two laps, which has no join there."""
-    if kernel == "numba":
-        pytest.importorskip("numba", reason="railfix[fast] is not installed")
-    monkeypatch.setattr(kernels, "CHOSEN", kernel)
     closed, laps = ring(1.0), ring(2.0)
     length = float(closed.arc_m[-1])
     case = ride(85, trajectory=laps, start_m=length - 400.0, noise=1.0)

@@ -6,14 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
 
 from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackingLimits, TrackStatus, track
-from railfix.tracking.predict import singer_step
-from railfix.tracking.robust import applied, log_evidence, prior_of, robust_update
-from railfix.tracking.rows import Rows
 from railfix.tracking.state import TrackState
-from railfix.tracking.student_t import Tails
+from railfix.tracking.transition import singer_step
 from tracking_cases import Ride, bent_line, part, reflected, ride, wheel, without_epochs
 
 
@@ -164,39 +160,6 @@ def test_a_place_put_wrong_is_lost_and_sought_again() -> None:
     later, _ = track(part(case.epochs, slice(50, 120)), case.line, replace(state, mean=mean))
     assert TrackStatus.LOST in later.status
     assert np.abs(later.arc_m[-20:] - case.arc_m[-20:]).max() < 3.0
-
-
-def _linear_rows(random: np.random.Generator, hypotheses: int, rows: int, width: int) -> tuple[Rows, np.ndarray]:
-    """Rows of codes, each over a combination of its own."""
-    made = Rows(
-        combine=random.normal(size=(hypotheses, rows, width)),
-        design=np.repeat(np.eye(rows)[None], hypotheses, axis=0),
-        value=random.normal(size=(hypotheses, rows)),
-        variance=random.uniform(0.5, 2.0, rows),
-        kind=np.zeros(rows, dtype=np.int64),
-        column=np.arange(rows),
-        bounds=(rows, rows, rows),
-    )
-    root = random.normal(size=(hypotheses, width, width))
-    return made, root @ np.swapaxes(root, 1, 2) + np.eye(width)
-
-
-@pytest.mark.requirement("E5")
-def test_with_normal_errors_the_update_is_kalmans_and_its_evidence_the_density() -> None:
-    rows, covariance = _linear_rows(np.random.default_rng(3), 2, 7, 9)
-    prior = prior_of(rows, covariance)
-    update = robust_update(rows, prior, np.ones((2, 7)), tails=Tails(1e9, 1e9), passes=3)
-    mean, after = applied(np.zeros((2, 9)), covariance, prior, update)
-    evidence = log_evidence(rows, prior, update, Tails(1e9, 1e9))
-    density = []
-    for k in range(2):
-        design = rows.design[k] @ rows.combine[k]
-        innovation = design @ covariance[k] @ design.T + np.diag(rows.variance)
-        gain = covariance[k] @ design.T @ np.linalg.inv(innovation)
-        np.testing.assert_allclose(mean[k], gain @ rows.value[k], rtol=1e-6, atol=1e-9)
-        np.testing.assert_allclose(after[k], covariance[k] - gain @ design @ covariance[k], rtol=1e-6, atol=1e-9)
-        density.append(multivariate_normal.logpdf(rows.value[k], cov=innovation))
-    assert evidence[0] - evidence[1] == pytest.approx(density[0] - density[1], abs=1e-5)
 
 
 @pytest.mark.requirement("E5")

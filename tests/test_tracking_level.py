@@ -8,13 +8,42 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from plain_kernels import memory, named_tuple, parameters, plain, subfilters, work_space
+from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits, track
-from railfix.tracking.bank import OTHERS, Branches, budget, compute_level
-from railfix.tracking.state import Bank
+from railfix.tracking.bank import OTHERS, budget
 from tracking_cases import bent_line, part, ride, wheel, without_epochs
 
 LIMITS = TrackingLimits()
-NO_BRANCH = Branches(probability=np.empty(0), apart_m=np.empty(0), ground_m=np.empty(0), sigma_m=np.empty(0))
+
+
+def level_of(
+    names: list[str],
+    place_m: list[float],
+    sigma_m: list[float],
+    *,
+    branch: tuple[float, float, float, float] | None = None,
+    weak_s: float = 0.0,
+) -> dict[str, float]:
+    """Levels of a place at 100 m with a standard deviation of 1 m, by sub-filters and at most one other branch.
+
+    The branch has a probability, a distance along the line, a straight one, and a standard deviation.
+    """
+    probability, apart, ground, sigma = branch or (0.0, 0.0, 0.0, 0.0)
+    count = 1 if branch is None else 2
+    held = memory(
+        np.array([100.0, 100.0 + apart])[:count],
+        np.array([1.0, sigma])[:count],
+        np.log(np.maximum([1.0 - probability, probability], 1e-300))[:count],
+    )
+    work = work_space(count)
+    far = probability if apart > LIMITS.start_separation_m else 0.0
+    work.branch[1:count] = 0.0 if far else apart, ground, sigma
+    bank = subfilters(names, place_m, sigma_m, LIMITS, weak_s)
+    fields = ("level_m", "ground_level_m", "level_noise_m", "separation_m")
+    answers = named_tuple(layout.Answers, **{name: np.full(1, np.nan) for name in fields})
+    plain("level").write_level(held, count, far, bank, parameters(LIMITS), work, answers, 0)
+    return {name: float(getattr(answers, name)[0]) for name in fields}
 
 
 @pytest.mark.requirement("C2")
@@ -23,14 +52,9 @@ def test_the_level_spends_the_risk_over_all_hypotheses() -> None:
     given = budget(LIMITS)
     assert given.risk == pytest.approx(1e-7 / 60.0)
     place, sigma = np.array([0.4, -2.0, 0.1, 1.0]), np.array([1.6, 2.5, 1.1, 3.0])
-    covariance = np.zeros((4, 30, 30))
-    covariance[:, 0, 0] = sigma**2
-    mean = np.zeros((4, 30))
-    mean[:, 0] = 100.0 + place
-    bank = Bank(without=("G01", "E", "G", "wheel"), mean=mean, covariance=covariance, weak_s=np.zeros(4))
-    found = compute_level(bank, NO_BRANCH, 100.0, 1.0, LIMITS)
-    level, noise, apart = found.along_m, found.noise_m, found.separation_m
-    assert found.ground_m == level
+    found = level_of(["G01", "E", "G", "wheel"], list(100.0 + place), list(sigma))
+    level, noise, apart = found["level_m"], found["level_noise_m"], found["separation_m"]
+    assert found["ground_level_m"] == level
     prior = np.array([given.prior[kind] for kind in (0, 1, 1, 2)])
     spent = 2.0 * norm.sf(level) + prior @ (norm.sf((level - place) / sigma) + norm.sf((level + place) / sigma))
     assert spent == pytest.approx(given.risk, rel=1e-6)
@@ -43,37 +67,26 @@ def test_the_level_spends_the_risk_over_all_hypotheses() -> None:
 def test_other_branches_are_hypotheses_of_the_level(probability: float) -> None:
     """Against the equation: near along the line, or at another place of it that is near on the ground."""
     given = budget(LIMITS)
-    covariance, mean = np.zeros((1, 30, 30)), np.zeros((1, 30))
-    covariance[:, 0, 0], mean[:, 0] = 4.0, 101.0
-    bank = Bank(without=("G01",), mean=mean, covariance=covariance, weak_s=np.zeros(1))
     for apart, ground in ((40.0, 35.0), (1815.0, 3.0), (900.0, 18.0)):
-        branch = Branches(
-            probability=np.array([probability]),
-            apart_m=np.array([apart]),
-            ground_m=np.array([ground]),
-            sigma_m=np.array([2.0]),
-        )
-        found = compute_level(bank, branch, 100.0, 1.0, LIMITS)
+        found = level_of(["G01"], [101.0], [2.0], branch=(probability, apart, ground, 2.0))
 
         def spent(level: float, distance: float) -> float:
             own = given.prior[0] * (norm.sf((level - 1.0) / 2.0) + norm.sf((level + 1.0) / 2.0))
             other = probability * (norm.sf((level - distance) / 2.0) + norm.sf((level + distance) / 2.0))
             return float(2.0 * norm.sf(level) + own + other)
 
-        assert spent(found.ground_m, ground) == pytest.approx(given.risk, rel=1e-5)
+        assert spent(found["ground_level_m"], ground) == pytest.approx(given.risk, rel=1e-5)
         if apart > LIMITS.start_separation_m and probability > given.risk:
-            assert found.along_m == np.inf
+            assert found["level_m"] == np.inf
         else:
             distance = apart if apart <= LIMITS.start_separation_m else 0.0
-            assert spent(found.along_m, distance) == pytest.approx(given.risk, rel=1e-5)
+            assert spent(found["level_m"], distance) == pytest.approx(given.risk, rel=1e-5)
 
 
 @pytest.mark.requirement("C2")
 def test_only_a_contradiction_that_lasts_takes_the_level_away() -> None:
-    mean, covariance = np.zeros((1, 30)), np.ones((1, 30, 30))
     for weak_s, told in ((0.0, True), (1.0, True), (LIMITS.level_doubt_s, True), (LIMITS.level_doubt_s + 0.1, False)):
-        bank = Bank(without=("G01",), mean=mean, covariance=covariance, weak_s=np.array([weak_s]))
-        assert np.isfinite(compute_level(bank, NO_BRANCH, 0.0, 1.0, LIMITS).along_m) == told
+        assert np.isfinite(level_of(["G01"], [100.0], [1.0], weak_s=weak_s)["level_m"]) == told
     # half of the codes 60 m late: the filter's own weights are those of a lost track, for 2 s and for 5 s
     case = ride(60, noise=1.0, seed=5)
     code = case.epochs.code_m.copy()

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from plain_kernels import memory, parameters, plain, work_space
 from posterior_score import bounds
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import TrackingLimits, TrackState, track
-from railfix.tracking.branches import judged
 from tracking_cases import LATITUDE, LONGITUDE, part, ride
 
 LAP_M = 800.0
@@ -72,13 +72,32 @@ def test_every_lap_is_a_hypothesis_at_the_start() -> None:
 PLACES = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [18.0, 0.0, 0.0], [300.0, 0.0, 0.0]])
 
 
+def judged(
+    log_probability: np.ndarray,
+    log_code: np.ndarray,
+    motion: np.ndarray,
+    code: np.ndarray,
+    places: np.ndarray,
+    branch_s: float,
+    branch_m: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Probabilities after a second of evidence for branches at places, and the part of them by codes."""
+    count = len(places)
+    held = memory(np.zeros(count), np.ones(count), log_probability, BRANCH_S=branch_s, BRANCH_M=branch_m)
+    held.log_code[:] = log_code
+    work = work_space(count)
+    work.evidence[:count], work.code_evidence[:count], work.places[:count] = motion, code, places
+    plain("branches").judge(parameters(TrackingLimits()), held, work, count, 1.0)
+    return held.log_probability, held.log_code
+
+
 def _after(seconds_: int, motion: float, code: float, *, speed_mps: float = 10.0) -> np.ndarray:
     """Logarithms of the odds of four branches after so many seconds of the same evidence against all but the first."""
-    limits, probability, of_code = TrackingLimits(), np.log(np.full(4, 0.25)), np.zeros(4)
+    probability, of_code = np.log(np.full(4, 0.25)), np.zeros(4)
     against = np.array([0.0, 1.0, 1.0, 1.0])
     for k in range(seconds_):
         probability, of_code = judged(
-            probability, of_code, motion * against, code * against, PLACES, float(k), k * speed_mps, 1.0, limits
+            probability, of_code, motion * against, code * against, PLACES, float(k), k * speed_mps
         )
     return np.asarray(probability - probability[0])
 
@@ -114,5 +133,5 @@ def test_what_codes_said_of_a_branch_far_away_does_not_hold_once_it_is_near() ->
     limits = TrackingLimits()
     probability, code = np.array([0.0, -60.0]), np.array([0.0, -60.0])
     near = np.array([[0.0, 0.0, 0.0], [18.0, 0.0, 0.0]])
-    after, _ = judged(probability, code, np.zeros(2), np.zeros(2), near, 60.0, 600.0, 1.0, limits)
+    after, _ = judged(probability, code, np.zeros(2), np.zeros(2), near, 60.0, 600.0)
     assert after[1] - after[0] == pytest.approx(np.log(limits.branch_floor))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from railfix.tracking import Later, Step, TrackingLimits, TrackState, smoothed, track
-from railfix.tracking.predict import transition
 from railfix.tracking.state import Unknown
+from railfix.tracking.transition import transition
 from tracking_cases import Ride, bent_line, part, ride, without_epochs
 
 LIMITS = TrackingLimits()
@@ -27,13 +27,10 @@ def _dense(trace: list[Step]) -> tuple[np.ndarray, np.ndarray]:
     means, combined = [], []
     for t, step in enumerate(trace):
         assert step.updated is not None
-        prior, combine, information, update = (
-            part[0] if isinstance(part, np.ndarray) else part for part in step.updated
-        )
-        assert not isinstance(update, np.ndarray)
-        precise = np.linalg.inv(update.covariance[0])
-        combined.append((combine, precise - information, precise @ update.change[0]))
-        innovation_free = step.mean[0] - prior @ combine.T @ information @ update.change[0]
+        prior, combine, information = (getattr(step.updated, name)[0] for name in ("prior", "combine", "information"))
+        precise = np.linalg.inv(step.updated.covariance[0])
+        combined.append((combine, precise - information, precise @ step.updated.change[0]))
+        innovation_free = _prediction(step)
         if t == 0:
             joint[0, :, 0] = prior
             means.append(innovation_free)
@@ -67,9 +64,9 @@ def _dense(trace: list[Step]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _prediction(step: Step) -> np.ndarray:
-    assert step.updated is not None
-    prior, combine, information, update = step.updated
-    return step.mean[0] - prior[0] @ combine[0].T @ information[0] @ update.change[0]
+    made = step.updated
+    assert made is not None
+    return np.asarray(step.mean[0] - made.prior[0] @ made.combine[0].T @ made.information[0] @ made.change[0])
 
 
 @pytest.mark.requirement("E5")

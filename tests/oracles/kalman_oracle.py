@@ -1,4 +1,4 @@
-"""The filter along the track as a textbook Kalman filter: filterpy on the equations of `railfix.tracking.rows`.
+"""The filter along the track as a textbook Kalman filter: filterpy on the filter's own equations.
 
 One hypothesis, normal errors, a straight line, satellites at rest, clocks of GPS and Galileo. The design comes from
 differences of ranges; prediction, update and smoother are filterpy's (R. Labbe, https://github.com/rlabbe/filterpy).

@@ -28,15 +28,18 @@ _INNER: Final[dict[str, Any]] = {"no_cpython_wrapper": True}
 def kernel(function: Function) -> Function:
     """Compile a function of arrays at its first call, without the interpreter lock, and keep the code on disk.
 
-    Divisions by zero give infinities and NaN as numpy's do. The code is kept beside the source, or in the user's cache
-    folder where that cannot be written, or in ``NUMBA_CACHE_DIR``. It is compiled anew when a file changes that
-    it imports functions from, or the constants: numba itself looks at the function's own file alone.
+    With ``NUMBA_DISABLE_JIT=1`` it stays plain Python. Divisions by zero give infinities and NaN as numpy's do. The
+    code is kept beside the source, or in the user's cache folder where that cannot be written, or in
+    ``NUMBA_CACHE_DIR``. It is compiled anew when a file changes that it imports functions from, or the constants:
+    numba itself looks at the function's own file alone.
 
     Raises
     ------
     SettingsError
         None of these folders can be written.
     """
+    if numba.config.DISABLE_JIT:
+        return function
     try:
         made = numba.njit(cache=True, **_OPTIONS)(function)
     except RuntimeError as error:

@@ -17,7 +17,7 @@ from railfix.motion.radar_watch import RadarWatch
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
 from railfix.run.sensor_checks import SensorChecks
-from railfix.tracking.rows import Kind
+from railfix.tracking import Kind
 
 #: The sensors are judged after so long, by places at least so far apart; the radar every so often [ns].
 WATCHED_NS: Final = 600_000_000_000

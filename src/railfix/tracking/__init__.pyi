@@ -1,11 +1,10 @@
 # The names of `railfix.tracking`, imported at their first use (lazy-loader).
 
-from .epochs import GnssEpochs, RangeEpochs, SensorEpochs
+from .epochs import GnssEpochs, Kind, RangeEpochs, SensorEpochs
 from .filter import track
 from .limits import TrackingLimits
 from .line import Line
 from .result import Tracked, TrackStatus
-from .rows import Kind
 from .smoother import Later, Smoothed, Step, smoothed
 from .state import TrackState
 

@@ -1,4 +1,4 @@
-"""Hypotheses over places of the line: where they begin, how they are joined and dropped."""
+"""Hypotheses over places of the line: where they begin."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices
 from railfix.core.geodesy import range_with_rotation
+from railfix.kernels.tracking.constants import CODE_CLOCK_SIGMA_M
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
-from railfix.tracking.predict import CODE_CLOCK_SIGMA_M
 from railfix.tracking.state import CLOCKS, OFFSETS, SATELLITES, Unknown
 
 #: The line is searched at points this far apart; a Gaussian of `start_sigma_m` covers what lies between, and codes
@@ -29,27 +29,9 @@ _ANY_DRIFT_MPS: Final = 1e3
 WHEEL_PRIOR: Final = 0.02
 FORCE_PRIOR_MPS2: Final = 0.1
 RADAR_PRIOR: Final = 0.02
-#: How much more probable another place must be to be gone by: near-equal ones would take turns.
-SWITCH: Final = 3.0
-#: Logarithm of the odds that a difference of one `map_branch_m` can give: 1 / (2 s^2) with s^2 = 2 (1/3)^2.
-MOST_ODDS: Final = 2.25
-#: Largest logarithm of the odds that motion gives in a second: more is a reflection.
-MOST_MOTION: Final = 5.0
-#: A hypothesis that leads although its probability was below this within the last seconds (its least logarithm rises
-#: by `LEAST_RISE` a second) has taken over from others that all failed: places are sought again. Not within the first
-#: seconds, when all are young.
-TAKEOVER: Final = -6.0
-LEAST_RISE: Final = 0.3
-TAKEOVER_AFTER_S: Final = 15.0
-#: Satellites with a phase or a Doppler, or codes, that an epoch's evidence needs: fewer fit any speed and place.
-MOTION_SATELLITES: Final = 4
-#: Distance that is worth one of the logarithm of the odds by motion [m]: a map does not tell tangents at rest.
-MOTION_M: Final = 3.0
 #: Standard deviation of the speed beyond a bend [m/s], and the share of probability that places beside get.
 _BEND_SPEED_MPS: Final = 10.0
 _BESIDE_SHARE: Final = 0.01
-#: Places beside are tried once motion has been contradicted for so long [s]: shorter it is a reflection, at any rate.
-BESIDE_AFTER_S: Final = 0.9
 #: What a new hypothesis takes over from a lost track: its error has gone into everything else.
 _KEPT: Final = np.array([Unknown.WHEEL, Unknown.FORCE_OFFSET, Unknown.RADAR])
 
@@ -197,112 +179,3 @@ def beside(mean: Floats, covariance: Floats, limits: TrackingLimits) -> tuple[Fl
     ):
         covariances[:, unknown, unknown] += sigma**2
     return means, covariances, np.full(len(steps), np.log(_BESIDE_SHARE / len(steps)))
-
-
-def judged(
-    log_probability: Floats,
-    log_code: Floats,
-    motion_evidence: Floats,
-    code_evidence: Floats,
-    ecef_m: Floats,
-    branch_s: float,
-    branch_m: float,
-    dt: float,
-    limits: TrackingLimits,
-) -> tuple[Floats, Floats]:
-    """Update the probabilities of branches, up to a constant, and the part of them that codes gave, shape (H,) each.
-
-    With d the distance of a branch from the most probable one, the difference of the evidence counts by
-    ``d^2 / (d^2 + map_branch_m^2)``: branches within the error of the map differ in their ranges at every epoch alike.
-
-    Motion (Dopplers, phases, sensors) has errors of seconds: it counts in full, `MOST_MOTION` a second at most, and its
-    odds go no further than ``d^2 / (2 s^2)`` with s^2 = 2 (map_branch_m / 3)^2, nor than one for `MOTION_M` of travel.
-
-    Codes have errors in common to all satellites of one side of a street, for minutes. Their odds go no further than
-    ``n d^2 / (2 code_common_m^2)``, what n independent epochs with such an error can say, and between branches that are
-    closer than `branch_floor_m` now never below `branch_floor`, whatever was gained while they were apart.
-
-    Parameters
-    ----------
-    log_probability, log_code : ndarray, shape (H,)
-        Before the epoch.
-    motion_evidence, code_evidence : ndarray, shape (H,)
-        Of motion, and of codes given the motion.
-    ecef_m : ndarray, shape (H, 3) [m]
-        Positions of the branches.
-    branch_s, branch_m : float [s], [m]
-        Time and distance since the branches began: n is 1 and one more in `code_common_s` or `code_common_travel_m`.
-    dt : float [s]
-    limits : TrackingLimits
-    """
-    best = int(np.argmax(log_probability))
-    square = ((ecef_m - ecef_m[best]) ** 2).sum(axis=1)
-    share = square / (square + limits.map_branch_m**2)
-    log_motion = log_probability - log_code
-    before = log_motion - log_motion[best]
-    most = MOST_MOTION * max(dt, 1.0)
-    motion = before + share * np.clip(motion_evidence - motion_evidence[best], -most, most)
-    reach = np.minimum(MOST_ODDS * square / limits.map_branch_m**2, branch_m / MOTION_M)
-    motion = np.clip(motion, np.minimum(before, -reach), np.maximum(before, reach))
-    before = log_code - log_code[best]
-    code = before + share * (code_evidence - code_evidence[best])
-    independent = 1.0 + branch_s / limits.code_common_s + branch_m / limits.code_common_travel_m
-    reach = independent * square / (2.0 * limits.code_common_m**2)
-    code = np.clip(code, np.minimum(before, -reach), np.maximum(before, reach))
-    near, most = square < limits.branch_floor_m**2, -np.log(limits.branch_floor)
-    code = np.where(near, np.clip(code, -most, most), code)
-    return motion + code, code
-
-
-def on_the_line(mean: Floats, covariance: Floats, line: Line, limits: TrackingLimits) -> Floats:
-    """Means with places a little beyond an end of the line put on it, shape (H, N).
-
-    Projection on the constraint along the correlations (D. Simon, Kalman filtering with state constraints, 2010); a
-    place within two sigmas of it is noise, and one further out than a start may be wrong is left: the map may end
-    before the line.
-    """
-    place = mean[:, Unknown.PLACE]
-    excess = np.clip(place, *line.bounds_m) - place
-    sigma = np.sqrt(covariance[:, Unknown.PLACE, Unknown.PLACE])
-    excess = np.where((np.abs(excess) > 2.0 * sigma) & (np.abs(excess) <= limits.start_sigma_m), excess, 0.0)
-    if not excess.any():
-        return mean
-    gain = covariance[:, :, Unknown.PLACE] / covariance[:, Unknown.PLACE, Unknown.PLACE, None]
-    return np.asarray(mean + gain * excess[:, None])
-
-
-def most_probable(log_probability: Floats) -> int:
-    """The hypothesis to go by: that of before, the first, unless another is `SWITCH` times as probable."""
-    best = int(np.argmax(log_probability))
-    return best if log_probability[best] > log_probability[0] + np.log(SWITCH) else 0
-
-
-def surviving(
-    mean: Floats, covariance: Floats, log_probability: Floats, origin_m: Floats, limits: TrackingLimits
-) -> tuple[Indices, Floats]:
-    """Hypotheses to go on with, the most probable first, and their probabilities.
-
-    Those that have come to the same place count as one. Improbable ones are dropped once all have travelled far
-    enough for their motion to have told them apart.
-    """
-    order = np.argsort(-log_probability, kind="stable")
-    first = most_probable(log_probability)
-    order = np.concatenate([[first], order[order != first]])
-    place = mean[:, Unknown.PLACE]
-    sigma = np.sqrt(covariance[:, Unknown.PLACE, Unknown.PLACE])
-    kept: list[int] = []
-    joined = log_probability.copy()
-    for one in order.tolist():
-        twin = next((k for k in kept if abs(place[one] - place[k]) < max(2.0, sigma[one] + sigma[k])), None)
-        if twin is None:
-            kept.append(one)
-        else:
-            joined[twin] = np.logaddexp(joined[twin], joined[one])
-    chosen = np.array(kept[: limits.most_hypotheses], dtype=np.intp)
-    probability = joined[chosen] - np.logaddexp.reduce(joined[chosen])
-    travelled = np.abs(place[chosen] - origin_m[chosen])
-    if travelled[0] >= limits.decided_travel_m:
-        alive = probability > np.log(limits.least_probability)
-        chosen, probability = chosen[alive], probability[alive]
-        probability = probability - np.logaddexp.reduce(probability)
-    return chosen, probability

@@ -155,26 +155,6 @@ def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> C
     )
 
 
-def code_interval_s(chunk: Chunk, epoch: int, coded: np.datetime64, limits: TrackingLimits) -> float:
-    """Return the time that an epoch's codes represent [s]; 0 where they are not used, as others were within the period.
-
-    Parameters
-    ----------
-    chunk : Chunk
-    epoch : int
-    coded : datetime64[ns]
-        Last epoch whose codes were used; NaT before the first and after a restart.
-    limits : TrackingLimits
-    """
-    dt = float(chunk.interval_s[epoch])
-    if not chunk.has[0, epoch].any():
-        return dt
-    since = float("inf") if np.isnat(coded) else float(seconds(chunk.time[epoch] - coded))
-    if chunk.motion_measured[epoch] and since < limits.code_period_s - 0.5 * dt:
-        return 0.0
-    return min(max(since, dt), max(limits.code_period_s, dt))
-
-
 def leave(chunk: Chunk, epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> None:
     """Make the state ready to be handed on: without satellites long unseen, with the phases of the last epoch."""
     phase = np.where(np.isfinite(epochs.phase_m[-1]), epochs.phase_m[-1], np.nan)

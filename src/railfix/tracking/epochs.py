@@ -3,9 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from enum import IntEnum
 from typing import Literal
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
+
+
+class Kind(IntEnum):
+    """Kind of a measurement."""
+
+    CODE = 0
+    PHASE = 1
+    DOPPLER = 2
+    WHEEL = 3
+    RADAR = 4
+    FORCE = 5
+    PLACE = 6  # by a feature of the line
+    RANGE = 7  # to a ground unit
 
 
 @dataclass(frozen=True, kw_only=True)

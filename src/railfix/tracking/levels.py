@@ -18,7 +18,7 @@ import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Indices
 from railfix.core.timescale import seconds
-from railfix.tracking.bank import SCALE_BOUND
+from railfix.kernels.tracking.constants import SCALE_BOUND
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
 from railfix.tracking.filter import track
 from railfix.tracking.limits import TrackingLimits

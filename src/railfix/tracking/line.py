@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -139,7 +140,7 @@ class Line:
         return 0.5 * (self.arc_m[1:] + self.arc_m[:-1])
 
     @cached_property
-    def written(self) -> dict[str, Floats | float]:
+    def written(self) -> dict[str, Any]:
         """Everything by its name, arrays as writable copies, row by row."""
         names = ("arc_m", "ecef_m", "axes", "segment", "middle_m", "gradient")
         arrays = {name: np.array(getattr(self, name), order="C") for name in names}

@@ -9,39 +9,35 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks
-from railfix.tracking.bank import SCALE_BOUND, Branches, compute_level, speed_bound_mps, uncovered
-from railfix.tracking.limits import TrackingLimits
-from railfix.tracking.line import Line
-from railfix.tracking.robust import mean_weight
-from railfix.tracking.rows import Kind, Rows
-from railfix.tracking.state import TrackState, Unknown
+from railfix.kernels.tracking import constants
+from railfix.tracking.epochs import Kind
 
 
 class TrackStatus(IntEnum):
     """What the filter says of an epoch."""
 
     #: One place, from measurements of this epoch.
-    TRACKING = 0
+    TRACKING = constants.TRACKING
     #: Several places are possible; the most probable one is given.
-    SEVERAL_BRANCHES = 1
+    SEVERAL_BRANCHES = constants.SEVERAL_BRANCHES
     #: No measurement of this epoch, or none that is believed: the predicted place.
-    COASTING = 2
+    COASTING = constants.COASTING
     #: Measurements contradict the track: places are sought again.
-    LOST = 3
+    LOST = constants.LOST
     #: No place: predicted too far.
-    EXPIRED = 4
+    EXPIRED = constants.EXPIRED
     #: No place yet: no epoch so far had redundant codes.
-    NOT_STARTED = 5
+    NOT_STARTED = constants.NOT_STARTED
     #: No place: the satellites have put the train away from the line for some time.
-    OFF_MAP = 6
+    OFF_MAP = constants.OFF_MAP
     #: One place, but 3-D positions of the last minutes lie beside or above the line: the map is wrong here, or it is
     #: another track.
-    MAP_OFFSET = 7
+    MAP_OFFSET = constants.MAP_OFFSET
     #: One place, but not as far from that of the other antenna as the antennas are apart, or not as fast, within the
     #: last 20 s: one of the two is wrong.
-    ANTENNAS_DISAGREE = 8
+    ANTENNAS_DISAGREE = constants.ANTENNAS_DISAGREE
     #: One place, but measurements contradict it or one of the sub-filters that bound it: nothing bounds its error.
-    DOUBTFUL = 9
+    DOUBTFUL = constants.DOUBTFUL
 
     @property
     def text(self) -> str:
@@ -79,11 +75,12 @@ class Tracked:
         Mean weights of codes, and of Dopplers and phases.
     wheel_scale, force_offset_mps2, radar_scale : ndarray, shape (T,)
     map_scale : ndarray, shape (T,)
-        Factor on the error of the map's lengths, 1 where codes do not contradict them (`misfit`).
+        Factor on the error of the map's lengths, 1 where codes do not contradict them.
     level_m, ground_level_m, level_noise_m, separation_m : ndarray, shape (T,) [m]
-        `bank.Level`: of the error along the line, of the straight distance; NaN where levels are off.
+        Of the error along the line; of the straight distance, all branches included; without faults and branches; and
+        the largest separation of a sub-filter. NaN where levels are off.
     level_speed_mps : ndarray, shape (T,)
-        `bank.speed_bound_mps`.
+        Bound of the error of the speed, which carries the level on to the next epochs.
     amount_m : ndarray, shape (T,) [m]
         Over- and under-reading amount: the level, and never less than the bound of the scale times the way since
         codes were used (SUBSET-026 3.6.8).
@@ -96,7 +93,7 @@ class Tracked:
     weight : ndarray, shape (T, 3, K)
         0 for codes that are left out.
     faulty : ndarray of bool, shape (T, K)
-        Codes that are left out (`railfix.tracking.faulty`).
+        Codes that are left out (`railfix.kernels.tracking.learning`).
     """
 
     time: Datetimes
@@ -149,81 +146,3 @@ class Tracked:
             faulty=np.zeros((size, channels), dtype=np.bool_),
             **{name: np.full(size, np.nan) for name in names},
         )
-
-
-def write_rows(result: Tracked, epoch: int, rows: Rows, innovation: Floats, weight: Floats) -> None:
-    """Innovations and weights of the best hypothesis."""
-    end = rows.bounds[2]
-    weight = weight.copy()
-    weight[rows.codes][result.faulty[epoch, rows.column[rows.codes]]] = 0.0
-    result.innovation[epoch, rows.kind[:end], rows.column[:end]] = innovation[:end]
-    result.weight[epoch, rows.kind[:end], rows.column[:end]] = weight[:end]
-    result.sensed[epoch, rows.kind[end:] - 3] = innovation[end:]
-    result.used[epoch] = np.bincount(rows.kind[weight > 0.5], minlength=len(Kind))
-    result.code_weight[epoch] = mean_weight(weight[None], rows.codes)[0]
-    result.motion_weight[epoch] = mean_weight(weight[None], rows.motion)[0]
-
-
-def write_place(
-    result: Tracked,
-    epoch: int,
-    state: TrackState,
-    line: Line,
-    dt: float,
-    *,
-    measured: bool,
-    lost: bool,
-    limits: TrackingLimits,
-) -> None:
-    """Write place, speed and status of the most probable hypothesis, and count how long branches have been open."""
-    mean, covariance = state.mean[0], state.covariance[0]
-    sigma = float(np.sqrt(covariance[Unknown.PLACE, Unknown.PLACE]))
-    result.hypotheses[epoch] = state.hypotheses
-    result.probability[epoch] = np.exp(state.log_probability[0])
-    if sigma > limits.expired_sigma_m:
-        result.status[epoch] = TrackStatus.EXPIRED
-        return
-    branches = _branches(state, line)
-    spread = float(branches.probability @ (branches.sigma_m**2 + branches.ground_m**2))
-    result.arc_m[epoch] = mean[Unknown.PLACE]
-    result.sigma_m[epoch] = np.sqrt((1.0 - branches.probability.sum()) * sigma**2 + spread)
-    result.speed_mps[epoch] = mean[Unknown.SPEED]
-    result.speed_sigma_mps[epoch] = np.sqrt(covariance[Unknown.SPEED, Unknown.SPEED])
-    result.acceleration_mps2[epoch] = mean[Unknown.ACCELERATION]
-    result.wheel_scale[epoch] = mean[Unknown.WHEEL]
-    result.force_offset_mps2[epoch] = mean[Unknown.FORCE_OFFSET]
-    result.radar_scale[epoch] = mean[Unknown.RADAR]
-    result.map_scale[epoch] = state.map_scale
-    open_s = limits.level_hold_s if uncovered(branches, limits) else state.open_s - dt
-    state.open_s = max(open_s, 0.0)
-    if state.bank is not None:
-        level = compute_level(state.bank, branches, float(mean[Unknown.PLACE]), sigma, limits)
-        ground = float("inf") if state.withheld_s > 0.0 else level.ground_m
-        along = float("inf") if max(state.withheld_s, state.open_s) > 0.0 else level.along_m
-        result.level_m[epoch], result.ground_level_m[epoch] = along, ground
-        result.level_noise_m[epoch], result.separation_m[epoch] = level.noise_m, level.separation_m
-        result.amount_m[epoch] = max(along, SCALE_BOUND * state.unaided_m)
-        result.level_speed_mps[epoch] = speed_bound_mps(
-            state.bank, float(mean[Unknown.SPEED]), float(result.speed_sigma_mps[epoch]), limits
-        )
-    if lost:
-        status = TrackStatus.LOST
-    elif state.open_s > 0.0:
-        status = TrackStatus.SEVERAL_BRANCHES
-    elif state.withheld_s > 0.0:
-        status = TrackStatus.DOUBTFUL
-    else:
-        status = TrackStatus.TRACKING if measured else TrackStatus.COASTING
-    result.status[epoch] = status
-
-
-def _branches(state: TrackState, line: Line) -> Branches:
-    """Hypotheses beside the most probable one."""
-    place = state.mean[:, Unknown.PLACE]
-    points, _ = line.at(place)
-    return Branches(
-        probability=np.exp(state.log_probability[1:]),
-        apart_m=np.abs(place[1:] - place[0]),
-        ground_m=np.asarray(np.linalg.norm(points[1:] - points[0], axis=1)),
-        sigma_m=np.sqrt(state.covariance[1:, Unknown.PLACE, Unknown.PLACE]),
-    )

@@ -2,20 +2,65 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
 import numpy as np
 
+from railfix.core.arrays import Floats, Indices
 from railfix.core.timescale import seconds
-from railfix.tracking.branches import BESIDE_AFTER_S, begin, beside, places, split
+from railfix.kernels.tracking.constants import ACROSS_DOUBT, ACROSS_LOST, ACROSS_TAKEN, BESIDE_AFTER_S, STEP_HELD_S
+from railfix.tracking.branches import begin, beside, places, split
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
-from railfix.tracking.monitors import ACROSS_DOUBT, ACROSS_LOST, ACROSS_TAKEN, ELSEWHERE, STEP_HELD_S
-from railfix.tracking.predict import predicted
-from railfix.tracking.state import ANY_SPEED, Narrowed, TrackState, Unknown
+from railfix.tracking.state import ANY_SPEED, TrackState, Unknown
+
+#: Probability of other places where the velocity contradicts the one that was sure: the map may be wrong just here.
+_ELSEWHERE: Final = 0.01
 
 
-def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> bool:
-    """Predict the state, and seek places at the start, after a gap and when lost; return whether it is lost."""
+@dataclass(frozen=True, kw_only=True)
+class Narrowed:
+    """One of the narrower hypotheses that a wide one was split into.
+
+    Attributes
+    ----------
+    parent : int
+        The wide one.
+    mean, covariance : ndarray, shapes (N,), (N, N)
+        Of the wide one.
+    place_m, sigma_m : float [m]
+        Of the narrower one.
+    """
+
+    parent: int
+    mean: Floats
+    covariance: Floats
+    place_m: float
+    sigma_m: float
+
+
+class Sought(NamedTuple):
+    """What was sought before an epoch.
+
+    Attributes
+    ----------
+    lost : bool
+        Whether the track was lost.
+    parent : ndarray of int, shape (H,)
+        Hypothesis of the epoch before that each one goes on from; -1 where it began.
+    narrowed : list of Narrowed or None
+        Hypotheses that began at this epoch within wider ones.
+    """
+
+    lost: bool
+    parent: Indices
+    narrowed: list[Narrowed | None] | None
+
+
+def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Sought:
+    """Seek places at the start, after a gap and when lost; the state is that predicted to the epoch."""
     satellites = len(state.satellite)
     if not state.hypotheses:
         arc, sigma = places(chunk, epoch, line, limits)
@@ -23,22 +68,20 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         state.log_probability, state.origin_m = np.full(len(arc), -np.log(max(len(arc), 1))), arc
         state.log_code, state.branch_s, state.branch_m = np.zeros(len(arc)), 0.0, 0.0
         state.log_least = state.log_probability
-        state.parent, state.narrowed = np.full(len(arc), -1), None
-        return False
-    mean, covariance = predicted(state.mean, state.covariance, line, chunk.interval_s[epoch], limits, state.map_scale)
-    state.mean, state.covariance = mean, covariance
-    state.parent, state.narrowed = np.arange(len(mean)), None
+        return Sought(lost=False, parent=np.full(len(arc), -1), narrowed=None)
+    mean, covariance = state.mean, state.covariance
+    parent: Indices = np.arange(len(mean))
     weak = state.weak_motion_s >= limits.lost_motion_s or state.weak_code_s >= limits.lost_code_s
     lost = weak or state.across >= ACROSS_LOST
     gap = bool(seconds(chunk.time[epoch] - state.measured) > limits.gap_s)
     wide = covariance[:, Unknown.PLACE, Unknown.PLACE] > limits.start_sigma_m**2
     if not (lost or (gap and wide.any())):
         if state.weak_motion_s >= BESIDE_AFTER_S or state.across >= ACROSS_DOUBT:
-            _try_beside(state, limits)
-        return False
+            parent = np.append(parent, np.full(_try_beside(state, limits), -1))
+        return Sought(lost=False, parent=parent, narrowed=None)
     arc, sigma = places(chunk, epoch, line, limits)
     if not len(arc):
-        return lost
+        return Sought(lost=lost, parent=parent, narrowed=None)
     parts = [(mean, covariance, state.log_probability, state.origin_m, state.log_code)]
     narrowed: list[Narrowed | None] = [None] * len(mean)
     for one in np.flatnonzero(wide) if not lost else []:
@@ -62,7 +105,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         arc = np.concatenate([going, arc]) if weak else arc
         sigma = np.full(len(arc), limits.start_sigma_m)
         fresh = begin(arc, sigma, satellites, line, limits, known=(mean[best], covariance[best]))
-        elsewhere = 1.0 if weak or state.across >= ACROSS_TAKEN else ELSEWHERE
+        elsewhere = 1.0 if weak or state.across >= ACROSS_TAKEN else _ELSEWHERE
         share = np.full(len(arc), np.log(elsewhere / max(len(arc), 1)))
         parts = [] if weak else parts
         parts.append((*fresh, share, arc, np.zeros(len(arc))))
@@ -71,10 +114,9 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
     state.log_probability = together[2] - np.logaddexp.reduce(together[2])
     state.log_code, state.branch_s, state.branch_m = together[4], 0.0, 0.0
     state.log_least = state.log_probability
-    state.parent = np.full(state.hypotheses, -1)
+    parent = np.full(state.hypotheses, -1)
     if not lost:
-        state.parent = np.array([k if item is None else item.parent for k, item in enumerate(narrowed)])
-        state.narrowed = narrowed
+        parent = np.array([k if item is None else item.parent for k, item in enumerate(narrowed)])
     state.coded = np.datetime64("NaT", "ns")
     if lost and state.weak_code_s >= limits.lost_code_s:
         # Codes have contradicted the place that motion carried: the next place is theirs alone.
@@ -83,13 +125,13 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         state.withheld_s = max(state.withheld_s, limits.level_start_s)
     state.weak_motion_s = state.weak_code_s = state.across = 0.0
     state.code_shift, state.speed_range_mps = (0.0, 0.0), ANY_SPEED
-    return lost
+    return Sought(lost=lost, parent=parent, narrowed=None if lost else narrowed)
 
 
-def _try_beside(state: TrackState, limits: TrackingLimits) -> None:
-    """Add hypotheses beside the best one, whose motion was contradicted at the epoch before."""
+def _try_beside(state: TrackState, limits: TrackingLimits) -> int:
+    """Add hypotheses beside the best one, whose motion was contradicted at the epoch before; return how many."""
     if state.hypotheses > limits.most_hypotheses // 2:
-        return
+        return 0
     best = int(np.argmax(state.log_probability))
     mean, covariance, share = beside(state.mean[best], state.covariance[best], limits)
     log_probability = np.concatenate([state.log_probability, state.log_probability[best] + share])
@@ -99,4 +141,4 @@ def _try_beside(state: TrackState, limits: TrackingLimits) -> None:
     state.log_least = np.concatenate([state.log_least, np.zeros(len(mean))])
     state.log_code = np.concatenate([state.log_code, np.full(len(mean), state.log_code[best])])
     state.origin_m = np.concatenate([state.origin_m, mean[:, Unknown.PLACE]])
-    state.parent = np.concatenate([state.parent, np.full(len(mean), -1)])
+    return len(mean)

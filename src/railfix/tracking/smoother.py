@@ -18,9 +18,35 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks, Strings
 from railfix.tracking.limits import TrackingLimits
-from railfix.tracking.predict import transition
-from railfix.tracking.robust import Update
-from railfix.tracking.state import SATELLITES, Narrowed, TrackState, Unknown
+from railfix.tracking.search import Narrowed
+from railfix.tracking.state import SATELLITES, TrackState, Unknown
+from railfix.tracking.transition import transition
+
+
+@dataclass(frozen=True, kw_only=True)
+class Updated:
+    """Update of H hypotheses by D combinations of the unknowns, in their standard deviations.
+
+    Attributes
+    ----------
+    prior : ndarray, shape (H, N, N)
+        Covariance of the unknowns before the measurements.
+    combine : ndarray, shape (H, D, N)
+    information, covariance : ndarray, shape (H, D, D)
+        Inverse covariance of the combinations before, and covariance after the measurements.
+    change : ndarray, shape (H, D)
+        Of their means.
+    """
+
+    prior: Floats
+    combine: Floats
+    information: Floats
+    covariance: Floats
+    change: Floats
+
+    def take(self, chosen: Indices) -> Updated:
+        """Return the update of some hypotheses."""
+        return Updated(**{name: getattr(self, name)[chosen] for name in self.__dataclass_fields__})
 
 
 @dataclass(kw_only=True)
@@ -38,9 +64,8 @@ class Step:
     parent : ndarray of int, shape (H,)
         Hypothesis of the epoch before; -1 where one began.
     narrowed : list of Narrowed or None
-    updated : tuple or None
-        Covariance before the measurements, shape (H, N, N); combinations in their standard deviations, (H, D, N), and
-        their information, (H, D, D); and the update. None without a measurement.
+    updated : Updated or None
+        None without a measurement.
     """
 
     dt: float
@@ -49,23 +74,26 @@ class Step:
     mean: Floats = field(default_factory=lambda: np.empty((0, 0)))
     covariance: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
     parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
-    updated: tuple[Floats, Floats, Floats, Update] | None = None
+    updated: Updated | None = None
     narrowed: list[Narrowed | None] | None = None
+
+    @classmethod
+    def without_place(cls, state: TrackState, dt: float) -> Step:
+        """Return an epoch without any hypothesis."""
+        return cls(dt=dt, cut=np.zeros(state.mean.shape, dtype=np.bool_), satellite=state.satellite)
 
     def choose(self, chosen: Indices) -> None:
         """Keep some hypotheses."""
-        self.cut = self.cut[chosen]
+        self.cut, self.parent = self.cut[chosen], self.parent[chosen]
         if self.narrowed is not None:
             self.narrowed = [self.narrowed[k] for k in chosen.tolist()]
         if self.updated is not None:
-            prior, combine, information, update = self.updated
-            kept = Update(**{name: getattr(update, name)[chosen] for name in update.__dataclass_fields__})
-            self.updated = (prior[chosen], combine[chosen], information[chosen], kept)
+            self.updated = self.updated.take(chosen)
 
     def before(self, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
         """Carry what later epochs say of hypothesis h backward through its measurements."""
         if self.updated is not None:
-            vector, matrix = self._before_measurements(h, vector, matrix)
+            vector, matrix = _before_measurements(self.updated, h, vector, matrix)
         part = None if self.narrowed is None else self.narrowed[h]
         if part is not None:
             # The density of the narrower one over the wide one, as if its place had been measured.
@@ -79,13 +107,13 @@ class Step:
             matrix[place, place] += share
         return vector, matrix
 
-    def _before_measurements(self, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
-        assert self.updated is not None
-        prior, combine, information, update = self.updated
-        said = combine[h].T @ information[h]
-        gained = said @ combine[h] - said @ update.covariance[h] @ said.T
-        back = np.eye(len(vector)) - gained @ prior[h]
-        return said @ update.change[h] + back @ vector, gained + back @ matrix @ back.T
+
+def _before_measurements(updated: Updated, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
+    """Carry what later epochs say of hypothesis h backward through an update."""
+    said = updated.combine[h].T @ updated.information[h]
+    gained = said @ updated.combine[h] - said @ updated.covariance[h] @ said.T
+    back = np.eye(len(vector)) - gained @ updated.prior[h]
+    return said @ updated.change[h] + back @ vector, gained + back @ matrix @ back.T
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,6 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks, Strings
 from railfix.tracking.epochs import Previous
-from railfix.tracking.line import Line
 
 #: Letters of the receiver clocks of codes, in the order of their offsets in the state.
 CLOCKS: Final = ("G", "E", "C", "R", "I")
@@ -87,27 +86,6 @@ class Bank:
         return cls(without=(), mean=np.empty((0, width)), covariance=np.empty((0, width, width)), weak_s=np.empty(0))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Narrowed:
-    """One of the narrower hypotheses that a wide one was split into.
-
-    Attributes
-    ----------
-    parent : int
-        The wide one.
-    mean, covariance : ndarray, shapes (N,), (N, N)
-        Of the wide one.
-    place_m, sigma_m : float [m]
-        Of the narrower one.
-    """
-
-    parent: int
-    mean: Floats
-    covariance: Floats
-    place_m: float
-    sigma_m: float
-
-
 @dataclass(kw_only=True)
 class TrackState:
     """What one epoch leaves to the next: H hypotheses of N unknowns. Its arrays are never written to.
@@ -120,16 +98,16 @@ class TrackState:
     covariance : ndarray, shape (H, N, N)
     log_probability : ndarray, shape (H,)
     log_code : ndarray, shape (H,)
-        Part of it that the codes gave (`railfix.tracking.branches.judged`).
+        Part of it that the codes gave (`railfix.kernels.tracking.branches`).
     across : float
-        Sum of the contradictions of the velocity (`railfix.tracking.monitors`).
+        Sum of the contradictions of the velocity (`railfix.kernels.tracking.monitors`).
     step_s, withheld_s, open_s : float [s]
         How long all codes have asked for another place, how long the level is withheld still, and how long that along
         the line, as other places of it were more probable than the risk.
     code_bias : ndarray, shape (N - SATELLITES,)
-        Mean innovation of each satellite's codes (`railfix.tracking.faulty`).
+        Mean innovation of each satellite's codes (`railfix.kernels.tracking.learning`).
     log_least : ndarray, shape (H,)
-        Least logarithm of the probability lately: it rises with time (`railfix.tracking.branches.LEAST_RISE`).
+        Least logarithm of the probability lately: it rises with time (`railfix.kernels.tracking.constants.LEAST_RISE`).
     branch_s, branch_m : float [s], [m]
         Time and distance since the hypotheses began.
     origin_m : ndarray, shape (H,) [m]
@@ -144,28 +122,24 @@ class TrackState:
     measured : datetime64[ns]
         Last epoch with measurements that the filter used.
     coded : datetime64[ns]
-        Last epoch whose codes counted (`railfix.tracking.chunk.code_interval_s`); NaT where the next ones do.
+        Last epoch whose codes counted (`TrackingLimits.code_period_s`); NaT where the next ones do.
     weak_motion_s, weak_code_s : float [s]
         How long the mean weights have been low.
     log_scale : tuple of float
         Logarithm of the variance of Dopplers and of phases against that of the limits.
     code_shift : tuple of float
-        Mean of `misfit.code_shift` over the last epochs, and its variance.
+        Mean of the shifts that codes ask for over the last epochs, and its variance.
     map_log_scale : float
         Logarithm of the variance of lengths along the map against that of the limits, at least 0.
     bank : Bank or None
         Where levels are asked for.
-    parent : ndarray of int, shape (H,)
-        Hypothesis of the epoch before that each one goes on from; -1 where it began.
-    narrowed : list of Narrowed or None
-        Hypotheses that began at this epoch within wider ones.
     unaided_m : float [m]
         Way since codes were used.
     direction : float
         Sign of the last speed with a direction.
     speed_range_mps : tuple of float
-        Speeds that are possible after those measured so far (`railfix.tracking.possible_speed`); no bounds while there
-        are several hypotheses.
+        Speeds that are possible after those measured so far (`railfix.kernels.tracking.possible_speed`); no bounds
+        while there are several hypotheses.
     """
 
     time: np.datetime64
@@ -194,8 +168,6 @@ class TrackState:
     branch_s: float = 0.0
     branch_m: float = 0.0
     bank: Bank | None = None
-    parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
-    narrowed: list[Narrowed | None] | None = None
     unaided_m: float = 0.0
     direction: float = 0.0
     speed_range_mps: tuple[float, float] = ANY_SPEED
@@ -226,19 +198,7 @@ class TrackState:
             measured=np.datetime64("NaT", "ns"),
         )
 
-    def go_round(self, line: Line) -> None:
-        """Let places beyond an end of a closed line go on where it closes."""
-        back = line.round_m(self.mean[:, Unknown.PLACE])
-        if not back.any():
-            return
-        self.mean, self.origin_m = self.mean.copy(), self.origin_m + back
-        self.mean[:, Unknown.PLACE] += back
-        if self.bank is not None and back[0]:
-            mean = self.bank.mean.copy()
-            mean[:, Unknown.PLACE] += back[0]
-            self.bank = replace(self.bank, mean=mean)
-
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Begin anew: no hypothesis, no sub-filter, no clock known, nothing learnt of noise and map."""
         width = SATELLITES + len(self.satellite)
         self.mean, self.covariance = np.empty((0, width)), np.empty((0, width, width))
@@ -282,12 +242,3 @@ def _rearranged(mean: Floats, covariance: Floats, index: Indices, new: int) -> t
     diagonal = np.arange(old, width)
     covariances[:, diagonal, diagonal] = 1.0
     return means, covariances
-
-
-def begun_anew(mean: Floats, covariance: Floats, unknowns: Indices) -> tuple[Floats, Floats]:
-    """Gaussians in which some unknowns are standard normal and independent of all else."""
-    mean, covariance = mean.copy(), covariance.copy()
-    mean[:, unknowns] = 0.0
-    covariance[:, unknowns, :] = covariance[:, :, unknowns] = 0.0
-    covariance[:, unknowns, unknowns] = 1.0
-    return mean, covariance

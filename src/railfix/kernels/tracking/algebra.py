@@ -104,18 +104,29 @@ def invert(matrix: Floats, m: int, size: int, factor: Floats, lower: Floats, res
 
 
 @borrowing
-def median(values: Floats, h: int, first: int, size: int, ordered: Floats) -> float:
-    """Median of a part of a row; `ordered` is work space."""
-    for i in range(size):
-        value = values[h, first + i]
-        j = i
-        while j > 0 and ordered[j - 1] > value:
-            ordered[j] = ordered[j - 1]
-            j -= 1
-        ordered[j] = value
+def insert(ordered: Floats, size: int, value: float) -> None:
+    """Insert a value among `size` others in rising order."""
+    j = size
+    while j > 0 and ordered[j - 1] > value:
+        ordered[j] = ordered[j - 1]
+        j -= 1
+    ordered[j] = value
+
+
+@borrowing
+def middle(ordered: Floats, size: int) -> float:
+    """Median of values in rising order."""
     if size % 2:
         return float(ordered[size // 2])
     return float(0.5 * (ordered[size // 2 - 1] + ordered[size // 2]))
+
+
+@borrowing
+def median(values: Floats, h: int, first: int, size: int, ordered: Floats) -> float:
+    """Median of a part of a row; `ordered` is work space."""
+    for i in range(size):
+        insert(ordered, i, values[h, first + i])
+    return middle(ordered, size)
 
 
 @borrowing

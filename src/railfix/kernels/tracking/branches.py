@@ -1,4 +1,4 @@
-"""Probabilities of hypotheses, and which of them go on (`railfix.tracking.branches`)."""
+"""Probabilities of hypotheses, and which of them go on."""
 
 from __future__ import annotations
 
@@ -6,44 +6,74 @@ import math
 
 from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.algebra import log_sum, most_probable
+from railfix.kernels.tracking.constants import (
+    MOST_MOTION,
+    MOST_ODDS,
+    MOTION_M,
+    MOTION_SATELLITES,
+    SWITCH,
+)
 from railfix.kernels.tracking.course import point_at
-from railfix.kernels.tracking.layout import BRANCH_M, BRANCH_S, PLACE, Course, Memory, Numbers, Rows, Work
+from railfix.kernels.tracking.layout import BRANCH_M, BRANCH_S, PLACE, Course, Memory, Parameters, Rows, Work
 from railfix.kernels.tracking.update import evidence_of, motion_evidence
 
 
 @borrowing
-def reweigh(course: Course, numbers: Numbers, rows: Rows, memory: Memory, work: Work, count: int, dt: float) -> None:
-    """Update the probabilities of hypotheses by the evidence of an epoch (`railfix.tracking.branches.judged`)."""
-    log_probability, log_code, places, after = memory.log_probability, memory.log_code, work.places, work.right
-    travel, counts = memory.scalars[BRANCH_M], rows.counts
-    independent = 1.0 + memory.scalars[BRANCH_S] / numbers.code_common_s + travel / numbers.code_common_travel_m
-    best, other = 0, work.mean.shape[0] - 1
+def reweigh(
+    course: Course, parameters: Parameters, rows: Rows, memory: Memory, work: Work, count: int, dt: float
+) -> None:
+    """Update the probabilities of hypotheses by the evidence of an epoch."""
+    counts, other = rows.counts, work.mean.shape[0] - 1
     for h in range(count):
+        joint = evidence_of(rows, work.variance, parameters.degrees, work.log_after[h], work, h, h)
+        work.evidence[h] = motion_evidence(rows, parameters, work, h, other)
+        work.code_evidence[h] = joint - work.evidence[h] if counts[0] >= MOTION_SATELLITES else 0.0
+        if max(counts[1], counts[2]) < MOTION_SATELLITES and counts[3] == 0:
+            work.evidence[h] = 0.0
+        point_at(course, work.new_mean[h, PLACE], work.places, work.place_axes, h)
+    judge(parameters, memory, work, count, dt)
+
+
+@borrowing
+def judge(parameters: Parameters, memory: Memory, work: Work, count: int, dt: float) -> None:
+    """Update the probabilities of branches, and the part of them that codes gave, by evidence of motion and codes.
+
+    With d the distance of a branch from the most probable one, the difference of the evidence counts by
+    ``d^2 / (d^2 + map_branch_m^2)``: branches within the error of the map differ in their ranges at every epoch alike.
+
+    Motion (Dopplers, phases, sensors) has errors of seconds: it counts in full, `MOST_MOTION` a second at most, and
+    its odds go no further than ``d^2 / (2 s^2)`` with s^2 = 2 (map_branch_m / 3)^2, nor than one for `MOTION_M` of
+    travel.
+
+    Codes have errors in common to all satellites of one side of a street, for minutes. Their odds go no further than
+    ``n d^2 / (2 code_common_m^2)``, what n independent epochs with such an error can say, n being 1 and one more in
+    `code_common_s` or `code_common_travel_m`; between branches that are closer than `branch_floor_m` now never below
+    `branch_floor`, whatever was gained while they were apart.
+    """
+    log_probability, log_code, places, after = memory.log_probability, memory.log_code, work.places, work.right
+    travel = memory.scalars[BRANCH_M]
+    independent = 1.0 + memory.scalars[BRANCH_S] / parameters.code_common_s + travel / parameters.code_common_travel_m
+    best = 0
+    for h in range(1, count):
         if log_probability[h] > log_probability[best]:
             best = h
-        joint = evidence_of(rows, work.variance, numbers.degrees, work.log_after[h], work, h, h)
-        work.evidence[h] = motion_evidence(rows, numbers, work, h, other)
-        work.code_evidence[h] = joint - work.evidence[h] if counts[0] >= numbers.motion_satellites else 0.0
-        if max(counts[1], counts[2]) < numbers.motion_satellites and counts[3] == 0:
-            work.evidence[h] = 0.0
-        point_at(course, work.new_mean[h, PLACE], places, work.place_axes, h)
     first, first_code = log_probability[best], log_code[best]
-    most = numbers.most_motion * max(dt, 1.0)
+    most = MOST_MOTION * max(dt, 1.0)
     for h in range(count):
         square = 0.0
         for c in range(3):
             square += (places[h, c] - places[best, c]) ** 2
-        part = square / (square + numbers.map_branch_m**2)
+        part = square / (square + parameters.map_branch_m**2)
         odds = log_probability[h] - log_code[h] - (first - first_code)
-        reach = min(numbers.most_odds * square / numbers.map_branch_m**2, travel / numbers.motion_m)
+        reach = min(MOST_ODDS * square / parameters.map_branch_m**2, travel / MOTION_M)
         gained = min(max(work.evidence[h] - work.evidence[best], -most), most)
         motion = min(max(odds + part * gained, min(odds, -reach)), max(odds, reach))
         odds = log_code[h] - first_code
-        reach = independent * square / (2.0 * numbers.code_common_m**2)
+        reach = independent * square / (2.0 * parameters.code_common_m**2)
         gained = work.code_evidence[h] - work.code_evidence[best]
         code = min(max(odds + part * gained, min(odds, -reach)), max(odds, reach))
-        if square < numbers.branch_floor_m**2:
-            code = min(max(code, math.log(numbers.branch_floor)), -math.log(numbers.branch_floor))
+        if square < parameters.branch_floor_m**2:
+            code = min(max(code, math.log(parameters.branch_floor)), -math.log(parameters.branch_floor))
         work.joined[0, h] = code
         after[h] = motion + work.joined[0, h]
     total = log_sum(after, count)
@@ -52,12 +82,15 @@ def reweigh(course: Course, numbers: Numbers, rows: Rows, memory: Memory, work: 
 
 
 @borrowing
-def keep_hypotheses(memory: Memory, numbers: Numbers, work: Work, count: int) -> int:
-    """Order the hypotheses, join twins, drop the improbable; return how many are left."""
+def keep_hypotheses(memory: Memory, parameters: Parameters, work: Work, count: int) -> int:
+    """Order the hypotheses, join twins, drop the improbable; return how many are left, `work.kept` by their old rows.
+
+    Improbable ones are dropped once the first has travelled far enough for motion to have told them apart.
+    """
     mean, covariance, log_probability = memory.mean, memory.covariance, memory.log_probability
     origin, ranked, kept, joined = memory.origin_m, work.ranked, work.kept, work.joined
     n = mean.shape[1]
-    first = most_probable(log_probability, count, numbers.switch)
+    first = most_probable(log_probability, count, SWITCH)
     ranked[0] = first
     for k in range(count):
         if k == first:
@@ -85,16 +118,16 @@ def keep_hypotheses(memory: Memory, numbers: Numbers, work: Work, count: int) ->
         else:
             one, two = max(joined[0, twin], joined[0, k]), min(joined[0, twin], joined[0, k])
             joined[0, twin] = one + math.log1p(math.exp(two - one))
-    size = min(size, numbers.most_hypotheses)
+    size = min(size, parameters.most_hypotheses)
     for j in range(size):
         log_probability[j] = joined[0, kept[j]]
     total = log_sum(log_probability, size)
     for j in range(size):
         log_probability[j] -= total
-    if abs(mean[kept[0], PLACE] - origin[kept[0]]) >= numbers.decided_travel_m:
+    if abs(mean[kept[0], PLACE] - origin[kept[0]]) >= parameters.decided_travel_m:
         alive = 0
         for j in range(size):
-            if log_probability[j] > math.log(numbers.least_probability):
+            if log_probability[j] > math.log(parameters.least_probability):
                 kept[alive], log_probability[alive] = kept[j], log_probability[j]
                 alive += 1
         size = alive

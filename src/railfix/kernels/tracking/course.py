@@ -10,7 +10,7 @@ from railfix.kernels.tracking.layout import PLACE, Course, Work
 
 
 @borrowing
-def _on_course(course: Course, arc: float) -> float:
+def on_course(course: Course, arc: float) -> float:
     """Arc length on the line of a place beyond an end of a closed one (`railfix.tracking.line.Line.round_m`)."""
     first, last = course.arc_m[0], course.arc_m[-1]
     if arc > last and course.end_turn_m > 0.0:
@@ -21,9 +21,23 @@ def _on_course(course: Course, arc: float) -> float:
 
 
 @borrowing
+def nearest_to(course: Course, place: float, to: float) -> float:
+    """Arc length of a place that is nearest to another (`railfix.tracking.line.Line.nearest_m`)."""
+    inside = on_course(course, to)
+    nearest = place
+    if course.end_turn_m > 0.0 and place >= course.arc_m[-1] - course.end_turn_m:
+        other = place + course.end_turn_m
+        nearest = other if abs(other - inside) < abs(nearest - inside) else nearest
+    if course.start_turn_m > 0.0 and place <= course.arc_m[0] + course.start_turn_m:
+        other = place - course.start_turn_m
+        nearest = other if abs(other - inside) < abs(nearest - inside) else nearest
+    return nearest + to - inside
+
+
+@borrowing
 def point_at(course: Course, arc: float, point: Floats, axes: Floats, p: int) -> None:
     """Write point and axes of the line at an arc length into row `p`."""
-    arc = _on_course(course, arc)
+    arc = on_course(course, arc)
     low, high = 1, len(course.arc_m) - 1
     while low < high:
         half = (low + high) // 2
@@ -61,7 +75,7 @@ def find_ends(course: Course, now: float, before: float, work: Work) -> None:
 def gradient_at(course: Course, arc: float) -> float:
     """Gradient of the line, linear between the middles of segments."""
     middle_m, gradient = course.middle_m, course.gradient
-    arc = _on_course(course, arc)
+    arc = on_course(course, arc)
     low, high = 0, len(middle_m)
     while low < high:
         half = (low + high) // 2
@@ -79,7 +93,12 @@ def gradient_at(course: Course, arc: float) -> float:
 
 @borrowing
 def onto_line(course: Course, reach_m: float, work: Work, h: int) -> float:
-    """Put a place a little beyond an end on the line (`railfix.tracking.branches.on_the_line`); return how far."""
+    """Put a place a little beyond an end on the line; return how far.
+
+    Projection on the constraint along the correlations (D. Simon, Kalman filtering with state constraints, 2010); a
+    place within two sigmas of it is noise, and one further out than a start may be wrong is left: the map may end
+    before the line.
+    """
     mean, covariance = work.new_mean, work.new_covariance
     excess = min(max(mean[h, PLACE], course.start_m), course.end_m) - mean[h, PLACE]
     variance = covariance[h, PLACE, PLACE]

@@ -1,13 +1,37 @@
-"""Equations of an epoch's measurements (`railfix.tracking.rows`), and their combinations."""
+r"""Measurement equations of one epoch, linearised at each hypothesis, and their combinations.
+
+With u the unit vector from receiver to satellite, e the tangent, c and h the axes to the right and up::
+
+    code    P = range(s + z) - u.c m_c - u.h m_h + b + o_g + sigma x_i + noise
+    Doppler r = A + slope (v + w) - u.(c q_c + h q_h) / dt + d + noise
+    phase   change L = range_k(s) - range_{k-1}(s') - u.(g q_a + c q_c + h q_h) + B + noise
+    wheel   W (1 + k) = s - s', radar alike;  force f = (v - v') / dt + g sin(gradient) + beta;  place = s
+    range   R = |unit - antenna(s - age v, m_c, m_h)|
+
+s' and v' are those of the epoch before, x_i the satellite's correlated error in units of its sigma, o_g the offset
+of its constellation's code clock, w the time-correlated error of Dopplers, z that of
+the codes' place over minutes, m the map's error, q the error of the map's displacement over the epoch. The
+gradient g of the phase's change is one for both ends: the direction of the chord. With a gradient for each end the
+phases would measure absolute place from the bend of the line, more sharply than the line is known.
+
+The rows depend on few combinations y of the unknowns: one for each code, the clock of the codes, six for all phases and
+Dopplers, one for each sensor. Rounds of reweighting need the covariance of y alone (`railfix.kernels.tracking.update`).
+"""
 
 from __future__ import annotations
 
 import math
 
-from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.constants import GRAVITY_MPS2, SPEED_OF_LIGHT
 from railfix.kernels.compiling import borrowing
 from railfix.kernels.sight import TURN, sight
-from railfix.kernels.tracking.course import find_ends, gradient_at
+from railfix.kernels.tracking.constants import (
+    CHORD_M,
+    DIRECTION_MPS,
+    SENSOR_FLOOR,
+    UNKNOWN_FLOOR,
+)
+from railfix.kernels.tracking.course import find_ends, gradient_at, nearest_to, on_course, point_at
 from railfix.kernels.tracking.layout import (
     C_CLOCK,
     C_DRIFT,
@@ -26,7 +50,9 @@ from railfix.kernels.tracking.layout import (
     OLD_SPEED,
     PHASE_CLOCK,
     PLACE,
+    PLACE_ROW,
     RADAR_ROW,
+    RANGE_ROW,
     RIGHT,
     SPEED,
     STEP_ALONG,
@@ -37,7 +63,6 @@ from railfix.kernels.tracking.layout import (
     Active,
     Course,
     Epochs,
-    Numbers,
     Rows,
     Work,
 )
@@ -49,7 +74,6 @@ def write_equations(
     t: int,
     course: Course,
     active: Active,
-    numbers: Numbers,
     rows: Rows,
     direction: float,
     work: Work,
@@ -59,7 +83,8 @@ def write_equations(
 
     `design` has three coefficients on the axes for each code, four for each phase (way, clock, right, up) and Doppler
     (right, up, speed, drift). `sensed` has for each sensor the coefficients of the place and the place before, the
-    speed and the speed before, of its own unknown and of the displacement along the map.
+    speed and the speed before, of its own unknown and of the displacement along the map; of a range the second and
+    the fourth are of the error of the map to the right and up.
     """
     mean, seen, design, value, sensed = work.mean, work.sight, work.design, work.value, work.sensed
     codes, phases, dopplers, sensors, point, axes = (
@@ -98,7 +123,7 @@ def write_equations(
     if nph:
         cx, cy, cz = point[0, 0] - point[1, 0], point[0, 1] - point[1, 1], point[0, 2] - point[1, 2]
         length = math.sqrt(cx * cx + cy * cy + cz * cz)
-        if length > numbers.chord_m:
+        if length > CHORD_M:
             sign = (1.0 if now >= before else -1.0) / length
             cx, cy, cz = sign * cx, sign * cy, sign * cz
         else:
@@ -144,18 +169,41 @@ def write_equations(
         if kind in (WHEEL_ROW, RADAR_ROW):
             if kind == WHEEL_ROW and epochs.unsigned:
                 speed = mean[h, SPEED]
-                measured *= math.copysign(1.0, speed) if abs(speed) > numbers.direction_mps else direction
+                measured *= math.copysign(1.0, speed) if abs(speed) > DIRECTION_MPS else direction
             own = active.wheel if kind == WHEEL_ROW else active.radar
             sensed[h, j, 0], sensed[h, j, 1], sensed[h, j, 4], sensed[h, j, 5] = 1.0, -1.0, -measured, 1.0
             value[h, i] = measured * (1.0 + mean[h, own]) - (mean[h, PLACE] - mean[h, n + OLD_PLACE])
         elif kind == FORCE_ROW:
             slope = gradient_at(course, 0.5 * (mean[h, PLACE] + mean[h, n + OLD_PLACE]))
-            gravity = numbers.gravity_mps2 * slope / math.sqrt(1.0 + slope**2)
+            gravity = GRAVITY_MPS2 * slope / math.sqrt(1.0 + slope**2)
             sensed[h, j, 2], sensed[h, j, 3], sensed[h, j, 4] = 1.0 / dt, -1.0 / dt, 1.0
             value[h, i] = measured - (mean[h, SPEED] - mean[h, n + OLD_SPEED]) / dt - gravity - mean[h, active.force]
-        else:
+        elif kind == PLACE_ROW:
             sensed[h, j, 0] = 1.0
-            value[h, i] = measured - mean[h, PLACE]
+            there = nearest_to(course, on_course(course, measured), mean[h, PLACE])
+            value[h, i] = there - mean[h, PLACE]
+        else:
+            value[h, i] = measured - _write_range(epochs, t, course, kind - RANGE_ROW, work, h, j)
+
+
+@borrowing
+def _write_range(epochs: Epochs, t: int, course: Course, unit: int, work: Work, h: int, j: int) -> float:
+    """Write the coefficients of a range to a ground unit; return the range at the mean."""
+    mean, sensed, point, axes, lever = work.mean, work.sensed, work.point, work.axes, epochs.lever_m
+    age = epochs.range_age_s[t, unit]
+    point_at(course, mean[h, PLACE] - age * mean[h, SPEED] + lever[0], point, axes, 0)
+    across, above, square = mean[h, RIGHT] + lever[1], mean[h, UP] + lever[2], 0.0
+    along = right = up = 0.0
+    for c in range(3):
+        away = epochs.range_unit_ecef_m[t, unit, c] - point[0, c] - across * axes[0, 1, c] - above * axes[0, 2, c]
+        square += away * away
+        along -= away * axes[0, 0, c]
+        right -= away * axes[0, 1, c]
+        up -= away * axes[0, 2, c]
+    distance = math.sqrt(square)
+    sensed[h, j, 0], sensed[h, j, 1], sensed[h, j, 3] = along / distance, right / distance, up / distance
+    sensed[h, j, 2] = -age * sensed[h, j, 0]
+    return distance
 
 
 @borrowing
@@ -168,6 +216,7 @@ def move_sensor_equations(active: Active, rows: Rows, best: int, work: Work, h: 
         mean[h, n + OLD_PLACE] - mean[best, n + OLD_PLACE],
         mean[h, n + OLD_SPEED] - mean[best, n + OLD_SPEED],
     )
+    across, above = mean[h, RIGHT] - mean[best, RIGHT], mean[h, UP] - mean[best, UP]
     for j in range(rows.counts[3]):
         i, kind = gnss + j, sensors[j]
         own = 0.0
@@ -181,21 +230,21 @@ def move_sensor_equations(active: Active, rows: Rows, best: int, work: Work, h: 
             sensed[h, j, c] = sensed[best, j, c]
         work.value[h, i] = work.value[best, i] - (
             sensed[best, j, 0] * place
-            + sensed[best, j, 1] * old
+            + sensed[best, j, 1] * (across if kind >= RANGE_ROW else old)
             + sensed[best, j, 2] * speed
-            + sensed[best, j, 3] * old_speed
+            + sensed[best, j, 3] * (above if kind >= RANGE_ROW else old_speed)
             + sensed[best, j, 4] * own
         )
 
 
 @borrowing
-def combine(epochs: Epochs, t: int, active: Active, floor: float, rows: Rows, work: Work, h: int) -> None:
+def combine(epochs: Epochs, t: int, active: Active, rows: Rows, work: Work, h: int) -> None:
     """Write the covariance of the combinations with the unknowns and with each other, in their standard deviations.
 
-    `unknown` and `share` are work space: the unknowns of each combination and their coefficients.
+    `unknown` and `share` are the unknowns of each combination and their coefficients, over `root`.
     """
     design, sensed, spread, cross, root, own = work.design, work.sensed, work.spread, work.cross, work.root, work.own
-    unknown, share = work.unknown, work.share
+    unknown, share = work.unknown[h], work.share[h]
     nc, ns = rows.counts[0], rows.counts[3]
     width = spread.shape[1]
     n = width - OF_EPOCH
@@ -224,9 +273,10 @@ def combine(epochs: Epochs, t: int, active: Active, floor: float, rows: Rows, wo
     for j in range(ns):
         i = nc + COMBINED + j
         unknown[i, 0], share[i, 0] = PLACE, sensed[h, j, 0]
-        unknown[i, 1], share[i, 1] = n + OLD_PLACE, sensed[h, j, 1]
+        ranged = rows.sensors[j] >= RANGE_ROW
+        unknown[i, 1], share[i, 1] = RIGHT if ranged else n + OLD_PLACE, sensed[h, j, 1]
         unknown[i, 2], share[i, 2] = SPEED, sensed[h, j, 2]
-        unknown[i, 3], share[i, 3] = n + OLD_SPEED, sensed[h, j, 3]
+        unknown[i, 3], share[i, 3] = UP if ranged else n + OLD_SPEED, sensed[h, j, 3]
         if rows.sensors[j] == WHEEL_ROW:
             unknown[i, 4] = active.wheel
         elif rows.sensors[j] == RADAR_ROW:
@@ -252,7 +302,8 @@ def combine(epochs: Epochs, t: int, active: Active, floor: float, rows: Rows, wo
             own[h, i, j] = total
     gnss = nc + rows.counts[1] + rows.counts[2]
     for j in range(ns):
-        own[h, nc + COMBINED + j, nc + COMBINED + j] += floor * work.variance[gnss + j]
+        i = nc + COMBINED + j
+        own[h, i, i] += SENSOR_FLOOR * work.variance[gnss + j] + UNKNOWN_FLOOR * own[h, i, i]
     for i in range(size):
         root[h, i] = math.sqrt(own[h, i, i])
     for i in range(size):
@@ -262,3 +313,5 @@ def combine(epochs: Epochs, t: int, active: Active, floor: float, rows: Rows, wo
         own[h, i, i] = 1.0
         for c in range(width):
             cross[h, i, c] /= root[h, i]
+        for k in range(6):
+            share[i, k] /= root[h, i]

@@ -16,23 +16,28 @@ OF_EPOCH = 7
 #: Combinations of phases and Dopplers after the clock of the codes.
 C_WAY, C_CLOCK, C_RIGHT, C_UP, C_SPEED, C_DRIFT = 1, 2, 3, 4, 5, 6
 COMBINED = 7
+#: Kinds of sensors, and their columns: wheel, radar, force, place, and one for each range to a ground unit.
 SENSORS = 5
 #: Sources of sub-filters after the sensors: all Dopplers, all phases, the map.
 OTHERS = 3
-WHEEL_ROW, RADAR_ROW, FORCE_ROW, PLACE_ROW = 0, 1, 2, 3
+WHEEL_ROW, RADAR_ROW, FORCE_ROW, PLACE_ROW, RANGE_ROW = 0, 1, 2, 3, 4
+#: Parts of an epoch: all of it; the prediction alone; what follows a prediction that is in the work space already,
+#: places sought in between; the same where the track was lost.
+WHOLE, PREDICTION, REST, REST_LOST = 0, 1, 2, 3
 
 
 class Epochs(NamedTuple):
     """T prepared epochs of K channels (`railfix.tracking.chunk.Chunk`) and sensors.
 
-    `left` marks epochs that numpy has to do (after long gaps, with ranges to ground units); `singer` is the row of
-    `step` and `noise` of each interval; columns of `sensor` and `sensor_sigma`: wheel, radar, force, place, NaN
-    without a measurement.
+    `begins` marks epochs before which the state begins anew; `singer` is the row of `step` and `noise` of each
+    interval; columns of `sensor` and `sensor_sigma`: wheel, radar, force, place, and R ranges to ground units, which
+    were measured `range_age_s` before, by a unit at `lever_m` along the line, to the right and up; NaN without a
+    measurement.
     """
 
     time_s: Floats
     interval_s: Floats
-    left: Masks
+    begins: Masks
     singer: Indices
     step: Floats
     noise: Floats
@@ -53,6 +58,9 @@ class Epochs(NamedTuple):
     velocity_age_s: Floats
     sensor: Floats
     sensor_sigma: Floats
+    range_unit_ecef_m: Floats
+    range_age_s: Floats
+    lever_m: Floats
     unsigned: bool
 
 
@@ -73,8 +81,8 @@ class Course(NamedTuple):
     end_turn_m: float
 
 
-class Numbers(NamedTuple):
-    """Settings and constants of the filter, by the names that they have there."""
+class Parameters(NamedTuple):
+    """Settings (`railfix.tracking.limits.TrackingLimits`), degrees of freedom, and the budget of the level."""
 
     degrees: tuple[float, float]
     passes: int
@@ -95,10 +103,6 @@ class Numbers(NamedTuple):
     map_misfit_sigmas: float
     map_misfit_s: float
     map_misfit_kept_s: float
-    misfit_codes: int
-    misfit_clipped: float
-    misfit_learnt_s: float
-    misfit_largest: float
     map_absolute_m: float
     map_branch_m: float
     code_common_m: float
@@ -106,18 +110,13 @@ class Numbers(NamedTuple):
     code_common_travel_m: float
     branch_floor: float
     branch_floor_m: float
-    most_motion: float
-    motion_m: float
-    least_rise: float
-    takeover: float
-    takeover_after_s: float
     decided_travel_m: float
     least_probability: float
     most_hypotheses: int
     start_sigma_m: float
     service_acceleration_mps2: float
+    level_acceleration_mps2: float
     trusted_satellites: int
-    speed_sigmas: float
     gap_s: float
     lost_motion_weight: float
     lost_motion_s: float
@@ -125,76 +124,17 @@ class Numbers(NamedTuple):
     lost_code_s: float
     level_doubt_s: float
     expired_sigma_m: float
-    least_step_m2: float
-    code_clock_sigma_m: float
-    wheel_walk: float
-    force_walk_mps2: float
-    radar_walk: float
-    stepped: float
-    unknown_clock: float
-    scale_s: float
-    least_scale: float
-    largest_scale: float
-    doubtful: float
-    freedom_place: float
-    freedom_speed: float
-    moved_m: float
-    relinearised: int
-    sensor_floor: float
-    direction_mps: float
-    chord_m: float
-    gravity_mps2: float
-    beside_after_s: float
-    switch: float
-    most_odds: float
     level_passes: int
     level_map_m: float
     level_risk: float
     level_k: float
     level_k_speed: float
-    precision_m: float
-    rounds: int
-    scale_bound: float
-    joined: float
-    motion_leak: float
     code_white_share: float
-    bias_memory_s: float
-    bias_most: float
-    bias_faulty: float
-    bias_inflated: float
-    freed_m: float
-    freed_sigmas: float
-    code_leak: float
     level_doubt_code_s: float
-    misfit_most: float
     level_hold_s: float
     end_doubt_s: float
     start_separation_m: float
-    reach_sigmas: float
-    reach_m: float
-    velocity_floor_mps: float
-    direction_share: float
-    largest_square: float
-    allowed_square: float
-    across_doubt: float
-    across_lost: float
-    across_taken: float
-    drift_sigmas: float
-    drift_log: float
     level_start_s: float
-    young: float
-    young_held_s: float
-    beside_sigmas: float
-    beside_m: float
-    motion_satellites: int
-    step_sigmas: float
-    step_s: float
-    step_held_s: float
-    tracking: int
-    unsure: int
-    several: int
-    coasting: int
-    expired: int
 
 
 class Active(NamedTuple):
@@ -315,6 +255,7 @@ class Work(NamedTuple):
     place_axes: Floats
 
 
+#: Places of `Memory.scalars`.
 HYPOTHESES, WEAK_MOTION, WEAK_CODE, SCALE_DOPPLER, SCALE_PHASE, UNAIDED, DIRECTION, MEASURED = range(8)
 SHIFT, SHIFT_VARIANCE, MAP_SCALE, LEAST_SPEED, MOST_SPEED, CODED, BRANCH_S, BRANCH_M = 8, 9, 10, 11, 12, 13, 14, 15
 ACROSS, STEP_TIME, WITHHELD, OPEN = 16, 17, 18, 19

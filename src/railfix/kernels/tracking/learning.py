@@ -1,11 +1,29 @@
-"""What an epoch teaches: noise of phases and Dopplers, doubt, the map's lengths, faulty satellites."""
+"""What an epoch teaches: noise of phases and Dopplers, doubt, the map's lengths, faulty satellites.
+
+The innovation of a code over its standard deviation has a mean near 0 over a minute, reflections included: they come
+and go. A clock record that is wrong, or a reflection that lasts, keeps its sign. The mean of the innovations, each
+clipped to a standard deviation, so that single large ones count little, tells one from the other: such a satellite's
+codes are left out (`BIAS_FAULTY`).
+"""
 
 from __future__ import annotations
 
 import math
 
+from railfix.core.arrays import Floats
 from railfix.kernels.compiling import borrowing
+from railfix.kernels.tracking.constants import (
+    BIAS_FAULTY,
+    BIAS_MEMORY_S,
+    BIAS_MOST,
+    CODE_LEAK,
+    LARGEST_SCALE,
+    LEAST_SCALE,
+    MOTION_LEAK,
+    SCALE_S,
+)
 from railfix.kernels.tracking.layout import (
+    RANGE_ROW,
     SCALE_DOPPLER,
     SCALE_PHASE,
     WEAK_CODE,
@@ -13,7 +31,7 @@ from railfix.kernels.tracking.layout import (
     Answers,
     Epochs,
     Memory,
-    Numbers,
+    Parameters,
     Rows,
     Work,
 )
@@ -24,9 +42,8 @@ from railfix.kernels.tracking.update import mean_weights
 @borrowing
 def learn(
     epochs: Epochs,
-    numbers: Numbers,
+    parameters: Parameters,
     memory: Memory,
-    answers: Answers,
     rows: Rows,
     work: Work,
     t: int,
@@ -35,7 +52,7 @@ def learn(
     dt: float,
     code_s: float,
 ) -> bool:
-    """Learn the noise of phases and Dopplers and the error of the map; write weights and innovations.
+    """Learn the noise of phases and Dopplers, doubt, the error of the map, and wrong codes.
 
     Returns whether another satellite's codes are left out from here on.
     """
@@ -43,7 +60,7 @@ def learn(
     scalars, weight, innovation = memory.scalars, work.weight, work.innovation
     nc, nph, nd = rows.counts[0], rows.counts[1], rows.counts[2]
     gnss = nc + nph + nd
-    share = 1.0 - math.exp(-min(dt, 1.0) / numbers.scale_s)
+    share = 1.0 - math.exp(-min(dt, 1.0) / SCALE_S)
     for kind in range(2):
         begin, end = (nc, nc + nph) if kind == 1 else (nc + nph, gnss)
         scalar = SCALE_PHASE if kind == 1 else SCALE_DOPPLER
@@ -53,33 +70,51 @@ def learn(
                 square = work.residual[best, i] ** 2 + work.fitted[best, i]
                 total += weight[best, i] * square / work.variance[i]
             scalars[scalar] += share * math.log(total / (end - begin))
-        scalars[scalar] = min(max(scalars[scalar], numbers.least_scale), numbers.largest_scale)
+        scalars[scalar] = min(max(scalars[scalar], LEAST_SCALE), LARGEST_SCALE)
     code, motion = mean_weights(rows, work.variance, work, best)
-    weak = motion < numbers.lost_motion_weight
-    scalars[WEAK_MOTION] = (
-        scalars[WEAK_MOTION] + dt if weak else max(scalars[WEAK_MOTION] - numbers.motion_leak * dt, 0.0)
-    )
+    weak = motion < parameters.lost_motion_weight
+    scalars[WEAK_MOTION] = scalars[WEAK_MOTION] + dt if weak else max(scalars[WEAK_MOTION] - MOTION_LEAK * dt, 0.0)
     if code_s > 0.0:
-        weak = code < numbers.lost_code_weight
-        gone = max(scalars[WEAK_CODE] - numbers.code_leak * code_s, 0.0)
+        weak = code < parameters.lost_code_weight
+        gone = max(scalars[WEAK_CODE] - CODE_LEAK * code_s, 0.0)
         scalars[WEAK_CODE] = scalars[WEAK_CODE] + code_s if weak else gone
-    learn_map(scalars, 0.0 if best else shift, code_s, numbers)
-    answers.code_weight[t], answers.motion_weight[t] = code, motion
+    learn_map(scalars, 0.0 if best else shift, code_s, parameters)
+    for i in range(nc):
+        k = rows.codes[i]
+        sigma = epochs.code_sigma_m[t, k] * math.sqrt(1.0 + parameters.code_white_share**2)
+        now = update_bias(memory.code_bias, epochs.slot[k], innovation[best, i] / sigma, code_s)
+        found = found or now
+    return found
+
+
+@borrowing
+def update_bias(code_bias: Floats, slot: int, innovation: float, code_s: float) -> bool:
+    """Take a code's innovation over its standard deviation into the satellite's mean.
+
+    Returns whether its codes are left out from here on.
+    """
+    before = abs(code_bias[slot])
+    share = 1.0 - math.exp(-min(code_s, 1.0) / BIAS_MEMORY_S)
+    code_bias[slot] += share * (min(max(innovation, -BIAS_MOST), BIAS_MOST) - code_bias[slot])
+    return bool(before <= BIAS_FAULTY < abs(code_bias[slot]))
+
+
+@borrowing
+def write_rows(answers: Answers, rows: Rows, work: Work, t: int, best: int, believed: float) -> None:
+    """Write innovations and weights of the measurements; `believed` is 0 where none of them counts, 1 otherwise."""
+    weight, innovation = work.weight, work.innovation
+    nc, nph = rows.counts[0], rows.counts[1]
+    gnss = nc + nph + rows.counts[2]
+    code, motion = mean_weights(rows, work.variance, work, best)
+    answers.code_weight[t], answers.motion_weight[t] = believed * code, believed * motion
     for i in range(gnss):
         kind = 0 if i < nc else (1 if i < nc + nph else 2)
         k = rows.codes[i] if kind == 0 else (rows.phases[i - nc] if kind == 1 else rows.dopplers[i - nc - nph])
         answers.innovation[t, kind, k] = innovation[best, i]
         left_out = kind == 0 and answers.faulty[t, k]
-        answers.weight[t, kind, k] = 0.0 if left_out else weight[best, i]
-        answers.used[t, kind] += weight[best, i] > 0.5 and not left_out
-        if kind == 0:
-            slot, sigma = epochs.slot[k], epochs.code_sigma_m[t, k] * math.sqrt(1.0 + numbers.code_white_share**2)
-            away = min(max(innovation[best, i] / sigma, -numbers.bias_most), numbers.bias_most)
-            share = 1.0 - math.exp(-min(code_s, 1.0) / numbers.bias_memory_s)
-            before = abs(memory.code_bias[slot])
-            memory.code_bias[slot] += share * (away - memory.code_bias[slot])
-            found = found or before <= numbers.bias_faulty < abs(memory.code_bias[slot])
+        answers.weight[t, kind, k] = 0.0 if left_out else believed * weight[best, i]
+        answers.used[t, kind] += believed * weight[best, i] > 0.5 and not left_out
     for j in range(rows.counts[3]):
-        answers.used[t, 3 + rows.sensors[j]] += weight[best, gnss + j] > 0.5
-        answers.sensed[t, rows.sensors[j]] = innovation[best, gnss + j]
-    return found
+        kind = min(rows.sensors[j], RANGE_ROW)
+        answers.used[t, 3 + kind] += believed * weight[best, gnss + j] > 0.5
+        answers.sensed[t, kind] = innovation[best, gnss + j]

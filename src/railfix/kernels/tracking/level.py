@@ -1,4 +1,17 @@
-"""Sub-filters and the level from them (`railfix.tracking.bank`)."""
+"""Level of the filtered position by solution separation over a bank of sub-filters.
+
+Each sub-filter runs the same recursion without one satellite, one constellation or one sensor, from its own beginning:
+a fault of that source, however long it has lasted and whatever it has left in the state, is not in it. With the place
+s and its standard deviation sigma, those of the sub-filters, Q the upper tail of the normal distribution and p_b the
+probability that source b is faulty or was so recently that the filter still remembers it, the level L solves::
+
+    2 Q(L / sigma) + sum over b of p_b [Q((L - |s - s_b|) / sigma_b) + Q((L + |s - s_b|) / sigma_b)] = risk
+
+of an independent error, other branches being such sources with the probabilities that they have. Every hypothesis thus
+spends what it needs instead of an equal share (the hypotheses of R. G. Brown and P. W. McBurney, 1988, the allocation
+of J. Blanch et al., 2013, doi:10.1109/TAES.2013.6494396, over a filter instead of an epoch). The separation bounds the
+error, it is no test: robust filters can settle in different modes without a fault.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +19,11 @@ import math
 
 from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.algebra import invert, restart
+from railfix.kernels.tracking.constants import (
+    JOINED,
+    PRECISION_M,
+    ROUNDS,
+)
 from railfix.kernels.tracking.course import find_ends, onto_line, point_at
 from railfix.kernels.tracking.equations import combine, move_sensor_equations, write_equations
 from railfix.kernels.tracking.layout import (
@@ -17,6 +35,7 @@ from railfix.kernels.tracking.layout import (
     OTHERS,
     PHASE_CLOCK,
     PLACE,
+    RANGE_ROW,
     RIGHT,
     SENSORS,
     SPEED,
@@ -26,7 +45,7 @@ from railfix.kernels.tracking.layout import (
     Course,
     Epochs,
     Memory,
-    Numbers,
+    Parameters,
     Rows,
     Subfilters,
     Work,
@@ -36,8 +55,11 @@ from railfix.kernels.tracking.update import apply_update, first_weights, mean_we
 
 
 @borrowing
-def _sources(epochs: Epochs, t: int, rows: Rows, bank: Subfilters, slots: int, best: int, work: Work) -> None:
-    """Mark the sources that an epoch needs a sub-filter for, and as `met` the clocks of all satellites in view."""
+def _sources(epochs: Epochs, t: int, rows: Rows, bank: Subfilters, slots: int, before: bool, work: Work) -> None:
+    """Mark the sources that an epoch needs a sub-filter for, and as `met` the clocks of all satellites in view.
+
+    Where there was none before, what the hypothesis has met before is still in it.
+    """
     clocks = len(bank.running) - OTHERS - SENSORS - slots
     source, met = work.source, work.met
     for b in range(len(bank.running)):
@@ -53,17 +75,17 @@ def _sources(epochs: Epochs, t: int, rows: Rows, bank: Subfilters, slots: int, b
         if epochs.has[0, t, k] or epochs.has[1, t, k] or epochs.has[2, t, k]:
             source[epochs.slot[k]] = True
     for j in range(rows.counts[3]):
-        source[slots + clocks + rows.sensors[j]] = True
+        source[slots + clocks + min(rows.sensors[j], RANGE_ROW)] = True
     first = slots + clocks + SENSORS
     source[first], source[first + 1], source[first + 2] = rows.counts[2] > 0, rows.counts[1] > 0, rows.counts[0] > 0
     for k in range(slots):
         if epochs.remembered[t, k]:
             met[slots + bank.clock[k]] = True
-            source[k] = source[k] or best > 0
+            source[k] = source[k] or not before
 
 
 @borrowing
-def _begin(bank: Subfilters, b: int, copied: bool, best: int, numbers: Numbers, work: Work, h: int) -> None:
+def _begin(bank: Subfilters, b: int, copied: bool, best: int, parameters: Parameters, work: Work, h: int) -> None:
     """Begin a sub-filter with the state of the filter, or with what is known of nothing but the place."""
     mean, spread = work.mean, work.spread
     width = mean.shape[1]
@@ -77,8 +99,8 @@ def _begin(bank: Subfilters, b: int, copied: bool, best: int, numbers: Numbers, 
     if not copied:
         mean[h, PLACE] = mean[h, width - OF_EPOCH + OLD_PLACE] = mean[best, PLACE]
     if b == len(bank.running) - 1:
-        spread[h, RIGHT, RIGHT] += numbers.level_map_m**2
-        spread[h, UP, UP] += numbers.level_map_m**2
+        spread[h, RIGHT, RIGHT] += parameters.level_map_m**2
+        spread[h, UP, UP] += parameters.level_map_m**2
 
 
 @borrowing
@@ -86,7 +108,7 @@ def _update(
     epochs: Epochs,
     t: int,
     course: Course,
-    numbers: Numbers,
+    parameters: Parameters,
     active: Active,
     rows: Rows,
     best: int,
@@ -95,29 +117,31 @@ def _update(
 ) -> None:
     """Update row `h` of the work space without the measurements whose `masked` variance is infinite."""
     mean, spread, n = work.mean, work.spread, work.mean.shape[1] - OF_EPOCH
-    for kind in range(2):
+    for kind in range(3):
         if work.anew[best, kind]:
             unknown = n + PHASE_CLOCK if kind == 0 else DRIFT
+            if kind == 2:
+                unknown = active.offset[epochs.offset[rows.codes[0]]]
             mean[h, unknown] = mean[best, unknown]
-            restart(spread, unknown, numbers.unknown_clock**2, h)
+            restart(spread, unknown, spread[best, unknown, unknown], h)
     mean[h, n + CODE_CLOCK] = mean[best, n + CODE_CLOCK]
     work.now[h], work.before[h] = mean[h, PLACE], mean[h, n + OLD_PLACE]
-    write_equations(epochs, t, course, active, numbers, rows, 1.0, work, h)
+    write_equations(epochs, t, course, active, rows, 1.0, work, h)
     move_sensor_equations(active, rows, best, work, h)
-    combine(epochs, t, active, numbers.sensor_floor, rows, work, h)
+    combine(epochs, t, active, rows, work, h)
     size = rows.counts[0] + COMBINED + rows.counts[3]
     invert(work.own, h, size, work.factor, work.lower, work.information, h)
-    first_weights(rows, work.masked, numbers.degrees, 0.0, 0.0, work, h, h)
-    reweight(rows, work.masked, numbers.degrees, numbers.level_passes, work, h, h, h)
+    first_weights(rows, work.masked, parameters.degrees, 0.0, 0.0, work, h, h)
+    reweight(rows, work.masked, parameters.degrees, parameters.level_passes, work, h, h, h)
     apply_update(rows, work, h)
-    onto_line(course, numbers.start_sigma_m, work, h)
+    onto_line(course, parameters.start_sigma_m, work, h)
 
 
 @borrowing
-def _contradicted(rows: Rows, numbers: Numbers, work: Work, h: int) -> bool:
+def _contradicted(rows: Rows, parameters: Parameters, work: Work, h: int) -> bool:
     """Return whether the measurements that a sub-filter uses, codes or phases and Dopplers, have lost their weight."""
     code, motion = mean_weights(rows, work.masked, work, h)
-    return code < numbers.lost_code_weight or motion < numbers.lost_motion_weight
+    return code < parameters.lost_code_weight or motion < parameters.lost_motion_weight
 
 
 @borrowing
@@ -125,7 +149,7 @@ def advance_subfilters(
     epochs: Epochs,
     t: int,
     course: Course,
-    numbers: Numbers,
+    parameters: Parameters,
     active: Active,
     bank: Subfilters,
     rows: Rows,
@@ -134,7 +158,12 @@ def advance_subfilters(
     work: Work,
     h: int,
 ) -> None:
-    """Do an epoch of all sub-filters (`railfix.tracking.bank.levelled`); `best` has the equations, `h` is free."""
+    """Do an epoch of all sub-filters; `best` has the equations, `h` is free.
+
+    Each has equations of its own about its place: where the line bends between the two, those of the filter are none
+    of it. One that its own measurements contradict has settled somewhere else and begins anew. The filter itself is
+    one without a source that it has not met.
+    """
     mean, spread = work.mean, work.spread
     n, dt = mean.shape[1] - OF_EPOCH, epochs.interval_s[t]
     nc, nph = rows.counts[0], rows.counts[1]
@@ -142,31 +171,33 @@ def advance_subfilters(
     slots = len(active.satellite)
     clocks = len(bank.running) - OTHERS - SENSORS - slots
     others = slots + clocks + SENSORS
-    _sources(epochs, t, rows, bank, slots, best, work)
-    source, met = work.source, work.met
     before = False
     for b in range(len(bank.running)):
         before = before or bank.running[b]
     before = before and not best
+    _sources(epochs, t, rows, bank, slots, before, work)
+    source, met = work.source, work.met
     for b in range(len(bank.running)):
         satellite = b < slots
         if best or (satellite and not epochs.remembered[t, b]):
             bank.running[b] = False
-        if bank.running[b] and bank.weak_s[b] >= numbers.lost_motion_s:
+        if bank.running[b] and bank.weak_s[b] >= parameters.lost_motion_s:
             bank.running[b], met[b] = False, True
         if bank.running[b]:
-            wrong_m = numbers.level_map_m if b == len(bank.running) - 1 else 0.0
-            predict(epochs, t, course, numbers, active, bank.mean, bank.covariance, b, map_log_scale, wrong_m, work, h)
+            wrong_m = parameters.level_map_m if b == len(bank.running) - 1 else 0.0
+            predict(
+                epochs, t, course, parameters, active, bank.mean, bank.covariance, b, map_log_scale, wrong_m, work, h
+            )
             find_ends(course, mean[h, PLACE], mean[h, n + OLD_PLACE], work)
-            add_bend(numbers, work, h)
+            add_bend(parameters, work, h)
             sigma = math.sqrt(spread[h, PLACE, PLACE])
-            near = abs(mean[h, PLACE] - mean[best, PLACE]) < numbers.joined * sigma
-            near = near and sigma < (1.0 + numbers.joined) * math.sqrt(spread[best, PLACE, PLACE])
+            near = abs(mean[h, PLACE] - mean[best, PLACE]) < JOINED * sigma
+            near = near and sigma < (1.0 + JOINED) * math.sqrt(spread[best, PLACE, PLACE])
             if near and satellite and not source[b]:
                 bank.running[b] = False
                 continue
         elif source[b] and bank.prior[b] > 0.0:
-            _begin(bank, b, before and not met[b], best, numbers, work, h)
+            _begin(bank, b, before and not met[b], best, parameters, work, h)
         else:
             continue
         for i in range(gnss):
@@ -176,13 +207,15 @@ def advance_subfilters(
             if (b == others and i >= nc + nph) or (b == others + 1 and nc <= i < nc + nph):
                 work.masked[i] = math.inf
         for j in range(rows.counts[3]):
-            own = slots + clocks + rows.sensors[j]
+            own = slots + clocks + min(rows.sensors[j], RANGE_ROW)
             work.masked[gnss + j] = math.inf if own == b else work.variance[gnss + j]
-        _update(epochs, t, course, numbers, active, rows, best, work, h)
-        if _contradicted(rows, numbers, work, h):
+        _update(epochs, t, course, parameters, active, rows, best, work, h)
+        if _contradicted(rows, parameters, work, h):
             bank.weak_s[b] += dt
         elif nc > 0:
             bank.weak_s[b] = 0.0
+        if not math.isfinite(work.new_mean[h, PLACE]):  # it begins anew, and bounds nothing before
+            bank.weak_s[b] = parameters.lost_motion_s + parameters.level_doubt_s
         for c in range(n):
             bank.mean[b, c] = work.new_mean[h, c]
             for e in range(n):
@@ -190,7 +223,7 @@ def advance_subfilters(
 
 
 @borrowing
-def write_branches(memory: Memory, course: Course, numbers: Numbers, work: Work, count: int) -> float:
+def write_branches(memory: Memory, course: Course, parameters: Parameters, work: Work, count: int) -> float:
     """Write distance along the line, straight distance and sigma of other hypotheses than the first.
 
     Returns the probability of those that are further along the line than a bound may reach.
@@ -206,7 +239,7 @@ def write_branches(memory: Memory, course: Course, numbers: Numbers, work: Work,
         apart = abs(memory.mean[h, PLACE] - memory.mean[0, PLACE])
         work.branch[h, 0], work.branch[h, 1] = apart, math.sqrt(square)
         work.branch[h, 2] = math.sqrt(memory.covariance[h, PLACE, PLACE])
-        if apart > numbers.start_separation_m:
+        if apart > parameters.start_separation_m:
             far += math.exp(memory.log_probability[h])
             work.branch[h, 0] = 0.0
     return far
@@ -214,15 +247,28 @@ def write_branches(memory: Memory, course: Course, numbers: Numbers, work: Work,
 
 @borrowing
 def write_level(
-    memory: Memory, count: int, far: float, bank: Subfilters, numbers: Numbers, work: Work, answers: Answers, t: int
+    memory: Memory,
+    count: int,
+    far: float,
+    bank: Subfilters,
+    parameters: Parameters,
+    work: Work,
+    answers: Answers,
+    t: int,
 ) -> None:
-    """Write the level of the first hypothesis and its parts (`railfix.tracking.bank.compute_level`)."""
+    """Write the level of the first hypothesis and its parts.
+
+    Infinite without a sub-filter, and where the measurements of one have contradicted it for longer than
+    `TrackingLimits.level_doubt_s`: it has settled somewhere else, or began where the fault of its source had led the
+    filter, and bounds nothing. Along the line it is infinite where another place of it, further away than a bound may
+    reach, is more probable than the risk; the straight distance is bounded with all branches.
+    """
     place, sigma = memory.mean[0, PLACE], math.sqrt(memory.covariance[0, PLACE, PLACE])
-    noise, apart = numbers.level_k * sigma, math.nan
+    noise, apart = parameters.level_k * sigma, math.nan
     start, contradicted = noise, False
     for b in range(len(bank.running)):
         if bank.running[b]:
-            contradicted = contradicted or bank.weak_s[b] > numbers.level_doubt_s
+            contradicted = contradicted or bank.weak_s[b] > parameters.level_doubt_s
             away = abs(bank.mean[b, PLACE] - place)
             apart = away if math.isnan(apart) else max(apart, away)
             start = max(start, away + bank.k[b] * math.sqrt(bank.covariance[b, PLACE, PLACE]))
@@ -230,11 +276,11 @@ def write_level(
     answers.level_m[t] = answers.ground_level_m[t] = math.inf
     if math.isnan(apart) or contradicted:
         return
-    answers.ground_level_m[t] = _solve(memory, count, bank, numbers, work, 1, start, place, sigma)
+    answers.ground_level_m[t] = _solve(memory, count, bank, parameters, work, 1, start, place, sigma)
     if count == 1:
         answers.level_m[t] = answers.ground_level_m[t]
-    elif far <= numbers.level_risk:
-        answers.level_m[t] = _solve(memory, count, bank, numbers, work, 0, start, place, sigma)
+    elif far <= parameters.level_risk:
+        answers.level_m[t] = _solve(memory, count, bank, parameters, work, 0, start, place, sigma)
     wrong = len(bank.running) - 1
     if bank.running[wrong]:
         aside = abs(bank.mean[wrong, RIGHT]) - 2.0 * math.sqrt(bank.covariance[wrong, RIGHT, RIGHT])
@@ -246,21 +292,25 @@ def _solve(
     memory: Memory,
     count: int,
     bank: Subfilters,
-    numbers: Numbers,
+    parameters: Parameters,
     work: Work,
     which: int,
     start: float,
     place: float,
     sigma: float,
 ) -> float:
-    """Level at which all hypotheses together have the risk; `which` is the column of the branches' distances."""
+    """Level at which all hypotheses together have the risk; `which` is the column of the branches' distances.
+
+    Newton's steps of its logarithm within a bracket, from the largest that one hypothesis alone asks for: they must
+    not begin where a branch makes it flat.
+    """
     level = start
     for h in range(1, count):
-        excess = math.exp(memory.log_probability[h]) / (2.0 * numbers.level_risk)
+        excess = math.exp(memory.log_probability[h]) / (2.0 * parameters.level_risk)
         k = math.sqrt(2.0 * math.log(excess)) if excess > 1.0 else 0.0
         level = max(level, work.branch[h, which] + k * work.branch[h, 2])
     low, high = 0.0, math.inf
-    for _ in range(numbers.rounds):
+    for _ in range(ROUNDS):
         away = level / sigma
         spent = math.erfc(away / math.sqrt(2.0))
         slope = 2.0 * math.exp(-0.5 * away * away) / sigma
@@ -277,23 +327,23 @@ def _solve(
                 spent += prior * 0.5 * math.erfc(away / math.sqrt(2.0))
                 slope += prior * math.exp(-0.5 * away * away) / own
         slope /= math.sqrt(2.0 * math.pi)
-        if spent > numbers.level_risk:
+        if spent > parameters.level_risk:
             low = level
         else:
             high = level
-        step = spent / slope * math.log(spent / numbers.level_risk) if spent > 0.0 and slope > 0.0 else -math.inf
+        step = spent / slope * math.log(spent / parameters.level_risk) if spent > 0.0 and slope > 0.0 else -math.inf
         if not low <= level + step <= high:
             step = (0.5 * (low + high) if high < math.inf else 2.0 * level) - level
         level += step
-        if abs(step) < numbers.precision_m:
+        if abs(step) < PRECISION_M:
             break
     return level
 
 
 @borrowing
-def speed_bound(speed: float, sigma: float, bank: Subfilters, numbers: Numbers) -> float:
-    """Return the bound of the error of the speed (`railfix.tracking.bank.speed_bound_mps`)."""
-    bound = numbers.level_k_speed * sigma
+def speed_bound(speed: float, sigma: float, bank: Subfilters, parameters: Parameters) -> float:
+    """Return the bound of the error of the speed: what carries the level over the epochs until the next one."""
+    bound = parameters.level_k_speed * sigma
     for b in range(len(bank.running)):
         if bank.running[b]:
             own = math.sqrt(bank.covariance[b, SPEED, SPEED])

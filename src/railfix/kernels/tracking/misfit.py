@@ -1,4 +1,4 @@
-"""Error of the map's lengths learnt from codes that ask for another place (`railfix.tracking.misfit`)."""
+"""Error of the map's lengths learnt from codes that ask for another place."""
 
 from __future__ import annotations
 
@@ -7,12 +7,25 @@ import math
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.algebra import factorise
-from railfix.kernels.tracking.layout import MAP_SCALE, SHIFT, SHIFT_VARIANCE, Numbers, Rows, Work
+from railfix.kernels.tracking.constants import (
+    MISFIT_CLIPPED,
+    MISFIT_CODES,
+    MISFIT_LARGEST,
+    MISFIT_LEARNT_S,
+    MISFIT_MOST,
+    STEP_SIGMAS,
+)
+from railfix.kernels.tracking.layout import MAP_SCALE, SHIFT, SHIFT_VARIANCE, Parameters, Rows, Work
 
 
 @borrowing
-def code_shift(rows: Rows, most: float, work: Work, h: int) -> float:
-    """Shift of the place that the codes ask for over its standard deviation (`railfix.tracking.misfit`)."""
+def code_shift(rows: Rows, work: Work, h: int) -> float:
+    """Shift of the place that the codes of an epoch ask for, over its standard deviation; 0 with too few codes.
+
+    The score of the innovations against a shift: standard normal and white over epochs where the model holds.
+    """
+    if rows.counts[0] < MISFIT_CODES:
+        return 0.0
     nc, root, own, design, value = rows.counts[0], work.root, work.own, work.design, work.value
     system, factor, right = work.system, work.factor, work.right
     clock = root[h, nc]
@@ -39,22 +52,20 @@ def code_shift(rows: Rows, most: float, work: Work, h: int) -> float:
             work.ordered[j] -= factor[i, j] * other
     if not information > 0.0:
         return 0.0
-    return float(min(max(score / math.sqrt(information), -most), most))
+    return float(min(max(score / math.sqrt(information), -MISFIT_MOST), MISFIT_MOST))
 
 
 @borrowing
-def learn_map(scalars: Floats, shift: float, dt: float, numbers: Numbers) -> None:
+def learn_map(scalars: Floats, shift: float, dt: float, parameters: Parameters) -> None:
     """Take an epoch's shift into the running mean, and raise or lower the error of the map's lengths."""
     dt = min(dt, 1.0)
-    share = 1.0 - math.exp(-dt / numbers.map_misfit_s)
-    shift = (
-        0.0 if abs(shift) > numbers.step_sigmas else min(max(shift, -numbers.misfit_clipped), numbers.misfit_clipped)
-    )
+    share = 1.0 - math.exp(-dt / parameters.map_misfit_s)
+    shift = 0.0 if abs(shift) > STEP_SIGMAS else min(max(shift, -MISFIT_CLIPPED), MISFIT_CLIPPED)
     mean = (1.0 - share) * scalars[SHIFT] + share * shift
     variance = (1.0 - share) ** 2 * scalars[SHIFT_VARIANCE] + share**2
     scalars[SHIFT], scalars[SHIFT_VARIANCE] = mean, variance
-    beyond = abs(mean) / (math.sqrt(variance) * numbers.map_misfit_sigmas)
-    scale = scalars[MAP_SCALE] * math.exp(-dt / numbers.map_misfit_kept_s)
+    beyond = abs(mean) / (math.sqrt(variance) * parameters.map_misfit_sigmas)
+    scale = scalars[MAP_SCALE] * math.exp(-dt / parameters.map_misfit_kept_s)
     if beyond > 1.0:
-        scale += 2.0 * math.log(beyond) * dt / numbers.misfit_learnt_s
-    scalars[MAP_SCALE] = min(scale, numbers.misfit_largest)
+        scale += 2.0 * math.log(beyond) * dt / MISFIT_LEARNT_S
+    scalars[MAP_SCALE] = min(scale, MISFIT_LARGEST)

@@ -1,10 +1,33 @@
-"""Monitors of the filter's place (`railfix.tracking.monitors`)."""
+"""Monitors of the filter's place: velocity across the line, the open end of a map, a step of all codes.
+
+Where one of them speaks against the place its level is withheld; where it lasts the track is lost, and places are
+sought over the whole line.
+"""
 
 from __future__ import annotations
 
 import math
 
 from railfix.kernels.compiling import borrowing
+from railfix.kernels.tracking.constants import (
+    ACROSS_DOUBT,
+    ACROSS_LOST,
+    ALLOWED_SQUARE,
+    BESIDE_M,
+    BESIDE_SIGMAS,
+    DIRECTION_SHARE,
+    DRIFT_LOG,
+    DRIFT_SIGMAS,
+    LARGEST_SQUARE,
+    REACH_M,
+    REACH_SIGMAS,
+    STEP_HELD_S,
+    STEP_S,
+    STEP_SIGMAS,
+    VELOCITY_FLOOR_MPS,
+    YOUNG,
+    YOUNG_HELD_S,
+)
 from railfix.kernels.tracking.course import point_at
 from railfix.kernels.tracking.layout import (
     ACCELERATION,
@@ -24,27 +47,28 @@ from railfix.kernels.tracking.layout import (
     Course,
     Epochs,
     Memory,
-    Numbers,
+    Parameters,
     Subfilters,
     Work,
 )
 
 
 @borrowing
-def contradiction(
-    epochs: Epochs, t: int, course: Course, numbers: Numbers, memory: Memory, work: Work, h: int
-) -> float:
-    """Square of the velocity against that of the place over its variance; NaN without a velocity."""
+def contradiction(epochs: Epochs, t: int, course: Course, memory: Memory, work: Work, h: int) -> float:
+    """Square of the velocity against that of the place over its variance; NaN without a velocity.
+
+    Along the line and across it, at the best of three places that the place's standard deviation allows.
+    """
     velocity, covariance, axes = epochs.velocity_mps, epochs.velocity_covariance, work.axes
     if not math.isfinite(velocity[t, 0]):
         return math.nan
-    reach = max(numbers.reach_m, numbers.reach_sigmas * math.sqrt(memory.covariance[h, PLACE, PLACE]))
+    reach = max(REACH_M, REACH_SIGMAS * math.sqrt(memory.covariance[h, PLACE, PLACE]))
     age_s = epochs.velocity_age_s[t]
     speed = memory.mean[h, SPEED] - age_s * memory.mean[h, ACCELERATION]
     floor, least = 0.0, math.inf
     for c in range(3):
         floor += velocity[t, c] * velocity[t, c]
-    floor = numbers.velocity_floor_mps**2 + numbers.direction_share**2 * floor
+    floor = VELOCITY_FLOOR_MPS**2 + DIRECTION_SHARE**2 * floor
     for turn in range(3):
         point_at(course, memory.mean[h, PLACE] - age_s * speed + (turn - 1) * reach, work.point, axes, 0)
         total = 0.0
@@ -63,42 +87,43 @@ def contradiction(
 
 @borrowing
 def watch(
-    numbers: Numbers, memory: Memory, bank: Subfilters, square: float, shift: float, pushed_m: float, dt: float,
+    parameters: Parameters, memory: Memory, bank: Subfilters, square: float, shift: float, pushed_m: float, dt: float,
     code_s: float,
 ) -> None:  # fmt: skip
-    """Take the contradictions of an epoch into the state."""
+    """Take the contradictions of an epoch into the state.
+
+    `square` is `contradiction` of the most probable hypothesis, `shift` the one that its codes ask for, `pushed_m` how
+    far its place was put back onto an open end of the line, `code_s` the time that the codes stand for.
+    """
     scalars = memory.scalars
     if not math.isnan(square):
-        gained = (min(square, numbers.largest_square) - numbers.allowed_square) * min(dt, 1.0)
+        gained = (min(square, LARGEST_SQUARE) - ALLOWED_SQUARE) * min(dt, 1.0)
         scalars[ACROSS] = max(scalars[ACROSS] + gained, 0.0)
-    if pushed_m > 0.0 and scalars[WEAK_MOTION] >= numbers.end_doubt_s:
-        scalars[ACROSS] = numbers.across_lost
+    if pushed_m > 0.0 and scalars[WEAK_MOTION] >= parameters.end_doubt_s:
+        scalars[ACROSS] = ACROSS_LOST
     if code_s > 0.0:
-        stepped = abs(shift) > numbers.step_sigmas
+        stepped = abs(shift) > STEP_SIGMAS
         scalars[STEP_TIME] = scalars[STEP_TIME] + code_s if stepped else max(scalars[STEP_TIME] - 0.5 * code_s, 0.0)
     withheld = 0.0
-    doubtful = scalars[WEAK_CODE] > numbers.level_doubt_code_s or scalars[WEAK_MOTION] > numbers.level_doubt_s
-    if doubtful or scalars[ACROSS] > numbers.across_doubt:
-        withheld = numbers.level_hold_s
-    if scalars[BRANCH_S] < numbers.level_start_s:
+    doubtful = scalars[WEAK_CODE] > parameters.level_doubt_code_s or scalars[WEAK_MOTION] > parameters.level_doubt_s
+    if doubtful or scalars[ACROSS] > ACROSS_DOUBT:
+        withheld = parameters.level_hold_s
+    if scalars[BRANCH_S] < parameters.level_start_s:
         largest = -math.inf
         for h in range(int(scalars[HYPOTHESES])):
             largest = max(largest, memory.log_probability[h])
-        if largest < math.log(numbers.young):
-            withheld = numbers.young_held_s
-    if (
-        scalars[SHIFT] ** 2 > numbers.drift_sigmas**2 * scalars[SHIFT_VARIANCE]
-        or scalars[MAP_SCALE] > numbers.drift_log
-    ):
-        withheld = numbers.level_hold_s
+        if largest < math.log(YOUNG):
+            withheld = YOUNG_HELD_S
+    if scalars[SHIFT] ** 2 > DRIFT_SIGMAS**2 * scalars[SHIFT_VARIANCE] or scalars[MAP_SCALE] > DRIFT_LOG:
+        withheld = parameters.level_hold_s
     for b in range(len(bank.running)):
-        if bank.running[b] and bank.weak_s[b] > numbers.level_doubt_s:
-            withheld = numbers.level_hold_s
+        if bank.running[b] and bank.weak_s[b] > parameters.level_doubt_s:
+            withheld = parameters.level_hold_s
     wrong = len(bank.running) - 1
     if wrong >= 0 and bank.running[wrong]:
-        reach = numbers.beside_sigmas * math.sqrt(bank.covariance[wrong, RIGHT, RIGHT])
-        if abs(bank.mean[wrong, RIGHT]) > max(numbers.beside_m, reach):
-            withheld = numbers.level_hold_s
-    if scalars[STEP_TIME] >= numbers.step_s:
-        withheld = numbers.step_held_s
+        reach = BESIDE_SIGMAS * math.sqrt(bank.covariance[wrong, RIGHT, RIGHT])
+        if abs(bank.mean[wrong, RIGHT]) > max(BESIDE_M, reach):
+            withheld = parameters.level_hold_s
+    if scalars[STEP_TIME] >= STEP_S:
+        withheld = STEP_HELD_S
     scalars[WITHHELD] = max(scalars[WITHHELD] - dt, withheld)

@@ -1,4 +1,4 @@
-"""Prediction of the unknowns from one epoch to the next (`railfix.tracking.predict`)."""
+"""Prediction of the unknowns from one epoch to the next."""
 
 from __future__ import annotations
 
@@ -6,6 +6,13 @@ import math
 
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import borrowing
+from railfix.kernels.tracking.constants import (
+    CODE_CLOCK_SIGMA_M,
+    FORCE_WALK_MPS2,
+    LEAST_STEP_M2,
+    RADAR_WALK,
+    WHEEL_WALK,
+)
 from railfix.kernels.tracking.layout import (
     CODE_CLOCK,
     CODE_PLACE,
@@ -25,7 +32,7 @@ from railfix.kernels.tracking.layout import (
     Active,
     Course,
     Epochs,
-    Numbers,
+    Parameters,
     Work,
 )
 
@@ -35,7 +42,7 @@ def predict(
     epochs: Epochs,
     t: int,
     course: Course,
-    numbers: Numbers,
+    parameters: Parameters,
     active: Active,
     mean: Floats,
     covariance: Floats,
@@ -51,10 +58,10 @@ def predict(
     n = mean.shape[1]
     speed = abs(mean[h, SPEED])
     travel = speed * dt
-    map_kept = math.exp(-travel / numbers.map_absolute_m)
-    code_kept = math.exp(-dt / numbers.code_correlation_s - travel / numbers.code_correlation_m)
-    doppler_kept = math.exp(-dt / numbers.doppler_correlation_s)
-    slow_kept = math.exp(-dt / numbers.slow_code_s)
+    map_kept = math.exp(-travel / parameters.map_absolute_m)
+    code_kept = math.exp(-dt / parameters.code_correlation_s - travel / parameters.code_correlation_m)
+    doppler_kept = math.exp(-dt / parameters.doppler_correlation_s)
+    slow_kept = math.exp(-dt / parameters.slow_code_s)
     for i in range(n):
         kept[i] = 1.0
     kept[RIGHT] = kept[UP] = map_kept
@@ -91,27 +98,27 @@ def predict(
     for i in range(3):
         for j in range(3):
             spread[to, i, j] += noise[i, j]
-    spread[to, PLACE, PLACE] += numbers.least_step_m2
-    spread[to, SPEED, SPEED] += numbers.least_step_m2
-    walk = numbers.clock_walk_mps**2
+    spread[to, PLACE, PLACE] += LEAST_STEP_M2
+    spread[to, SPEED, SPEED] += LEAST_STEP_M2
+    walk = parameters.clock_walk_mps**2
     spread[to, DRIFT, DRIFT] += walk * dt
     spread[to, n + PHASE_CLOCK, n + PHASE_CLOCK] += walk * dt**3 / 3.0 + 1e-6
     spread[to, n + PHASE_CLOCK, DRIFT] += walk * dt**2 / 2.0
     spread[to, DRIFT, n + PHASE_CLOCK] += walk * dt**2 / 2.0
     spread[to, RIGHT, RIGHT] += (course.sigma_plan_m**2 + map_sigma_m**2) * (1.0 - map_kept**2)
     spread[to, UP, UP] += (course.sigma_height_m**2 + map_sigma_m**2) * (1.0 - map_kept**2)
-    spread[to, CODE_PLACE, CODE_PLACE] += numbers.slow_code_m**2 * (1.0 - slow_kept**2)
-    lasting = numbers.doppler_error_mps + numbers.doppler_error_share * speed
+    spread[to, CODE_PLACE, CODE_PLACE] += parameters.slow_code_m**2 * (1.0 - slow_kept**2)
+    lasting = parameters.doppler_error_mps + parameters.doppler_error_share * speed
     spread[to, DOPPLER_SPEED, DOPPLER_SPEED] += lasting**2 * (1.0 - doppler_kept**2)
     if active.wheel >= 0:
-        spread[to, active.wheel, active.wheel] += numbers.wheel_walk**2 * dt
+        spread[to, active.wheel, active.wheel] += WHEEL_WALK**2 * dt
     if active.force >= 0:
-        spread[to, active.force, active.force] += numbers.force_walk_mps2**2 * dt
+        spread[to, active.force, active.force] += FORCE_WALK_MPS2**2 * dt
     if active.radar >= 0:
-        spread[to, active.radar, active.radar] += numbers.radar_walk**2 * dt
+        spread[to, active.radar, active.radar] += RADAR_WALK**2 * dt
     for i in active.offset:
         if i >= 0:
-            spread[to, i, i] += numbers.offset_walk_m**2 * dt
+            spread[to, i, i] += parameters.offset_walk_m**2 * dt
     for i in active.satellite:
         if i >= 0:
             spread[to, i, i] += 1.0 - code_kept**2
@@ -126,22 +133,22 @@ def predict(
     )
     for i in range(n + 3, n + OF_EPOCH):
         after[to, i] = 0.0
-    rough = 2.0 * numbers.map_roughness_m**2 * (1.0 - math.exp(-travel / numbers.map_correlation_m)) + 1e-8
+    rough = 2.0 * parameters.map_roughness_m**2 * (1.0 - math.exp(-travel / parameters.map_correlation_m)) + 1e-8
     spread[to, n + STEP_RIGHT, n + STEP_RIGHT] = rough
     spread[to, n + STEP_UP, n + STEP_UP] = rough
     # The way on the map is the way run less the error of the length: what codes see of it, phases do not.
-    length = numbers.map_scale_m**2 * math.exp(map_log_scale) * travel + numbers.phase_walk_m**2 * dt
+    length = parameters.map_scale_m**2 * math.exp(map_log_scale) * travel + parameters.phase_walk_m**2 * dt
     spread[to, PLACE, PLACE] += length
     spread[to, n + STEP_ALONG, n + STEP_ALONG] = length + 1e-8
     spread[to, PLACE, n + STEP_ALONG] = spread[to, n + STEP_ALONG, PLACE] = -length
-    spread[to, n + CODE_CLOCK, n + CODE_CLOCK] = numbers.code_clock_sigma_m**2
+    spread[to, n + CODE_CLOCK, n + CODE_CLOCK] = CODE_CLOCK_SIGMA_M**2
 
 
 @borrowing
-def add_bend(numbers: Numbers, work: Work, h: int) -> None:
+def add_bend(parameters: Parameters, work: Work, h: int) -> None:
     """Add what the line bends by where the place is uncertain to the displacements across."""
     spread, bend, n = work.spread, work.bend, work.mean.shape[1] - OF_EPOCH
     length = spread[h, n + STEP_ALONG, n + STEP_ALONG] - 1e-8
-    vague = min(spread[h, PLACE, PLACE] - length, numbers.start_sigma_m**2)
+    vague = min(spread[h, PLACE, PLACE] - length, parameters.start_sigma_m**2)
     spread[h, n + STEP_RIGHT, n + STEP_RIGHT] += vague * bend[0] ** 2
     spread[h, n + STEP_UP, n + STEP_UP] += vague * bend[1] ** 2

@@ -1,4 +1,7 @@
-"""Epochs one after the other (`railfix.tracking.filter`): the part of the recursion that is compiled."""
+"""Epochs one after the other: the recursion of the filter along the track.
+
+Places are sought outside (`railfix.tracking.search`), between the prediction of an epoch and what follows it.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,38 @@ import math
 
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import borrowing, kernel
-from railfix.kernels.tracking.algebra import invert, median, most_probable, restart
+from railfix.kernels.tracking.algebra import insert, invert, median, middle, most_probable, restart
 from railfix.kernels.tracking.branches import keep_hypotheses, reweigh
-from railfix.kernels.tracking.course import onto_line
+from railfix.kernels.tracking.constants import (
+    ACROSS_DOUBT,
+    ACROSS_LOST,
+    ACROSS_TAKEN,
+    BESIDE_AFTER_S,
+    BIAS_FAULTY,
+    BIAS_INFLATED,
+    COASTING,
+    DIRECTION_MPS,
+    DOUBTFUL,
+    EXPIRED,
+    FIRST_OFFSET_M2,
+    FREED_M,
+    FREED_SIGMAS,
+    LEAST_RISE,
+    LOST,
+    MOVED_M,
+    RELINEARISED,
+    SCALE_BOUND,
+    SEVERAL_BRANCHES,
+    STEPPED,
+    STILL_MPS,
+    SWITCH,
+    TAKEOVER,
+    TAKEOVER_AFTER_S,
+    TRACKING,
+    UNKNOWN_CLOCK,
+    WEAK_FIT,
+)
+from railfix.kernels.tracking.course import on_course, onto_line
 from railfix.kernels.tracking.equations import combine, write_equations
 from railfix.kernels.tracking.layout import (
     ACCELERATION,
@@ -28,26 +60,30 @@ from railfix.kernels.tracking.layout import (
     OPEN,
     PHASE_CLOCK,
     PLACE,
+    PREDICTION,
+    RANGE_ROW,
+    REST,
+    REST_LOST,
     SCALE_DOPPLER,
     SCALE_PHASE,
-    SENSORS,
     SPEED,
     UNAIDED,
     WEAK_CODE,
     WEAK_MOTION,
     WHEEL_ROW,
+    WHOLE,
     WITHHELD,
     Active,
     Answers,
     Course,
     Epochs,
     Memory,
-    Numbers,
+    Parameters,
     Rows,
     Subfilters,
     Work,
 )
-from railfix.kernels.tracking.learning import learn
+from railfix.kernels.tracking.learning import learn, write_rows
 from railfix.kernels.tracking.level import advance_subfilters, speed_bound, write_branches, write_level
 from railfix.kernels.tracking.misfit import code_shift
 from railfix.kernels.tracking.monitors import contradiction, watch
@@ -57,31 +93,45 @@ from railfix.kernels.tracking.update import apply_update, first_weights, mean_we
 
 
 @borrowing
-def _left_to_numpy(epochs: Epochs, t: int, course: Course, numbers: Numbers, memory: Memory) -> bool:
-    """Return whether numpy has to do an epoch: a restart, a search, or places that go round a closed line."""
-    scalars, count = memory.scalars, int(memory.scalars[HYPOTHESES])
-    left = epochs.left[t]
-    left = left or scalars[WEAK_MOTION] >= numbers.lost_motion_s or scalars[WEAK_CODE] >= numbers.lost_code_s
-    left = left or scalars[ACROSS] >= numbers.across_lost
-    beside = scalars[WEAK_MOTION] >= numbers.beside_after_s or scalars[ACROSS] >= numbers.across_doubt
-    left = left or (beside and count <= numbers.most_hypotheses // 2)
-    # Beyond an end of a closed line numpy lets places go on where it closes.
-    for h in range(count):
-        left = left or (memory.mean[h, PLACE] < course.arc_m[0] and course.start_m == -math.inf)
-        left = left or (memory.mean[h, PLACE] > course.arc_m[-1] and course.end_m == math.inf)
-    return left
+def _go_round(course: Course, memory: Memory, bank: Subfilters) -> None:
+    """Let places beyond an end of a closed line go on where it closes."""
+    for h in range(int(memory.scalars[HYPOTHESES])):
+        back = on_course(course, memory.mean[h, PLACE]) - memory.mean[h, PLACE]
+        if back != 0.0:
+            memory.mean[h, PLACE] += back
+            memory.origin_m[h] += back
+            for b in range(len(bank.running)):
+                if h == 0 and bank.running[b]:
+                    bank.mean[b, PLACE] += back
 
 
 @borrowing
-def _code_interval_s(epochs: Epochs, t: int, numbers: Numbers, memory: Memory, answers: Answers) -> float:
-    """Time that the codes of an epoch stand for (`railfix.tracking.chunk.code_interval_s`), in force from here on."""
+def _needs_search(epochs: Epochs, t: int, parameters: Parameters, memory: Memory) -> bool:
+    """Return whether places have to be sought before an epoch: the track is lost or in doubt, or after a gap."""
+    scalars = memory.scalars
+    lost = scalars[WEAK_MOTION] >= parameters.lost_motion_s or scalars[WEAK_CODE] >= parameters.lost_code_s
+    lost = lost or scalars[ACROSS] >= ACROSS_LOST
+    beside = scalars[WEAK_MOTION] >= BESIDE_AFTER_S or scalars[ACROSS] >= ACROSS_DOUBT
+    coded = False
+    for k in range(epochs.has.shape[2]):
+        coded = coded or epochs.has[0, t, k]
+    gap = coded and epochs.time_s[t] - scalars[MEASURED] > parameters.gap_s
+    return bool(lost or gap or (beside and scalars[HYPOTHESES] <= parameters.most_hypotheses // 2))
+
+
+@borrowing
+def _code_interval_s(epochs: Epochs, t: int, parameters: Parameters, memory: Memory, answers: Answers) -> float:
+    """Time that the codes of an epoch stand for [s]; 0 where they are not used, as others were within the period.
+
+    Their variances are settled with it, those of codes that are left out are inflated.
+    """
     dt, since, coded = epochs.interval_s[t], epochs.time_s[t] - memory.scalars[CODED], False
     for k in range(epochs.has.shape[2]):
         coded = coded or epochs.has[0, t, k]
     if not coded:
         return float(dt)
-    recent = epochs.motion_measured[t] and since < numbers.code_period_s - 0.5 * dt
-    code_s = 0.0 if recent else min(max(since, dt), max(numbers.code_period_s, dt))
+    recent = epochs.motion_measured[t] and since < parameters.code_period_s - 0.5 * dt
+    code_s = 0.0 if recent else min(max(since, dt), max(parameters.code_period_s, dt))
     for k in range(epochs.has.shape[2]):
         if recent:
             epochs.has[0, t, k] = False
@@ -89,22 +139,20 @@ def _code_interval_s(epochs: Epochs, t: int, numbers: Numbers, memory: Memory, a
         epochs.variance[0, t, k] /= min(code_s, 1.0)
         slot = epochs.slot[k]
         if slot >= 0 and epochs.has[0, t, k] and not epochs.fresh[t, slot]:
-            answers.faulty[t, k] = abs(memory.code_bias[slot]) > numbers.bias_faulty
+            answers.faulty[t, k] = abs(memory.code_bias[slot]) > BIAS_FAULTY
             if answers.faulty[t, k]:
-                epochs.variance[0, t, k] *= numbers.bias_inflated
+                epochs.variance[0, t, k] *= BIAS_INFLATED
     return float(code_s)
 
 
 @borrowing
-def _choose_rows(epochs: Epochs, t: int, numbers: Numbers, memory: Memory, rows: Rows) -> bool:
-    """List the channels of each kind of measurement; return False where numpy has to seek places first."""
+def _choose_rows(epochs: Epochs, t: int, rows: Rows) -> None:
+    """List the channels of each kind of measurement."""
     counts = rows.counts
     for kind in range(4):
         counts[kind] = 0
-    known = True
     for k in range(epochs.has.shape[2]):
         if epochs.has[0, t, k]:
-            known = known and memory.offset_known[epochs.offset[k]]
             rows.codes[counts[0]] = k
             counts[0] += 1
         if epochs.has[1, t, k]:
@@ -113,18 +161,18 @@ def _choose_rows(epochs: Epochs, t: int, numbers: Numbers, memory: Memory, rows:
         if epochs.has[2, t, k]:
             rows.dopplers[counts[2]] = k
             counts[2] += 1
-    return known and not (counts[0] > 0 and epochs.time_s[t] - memory.scalars[MEASURED] > numbers.gap_s)
 
 
 @borrowing
-def _choose_sensors(epochs: Epochs, t: int, numbers: Numbers, memory: Memory, rows: Rows, work: Work) -> None:
-    """List the sensors that have measured; a wheel without a sign needs a direction."""
+def _choose_sensors(epochs: Epochs, t: int, memory: Memory, rows: Rows, work: Work) -> None:
+    """List the sensors that have measured; a wheel without a sign needs a direction, a range to a unit a speed."""
     count = int(memory.scalars[HYPOTHESES])
-    for kind in range(SENSORS):
+    for kind in range(epochs.sensor.shape[1]):
         known = math.isfinite(epochs.sensor[t, kind])
+        known = known and (kind < RANGE_ROW or abs(work.mean[0, SPEED]) >= STILL_MPS)
         if kind == WHEEL_ROW and epochs.unsigned and memory.scalars[DIRECTION] == 0.0:
             for h in range(count):
-                known = known and abs(work.mean[h, SPEED]) > numbers.direction_mps
+                known = known and abs(work.mean[h, SPEED]) > DIRECTION_MPS
         if known:
             rows.sensors[rows.counts[3]] = kind
             rows.counts[3] += 1
@@ -156,11 +204,21 @@ def _take(mean: Floats, covariance: Floats, to: int, new_mean: Floats, new_covar
 
 
 @borrowing
+def _predict_all(
+    epochs: Epochs, t: int, course: Course, parameters: Parameters, active: Active, memory: Memory, work: Work
+) -> None:
+    """Predict all hypotheses."""
+    scale = memory.scalars[MAP_SCALE]
+    for h in range(int(memory.scalars[HYPOTHESES])):
+        predict(epochs, t, course, parameters, active, memory.mean, memory.covariance, h, scale, 0.0, work, h)
+
+
+@borrowing
 def _coast(
     epochs: Epochs,
     t: int,
     course: Course,
-    numbers: Numbers,
+    parameters: Parameters,
     active: Active,
     memory: Memory,
     bank: Subfilters,
@@ -173,9 +231,50 @@ def _coast(
     for b in range(len(bank.running)):
         if bank.running[b]:
             scale = memory.scalars[MAP_SCALE]
-            wrong_m = numbers.level_map_m if b == len(bank.running) - 1 else 0.0
-            predict(epochs, t, course, numbers, active, bank.mean, bank.covariance, b, scale, wrong_m, work, h)
+            wrong_m = parameters.level_map_m if b == len(bank.running) - 1 else 0.0
+            predict(epochs, t, course, parameters, active, bank.mean, bank.covariance, b, scale, wrong_m, work, h)
             _take(bank.mean, bank.covariance, b, work.mean, work.spread, h)
+
+
+@borrowing
+def _measure(
+    epochs: Epochs,
+    t: int,
+    course: Course,
+    parameters: Parameters,
+    active: Active,
+    memory: Memory,
+    bank: Subfilters,
+    answers: Answers,
+    rows: Rows,
+    work: Work,
+    shift: float,
+    map_log_scale: float,
+    code_s: float,
+) -> int:
+    """Take over what an epoch's measurements have given, and learn from it; return the hypothesis to go by."""
+    scalars, dt, count = memory.scalars, epochs.interval_s[t], int(memory.scalars[HYPOTHESES])
+    for h in range(count):
+        _take(memory.mean, memory.covariance, h, work.new_mean, work.new_covariance, h)
+    scalars[MEASURED] = epochs.time_s[t]
+    if rows.counts[0] > 0:
+        scalars[CODED] = epochs.time_s[t]
+    for i in range(rows.counts[0]):
+        memory.offset_known[epochs.offset[rows.codes[i]]] = True
+    best = most_probable(memory.log_probability, count, SWITCH)
+    found = learn(epochs, parameters, memory, rows, work, t, best, shift, dt, code_s)
+    write_rows(answers, rows, work, t, best, 1.0)
+    if len(bank.running):
+        room = len(work.now) - 1
+        advance_subfilters(epochs, t, course, parameters, active, bank, rows, best, map_log_scale, work, room)
+    if found and abs(shift) < FREED_SIGMAS:
+        for h in range(count):
+            memory.covariance[h, PLACE, PLACE] += FREED_M**2
+        for b in range(len(bank.running)):
+            bank.covariance[b, PLACE, PLACE] += FREED_M**2
+    square = contradiction(epochs, t, course, memory, work, best)
+    watch(parameters, memory, bank, square, 0.0 if best else shift, work.pushed[best], dt, code_s)
+    return best
 
 
 @borrowing
@@ -193,26 +292,69 @@ def _write_variances(epochs: Epochs, t: int, memory: Memory, rows: Rows, varianc
 
 
 @borrowing
-def _start_clocks(numbers: Numbers, rows: Rows, work: Work, h: int) -> None:
+def _start_code_clocks(epochs: Epochs, active: Active, memory: Memory, rows: Rows, work: Work, h: int) -> None:
+    """Take the median innovation of the codes into their clock, and those of new constellations into their offsets.
+
+    At the first epoch the first constellation is that of the clock.
+    """
+    mean, value, ordered, known = work.mean, work.value, work.ordered, memory.offset_known
+    n, nc, first, some = mean.shape[1] - OF_EPOCH, rows.counts[0], epochs.offset[rows.codes[0]], False
+    for g in range(len(known)):
+        some = some or known[g]
+    if not some:
+        unknown = active.offset[first]
+        work.spread[h, unknown, unknown] = FIRST_OFFSET_M2
+        work.anew[h, 2] = True
+    size = 0
+    for i in range(nc):
+        if known[epochs.offset[rows.codes[i]]]:
+            insert(ordered, size, value[h, i])
+            size += 1
+    begun = size == 0
+    for i in range(nc):
+        if begun and epochs.offset[rows.codes[i]] == first:
+            insert(ordered, size, value[h, i])
+            size += 1
+    clock = middle(ordered, size)
+    mean[h, n + CODE_CLOCK] += clock
+    for g in range(len(known)):
+        own = clock
+        if not known[g] and not (begun and g == first):
+            size = 0
+            for i in range(nc):
+                if epochs.offset[rows.codes[i]] == g:
+                    insert(ordered, size, value[h, i])
+                    size += 1
+            if size > 0:
+                own = middle(ordered, size)
+                mean[h, active.offset[g]] += own - clock
+        for i in range(nc):
+            if epochs.offset[rows.codes[i]] == g:
+                value[h, i] -= own
+
+
+@borrowing
+def _start_clocks(epochs: Epochs, active: Active, memory: Memory, rows: Rows, work: Work, h: int) -> None:
     """Take the median of each kind of innovation into its clock; clocks that have stepped begin anew."""
     mean, spread, value = work.mean, work.spread, work.value
     n = mean.shape[1] - OF_EPOCH
-    work.anew[h, 0] = work.anew[h, 1] = False
-    begin = 0
-    for kind in range(3):
+    work.anew[h, 0] = work.anew[h, 1] = work.anew[h, 2] = False
+    if rows.counts[0] > 0:
+        _start_code_clocks(epochs, active, memory, rows, work, h)
+    begin = rows.counts[0]
+    for kind in range(1, 3):
         end = begin + rows.counts[kind]
         if end > begin:
-            middle = median(value, h, begin, end - begin, work.ordered)
-            unknown = n + CODE_CLOCK if kind == 0 else (n + PHASE_CLOCK if kind == 1 else DRIFT)
+            away = median(value, h, begin, end - begin, work.ordered)
+            unknown = n + PHASE_CLOCK if kind == 1 else DRIFT
             own_variance = spread[h, unknown, unknown]
-            stepped = own_variance > numbers.unknown_clock**2
-            stepped = stepped or abs(middle) > numbers.stepped * math.sqrt(own_variance + 0.25)
-            if kind == 0 or stepped:
-                mean[h, unknown] += middle
+            stepped = own_variance > UNKNOWN_CLOCK**2
+            stepped = stepped or abs(away) > STEPPED * math.sqrt(own_variance + 0.25)
+            if stepped:
+                mean[h, unknown] += away
                 for i in range(begin, end):
-                    value[h, i] -= middle
-            if kind > 0 and stepped:
-                restart(spread, unknown, numbers.unknown_clock**2, h)
+                    value[h, i] -= away
+                restart(spread, unknown, UNKNOWN_CLOCK**2, h)
                 work.anew[h, kind - 1] = True
         begin = end
 
@@ -222,7 +364,7 @@ def _update(
     epochs: Epochs,
     t: int,
     course: Course,
-    numbers: Numbers,
+    parameters: Parameters,
     active: Active,
     memory: Memory,
     rows: Rows,
@@ -234,40 +376,40 @@ def _update(
     count, nc = int(memory.scalars[HYPOTHESES]), rows.counts[0]
     gnss = nc + rows.counts[1] + rows.counts[2]
     size = nc + COMBINED + rows.counts[3]
-    going = most_probable(memory.log_probability, count, numbers.switch)
+    going = most_probable(memory.log_probability, count, SWITCH)
     shift, doubtful = 0.0, False
-    for turn in range(1 + numbers.relinearised):
+    for turn in range(1 + RELINEARISED):
         furthest = 0.0
         for h in range(count):
             work.now[h] = new_mean[h, PLACE] if turn else mean[h, PLACE]
             work.before[h] = new_mean[h, n] if turn else mean[h, n + OLD_PLACE]
-            write_equations(epochs, t, course, active, numbers, rows, memory.scalars[DIRECTION], work, h)
+            write_equations(epochs, t, course, active, rows, memory.scalars[DIRECTION], work, h)
             if turn == 0:
-                add_bend(numbers, work, h)
-                _start_clocks(numbers, rows, work, h)
+                add_bend(parameters, work, h)
+                _start_clocks(epochs, active, memory, rows, work, h)
                 for i in range(gnss + rows.counts[3]):
                     work.innovation[h, i] = work.value[h, i]
-            combine(epochs, t, active, numbers.sensor_floor, rows, work, h)
+            combine(epochs, t, active, rows, work, h)
             work.log_before[h] = invert(work.own, h, size, work.factor, work.lower, work.information, h)
             if turn == 0:
-                first_weights(rows, work.variance, numbers.degrees, 0.0, 0.0, work, h, h)
-                if h == going and nc >= numbers.misfit_codes:
-                    shift = code_shift(rows, numbers.misfit_most, work, h)
-            work.log_after[h] = reweight(rows, work.variance, numbers.degrees, numbers.passes, work, h, h, h)
+                first_weights(rows, work.variance, parameters.degrees, 0.0, 0.0, work, h, h)
+                if h == going:
+                    shift = code_shift(rows, work, h)
+            work.log_after[h] = reweight(rows, work.variance, parameters.degrees, parameters.passes, work, h, h, h)
             if turn == 0:
                 code, motion = mean_weights(rows, work.variance, work, h)
-                doubtful = doubtful or code < numbers.doubtful or motion < numbers.doubtful
+                doubtful = doubtful or code < WEAK_FIT or motion < WEAK_FIT
         for h in range(count):
             if turn == 0 and doubtful:
-                second_start(numbers, rows, work, h, room)
+                second_start(parameters, rows, work, h, room)
             apply_update(rows, work, h)
             furthest = max(furthest, abs(new_mean[h, PLACE] - work.now[h]))
-        if furthest < numbers.moved_m:
+        if furthest < MOVED_M:
             break
     if count > 1:
-        reweigh(course, numbers, rows, memory, work, count, epochs.interval_s[t])
+        reweigh(course, parameters, rows, memory, work, count, epochs.interval_s[t])
     for h in range(count):
-        work.pushed[h] = onto_line(course, numbers.start_sigma_m, work, h)
+        work.pushed[h] = onto_line(course, parameters.start_sigma_m, work, h)
     return shift
 
 
@@ -277,9 +419,10 @@ def _finish(
     best: int,
     aided: bool,
     measured: bool,
+    lost: bool,
     dt: float,
     course: Course,
-    numbers: Numbers,
+    parameters: Parameters,
     active: Active,
     memory: Memory,
     bank: Subfilters,
@@ -290,25 +433,25 @@ def _finish(
     scalars = memory.scalars
     count = int(scalars[HYPOTHESES])
     speed = memory.mean[best, SPEED]
-    if abs(speed) > numbers.direction_mps:
+    if abs(speed) > DIRECTION_MPS:
         scalars[DIRECTION] = math.copysign(1.0, speed)
     scalars[UNAIDED] = 0.0 if aided else scalars[UNAIDED] + abs(speed) * dt
     scalars[BRANCH_S] += dt
     scalars[BRANCH_M] += abs(speed) * dt
     for h in range(count):
-        memory.log_least[h] = min(memory.log_least[h] + numbers.least_rise * dt, memory.log_probability[h])
+        memory.log_least[h] = min(memory.log_least[h] + LEAST_RISE * dt, memory.log_probability[h])
     if count > 1:
-        count = keep_hypotheses(memory, numbers, work, count)
+        count = keep_hypotheses(memory, parameters, work, count)
         scalars[HYPOTHESES] = count
-    if scalars[BRANCH_S] > numbers.takeover_after_s and memory.log_least[0] < numbers.takeover:
-        scalars[ACROSS] = numbers.across_taken
+    if scalars[BRANCH_S] > TAKEOVER_AFTER_S and memory.log_least[0] < TAKEOVER:
+        scalars[ACROSS] = ACROSS_TAKEN
     probability = math.exp(memory.log_probability[0])
     sigma = math.sqrt(memory.covariance[0, PLACE, PLACE])
     answers.hypotheses[t], answers.probability[t] = count, probability
-    if sigma > numbers.expired_sigma_m:
-        answers.status[t] = numbers.expired
+    if not sigma <= parameters.expired_sigma_m:
+        answers.status[t] = EXPIRED
         return
-    far = write_branches(memory, course, numbers, work, count)
+    far = write_branches(memory, course, parameters, work, count)
     spread = sigma * sigma
     for h in range(1, count):
         own = work.branch[h, 1] ** 2 + work.branch[h, 2] ** 2
@@ -324,28 +467,30 @@ def _finish(
     if active.radar >= 0:
         answers.radar_scale[t] = memory.mean[0, active.radar]
     answers.map_scale[t] = math.exp(0.5 * scalars[MAP_SCALE])
-    scalars[OPEN] = numbers.level_hold_s if far > numbers.level_risk else max(scalars[OPEN] - dt, 0.0)
+    scalars[OPEN] = parameters.level_hold_s if far > parameters.level_risk else max(scalars[OPEN] - dt, 0.0)
     if len(bank.running):
-        write_level(memory, count, far, bank, numbers, work, answers, t)
+        write_level(memory, count, far, bank, parameters, work, answers, t)
         if scalars[WITHHELD] > 0.0:
             answers.ground_level_m[t] = math.inf
         if scalars[WITHHELD] > 0.0 or scalars[OPEN] > 0.0:
             answers.level_m[t] = math.inf
-        answers.amount_m[t] = max(answers.level_m[t], numbers.scale_bound * scalars[UNAIDED])
-        answers.level_speed_mps[t] = speed_bound(memory.mean[0, SPEED], answers.speed_sigma_mps[t], bank, numbers)
-    if scalars[OPEN] > 0.0:
-        answers.status[t] = numbers.several
+        answers.amount_m[t] = max(answers.level_m[t], SCALE_BOUND * scalars[UNAIDED])
+        answers.level_speed_mps[t] = speed_bound(memory.mean[0, SPEED], answers.speed_sigma_mps[t], bank, parameters)
+    if lost:
+        answers.status[t] = LOST
+    elif scalars[OPEN] > 0.0:
+        answers.status[t] = SEVERAL_BRANCHES
     elif scalars[WITHHELD] > 0.0:
-        answers.status[t] = numbers.unsure
+        answers.status[t] = DOUBTFUL
     else:
-        answers.status[t] = numbers.tracking if measured else numbers.coasting
+        answers.status[t] = TRACKING if measured else COASTING
 
 
 @kernel
 def advance(
     epochs: Epochs,
     course: Course,
-    numbers: Numbers,
+    parameters: Parameters,
     active: Active,
     memory: Memory,
     bank: Subfilters,
@@ -354,50 +499,48 @@ def advance(
     work: Work,
     first: int,
     last: int,
+    part: int,
 ) -> int:
-    """Do epochs from `first` on; return the first that is left to numpy, or `last`."""
-    scalars, room = memory.scalars, len(memory.log_probability)
+    """Do epochs from `first` on; return the first before which places have to be sought, or `last`.
+
+    `part` says what of an epoch is done: `layout.WHOLE`, or of the first alone the `PREDICTION`, or the `REST`.
+    """
+    scalars, room = memory.scalars, len(work.now) - 1
     for t in range(first, last):
-        if _left_to_numpy(epochs, t, course, numbers, memory):
-            return t
-        code_s = _code_interval_s(epochs, t, numbers, memory, answers)
-        if not _choose_rows(epochs, t, numbers, memory, rows):
-            return t
-        count, dt, map_scale = int(scalars[HYPOTHESES]), epochs.interval_s[t], scalars[MAP_SCALE]
-        _forget(epochs, t, active, memory, bank)
-        for h in range(count):
-            predict(epochs, t, course, numbers, active, memory.mean, memory.covariance, h, map_scale, 0.0, work, h)
-        _choose_sensors(epochs, t, numbers, memory, rows, work)
+        if part < REST:
+            if epochs.begins[t] or (part == WHOLE and _needs_search(epochs, t, parameters, memory)):
+                return t
+            _forget(epochs, t, active, memory, bank)
+            _go_round(course, memory, bank)
+            _predict_all(epochs, t, course, parameters, active, memory, work)
+            if part == PREDICTION:
+                return t
+        code_s = _code_interval_s(epochs, t, parameters, memory, answers)
+        _choose_rows(epochs, t, rows)
+        _choose_sensors(epochs, t, memory, rows, work)
         measured = rows.counts[0] + rows.counts[1] + rows.counts[2] + rows.counts[3] > 0
-        shift = 0.0
+        dt, map_scale, shift = epochs.interval_s[t], scalars[MAP_SCALE], 0.0
         if measured:
             _write_variances(epochs, t, memory, rows, work.variance)
-            shift = _update(epochs, t, course, numbers, active, memory, rows, work)
-        if not possible(numbers, memory, rows, work, dt, measured):
-            return t
+            shift = _update(epochs, t, course, parameters, active, memory, rows, work)
+        if not possible(parameters, memory, rows, work, dt, measured):
+            # What no train can do is not believed: the prediction goes on, made anew as the clocks in it were moved.
+            measured = False
+            scalars[WEAK_MOTION] += dt
+            write_rows(answers, rows, work, t, 0, 0.0)
+            if part == WHOLE:
+                _predict_all(epochs, t, course, parameters, active, memory, work)
         if measured:
-            for h in range(count):
-                _take(memory.mean, memory.covariance, h, work.new_mean, work.new_covariance, h)
-            scalars[MEASURED] = epochs.time_s[t]
-            if rows.counts[0] > 0:
-                scalars[CODED] = epochs.time_s[t]
+            best = _measure(
+                epochs, t, course, parameters, active, memory, bank, answers, rows, work, shift, map_scale, code_s
+            )
         else:
-            _coast(epochs, t, course, numbers, active, memory, bank, work, room)
-        best = most_probable(memory.log_probability, count, numbers.switch)
-        if measured:
-            found = learn(epochs, numbers, memory, answers, rows, work, t, best, shift, dt, code_s)
-            if len(bank.running):
-                advance_subfilters(epochs, t, course, numbers, active, bank, rows, best, map_scale, work, room)
-            if found and abs(shift) < numbers.freed_sigmas:
-                for h in range(count):
-                    memory.covariance[h, PLACE, PLACE] += numbers.freed_m**2
-                for b in range(len(bank.running)):
-                    bank.covariance[b, PLACE, PLACE] += numbers.freed_m**2
-        aided = rows.counts[0] > 0
-        if measured:
-            square = contradiction(epochs, t, course, numbers, memory, work, best)
-            watch(numbers, memory, bank, square, 0.0 if best else shift, work.pushed[best], dt, code_s)
-        else:
+            _coast(epochs, t, course, parameters, active, memory, bank, work, room)
+            best = most_probable(memory.log_probability, int(scalars[HYPOTHESES]), SWITCH)
             scalars[WITHHELD] = max(scalars[WITHHELD] - dt, 0.0)
-        _finish(t, best, aided, measured, dt, course, numbers, active, memory, bank, answers, work)
+        aided = measured and rows.counts[0] > 0
+        lost = part == REST_LOST
+        _finish(t, best, aided, measured, lost, dt, course, parameters, active, memory, bank, answers, work)
+        if not math.isfinite(memory.mean[0, PLACE]):
+            return t + 1
     return last

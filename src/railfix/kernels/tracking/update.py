@@ -1,4 +1,4 @@
-"""Robust update by the measurements of an epoch (`railfix.tracking.robust`)."""
+"""Update of Gaussians by measurements with Student's t errors: iterated reweighting of one epoch."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ import math
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.algebra import factorise, invert, invert_factor, median, multiply, square
-from railfix.kernels.tracking.layout import C_RIGHT, C_SPEED, C_WAY, COMBINED, Numbers, Rows, Work
+from railfix.kernels.tracking.constants import (
+    FREEDOM_PLACE_M2,
+    FREEDOM_SPEED_M2PS2,
+)
+from railfix.kernels.tracking.layout import C_RIGHT, C_SPEED, C_WAY, COMBINED, Parameters, Rows, Work
 
 
 @borrowing
 def weight_of(square: float, late: bool, degrees: tuple[float, float]) -> float:
-    """Weight of a measurement by its square over its variance: `railfix.tracking.robust.Tails`."""
+    """Weight of a measurement by its square over its variance: `railfix.tracking.student_t.Tails`."""
     own = degrees[1] if late else degrees[0]
     return (degrees[0] + 1.0) / degrees[0] * own / (own + square)
 
@@ -28,7 +32,11 @@ def first_weights(
     h: int,
     to: int,
 ) -> None:
-    """Weights from innovations, without what clocks take up."""
+    """Weights from innovations, what a clock common to a kind takes up left out as their median.
+
+    The clocks begin at every epoch nearly unknown: with their prior in it, the variance of an innovation would
+    hide every outlier.
+    """
     design, value, root, own, weight = work.design, work.value, work.root, work.own, work.weight
     counts, sensed, part = rows.counts, work.sensed, work.part
     nc, gnss = counts[0], counts[0] + counts[1] + counts[2]
@@ -175,14 +183,14 @@ def evidence_of(
 
 
 @borrowing
-def motion_evidence(rows: Rows, numbers: Numbers, work: Work, h: int, other: int) -> float:
-    """Logarithm of the evidence of all measurements but the codes (`railfix.tracking.robust.motion_evidence`)."""
+def motion_evidence(rows: Rows, parameters: Parameters, work: Work, h: int, other: int) -> float:
+    """Logarithm of the evidence of all measurements but the codes."""
     nc, count = rows.counts[0], rows.counts[0] + rows.counts[1] + rows.counts[2] + rows.counts[3]
     for i in range(count):
         work.masked[i] = math.inf if i < nc else work.variance[i]
         work.weight[other, i] = work.weight[h, i]
-    log_after = reweight(rows, work.masked, numbers.degrees, numbers.passes, work, h, h, other)
-    return evidence_of(rows, work.masked, numbers.degrees, log_after, work, h, other)
+    log_after = reweight(rows, work.masked, parameters.degrees, parameters.passes, work, h, h, other)
+    return evidence_of(rows, work.masked, parameters.degrees, log_after, work, h, other)
 
 
 @borrowing
@@ -202,7 +210,7 @@ def mean_weights(rows: Rows, variance: Floats, work: Work, h: int) -> tuple[floa
 
 
 @borrowing
-def second_start(numbers: Numbers, rows: Rows, work: Work, h: int, other: int) -> None:
+def second_start(parameters: Parameters, rows: Rows, work: Work, h: int, other: int) -> None:
     """Fit again with weights from innovations with place and speed set free, in row `other`; keep the better fit."""
     own, root, sensed, share = work.own, work.root, work.sensed, work.right
     nc, ns = rows.counts[0], rows.counts[3]
@@ -220,17 +228,17 @@ def second_start(numbers: Numbers, rows: Rows, work: Work, h: int, other: int) -
             elif i == (nc + C_WAY if kind == 0 else nc + C_SPEED):
                 coefficient = 1.0
             share[i] = coefficient / root[h, i]
-        freedom = numbers.freedom_place if kind == 0 else numbers.freedom_speed
+        freedom = FREEDOM_PLACE_M2 if kind == 0 else FREEDOM_SPEED_M2PS2
         for i in range(size):
             for j in range(i, size):
                 own[other, i, j] += freedom * share[i] * share[j]
     invert(own, other, size, work.factor, work.lower, work.information, other)
-    first_weights(rows, work.variance, numbers.degrees, numbers.freedom_place, numbers.freedom_speed, work, h, other)
+    first_weights(rows, work.variance, parameters.degrees, FREEDOM_PLACE_M2, FREEDOM_SPEED_M2PS2, work, h, other)
     log_after = 0.0
     for by in (other, h):
-        log_after = reweight(rows, work.variance, numbers.degrees, numbers.passes, work, h, by, other)
-    first = evidence_of(rows, work.variance, numbers.degrees, work.log_after[h], work, h, h)
-    if evidence_of(rows, work.variance, numbers.degrees, log_after, work, h, other) > first:
+        log_after = reweight(rows, work.variance, parameters.degrees, parameters.passes, work, h, by, other)
+    first = evidence_of(rows, work.variance, parameters.degrees, work.log_after[h], work, h, h)
+    if evidence_of(rows, work.variance, parameters.degrees, log_after, work, h, other) > first:
         work.log_after[h] = log_after
         for i in range(size):
             work.change[h, i] = work.change[other, i]

@@ -1,0 +1,165 @@
+"""Constants of the filter along the track that nobody tunes, each with its reason.
+
+`railfix.tracking.limits` has what a user may set. The compiler takes the values as they
+stand here.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+# Statuses (`railfix.tracking.TrackStatus`).
+TRACKING: Final = 0
+SEVERAL_BRANCHES: Final = 1
+COASTING: Final = 2
+LOST: Final = 3
+EXPIRED: Final = 4
+NOT_STARTED: Final = 5
+OFF_MAP: Final = 6
+MAP_OFFSET: Final = 7
+ANTENNAS_DISAGREE: Final = 8
+DOUBTFUL: Final = 9
+
+# Prediction.
+#: Standard deviation of the clock of the codes about the median of an epoch [m].
+CODE_CLOCK_SIGMA_M: Final = 1e3
+#: Random walks of the sensors' scales and offset in the square root of a second. A wheel of a car wandered over 2 %
+#: within half a minute at bends; an accelerometer's offset follows its temperature.
+WHEEL_WALK: Final = 5e-4
+FORCE_WALK_MPS2: Final = 1e-3
+RADAR_WALK: Final = 2e-4
+#: Least variance of a step of the place [m2], keeps matrices regular.
+LEAST_STEP_M2: Final = 1e-6
+
+# Equations.
+#: Slower than this ranges to ground units are not used [m/s]: the error of a standing range stays (P2 3.3).
+STILL_MPS: Final = 0.3
+#: Slower than this a speed does not tell the direction [m/s]: four sigmas of what a wheel of one hertz leaves of it.
+DIRECTION_MPS: Final = 1.0
+#: Shorter than this the tangent is the direction of a displacement [m].
+CHORD_M: Final = 0.5
+#: Shares of a sensor's variance, and of that of what it measures, that no weight takes away: two sensors of the same
+#: combination, or a wheel and phases before the speed is known, keep it regular.
+SENSOR_FLOOR: Final = 1e-6
+UNKNOWN_FLOOR: Final = 1e-10
+
+# Clocks.
+#: A clock whose median innovation is beyond this many standard deviations has stepped.
+STEPPED: Final = 5.0
+#: Standard deviation of the clock of phases and its drift after a step [m, m/s].
+UNKNOWN_CLOCK: Final = 100.0
+#: Variance of the offset of the first constellation from the clock of the codes [m2].
+FIRST_OFFSET_M2: Final = 1e-4
+
+# Reweighting.
+#: Mean weight of codes, or of phases and Dopplers, under which another start of the reweighting is tried.
+WEAK_FIT: Final = 0.7
+#: Variances of place and speed added for that start [m2, m2/s2].
+FREEDOM_PLACE_M2: Final = 30.0**2
+FREEDOM_SPEED_M2PS2: Final = 10.0**2
+#: The equations are made again when a place has moved by more than this [m]: 26 000 km away a range bends by 2 cm
+#: over 1 km, the line by 1 m over 20 m in its sharpest curves.
+MOVED_M: Final = 2.0
+RELINEARISED: Final = 4
+
+# What is learnt of noise.
+#: Time over which the scales of Dopplers and phases are learnt [s].
+SCALE_S: Final = 60.0
+#: Logarithms that the scales of their variances stay within.
+LEAST_SCALE: Final = -1.5
+LARGEST_SCALE: Final = 3.0
+#: Shares of an interval by which the counters of doubt in motion and in codes fall at an epoch without doubt: weights
+#: that alternate about the limit are a contradiction as well.
+MOTION_LEAK: Final = 0.5
+CODE_LEAK: Final = 1.0
+
+# Satellites whose codes are wrong for long.
+#: Time constant of the mean innovation [s], what one innovation counts at most, and the mean from which on codes are
+#: left out.
+BIAS_MEMORY_S: Final = 60.0
+BIAS_MOST: Final = 1.0
+BIAS_FAULTY: Final = 0.35
+#: Factor on the variance of codes that are left out: their innovations go on telling when the fault ends.
+BIAS_INFLATED: Final = 1e6
+#: Standard deviation added to the place when a satellite is left out from here on: its codes have led it so far [m].
+FREED_M: Final = 15.0
+#: Not where all codes ask for another place by more standard deviations: they may have stepped together.
+FREED_SIGMAS: Final = 3.0
+
+# Lengths of the map.
+#: Fewer codes of an epoch do not tell a shift from clocks.
+MISFIT_CODES: Final = 4
+#: A single epoch counts with at most so many standard deviations; beyond `STEP_SIGMAS` it is a step of all codes and
+#: tells nothing of the map.
+MISFIT_CLIPPED: Final = 3.0
+MISFIT_MOST: Final = 20.0
+#: Time constant of learning [s], and the largest logarithm: beyond 1.6 m in the square root of a metre nothing changes.
+MISFIT_LEARNT_S: Final = 5.0
+MISFIT_LARGEST: Final = 8.0
+
+# Speeds.
+#: A measured speed is known to so many standard deviations.
+SPEED_SIGMAS: Final = 4.0
+
+# Branches.
+#: How much more probable another place must be to be gone by: near-equal ones would take turns.
+SWITCH: Final = 3.0
+#: Logarithm of the odds that a difference of one `map_branch_m` can give: 1 / (2 s^2) with s^2 = 2 (1/3)^2.
+MOST_ODDS: Final = 2.25
+#: Largest logarithm of the odds that motion gives in a second: more is a reflection.
+MOST_MOTION: Final = 5.0
+#: A hypothesis that leads although its probability was below this within the last seconds (its least logarithm rises
+#: by `LEAST_RISE` a second) has taken over from others that all failed: places are sought again. Not within the first
+#: seconds, when all are young.
+TAKEOVER: Final = -6.0
+LEAST_RISE: Final = 0.3
+TAKEOVER_AFTER_S: Final = 15.0
+#: Satellites with a phase or a Doppler, or codes, that an epoch's evidence needs: fewer fit any speed and place.
+MOTION_SATELLITES: Final = 4
+#: Distance that is worth one of the logarithm of the odds by motion [m]: a map does not tell tangents at rest.
+MOTION_M: Final = 3.0
+#: Places beside are tried once motion has been contradicted for so long [s]: shorter it is a reflection, at any rate.
+BESIDE_AFTER_S: Final = 0.9
+
+# Monitors of the place.
+#: The velocity is compared with the line at the place and so many of its standard deviations, or metres, beside it.
+REACH_SIGMAS: Final = 2.0
+REACH_M: Final = 3.0
+#: Errors of the velocity beside its covariance [m/s], and of the line's direction as a share of the speed.
+VELOCITY_FLOOR_MPS: Final = 0.15
+DIRECTION_SHARE: Final = 0.03
+#: A squared contradiction counts up to this, less this a second (cumulative sum, E. S. Page, 1954).
+LARGEST_SQUARE: Final = 12.0
+ALLOWED_SQUARE: Final = 4.0
+#: Sums from which on the level is withheld, and the track is lost.
+ACROSS_DOUBT: Final = 12.0
+ACROSS_LOST: Final = 30.0
+#: The sum after a takeover: more than a velocity across the line gives.
+ACROSS_TAKEN: Final = 60.0
+#: Mean of the places that codes ask for, over its standard deviation, and logarithm of the variance of lengths of the
+#: map, 6 times their error: beyond them codes contradict motion, by a step of all codes, a pull, or a wrong map.
+DRIFT_SIGMAS: Final = 5.0
+DRIFT_LOG: Final = 2.0 * math.log(6.0)
+#: A displacement of the map across, by the sub-filter that lets it be wrong, is real beyond so many of its standard
+#: deviations and metres.
+BESIDE_SIGMAS: Final = 4.5
+BESIDE_M: Final = 8.0
+#: Young hypotheses bound nothing before one of them is this probable: the right place may not be among them yet.
+YOUNG: Final = 0.99
+YOUNG_HELD_S: Final = 1.0
+#: Codes that ask for another place by more than so many standard deviations for so long [s] have stepped together.
+STEP_SIGMAS: Final = 6.0
+STEP_S: Final = 3.0
+#: The level is withheld for so long after a step of all codes [s]: the place after it is the codes' own.
+STEP_HELD_S: Final = 300.0
+
+# Levels.
+#: Share of a way that a source without codes may be wrong by: a worn or wrongly entered wheel.
+SCALE_BOUND: Final = 0.02
+#: A source that is not measured needs no sub-filter once it has left the filter: place and standard deviation differ
+#: by less than this share of the standard deviation.
+JOINED: Final = 0.05
+#: Newton's steps for the level end when one is smaller than this [m].
+PRECISION_M: Final = 1e-7
+ROUNDS: Final = 60

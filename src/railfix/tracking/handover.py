@@ -1,0 +1,307 @@
+"""State of the filter as the compiled recursion takes it: the unknowns in use, and work space."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.timescale import seconds, timedelta
+from railfix.kernels.tracking import layout
+from railfix.kernels.tracking.constants import FORCE_WALK_MPS2, RADAR_WALK, WHEEL_WALK
+from railfix.tracking import bank
+from railfix.tracking.branches import begin
+from railfix.tracking.chunk import Chunk
+from railfix.tracking.limits import TrackingLimits
+from railfix.tracking.line import Line
+from railfix.tracking.smoother import Updated
+from railfix.tracking.state import CLOCKS, OFFSETS, SATELLITES, Bank, TrackState, Unknown
+
+if TYPE_CHECKING:
+    from railfix.tracking.recursion import Recursion
+
+#: Unknowns that are always in use, in the order of the kernel.
+_ALWAYS: Final = np.array([
+    Unknown.PLACE, Unknown.SPEED, Unknown.ACCELERATION, Unknown.DRIFT, Unknown.MAP_RIGHT, Unknown.MAP_UP,
+    Unknown.DOPPLER_SPEED, Unknown.CODE_PLACE,
+])  # fmt: skip
+#: Unknowns of sensors, as the kernel names them, the columns of measurements that need them, and their random walks.
+_SENSORS: Final = (
+    (Unknown.WHEEL, layout.WHEEL_ROW, WHEEL_WALK),
+    (Unknown.FORCE_OFFSET, layout.FORCE_ROW, FORCE_WALK_MPS2),
+    (Unknown.RADAR, layout.RADAR_ROW, RADAR_WALK),
+)
+_OF_SENSORS: Final = np.isin(np.arange(OFFSETS), [unknown for unknown, _, _ in _SENSORS])
+#: Unknowns of an epoch, as the kernel orders them after those in use.
+_OF_EPOCH: Final = np.array([
+    Unknown.BEFORE, Unknown.SPEED_BEFORE, Unknown.PHASE_CLOCK, Unknown.STEP_RIGHT, Unknown.STEP_UP, Unknown.STEP_ALONG,
+    Unknown.CODE_CLOCK,
+])  # fmt: skip
+
+
+class Handover:
+    """State of the filter as the kernel takes it at some epochs, with its work space.
+
+    Parameters
+    ----------
+    recursion : Recursion
+    state : TrackState
+    first, last : int
+        Epochs that it is for.
+    every : bool
+        Whether all unknowns are handed over, not only those in use.
+    predicted : bool
+        Whether the state is that before the measurements of `first`.
+    """
+
+    def __init__(
+        self,
+        recursion: Recursion,
+        state: TrackState,
+        first: int,
+        last: int,
+        *,
+        every: bool = False,
+        predicted: bool = False,
+    ) -> None:
+        self.recursion, self.first, self.last, self.predicted = recursion, first, last, predicted
+        chunk, limits = recursion.chunk, recursion.limits
+        in_use = _in_use(state, chunk, recursion.sensed, first, last)
+        in_use[:] |= every
+        in_use[:OFFSETS] &= _OF_SENSORS
+        self.full = np.concatenate([_ALWAYS, np.flatnonzero(in_use)]).astype(np.intp)
+        self.both = np.concatenate([self.full, _OF_EPOCH])
+        full, place = self.full, np.full(state.mean.shape[1], -1, dtype=np.intp)
+        place[full] = np.arange(len(full))
+        self.active = layout.Active(
+            full=full,
+            wheel=int(place[Unknown.WHEEL]),
+            force=int(place[Unknown.FORCE_OFFSET]),
+            radar=int(place[Unknown.RADAR]),
+            offset=place[OFFSETS:SATELLITES].copy(),
+            satellite=place[SATELLITES:].copy(),
+        )
+        origin = chunk.time[0]
+        scalars = np.array([
+            state.hypotheses, state.weak_motion_s, state.weak_code_s, *state.log_scale, state.unaided_m,
+            state.direction, seconds(state.measured - origin), *state.code_shift, state.map_log_scale,
+            *state.speed_range_mps, np.nan_to_num(seconds(state.coded - origin), nan=-np.inf), state.branch_s,
+            state.branch_m, state.across, state.step_s, state.withheld_s, state.open_s,
+        ])  # fmt: skip
+        self.memory = layout.Memory(
+            mean=row_major(state.mean[:, full]),
+            covariance=row_major(state.covariance[:, full[:, None], full]),
+            log_probability=row_major(state.log_probability),
+            log_code=row_major(state.log_code),
+            log_least=row_major(state.log_least),
+            code_bias=row_major(state.code_bias),
+            origin_m=row_major(state.origin_m),
+            offset_known=row_major(state.offset_known),
+            scalars=scalars,
+        )
+        self.names = _sources(state) if recursion.levels else []
+        self.subfilters = _subfilters(state, full, self.names, recursion.line, limits)
+        sensors = recursion.epochs.sensor.shape[1]
+        self.rows, self.work = _work_space(len(chunk.slot), sensors, len(full), state.hypotheses, len(self.names))
+        if predicted:
+            self.work.mean[: state.hypotheses] = state.mean[:, self.both]
+            self.work.spread[: state.hypotheses] = state.covariance[:, self.both[:, None], self.both]
+
+    def run(self, part: int) -> int:
+        """Run the kernel; return the first epoch that it has not done."""
+        given = self.recursion
+        return int(
+            given.kernel(
+                given.epochs, given.course, given.parameters, self.active, self.memory, self.subfilters,
+                given.answers, self.rows, self.work, self.first, self.last, part,
+            )
+        )  # fmt: skip
+
+    def take_back_prediction(self, state: TrackState, epoch: int) -> None:
+        """Put the prediction to an epoch into the state."""
+        count, elapsed = state.hypotheses, float(self.recursion.chunk.interval_s[epoch])
+        idle = self._idle(state, elapsed)
+        state.mean, state.covariance = _scattered(self.both, self.work.mean[:count], self.work.spread[:count], *idle)
+        state.code_bias, state.origin_m = self.memory.code_bias, self.memory.origin_m
+        self._take_back_bank(state, *idle)
+
+    def take_back(self, state: TrackState, first: int, done: int) -> None:
+        """Put what the kernel leaves into the state; unknowns that are not in use only walk."""
+        chunk, result, memory = self.recursion.chunk, self.recursion.result, self.memory
+        idle = self._idle(state, 0.0 if self.predicted else float(chunk.interval_s[first:done].sum()))
+        placed = slice(first, done)
+        known = np.isfinite(result.arc_m[placed])
+        for name, unknown in (
+            ("wheel_scale", Unknown.WHEEL),
+            ("force_offset_mps2", Unknown.FORCE_OFFSET),
+            ("radar_scale", Unknown.RADAR),
+        ):
+            if unknown not in self.full:
+                getattr(result, name)[placed][known] = idle[0][unknown]
+        count, *scalars = memory.scalars.tolist()
+        kept = slice(0, int(count))
+        state.mean, state.covariance = _scattered(self.full, memory.mean[kept], memory.covariance[kept], *idle)
+        self._take_back_bank(state, *idle)
+        state.log_probability = memory.log_probability[kept].copy()
+        state.log_code, state.log_least = memory.log_code[kept].copy(), memory.log_least[kept].copy()
+        state.origin_m = memory.origin_m[kept].copy()
+        state.code_bias, state.offset_known = memory.code_bias, memory.offset_known
+        state.time, origin = chunk.time[done - 1], chunk.time[0]
+        state.weak_motion_s, state.weak_code_s, doppler, phase, state.unaided_m, state.direction = scalars[:6]
+        state.log_scale, state.code_shift, state.map_log_scale = (doppler, phase), (scalars[7], scalars[8]), scalars[9]
+        state.measured = origin + timedelta(scalars[6])
+        state.speed_range_mps, state.coded = (scalars[10], scalars[11]), origin + timedelta(scalars[12])
+        state.branch_s, state.branch_m = scalars[13:15]
+        state.across, state.step_s, state.withheld_s, state.open_s = scalars[15:19]
+
+    def _take_back_bank(self, state: TrackState, mean: Floats, variance: Floats) -> None:
+        """Put the sub-filters that there are into the state."""
+        if not self.names:
+            return
+        running = np.flatnonzero(self.subfilters.running)
+        means, covariances = _scattered(
+            self.full, self.subfilters.mean[running], self.subfilters.covariance[running], mean, variance
+        )
+        state.bank = Bank(
+            without=tuple(self.names[k] for k in running),
+            mean=means,
+            covariance=covariances,
+            weak_s=self.subfilters.weak_s[running],
+        )
+
+    def _idle(self, state: TrackState, elapsed_s: float) -> tuple[Floats, Floats]:
+        """Mean and variance of unknowns that are not in use, after so many seconds of random walks."""
+        mean, variance = state.mean[0].copy(), np.diagonal(state.covariance[0]).copy()
+        for unknown, _, walk in _SENSORS:
+            variance[unknown] += walk**2 * elapsed_s
+        variance[OFFSETS:SATELLITES] += self.recursion.limits.offset_walk_m**2 * elapsed_s
+        return mean, variance
+
+    def updated(self, state: TrackState, epoch: int) -> tuple[Updated | None, Masks]:
+        """Return the update of an epoch, None where nothing was used, and the unknowns that have begun anew."""
+        work, count, both = self.work, state.hypotheses, self.both
+        cut = np.zeros(state.mean.shape, dtype=np.bool_)
+        if self.memory.scalars[layout.MEASURED] != self.recursion.epochs.time_s[epoch]:
+            return None, cut
+        cut[:, [Unknown.PHASE_CLOCK, Unknown.DRIFT]] = work.anew[:count, :2]
+        if self.rows.counts[0]:
+            cut[:, OFFSETS + self.recursion.chunk.offset[self.rows.codes[0]]] = work.anew[:count, 2]
+        size = int(self.rows.counts[0] + layout.COMBINED + self.rows.counts[3])
+        _, prior = _scattered(both, work.mean[:count], work.spread[:count], *self._idle(state, 0.0))
+        combine = np.zeros((count, size, state.mean.shape[1]))
+        at = both[work.unknown[:count, :size]]
+        np.add.at(combine, (*np.ogrid[:count, :size, :0][:2], at), work.share[:count, :size])
+        return Updated(
+            prior=prior,
+            combine=combine,
+            information=work.information[:count, :size, :size].copy(),
+            covariance=work.after[:count, :size, :size].copy(),
+            change=work.change[:count, :size].copy(),
+        ), cut
+
+
+def _in_use(state: TrackState, chunk: Chunk, sensed: Masks, first: int, last: int) -> Masks:
+    """Unknowns that are measured in some epochs, or correlated with others, shape (N,)."""
+    used = np.count_nonzero(state.covariance, axis=1).max(axis=0) > 1
+    if state.bank is not None and len(state.bank.without):
+        used |= np.count_nonzero(state.bank.covariance, axis=1).max(axis=0) > 1
+    for unknown, column, _ in _SENSORS:
+        used[unknown] |= sensed[column]
+    channels = np.flatnonzero(chunk.has[:, first:last].any(axis=(0, 1)))
+    used[OFFSETS + chunk.offset[channels]] = True
+    used[SATELLITES + chunk.slot[channels]] = True
+    return np.asarray(used)
+
+
+def _scattered(
+    at: Indices, means: Floats, covariances: Floats, idle_mean: Floats, idle_variance: Floats
+) -> tuple[Floats, Floats]:
+    """Gaussians of all unknowns from those `at` some of them; the others are independent."""
+    mean = np.repeat(idle_mean[None], len(means), axis=0)
+    covariance = np.zeros((len(means), len(idle_mean), len(idle_mean)))
+    covariance[:, np.arange(len(idle_mean)), np.arange(len(idle_mean))] = idle_variance
+    mean[:, at] = means
+    covariance[:, at[:, None], at] = covariances
+    return mean, covariance
+
+
+def _subfilters(
+    state: TrackState, full: Indices, names: list[str], line: Line, limits: TrackingLimits
+) -> layout.Subfilters:
+    """Sub-filters by source, none of them where levels are off."""
+    n = len(full)
+    prior, k, k_speed = (np.zeros(len(names)) for _ in range(3))
+    begun = np.zeros(n + len(_OF_EPOCH))
+    running, weak = np.zeros(len(names), dtype=np.bool_), np.zeros(len(names))
+    mean, covariance = np.zeros((len(names), n)), np.zeros((len(names), n, n))
+    if names:
+        given, kinds = bank.budget(limits), [bank.kind_of(name) for name in names]
+        prior[:], k[:] = np.array(given.prior)[kinds], np.array(given.k_fault)[kinds]
+        k_speed[:] = np.array(given.k_speed_fault)[kinds]
+        start = np.full(1, limits.expired_sigma_m)
+        _, fresh = begin(np.zeros(1), start, len(state.satellite), line, limits)
+        begun[:] = np.diagonal(fresh[0])[np.concatenate([full, _OF_EPOCH])]
+    if names and state.bank is not None:
+        kept = [k for k, name in enumerate(state.bank.without) if name in names]
+        at = [names.index(state.bank.without[k]) for k in kept]
+        running[at], weak[at] = True, state.bank.weak_s[kept]
+        mean[at] = state.bank.mean[kept][:, full]
+        covariance[at] = state.bank.covariance[kept][:, full[:, None], full]
+    clock = [CLOCKS.index(bank.clock_of(name)) for name in state.satellite.tolist()] if names else []
+    return layout.Subfilters(
+        running=running,
+        mean=mean,
+        covariance=covariance,
+        weak_s=weak,
+        prior=prior,
+        k=k,
+        k_speed=k_speed,
+        begun=begun,
+        clock=np.array(clock, dtype=np.intp),
+    )
+
+
+def _work_space(
+    channels: int, sensors: int, unknowns: int, hypotheses: int, sources: int
+) -> tuple[layout.Rows, layout.Work]:
+    """Lists of rows and work space of the kernel for so many channels, compact unknowns and hypotheses."""
+    width, room = unknowns + len(_OF_EPOCH), hypotheses + 1
+    most = 3 * channels + sensors
+    size = channels + layout.COMBINED + sensors
+    shapes = {
+        "mean": (room, width), "spread": (room, width, width), "now": (room,), "before": (room,),
+        "design": (room, most, 4), "value": (room, most), "innovation": (room, most), "sensed": (room, sensors, 6),
+        "cross": (room, size, width), "root": (room, size), "own": (room, size, size),
+        "information": (room, size, size), "after": (room, size, size), "change": (room, size),
+        "weight": (room, most), "residual": (room, most), "fitted": (room, most), "new_mean": (room, unknowns + 1),
+        "new_covariance": (room, unknowns, unknowns), "log_before": (room,), "log_after": (room,),
+        "evidence": (room,), "code_evidence": (room,), "joined": (4, room), "branch": (room, 3),
+        "pushed": (room,), "variance": (most,), "masked": (most,),
+        "system": (room, size, size), "factor": (size, size), "lower": (size, size), "right": (max(size, room),),
+        "diagonal": (size,), "with_clock": (size,),
+        "ordered": (most,), "part": (4,), "gain": (size, unknowns + 1), "less": (size, unknowns),
+        "stepped": (width, unknowns), "faded": (unknowns,), "share": (room, size, 6), "sight": (channels, 7),
+        "bend": (2,), "point": (2, 3), "axes": (2, 3, 3), "places": (room, 3), "place_axes": (room, 3, 3),
+    }  # fmt: skip
+    work = layout.Work(
+        **{name: np.zeros(shape) for name, shape in shapes.items()},
+        anew=np.zeros((room, 3), dtype=np.bool_),
+        source=np.zeros(sources, dtype=np.bool_),
+        met=np.zeros(sources, dtype=np.bool_),
+        ranked=np.empty(room, dtype=np.intp),
+        kept=np.empty(room, dtype=np.intp),
+        unknown=np.zeros((room, size, 6), dtype=np.intp),
+    )
+    listed = (np.empty(length, dtype=np.intp) for length in (channels, channels, channels, sensors, 4))
+    return layout.Rows(*listed), work
+
+
+def _sources(state: TrackState) -> list[str]:
+    """Sources of sub-filters in the order of the kernel."""
+    return [*state.satellite.tolist(), *CLOCKS, *bank.SENSORS.values(), *bank.OTHERS]
+
+
+def row_major(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """A writable copy, row by row: one type of arrays for the compiler."""
+    return np.array(array, order="C")

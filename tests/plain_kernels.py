@@ -1,0 +1,89 @@
+"""The kernels of the filter as plain Python, and their arrays made by hand."""
+
+from __future__ import annotations
+
+import sys
+from functools import cache
+from importlib import import_module
+from types import ModuleType
+from typing import Any, cast
+
+import numba
+import numpy as np
+import pytest
+
+from railfix.kernels.tracking import layout
+from railfix.tracking import TrackingLimits
+from railfix.tracking.bank import SENSORS, budget, kind_of
+from railfix.tracking.handover import _work_space
+from railfix.tracking.recursion import _parameters
+
+
+def _compiled_modules() -> list[str]:
+    """Modules with compiled functions: compiled or not, they are imported together."""
+    kept = (".layout", ".constants", ".compiling")
+    return [name for name in sys.modules if name.startswith("railfix.kernels.") and not name.endswith(kept)]
+
+
+@cache
+def plain(name: str) -> ModuleType:
+    """A module of `railfix.kernels.tracking` that the compiler has left alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(numba.config, "DISABLE_JIT", True)
+        for module in _compiled_modules():
+            patch.delitem(sys.modules, module)
+        found = import_module(f"railfix.kernels.tracking.{name}")
+        for module in _compiled_modules():
+            del sys.modules[module]
+    return found
+
+
+def named_tuple(kind: type, **values: Any) -> Any:
+    """A tuple of the kernels of which only some fields are used."""
+    fields = cast(Any, kind)._fields
+    return kind(**{name: values.get(name) for name in fields})
+
+
+def parameters(limits: TrackingLimits) -> layout.Parameters:
+    return _parameters(limits)
+
+
+def work_space(hypotheses: int, sources: int = 0) -> layout.Work:
+    return _work_space(4, len(SENSORS), 12, hypotheses, sources)[1]
+
+
+def memory(place_m: np.ndarray, sigma_m: np.ndarray, log_probability: np.ndarray, **scalars: float) -> layout.Memory:
+    """Hypotheses at places; scalars by their names in the layout."""
+    count = len(place_m)
+    mean, covariance = np.zeros((count, 12)), np.zeros((count, 12, 12))
+    mean[:, layout.PLACE], covariance[:, layout.PLACE, layout.PLACE] = place_m, sigma_m**2
+    values = np.zeros(20)
+    values[layout.HYPOTHESES] = count
+    for name, value in scalars.items():
+        values[getattr(layout, name)] = value
+    made = named_tuple(
+        layout.Memory,
+        mean=mean,
+        covariance=covariance,
+        log_probability=log_probability.copy(),
+        log_code=np.zeros(count),
+        scalars=values,
+    )
+    return cast(layout.Memory, made)
+
+
+def subfilters(names: list[str], place_m: Any, sigma_m: Any, limits: TrackingLimits, weak_s: Any = 0.0) -> Any:
+    """Running sub-filters at places, the last one, of the map, not running."""
+    given, kinds = budget(limits), [kind_of(name) for name in names]
+    size = len(names) + 1
+    mean, covariance = np.zeros((size, 12)), np.zeros((size, 12, 12))
+    mean[:-1, layout.PLACE], covariance[:-1, layout.PLACE, layout.PLACE] = place_m, np.square(sigma_m)
+    return named_tuple(
+        layout.Subfilters,
+        running=np.arange(size) < len(names),
+        mean=mean,
+        covariance=covariance,
+        weak_s=np.append(np.broadcast_to(weak_s, len(names)), 0.0),
+        prior=np.append(np.array(given.prior)[kinds], given.prior[4]),
+        k=np.append(np.array(given.k_fault)[kinds], given.k_fault[4]),
+    )
