@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,6 @@ from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
-with_numba = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed (railfix[fast])")
 #: Positions and levels may differ by this much [m].
 TOLERANCE_M = 1e-6
 
@@ -81,7 +79,6 @@ def calls() -> dict[str, list[tuple[Any, ...]]]:
     return found
 
 
-@with_numba
 @pytest.mark.requirement("A7")
 def test_each_kernel_gives_what_its_reference_gives(calls: dict[str, list[tuple[Any, ...]]]) -> None:
     assert sorted(calls) == sorted(kernels.REGISTERED), "a kernel that no run calls is not compared"
@@ -100,7 +97,6 @@ def test_each_kernel_gives_what_its_reference_gives(calls: dict[str, list[tuple[
                     np.testing.assert_array_equal(one, other, err_msg=name)
 
 
-@with_numba
 @pytest.mark.requirement("A7")
 def test_a_run_is_the_same_with_compiled_kernels() -> None:
     both = {}
@@ -122,7 +118,6 @@ def test_a_run_is_the_same_with_compiled_kernels() -> None:
                     assert one.equals(other, null_equal=True), column
 
 
-@with_numba
 @pytest.mark.requirement("A7", "C2")
 @pytest.mark.parametrize("systems", ["GGGGG", "GGGEE", "GGGGGEE", "GGGGEEEECCCR", "GGGGGGGGEEEEEEECCCC"])
 @pytest.mark.parametrize(
@@ -167,7 +162,6 @@ def test_levels_of_every_kind_of_hypothesis_are_the_same(
             np.testing.assert_array_equal(given, expected, err_msg=name)
 
 
-@with_numba
 @pytest.mark.requirement("A8")
 def test_all_kernels_are_loaded_before_a_live_session_needs_them(calls: dict[str, list[tuple[Any, ...]]]) -> None:
     for name, arguments in calls.items():
@@ -188,15 +182,14 @@ print(loaded, len(kernels.REGISTERED), *names)
     assert set(names) <= set(calls)
 
 
-@with_numba
 @pytest.mark.slow
 @pytest.mark.requirement("A8")
 def test_a_session_on_a_new_machine_compiles_all_kernels_before_it_begins(tmp_path: Path) -> None:
     """Twice in processes of their own: the second finds all of them on disk."""
     program = """
 from railfix import kernels
-from railfix.live.warm_up import compile_kernels
-print(compile_kernels(), *kernels.missing())
+from railfix.run.warm_up import prepare_kernels
+print(prepare_kernels(), *kernels.missing())
 """
     environment = {**os.environ, kernels.VARIABLE: "numba", "NUMBA_CACHE_DIR": str(tmp_path)}
     for expected in ("True", "False"):
@@ -206,7 +199,6 @@ print(compile_kernels(), *kernels.missing())
         assert done.stdout.split() == [expected]
 
 
-@with_numba
 @pytest.mark.requirement("A7")
 def test_code_on_disk_is_that_of_all_files_that_it_calls(tmp_path: Path) -> None:
     """numba looks at the file of the function alone; here a change of what it calls compiles anew."""
@@ -218,9 +210,9 @@ def test_code_on_disk_is_that_of_all_files_that_it_calls(tmp_path: Path) -> None
     shutil.copytree(room, copied, ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "railfix" / "core").mkdir()
     shutil.copy(room.parent / "core" / "constants.py", tmp_path / "railfix" / "core")
-    before = {name: stamp(copied, name) for name in (recursion, "orbits")}
+    before = {name: stamp(copied, name) for name in (recursion, "search")}
     assert before == {name: stamp(room, name) for name in before}
-    for changed, names in {"kernels/tracking/algebra": {recursion}, "core/constants": {recursion, "orbits"}}.items():
+    for changed, names in {"kernels/tracking/algebra": {recursion}, "core/constants": {recursion, "search"}}.items():
         with (tmp_path / "railfix" / f"{changed}.py").open("a") as file:
             file.write("# changed\n")
         stamp.cache_clear()
@@ -246,14 +238,13 @@ def test_arrays_of_a_trajectory_and_records_stay_read_only_in_another_process() 
             np.testing.assert_array_equal(vars(got)[name], value)
 
 
-@with_numba
 @pytest.mark.requirement("A7")
 def test_code_on_disk_with_types_of_an_older_version_is_compiled_anew(tmp_path: Path) -> None:
     """A table of arguments was renamed since: numba cannot read the index of the code on disk."""
     (tmp_path / "tables.py").write_text("from typing import NamedTuple\nclass Old(NamedTuple):\n    x: float\n")
     program = """
 import sys
-import railfix.kernels.forgetting
+import railfix.kernels.search
 from railfix.kernels import compiling
 function = compiling.COMPILED[0]
 index = function._cache._cache_file
@@ -274,7 +265,6 @@ else:
         )  # fmt: skip
 
 
-@with_numba
 @pytest.mark.requirement("A7")
 @pytest.mark.parametrize("terminal", [True, False])
 def test_a_terminal_is_told_of_compilation_once(terminal: bool) -> None:
@@ -292,20 +282,17 @@ for value in (1, 2):
     told = ""
     while not told.endswith("end\n"):
         told += os.read(reader, 1000).decode().replace("\r", "")
-    assert told == ("compiling for this processor, once: one to two minutes\n" if terminal else "") + "end\n"
+    assert told == ("compiling for this processor, once: about a minute\n" if terminal else "") + "end\n"
     for end in pipe:
         os.close(end)
 
 
 @pytest.mark.requirement("A7")
 def test_the_variable_chooses_and_what_cannot_be_is_said() -> None:
-    assert kernels.choose("", installed=True) == "numba"
-    assert kernels.choose("auto", installed=False) == "numpy"
-    assert kernels.choose("numpy", installed=True) == "numpy"
-    with pytest.raises(SettingsError, match=r"not installed; pip install 'railfix\[fast\]'"):
-        kernels.choose("numba", installed=False)
-    with pytest.raises(SettingsError, match="RAILFIX_KERNELS is 'fast', expected auto, numpy or numba"):
-        kernels.choose("fast", installed=True)
+    assert kernels.choose("") == kernels.choose("numba") == "numba"
+    assert kernels.choose("numpy") == "numpy"
+    with pytest.raises(SettingsError, match="RAILFIX_KERNELS is 'fast', expected numpy or numba"):
+        kernels.choose("fast")
 
 
 @pytest.mark.requirement("A7")

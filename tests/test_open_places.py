@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -173,7 +172,6 @@ def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.requirement("C2")
-@pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed (railfix[fast])")
 @pytest.mark.parametrize("enough", [0.0, 1.0], ids=["each hypothesis", "loose bound"])
 def test_bounds_are_the_same_compiled(
     pixel: integrity_tables.Case, monkeypatch: pytest.MonkeyPatch, enough: float

@@ -1,13 +1,13 @@
-"""Compiled alternatives to the hottest functions of arrays, with numba (``pip install railfix[fast]``).
+"""Compiled functions, with numba.
 
-A function of arrays that is worth compiling stands in numpy where it belongs and is decorated with `compiled_by`, which
-names a module of this package that has a function of the same name, arguments and results. The numpy function is the
-reference: it is what runs without numba, and tests hold both equal. Which of the two run is chosen once, when this
-package is imported: the compiled ones where numba is installed, unless the environment variable ``RAILFIX_KERNELS``
-says ``numpy``; ``numba`` asks for them and fails where they cannot run. ``run.json`` names the choice ("kernels").
+The filter along the track (`railfix.kernels.tracking`) stands here alone. A function of arrays of single epochs that is
+worth compiling stands in numpy where it belongs and is decorated with `compiled_by`, which names a module of this
+package that has a function of the same name, arguments and results. The numpy function is the reference, and tests hold
+both equal; it runs where the environment variable ``RAILFIX_KERNELS`` says ``numpy``. ``run.json`` names the choice
+("kernels").
 
-Modules of this package are imported at the first call of one of their functions, so that numba costs nothing where it
-is not used. They see arrays and numbers alone, and import nothing of railfix but this package and `railfix.core`.
+Modules of this package are imported at the first call of one of their functions. They see arrays and numbers alone, and
+import nothing of railfix but this package and `railfix.core`.
 """
 
 from __future__ import annotations
@@ -17,49 +17,47 @@ from collections.abc import Callable
 from functools import cache, wraps
 from importlib import import_module
 from importlib.metadata import version
-from importlib.util import find_spec
 from typing import Any, Final, Literal, ParamSpec, TypeVar
 
 from railfix.core.errors import SettingsError
 
-#: Environment variable that chooses the kernels: "auto" (as if not set), "numpy" or "numba".
+#: Environment variable that chooses the form of the stages of single epochs: "numba" (as if not set) or "numpy".
 VARIABLE: Final = "RAILFIX_KERNELS"
+#: The compiled function of the filter.
+FILTER: Final = "advance"
 
 Arguments = ParamSpec("Arguments")
 Returned = TypeVar("Returned")
 
 
-def choose(asked: str, *, installed: bool) -> Literal["numpy", "numba"]:
-    """Return the kernels to run.
+def choose(asked: str) -> Literal["numpy", "numba"]:
+    """Return the form of the stages of single epochs.
 
     Parameters
     ----------
     asked : str
         Value of `VARIABLE`; empty where it is not set.
-    installed : bool
-        Whether numba is.
 
     Raises
     ------
     SettingsError
-        The value is unknown, or asks for numba where it is not installed.
+        The value is unknown.
     """
-    if asked not in ("", "auto", "numpy", "numba"):
-        raise SettingsError(f"{VARIABLE} is {asked!r}, expected auto, numpy or numba")
-    if asked == "numba" and not installed:
-        raise SettingsError(f"{VARIABLE} asks for numba, which is not installed; pip install 'railfix[fast]'")
-    return "numba" if installed and asked != "numpy" else "numpy"
+    if asked not in ("", "numpy", "numba"):
+        raise SettingsError(f"{VARIABLE} is {asked!r}, expected numpy or numba")
+    return "numpy" if asked == "numpy" else "numba"
 
 
-#: Kernels of this process.
-CHOSEN: Final = choose(os.environ.get(VARIABLE, ""), installed=find_spec("numba") is not None)
+#: Form of the stages of single epochs in this process.
+CHOSEN: Final = choose(os.environ.get(VARIABLE, ""))
 #: Compiled functions by the name of their reference, as (reference, module of this package).
 REGISTERED: Final[dict[str, tuple[Callable[..., Any], str]]] = {}
 
 
 def kernels_in_use() -> str:
-    """Return the kernels of this process in words: "numpy", or "numba" with its version."""
-    return CHOSEN if CHOSEN == "numpy" else f"numba {version('numba')}"
+    """Return the kernels of this process in words: numba with its version, "numpy" in front where stages run in it."""
+    of_numba = f"numba {version('numba')}"
+    return of_numba if CHOSEN == "numba" else f"numpy, filter {of_numba}"
 
 
 @cache
@@ -69,25 +67,31 @@ def compiled(name: str) -> Callable[..., Any]:
     return function
 
 
-def load() -> int:
-    """Load all compiled functions, so that none is loaded while epochs wait; return how many, 0 with numpy.
-
-    Those that have never run on this machine (`missing`) are compiled at their first call.
-    """
-    if CHOSEN == "numpy":
-        return 0
+def _import_all() -> Any:
+    """Import all kernels, and return the module that compiles them."""
     for module in {"tracking.recursion", *(module for _, module in REGISTERED.values())}:
         import_module(f"railfix.kernels.{module}")
-    loaded: int = import_module("railfix.kernels.compiling").load()
+    return import_module("railfix.kernels.compiling")
+
+
+def load() -> int:
+    """Load all compiled functions, so that none is loaded while epochs wait; return how many.
+
+    Those that this machine has no code of (`missing`) are compiled at their first call.
+    """
+    loaded: int = _import_all().load()
     return loaded
 
 
 def missing() -> list[str]:
-    """Return the names of the compiled functions that `load` found nothing of; none with numpy."""
-    if CHOSEN == "numpy":
-        return []
-    names: list[str] = import_module("railfix.kernels.compiling").missing()
-    return names
+    """Return the names of the functions in use that this machine has no code of."""
+    names: list[str] = _import_all().missing()
+    return names if CHOSEN == "numba" else [name for name in names if name == FILTER]
+
+
+def announced() -> None:
+    """Leave the line that tells of compilation away: the caller has told it."""
+    import_module("railfix.kernels.compiling").ANNOUNCEMENT.said = True
 
 
 def compiled_by(module: str) -> Callable[[Callable[Arguments, Returned]], Callable[Arguments, Returned]]:

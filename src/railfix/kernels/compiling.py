@@ -27,6 +27,13 @@ COMPILED: Final[list[Any]] = []
 _OPTIONS: Final[dict[str, Any]] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
+def _finish_unbuilt(library: Any) -> None:
+    """End a library of numba that callers take in as it is."""
+    library._finalize_dynamic_globals()
+    library._verify_declare_only_symbols()
+    library._finalized = True
+
+
 @register_pass(mutates_CFG=True, analysis_only=False)  # type: ignore[no-untyped-call]
 class _LoweringForCallers(NativeLowering):
     """Lowers a function to what its callers take in, without machine code of its own, which nothing would run.
@@ -43,7 +50,9 @@ class _LoweringForCallers(NativeLowering):
         """
         state.flags.no_compile = True
         changed: bool = super().run_pass(state)  # type: ignore[no-untyped-call]
-        state.library._optimize_final_module = lambda: None
+        library = state.library
+        library._optimize_final_module = lambda: None
+        library._finalize_final_module = lambda: _finish_unbuilt(library)
         state.cr = state.cr._replace(cfunc=[].append)
         state.targetctx.insert_user_function(state.cr.cfunc, state.cr.fndesc, [state.library])
         return changed
@@ -60,7 +69,13 @@ class _InnerCompiler(CompilerBase):
         return [manager]
 
 
-_INNER: Final[dict[str, Any]] = {"no_cpython_wrapper": True, "pipeline_class": _InnerCompiler}
+#: Versions of numba whose inner workings `_InnerCompiler` is known to suit; others compile in the usual way.
+_SUITED: Final = ((0, 61), (0, 68))
+_IS_SUITED: Final = _SUITED[0] <= tuple(int(part) for part in numba.__version__.split(".")[:2]) <= _SUITED[1]
+_INNER: Final[dict[str, Any]] = {
+    "no_cpython_wrapper": True,
+    **({"pipeline_class": _InnerCompiler} if _IS_SUITED else {}),
+}
 
 
 def kernel(function: Function) -> Function:
@@ -133,14 +148,15 @@ class _Announcement(event.Listener):
         """Write the line, once, for functions of railfix."""
         ours = event.data["dispatcher"].py_func.__module__.startswith("railfix.")
         if ours and not self.said and sys.stderr.isatty() and multiprocessing.parent_process() is None:
-            sys.stderr.write("compiling for this processor, once: one to two minutes\n")
+            sys.stderr.write("compiling for this processor, once: about a minute\n")
             self.said = True
 
     def on_end(self, event: Any) -> None:
         """Nothing is written at the end of a compilation."""
 
 
-event.register("numba:compile", _Announcement())  # type: ignore[no-untyped-call]
+ANNOUNCEMENT: Final = _Announcement()
+event.register("numba:compile", ANNOUNCEMENT)  # type: ignore[no-untyped-call]
 
 
 def _files(package: Path, module: str) -> set[Path]:
@@ -171,5 +187,9 @@ def load() -> int:
 
 
 def missing() -> list[str]:
-    """Return the names of the functions of `COMPILED` without code for any types of arguments."""
-    return [function.py_func.__name__ for function in COMPILED if not function.signatures]
+    """Return the names of the functions of `COMPILED` that there is no code of, neither in this process nor on disk."""
+    return [
+        function.py_func.__name__
+        for function in COMPILED
+        if not function.signatures and not function._cache._cache_file._load_index()
+    ]

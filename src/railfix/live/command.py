@@ -14,6 +14,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from pydantic import Field
 
+from railfix import kernels
 from railfix.core.errors import OutputError, SettingsError
 from railfix.core.settings import Settings, validated
 from railfix.io.logs import read_navigation
@@ -31,7 +32,6 @@ from railfix.live.settings import LiveSettings
 from railfix.live.sinks import file_of, open_sink
 from railfix.live.sources import check_source, is_file
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
-from railfix.live.warm_up import compile_kernels
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor
@@ -42,6 +42,7 @@ from railfix.run.output import check_not_input
 from railfix.run.processor import processor_of
 from railfix.run.sensors import check_filter, read_sensors, units_of_ranges
 from railfix.run.sources import Line, open_line
+from railfix.run.warm_up import prepare_kernels
 
 #: Longest distance from the reference location that a position report of ETCS can say, doubts apart [m].
 _REACH_OF_REFERENCE_M: Final = 300_000.0
@@ -126,8 +127,9 @@ async def run_live(inputs: LiveInputs) -> list[str]:
         messages_on_terminal = sys.stdout.isatty() and any(text.endswith("@-") for text in inputs.send)
         log = SessionLog(inputs.log, live, status=not messages_on_terminal)
         held.callback(log.close)
-        if compile_kernels():
+        if prepare_kernels():
             log.say("kernels compiled for this processor; later sessions load them")
+        kernels.load()
         sinks = []
         for text in inputs.send:
             full = "wait" if replay else "drop"

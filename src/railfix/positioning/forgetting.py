@@ -8,7 +8,6 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.timescale import seconds
-from railfix.kernels import compiled_by
 
 #: Windows that one running sum spans; exp(50) = 5e21, so that it overflows nowhere and keeps all digits of its terms.
 _SPAN: Final = 50.0
@@ -26,7 +25,6 @@ def steps_s(time: Datetimes, last: np.datetime64) -> Floats:
     return steps_of(time.astype(np.int64), int(np.asarray(last, dtype="datetime64[ns]").astype(np.int64)))
 
 
-@compiled_by("forgetting")
 def steps_of(time_ns: Integers, last_ns: int) -> Floats:
     """Compute `steps_s` of instants as numbers of nanoseconds."""
     time = np.concatenate([[last_ns], time_ns]).astype("datetime64[ns]")
@@ -119,7 +117,6 @@ def correlated_sums(
     return before, own, after, float(age[-1]) if len(time) else last_age
 
 
-@compiled_by("forgetting")
 def decayed(age: Floats, values: Floats, start: Floats, last_age: float) -> tuple[Floats, Floats]:
     """Compute `decayed_sums`; arrays in C order."""
     span = np.floor(age / _SPAN)

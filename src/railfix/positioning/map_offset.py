@@ -19,7 +19,6 @@ from scipy.special import chdtri, chndtrinc
 
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
-from railfix.kernels import compiled_by
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.forgetting import correlated_sums
 from railfix.positioning.normal_equations import RangeArrays, Ranges, reduced_equations
@@ -229,7 +228,6 @@ def _window(
     return before + own, MapOffsetState(time=time[-1], age=age, sums=sums) if len(time) else state
 
 
-@compiled_by("map_offset")
 def terms_of_epochs(
     ranges: RangeArrays,
     ecef_m: Floats,
@@ -268,7 +266,6 @@ def terms_of_epochs(
     )
 
 
-@compiled_by("map_offset")
 def means_of_windows(
     sums: Floats, sigma_plan_m: float, sigma_height_m: float, detectable_sigmas: float
 ) -> tuple[Floats, Floats, Floats, Floats]:

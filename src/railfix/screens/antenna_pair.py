@@ -32,7 +32,6 @@ from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
-from railfix.kernels import compiled_by
 from railfix.screens.base import (
     AntennaRanges,
     PairedEpochs,
@@ -180,7 +179,6 @@ def ambiguity_m(
     return np.asarray(np.asarray(spacing_m, dtype=np.float64) * changes.reshape(shape))
 
 
-@compiled_by("screens")
 def largest_changes(elevation: Floats, azimuth: Floats, elevation_error: float, azimuth_error: float) -> Floats:
     """Largest change of ``cos(elevation) cos(azimuth)`` within the errors of both, shape (T, M); all in radians."""
     exact = np.cos(elevation) * np.cos(azimuth)

@@ -24,7 +24,6 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, fre
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
-from railfix.kernels import compiled_by
 from railfix.screens.base import (
     AntennaRanges,
     ObservationScreen,
@@ -245,7 +244,6 @@ def _limit_m(
     return np.broadcast_to(row[:, None], metric.shape), total, epochs
 
 
-@compiled_by("screens")
 def suspicions(
     time_ns: Integers, metric: Floats, limit: Floats, level_before: Floats, since_before: Integers, hold_ns: int
 ) -> tuple[Masks, Floats, Integers]:

@@ -8,7 +8,6 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Strings, read_only
 from railfix.core.constants import CLOCK_GROUP
-from railfix.kernels import compiled_by
 
 
 def row_median(values: Floats) -> Floats:
@@ -41,7 +40,6 @@ def _numbered(satellites: tuple[str, ...]) -> tuple[Indices, Indices]:
     return read_only(clock.astype(np.intp)), read_only(number.astype(np.intp))
 
 
-@compiled_by("screens")
 def medians_of_clocks(values: Floats, clock: Indices, satellite: Indices, least: int) -> Floats:
     """Compute `clock_medians`; clocks and satellites as numbers from 0 on, arrays in C order."""
     result = np.full(values.shape, np.nan)

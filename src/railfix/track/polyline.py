@@ -7,7 +7,6 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats, Indices, Masks
-from railfix.kernels import compiled_by
 
 #: Samples examined in the first round; four times as many for positions not yet proven.
 _FIRST_CANDIDATES = 6
@@ -77,7 +76,6 @@ class NearestOnPolyline:
         return chosen, share * self._length[chosen], best, proven
 
 
-@compiled_by("trajectory")
 def nearest_segments(
     points_m: Floats, segment: Indices, start_m: Floats, step_m: Floats
 ) -> tuple[Indices, Floats, Floats]:

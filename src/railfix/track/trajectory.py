@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Floats, FrozenArrays, Indices, freeze_arrays, read_only
 from railfix.core.display import NotebookTable, plural
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
-from railfix.kernels import compiled_by
 from railfix.track.closing import joins_m
 from railfix.track.polyline import NearestOnPolyline
 from railfix.track.track import (
@@ -276,7 +275,6 @@ class Trajectory(FrozenArrays, NotebookTable):
         return arc, offset
 
 
-@compiled_by("trajectory")
 def interpolated(arc: Floats, arc_m: Floats, length_m: Floats, values: Floats, tolerance_m: float) -> Floats:
     """Interpolate values of points of a line, shape (V, C), at arc lengths, shape (n, C); NaN beyond the ends.
 

@@ -16,7 +16,6 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits.kepler import Orbits, kepler_state
 from railfix.gnss.orbits.precise import precise_clock_s, precise_state
 from railfix.gnss.orbits.prepared_records import ChannelRecords, PreparedRecords, prepared_records
-from railfix.kernels import compiled_by
 
 #: Chunks of fewer epochs are computed with all channels together, longer ones channel by channel: the same
 #: arithmetic on every element, arranged so that single live epochs and complete logs are both fast.
@@ -247,7 +246,6 @@ class KeplerStates(NamedTuple):
     unhealthy: Masks
 
 
-@compiled_by("orbits")
 def kepler_channels(
     time_ns: Integers, code_m: Floats, channels: KeplerChannels, records: KeplerRecords, states: KeplerStates
 ) -> KeplerStates:

@@ -24,7 +24,6 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.geodesy import range_with_rotation
-from railfix.kernels import compiled_by
 from railfix.positioning.normal_equations import RangeArrays, Ranges, inverse_3x3
 from railfix.track.trajectory import Trajectory
 
@@ -202,7 +201,6 @@ def compact(model: LinearModel) -> Compact:
     return Compact(channel=channel, used=used, projector=projector, residual=residual, sigma_m=sigma, gain_m=gain)
 
 
-@compiled_by("raim")
 def side_by_side(
     root_weight: Floats,
     design: Floats,
@@ -289,7 +287,6 @@ def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *,
     )
 
 
-@compiled_by("raim")
 def linearised(
     ranges: RangeArrays, place_ecef_m: Floats, axes: Floats, prior: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:

@@ -1,0 +1,96 @@
+"""Compilation of all kernels at the first command on a machine: later ones load them from disk.
+
+Two processes share it: the recursion of the filter takes as long as all kernels of single epochs together. During a
+live session it would delay epochs by seconds, in a run nobody would know why nothing happens.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+
+from railfix import kernels
+from railfix.gnss.observations import Observations
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import parse_config
+from railfix.run.processor import processor_of
+from railfix.simulate.demonstration import demo_inputs
+from railfix.track import read_track
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
+
+_Settings: TypeAlias = tuple[tuple[dict[str, Any], int], ...]
+#: Settings and numbers of epochs that together call every kernel of single epochs; the second has too few satellites
+#: for 3-D positions.
+_STAGES: Final[_Settings] = (
+    ({"filter": "off"}, 60),
+    ({"filter": "off", "systems": ["G"], "elevation": {"mask_deg": 45.0}, "protection": "off"}, 5),
+)
+_FILTER: Final[_Settings] = (({"filter": "track"}, 8),)
+#: Runs the filter with the stages in numpy: another process compiles those.
+_PROGRAM = "from railfix.run.warm_up import compile_filter; compile_filter()"
+
+
+def prepare_kernels() -> bool:
+    """Compile the kernels that this machine has no code of, and say so on a terminal; return whether there were any.
+
+    Raises
+    ------
+    InputFileError
+        Neither the package nor the clone has the files of the demonstration, on which they are compiled.
+    """
+    missing = kernels.missing()
+    if not missing:
+        return False
+    begin = time.monotonic()
+    kernels.announced()
+    _say("compiling for this processor, once: about 40 s on two cores")
+    environment = {**os.environ, kernels.VARIABLE: "numpy"}
+    if kernels.FILTER in missing:
+        with subprocess.Popen([sys.executable, "-c", _PROGRAM], env=environment, stderr=subprocess.PIPE) as other:
+            _run(_STAGES)
+            _say(f"single epochs compiled after {time.monotonic() - begin:.0f} s; the filter still is")
+            _, error = other.communicate()
+        if other.returncode:
+            raise RuntimeError(f"the filter cannot be compiled: {error.decode(errors='replace').strip()}")
+    else:
+        _run(_STAGES)
+    _say(f"compiled in {time.monotonic() - begin:.0f} s; later commands load it")
+    return True
+
+
+def compile_filter() -> None:
+    """Compile the recursion of the filter."""
+    _run(_FILTER)
+
+
+def _say(text: str) -> None:
+    if sys.stderr.isatty():
+        sys.stderr.write(text + "\n")
+
+
+def _run(settings: _Settings) -> None:
+    """Process epochs of the demonstration at once and one by one: kernels are compiled for the arrays of both."""
+    inputs = demo_inputs()
+    assert inputs.vehicle is not None
+    track, vehicle = read_track(inputs.track), read_vehicle(inputs.vehicle)
+    logs = {"front": read_observations(inputs.front), "rear": read_observations(inputs.rear)}
+    strongest = str(logs["front"].satellite[np.nan_to_num(logs["front"].cn0_dbhz[0]).argmax()])
+    logs = {name: _faulty(log, strongest) for name, log in logs.items()}
+    paths = {name: antenna_trajectory(track, vehicle, name) for name in ("front", "rear")}
+    navigation = read_navigation(inputs.nav)
+    for chosen, epochs in settings:
+        processor, state = processor_of(parse_config(chosen), navigation, paths), None
+        processor.process({name: log[:epochs] for name, log in logs.items()})
+        for epoch in range(epochs):
+            _, state = processor.process({name: log[epoch : epoch + 1] for name, log in logs.items()}, state)
+
+
+def _faulty(log: Observations, satellite: str) -> Observations:
+    """The log with the codes of a satellite 300 m too long: RAIM looks for it."""
+    return replace(log, code_m=log.code_m + np.where(log.satellite == satellite, 300.0, 0.0))
