@@ -188,7 +188,7 @@ def test_a_session_on_a_new_machine_compiles_all_kernels_before_it_begins(tmp_pa
     """Twice in processes of their own: the second finds all of them on disk."""
     program = """
 from railfix import kernels
-from railfix.run.warm_up import prepare_kernels
+from railfix.live.warm_up import prepare_kernels
 print(prepare_kernels(), *kernels.missing())
 """
     environment = {**os.environ, kernels.VARIABLE: "numba", "NUMBA_CACHE_DIR": str(tmp_path)}

@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from railfix.cli.console import console_of_tables, show_files
+from railfix.cli.console import console_of_tables, prepare_kernels, show_files
 from railfix.cli.options import OutOption
 from railfix.core.errors import MismatchError, NoPositionError, SettingsError
 from railfix.run.campaign import run_campaign
@@ -64,6 +64,7 @@ def campaign(
         sys.stderr.flush()
 
     with _executor(workers, scheduler) as (executor, lost):
+        prepare_kernels()
         table = run_campaign(path, out=out, executor=executor, progress=progress, lost=lost)
     failed = table.filter(status="failed")
     console = console_of_tables()

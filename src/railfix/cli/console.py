@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column as TableColumn
 from rich.table import Table
 
+from railfix import kernels
 from railfix.cli.verdict import verdict_of_run
 from railfix.core.reasons import Status
 
@@ -23,6 +25,12 @@ if TYPE_CHECKING:
     from railfix.run.driver import Progress as ProgressCall
     from railfix.run.record import Filtered
     from railfix.run.tally import AntennaTally
+
+
+def prepare_kernels() -> None:
+    """Compile the kernels that this machine has no code of, before a command needs them."""
+    if kernels.missing():
+        import_module("railfix.live.warm_up").prepare_kernels()
 
 
 #: Width of tables where the output is no terminal, so that no cell is cut or folded.

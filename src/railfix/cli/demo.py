@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from railfix.cli.console import console_of_tables, progress_bar, show_summary
+from railfix.cli.console import console_of_tables, prepare_kernels, progress_bar, show_summary
 from railfix.cli.evaluate_tables import outages
 from railfix.cli.options import OverwriteOption, overwriting
 from railfix.evaluate import Evaluation
@@ -47,6 +47,7 @@ def demo(
     Exit codes: 0 done; 8 DIR cannot be written; 1 a defect of railfix.
     """
     inputs = demo_inputs()
+    prepare_kernels()
     with progress_bar() as progress:
         options = RunOptions(observations="write", overwrite=overwriting(overwrite), chunk_epochs=200)
         summary = run_files(inputs, Config(filter="track"), out=out, options=options, progress=progress)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from railfix.cli.console import progress_bar, show_summary
+from railfix.cli.console import prepare_kernels, progress_bar, show_summary
 from railfix.cli.options import OutOption, Without, from_models
 from railfix.cli.settings import Choices, settings_of
 from railfix.run import RunInputs, RunOptions, run_files
@@ -48,6 +48,7 @@ def run(
     if "filter" not in asked:
         settings = settings.replaced(filter="track")
     inputs = inputs.replaced(config=choices.config)
+    prepare_kernels()
     with progress_bar() as progress:
         summary = run_files(inputs, settings, out=out, options=options, asked=asked, progress=progress)
     show_summary(summary)

@@ -32,6 +32,7 @@ from railfix.live.settings import LiveSettings
 from railfix.live.sinks import file_of, open_sink
 from railfix.live.sources import check_source, is_file
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
+from railfix.live.warm_up import prepare_kernels
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor
@@ -42,7 +43,6 @@ from railfix.run.output import check_not_input
 from railfix.run.processor import processor_of
 from railfix.run.sensors import check_filter, read_sensors, units_of_ranges
 from railfix.run.sources import Line, open_line
-from railfix.run.warm_up import prepare_kernels
 
 #: Longest distance from the reference location that a position report of ETCS can say, doubts apart [m].
 _REACH_OF_REFERENCE_M: Final = 300_000.0

@@ -36,7 +36,6 @@ from railfix.run.sensors import check_filter, read_sensors, units_of_ranges
 from railfix.run.smoothed_columns import add_smoothed
 from railfix.run.sources import TRACK_FILE, Line, Log, open_line
 from railfix.run.tally import Tally
-from railfix.run.warm_up import prepare_kernels
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
 
@@ -120,7 +119,6 @@ def run_files(
     inputs, config = inputs.checked(config or Config())
     needing = [name for name in SENSORS if getattr(inputs, name) is not None]
     check_filter(config, [*needing, *(["smooth"] if options.smooth == "on" else [])])
-    prepare_kernels()
     with ExitStack() as stack:
         # Forked before any thread is started, and before polars starts its own.
         others = [

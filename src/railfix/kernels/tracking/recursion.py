@@ -9,20 +9,18 @@ import math
 
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import borrowing, kernel
-from railfix.kernels.tracking.algebra import insert, invert, median, middle, most_probable, restart
+from railfix.kernels.tracking.algebra import invert, most_probable, restart
 from railfix.kernels.tracking.branches import keep_hypotheses, reweigh
+from railfix.kernels.tracking.clocks import start_clocks
 from railfix.kernels.tracking.constants import (
     ACROSS_DOUBT,
     ACROSS_LOST,
     ACROSS_TAKEN,
     BESIDE_AFTER_S,
-    BIAS_FAULTY,
-    BIAS_INFLATED,
     COASTING,
     DIRECTION_MPS,
     DOUBTFUL,
     EXPIRED,
-    FIRST_OFFSET_M2,
     FREED_M,
     FREED_SIGMAS,
     LEAST_RISE,
@@ -31,13 +29,10 @@ from railfix.kernels.tracking.constants import (
     RELINEARISED,
     SCALE_BOUND,
     SEVERAL_BRANCHES,
-    STEPPED,
-    STILL_MPS,
     SWITCH,
     TAKEOVER,
     TAKEOVER_AFTER_S,
     TRACKING,
-    UNKNOWN_CLOCK,
     WEAK_FIT,
 )
 from railfix.kernels.tracking.course import on_course, onto_line
@@ -47,30 +42,23 @@ from railfix.kernels.tracking.layout import (
     ACROSS,
     BRANCH_M,
     BRANCH_S,
-    CODE_CLOCK,
     CODED,
     COMBINED,
     DIRECTION,
-    DRIFT,
     HYPOTHESES,
     MAP_SCALE,
     MEASURED,
     OF_EPOCH,
     OLD_PLACE,
     OPEN,
-    PHASE_CLOCK,
     PLACE,
     PREDICTION,
-    RANGE_ROW,
     REST,
     REST_LOST,
-    SCALE_DOPPLER,
-    SCALE_PHASE,
     SPEED,
     UNAIDED,
     WEAK_CODE,
     WEAK_MOTION,
-    WHEEL_ROW,
     WHOLE,
     WITHHELD,
     Active,
@@ -85,6 +73,7 @@ from railfix.kernels.tracking.layout import (
 )
 from railfix.kernels.tracking.learning import learn, write_rows
 from railfix.kernels.tracking.level import advance_subfilters, speed_bound, write_branches, write_level
+from railfix.kernels.tracking.measurements import choose_rows, choose_sensors, code_interval_s, write_variances
 from railfix.kernels.tracking.misfit import code_shift
 from railfix.kernels.tracking.monitors import contradiction, watch
 from railfix.kernels.tracking.possible_speed import possible
@@ -117,65 +106,6 @@ def _needs_search(epochs: Epochs, t: int, parameters: Parameters, memory: Memory
         coded = coded or epochs.has[0, t, k]
     gap = coded and epochs.time_s[t] - scalars[MEASURED] > parameters.gap_s
     return bool(lost or gap or (beside and scalars[HYPOTHESES] <= parameters.most_hypotheses // 2))
-
-
-@borrowing
-def _code_interval_s(epochs: Epochs, t: int, parameters: Parameters, memory: Memory, answers: Answers) -> float:
-    """Time that the codes of an epoch stand for [s]; 0 where they are not used, as others were within the period.
-
-    Their variances are settled with it, those of codes that are left out are inflated.
-    """
-    dt, since, coded = epochs.interval_s[t], epochs.time_s[t] - memory.scalars[CODED], False
-    for k in range(epochs.has.shape[2]):
-        coded = coded or epochs.has[0, t, k]
-    if not coded:
-        return float(dt)
-    recent = epochs.motion_measured[t] and since < parameters.code_period_s - 0.5 * dt
-    code_s = 0.0 if recent else min(max(since, dt), max(parameters.code_period_s, dt))
-    for k in range(epochs.has.shape[2]):
-        if recent:
-            epochs.has[0, t, k] = False
-            continue
-        epochs.variance[0, t, k] /= min(code_s, 1.0)
-        slot = epochs.slot[k]
-        if slot >= 0 and epochs.has[0, t, k] and not epochs.fresh[t, slot]:
-            answers.faulty[t, k] = abs(memory.code_bias[slot]) > BIAS_FAULTY
-            if answers.faulty[t, k]:
-                epochs.variance[0, t, k] *= BIAS_INFLATED
-    return float(code_s)
-
-
-@borrowing
-def _choose_rows(epochs: Epochs, t: int, rows: Rows) -> None:
-    """List the channels of each kind of measurement."""
-    counts = rows.counts
-    for kind in range(4):
-        counts[kind] = 0
-    for k in range(epochs.has.shape[2]):
-        if epochs.has[0, t, k]:
-            rows.codes[counts[0]] = k
-            counts[0] += 1
-        if epochs.has[1, t, k]:
-            rows.phases[counts[1]] = k
-            counts[1] += 1
-        if epochs.has[2, t, k]:
-            rows.dopplers[counts[2]] = k
-            counts[2] += 1
-
-
-@borrowing
-def _choose_sensors(epochs: Epochs, t: int, memory: Memory, rows: Rows, work: Work) -> None:
-    """List the sensors that have measured; a wheel without a sign needs a direction, a range to a unit a speed."""
-    count = int(memory.scalars[HYPOTHESES])
-    for kind in range(epochs.sensor.shape[1]):
-        known = math.isfinite(epochs.sensor[t, kind])
-        known = known and (kind < RANGE_ROW or abs(work.mean[0, SPEED]) >= STILL_MPS)
-        if kind == WHEEL_ROW and epochs.unsigned and memory.scalars[DIRECTION] == 0.0:
-            for h in range(count):
-                known = known and abs(work.mean[h, SPEED]) > DIRECTION_MPS
-        if known:
-            rows.sensors[rows.counts[3]] = kind
-            rows.counts[3] += 1
 
 
 @borrowing
@@ -278,88 +208,6 @@ def _measure(
 
 
 @borrowing
-def _write_variances(epochs: Epochs, t: int, memory: Memory, rows: Rows, variance: Floats) -> None:
-    """Write the variances of the measurements, with what has been learnt of phases and Dopplers."""
-    nc, nph, nd = rows.counts[0], rows.counts[1], rows.counts[2]
-    for i in range(nc):
-        variance[i] = epochs.variance[0, t, rows.codes[i]]
-    for i in range(nph):
-        variance[nc + i] = epochs.variance[1, t, rows.phases[i]] * math.exp(memory.scalars[SCALE_PHASE])
-    for i in range(nd):
-        variance[nc + nph + i] = epochs.variance[2, t, rows.dopplers[i]] * math.exp(memory.scalars[SCALE_DOPPLER])
-    for j in range(rows.counts[3]):
-        variance[nc + nph + nd + j] = epochs.sensor_sigma[t, rows.sensors[j]] ** 2
-
-
-@borrowing
-def _start_code_clocks(epochs: Epochs, active: Active, memory: Memory, rows: Rows, work: Work, h: int) -> None:
-    """Take the median innovation of the codes into their clock, and those of new constellations into their offsets.
-
-    At the first epoch the first constellation is that of the clock.
-    """
-    mean, value, ordered, known = work.mean, work.value, work.ordered, memory.offset_known
-    n, nc, first, some = mean.shape[1] - OF_EPOCH, rows.counts[0], epochs.offset[rows.codes[0]], False
-    for g in range(len(known)):
-        some = some or known[g]
-    if not some:
-        unknown = active.offset[first]
-        work.spread[h, unknown, unknown] = FIRST_OFFSET_M2
-        work.anew[h, 2] = True
-    size = 0
-    for i in range(nc):
-        if known[epochs.offset[rows.codes[i]]]:
-            insert(ordered, size, value[h, i])
-            size += 1
-    begun = size == 0
-    for i in range(nc):
-        if begun and epochs.offset[rows.codes[i]] == first:
-            insert(ordered, size, value[h, i])
-            size += 1
-    clock = middle(ordered, size)
-    mean[h, n + CODE_CLOCK] += clock
-    for g in range(len(known)):
-        own = clock
-        if not known[g] and not (begun and g == first):
-            size = 0
-            for i in range(nc):
-                if epochs.offset[rows.codes[i]] == g:
-                    insert(ordered, size, value[h, i])
-                    size += 1
-            if size > 0:
-                own = middle(ordered, size)
-                mean[h, active.offset[g]] += own - clock
-        for i in range(nc):
-            if epochs.offset[rows.codes[i]] == g:
-                value[h, i] -= own
-
-
-@borrowing
-def _start_clocks(epochs: Epochs, active: Active, memory: Memory, rows: Rows, work: Work, h: int) -> None:
-    """Take the median of each kind of innovation into its clock; clocks that have stepped begin anew."""
-    mean, spread, value = work.mean, work.spread, work.value
-    n = mean.shape[1] - OF_EPOCH
-    work.anew[h, 0] = work.anew[h, 1] = work.anew[h, 2] = False
-    if rows.counts[0] > 0:
-        _start_code_clocks(epochs, active, memory, rows, work, h)
-    begin = rows.counts[0]
-    for kind in range(1, 3):
-        end = begin + rows.counts[kind]
-        if end > begin:
-            away = median(value, h, begin, end - begin, work.ordered)
-            unknown = n + PHASE_CLOCK if kind == 1 else DRIFT
-            own_variance = spread[h, unknown, unknown]
-            stepped = own_variance > UNKNOWN_CLOCK**2
-            stepped = stepped or abs(away) > STEPPED * math.sqrt(own_variance + 0.25)
-            if stepped:
-                mean[h, unknown] += away
-                for i in range(begin, end):
-                    value[h, i] -= away
-                restart(spread, unknown, UNKNOWN_CLOCK**2, h)
-                work.anew[h, kind - 1] = True
-        begin = end
-
-
-@borrowing
 def _update(
     epochs: Epochs,
     t: int,
@@ -386,7 +234,7 @@ def _update(
             write_equations(epochs, t, course, active, rows, memory.scalars[DIRECTION], work, h)
             if turn == 0:
                 add_bend(parameters, work, h)
-                _start_clocks(epochs, active, memory, rows, work, h)
+                start_clocks(epochs, active, memory, rows, work, h)
                 for i in range(gnss + rows.counts[3]):
                     work.innovation[h, i] = work.value[h, i]
             combine(epochs, t, active, rows, work, h)
@@ -515,13 +363,13 @@ def advance(
             _predict_all(epochs, t, course, parameters, active, memory, work)
             if part == PREDICTION:
                 return t
-        code_s = _code_interval_s(epochs, t, parameters, memory, answers)
-        _choose_rows(epochs, t, rows)
-        _choose_sensors(epochs, t, memory, rows, work)
+        code_s = code_interval_s(epochs, t, parameters, memory, answers)
+        choose_rows(epochs, t, rows)
+        choose_sensors(epochs, t, memory, rows, work)
         measured = rows.counts[0] + rows.counts[1] + rows.counts[2] + rows.counts[3] > 0
         dt, map_scale, shift = epochs.interval_s[t], scalars[MAP_SCALE], 0.0
         if measured:
-            _write_variances(epochs, t, memory, rows, work.variance)
+            write_variances(epochs, t, memory, rows, work.variance)
             shift = _update(epochs, t, course, parameters, active, memory, rows, work)
         if not possible(parameters, memory, rows, work, dt, measured):
             # What no train can do is not believed: the prediction goes on, made anew as the clocks in it were moved.

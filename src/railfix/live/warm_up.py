@@ -33,7 +33,7 @@ _STAGES: Final[_Settings] = (
 )
 _FILTER: Final[_Settings] = (({"filter": "track"}, 8),)
 #: Runs the filter with the stages in numpy: another process compiles those.
-_PROGRAM = "from railfix.run.warm_up import compile_filter; compile_filter()"
+_PROGRAM = "from railfix.live.warm_up import compile_filter; compile_filter()"
 
 
 def prepare_kernels() -> bool:

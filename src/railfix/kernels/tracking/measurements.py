@@ -1,0 +1,98 @@
+"""Which measurements an epoch has, and their variances."""
+
+from __future__ import annotations
+
+import math
+
+from railfix.core.arrays import Floats
+from railfix.kernels.compiling import borrowing
+from railfix.kernels.tracking.constants import BIAS_FAULTY, BIAS_INFLATED, DIRECTION_MPS, STILL_MPS
+from railfix.kernels.tracking.layout import (
+    CODED,
+    DIRECTION,
+    HYPOTHESES,
+    RANGE_ROW,
+    SCALE_DOPPLER,
+    SCALE_PHASE,
+    SPEED,
+    WHEEL_ROW,
+    Answers,
+    Epochs,
+    Memory,
+    Parameters,
+    Rows,
+    Work,
+)
+
+
+@borrowing
+def code_interval_s(epochs: Epochs, t: int, parameters: Parameters, memory: Memory, answers: Answers) -> float:
+    """Time that the codes of an epoch stand for [s]; 0 where they are not used, as others were within the period.
+
+    Their variances are settled with it, those of codes that are left out are inflated.
+    """
+    dt, since, coded = epochs.interval_s[t], epochs.time_s[t] - memory.scalars[CODED], False
+    for k in range(epochs.has.shape[2]):
+        coded = coded or epochs.has[0, t, k]
+    if not coded:
+        return float(dt)
+    recent = epochs.motion_measured[t] and since < parameters.code_period_s - 0.5 * dt
+    code_s = 0.0 if recent else min(max(since, dt), max(parameters.code_period_s, dt))
+    for k in range(epochs.has.shape[2]):
+        if recent:
+            epochs.has[0, t, k] = False
+            continue
+        epochs.variance[0, t, k] /= min(code_s, 1.0)
+        slot = epochs.slot[k]
+        if slot >= 0 and epochs.has[0, t, k] and not epochs.fresh[t, slot]:
+            answers.faulty[t, k] = abs(memory.code_bias[slot]) > BIAS_FAULTY
+            if answers.faulty[t, k]:
+                epochs.variance[0, t, k] *= BIAS_INFLATED
+    return float(code_s)
+
+
+@borrowing
+def choose_rows(epochs: Epochs, t: int, rows: Rows) -> None:
+    """List the channels of each kind of measurement."""
+    counts = rows.counts
+    for kind in range(4):
+        counts[kind] = 0
+    for k in range(epochs.has.shape[2]):
+        if epochs.has[0, t, k]:
+            rows.codes[counts[0]] = k
+            counts[0] += 1
+        if epochs.has[1, t, k]:
+            rows.phases[counts[1]] = k
+            counts[1] += 1
+        if epochs.has[2, t, k]:
+            rows.dopplers[counts[2]] = k
+            counts[2] += 1
+
+
+@borrowing
+def choose_sensors(epochs: Epochs, t: int, memory: Memory, rows: Rows, work: Work) -> None:
+    """List the sensors that have measured; a wheel without a sign needs a direction, a range to a unit a speed."""
+    count = int(memory.scalars[HYPOTHESES])
+    for kind in range(epochs.sensor.shape[1]):
+        known = math.isfinite(epochs.sensor[t, kind])
+        known = known and (kind < RANGE_ROW or abs(work.mean[0, SPEED]) >= STILL_MPS)
+        if kind == WHEEL_ROW and epochs.unsigned and memory.scalars[DIRECTION] == 0.0:
+            for h in range(count):
+                known = known and abs(work.mean[h, SPEED]) > DIRECTION_MPS
+        if known:
+            rows.sensors[rows.counts[3]] = kind
+            rows.counts[3] += 1
+
+
+@borrowing
+def write_variances(epochs: Epochs, t: int, memory: Memory, rows: Rows, variance: Floats) -> None:
+    """Write the variances of the measurements, with what has been learnt of phases and Dopplers."""
+    nc, nph, nd = rows.counts[0], rows.counts[1], rows.counts[2]
+    for i in range(nc):
+        variance[i] = epochs.variance[0, t, rows.codes[i]]
+    for i in range(nph):
+        variance[nc + i] = epochs.variance[1, t, rows.phases[i]] * math.exp(memory.scalars[SCALE_PHASE])
+    for i in range(nd):
+        variance[nc + nph + i] = epochs.variance[2, t, rows.dopplers[i]] * math.exp(memory.scalars[SCALE_DOPPLER])
+    for j in range(rows.counts[3]):
+        variance[nc + nph + nd + j] = epochs.sensor_sigma[t, rows.sensors[j]] ** 2
