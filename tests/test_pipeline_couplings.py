@@ -17,7 +17,7 @@ from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
-from railfix.pipeline import fault_exclusion, level_stage, solution
+from railfix.pipeline import level_stage, solution, solve
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
@@ -181,7 +181,7 @@ def test_sigmas_of_the_level_are_the_larger_of_model_and_receiver() -> None:
 @pytest.mark.requirement("B4")
 def test_the_ranges_left_by_an_exclusion_are_tested_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """An exclusion whose remaining ranges fit badly at their own section leaves the epoch unresolved."""
-    original, solved = fault_exclusion.place_on_line, []
+    original, solved = solve.place_on_line, []
 
     def worse(*arguments: Any, **options: Any) -> Any:
         place = original(*arguments, **options)
@@ -191,7 +191,7 @@ def test_the_ranges_left_by_an_exclusion_are_tested_again(monkeypatch: pytest.Mo
             solved.append(len(wsse))
         return replace(place, constrained=replace(place.constrained, wsse=wsse))
 
-    monkeypatch.setattr(fault_exclusion, "place_on_line", worse)
+    monkeypatch.setattr(solve, "place_on_line", worse)
     found = front_alone(with_code(front(), with_fault(80.0)), BASE)
     assert solved
     assert (found.raim.outcome[::2] == Outcome.UNRESOLVED).all()

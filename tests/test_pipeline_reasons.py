@@ -272,7 +272,9 @@ CASES: dict[Reason, Callable[[], tuple[AntennaResult, int, int]]] = {
     Reason.FAULT_EXCLUDED: lambda: (front_alone(one_wrong(80.0), {"screens": ["elevation", "raim"]}), top_channel(), 0),
 }
 #: Reasons of screens that need more than one log and the settings; tested beside those screens, or below.
-ELSEWHERE = {Reason.CN0_CURVE, Reason.ANTENNA_PAIR, Reason.USED} | {r for r in Reason if r.name.startswith("SBAS_")}
+ELSEWHERE = {Reason.CN0_CURVE, Reason.ANTENNA_PAIR, Reason.LASTING_ERROR, Reason.USED} | {
+    r for r in Reason if r.name.startswith("SBAS_")
+}
 
 
 def test_every_reason_has_a_case():

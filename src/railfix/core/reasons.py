@@ -59,6 +59,8 @@ class Reason(IntFlag):
     ANTENNA_PAIR = 1 << 18
     #: Excluded by RAIM: its estimated range error exceeds the limit.
     FAULT_EXCLUDED = 1 << 19
+    #: Left out: the residuals have had one sign and size for a minute (`railfix.pipeline.lasting_errors`).
+    LASTING_ERROR = 1 << 20
 
 
 class Status(IntEnum):

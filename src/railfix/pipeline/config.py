@@ -34,6 +34,7 @@ from railfix.positioning.constrained import ConstrainedLimits
 from railfix.positioning.intersystem_bias import ClockOffsetLimits
 from railfix.positioning.map_offset import MapOffsetLimits
 from railfix.positioning.noise_scale import NoiseScaleLimits
+from railfix.positioning.residual_means import LastingErrorLimits
 from railfix.positioning.robust_fit import RobustFitLimits
 from railfix.positioning.section_search import SectionLimits
 from railfix.positioning.single_point import SinglePointLimits
@@ -139,6 +140,8 @@ class Config(ScreenSettings):
         In place of the track's own map error (P1 4.1(3): 0.30 m and 0.60 m).
     noise_scale : NoiseScaleLimits
         Estimation of the receiver's noise from the residuals.
+    lasting_errors : LastingErrorLimits
+        Satellites that are wrong for a minute and longer.
     robust_fit : RobustFitLimits
         Selection of the ranges of an epoch that agree with each other; clock offsets and noise are estimated from them.
     map_offset : MapOffsetLimits
@@ -209,6 +212,7 @@ class Config(ScreenSettings):
     map_plan_sigma_m: float | None = Field(default=None, gt=0)
     map_height_sigma_m: float | None = Field(default=None, gt=0)
     noise_scale: NoiseScaleLimits = NoiseScaleLimits()
+    lasting_errors: LastingErrorLimits = LastingErrorLimits()
     robust_fit: RobustFitLimits = RobustFitLimits()
     map_offset: MapOffsetLimits = MapOffsetLimits()
     noise: CodeNoise = CodeNoise()

@@ -21,8 +21,8 @@ from railfix.integrity.raim import (
 )
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import without
-from railfix.pipeline.results import RaimResult, patched
-from railfix.pipeline.solve import Place, place_on_line, redundancy_of
+from railfix.pipeline.results import RaimResult
+from railfix.pipeline.solve import Place, place_on_line, redundancy_of, solved_again
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.section_search import SearchIndex
@@ -100,19 +100,16 @@ def _faults_excluded(
     if not len(changed):
         return ranges, place, raim
     ranges = without(ranges, raim.excluded)
-    part = ranges.take(changed)
-    point = single_point(part, place.point.ecef_m[changed], limits=config.single_point)
-    solved = place_on_line(part, index, point, config)
+    place = solved_again(ranges, index, place, changed, config)
     # Without the fault another section can fit best: the remaining ranges must be consistent there, too.
     recheck = detect(
-        solved.constrained.wsse, solved.constrained.residual_m, redundancy_of(part), limits=limits, scale=scale[changed]
+        place.constrained.wsse[changed],
+        place.constrained.residual_m[changed],
+        redundancy_of(ranges)[changed],
+        limits=limits,
+        scale=scale[changed],
     )
     outcome = np.where(recheck.detected, Outcome.UNRESOLVED, raim.outcome[changed])
-    place = Place(
-        point=patched(place.point, changed, solved.point),
-        section=patched(place.section, changed, solved.section),
-        constrained=patched(place.constrained, changed, solved.constrained),
-    )
     return ranges, place, replace(raim, outcome=_put(raim.outcome, changed, outcome))
 
 

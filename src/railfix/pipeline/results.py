@@ -23,6 +23,7 @@ from railfix.positioning.constrained import Constrained
 from railfix.positioning.intersystem_bias import OffsetState
 from railfix.positioning.map_offset import MapOffset, MapOffsetState
 from railfix.positioning.noise_scale import NoiseState
+from railfix.positioning.residual_means import LastingErrorState
 from railfix.positioning.section_search import Section
 from railfix.positioning.single_point import SinglePoint
 from railfix.screens import Screened
@@ -96,6 +97,8 @@ class AntennaState:
         Sums behind the noise scales.
     map_offset : MapOffsetState
         Sums behind the test of the map.
+    lasting : LastingErrorState
+        Means of the residuals of each satellite.
     off_map : OffMapState
         Whether the train was away from the line.
     offsets : OffsetState
@@ -108,6 +111,7 @@ class AntennaState:
 
     noise: NoiseState = field(default_factory=NoiseState)
     map_offset: MapOffsetState = field(default_factory=MapOffsetState)
+    lasting: LastingErrorState = field(default_factory=LastingErrorState)
     off_map: OffMapState = field(default_factory=OffMapState)
     offsets: OffsetState = field(default_factory=OffsetState)
     screens: Mapping[str, Any] = field(default_factory=dict)

@@ -17,6 +17,7 @@ from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
+from railfix.pipeline.lasting_errors import lasting_errors
 from railfix.pipeline.level_stage import low_sides, places_left_open, protection_levels
 from railfix.pipeline.off_map import OffMapState, off_map_epochs
 from railfix.pipeline.reason_table import alone_on_their_clocks
@@ -112,7 +113,16 @@ def solve(
     place = antennas.each(lambda index, rows: place_on_line(rows_of(ranges, rows), index, rows_of(tied, rows), config))
     corrected = corrected.rejected(alone_on_their_clocks(corrected, ties), Reason.ALONE_ON_ITS_CLOCK)
     ages = antennas.apart(lambda _, rows, state: noise_age(time[rows], state.noise, limits=config.noise_scale), states)
-    robust, robust_sums, on_line = _robust_scale(corrected, ranges, antennas, place, ages, config, states)
+    on_line, teaching = _fit_on_line(corrected, ranges, antennas, place, config)
+    lasting_noise = [changed(state.noise, robust=state.lasting.noise) for state in states]
+    raised, raised_sums = _robust_scale(on_line, teaching, antennas, ages, config, lasting_noise)
+    ranges, place, lasting, lasting_states = lasting_errors(
+        corrected, ranges, antennas, place, raised, config, [state.lasting for state in states]
+    )
+    if lasting.any():
+        corrected = corrected.rejected(lasting, Reason.LASTING_ERROR)
+        on_line, teaching = _fit_on_line(corrected, ranges, antennas, place, config)
+    robust, robust_sums = _robust_scale(on_line, teaching, antennas, ages, config, [state.noise for state in states])
     ranges, place, raim = fault_free(ranges, antennas, place, robust, on_line.kept, config)
     constrained, redundancy = place.constrained, redundancy_of(ranges)
     off_map = _off_map(ranges, antennas, place, constrained.arc_m, config)
@@ -187,8 +197,12 @@ def solve(
         if len(time[rows]):
             sums = {"robust": robust_sums[k], "remaining": stated_sums[k]}
             noise = NoiseState(time=time[rows][-1], age=float(ages[k][-1]), **sums)
-        values = {"offsets": offsets[k], "noise": noise, "map_offset": map_states[k], "off_map": off_map_states[k]}
-        after.append(changed(state, **values, carrier=carriers[k]))
+        after.append(
+            replace(
+                state, offsets=offsets[k], noise=noise, map_offset=map_states[k], off_map=off_map_states[k],
+                lasting=replace(lasting_states[k], noise=raised_sums[k]), carrier=carriers[k],
+            )
+        )  # fmt: skip
     return corrected, solution, after
 
 
@@ -216,28 +230,33 @@ def _agreeing(ranges: Ranges, point: SinglePoint, anchor_ecef_m: Floats, config:
     return agreeing, patched(point, changed, again)
 
 
-def _robust_scale(
-    corrected: CorrectedRanges,
-    ranges: Ranges,
-    antennas: AntennaRows,
-    place: Place,
-    ages: Sequence[Floats],
-    config: Config,
-    states: Sequence[AntennaState],
-) -> tuple[Floats, list[Floats], RobustFit]:
-    """Return the noise scale that RAIM tests with, its new sums, and the robust fit on the line that it comes from."""
+def _fit_on_line(
+    corrected: CorrectedRanges, ranges: Ranges, antennas: AntennaRows, place: Place, config: Config
+) -> tuple[RobustFit, Masks]:
+    """Return the robust fit on the line, and the epochs whose noise is learnt from."""
     arc, section = place.constrained.arc_m, np.maximum(place.constrained.section, 0)
     known = np.isfinite(arc)
     at = np.where(known[:, None], antennas.at_arc(arc), corrected.anchor_ecef_m)
     information = antennas.each(lambda index, rows: map_information(index.trajectory, section[rows]))
     fit = robust_fit(ranges, at, information=information, limits=config.robust_fit)
-    teaching = known & ~_off_map(ranges, antennas, place, arc, config)
+    return fit, known & ~_off_map(ranges, antennas, place, arc, config)
 
-    def own_scale(_: SearchIndex, rows: slice, age: Floats, state: AntennaState) -> tuple[Floats, Floats]:
-        return robust_scale(age, rows_of(fit, rows), teaching[rows], state.noise, limits=config.noise_scale)
+
+def _robust_scale(
+    fit: RobustFit,
+    teaching: Masks,
+    antennas: AntennaRows,
+    ages: Sequence[Floats],
+    config: Config,
+    states: Sequence[NoiseState],
+) -> tuple[Floats, list[Floats]]:
+    """Return the noise scale of the receiver by robust fits, and its new sums."""
+
+    def own_scale(_: SearchIndex, rows: slice, age: Floats, state: NoiseState) -> tuple[Floats, Floats]:
+        return robust_scale(age, rows_of(fit, rows), teaching[rows], state, limits=config.noise_scale)
 
     scale, sums = antennas.each_with_state(own_scale, ages, states)
-    return np.maximum(scale, _least_scale(config)), sums, fit
+    return np.maximum(scale, _least_scale(config)), sums
 
 
 def _least_scale(config: Config) -> float:

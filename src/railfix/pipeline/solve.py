@@ -6,14 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from railfix.core.arrays import Integers
+from railfix.core.arrays import Indices, Integers
 from railfix.integrity.raim.model import LinearModel, model_on_line
 from railfix.pipeline.config import Config
+from railfix.pipeline.results import patched
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.constrained import Constrained, constrained_position
 from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.section_search import SearchIndex, Section, search
-from railfix.positioning.single_point import SinglePoint
+from railfix.positioning.single_point import SinglePoint, single_point
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +51,18 @@ def place_on_line(ranges: Ranges, index: SearchIndex, point: SinglePoint, config
     vertex = np.where(ranges.n_used >= config.min_satellites, section.vertex, -1)
     constrained = constrained_position(ranges, index.trajectory, vertex, limits=config.constrained)
     return Place(point=point, section=section, constrained=constrained)
+
+
+def solved_again(ranges: Ranges, index: SearchIndex, place: Place, epochs: Indices, config: Config) -> Place:
+    """Return positions of which those of some epochs of one antenna are solved again, from other ranges."""
+    part = ranges.take(epochs)
+    point = single_point(part, place.point.ecef_m[epochs], limits=config.single_point)
+    solved = place_on_line(part, index, point, config)
+    return Place(
+        point=patched(place.point, epochs, solved.point),
+        section=patched(place.section, epochs, solved.section),
+        constrained=patched(place.constrained, epochs, solved.constrained),
+    )
 
 
 def line_model(ranges: Ranges, antennas: AntennaRows, constrained: Constrained) -> LinearModel:

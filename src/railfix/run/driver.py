@@ -331,11 +331,12 @@ def notes_of(
         if antenna.never_recorded:
             seen = ", ".join(antenna.never_recorded)
             notes.append(f"{name}: satellites seen without any usable navigation record: {seen}")
-        for satellite, (count, first) in sorted(antenna.left_out.items(), key=lambda item: -item[1][0])[:_NAMED]:
-            notes.append(
-                f"{name}: the filter left out the codes of {satellite} at {count} epochs from {str(first)[:19]} on: "
+        for by, counts in (("single epochs", antenna.lasting), ("the filter", antenna.left_out)):
+            notes += [
+                f"{name}: {by} left out the codes of {satellite} at {count} epochs from {str(first)[:19]} on: "
                 "over a minute they contradict all others"
-            )
+                for satellite, (count, first) in sorted(counts.items(), key=lambda item: -item[1][0])[:_NAMED]
+            ]
         offset = antenna.map_offset
         if offset is not None and offset.statistic > note_statistic:
             doubt = "contradicts the positions" if antenna.status["map_offset"] else "may be wrong"

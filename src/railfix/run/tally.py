@@ -85,8 +85,9 @@ class AntennaTally:
         Epochs without a level because more faults than can be left out are likelier than the risk allows.
     map_offset : MapOffsetFound or None
         Where the 3-D positions contradicted the map most; None before there were enough.
-    left_out : dict of str to (int, datetime64[ns])
-        Epochs at which the filter left a satellite's codes out, and the first of them.
+    left_out, lasting : dict of str to (int, datetime64[ns])
+        Epochs at which the filter, and the single epochs, left a satellite's codes out as wrong for long, and the first
+        of them.
     """
 
     min_satellites: int = 3
@@ -112,6 +113,7 @@ class AntennaTally:
     without_budget: int = 0
     map_offset: MapOffsetFound | None = None
     left_out: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
+    lasting: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
     map_detectable_m: Floats = field(default_factory=lambda: np.full((2, 2), np.nan))
 
     def add(self, result: AntennaResult) -> None:
@@ -137,6 +139,8 @@ class AntennaTally:
         if np.isfinite(offset).any():
             self.conventional_nearest_m = float(np.fmin(self.conventional_nearest_m, np.nanmin(offset)))
         self._add_map_offset(result)
+        lasting = (result.reason & int(Reason.LASTING_ERROR)) != 0
+        _count_left_out(self.lasting, lasting, result.satellite, result.time)
         if result.protection is not None:
             levels = np.bincount(result.protection.status, minlength=len(LevelStatus))
             self.level_status.update({s.name.lower(): int(levels[s]) for s in LevelStatus})
@@ -144,11 +148,7 @@ class AntennaTally:
 
     def add_filter(self, filtered: AlongTrack, satellite: Strings) -> None:
         """Count the satellites, by channel of the filter, whose codes it left out in one more chunk."""
-        faulty = filtered.tracked.faulty
-        for k in np.flatnonzero(faulty.any(axis=0)).tolist():
-            name, first = str(satellite[k]), filtered.time[int(np.argmax(faulty[:, k]))]
-            before = self.left_out.get(name, (0, first))
-            self.left_out[name] = (before[0] + int(faulty[:, k].sum()), before[1])
+        _count_left_out(self.left_out, filtered.tracked.faulty, satellite, filtered.time)
 
     def _add_map_offset(self, result: AntennaResult) -> None:
         """Keep the window that contradicts the map most."""
@@ -238,6 +238,7 @@ class AntennaTally:
             "observations_rejected_by_one_reason_alone": dict(self.only_reason),
             "satellites_seen": dict(sorted(self.satellites.items())),
             "satellites_without_any_record": self.never_recorded,
+            "satellites_left_out": {s: n for s, (n, _) in sorted(self.lasting.items())},
             "satellites_left_out_by_the_filter": {s: n for s, (n, _) in sorted(self.left_out.items())},
         }
 
@@ -309,3 +310,13 @@ class Tally:
     def positioned(self) -> int:
         """Epochs with a position, of all antennas."""
         return sum(a.positioned for a in self.antennas.values())
+
+
+def _count_left_out(
+    counts: dict[str, tuple[int, np.datetime64]], left_out: Masks, satellite: Strings, time: Datetimes
+) -> None:
+    """Count the epochs of a chunk at which satellites were left out, shape (T, K), and keep the first of each."""
+    for k in np.flatnonzero(left_out.any(axis=0)).tolist():
+        name, first = str(satellite[k]), time[int(np.argmax(left_out[:, k]))]
+        before = counts.get(name, (0, first))
+        counts[name] = (before[0] + int(left_out[:, k].sum()), before[1])
