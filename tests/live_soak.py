@@ -91,7 +91,7 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False) -> d
                     heard = between(messages, last, now)
                 last = now
                 if heard is not None:
-                    engine.hear(heard)
+                    engine.add_sbas(heard)
                 yield Received(epochs=(epoch,), navigation=new, after=state)
                 await asyncio.sleep(0)
 

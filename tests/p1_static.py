@@ -74,7 +74,7 @@ class Subsets:
         return self.over & (np.abs(self.error_m) > WRONG_SIGMAS * self.sigma_m)
 
 
-def standing(start: np.datetime64, seed: int, place: Place, places: Sequence[float] = PLACES_M) -> Scenario:
+def prior_basis_text(start: np.datetime64, seed: int, place: Place, places: Sequence[float] = PLACES_M) -> Scenario:
     """A train that stands at many places of the test line, between its houses or on an open field."""
     base = load_recipe("p1-test-line").scenario()
     run = RunSettings(
@@ -124,7 +124,7 @@ def only(observations: Observations, channels: Sequence[int], epochs: Indices) -
 
 def subsets(start: np.datetime64, seed: int, size: int, place: Place, places: Sequence[float] = PLACES_M) -> Subsets:
     """Every subset of so many satellites of one standing experiment."""
-    simulation = Simulation(standing(start, seed, place, places))
+    simulation = Simulation(prior_basis_text(start, seed, place, places))
     config = parse_config(
         {
             "systems": ["G"],

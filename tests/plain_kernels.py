@@ -52,24 +52,26 @@ def work_space(hypotheses: int, sources: int = 0) -> layout.Work:
     return _work_space(4, len(SENSORS), 12, hypotheses, sources)[1]
 
 
-def memory(place_m: np.ndarray, sigma_m: np.ndarray, log_probability: np.ndarray, **scalars: float) -> layout.Memory:
+def memory(
+    place_m: np.ndarray, sigma_m: np.ndarray, log_probability: np.ndarray, **scalars: float
+) -> layout.KernelState:
     """Hypotheses at places; scalars by their names in the layout."""
     count = len(place_m)
     mean, covariance = np.zeros((count, 12)), np.zeros((count, 12, 12))
-    mean[:, layout.PLACE], covariance[:, layout.PLACE, layout.PLACE] = place_m, sigma_m**2
+    mean[:, layout.ARC], covariance[:, layout.ARC, layout.ARC] = place_m, sigma_m**2
     values = np.zeros(20)
     values[layout.HYPOTHESES] = count
     for name, value in scalars.items():
         values[getattr(layout, name)] = value
     made = named_tuple(
-        layout.Memory,
+        layout.KernelState,
         mean=mean,
         covariance=covariance,
         log_probability=log_probability.copy(),
         log_code=np.zeros(count),
         scalars=values,
     )
-    return cast(layout.Memory, made)
+    return cast(layout.KernelState, made)
 
 
 def subfilters(names: list[str], place_m: Any, sigma_m: Any, limits: TrackingLimits, weak_s: Any = 0.0) -> Any:
@@ -77,7 +79,7 @@ def subfilters(names: list[str], place_m: Any, sigma_m: Any, limits: TrackingLim
     given, kinds = budget(limits), [kind_of(name) for name in names]
     size = len(names) + 1
     mean, covariance = np.zeros((size, 12)), np.zeros((size, 12, 12))
-    mean[:-1, layout.PLACE], covariance[:-1, layout.PLACE, layout.PLACE] = place_m, np.square(sigma_m)
+    mean[:-1, layout.ARC], covariance[:-1, layout.ARC, layout.ARC] = place_m, np.square(sigma_m)
     return named_tuple(
         layout.Subfilters,
         running=np.arange(size) < len(names),

@@ -16,7 +16,7 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.core.timescale import timedelta
 from railfix.evaluate import evaluate_run
 from railfix.io.reference_log import AntennaReference
-from railfix.pipeline.return_gate import ReturnState, refused_codes
+from railfix.pipeline.return_gate import ReturnState, gated_codes
 from railfix.pipeline.smoothing import Replay, smooth
 from railfix.positioning.constrained import constrained_position
 from railfix.positioning.section_search import SearchIndex, SectionLimits, search
@@ -147,7 +147,7 @@ def test_codes_that_come_back_beyond_the_join_count() -> None:
     observed = np.arange(8) >= 3
     state = ReturnState(time=time[0], place_m=length - 20.0, sigma_m=1.0)
     place = np.mod(length - 20.0 + 10.0 * np.arange(1, 9), length)
-    refused, _ = refused_codes(
+    refused, _ = gated_codes(
         time, observed, np.full(8, 10.0), place, np.ones(8), state, line, sigmas=4.0, longest_s=60.0
     )
     np.testing.assert_array_equal(np.flatnonzero(refused), [3, 4])

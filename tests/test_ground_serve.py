@@ -219,12 +219,12 @@ def centre(tmp_path: Path) -> Iterator[tuple[ControlCentre, list[Authority], lis
 
 
 def layout_state() -> Interlocking:
-    def standing(train: int, direction: int, front: float, station: int) -> TrainInterval:
+    def prior_basis_text(train: int, direction: int, front: float, station: int) -> TrainInterval:
         return standing_train(
             train, direction=direction, front_m=front, length_m=80.0, bound_m=5.0, station=station, track=train
         )
 
-    return at_start(line_with_loops(3), [standing(1, 1, 400.0, 0), standing(2, -1, 3100.0, 2)])
+    return at_start(line_with_loops(3), [prior_basis_text(1, 1, 400.0, 0), prior_basis_text(2, -1, 3100.0, 2)])
 
 
 def restored(store: Store, state: Interlocking, sent: list[Authority], now: list[float]) -> ControlCentre:

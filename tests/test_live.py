@@ -206,7 +206,7 @@ def test_what_is_used_in_place_of_what_was_asked_for_is_told(logs: dict[str, tup
     at = tag_ns(logs["front"][0])
     played(engine, [(at + 100 * MS * k, "front", epoch) for k, epoch in enumerate(logs["front"][:10])])
     assert not engine.told
-    engine.learn(navigation)
+    engine.add_navigation(navigation)
     played(engine, [(at + 100 * MS * k, "front", epoch) for k, epoch in enumerate(logs["front"][10:20], 10)])
     assert [text.startswith("no longer so: ionosphere") for text in engine.told] == [True]
 
@@ -300,7 +300,7 @@ def test_ephemerides_count_from_when_they_are_complete(recordings: Path, tmp_pat
         state = items[-1].after
         for received in items:
             if received.navigation is not None:
-                engine.learn(received.navigation)
+                engine.add_navigation(received.navigation)
                 records += len(received.navigation.kepler)
             for epoch in received.epochs:
                 engine.push("front", epoch, now_ns=tag_ns(epoch))

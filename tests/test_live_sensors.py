@@ -116,7 +116,7 @@ def live(case: Ride, engine: LiveEngine, *, latency_s: float, beat: bool = True)
             sent = -(-at_ns(t) // 20_000_000) * 20_000_000
             parts[sent] = parts.get(sent, b"") + line
         lines = SensorLines(sensor=sensor, source="test")
-        engine.sense(lines.take(f"{HEADERS[sensor]}\n".encode()))
+        engine.add_samples(lines.take(f"{HEADERS[sensor]}\n".encode()))
         rest = b""
         for sent, data in parts.items():
             data, rest = (rest + data)[:-7], (rest + data)[-7:]
@@ -128,7 +128,7 @@ def live(case: Ride, engine: LiveEngine, *, latency_s: float, beat: bool = True)
             engine.push("front", event, now_ns=now)  # type: ignore[arg-type]
         else:
             lines, data = event  # type: ignore[misc]
-            engine.sense(lines.take(data))
+            engine.add_samples(lines.take(data))
         outputs += engine.poll(now_ns=now)
     return [*outputs, *engine.poll(now_ns=END_NS)]
 
@@ -179,7 +179,7 @@ def test_a_restart_in_a_slip_goes_on_from_the_state_file(case: Ride, tmp_path: P
         engine = engine_of(case, tmp_path)
         for name in SENSORS:
             samples = SensorSamples(**{name: case.samples.tables[name]})
-            engine.sense(Sensed(sensor=name, samples=samples, until=FOREVER))
+            engine.add_samples(Sensed(sensor=name, samples=samples, until=FOREVER))
         return engine
 
     engine, outputs = begun(), []

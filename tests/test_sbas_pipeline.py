@@ -24,7 +24,7 @@ from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.fault_exclusion import fault_free
-from railfix.pipeline.level_stage import level_facts, low_sides, protection_levels, standing
+from railfix.pipeline.level_stage import level_facts, low_sides, prior_basis_text, protection_levels
 from railfix.pipeline.processor import AntennaResult
 from railfix.pipeline.results import State
 from railfix.pipeline.solve import place_on_line
@@ -290,7 +290,7 @@ def test_every_output_names_what_a_level_rests_on() -> None:
         ({"priors": "measured", "local_prior": 2e-5, "side_prior": 5e-6}, False, False),  # measured there
         ({"priors": "measured", "local_prior": 2e-5, "side_prior": 0.0}, False, True),
     ):
-        text = standing(level_facts(parse_config({"risk": risk})))
+        text = prior_basis_text(level_facts(parse_config({"risk": risk})))
         assert ("indicative" in text, "no risk an hour" in text) == (indicative, indicative)
         assert ("no data supports" in text) == unsupported
-    assert standing({}) == "not recorded"
+    assert prior_basis_text({}) == "not recorded"

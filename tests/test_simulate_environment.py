@@ -551,7 +551,7 @@ def test_pieces_equal_the_whole_and_satellites_may_be_permuted() -> None:
 
 
 def test_a_second_pass_finds_the_same_place() -> None:
-    """Later, the other way, another antenna: the same numbers, only the Doppler turns about."""
+    """BackwardInformation, the other way, another antenna: the same numbers, only the Doppler turns about."""
     geometry, place = everywhere(), town()
     back = replace(geometry, antenna="rear", time=geometry.time + np.timedelta64(3, "h"), speed_mps=-geometry.speed_mps)
     one, other = place(geometry), place(back)

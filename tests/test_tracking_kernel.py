@@ -11,7 +11,7 @@ import pytest
 from plain_kernels import plain
 from railfix.kernels.tracking import layout
 from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
-from railfix.tracking.chunk import prepared
+from railfix.tracking.chunk import prepare_chunk
 from railfix.tracking.handover import Handover
 from railfix.tracking.recursion import Recursion
 from tracking_cases import Ride, bent_line, part, reflected, ride, without_epochs
@@ -134,7 +134,7 @@ def test_with_normal_errors_the_update_is_kalmans_and_its_evidence_the_density()
     for name in ("log_probability", "log_code", "log_least", "origin_m"):
         setattr(state, name, np.repeat(getattr(state, name), 2) + np.log(0.5) * (name == "log_probability"))
     epochs = part(case.epochs, slice(20, 21))
-    chunk = prepared(epochs, state, limits)
+    chunk = prepare_chunk(epochs, state, limits)
     recursion = Recursion(chunk, case.line, SensorEpochs(), limits, Tracked.empty(epochs.time, 10), levels=False)
     handed = Handover(recursion, state, 0, 1)
     assert handed.run(layout.WHOLE) == 1

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from railfix.tracking import Later, Step, TrackingLimits, TrackState, smoothed, track
-from railfix.tracking.state import Unknown
+from railfix.tracking import BackwardInformation, Step, TrackingLimits, TrackState, smoothed, track
+from railfix.tracking.state import StateIndex
 from railfix.tracking.transition import transition
 from tracking_cases import Ride, bent_line, part, ride, without_epochs
 
@@ -58,8 +58,8 @@ def _dense(trace: list[Step]) -> tuple[np.ndarray, np.ndarray]:
     system = np.eye(len(right)) + weights @ rows @ cross
     change = cross @ np.linalg.solve(system, right)
     after = whole - cross @ np.linalg.solve(system, weights @ cross.T)
-    place = np.arange(size) * width + int(Unknown.PLACE)
-    arc = np.array([mean[Unknown.PLACE] for mean in means]) + change[place]
+    place = np.arange(size) * width + int(StateIndex.ARC)
+    arc = np.array([mean[StateIndex.ARC] for mean in means]) + change[place]
     return arc, np.sqrt(after[place, place])
 
 
@@ -92,7 +92,7 @@ def test_chunks_backward_give_what_the_whole_gives() -> None:
         trace, state = _traced(one, state)
         pieces.append(trace)
         states.append(state)
-    later: Later | None = None
+    later: BackwardInformation | None = None
     arcs = []
     for trace, before in zip(pieces[::-1], states[-2::-1], strict=True):
         result, later = smoothed(trace, before, later, LIMITS)

@@ -15,7 +15,7 @@ from railfix.cli.options import OverwriteOption, overwriting
 from railfix.evaluate import Evaluation
 from railfix.evaluate.run_folder import POSITIONS_TABLE
 from railfix.pipeline.config import Config
-from railfix.pipeline.level_stage import standing
+from railfix.pipeline.level_stage import prior_basis_text
 from railfix.report import read_runs, write_page
 from railfix.run import RunOptions, run_files
 from railfix.simulate.demonstration import demo_inputs, demo_truth
@@ -105,7 +105,7 @@ def show_levels(evaluation: Evaluation, console: Console) -> None:
                 f"{int((~over['usable']).sum())} where the run had raised an alarm or a doubt",
                 soft_wrap=True,
             )
-    for text in dict.fromkeys(standing(run.protection) for run in evaluation.runs if run.protection):
+    for text in dict.fromkeys(prior_basis_text(run.protection) for run in evaluation.runs if run.protection):
         console.print(f"protection level: {text}", soft_wrap=True)
 
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from railfix.cli.console import Column, count, listed, percent
-from railfix.pipeline.level_stage import standing
+from railfix.pipeline.level_stage import prior_basis_text
 
 if TYPE_CHECKING:
     from railfix.evaluate import Evaluation, Integrity
@@ -34,7 +34,7 @@ _COUNTS: Final = {
 
 def show_integrity(evaluation: Evaluation, console: Console) -> None:
     """Levels of each kind against the errors."""
-    for text in dict.fromkeys(standing(run.protection) for run in evaluation.runs if run.protection):
+    for text in dict.fromkeys(prior_basis_text(run.protection) for run in evaluation.runs if run.protection):
         console.print(f"Protection levels: {text}", markup=False, soft_wrap=True)
     for kind, found in evaluation.integrity.items():
         console.print(

@@ -57,7 +57,7 @@ class StationStreams:
         self._done = np.datetime64("1980-01-06", "ns")
         self._levels = [deque[float](maxlen=_USUAL_EPOCHS) for _ in points_ecef_m]
 
-    def learn(self, navigation: Navigation) -> None:
+    def add_navigation(self, navigation: Navigation) -> None:
         """Take navigation records."""
         self._known = receive(self._known, self._config, np.datetime64("NaT", "ns"), navigation=navigation)
 
@@ -138,7 +138,7 @@ async def stream_fixes(
                 running -= 1
                 continue
             if received.navigation is not None:
-                stations.learn(received.navigation)
+                stations.add_navigation(received.navigation)
             for epoch in received.epochs:
                 if (fixes := stations.push(receiver, epoch)) is not None:
                     yield fixes

@@ -78,7 +78,7 @@ def _quantile(probability: float) -> float:
 
 
 @kernel
-def lowered(
+def solve_level(
     offset_m: Floats, sigma_m: Floats, weight: Floats, bounds: Indices, share: Floats, reserved: Floats
 ) -> tuple[Floats, Codes, Floats, Floats, Indices]:
     """Return the fields of `Levels`, epoch by epoch."""

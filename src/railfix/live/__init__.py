@@ -4,7 +4,7 @@
 and sinks, `run_live` all that ``railfix live`` does::
 
     engine = LiveEngine(processor, LiveSettings(train=7))
-    engine.learn(navigation)
+    engine.add_navigation(navigation)
     engine.push("front", epoch, now_ns=time.monotonic_ns())
     for output in engine.poll(now_ns=time.monotonic_ns()):
         print(output.message.chainage_cm, output.result)

@@ -99,20 +99,20 @@ class TwoChannels(LiveEngine):
         super().resume(saved)
         self._call("resume", saved)
 
-    def learn(self, navigation: Navigation) -> None:
+    def add_navigation(self, navigation: Navigation) -> None:
         """As `LiveEngine.learn`."""
-        super().learn(navigation)
-        self._call("learn", navigation)
+        super().add_navigation(navigation)
+        self._call("add_navigation", navigation)
 
-    def hear(self, messages: SbasMessages) -> None:
+    def add_sbas(self, messages: SbasMessages) -> None:
         """As `LiveEngine.hear`."""
-        super().hear(messages)
-        self._call("hear", messages)
+        super().add_sbas(messages)
+        self._call("add_sbas", messages)
 
-    def sense(self, sensed: Sensed) -> None:
+    def add_samples(self, sensed: Sensed) -> None:
         """As `LiveEngine.sense`."""
-        super().sense(sensed)
-        self._call("sense", sensed)
+        super().add_samples(sensed)
+        self._call("add_samples", sensed)
 
     def push(self, antenna: str, epoch: Observations, *, now_ns: int) -> None:
         """As `LiveEngine.push`."""

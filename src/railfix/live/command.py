@@ -146,7 +146,7 @@ async def run_live(inputs: LiveInputs) -> list[str]:
         for name in set(inputs.sensors) - set(listened):
             samples = SensorSamples(**{str(name): getattr(tables, name)})
             table = Sensed(sensor=name, samples=samples, until=FOREVER)
-            engine.sense(table)
+            engine.add_samples(table)
             if hooks.sensed is not None:
                 hooks.sensed(table)
         gc.freeze()  # what is loaded stays: looking through it for garbage would hold an epoch up for 0.1 s

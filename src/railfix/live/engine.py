@@ -147,21 +147,21 @@ class LiveEngine:
         self._period_ns = round(settings.period_s * 1e9)
         self._tolerance_ns = round(processor.config.antenna_pair.tag_tolerance_s * 1e9)
 
-    def learn(self, navigation: Navigation) -> None:
+    def add_navigation(self, navigation: Navigation) -> None:
         """Take navigation records; they are used from the next epoch on."""
         self._hear(_FromSatellites(heard=self._heard + 1, navigation=navigation))
 
-    def hear(self, messages: SbasMessages) -> None:
+    def add_sbas(self, messages: SbasMessages) -> None:
         """Take SBAS messages; they are used from the next epoch on."""
         self._hear(_FromSatellites(heard=self._heard + 1, messages=messages))
 
-    def sense(self, sensed: Sensed) -> None:
+    def add_samples(self, sensed: Sensed) -> None:
         """Take samples of a sensor on board that was named when the engine was made."""
         self._heard_to[sensed.sensor] = np.fmax(self._heard_to[sensed.sensor], sensed.until)
         if sensed.samples:
             self._samples = self._samples.joined(sensed.samples)
 
-    def _unheard(self, tag_ns: int) -> frozenset[str]:
+    def _late_sensors(self, tag_ns: int) -> frozenset[str]:
         """Sensors that have not been heard up to an epoch."""
         time = GPS_EPOCH + np.timedelta64(tag_ns, "ns")
         return frozenset(name for name, heard in self._heard_to.items() if not heard >= time)
@@ -359,7 +359,7 @@ class LiveEngine:
             waited_s = (now_ns - first.arrived_ns) * 1e-9
             if not complete and waited_s < self.settings.pair_wait_s:
                 return
-            if waited_s < self.settings.sensor_wait_s and self._unheard(first.tag_ns):
+            if waited_s < self.settings.sensor_wait_s and self._late_sensors(first.tag_ns):
                 return
             for name in together:
                 self._waiting[name].popleft()
@@ -386,7 +386,7 @@ class LiveEngine:
 
     def _samples_until(self, tag_ns: int) -> SensorSamples:
         """Samples since the epoch before up to an epoch; later ones wait."""
-        time, silent = GPS_EPOCH + np.timedelta64(tag_ns, "ns"), self._unheard(tag_ns)
+        time, silent = GPS_EPOCH + np.timedelta64(tag_ns, "ns"), self._late_sensors(tag_ns)
         self.counts.update(f"{name} silent" for name in silent)
         samples = self._samples.between(np.datetime64("NaT", "ns"), time)
         self._samples = self._samples.between(time, FOREVER)

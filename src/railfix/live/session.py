@@ -157,7 +157,7 @@ class _Session:
                     skipped, units = self.metrics.skipped, self.engine.processor.units
                     skipped[f"lines of the {item.sensor} that are no rows"] += item.skipped
                     skipped["ranges to ground units that are not surveyed"] += item.unsurveyed(units)
-                    self.engine.sense(item)
+                    self.engine.add_samples(item)
                     if self.hooks.sensed is not None:
                         self.hooks.sensed(item)
                 elif item is not None:
@@ -229,12 +229,12 @@ class _Session:
         skipped["bytes outside messages"] += received.skipped_bytes
         skipped["messages with a bad checksum"] += received.bad_checksums
         if received.navigation is not None:
-            self.engine.learn(received.navigation)
+            self.engine.add_navigation(received.navigation)
         if received.sbas is not None and self.engine.uses_sbas:
             messages = from_receiver(received.sbas, source=name)
             skipped.update({f"SBAS messages: {why}": n for why, n in messages.rejected.items() if n})
             if len(messages):
-                self.engine.hear(messages)
+                self.engine.add_sbas(messages)
         tag_ns = -1
         for epoch in received.epochs:
             tag_ns = int((epoch.time[0] - GPS_EPOCH).astype(np.int64))

@@ -16,9 +16,9 @@ from railfix.core.timescale import seconds
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
-from railfix.pipeline.return_gate import ReturnState, refused_codes
+from railfix.pipeline.return_gate import ReturnState, gated_codes
 from railfix.pipeline.sensed_motion import SensedMotion
-from railfix.pipeline.sensor_epochs import SensorState, Surroundings, sensor_epochs
+from railfix.pipeline.sensor_epochs import LineReferences, SensorState, sensor_epochs
 from railfix.pipeline.smoothing import Replay, SmoothedTrack
 from railfix.positioning.carrier import SlipState, corrected_phase_m, find_slips
 from railfix.screens import Screened
@@ -48,7 +48,7 @@ _DIRECTION_SIGMAS: Final = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fixed:
+class FilterFix:
     """Place by the filter at its last epoch: what the place by the wheel begins from anew every few seconds.
 
     Attributes
@@ -108,7 +108,7 @@ class FilterState:
     level : LevelState
         Of the filter that gives the levels.
     sensors : SensorState
-    fixed, anchor : Fixed or None
+    fixed, anchor : FilterFix or None
         Place of the filter at the last epoch, and at the last one before the present stretch.
     gate : ReturnState
     disagreed : datetime64[ns]
@@ -120,8 +120,8 @@ class FilterState:
     track: TrackState | None = None
     level: LevelState = field(default_factory=LevelState)
     sensors: SensorState = field(default_factory=SensorState.empty)
-    fixed: Fixed | None = None
-    anchor: Fixed | None = None
+    fixed: FilterFix | None = None
+    anchor: FilterFix | None = None
     gate: ReturnState = field(default_factory=ReturnState)
     disagreed: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
 
@@ -178,7 +178,7 @@ def along_track(
     state: FilterState,
     *,
     samples: SensorSamples | None = None,
-    surroundings: Surroundings | None = None,
+    surroundings: LineReferences | None = None,
 ) -> tuple[AlongTrack, FilterState]:
     """Return the filtered positions of one antenna, and the state to pass on.
 
@@ -192,7 +192,7 @@ def along_track(
     state : FilterState
     samples : SensorSamples, optional
         Of the sensors on board since the chunk before.
-    surroundings : Surroundings, optional
+    surroundings : LineReferences, optional
         Features of the line and ground units that the sensors meet.
     """
     epochs, slips = gnss_epochs(ranges, single.noise_scale, config, state.slips)
@@ -261,7 +261,7 @@ def _tracked(
     config: Config,
     state: FilterState,
     samples: SensorSamples | None,
-    surroundings: Surroundings | None,
+    surroundings: LineReferences | None,
     alone: tuple[Floats, Floats],
 ) -> tuple[Tracked, SensedMotion, tuple[Replay, ...], FilterState]:
     """Places of the filter, motion by the sensors, and the state to pass on.
@@ -323,7 +323,7 @@ def _gated(
         if other is not None and (other is not sensors.wheel_m or sensors.wheel_sign == "measured"):
             way = np.where(np.isfinite(other), other, way)
     observed = np.asarray(np.isfinite(epochs.code_m).any(axis=1))
-    refused, gate = refused_codes(
+    refused, gate = gated_codes(
         epochs.time, observed, way, place_m, sigma_m, state.gate, line,
         sigmas=config.sensors.return_sigmas, longest_s=config.sensors.return_s,
     )  # fmt: skip
@@ -358,7 +358,7 @@ def _stretch(time: np.datetime64) -> int:
     return int(time.astype(np.int64)) // _STRETCH_NS
 
 
-def _begun_anew(state: FilterState, fixed: Fixed) -> FilterState:
+def _begun_anew(state: FilterState, fixed: FilterFix) -> FilterState:
     """State at the beginning of a stretch: what the sensors carry begins from the place of the filter."""
     sensors = state.sensors
     if sensors.motion.tick:
@@ -368,11 +368,11 @@ def _begun_anew(state: FilterState, fixed: Fixed) -> FilterState:
     return replace(state, sensors=sensors, anchor=fixed, gate=gate)
 
 
-def _fixed(tracked: Tracked) -> Fixed:
+def _fixed(tracked: Tracked) -> FilterFix:
     decided = tracked.status[-1] in (TrackStatus.TRACKING, TrackStatus.COASTING)
     arc, speed = float(tracked.arc_m[-1]), float(tracked.speed_mps[-1])
     sigma = float(tracked.sigma_m[-1])
-    return Fixed(time=tracked.time[-1], arc_m=arc if decided else np.nan, sigma_m=sigma, speed_mps=speed)
+    return FilterFix(time=tracked.time[-1], arc_m=arc if decided else np.nan, sigma_m=sigma, speed_mps=speed)
 
 
 def _joined(parts: list[Tracked]) -> Tracked:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _FEW: Final = 16
 
 
-def few(observations: Sequence[Observations]) -> bool:
+def is_short(observations: Sequence[Observations]) -> bool:
     """Whether chunks of several antennas are so short that their stages are better called once."""
     lengths = [len(part) for part in observations]
     return len(lengths) > 1 and min(lengths) > 0 and sum(lengths) <= _FEW
@@ -163,7 +163,7 @@ class AntennaChunk:
         self._sensors, self._together = sensors, together
         self._number, corrected = together.add(self)
         self._rows, self._trajectory = together.rows(self._number), together.index(self._number).trajectory
-        self._surroundings = processor.surroundings(name, sensors)
+        self._surroundings = processor.line_references(name, sensors)
         self._ranges, self.state = self._screened(corrected, state, processor)
         self.status = np.zeros(0, dtype=np.int8)
         self._result: AntennaResult | None = None

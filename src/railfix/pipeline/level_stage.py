@@ -49,7 +49,7 @@ def basis_of(config: Config) -> str:
     return BASES[0] if config.risk.priors == "measured" else BASES[1]
 
 
-def standing(facts: Mapping[str, Any]) -> str:
+def prior_basis_text(facts: Mapping[str, Any]) -> str:
     """Return a sentence on the priors of a run's levels: measured or assumed, and supported by data or not.
 
     Parameters
@@ -159,7 +159,7 @@ def protection_levels(
     return ProtectionResult(level=level, status=status, kind=kind_of(config), basis=basis_of(config))
 
 
-def places_left_open(
+def unresolved_alternatives(
     corrected: CorrectedRanges,
     ranges: Ranges,
     antennas: AntennaRows,

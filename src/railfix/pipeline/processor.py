@@ -18,7 +18,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, SensorSamples
 from railfix.pipeline.along_track import FilterState
-from railfix.pipeline.antenna_chunk import AntennaChunk, SolvedTogether, few, one_after_the_other
+from railfix.pipeline.antenna_chunk import AntennaChunk, SolvedTogether, is_short, one_after_the_other
 from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.compared import (
@@ -32,7 +32,7 @@ from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
 from railfix.pipeline.received import Received, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
-from railfix.pipeline.sensor_epochs import Surroundings, waiting_samples
+from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.cn0_curve import Cn0Curve
@@ -138,14 +138,14 @@ class EpochProcessor:
         self._track, self.units = track, units
         self._features: dict[str, LineFeatures] = {}
         self._before_filter = FilterState()
-        self._lacking = self._unable()
+        self._lacking = self._inactive_notes()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on the data known from the start, and on screens that cannot judge."""
         return (*self.received.notes, *self._lacking)
 
-    def _unable(self) -> tuple[str, ...]:
+    def _inactive_notes(self) -> tuple[str, ...]:
         """Return one sentence for each part of the settings that cannot work as asked."""
         notes = [note for screen, limits in self.screens for note in screen.notes(limits, self.setup)]
         conditions = None if self._error_model is None else self._error_model.conditions
@@ -262,7 +262,7 @@ class EpochProcessor:
     def _joinable(self, observations: Mapping[str, Observations]) -> bool:
         """Whether the epochs of all antennas are rows of the same arrays."""
         sigmas = {(t.sigma_plan_m, t.sigma_height_m) for t in (self.trajectories[name] for name in observations)}
-        return self.config.carrier == "off" and len(sigmas) == 1 and few(list(observations.values()))
+        return self.config.carrier == "off" and len(sigmas) == 1 and is_short(list(observations.values()))
 
     def _corrected(self, observations: Mapping[str, Observations], received: Received) -> SolvedTogether:
         """Return the corrected ranges of one antenna, or of the rows of several."""
@@ -295,13 +295,13 @@ class EpochProcessor:
         )
         return Result(antennas=results, notes=notes, fusion=tracks), after
 
-    def surroundings(self, name: str, sensors: SensorSamples | None) -> Surroundings:
+    def line_references(self, name: str, sensors: SensorSamples | None) -> LineReferences:
         """Ground units, and the features of the line: made when there is an inertial unit."""
         wanted = "feature" in self.config.filter_sources and sensors is not None and len(sensors.inertial) > 0
         if wanted and self._track is not None and name not in self._features:
             limits = self.config.sensors.feature
             self._features[name] = LineFeatures.of(self._track, self.trajectories[name], limits)
-        return Surroundings(features=self._features.get(name), units=self.units)
+        return LineReferences(features=self._features.get(name), units=self.units)
 
     def compare(self, chunks: Mapping[str, ChunkSteps]) -> None:
         """Take the same chunk of all antennas through the screens that compare them, up to their last step.

@@ -48,7 +48,7 @@ class ReturnState:
     agreeing: int = 0
 
 
-def refused_codes(
+def gated_codes(
     time: Datetimes,
     observed: Masks,
     way_m: Floats,

@@ -38,7 +38,7 @@ Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, Sta
 
 
 @dataclass(frozen=True, kw_only=True)
-class Surroundings:
+class LineReferences:
     """What sensors are compared with.
 
     Attributes
@@ -157,7 +157,7 @@ def sensor_epochs(
     limits: SensorLimits,
     sine_at: Callable[[Floats], Floats] | None = None,
     sources: Container[str] = ("wheel", "radar", "force", "feature", "range"),
-    surroundings: Surroundings | None = None,
+    surroundings: LineReferences | None = None,
 ) -> tuple[SensorEpochs, SensedMotion, SensorState]:
     """Return ways and forces between the epochs, the motion that wheel and inertia agree on, and the state to keep.
 
@@ -175,7 +175,7 @@ def sensor_epochs(
         Sine of the gradient at arc lengths; the line is unknown without.
     sources : container of str
         Which of `wheel`, `radar`, `force`, `feature` and `range` are wanted.
-    surroundings : Surroundings, optional
+    surroundings : LineReferences, optional
         Features of the line and ground units.
     """
     if not (samples or state.samples):

@@ -9,7 +9,17 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats
-from railfix.tracking import GnssEpochs, Later, Line, SensorEpochs, Step, TrackingLimits, TrackState, smoothed, track
+from railfix.tracking import (
+    BackwardInformation,
+    GnssEpochs,
+    Line,
+    SensorEpochs,
+    Step,
+    TrackingLimits,
+    TrackState,
+    smoothed,
+    track,
+)
 
 #: Epochs whose covariances are in memory at a time.
 _EPOCHS: Final = 300
@@ -60,7 +70,7 @@ def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> Sm
     limits : TrackingLimits
     """
     parts: list[SmoothedTrack] = []
-    later: Later | None = None
+    later: BackwardInformation | None = None
     for replay in backward:
         for epochs, before in reversed(_pieces(replay, line, limits)):
             trace: list[Step] = []

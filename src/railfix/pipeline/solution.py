@@ -18,7 +18,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
 from railfix.pipeline.lasting_errors import lasting_errors
-from railfix.pipeline.level_stage import low_sides, places_left_open, protection_levels
+from railfix.pipeline.level_stage import low_sides, protection_levels, unresolved_alternatives
 from railfix.pipeline.off_map import OffMapState, off_map_epochs
 from railfix.pipeline.reason_table import alone_on_their_clocks
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
@@ -158,7 +158,7 @@ def solve(
         heading = antennas.each(lambda index, rows: index.trajectory.heading_deg[section[rows]])
         sides = low_sides(corrected, heading, config.risk.side_elevation_deg)
         level = protection_levels(corrected, model, offset, raim, scale, sides, config)
-        open_elsewhere = places_left_open(corrected, ranges, antennas, place, model, level, scale, sides, config)
+        open_elsewhere = unresolved_alternatives(corrected, ranges, antennas, place, model, level, scale, sides, config)
     own_sigma = own_sigma_m(redundancy, constrained.wsse, constrained.exact_map_sigma_m, scale)
     arc, exact, total = constrained.arc_m, constrained.exact_map_sigma_m, constrained.sigma_m
     variance = epoch_variance(scale, constrained.wsse, redundancy, limits=config.noise_scale)
@@ -172,7 +172,7 @@ def solve(
         arc, exact, total, variance = phase.arc_m, phase.noise_sigma_m, phase.sigma_m, scale**2
     along_sigma = np.sqrt(variance * exact**2 + (total**2 - exact**2) + nominal)
     judged = own_sigma if phase is None else along_sigma
-    along_sigma = np.sqrt(along_sigma**2 + _other_place_m2(ranges, antennas, place, arc, config))
+    along_sigma = np.sqrt(along_sigma**2 + _ambiguity_variance_m2(ranges, antennas, place, arc, config))
     if phase is not None:
         off_map = _off_map(ranges, antennas, place, arc, config)
     solution = Solution(
@@ -273,7 +273,7 @@ def _nominal_variance_m2(model: LinearModel, corrected: CorrectedRanges, config:
     return np.asarray((share**2).sum(axis=1))
 
 
-def _other_place_m2(ranges: Ranges, antennas: AntennaRows, place: Place, arc: Floats, config: Config) -> Floats:
+def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, place: Place, arc: Floats, config: Config) -> Floats:
     """Return the mean square distance to the best other place of ambiguous epochs, shape (T,).
 
     The other place fits worse by the excess x, so that it is the true one with the probability ``1/(1 + exp(x/2))``

@@ -11,7 +11,7 @@ import polars as pl
 from railfix.evaluate import Evaluation, EvaluationOptions, Integrity
 from railfix.evaluate.integrity import LEVELS_OF, positions_diagram
 from railfix.evaluate.run_folder import floats
-from railfix.pipeline.level_stage import standing
+from railfix.pipeline.level_stage import prior_basis_text
 from railfix.report.content import Absent, Block, Folded, Sentence, Table, number, share
 from railfix.report.runs import ReportedRun
 from railfix.report.tables import level_sizes
@@ -76,7 +76,7 @@ def _assumptions(run: ReportedRun, kind: str) -> Table:
     sigmas = f"error model {model}" if model is not None else str(stated.get("sigmas", "not recorded"))
     rows = [
         ("kind", f"{kind}: {_KINDS.get(kind, 'not recorded')}"),
-        ("standing", standing(stated)),
+        ("standing", prior_basis_text(stated)),
         ("errors without a fault", sigmas),
         ("alarm limit", _value(stated.get("alarm_limit_m"), " m")),
         ("risk per hour", _value(stated.get("risk_per_hour"))),

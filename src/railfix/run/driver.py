@@ -21,7 +21,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
-from railfix.pipeline.level_stage import basis_of, level_facts, risk_of, standing
+from railfix.pipeline.level_stage import basis_of, level_facts, prior_basis_text, risk_of
 from railfix.pipeline.processor import EpochProcessor
 from railfix.run.antennas import AntennaRun, OtherProcess, processes, write_rows
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
@@ -391,8 +391,8 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
             )
     risk = risk_of(config)
     yield (
-        f"protection level: {standing(level_facts(config))} (railfix error-model measures priors; risk.local_prior, "
-        "risk.side_prior and risk.priors state them)"
+        f"protection level: {prior_basis_text(level_facts(config))} (railfix error-model measures priors; "
+        "risk.local_prior, risk.side_prior and risk.priors state them)"
     )
     if "raim" not in config.screens:
         return

@@ -5,13 +5,13 @@ from .filter import track
 from .limits import TrackingLimits
 from .line import Line
 from .result import Tracked, TrackStatus
-from .smoother import Later, Smoothed, Step, smoothed
+from .smoother import BackwardInformation, Smoothed, Step, smoothed
 from .state import TrackState
 
 __all__ = [
+    "BackwardInformation",
     "GnssEpochs",
     "Kind",
-    "Later",
     "Line",
     "RangeEpochs",
     "SensorEpochs",

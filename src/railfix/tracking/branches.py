@@ -12,7 +12,7 @@ from railfix.kernels.tracking.constants import CODE_CLOCK_SIGMA_M
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
-from railfix.tracking.state import CLOCKS, OFFSETS, SATELLITES, Unknown
+from railfix.tracking.state import CLOCKS, OFFSETS, SATELLITES, StateIndex
 
 #: The line is searched at points this far apart; a Gaussian of `start_sigma_m` covers what lies between, and codes
 #: count with the error that a place between two points makes [m].
@@ -33,7 +33,7 @@ RADAR_PRIOR: Final = 0.02
 _BEND_SPEED_MPS: Final = 10.0
 _BESIDE_SHARE: Final = 0.01
 #: What a new hypothesis takes over from a lost track: its error has gone into everything else.
-_KEPT: Final = np.array([Unknown.WHEEL, Unknown.FORCE_OFFSET, Unknown.RADAR])
+_KEPT: Final = np.array([StateIndex.WHEEL, StateIndex.FORCE_OFFSET, StateIndex.RADAR])
 
 
 def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tuple[Floats, Floats]:
@@ -109,25 +109,25 @@ def begin(
     """
     width = SATELLITES + satellites
     mean = np.zeros((len(arc_m), width))
-    mean[:, Unknown.PLACE] = mean[:, Unknown.BEFORE] = arc_m
+    mean[:, StateIndex.ARC] = mean[:, StateIndex.PREVIOUS_ARC] = arc_m
     variance = np.ones((len(arc_m), width))
-    variance[:, Unknown.PLACE] = variance[:, Unknown.BEFORE] = sigma_m**2
-    variance[:, Unknown.SPEED] = variance[:, Unknown.SPEED_BEFORE] = _ANY_SPEED_MPS**2
-    variance[:, Unknown.ACCELERATION] = limits.acceleration_mps2**2
-    variance[:, Unknown.DRIFT] = _ANY_DRIFT_MPS**2
-    variance[:, Unknown.MAP_RIGHT] = line.sigma_plan_m**2
-    variance[:, Unknown.MAP_UP] = line.sigma_height_m**2
-    variance[:, Unknown.CODE_PLACE] = limits.slow_code_m**2
-    variance[:, Unknown.DOPPLER_SPEED] = limits.doppler_error_mps**2
-    variance[:, Unknown.WHEEL] = WHEEL_PRIOR**2
-    variance[:, Unknown.FORCE_OFFSET] = FORCE_PRIOR_MPS2**2
-    variance[:, Unknown.RADAR] = RADAR_PRIOR**2
+    variance[:, StateIndex.ARC] = variance[:, StateIndex.PREVIOUS_ARC] = sigma_m**2
+    variance[:, StateIndex.SPEED] = variance[:, StateIndex.PREVIOUS_SPEED] = _ANY_SPEED_MPS**2
+    variance[:, StateIndex.ACCELERATION] = limits.acceleration_mps2**2
+    variance[:, StateIndex.DRIFT] = _ANY_DRIFT_MPS**2
+    variance[:, StateIndex.MAP_RIGHT] = line.sigma_plan_m**2
+    variance[:, StateIndex.MAP_UP] = line.sigma_height_m**2
+    variance[:, StateIndex.CODE_PLACE] = limits.slow_code_m**2
+    variance[:, StateIndex.DOPPLER_SPEED] = limits.doppler_error_mps**2
+    variance[:, StateIndex.WHEEL] = WHEEL_PRIOR**2
+    variance[:, StateIndex.FORCE_OFFSET] = FORCE_PRIOR_MPS2**2
+    variance[:, StateIndex.RADAR] = RADAR_PRIOR**2
     variance[:, OFFSETS:SATELLITES] = limits.offset_prior_m**2
     covariance = np.zeros((len(arc_m), width, width))
     diagonal = np.arange(width)
     covariance[:, diagonal, diagonal] = variance
-    covariance[:, Unknown.CODE_CLOCK, Unknown.CODE_CLOCK] = CODE_CLOCK_SIGMA_M**2
-    covariance[:, Unknown.PHASE_CLOCK, Unknown.PHASE_CLOCK] = CODE_CLOCK_SIGMA_M**2
+    covariance[:, StateIndex.CODE_CLOCK, StateIndex.CODE_CLOCK] = CODE_CLOCK_SIGMA_M**2
+    covariance[:, StateIndex.PHASE_CLOCK, StateIndex.PHASE_CLOCK] = CODE_CLOCK_SIGMA_M**2
     if known is not None:
         mean[:, _KEPT] = known[0][_KEPT]
         covariance[:, _KEPT[:, None], _KEPT] = known[1][_KEPT[:, None], _KEPT]
@@ -146,7 +146,7 @@ def split(
     log_probability : float
     arc_m, sigma_m : ndarray, shape (C,) [m]
     """
-    place = Unknown.PLACE
+    place = StateIndex.ARC
     wide = covariance[place, place]
     gain = covariance[:, place] / wide
     means = mean + gain * (arc_m - mean[place])[:, None]
@@ -170,12 +170,12 @@ def beside(mean: Floats, covariance: Floats, limits: TrackingLimits) -> tuple[Fl
     """
     steps = limits.bend_m * np.array([-2.0, -1.0, 1.0, 2.0])
     means = np.repeat(mean[None], len(steps), axis=0)
-    means[:, Unknown.PLACE] += steps
+    means[:, StateIndex.ARC] += steps
     covariances = np.repeat(covariance[None], len(steps), axis=0)
     for unknown, sigma in (
-        (Unknown.PLACE, 0.5 * limits.bend_m),
-        (Unknown.SPEED, _BEND_SPEED_MPS),
-        (Unknown.ACCELERATION, limits.acceleration_mps2),
+        (StateIndex.ARC, 0.5 * limits.bend_m),
+        (StateIndex.SPEED, _BEND_SPEED_MPS),
+        (StateIndex.ACCELERATION, limits.acceleration_mps2),
     ):
         covariances[:, unknown, unknown] += sigma**2
     return means, covariances, np.full(len(steps), np.log(_BESIDE_SHARE / len(steps)))

@@ -32,7 +32,7 @@ class Chunk:
     ----------
     time : ndarray of datetime64[ns], shape (T,)
     interval_s : ndarray, shape (T,) [s]
-        Since the epoch before; 1 for the first.
+        AccumulatedIncrement the epoch before; 1 for the first.
     apart : ndarray of bool, shape (T,)
         Epochs so long after the one before that they begin anew.
     satellite : ndarray of str, shape (K,)
@@ -84,7 +84,7 @@ class Chunk:
     velocity_age_s: Floats
 
 
-def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
+def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
     """The chunk; the state gets an error for each satellite measured in it."""
     phase, before = _previous(epochs, state.previous)
     phase = np.concatenate([phase[None], epochs.phase_m])
@@ -155,7 +155,7 @@ def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> C
     )
 
 
-def leave(chunk: Chunk, epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> None:
+def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> None:
     """Make the state ready to be handed on: without satellites long unseen, with the phases of the last epoch."""
     phase = np.where(np.isfinite(epochs.phase_m[-1]), epochs.phase_m[-1], np.nan)
     state.previous = Previous(satellite=epochs.satellite, sat_ecef_m=epochs.sat_ecef_m[-1], phase_m=phase)

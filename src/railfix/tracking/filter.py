@@ -6,14 +6,14 @@ from copy import copy
 
 import numpy as np
 
-from railfix.tracking.chunk import leave, prepared
+from railfix.tracking.chunk import finish_chunk, prepare_chunk
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.recursion import Recursion
 from railfix.tracking.result import Tracked, TrackStatus
 from railfix.tracking.smoother import Step
-from railfix.tracking.state import TrackState, Unknown
+from railfix.tracking.state import StateIndex, TrackState
 
 
 def track(
@@ -55,11 +55,11 @@ def track(
     state = TrackState.empty() if state is None else copy(state)
     result = Tracked.empty(epochs.time, len(epochs.satellite))
     if len(epochs):
-        chunk = prepared(epochs, state, limits)
+        chunk = prepare_chunk(epochs, state, limits)
         recursion = Recursion(chunk, line, sensors, limits, result, levels=levels)
         epoch = 0
         while epoch < len(epochs):
-            lost = not np.isfinite(state.mean[:, Unknown.PLACE]).all()
+            lost = not np.isfinite(state.mean[:, StateIndex.ARC]).all()
             if lost or chunk.apart[epoch] or chunk.off_map[epoch]:
                 state.reset()
             if chunk.off_map[epoch]:
@@ -75,6 +75,6 @@ def track(
                 recursion.search(state, epoch, trace)
                 done += 1
             epoch = done
-        leave(chunk, epochs, state, limits)
+        finish_chunk(chunk, epochs, state, limits)
     np.add(result.arc_m, line.round_m(result.arc_m), out=result.arc_m)
     return result, state

@@ -16,27 +16,27 @@ from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.smoother import Updated
-from railfix.tracking.state import CLOCKS, OFFSETS, SATELLITES, Bank, TrackState, Unknown
+from railfix.tracking.state import CLOCKS, OFFSETS, SATELLITES, Bank, StateIndex, TrackState
 
 if TYPE_CHECKING:
     from railfix.tracking.recursion import Recursion
 
 #: Unknowns that are always in use, in the order of the kernel.
 _ALWAYS: Final = np.array([
-    Unknown.PLACE, Unknown.SPEED, Unknown.ACCELERATION, Unknown.DRIFT, Unknown.MAP_RIGHT, Unknown.MAP_UP,
-    Unknown.DOPPLER_SPEED, Unknown.CODE_PLACE,
+    StateIndex.ARC, StateIndex.SPEED, StateIndex.ACCELERATION, StateIndex.DRIFT, StateIndex.MAP_RIGHT,
+    StateIndex.MAP_UP, StateIndex.DOPPLER_SPEED, StateIndex.CODE_PLACE,
 ])  # fmt: skip
 #: Unknowns of sensors, as the kernel names them, the columns of measurements that need them, and their random walks.
 _SENSORS: Final = (
-    (Unknown.WHEEL, layout.WHEEL_ROW, WHEEL_WALK),
-    (Unknown.FORCE_OFFSET, layout.FORCE_ROW, FORCE_WALK_MPS2),
-    (Unknown.RADAR, layout.RADAR_ROW, RADAR_WALK),
+    (StateIndex.WHEEL, layout.WHEEL_ROW, WHEEL_WALK),
+    (StateIndex.FORCE_OFFSET, layout.FORCE_ROW, FORCE_WALK_MPS2),
+    (StateIndex.RADAR, layout.RADAR_ROW, RADAR_WALK),
 )
 _OF_SENSORS: Final = np.isin(np.arange(OFFSETS), [unknown for unknown, _, _ in _SENSORS])
 #: Unknowns of an epoch, as the kernel orders them after those in use.
 _OF_EPOCH: Final = np.array([
-    Unknown.BEFORE, Unknown.SPEED_BEFORE, Unknown.PHASE_CLOCK, Unknown.STEP_RIGHT, Unknown.STEP_UP, Unknown.STEP_ALONG,
-    Unknown.CODE_CLOCK,
+    StateIndex.PREVIOUS_ARC, StateIndex.PREVIOUS_SPEED, StateIndex.PHASE_CLOCK, StateIndex.STEP_RIGHT,
+    StateIndex.STEP_UP, StateIndex.MAP_LENGTH_ERROR, StateIndex.CODE_CLOCK,
 ])  # fmt: skip
 
 
@@ -76,20 +76,20 @@ class Handover:
         place[full] = np.arange(len(full))
         self.active = layout.Active(
             full=full,
-            wheel=int(place[Unknown.WHEEL]),
-            force=int(place[Unknown.FORCE_OFFSET]),
-            radar=int(place[Unknown.RADAR]),
+            wheel=int(place[StateIndex.WHEEL]),
+            force=int(place[StateIndex.FORCE_OFFSET]),
+            radar=int(place[StateIndex.RADAR]),
             offset=place[OFFSETS:SATELLITES].copy(),
             satellite=place[SATELLITES:].copy(),
         )
         origin = chunk.time[0]
         scalars = np.array([
-            state.hypotheses, state.weak_motion_s, state.weak_code_s, *state.log_scale, state.unaided_m,
-            state.direction, seconds(state.measured - origin), *state.code_shift, state.map_log_scale,
+            state.hypotheses, state.weak_motion_s, state.weak_code_s, *state.log_scale, state.distance_since_code_m,
+            state.direction, seconds(state.measured - origin), *state.code_shift, state.map_log_variance,
             *state.speed_range_mps, np.nan_to_num(seconds(state.coded - origin), nan=-np.inf), state.branch_s,
             state.branch_m, state.across, state.step_s, state.withheld_s, state.open_s,
         ])  # fmt: skip
-        self.memory = layout.Memory(
+        self.memory = layout.KernelState(
             mean=row_major(state.mean[:, full]),
             covariance=row_major(state.covariance[:, full[:, None], full]),
             log_probability=row_major(state.log_probability),
@@ -133,9 +133,9 @@ class Handover:
         placed = slice(first, done)
         known = np.isfinite(result.arc_m[placed])
         for name, unknown in (
-            ("wheel_scale", Unknown.WHEEL),
-            ("force_offset_mps2", Unknown.FORCE_OFFSET),
-            ("radar_scale", Unknown.RADAR),
+            ("wheel_scale", StateIndex.WHEEL),
+            ("force_offset_mps2", StateIndex.FORCE_OFFSET),
+            ("radar_scale", StateIndex.RADAR),
         ):
             if unknown not in self.full:
                 getattr(result, name)[placed][known] = idle[0][unknown]
@@ -148,8 +148,14 @@ class Handover:
         state.origin_m = memory.origin_m[kept].copy()
         state.code_bias, state.offset_known = memory.code_bias, memory.offset_known
         state.time, origin = chunk.time[done - 1], chunk.time[0]
-        state.weak_motion_s, state.weak_code_s, doppler, phase, state.unaided_m, state.direction = scalars[:6]
-        state.log_scale, state.code_shift, state.map_log_scale = (doppler, phase), (scalars[7], scalars[8]), scalars[9]
+        state.weak_motion_s, state.weak_code_s, doppler, phase, state.distance_since_code_m, state.direction = scalars[
+            :6
+        ]
+        state.log_scale, state.code_shift, state.map_log_variance = (
+            (doppler, phase),
+            (scalars[7], scalars[8]),
+            scalars[9],
+        )
         state.measured = origin + timedelta(scalars[6])
         state.speed_range_mps, state.coded = (scalars[10], scalars[11]), origin + timedelta(scalars[12])
         state.branch_s, state.branch_m = scalars[13:15]
@@ -184,7 +190,7 @@ class Handover:
         cut = np.zeros(state.mean.shape, dtype=np.bool_)
         if self.memory.scalars[layout.MEASURED] != self.recursion.epochs.time_s[epoch]:
             return None, cut
-        cut[:, [Unknown.PHASE_CLOCK, Unknown.DRIFT]] = work.anew[:count, :2]
+        cut[:, [StateIndex.PHASE_CLOCK, StateIndex.DRIFT]] = work.anew[:count, :2]
         if self.rows.counts[0]:
             cut[:, OFFSETS + self.recursion.chunk.offset[self.rows.codes[0]]] = work.anew[:count, 2]
         size = int(self.rows.counts[0] + layout.COMBINED + self.rows.counts[3])

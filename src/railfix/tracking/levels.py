@@ -25,7 +25,7 @@ from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.result import Tracked, TrackStatus, is_bounded
 from railfix.tracking.state import TrackState
-from railfix.tracking.thinned import Since, thinned
+from railfix.tracking.thinned import AccumulatedIncrement, thinned
 
 _KEPT: Final = (
     "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m", "amount_m",
@@ -40,7 +40,7 @@ class LevelState:
     Attributes
     ----------
     track : TrackState or None
-    since : Since
+    since : AccumulatedIncrement
     time : datetime64[ns]
         Of its last epoch.
     values : ndarray, shape (9,)
@@ -51,7 +51,7 @@ class LevelState:
 
     track: TrackState | None = None
     every: bool = True
-    since: Since = field(default_factory=Since)
+    since: AccumulatedIncrement = field(default_factory=AccumulatedIncrement)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     values: Floats = field(default_factory=lambda: np.full(len(_KEPT), np.nan))
 

@@ -78,10 +78,10 @@ class Recursion:
                 values[name] = getattr(chunk, name)
         arrays = {name: row_major(array) for name, array in values.items()}
         self.epochs = layout.Epochs(**arrays, unsigned=sensors.wheel_sign == "unknown")
-        self.course = layout.Course(**line.written)
+        self.course = layout.LineArrays(**line.written)
         self.parameters = _parameters(limits)
         written = {field.name: getattr(result, field.name) for field in fields(result)}
-        self.answers = layout.Answers(**{name: written[name] for name in layout.Answers._fields})
+        self.answers = layout.Outputs(**{name: written[name] for name in layout.Outputs._fields})
 
     def advance(self, state: TrackState, first: int, trace: list[Step] | None) -> int:
         """Do epochs from `first` on, change the state, and return the first before which places have to be sought.
@@ -101,7 +101,7 @@ class Recursion:
         handed = Handover(self, state, epoch, epoch + 1, every=True)
         if handed.run(layout.WHOLE) == epoch:
             return epoch
-        parents = Sought(lost=False, parent=np.arange(state.hypotheses), narrowed=None)
+        parents = Sought(lost=False, parent=np.arange(state.hypotheses), splits=None)
         self._take_back_traced(state, epoch, handed, parents, trace)
         return epoch + 1
 
@@ -142,7 +142,7 @@ class Recursion:
             cut=cut,
             satellite=state.satellite,
             parent=found.parent,
-            narrowed=found.narrowed,
+            splits=found.splits,
             updated=updated,
         )
         if hypotheses > 1:

@@ -14,14 +14,14 @@ from railfix.tracking.branches import begin, beside, places, split
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
-from railfix.tracking.state import ANY_SPEED, TrackState, Unknown
+from railfix.tracking.state import ANY_SPEED, StateIndex, TrackState
 
 #: Probability of other places where the velocity contradicts the one that was sure: the map may be wrong just here.
 _ELSEWHERE: Final = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
-class Narrowed:
+class SplitHypothesis:
     """One of the narrower hypotheses that a wide one was split into.
 
     Attributes
@@ -50,13 +50,13 @@ class Sought(NamedTuple):
         Whether the track was lost.
     parent : ndarray of int, shape (H,)
         Hypothesis of the epoch before that each one goes on from; -1 where it began.
-    narrowed : list of Narrowed or None
+    splits : list of SplitHypothesis or None
         Hypotheses that began at this epoch within wider ones.
     """
 
     lost: bool
     parent: Indices
-    narrowed: list[Narrowed | None] | None
+    splits: list[SplitHypothesis | None] | None
 
 
 def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Sought:
@@ -68,36 +68,36 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         state.log_probability, state.origin_m = np.full(len(arc), -np.log(max(len(arc), 1))), arc
         state.log_code, state.branch_s, state.branch_m = np.zeros(len(arc)), 0.0, 0.0
         state.log_least = state.log_probability
-        return Sought(lost=False, parent=np.full(len(arc), -1), narrowed=None)
+        return Sought(lost=False, parent=np.full(len(arc), -1), splits=None)
     mean, covariance = state.mean, state.covariance
     parent: Indices = np.arange(len(mean))
     weak = state.weak_motion_s >= limits.lost_motion_s or state.weak_code_s >= limits.lost_code_s
     lost = weak or state.across >= ACROSS_LOST
     gap = bool(seconds(chunk.time[epoch] - state.measured) > limits.gap_s)
-    wide = covariance[:, Unknown.PLACE, Unknown.PLACE] > limits.start_sigma_m**2
+    wide = covariance[:, StateIndex.ARC, StateIndex.ARC] > limits.start_sigma_m**2
     if not (lost or (gap and wide.any())):
         if state.weak_motion_s >= BESIDE_AFTER_S or state.across >= ACROSS_DOUBT:
             parent = np.append(parent, np.full(_try_beside(state, limits), -1))
-        return Sought(lost=False, parent=parent, narrowed=None)
+        return Sought(lost=False, parent=parent, splits=None)
     arc, sigma = places(chunk, epoch, line, limits)
     if not len(arc):
-        return Sought(lost=lost, parent=parent, narrowed=None)
+        return Sought(lost=lost, parent=parent, splits=None)
     parts = [(mean, covariance, state.log_probability, state.origin_m, state.log_code)]
-    narrowed: list[Narrowed | None] = [None] * len(mean)
+    splits: list[SplitHypothesis | None] = [None] * len(mean)
     for one in np.flatnonzero(wide) if not lost else []:
-        reach = 5.0 * np.sqrt(covariance[one, Unknown.PLACE, Unknown.PLACE])
-        there = line.nearest_m(arc, mean[one, Unknown.PLACE])
-        near = np.abs(there - mean[one, Unknown.PLACE]) < reach
+        reach = 5.0 * np.sqrt(covariance[one, StateIndex.ARC, StateIndex.ARC])
+        there = line.nearest_m(arc, mean[one, StateIndex.ARC])
+        near = np.abs(there - mean[one, StateIndex.ARC]) < reach
         if near.any():
             new = split(mean[one], covariance[one], float(state.log_probability[one]), there[near], sigma[near])
             parts.append((*new, there[near], np.full(int(near.sum()), state.log_code[one])))
-            narrowed += [
-                Narrowed(parent=int(one), mean=mean[one], covariance=covariance[one], place_m=at, sigma_m=wide_m)
+            splits += [
+                SplitHypothesis(parent=int(one), mean=mean[one], covariance=covariance[one], place_m=at, sigma_m=wide_m)
                 for at, wide_m in zip(there[near].tolist(), sigma[near].tolist(), strict=True)
             ]
     if lost:
         best = int(np.argmax(state.log_probability))
-        going = mean[best : best + 1, Unknown.PLACE] if weak else mean[:, Unknown.PLACE]
+        going = mean[best : best + 1, StateIndex.ARC] if weak else mean[:, StateIndex.ARC]
         there = line.nearest_m(arc[:, None], going)
         arc = arc[(np.abs(there - going) > limits.start_separation_m).all(axis=1)]
         # The old place goes on too, free to be pulled to where the codes are; where the velocity alone contradicts it,
@@ -116,7 +116,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
     state.log_least = state.log_probability
     parent = np.full(state.hypotheses, -1)
     if not lost:
-        parent = np.array([k if item is None else item.parent for k, item in enumerate(narrowed)])
+        parent = np.array([k if item is None else item.parent for k, item in enumerate(splits)])
     state.coded = np.datetime64("NaT", "ns")
     if lost and state.weak_code_s >= limits.lost_code_s:
         # Codes have contradicted the place that motion carried: the next place is theirs alone.
@@ -125,7 +125,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         state.withheld_s = max(state.withheld_s, limits.level_start_s)
     state.weak_motion_s = state.weak_code_s = state.across = 0.0
     state.code_shift, state.speed_range_mps = (0.0, 0.0), ANY_SPEED
-    return Sought(lost=lost, parent=parent, narrowed=None if lost else narrowed)
+    return Sought(lost=lost, parent=parent, splits=None if lost else splits)
 
 
 def _try_beside(state: TrackState, limits: TrackingLimits) -> int:
@@ -140,5 +140,5 @@ def _try_beside(state: TrackState, limits: TrackingLimits) -> int:
     state.log_probability = log_probability - np.logaddexp.reduce(log_probability)
     state.log_least = np.concatenate([state.log_least, np.zeros(len(mean))])
     state.log_code = np.concatenate([state.log_code, np.full(len(mean), state.log_code[best])])
-    state.origin_m = np.concatenate([state.origin_m, mean[:, Unknown.PLACE]])
+    state.origin_m = np.concatenate([state.origin_m, mean[:, StateIndex.ARC]])
     return len(mean)

@@ -18,8 +18,8 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks, Strings
 from railfix.tracking.limits import TrackingLimits
-from railfix.tracking.search import Narrowed
-from railfix.tracking.state import SATELLITES, TrackState, Unknown
+from railfix.tracking.search import SplitHypothesis
+from railfix.tracking.state import SATELLITES, StateIndex, TrackState
 from railfix.tracking.transition import transition
 
 
@@ -63,7 +63,7 @@ class Step:
         After the epoch.
     parent : ndarray of int, shape (H,)
         Hypothesis of the epoch before; -1 where one began.
-    narrowed : list of Narrowed or None
+    splits : list of SplitHypothesis or None
     updated : Updated or None
         None without a measurement.
     """
@@ -75,7 +75,7 @@ class Step:
     covariance: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
     parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
     updated: Updated | None = None
-    narrowed: list[Narrowed | None] | None = None
+    splits: list[SplitHypothesis | None] | None = None
 
     @classmethod
     def without_place(cls, state: TrackState, dt: float) -> Step:
@@ -85,8 +85,8 @@ class Step:
     def choose(self, chosen: Indices) -> None:
         """Keep some hypotheses."""
         self.cut, self.parent = self.cut[chosen], self.parent[chosen]
-        if self.narrowed is not None:
-            self.narrowed = [self.narrowed[k] for k in chosen.tolist()]
+        if self.splits is not None:
+            self.splits = [self.splits[k] for k in chosen.tolist()]
         if self.updated is not None:
             self.updated = self.updated.take(chosen)
 
@@ -94,10 +94,10 @@ class Step:
         """Carry what later epochs say of hypothesis h backward through its measurements."""
         if self.updated is not None:
             vector, matrix = _before_measurements(self.updated, h, vector, matrix)
-        part = None if self.narrowed is None else self.narrowed[h]
+        part = None if self.splits is None else self.splits[h]
         if part is not None:
             # The density of the narrower one over the wide one, as if its place had been measured.
-            place = Unknown.PLACE
+            place = StateIndex.ARC
             wide = part.covariance[place, place]
             back = np.eye(len(vector))
             share = (1.0 - part.sigma_m**2 / wide) / wide
@@ -117,7 +117,7 @@ def _before_measurements(updated: Updated, h: int, vector: Floats, matrix: Float
 
 
 @dataclass(frozen=True, kw_only=True)
-class Later:
+class BackwardInformation:
     """What all later epochs say of the unknowns after an epoch.
 
     Attributes
@@ -150,8 +150,8 @@ class Smoothed:
 
 
 def smoothed(
-    steps: list[Step], before: TrackState, later: Later | None, limits: TrackingLimits
-) -> tuple[Smoothed, Later]:
+    steps: list[Step], before: TrackState, later: BackwardInformation | None, limits: TrackingLimits
+) -> tuple[Smoothed, BackwardInformation]:
     """Smooth the epochs of a chunk.
 
     Parameters
@@ -160,14 +160,14 @@ def smoothed(
         From `railfix.tracking.track`, one an epoch.
     before : TrackState
         Before the chunk.
-    later : Later or None
+    later : BackwardInformation or None
         From the chunk after; None at the end.
     limits : TrackingLimits
 
     Returns
     -------
     Smoothed
-    Later
+    BackwardInformation
         For the chunk before.
     """
     size = len(steps)
@@ -177,7 +177,7 @@ def smoothed(
     vector, matrix, index = np.zeros(width), np.zeros((width, width)), 0
     last = steps[-1].mean if size else before.mean
     if later is not None and np.isfinite(later.place_m) and len(last):
-        index = int(np.argmin(np.abs(last[:, Unknown.PLACE] - later.place_m)))
+        index = int(np.argmin(np.abs(last[:, StateIndex.ARC] - later.place_m)))
         vector, matrix = _arranged(later, satellite)
     for t in range(size - 1, -1, -1):
         step = steps[t]
@@ -185,11 +185,11 @@ def smoothed(
             vector, matrix, index = np.zeros(width), np.zeros((width, width)), 0
             continue
         mean, covariance = step.mean[index], step.covariance[index]
-        row = covariance[Unknown.PLACE]
-        variance = row[Unknown.PLACE] - row @ matrix @ row
-        if covariance[Unknown.PLACE, Unknown.PLACE] <= limits.expired_sigma_m**2:
-            arc[t], sigma[t] = mean[Unknown.PLACE] + row @ vector, np.sqrt(max(variance, 0.0))
-            speed[t] = mean[Unknown.SPEED] + covariance[Unknown.SPEED] @ vector
+        row = covariance[StateIndex.ARC]
+        variance = row[StateIndex.ARC] - row @ matrix @ row
+        if covariance[StateIndex.ARC, StateIndex.ARC] <= limits.expired_sigma_m**2:
+            arc[t], sigma[t] = mean[StateIndex.ARC] + row @ vector, np.sqrt(max(variance, 0.0))
+            speed[t] = mean[StateIndex.SPEED] + covariance[StateIndex.SPEED] @ vector
         vector, matrix = step.before(index, vector, matrix)
         parent, cut = int(step.parent[index]), step.cut[index]
         earlier = steps[t - 1].mean if t else before.mean
@@ -201,11 +201,11 @@ def smoothed(
         move = transition(start, step.dt, limits)
         move[cut] = 0.0
         vector, matrix, index = move.T @ vector, move.T @ matrix @ move, parent
-    place = float(before.mean[index, Unknown.PLACE]) if len(before.mean) > index else float("nan")
+    place = float(before.mean[index, StateIndex.ARC]) if len(before.mean) > index else float("nan")
     known = len(before.satellite)
     return (
         Smoothed(arc_m=arc, sigma_m=sigma, speed_mps=speed),
-        Later(
+        BackwardInformation(
             place_m=place,
             vector=vector[: SATELLITES + known],
             matrix=matrix[: SATELLITES + known, : SATELLITES + known],
@@ -214,7 +214,7 @@ def smoothed(
     )
 
 
-def _arranged(later: Later, satellite: Strings) -> tuple[Floats, Floats]:
+def _arranged(later: BackwardInformation, satellite: Strings) -> tuple[Floats, Floats]:
     """The vector and matrix for other satellites; those that are not in the state any more said nothing."""
     _, here, there = np.intersect1d(satellite, later.satellite, return_indices=True)
     to = np.concatenate([np.arange(SATELLITES), SATELLITES + here])

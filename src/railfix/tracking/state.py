@@ -15,15 +15,15 @@ from railfix.tracking.epochs import Previous
 CLOCKS: Final = ("G", "E", "C", "R", "I")
 
 
-class Unknown(IntEnum):
+class StateIndex(IntEnum):
     """Place of each unknown in the state; offsets of the clocks and satellites' errors come after."""
 
     #: Arc length, speed, acceleration along the trajectory [m, m/s, m/s2].
-    PLACE = 0
+    ARC = 0
     SPEED = 1
     ACCELERATION = 2
     #: Arc length at the epoch before [m].
-    BEFORE = 3
+    PREVIOUS_ARC = 3
     #: Change of the clock of the carrier phases since the epoch before [m].
     PHASE_CLOCK = 4
     #: Drift of that clock [m/s].
@@ -36,7 +36,7 @@ class Unknown(IntEnum):
     #: Error of the map's displacement since the epoch before: right, up, along [m].
     STEP_RIGHT = 9
     STEP_UP = 10
-    STEP_ALONG = 11
+    MAP_LENGTH_ERROR = 11
     #: Share that the wheel's way is too short by.
     WHEEL = 12
     #: Offset of the accelerometer [m/s2].
@@ -48,17 +48,17 @@ class Unknown(IntEnum):
     #: Displacement along the line by errors of the codes that last minutes (orbits, ionosphere) [m].
     CODE_PLACE = 16
     #: Speed at the epoch before [m/s].
-    SPEED_BEFORE = 17
+    PREVIOUS_SPEED = 17
 
 
 #: First offset of the clocks.
-OFFSETS: Final = len(Unknown)
+OFFSETS: Final = len(StateIndex)
 #: First error of a satellite.
 SATELLITES: Final = OFFSETS + len(CLOCKS)
 #: Bounds of the speed where nothing is known of it [m/s].
 ANY_SPEED: Final = (-np.inf, np.inf)
 #: Unknowns that begin anew at every epoch: clock of the codes, displacements of the map.
-FRESH: Final = slice(Unknown.CODE_CLOCK, Unknown.STEP_ALONG + 1)
+FRESH: Final = slice(StateIndex.CODE_CLOCK, StateIndex.MAP_LENGTH_ERROR + 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,11 +129,11 @@ class TrackState:
         Logarithm of the variance of Dopplers and of phases against that of the limits.
     code_shift : tuple of float
         Mean of the shifts that codes ask for over the last epochs, and its variance.
-    map_log_scale : float
+    map_log_variance : float
         Logarithm of the variance of lengths along the map against that of the limits, at least 0.
     bank : Bank or None
         Where levels are asked for.
-    unaided_m : float [m]
+    distance_since_code_m : float [m]
         Way since codes were used.
     direction : float
         Sign of the last speed with a direction.
@@ -157,7 +157,7 @@ class TrackState:
     weak_code_s: float = 0.0
     log_scale: tuple[float, float] = (0.0, 0.0)
     code_shift: tuple[float, float] = (0.0, 0.0)
-    map_log_scale: float = 0.0
+    map_log_variance: float = 0.0
     log_code: Floats = field(default_factory=lambda: np.empty(0))
     code_bias: Floats = field(default_factory=lambda: np.empty(0))
     log_least: Floats = field(default_factory=lambda: np.empty(0))
@@ -168,14 +168,14 @@ class TrackState:
     branch_s: float = 0.0
     branch_m: float = 0.0
     bank: Bank | None = None
-    unaided_m: float = 0.0
+    distance_since_code_m: float = 0.0
     direction: float = 0.0
     speed_range_mps: tuple[float, float] = ANY_SPEED
 
     @property
     def map_scale(self) -> float:
         """Factor on the error of lengths along the map, at least 1."""
-        return float(np.exp(0.5 * self.map_log_scale))
+        return float(np.exp(0.5 * self.map_log_variance))
 
     @property
     def hypotheses(self) -> int:
@@ -206,9 +206,9 @@ class TrackState:
         self.branch_s = self.branch_m = self.across = self.step_s = 0.0
         self.offset_known = np.zeros(len(CLOCKS), dtype=np.bool_)
         self.code_bias = np.zeros(len(self.satellite))
-        self.weak_motion_s = self.weak_code_s = self.unaided_m = self.direction = 0.0
+        self.weak_motion_s = self.weak_code_s = self.distance_since_code_m = self.direction = 0.0
         self.code_shift = self.log_scale = (0.0, 0.0)
-        self.map_log_scale = 0.0
+        self.map_log_variance = 0.0
         self.speed_range_mps = ANY_SPEED
         self.coded = np.datetime64("NaT", "ns")
         self.bank = None

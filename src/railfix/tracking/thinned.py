@@ -17,7 +17,7 @@ _MEAN: Final = np.array([False, False, True])
 
 
 @dataclass(frozen=True, kw_only=True)
-class Since:
+class AccumulatedIncrement:
     """What was measured after the last epoch that was taken.
 
     Attributes
@@ -27,7 +27,7 @@ class Since:
     number : int
         Of periods from `start` to the last epoch taken; -1 before the first.
     epochs : int
-        Since then.
+        AccumulatedIncrement then.
     unbroken : frozenset of str or None
         Satellites whose carrier phase went on at all of them; None where there was no epoch.
     total, variance : ndarray, shape (3,)
@@ -43,8 +43,8 @@ class Since:
 
 
 def thinned(
-    epochs: GnssEpochs, sensors: SensorEpochs, since: Since, period_s: float
-) -> tuple[Indices, GnssEpochs, SensorEpochs, Since]:
+    epochs: GnssEpochs, sensors: SensorEpochs, since: AccumulatedIncrement, period_s: float
+) -> tuple[Indices, GnssEpochs, SensorEpochs, AccumulatedIncrement]:
     """Return which epochs are taken, these with what was measured since the one before, and what to go on with.
 
     A carrier phase goes on where it did so at all epochs between. Ways between epochs are added, the force is their
@@ -55,7 +55,7 @@ def thinned(
     epochs : GnssEpochs
         T epochs.
     sensors : SensorEpochs
-    since : Since
+    since : AccumulatedIncrement
         Left by the epochs before.
     period_s : float [s]
     """
@@ -104,7 +104,7 @@ def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
     return value, variance
 
 
-def _unbroken(epochs: GnssEpochs, since: Since) -> Masks:
+def _unbroken(epochs: GnssEpochs, since: AccumulatedIncrement) -> Masks:
     """Which satellites' phases went on at all epochs since the last one that was taken, shape (K,)."""
     if since.unbroken is None:
         return np.ones(len(epochs.satellite), dtype=np.bool_)

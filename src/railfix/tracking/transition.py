@@ -9,7 +9,7 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.motion.singer import singer_steps
 from railfix.tracking.limits import TrackingLimits
-from railfix.tracking.state import FRESH, SATELLITES, Unknown
+from railfix.tracking.state import FRESH, SATELLITES, StateIndex
 
 
 def singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]:
@@ -23,12 +23,12 @@ singer = lru_cache(maxsize=64)(singer_step)
 
 def _kept(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
     """Share of each unknown that is left after an interval, shape (H, N)."""
-    travel = np.abs(mean[:, Unknown.SPEED]) * dt
+    travel = np.abs(mean[:, StateIndex.SPEED]) * dt
     kept = np.ones(mean.shape)
     kept[:, FRESH] = 0.0
-    kept[:, Unknown.MAP_RIGHT] = kept[:, Unknown.MAP_UP] = np.exp(-travel / limits.map_absolute_m)
-    kept[:, Unknown.DOPPLER_SPEED] = np.exp(-dt / limits.doppler_correlation_s)
-    kept[:, Unknown.CODE_PLACE] = np.exp(-dt / limits.slow_code_s)
+    kept[:, StateIndex.MAP_RIGHT] = kept[:, StateIndex.MAP_UP] = np.exp(-travel / limits.map_absolute_m)
+    kept[:, StateIndex.DOPPLER_SPEED] = np.exp(-dt / limits.doppler_correlation_s)
+    kept[:, StateIndex.CODE_PLACE] = np.exp(-dt / limits.slow_code_s)
     kept[:, SATELLITES:] = np.exp(-dt / limits.code_correlation_s - travel / limits.code_correlation_m)[:, None]
     return kept
 
@@ -43,7 +43,7 @@ def _moved(rows: Floats, kept: Floats, step: Floats, dt: float) -> Floats:
     """The transition times a matrix, shape (H, N, ...)."""
     moved = rows * kept[:, :, None]
     moved[:, :3] = step @ rows[:, :3]
-    moved[:, Unknown.BEFORE] = rows[:, Unknown.PLACE]
-    moved[:, Unknown.SPEED_BEFORE] = rows[:, Unknown.SPEED]
-    moved[:, Unknown.PHASE_CLOCK] = dt * rows[:, Unknown.DRIFT]
+    moved[:, StateIndex.PREVIOUS_ARC] = rows[:, StateIndex.ARC]
+    moved[:, StateIndex.PREVIOUS_SPEED] = rows[:, StateIndex.SPEED]
+    moved[:, StateIndex.PHASE_CLOCK] = dt * rows[:, StateIndex.DRIFT]
     return moved

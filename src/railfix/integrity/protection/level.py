@@ -32,7 +32,7 @@ from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings
 from railfix.integrity.protection.allocation import FEW, Allocation, allocate
 from railfix.integrity.protection.risk import MOST_TOGETHER, RiskBudget
 from railfix.integrity.protection.separation import all_in_view, without_group, without_map
-from railfix.integrity.protection.tails import lowered
+from railfix.integrity.protection.tails import solve_level
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.model import ModelArrays
 from railfix.kernels import compiled_by
@@ -268,7 +268,7 @@ def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: 
     n = int(np.count_nonzero(model.used, axis=1).max())
     channel, offset, sigma, weight, separation = hypotheses(model.arrays, of_block, asked := _asked(plan, rows, n))
     share = np.stack([each[rows] for each in (plan.fault_free, plan.one, plan.two, plan.more)], axis=1)
-    level, spender, part, k, worst = lowered(offset, sigma, weight, asked.bounds, share, plan.reserved[rows])
+    level, spender, part, k, worst = solve_level(offset, sigma, weight, asked.bounds, share, plan.reserved[rows])
 
     one, two = worst[:, 1], worst[:, 2]
     # After the channels: constellations, then the sides, a wrong map, and none.
@@ -365,7 +365,7 @@ def hypotheses(model: ModelArrays, errors: Errors, asked: Asked) -> tuple[Indice
     channel : ndarray of int, shape (T, n)
         Channels in use, side by side.
     offset_m, sigma_m, weight : ndarray, shape (T, K)
-        As `tails.lowered` takes them: threshold and bias, sigma (infinite where nothing bounds a fault), probability.
+        As `tails.solve_level` takes them: threshold and bias, sigma (infinite where nothing bounds a fault), prior.
     separation : ndarray, shape (T,)
         `ProtectionLevel.separation`.
     """

@@ -31,7 +31,7 @@ _MILLS: Final = (0.339, 5.510)
 
 
 @compiled_by("level")
-def lowered(
+def solve_level(
     offset_m: Floats, sigma_m: Floats, weight: Floats, bounds: Indices, share: Floats, reserved: Floats
 ) -> tuple[Floats, Codes, Floats, Floats, Indices]:
     """Find the level at which the tails of all hypotheses keep within the risk: ``weight Q((L - offset)/sigma)`` each.

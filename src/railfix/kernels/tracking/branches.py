@@ -14,13 +14,13 @@ from railfix.kernels.tracking.constants import (
     SWITCH,
 )
 from railfix.kernels.tracking.course import point_at
-from railfix.kernels.tracking.layout import BRANCH_M, BRANCH_S, PLACE, Course, Memory, Parameters, Rows, Work
+from railfix.kernels.tracking.layout import ARC, BRANCH_M, BRANCH_S, KernelState, LineArrays, Parameters, Rows, Work
 from railfix.kernels.tracking.update import evidence_of, motion_evidence
 
 
 @borrowing
 def reweigh(
-    course: Course, parameters: Parameters, rows: Rows, memory: Memory, work: Work, count: int, dt: float
+    line: LineArrays, parameters: Parameters, rows: Rows, state: KernelState, work: Work, count: int, dt: float
 ) -> None:
     """Update the probabilities of hypotheses by the evidence of an epoch."""
     counts, other = rows.counts, work.mean.shape[0] - 1
@@ -30,12 +30,12 @@ def reweigh(
         work.code_evidence[h] = joint - work.evidence[h] if counts[0] >= MOTION_SATELLITES else 0.0
         if max(counts[1], counts[2]) < MOTION_SATELLITES and counts[3] == 0:
             work.evidence[h] = 0.0
-        point_at(course, work.new_mean[h, PLACE], work.places, work.place_axes, h)
-    judge(parameters, memory, work, count, dt)
+        point_at(line, work.new_mean[h, ARC], work.places, work.place_axes, h)
+    judge(parameters, state, work, count, dt)
 
 
 @borrowing
-def judge(parameters: Parameters, memory: Memory, work: Work, count: int, dt: float) -> None:
+def judge(parameters: Parameters, state: KernelState, work: Work, count: int, dt: float) -> None:
     """Update the probabilities of branches, and the part of them that codes gave, by evidence of motion and codes.
 
     With d the distance of a branch from the most probable one, the difference of the evidence counts by
@@ -50,9 +50,9 @@ def judge(parameters: Parameters, memory: Memory, work: Work, count: int, dt: fl
     `code_common_s` or `code_common_travel_m`; between branches that are closer than `branch_floor_m` now never below
     `branch_floor`, whatever was gained while they were apart.
     """
-    log_probability, log_code, places, after = memory.log_probability, memory.log_code, work.places, work.right
-    travel = memory.scalars[BRANCH_M]
-    independent = 1.0 + memory.scalars[BRANCH_S] / parameters.code_common_s + travel / parameters.code_common_travel_m
+    log_probability, log_code, places, after = state.log_probability, state.log_code, work.places, work.right
+    travel = state.scalars[BRANCH_M]
+    independent = 1.0 + state.scalars[BRANCH_S] / parameters.code_common_s + travel / parameters.code_common_travel_m
     best = 0
     for h in range(1, count):
         if log_probability[h] > log_probability[best]:
@@ -82,13 +82,13 @@ def judge(parameters: Parameters, memory: Memory, work: Work, count: int, dt: fl
 
 
 @borrowing
-def keep_hypotheses(memory: Memory, parameters: Parameters, work: Work, count: int) -> int:
+def keep_hypotheses(state: KernelState, parameters: Parameters, work: Work, count: int) -> int:
     """Order the hypotheses, join twins, drop the improbable; return how many are left, `work.kept` by their old rows.
 
     Improbable ones are dropped once the first has travelled far enough for motion to have told them apart.
     """
-    mean, covariance, log_probability = memory.mean, memory.covariance, memory.log_probability
-    origin, ranked, kept, joined = memory.origin_m, work.ranked, work.kept, work.joined
+    mean, covariance, log_probability = state.mean, state.covariance, state.log_probability
+    origin, ranked, kept, joined = state.origin_m, work.ranked, work.kept, work.joined
     n = mean.shape[1]
     first = most_probable(log_probability, count, SWITCH)
     ranked[0] = first
@@ -103,13 +103,13 @@ def keep_hypotheses(memory: Memory, parameters: Parameters, work: Work, count: i
     size = 0
     for k in range(count):
         joined[0, k], joined[1, k] = log_probability[k], origin[k]
-        joined[2, k], joined[3, k] = memory.log_code[k], memory.log_least[k]
+        joined[2, k], joined[3, k] = state.log_code[k], state.log_least[k]
     for r in range(count):
         k, twin = ranked[r], -1
         for j in range(size):
             other = kept[j]
-            reach = max(2.0, math.sqrt(covariance[k, PLACE, PLACE]) + math.sqrt(covariance[other, PLACE, PLACE]))
-            if abs(mean[k, PLACE] - mean[other, PLACE]) < reach:
+            reach = max(2.0, math.sqrt(covariance[k, ARC, ARC]) + math.sqrt(covariance[other, ARC, ARC]))
+            if abs(mean[k, ARC] - mean[other, ARC]) < reach:
                 twin = other
                 break
         if twin < 0:
@@ -124,7 +124,7 @@ def keep_hypotheses(memory: Memory, parameters: Parameters, work: Work, count: i
     total = log_sum(log_probability, size)
     for j in range(size):
         log_probability[j] -= total
-    if abs(mean[kept[0], PLACE] - origin[kept[0]]) >= parameters.decided_travel_m:
+    if abs(mean[kept[0], ARC] - origin[kept[0]]) >= parameters.decided_travel_m:
         alive = 0
         for j in range(size):
             if log_probability[j] > math.log(parameters.least_probability):
@@ -136,7 +136,7 @@ def keep_hypotheses(memory: Memory, parameters: Parameters, work: Work, count: i
             log_probability[j] -= total
     for j in range(size):
         k = kept[j]
-        origin[j], memory.log_code[j], memory.log_least[j] = joined[1, k], joined[2, k], joined[3, k]
+        origin[j], state.log_code[j], state.log_least[j] = joined[1, k], joined[2, k], joined[3, k]
         for c in range(n):
             work.new_mean[j, c] = mean[k, c]
             for e in range(n):

@@ -14,19 +14,19 @@ from railfix.kernels.tracking.layout import (
     PHASE_CLOCK,
     Active,
     Epochs,
-    Memory,
+    KernelState,
     Rows,
     Work,
 )
 
 
 @borrowing
-def _start_code_clocks(epochs: Epochs, active: Active, memory: Memory, rows: Rows, work: Work, h: int) -> None:
+def _start_code_clocks(epochs: Epochs, active: Active, state: KernelState, rows: Rows, work: Work, h: int) -> None:
     """Take the median innovation of the codes into their clock, and those of new constellations into their offsets.
 
     At the first epoch the first constellation is that of the clock.
     """
-    mean, value, ordered, known = work.mean, work.value, work.ordered, memory.offset_known
+    mean, value, ordered, known = work.mean, work.value, work.ordered, state.offset_known
     n, nc, first, some = mean.shape[1] - OF_EPOCH, rows.counts[0], epochs.offset[rows.codes[0]], False
     for g in range(len(known)):
         some = some or known[g]
@@ -63,13 +63,13 @@ def _start_code_clocks(epochs: Epochs, active: Active, memory: Memory, rows: Row
 
 
 @borrowing
-def start_clocks(epochs: Epochs, active: Active, memory: Memory, rows: Rows, work: Work, h: int) -> None:
+def start_clocks(epochs: Epochs, active: Active, state: KernelState, rows: Rows, work: Work, h: int) -> None:
     """Take the median of each kind of innovation into its clock; clocks that have stepped begin anew."""
     mean, spread, value = work.mean, work.spread, work.value
     n = mean.shape[1] - OF_EPOCH
     work.anew[h, 0] = work.anew[h, 1] = work.anew[h, 2] = False
     if rows.counts[0] > 0:
-        _start_code_clocks(epochs, active, memory, rows, work, h)
+        _start_code_clocks(epochs, active, state, rows, work, h)
     begin = rows.counts[0]
     for kind in range(1, 3):
         end = begin + rows.counts[kind]

@@ -33,6 +33,7 @@ from railfix.kernels.tracking.constants import (
 )
 from railfix.kernels.tracking.course import find_ends, gradient_at, nearest_to, on_course, point_at
 from railfix.kernels.tracking.layout import (
+    ARC,
     C_CLOCK,
     C_DRIFT,
     C_RIGHT,
@@ -45,24 +46,23 @@ from railfix.kernels.tracking.layout import (
     DOPPLER_SPEED,
     DRIFT,
     FORCE_ROW,
+    MAP_LENGTH_ERROR,
     OF_EPOCH,
-    OLD_PLACE,
-    OLD_SPEED,
     PHASE_CLOCK,
-    PLACE,
     PLACE_ROW,
+    PREVIOUS_ARC,
+    PREVIOUS_SPEED,
     RADAR_ROW,
     RANGE_ROW,
     RIGHT,
     SPEED,
-    STEP_ALONG,
     STEP_RIGHT,
     STEP_UP,
     UP,
     WHEEL_ROW,
     Active,
-    Course,
     Epochs,
+    LineArrays,
     Rows,
     Work,
 )
@@ -72,7 +72,7 @@ from railfix.kernels.tracking.layout import (
 def write_equations(
     epochs: Epochs,
     t: int,
-    course: Course,
+    line: LineArrays,
     active: Active,
     rows: Rows,
     direction: float,
@@ -98,8 +98,8 @@ def write_equations(
     n, dt = mean.shape[1] - OF_EPOCH, epochs.interval_s[t]
     nc, nph, nd, ns = rows.counts[0], rows.counts[1], rows.counts[2], rows.counts[3]
     now, before = work.now[h], work.before[h]
-    find_ends(course, now, before, work)
-    moved, moved_before = mean[h, PLACE] - now, mean[h, n + OLD_PLACE] - before
+    find_ends(line, now, before, work)
+    moved, moved_before = mean[h, ARC] - now, mean[h, n + PREVIOUS_ARC] - before
     for k in range(epochs.has.shape[2]):
         if epochs.has[0, t, k] or epochs.has[1, t, k] or epochs.has[2, t, k]:
             sat = epochs.sat_ecef_m
@@ -172,26 +172,28 @@ def write_equations(
                 measured *= math.copysign(1.0, speed) if abs(speed) > DIRECTION_MPS else direction
             own = active.wheel if kind == WHEEL_ROW else active.radar
             sensed[h, j, 0], sensed[h, j, 1], sensed[h, j, 4], sensed[h, j, 5] = 1.0, -1.0, -measured, 1.0
-            value[h, i] = measured * (1.0 + mean[h, own]) - (mean[h, PLACE] - mean[h, n + OLD_PLACE])
+            value[h, i] = measured * (1.0 + mean[h, own]) - (mean[h, ARC] - mean[h, n + PREVIOUS_ARC])
         elif kind == FORCE_ROW:
-            slope = gradient_at(course, 0.5 * (mean[h, PLACE] + mean[h, n + OLD_PLACE]))
+            slope = gradient_at(line, 0.5 * (mean[h, ARC] + mean[h, n + PREVIOUS_ARC]))
             gravity = GRAVITY_MPS2 * slope / math.sqrt(1.0 + slope**2)
             sensed[h, j, 2], sensed[h, j, 3], sensed[h, j, 4] = 1.0 / dt, -1.0 / dt, 1.0
-            value[h, i] = measured - (mean[h, SPEED] - mean[h, n + OLD_SPEED]) / dt - gravity - mean[h, active.force]
+            value[h, i] = (
+                measured - (mean[h, SPEED] - mean[h, n + PREVIOUS_SPEED]) / dt - gravity - mean[h, active.force]
+            )
         elif kind == PLACE_ROW:
             sensed[h, j, 0] = 1.0
-            there = nearest_to(course, on_course(course, measured), mean[h, PLACE])
-            value[h, i] = there - mean[h, PLACE]
+            there = nearest_to(line, on_course(line, measured), mean[h, ARC])
+            value[h, i] = there - mean[h, ARC]
         else:
-            value[h, i] = measured - _write_range(epochs, t, course, kind - RANGE_ROW, work, h, j)
+            value[h, i] = measured - _write_range(epochs, t, line, kind - RANGE_ROW, work, h, j)
 
 
 @borrowing
-def _write_range(epochs: Epochs, t: int, course: Course, unit: int, work: Work, h: int, j: int) -> float:
+def _write_range(epochs: Epochs, t: int, line: LineArrays, unit: int, work: Work, h: int, j: int) -> float:
     """Write the coefficients of a range to a ground unit; return the range at the mean."""
     mean, sensed, point, axes, lever = work.mean, work.sensed, work.point, work.axes, epochs.lever_m
     age = epochs.range_age_s[t, unit]
-    point_at(course, mean[h, PLACE] - age * mean[h, SPEED] + lever[0], point, axes, 0)
+    point_at(line, mean[h, ARC] - age * mean[h, SPEED] + lever[0], point, axes, 0)
     across, above, square = mean[h, RIGHT] + lever[1], mean[h, UP] + lever[2], 0.0
     along = right = up = 0.0
     for c in range(3):
@@ -211,10 +213,10 @@ def move_sensor_equations(active: Active, rows: Rows, best: int, work: Work, h: 
     """Take over the equations of the sensors in row `best`, about another mean, `work.mean[h]`."""
     mean, sensed, sensors = work.mean, work.sensed, rows.sensors
     n, gnss = mean.shape[1] - OF_EPOCH, rows.counts[0] + rows.counts[1] + rows.counts[2]
-    place, speed = mean[h, PLACE] - mean[best, PLACE], mean[h, SPEED] - mean[best, SPEED]
+    place, speed = mean[h, ARC] - mean[best, ARC], mean[h, SPEED] - mean[best, SPEED]
     old, old_speed = (
-        mean[h, n + OLD_PLACE] - mean[best, n + OLD_PLACE],
-        mean[h, n + OLD_SPEED] - mean[best, n + OLD_SPEED],
+        mean[h, n + PREVIOUS_ARC] - mean[best, n + PREVIOUS_ARC],
+        mean[h, n + PREVIOUS_SPEED] - mean[best, n + PREVIOUS_SPEED],
     )
     across, above = mean[h, RIGHT] - mean[best, RIGHT], mean[h, UP] - mean[best, UP]
     for j in range(rows.counts[3]):
@@ -254,16 +256,16 @@ def combine(epochs: Epochs, t: int, active: Active, rows: Rows, work: Work, h: i
             unknown[i, k], share[i, k] = 0, 0.0
     for i in range(nc):
         k = rows.codes[i]
-        unknown[i, 0], share[i, 0] = PLACE, design[h, i, 0]
+        unknown[i, 0], share[i, 0] = ARC, design[h, i, 0]
         unknown[i, 1], share[i, 1] = CODE_PLACE, design[h, i, 0]
         unknown[i, 2], share[i, 2] = RIGHT, design[h, i, 1]
         unknown[i, 3], share[i, 3] = UP, design[h, i, 2]
         unknown[i, 4], share[i, 4] = active.offset[epochs.offset[k]], 1.0
         unknown[i, 5], share[i, 5] = active.satellite[epochs.slot[k]], epochs.code_sigma_m[t, k]
     unknown[nc, 0], share[nc, 0] = n + CODE_CLOCK, 1.0
-    unknown[nc + C_WAY, 0], share[nc + C_WAY, 0] = PLACE, 1.0
-    unknown[nc + C_WAY, 1], share[nc + C_WAY, 1] = n + OLD_PLACE, -1.0
-    unknown[nc + C_WAY, 2], share[nc + C_WAY, 2] = n + STEP_ALONG, 1.0
+    unknown[nc + C_WAY, 0], share[nc + C_WAY, 0] = ARC, 1.0
+    unknown[nc + C_WAY, 1], share[nc + C_WAY, 1] = n + PREVIOUS_ARC, -1.0
+    unknown[nc + C_WAY, 2], share[nc + C_WAY, 2] = n + MAP_LENGTH_ERROR, 1.0
     unknown[nc + C_CLOCK, 0], share[nc + C_CLOCK, 0] = n + PHASE_CLOCK, 1.0
     unknown[nc + C_RIGHT, 0], share[nc + C_RIGHT, 0] = n + STEP_RIGHT, 1.0
     unknown[nc + C_UP, 0], share[nc + C_UP, 0] = n + STEP_UP, 1.0
@@ -272,11 +274,11 @@ def combine(epochs: Epochs, t: int, active: Active, rows: Rows, work: Work, h: i
     unknown[nc + C_DRIFT, 0], share[nc + C_DRIFT, 0] = DRIFT, 1.0
     for j in range(ns):
         i = nc + COMBINED + j
-        unknown[i, 0], share[i, 0] = PLACE, sensed[h, j, 0]
+        unknown[i, 0], share[i, 0] = ARC, sensed[h, j, 0]
         ranged = rows.sensors[j] >= RANGE_ROW
-        unknown[i, 1], share[i, 1] = RIGHT if ranged else n + OLD_PLACE, sensed[h, j, 1]
+        unknown[i, 1], share[i, 1] = RIGHT if ranged else n + PREVIOUS_ARC, sensed[h, j, 1]
         unknown[i, 2], share[i, 2] = SPEED, sensed[h, j, 2]
-        unknown[i, 3], share[i, 3] = UP if ranged else n + OLD_SPEED, sensed[h, j, 3]
+        unknown[i, 3], share[i, 3] = UP if ranged else n + PREVIOUS_SPEED, sensed[h, j, 3]
         if rows.sensors[j] == WHEEL_ROW:
             unknown[i, 4] = active.wheel
         elif rows.sensors[j] == RADAR_ROW:
@@ -284,7 +286,7 @@ def combine(epochs: Epochs, t: int, active: Active, rows: Rows, work: Work, h: i
         elif rows.sensors[j] == FORCE_ROW:
             unknown[i, 4] = active.force
         share[i, 4] = sensed[h, j, 4]
-        unknown[i, 5], share[i, 5] = n + STEP_ALONG, sensed[h, j, 5]
+        unknown[i, 5], share[i, 5] = n + MAP_LENGTH_ERROR, sensed[h, j, 5]
     for i in range(size):
         for c in range(width):
             cross[h, i, c] = 0.0

@@ -1,4 +1,4 @@
-"""Arrays of the recursion: unknowns in use and their order, epochs, settings, state, work space, answers."""
+"""Arrays of the recursion: unknowns in use and their order, epochs, settings, state, work space, outputs."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
 
 #: Compact unknowns that are always there: place, speed, acceleration, drift, error of the map to the right and up,
 #: error of the speed by Dopplers, displacement of the codes.
-PLACE, SPEED, ACCELERATION, DRIFT, RIGHT, UP, DOPPLER_SPEED, CODE_PLACE = 0, 1, 2, 3, 4, 5, 6, 7
+ARC, SPEED, ACCELERATION, DRIFT, RIGHT, UP, DOPPLER_SPEED, CODE_PLACE = 0, 1, 2, 3, 4, 5, 6, 7
 #: Unknowns of one epoch, after the compact ones: place and speed before, clock of the phases, displacement of the map
 #: to the right, up and along, clock of the codes.
-OLD_PLACE, OLD_SPEED, PHASE_CLOCK, STEP_RIGHT, STEP_UP, STEP_ALONG, CODE_CLOCK = 0, 1, 2, 3, 4, 5, 6
+PREVIOUS_ARC, PREVIOUS_SPEED, PHASE_CLOCK, STEP_RIGHT, STEP_UP, MAP_LENGTH_ERROR, CODE_CLOCK = 0, 1, 2, 3, 4, 5, 6
 OF_EPOCH = 7
 #: Combinations of phases and Dopplers after the clock of the codes.
 C_WAY, C_CLOCK, C_RIGHT, C_UP, C_SPEED, C_DRIFT = 1, 2, 3, 4, 5, 6
@@ -64,7 +64,7 @@ class Epochs(NamedTuple):
     unsigned: bool
 
 
-class Course(NamedTuple):
+class LineArrays(NamedTuple):
     """`railfix.tracking.line.Line`, with the arc lengths of the middles of segments."""
 
     arc_m: Floats
@@ -151,7 +151,7 @@ class Active(NamedTuple):
     satellite: Indices
 
 
-class Memory(NamedTuple):
+class KernelState(NamedTuple):
     """State that is read and written: compact means and covariances, and `scalars` (`HYPOTHESES` and following)."""
 
     mean: Floats
@@ -255,13 +255,22 @@ class Work(NamedTuple):
     place_axes: Floats
 
 
-#: Places of `Memory.scalars`.
-HYPOTHESES, WEAK_MOTION, WEAK_CODE, SCALE_DOPPLER, SCALE_PHASE, UNAIDED, DIRECTION, MEASURED = range(8)
-SHIFT, SHIFT_VARIANCE, MAP_SCALE, LEAST_SPEED, MOST_SPEED, CODED, BRANCH_S, BRANCH_M = 8, 9, 10, 11, 12, 13, 14, 15
+#: Places of `KernelState.scalars`.
+HYPOTHESES, WEAK_MOTION, WEAK_CODE, SCALE_DOPPLER, SCALE_PHASE, DISTANCE_SINCE_CODE, DIRECTION, MEASURED = range(8)
+SHIFT, SHIFT_VARIANCE, MAP_LOG_VARIANCE, LEAST_SPEED, MOST_SPEED, CODED, BRANCH_S, BRANCH_M = (
+    8,
+    9,
+    10,
+    11,
+    12,
+    13,
+    14,
+    15,
+)
 ACROSS, STEP_TIME, WITHHELD, OPEN = 16, 17, 18, 19
 
 
-class Answers(NamedTuple):
+class Outputs(NamedTuple):
     """Arrays of `railfix.tracking.result.Tracked` that are written."""
 
     status: Codes

@@ -28,9 +28,9 @@ from railfix.kernels.tracking.layout import (
     SCALE_PHASE,
     WEAK_CODE,
     WEAK_MOTION,
-    Answers,
     Epochs,
-    Memory,
+    KernelState,
+    Outputs,
     Parameters,
     Rows,
     Work,
@@ -43,7 +43,7 @@ from railfix.kernels.tracking.update import mean_weights
 def learn(
     epochs: Epochs,
     parameters: Parameters,
-    memory: Memory,
+    state: KernelState,
     rows: Rows,
     work: Work,
     t: int,
@@ -57,7 +57,7 @@ def learn(
     Returns whether another satellite's codes are left out from here on.
     """
     found = False
-    scalars, weight, innovation = memory.scalars, work.weight, work.innovation
+    scalars, weight, innovation = state.scalars, work.weight, work.innovation
     nc, nph, nd = rows.counts[0], rows.counts[1], rows.counts[2]
     gnss = nc + nph + nd
     share = 1.0 - math.exp(-min(dt, 1.0) / SCALE_S)
@@ -82,7 +82,7 @@ def learn(
     for i in range(nc):
         k = rows.codes[i]
         sigma = epochs.code_sigma_m[t, k] * math.sqrt(1.0 + parameters.code_white_share**2)
-        now = update_bias(memory.code_bias, epochs.slot[k], innovation[best, i] / sigma, code_s)
+        now = update_bias(state.code_bias, epochs.slot[k], innovation[best, i] / sigma, code_s)
         found = found or now
     return found
 
@@ -100,21 +100,21 @@ def update_bias(code_bias: Floats, slot: int, innovation: float, code_s: float) 
 
 
 @borrowing
-def write_rows(answers: Answers, rows: Rows, work: Work, t: int, best: int, believed: float) -> None:
+def write_rows(outputs: Outputs, rows: Rows, work: Work, t: int, best: int, believed: float) -> None:
     """Write innovations and weights of the measurements; `believed` is 0 where none of them counts, 1 otherwise."""
     weight, innovation = work.weight, work.innovation
     nc, nph = rows.counts[0], rows.counts[1]
     gnss = nc + nph + rows.counts[2]
     code, motion = mean_weights(rows, work.variance, work, best)
-    answers.code_weight[t], answers.motion_weight[t] = believed * code, believed * motion
+    outputs.code_weight[t], outputs.motion_weight[t] = believed * code, believed * motion
     for i in range(gnss):
         kind = 0 if i < nc else (1 if i < nc + nph else 2)
         k = rows.codes[i] if kind == 0 else (rows.phases[i - nc] if kind == 1 else rows.dopplers[i - nc - nph])
-        answers.innovation[t, kind, k] = innovation[best, i]
-        left_out = kind == 0 and answers.faulty[t, k]
-        answers.weight[t, kind, k] = 0.0 if left_out else believed * weight[best, i]
-        answers.used[t, kind] += believed * weight[best, i] > 0.5 and not left_out
+        outputs.innovation[t, kind, k] = innovation[best, i]
+        left_out = kind == 0 and outputs.faulty[t, k]
+        outputs.weight[t, kind, k] = 0.0 if left_out else believed * weight[best, i]
+        outputs.used[t, kind] += believed * weight[best, i] > 0.5 and not left_out
     for j in range(rows.counts[3]):
         kind = min(rows.sensors[j], RANGE_ROW)
-        answers.used[t, 3 + kind] += believed * weight[best, gnss + j] > 0.5
-        answers.sensed[t, kind] = innovation[best, gnss + j]
+        outputs.used[t, 3 + kind] += believed * weight[best, gnss + j] > 0.5
+        outputs.sensed[t, kind] = innovation[best, gnss + j]

@@ -27,24 +27,24 @@ from railfix.kernels.tracking.constants import (
 from railfix.kernels.tracking.course import find_ends, onto_line, point_at
 from railfix.kernels.tracking.equations import combine, move_sensor_equations, write_equations
 from railfix.kernels.tracking.layout import (
+    ARC,
     CODE_CLOCK,
     COMBINED,
     DRIFT,
     OF_EPOCH,
-    OLD_PLACE,
     OTHERS,
     PHASE_CLOCK,
-    PLACE,
+    PREVIOUS_ARC,
     RANGE_ROW,
     RIGHT,
     SENSORS,
     SPEED,
     UP,
     Active,
-    Answers,
-    Course,
     Epochs,
-    Memory,
+    KernelState,
+    LineArrays,
+    Outputs,
     Parameters,
     Rows,
     Subfilters,
@@ -97,7 +97,7 @@ def _begin(bank: Subfilters, b: int, copied: bool, best: int, parameters: Parame
         if not copied:
             spread[h, c, c] = bank.begun[c]
     if not copied:
-        mean[h, PLACE] = mean[h, width - OF_EPOCH + OLD_PLACE] = mean[best, PLACE]
+        mean[h, ARC] = mean[h, width - OF_EPOCH + PREVIOUS_ARC] = mean[best, ARC]
     if b == len(bank.running) - 1:
         spread[h, RIGHT, RIGHT] += parameters.level_map_m**2
         spread[h, UP, UP] += parameters.level_map_m**2
@@ -107,7 +107,7 @@ def _begin(bank: Subfilters, b: int, copied: bool, best: int, parameters: Parame
 def _update(
     epochs: Epochs,
     t: int,
-    course: Course,
+    line: LineArrays,
     parameters: Parameters,
     active: Active,
     rows: Rows,
@@ -125,8 +125,8 @@ def _update(
             mean[h, unknown] = mean[best, unknown]
             restart(spread, unknown, spread[best, unknown, unknown], h)
     mean[h, n + CODE_CLOCK] = mean[best, n + CODE_CLOCK]
-    work.now[h], work.before[h] = mean[h, PLACE], mean[h, n + OLD_PLACE]
-    write_equations(epochs, t, course, active, rows, 1.0, work, h)
+    work.now[h], work.before[h] = mean[h, ARC], mean[h, n + PREVIOUS_ARC]
+    write_equations(epochs, t, line, active, rows, 1.0, work, h)
     move_sensor_equations(active, rows, best, work, h)
     combine(epochs, t, active, rows, work, h)
     size = rows.counts[0] + COMBINED + rows.counts[3]
@@ -134,7 +134,7 @@ def _update(
     first_weights(rows, work.masked, parameters.degrees, 0.0, 0.0, work, h, h)
     reweight(rows, work.masked, parameters.degrees, parameters.level_passes, work, h, h, h)
     apply_update(rows, work, h)
-    onto_line(course, parameters.start_sigma_m, work, h)
+    onto_line(line, parameters.start_sigma_m, work, h)
 
 
 @borrowing
@@ -148,13 +148,13 @@ def _contradicted(rows: Rows, parameters: Parameters, work: Work, h: int) -> boo
 def advance_subfilters(
     epochs: Epochs,
     t: int,
-    course: Course,
+    line: LineArrays,
     parameters: Parameters,
     active: Active,
     bank: Subfilters,
     rows: Rows,
     best: int,
-    map_log_scale: float,
+    map_log_variance: float,
     work: Work,
     h: int,
 ) -> None:
@@ -186,13 +186,13 @@ def advance_subfilters(
         if bank.running[b]:
             wrong_m = parameters.level_map_m if b == len(bank.running) - 1 else 0.0
             predict(
-                epochs, t, course, parameters, active, bank.mean, bank.covariance, b, map_log_scale, wrong_m, work, h
+                epochs, t, line, parameters, active, bank.mean, bank.covariance, b, map_log_variance, wrong_m, work, h
             )
-            find_ends(course, mean[h, PLACE], mean[h, n + OLD_PLACE], work)
+            find_ends(line, mean[h, ARC], mean[h, n + PREVIOUS_ARC], work)
             add_bend(parameters, work, h)
-            sigma = math.sqrt(spread[h, PLACE, PLACE])
-            near = abs(mean[h, PLACE] - mean[best, PLACE]) < JOINED * sigma
-            near = near and sigma < (1.0 + JOINED) * math.sqrt(spread[best, PLACE, PLACE])
+            sigma = math.sqrt(spread[h, ARC, ARC])
+            near = abs(mean[h, ARC] - mean[best, ARC]) < JOINED * sigma
+            near = near and sigma < (1.0 + JOINED) * math.sqrt(spread[best, ARC, ARC])
             if near and satellite and not source[b]:
                 bank.running[b] = False
                 continue
@@ -209,12 +209,12 @@ def advance_subfilters(
         for j in range(rows.counts[3]):
             own = slots + clocks + min(rows.sensors[j], RANGE_ROW)
             work.masked[gnss + j] = math.inf if own == b else work.variance[gnss + j]
-        _update(epochs, t, course, parameters, active, rows, best, work, h)
+        _update(epochs, t, line, parameters, active, rows, best, work, h)
         if _contradicted(rows, parameters, work, h):
             bank.weak_s[b] += dt
         elif nc > 0:
             bank.weak_s[b] = 0.0
-        if not math.isfinite(work.new_mean[h, PLACE]):  # it begins anew, and bounds nothing before
+        if not math.isfinite(work.new_mean[h, ARC]):  # it begins anew, and bounds nothing before
             bank.weak_s[b] = parameters.lost_motion_s + parameters.level_doubt_s
         for c in range(n):
             bank.mean[b, c] = work.new_mean[h, c]
@@ -223,37 +223,37 @@ def advance_subfilters(
 
 
 @borrowing
-def write_branches(memory: Memory, course: Course, parameters: Parameters, work: Work, count: int) -> float:
+def write_branches(state: KernelState, line: LineArrays, parameters: Parameters, work: Work, count: int) -> float:
     """Write distance along the line, straight distance and sigma of other hypotheses than the first.
 
     Returns the probability of those that are further along the line than a bound may reach.
     """
     far = 0.0
     if count > 1:
-        point_at(course, memory.mean[0, PLACE], work.places, work.place_axes, 0)
+        point_at(line, state.mean[0, ARC], work.places, work.place_axes, 0)
     for h in range(1, count):
-        point_at(course, memory.mean[h, PLACE], work.places, work.place_axes, h)
+        point_at(line, state.mean[h, ARC], work.places, work.place_axes, h)
         square = 0.0
         for c in range(3):
             square += (work.places[h, c] - work.places[0, c]) ** 2
-        apart = abs(memory.mean[h, PLACE] - memory.mean[0, PLACE])
+        apart = abs(state.mean[h, ARC] - state.mean[0, ARC])
         work.branch[h, 0], work.branch[h, 1] = apart, math.sqrt(square)
-        work.branch[h, 2] = math.sqrt(memory.covariance[h, PLACE, PLACE])
+        work.branch[h, 2] = math.sqrt(state.covariance[h, ARC, ARC])
         if apart > parameters.start_separation_m:
-            far += math.exp(memory.log_probability[h])
+            far += math.exp(state.log_probability[h])
             work.branch[h, 0] = 0.0
     return far
 
 
 @borrowing
 def write_level(
-    memory: Memory,
+    state: KernelState,
     count: int,
     far: float,
     bank: Subfilters,
     parameters: Parameters,
     work: Work,
-    answers: Answers,
+    outputs: Outputs,
     t: int,
 ) -> None:
     """Write the level of the first hypothesis and its parts.
@@ -263,33 +263,33 @@ def write_level(
     filter, and bounds nothing. Along the line it is infinite where another place of it, further away than a bound may
     reach, is more probable than the risk; the straight distance is bounded with all branches.
     """
-    place, sigma = memory.mean[0, PLACE], math.sqrt(memory.covariance[0, PLACE, PLACE])
+    place, sigma = state.mean[0, ARC], math.sqrt(state.covariance[0, ARC, ARC])
     noise, apart = parameters.level_k * sigma, math.nan
     start, contradicted = noise, False
     for b in range(len(bank.running)):
         if bank.running[b]:
             contradicted = contradicted or bank.weak_s[b] > parameters.level_doubt_s
-            away = abs(bank.mean[b, PLACE] - place)
+            away = abs(bank.mean[b, ARC] - place)
             apart = away if math.isnan(apart) else max(apart, away)
-            start = max(start, away + bank.k[b] * math.sqrt(bank.covariance[b, PLACE, PLACE]))
-    answers.level_noise_m[t], answers.separation_m[t] = noise, apart
-    answers.level_m[t] = answers.ground_level_m[t] = math.inf
+            start = max(start, away + bank.k[b] * math.sqrt(bank.covariance[b, ARC, ARC]))
+    outputs.level_noise_m[t], outputs.separation_m[t] = noise, apart
+    outputs.level_m[t] = outputs.ground_level_m[t] = math.inf
     if math.isnan(apart) or contradicted:
         return
-    answers.ground_level_m[t] = _solve(memory, count, bank, parameters, work, 1, start, place, sigma)
+    outputs.ground_level_m[t] = _solve(state, count, bank, parameters, work, 1, start, place, sigma)
     if count == 1:
-        answers.level_m[t] = answers.ground_level_m[t]
+        outputs.level_m[t] = outputs.ground_level_m[t]
     elif far <= parameters.level_risk:
-        answers.level_m[t] = _solve(memory, count, bank, parameters, work, 0, start, place, sigma)
+        outputs.level_m[t] = _solve(state, count, bank, parameters, work, 0, start, place, sigma)
     wrong = len(bank.running) - 1
     if bank.running[wrong]:
         aside = abs(bank.mean[wrong, RIGHT]) - 2.0 * math.sqrt(bank.covariance[wrong, RIGHT, RIGHT])
-        answers.ground_level_m[t] += max(aside, 0.0)
+        outputs.ground_level_m[t] += max(aside, 0.0)
 
 
 @borrowing
 def _solve(
-    memory: Memory,
+    state: KernelState,
     count: int,
     bank: Subfilters,
     parameters: Parameters,
@@ -306,7 +306,7 @@ def _solve(
     """
     level = start
     for h in range(1, count):
-        excess = math.exp(memory.log_probability[h]) / (2.0 * parameters.level_risk)
+        excess = math.exp(state.log_probability[h]) / (2.0 * parameters.level_risk)
         k = math.sqrt(2.0 * math.log(excess)) if excess > 1.0 else 0.0
         level = max(level, work.branch[h, which] + k * work.branch[h, 2])
     low, high = 0.0, math.inf
@@ -317,12 +317,12 @@ def _solve(
         for side in (-1.0, 1.0):
             for b in range(len(bank.running)):
                 if bank.running[b]:
-                    own = math.sqrt(bank.covariance[b, PLACE, PLACE])
-                    away = (level + side * abs(bank.mean[b, PLACE] - place)) / own
+                    own = math.sqrt(bank.covariance[b, ARC, ARC])
+                    away = (level + side * abs(bank.mean[b, ARC] - place)) / own
                     spent += bank.prior[b] * 0.5 * math.erfc(away / math.sqrt(2.0))
                     slope += bank.prior[b] * math.exp(-0.5 * away * away) / own
             for h in range(1, count):
-                prior, own = math.exp(memory.log_probability[h]), work.branch[h, 2]
+                prior, own = math.exp(state.log_probability[h]), work.branch[h, 2]
                 away = (level + side * work.branch[h, which]) / own
                 spent += prior * 0.5 * math.erfc(away / math.sqrt(2.0))
                 slope += prior * math.exp(-0.5 * away * away) / own

@@ -16,9 +16,9 @@ from railfix.kernels.tracking.layout import (
     SCALE_PHASE,
     SPEED,
     WHEEL_ROW,
-    Answers,
     Epochs,
-    Memory,
+    KernelState,
+    Outputs,
     Parameters,
     Rows,
     Work,
@@ -26,12 +26,12 @@ from railfix.kernels.tracking.layout import (
 
 
 @borrowing
-def code_interval_s(epochs: Epochs, t: int, parameters: Parameters, memory: Memory, answers: Answers) -> float:
+def code_interval_s(epochs: Epochs, t: int, parameters: Parameters, state: KernelState, outputs: Outputs) -> float:
     """Time that the codes of an epoch stand for [s]; 0 where they are not used, as others were within the period.
 
     Their variances are settled with it, those of codes that are left out are inflated.
     """
-    dt, since, coded = epochs.interval_s[t], epochs.time_s[t] - memory.scalars[CODED], False
+    dt, since, coded = epochs.interval_s[t], epochs.time_s[t] - state.scalars[CODED], False
     for k in range(epochs.has.shape[2]):
         coded = coded or epochs.has[0, t, k]
     if not coded:
@@ -45,8 +45,8 @@ def code_interval_s(epochs: Epochs, t: int, parameters: Parameters, memory: Memo
         epochs.variance[0, t, k] /= min(code_s, 1.0)
         slot = epochs.slot[k]
         if slot >= 0 and epochs.has[0, t, k] and not epochs.fresh[t, slot]:
-            answers.faulty[t, k] = abs(memory.code_bias[slot]) > BIAS_FAULTY
-            if answers.faulty[t, k]:
+            outputs.faulty[t, k] = abs(state.code_bias[slot]) > BIAS_FAULTY
+            if outputs.faulty[t, k]:
                 epochs.variance[0, t, k] *= BIAS_INFLATED
     return float(code_s)
 
@@ -70,13 +70,13 @@ def choose_rows(epochs: Epochs, t: int, rows: Rows) -> None:
 
 
 @borrowing
-def choose_sensors(epochs: Epochs, t: int, memory: Memory, rows: Rows, work: Work) -> None:
+def choose_sensors(epochs: Epochs, t: int, state: KernelState, rows: Rows, work: Work) -> None:
     """List the sensors that have measured; a wheel without a sign needs a direction, a range to a unit a speed."""
-    count = int(memory.scalars[HYPOTHESES])
+    count = int(state.scalars[HYPOTHESES])
     for kind in range(epochs.sensor.shape[1]):
         known = math.isfinite(epochs.sensor[t, kind])
         known = known and (kind < RANGE_ROW or abs(work.mean[0, SPEED]) >= STILL_MPS)
-        if kind == WHEEL_ROW and epochs.unsigned and memory.scalars[DIRECTION] == 0.0:
+        if kind == WHEEL_ROW and epochs.unsigned and state.scalars[DIRECTION] == 0.0:
             for h in range(count):
                 known = known and abs(work.mean[h, SPEED]) > DIRECTION_MPS
         if known:
@@ -85,14 +85,14 @@ def choose_sensors(epochs: Epochs, t: int, memory: Memory, rows: Rows, work: Wor
 
 
 @borrowing
-def write_variances(epochs: Epochs, t: int, memory: Memory, rows: Rows, variance: Floats) -> None:
+def write_variances(epochs: Epochs, t: int, state: KernelState, rows: Rows, variance: Floats) -> None:
     """Write the variances of the measurements, with what has been learnt of phases and Dopplers."""
     nc, nph, nd = rows.counts[0], rows.counts[1], rows.counts[2]
     for i in range(nc):
         variance[i] = epochs.variance[0, t, rows.codes[i]]
     for i in range(nph):
-        variance[nc + i] = epochs.variance[1, t, rows.phases[i]] * math.exp(memory.scalars[SCALE_PHASE])
+        variance[nc + i] = epochs.variance[1, t, rows.phases[i]] * math.exp(state.scalars[SCALE_PHASE])
     for i in range(nd):
-        variance[nc + nph + i] = epochs.variance[2, t, rows.dopplers[i]] * math.exp(memory.scalars[SCALE_DOPPLER])
+        variance[nc + nph + i] = epochs.variance[2, t, rows.dopplers[i]] * math.exp(state.scalars[SCALE_DOPPLER])
     for j in range(rows.counts[3]):
         variance[nc + nph + nd + j] = epochs.sensor_sigma[t, rows.sensors[j]] ** 2

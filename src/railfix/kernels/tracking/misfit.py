@@ -15,7 +15,7 @@ from railfix.kernels.tracking.constants import (
     MISFIT_MOST,
     STEP_SIGMAS,
 )
-from railfix.kernels.tracking.layout import MAP_SCALE, SHIFT, SHIFT_VARIANCE, Parameters, Rows, Work
+from railfix.kernels.tracking.layout import MAP_LOG_VARIANCE, SHIFT, SHIFT_VARIANCE, Parameters, Rows, Work
 
 
 @borrowing
@@ -65,7 +65,7 @@ def learn_map(scalars: Floats, shift: float, dt: float, parameters: Parameters) 
     variance = (1.0 - share) ** 2 * scalars[SHIFT_VARIANCE] + share**2
     scalars[SHIFT], scalars[SHIFT_VARIANCE] = mean, variance
     beyond = abs(mean) / (math.sqrt(variance) * parameters.map_misfit_sigmas)
-    scale = scalars[MAP_SCALE] * math.exp(-dt / parameters.map_misfit_kept_s)
+    scale = scalars[MAP_LOG_VARIANCE] * math.exp(-dt / parameters.map_misfit_kept_s)
     if beyond > 1.0:
         scale += 2.0 * math.log(beyond) * dt / MISFIT_LEARNT_S
-    scalars[MAP_SCALE] = min(scale, MISFIT_LARGEST)
+    scalars[MAP_LOG_VARIANCE] = min(scale, MISFIT_LARGEST)

@@ -32,10 +32,10 @@ from railfix.kernels.tracking.course import point_at
 from railfix.kernels.tracking.layout import (
     ACCELERATION,
     ACROSS,
+    ARC,
     BRANCH_S,
     HYPOTHESES,
-    MAP_SCALE,
-    PLACE,
+    MAP_LOG_VARIANCE,
     RIGHT,
     SHIFT,
     SHIFT_VARIANCE,
@@ -44,9 +44,9 @@ from railfix.kernels.tracking.layout import (
     WEAK_CODE,
     WEAK_MOTION,
     WITHHELD,
-    Course,
     Epochs,
-    Memory,
+    KernelState,
+    LineArrays,
     Parameters,
     Subfilters,
     Work,
@@ -54,7 +54,7 @@ from railfix.kernels.tracking.layout import (
 
 
 @borrowing
-def contradiction(epochs: Epochs, t: int, course: Course, memory: Memory, work: Work, h: int) -> float:
+def contradiction(epochs: Epochs, t: int, line: LineArrays, state: KernelState, work: Work, h: int) -> float:
     """Square of the velocity against that of the place over its variance; NaN without a velocity.
 
     Along the line and across it, at the best of three places that the place's standard deviation allows.
@@ -62,15 +62,15 @@ def contradiction(epochs: Epochs, t: int, course: Course, memory: Memory, work: 
     velocity, covariance, axes = epochs.velocity_mps, epochs.velocity_covariance, work.axes
     if not math.isfinite(velocity[t, 0]):
         return math.nan
-    reach = max(REACH_M, REACH_SIGMAS * math.sqrt(memory.covariance[h, PLACE, PLACE]))
+    reach = max(REACH_M, REACH_SIGMAS * math.sqrt(state.covariance[h, ARC, ARC]))
     age_s = epochs.velocity_age_s[t]
-    speed = memory.mean[h, SPEED] - age_s * memory.mean[h, ACCELERATION]
+    speed = state.mean[h, SPEED] - age_s * state.mean[h, ACCELERATION]
     floor, least = 0.0, math.inf
     for c in range(3):
         floor += velocity[t, c] * velocity[t, c]
     floor = VELOCITY_FLOOR_MPS**2 + DIRECTION_SHARE**2 * floor
     for turn in range(3):
-        point_at(course, memory.mean[h, PLACE] - age_s * speed + (turn - 1) * reach, work.point, axes, 0)
+        point_at(line, state.mean[h, ARC] - age_s * speed + (turn - 1) * reach, work.point, axes, 0)
         total = 0.0
         for k in range(2):
             away, own = -speed if k == 0 else 0.0, floor
@@ -79,7 +79,7 @@ def contradiction(epochs: Epochs, t: int, course: Course, memory: Memory, work: 
                 for e in range(3):
                     own += axes[0, k, c] * covariance[t, c, e] * axes[0, k, e]
             if k == 0:
-                own += memory.covariance[h, SPEED, SPEED]
+                own += state.covariance[h, SPEED, SPEED]
             total += away * away / own
         least = min(least, total)
     return least
@@ -87,15 +87,21 @@ def contradiction(epochs: Epochs, t: int, course: Course, memory: Memory, work: 
 
 @borrowing
 def watch(
-    parameters: Parameters, memory: Memory, bank: Subfilters, square: float, shift: float, pushed_m: float, dt: float,
+    parameters: Parameters,
+    state: KernelState,
+    bank: Subfilters,
+    square: float,
+    shift: float,
+    pushed_m: float,
+    dt: float,
     code_s: float,
-) -> None:  # fmt: skip
+) -> None:
     """Take the contradictions of an epoch into the state.
 
     `square` is `contradiction` of the most probable hypothesis, `shift` the one that its codes ask for, `pushed_m` how
     far its place was put back onto an open end of the line, `code_s` the time that the codes stand for.
     """
-    scalars = memory.scalars
+    scalars = state.scalars
     if not math.isnan(square):
         gained = (min(square, LARGEST_SQUARE) - ALLOWED_SQUARE) * min(dt, 1.0)
         scalars[ACROSS] = max(scalars[ACROSS] + gained, 0.0)
@@ -111,10 +117,10 @@ def watch(
     if scalars[BRANCH_S] < parameters.level_start_s:
         largest = -math.inf
         for h in range(int(scalars[HYPOTHESES])):
-            largest = max(largest, memory.log_probability[h])
+            largest = max(largest, state.log_probability[h])
         if largest < math.log(YOUNG):
             withheld = YOUNG_HELD_S
-    if scalars[SHIFT] ** 2 > DRIFT_SIGMAS**2 * scalars[SHIFT_VARIANCE] or scalars[MAP_SCALE] > DRIFT_LOG:
+    if scalars[SHIFT] ** 2 > DRIFT_SIGMAS**2 * scalars[SHIFT_VARIANCE] or scalars[MAP_LOG_VARIANCE] > DRIFT_LOG:
         withheld = parameters.level_hold_s
     for b in range(len(bank.running)):
         if bank.running[b] and bank.weak_s[b] > parameters.level_doubt_s:

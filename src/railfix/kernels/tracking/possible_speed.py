@@ -13,17 +13,26 @@ from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.constants import (
     SPEED_SIGMAS,
 )
-from railfix.kernels.tracking.layout import HYPOTHESES, LEAST_SPEED, MOST_SPEED, SPEED, Memory, Parameters, Rows, Work
+from railfix.kernels.tracking.layout import (
+    HYPOTHESES,
+    LEAST_SPEED,
+    MOST_SPEED,
+    SPEED,
+    KernelState,
+    Parameters,
+    Rows,
+    Work,
+)
 
 
 @borrowing
-def possible(parameters: Parameters, memory: Memory, rows: Rows, work: Work, dt: float, measured: bool) -> bool:
+def possible(parameters: Parameters, state: KernelState, rows: Rows, work: Work, dt: float, measured: bool) -> bool:
     """Return whether the speed after an epoch is possible, and narrow its range to it; no bounds on several branches.
 
     Enough satellites, or a sensor on board too, are believed whatever the range. Where the speed is not, the range
     grows by emergency braking, so that braking is followed from the next epoch.
     """
-    scalars, counts = memory.scalars, rows.counts
+    scalars, counts = state.scalars, rows.counts
     low, high = -math.inf, math.inf
     if int(scalars[HYPOTHESES]) == 1:
         change = parameters.service_acceleration_mps2 * dt

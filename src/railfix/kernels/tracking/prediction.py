@@ -14,24 +14,24 @@ from railfix.kernels.tracking.constants import (
     WHEEL_WALK,
 )
 from railfix.kernels.tracking.layout import (
+    ARC,
     CODE_CLOCK,
     CODE_PLACE,
     DOPPLER_SPEED,
     DRIFT,
+    MAP_LENGTH_ERROR,
     OF_EPOCH,
-    OLD_PLACE,
-    OLD_SPEED,
     PHASE_CLOCK,
-    PLACE,
+    PREVIOUS_ARC,
+    PREVIOUS_SPEED,
     RIGHT,
     SPEED,
-    STEP_ALONG,
     STEP_RIGHT,
     STEP_UP,
     UP,
     Active,
-    Course,
     Epochs,
+    LineArrays,
     Parameters,
     Work,
 )
@@ -41,13 +41,13 @@ from railfix.kernels.tracking.layout import (
 def predict(
     epochs: Epochs,
     t: int,
-    course: Course,
+    line: LineArrays,
     parameters: Parameters,
     active: Active,
     mean: Floats,
     covariance: Floats,
     h: int,
-    map_log_scale: float,
+    map_log_variance: float,
     map_sigma_m: float,
     work: Work,
     to: int,
@@ -78,16 +78,16 @@ def predict(
                 step[i, 0] * covariance[h, 0, j] + step[i, 1] * covariance[h, 1, j] + step[i, 2] * covariance[h, 2, j]
             )
     for j in range(n):
-        rows[n + OLD_PLACE, j] = covariance[h, PLACE, j]
-        rows[n + OLD_SPEED, j] = covariance[h, SPEED, j]
+        rows[n + PREVIOUS_ARC, j] = covariance[h, ARC, j]
+        rows[n + PREVIOUS_SPEED, j] = covariance[h, SPEED, j]
         rows[n + PHASE_CLOCK, j] = dt * covariance[h, DRIFT, j]
     for i in range(n + 3):
         for j in range(3, n):
             spread[to, i, j] = kept[j] * rows[i, j]
         for j in range(3):
             spread[to, i, j] = step[j, 0] * rows[i, 0] + step[j, 1] * rows[i, 1] + step[j, 2] * rows[i, 2]
-        spread[to, i, n + OLD_PLACE] = rows[i, PLACE]
-        spread[to, i, n + OLD_SPEED] = rows[i, SPEED]
+        spread[to, i, n + PREVIOUS_ARC] = rows[i, ARC]
+        spread[to, i, n + PREVIOUS_SPEED] = rows[i, SPEED]
         spread[to, i, n + PHASE_CLOCK] = dt * rows[i, DRIFT]
         for j in range(n + 3, n + OF_EPOCH):
             spread[to, i, j] = 0.0
@@ -98,15 +98,15 @@ def predict(
     for i in range(3):
         for j in range(3):
             spread[to, i, j] += noise[i, j]
-    spread[to, PLACE, PLACE] += LEAST_STEP_M2
+    spread[to, ARC, ARC] += LEAST_STEP_M2
     spread[to, SPEED, SPEED] += LEAST_STEP_M2
     walk = parameters.clock_walk_mps**2
     spread[to, DRIFT, DRIFT] += walk * dt
     spread[to, n + PHASE_CLOCK, n + PHASE_CLOCK] += walk * dt**3 / 3.0 + 1e-6
     spread[to, n + PHASE_CLOCK, DRIFT] += walk * dt**2 / 2.0
     spread[to, DRIFT, n + PHASE_CLOCK] += walk * dt**2 / 2.0
-    spread[to, RIGHT, RIGHT] += (course.sigma_plan_m**2 + map_sigma_m**2) * (1.0 - map_kept**2)
-    spread[to, UP, UP] += (course.sigma_height_m**2 + map_sigma_m**2) * (1.0 - map_kept**2)
+    spread[to, RIGHT, RIGHT] += (line.sigma_plan_m**2 + map_sigma_m**2) * (1.0 - map_kept**2)
+    spread[to, UP, UP] += (line.sigma_height_m**2 + map_sigma_m**2) * (1.0 - map_kept**2)
     spread[to, CODE_PLACE, CODE_PLACE] += parameters.slow_code_m**2 * (1.0 - slow_kept**2)
     lasting = parameters.doppler_error_mps + parameters.doppler_error_share * speed
     spread[to, DOPPLER_SPEED, DOPPLER_SPEED] += lasting**2 * (1.0 - doppler_kept**2)
@@ -126,8 +126,8 @@ def predict(
         after[to, i] = kept[i] * mean[h, i]
     for i in range(3):
         after[to, i] = step[i, 0] * mean[h, 0] + step[i, 1] * mean[h, 1] + step[i, 2] * mean[h, 2]
-    after[to, n + OLD_PLACE], after[to, n + OLD_SPEED], after[to, n + PHASE_CLOCK] = (
-        mean[h, PLACE],
+    after[to, n + PREVIOUS_ARC], after[to, n + PREVIOUS_SPEED], after[to, n + PHASE_CLOCK] = (
+        mean[h, ARC],
         mean[h, SPEED],
         dt * mean[h, DRIFT],
     )
@@ -137,10 +137,10 @@ def predict(
     spread[to, n + STEP_RIGHT, n + STEP_RIGHT] = rough
     spread[to, n + STEP_UP, n + STEP_UP] = rough
     # The way on the map is the way run less the error of the length: what codes see of it, phases do not.
-    length = parameters.map_scale_m**2 * math.exp(map_log_scale) * travel + parameters.phase_walk_m**2 * dt
-    spread[to, PLACE, PLACE] += length
-    spread[to, n + STEP_ALONG, n + STEP_ALONG] = length + 1e-8
-    spread[to, PLACE, n + STEP_ALONG] = spread[to, n + STEP_ALONG, PLACE] = -length
+    length = parameters.map_scale_m**2 * math.exp(map_log_variance) * travel + parameters.phase_walk_m**2 * dt
+    spread[to, ARC, ARC] += length
+    spread[to, n + MAP_LENGTH_ERROR, n + MAP_LENGTH_ERROR] = length + 1e-8
+    spread[to, ARC, n + MAP_LENGTH_ERROR] = spread[to, n + MAP_LENGTH_ERROR, ARC] = -length
     spread[to, n + CODE_CLOCK, n + CODE_CLOCK] = CODE_CLOCK_SIGMA_M**2
 
 
@@ -148,7 +148,7 @@ def predict(
 def add_bend(parameters: Parameters, work: Work, h: int) -> None:
     """Add what the line bends by where the place is uncertain to the displacements across."""
     spread, bend, n = work.spread, work.bend, work.mean.shape[1] - OF_EPOCH
-    length = spread[h, n + STEP_ALONG, n + STEP_ALONG] - 1e-8
-    vague = min(spread[h, PLACE, PLACE] - length, parameters.start_sigma_m**2)
-    spread[h, n + STEP_RIGHT, n + STEP_RIGHT] += vague * bend[0] ** 2
-    spread[h, n + STEP_UP, n + STEP_UP] += vague * bend[1] ** 2
+    length = spread[h, n + MAP_LENGTH_ERROR, n + MAP_LENGTH_ERROR] - 1e-8
+    position_variance = min(spread[h, ARC, ARC] - length, parameters.start_sigma_m**2)
+    spread[h, n + STEP_RIGHT, n + STEP_RIGHT] += position_variance * bend[0] ** 2
+    spread[h, n + STEP_UP, n + STEP_UP] += position_variance * bend[1] ** 2

@@ -40,32 +40,32 @@ from railfix.kernels.tracking.equations import combine, write_equations
 from railfix.kernels.tracking.layout import (
     ACCELERATION,
     ACROSS,
+    ARC,
     BRANCH_M,
     BRANCH_S,
     CODED,
     COMBINED,
     DIRECTION,
+    DISTANCE_SINCE_CODE,
     HYPOTHESES,
-    MAP_SCALE,
+    MAP_LOG_VARIANCE,
     MEASURED,
     OF_EPOCH,
-    OLD_PLACE,
     OPEN,
-    PLACE,
     PREDICTION,
+    PREVIOUS_ARC,
     REST,
     REST_LOST,
     SPEED,
-    UNAIDED,
     WEAK_CODE,
     WEAK_MOTION,
     WHOLE,
     WITHHELD,
     Active,
-    Answers,
-    Course,
     Epochs,
-    Memory,
+    KernelState,
+    LineArrays,
+    Outputs,
     Parameters,
     Rows,
     Subfilters,
@@ -82,22 +82,22 @@ from railfix.kernels.tracking.update import apply_update, first_weights, mean_we
 
 
 @borrowing
-def _go_round(course: Course, memory: Memory, bank: Subfilters) -> None:
+def _go_round(line: LineArrays, state: KernelState, bank: Subfilters) -> None:
     """Let places beyond an end of a closed line go on where it closes."""
-    for h in range(int(memory.scalars[HYPOTHESES])):
-        back = on_course(course, memory.mean[h, PLACE]) - memory.mean[h, PLACE]
+    for h in range(int(state.scalars[HYPOTHESES])):
+        back = on_course(line, state.mean[h, ARC]) - state.mean[h, ARC]
         if back != 0.0:
-            memory.mean[h, PLACE] += back
-            memory.origin_m[h] += back
+            state.mean[h, ARC] += back
+            state.origin_m[h] += back
             for b in range(len(bank.running)):
                 if h == 0 and bank.running[b]:
-                    bank.mean[b, PLACE] += back
+                    bank.mean[b, ARC] += back
 
 
 @borrowing
-def _needs_search(epochs: Epochs, t: int, parameters: Parameters, memory: Memory) -> bool:
+def _needs_search(epochs: Epochs, t: int, parameters: Parameters, state: KernelState) -> bool:
     """Return whether places have to be sought before an epoch: the track is lost or in doubt, or after a gap."""
-    scalars = memory.scalars
+    scalars = state.scalars
     lost = scalars[WEAK_MOTION] >= parameters.lost_motion_s or scalars[WEAK_CODE] >= parameters.lost_code_s
     lost = lost or scalars[ACROSS] >= ACROSS_LOST
     beside = scalars[WEAK_MOTION] >= BESIDE_AFTER_S or scalars[ACROSS] >= ACROSS_DOUBT
@@ -109,15 +109,15 @@ def _needs_search(epochs: Epochs, t: int, parameters: Parameters, memory: Memory
 
 
 @borrowing
-def _forget(epochs: Epochs, t: int, active: Active, memory: Memory, bank: Subfilters) -> None:
+def _forget(epochs: Epochs, t: int, active: Active, state: KernelState, bank: Subfilters) -> None:
     """Make the code errors of satellites that come into view independent of all else."""
     for i in range(epochs.fresh.shape[1]):
         if epochs.fresh[t, i]:
             k = active.satellite[i]
-            memory.code_bias[i] = 0.0
-            for h in range(int(memory.scalars[HYPOTHESES])):
-                memory.mean[h, k] = 0.0
-                restart(memory.covariance, k, 1.0, h)
+            state.code_bias[i] = 0.0
+            for h in range(int(state.scalars[HYPOTHESES])):
+                state.mean[h, k] = 0.0
+                restart(state.covariance, k, 1.0, h)
             for b in range(len(bank.running)):
                 if bank.running[b]:
                     bank.mean[b, k] = 0.0
@@ -135,34 +135,34 @@ def _take(mean: Floats, covariance: Floats, to: int, new_mean: Floats, new_covar
 
 @borrowing
 def _predict_all(
-    epochs: Epochs, t: int, course: Course, parameters: Parameters, active: Active, memory: Memory, work: Work
+    epochs: Epochs, t: int, line: LineArrays, parameters: Parameters, active: Active, state: KernelState, work: Work
 ) -> None:
     """Predict all hypotheses."""
-    scale = memory.scalars[MAP_SCALE]
-    for h in range(int(memory.scalars[HYPOTHESES])):
-        predict(epochs, t, course, parameters, active, memory.mean, memory.covariance, h, scale, 0.0, work, h)
+    scale = state.scalars[MAP_LOG_VARIANCE]
+    for h in range(int(state.scalars[HYPOTHESES])):
+        predict(epochs, t, line, parameters, active, state.mean, state.covariance, h, scale, 0.0, work, h)
 
 
 @borrowing
 def _coast(
     epochs: Epochs,
     t: int,
-    course: Course,
+    line: LineArrays,
     parameters: Parameters,
     active: Active,
-    memory: Memory,
+    state: KernelState,
     bank: Subfilters,
     work: Work,
     h: int,
 ) -> None:
     """Take over the prediction of all hypotheses and sub-filters where nothing is measured; row `h` is free."""
-    for k in range(int(memory.scalars[HYPOTHESES])):
-        _take(memory.mean, memory.covariance, k, work.mean, work.spread, k)
+    for k in range(int(state.scalars[HYPOTHESES])):
+        _take(state.mean, state.covariance, k, work.mean, work.spread, k)
     for b in range(len(bank.running)):
         if bank.running[b]:
-            scale = memory.scalars[MAP_SCALE]
+            scale = state.scalars[MAP_LOG_VARIANCE]
             wrong_m = parameters.level_map_m if b == len(bank.running) - 1 else 0.0
-            predict(epochs, t, course, parameters, active, bank.mean, bank.covariance, b, scale, wrong_m, work, h)
+            predict(epochs, t, line, parameters, active, bank.mean, bank.covariance, b, scale, wrong_m, work, h)
             _take(bank.mean, bank.covariance, b, work.mean, work.spread, h)
 
 
@@ -170,40 +170,40 @@ def _coast(
 def _measure(
     epochs: Epochs,
     t: int,
-    course: Course,
+    line: LineArrays,
     parameters: Parameters,
     active: Active,
-    memory: Memory,
+    state: KernelState,
     bank: Subfilters,
-    answers: Answers,
+    outputs: Outputs,
     rows: Rows,
     work: Work,
     shift: float,
-    map_log_scale: float,
+    map_log_variance: float,
     code_s: float,
 ) -> int:
     """Take over what an epoch's measurements have given, and learn from it; return the hypothesis to go by."""
-    scalars, dt, count = memory.scalars, epochs.interval_s[t], int(memory.scalars[HYPOTHESES])
+    scalars, dt, count = state.scalars, epochs.interval_s[t], int(state.scalars[HYPOTHESES])
     for h in range(count):
-        _take(memory.mean, memory.covariance, h, work.new_mean, work.new_covariance, h)
+        _take(state.mean, state.covariance, h, work.new_mean, work.new_covariance, h)
     scalars[MEASURED] = epochs.time_s[t]
     if rows.counts[0] > 0:
         scalars[CODED] = epochs.time_s[t]
     for i in range(rows.counts[0]):
-        memory.offset_known[epochs.offset[rows.codes[i]]] = True
-    best = most_probable(memory.log_probability, count, SWITCH)
-    found = learn(epochs, parameters, memory, rows, work, t, best, shift, dt, code_s)
-    write_rows(answers, rows, work, t, best, 1.0)
+        state.offset_known[epochs.offset[rows.codes[i]]] = True
+    best = most_probable(state.log_probability, count, SWITCH)
+    found = learn(epochs, parameters, state, rows, work, t, best, shift, dt, code_s)
+    write_rows(outputs, rows, work, t, best, 1.0)
     if len(bank.running):
         room = len(work.now) - 1
-        advance_subfilters(epochs, t, course, parameters, active, bank, rows, best, map_log_scale, work, room)
+        advance_subfilters(epochs, t, line, parameters, active, bank, rows, best, map_log_variance, work, room)
     if found and abs(shift) < FREED_SIGMAS:
         for h in range(count):
-            memory.covariance[h, PLACE, PLACE] += FREED_M**2
+            state.covariance[h, ARC, ARC] += FREED_M**2
         for b in range(len(bank.running)):
-            bank.covariance[b, PLACE, PLACE] += FREED_M**2
-    square = contradiction(epochs, t, course, memory, work, best)
-    watch(parameters, memory, bank, square, 0.0 if best else shift, work.pushed[best], dt, code_s)
+            bank.covariance[b, ARC, ARC] += FREED_M**2
+    square = contradiction(epochs, t, line, state, work, best)
+    watch(parameters, state, bank, square, 0.0 if best else shift, work.pushed[best], dt, code_s)
     return best
 
 
@@ -211,30 +211,30 @@ def _measure(
 def _update(
     epochs: Epochs,
     t: int,
-    course: Course,
+    line: LineArrays,
     parameters: Parameters,
     active: Active,
-    memory: Memory,
+    state: KernelState,
     rows: Rows,
     work: Work,
 ) -> float:
     """Write all hypotheses after an epoch's measurements; return the shift that codes ask of the one in the lead."""
     mean, new_mean = work.mean, work.new_mean
     n, room = mean.shape[1] - OF_EPOCH, mean.shape[0] - 1
-    count, nc = int(memory.scalars[HYPOTHESES]), rows.counts[0]
+    count, nc = int(state.scalars[HYPOTHESES]), rows.counts[0]
     gnss = nc + rows.counts[1] + rows.counts[2]
     size = nc + COMBINED + rows.counts[3]
-    going = most_probable(memory.log_probability, count, SWITCH)
+    going = most_probable(state.log_probability, count, SWITCH)
     shift, doubtful = 0.0, False
     for turn in range(1 + RELINEARISED):
         furthest = 0.0
         for h in range(count):
-            work.now[h] = new_mean[h, PLACE] if turn else mean[h, PLACE]
-            work.before[h] = new_mean[h, n] if turn else mean[h, n + OLD_PLACE]
-            write_equations(epochs, t, course, active, rows, memory.scalars[DIRECTION], work, h)
+            work.now[h] = new_mean[h, ARC] if turn else mean[h, ARC]
+            work.before[h] = new_mean[h, n] if turn else mean[h, n + PREVIOUS_ARC]
+            write_equations(epochs, t, line, active, rows, state.scalars[DIRECTION], work, h)
             if turn == 0:
                 add_bend(parameters, work, h)
-                start_clocks(epochs, active, memory, rows, work, h)
+                start_clocks(epochs, active, state, rows, work, h)
                 for i in range(gnss + rows.counts[3]):
                     work.innovation[h, i] = work.value[h, i]
             combine(epochs, t, active, rows, work, h)
@@ -251,13 +251,13 @@ def _update(
             if turn == 0 and doubtful:
                 second_start(parameters, rows, work, h, room)
             apply_update(rows, work, h)
-            furthest = max(furthest, abs(new_mean[h, PLACE] - work.now[h]))
+            furthest = max(furthest, abs(new_mean[h, ARC] - work.now[h]))
         if furthest < MOVED_M:
             break
     if count > 1:
-        reweigh(course, parameters, rows, memory, work, count, epochs.interval_s[t])
+        reweigh(line, parameters, rows, state, work, count, epochs.interval_s[t])
     for h in range(count):
-        work.pushed[h] = onto_line(course, parameters.start_sigma_m, work, h)
+        work.pushed[h] = onto_line(line, parameters.start_sigma_m, work, h)
     return shift
 
 
@@ -269,80 +269,80 @@ def _finish(
     measured: bool,
     lost: bool,
     dt: float,
-    course: Course,
+    line: LineArrays,
     parameters: Parameters,
     active: Active,
-    memory: Memory,
+    state: KernelState,
     bank: Subfilters,
-    answers: Answers,
+    outputs: Outputs,
     work: Work,
 ) -> None:
     """End an epoch: direction, way without codes, hypotheses to go on with; write its answer."""
-    scalars = memory.scalars
+    scalars = state.scalars
     count = int(scalars[HYPOTHESES])
-    speed = memory.mean[best, SPEED]
+    speed = state.mean[best, SPEED]
     if abs(speed) > DIRECTION_MPS:
         scalars[DIRECTION] = math.copysign(1.0, speed)
-    scalars[UNAIDED] = 0.0 if aided else scalars[UNAIDED] + abs(speed) * dt
+    scalars[DISTANCE_SINCE_CODE] = 0.0 if aided else scalars[DISTANCE_SINCE_CODE] + abs(speed) * dt
     scalars[BRANCH_S] += dt
     scalars[BRANCH_M] += abs(speed) * dt
     for h in range(count):
-        memory.log_least[h] = min(memory.log_least[h] + LEAST_RISE * dt, memory.log_probability[h])
+        state.log_least[h] = min(state.log_least[h] + LEAST_RISE * dt, state.log_probability[h])
     if count > 1:
-        count = keep_hypotheses(memory, parameters, work, count)
+        count = keep_hypotheses(state, parameters, work, count)
         scalars[HYPOTHESES] = count
-    if scalars[BRANCH_S] > TAKEOVER_AFTER_S and memory.log_least[0] < TAKEOVER:
+    if scalars[BRANCH_S] > TAKEOVER_AFTER_S and state.log_least[0] < TAKEOVER:
         scalars[ACROSS] = ACROSS_TAKEN
-    probability = math.exp(memory.log_probability[0])
-    sigma = math.sqrt(memory.covariance[0, PLACE, PLACE])
-    answers.hypotheses[t], answers.probability[t] = count, probability
+    probability = math.exp(state.log_probability[0])
+    sigma = math.sqrt(state.covariance[0, ARC, ARC])
+    outputs.hypotheses[t], outputs.probability[t] = count, probability
     if not sigma <= parameters.expired_sigma_m:
-        answers.status[t] = EXPIRED
+        outputs.status[t] = EXPIRED
         return
-    far = write_branches(memory, course, parameters, work, count)
+    far = write_branches(state, line, parameters, work, count)
     spread = sigma * sigma
     for h in range(1, count):
         own = work.branch[h, 1] ** 2 + work.branch[h, 2] ** 2
-        spread += math.exp(memory.log_probability[h]) * (own - sigma * sigma)
-    answers.arc_m[t], answers.sigma_m[t] = memory.mean[0, PLACE], math.sqrt(spread)
-    answers.speed_mps[t] = memory.mean[0, SPEED]
-    answers.speed_sigma_mps[t] = math.sqrt(memory.covariance[0, SPEED, SPEED])
-    answers.acceleration_mps2[t] = memory.mean[0, ACCELERATION]
+        spread += math.exp(state.log_probability[h]) * (own - sigma * sigma)
+    outputs.arc_m[t], outputs.sigma_m[t] = state.mean[0, ARC], math.sqrt(spread)
+    outputs.speed_mps[t] = state.mean[0, SPEED]
+    outputs.speed_sigma_mps[t] = math.sqrt(state.covariance[0, SPEED, SPEED])
+    outputs.acceleration_mps2[t] = state.mean[0, ACCELERATION]
     if active.wheel >= 0:
-        answers.wheel_scale[t] = memory.mean[0, active.wheel]
+        outputs.wheel_scale[t] = state.mean[0, active.wheel]
     if active.force >= 0:
-        answers.force_offset_mps2[t] = memory.mean[0, active.force]
+        outputs.force_offset_mps2[t] = state.mean[0, active.force]
     if active.radar >= 0:
-        answers.radar_scale[t] = memory.mean[0, active.radar]
-    answers.map_scale[t] = math.exp(0.5 * scalars[MAP_SCALE])
+        outputs.radar_scale[t] = state.mean[0, active.radar]
+    outputs.map_scale[t] = math.exp(0.5 * scalars[MAP_LOG_VARIANCE])
     scalars[OPEN] = parameters.level_hold_s if far > parameters.level_risk else max(scalars[OPEN] - dt, 0.0)
     if len(bank.running):
-        write_level(memory, count, far, bank, parameters, work, answers, t)
+        write_level(state, count, far, bank, parameters, work, outputs, t)
         if scalars[WITHHELD] > 0.0:
-            answers.ground_level_m[t] = math.inf
+            outputs.ground_level_m[t] = math.inf
         if scalars[WITHHELD] > 0.0 or scalars[OPEN] > 0.0:
-            answers.level_m[t] = math.inf
-        answers.amount_m[t] = max(answers.level_m[t], SCALE_BOUND * scalars[UNAIDED])
-        answers.level_speed_mps[t] = speed_bound(memory.mean[0, SPEED], answers.speed_sigma_mps[t], bank, parameters)
+            outputs.level_m[t] = math.inf
+        outputs.amount_m[t] = max(outputs.level_m[t], SCALE_BOUND * scalars[DISTANCE_SINCE_CODE])
+        outputs.level_speed_mps[t] = speed_bound(state.mean[0, SPEED], outputs.speed_sigma_mps[t], bank, parameters)
     if lost:
-        answers.status[t] = LOST
+        outputs.status[t] = LOST
     elif scalars[OPEN] > 0.0:
-        answers.status[t] = SEVERAL_BRANCHES
+        outputs.status[t] = SEVERAL_BRANCHES
     elif scalars[WITHHELD] > 0.0:
-        answers.status[t] = DOUBTFUL
+        outputs.status[t] = DOUBTFUL
     else:
-        answers.status[t] = TRACKING if measured else COASTING
+        outputs.status[t] = TRACKING if measured else COASTING
 
 
 @kernel
 def advance(
     epochs: Epochs,
-    course: Course,
+    line: LineArrays,
     parameters: Parameters,
     active: Active,
-    memory: Memory,
+    state: KernelState,
     bank: Subfilters,
-    answers: Answers,
+    outputs: Outputs,
     rows: Rows,
     work: Work,
     first: int,
@@ -353,42 +353,42 @@ def advance(
 
     `part` says what of an epoch is done: `layout.WHOLE`, or of the first alone the `PREDICTION`, or the `REST`.
     """
-    scalars, room = memory.scalars, len(work.now) - 1
+    scalars, room = state.scalars, len(work.now) - 1
     for t in range(first, last):
         if part < REST:
-            if epochs.begins[t] or (part == WHOLE and _needs_search(epochs, t, parameters, memory)):
+            if epochs.begins[t] or (part == WHOLE and _needs_search(epochs, t, parameters, state)):
                 return t
-            _forget(epochs, t, active, memory, bank)
-            _go_round(course, memory, bank)
-            _predict_all(epochs, t, course, parameters, active, memory, work)
+            _forget(epochs, t, active, state, bank)
+            _go_round(line, state, bank)
+            _predict_all(epochs, t, line, parameters, active, state, work)
             if part == PREDICTION:
                 return t
-        code_s = code_interval_s(epochs, t, parameters, memory, answers)
+        code_s = code_interval_s(epochs, t, parameters, state, outputs)
         choose_rows(epochs, t, rows)
-        choose_sensors(epochs, t, memory, rows, work)
+        choose_sensors(epochs, t, state, rows, work)
         measured = rows.counts[0] + rows.counts[1] + rows.counts[2] + rows.counts[3] > 0
-        dt, map_scale, shift = epochs.interval_s[t], scalars[MAP_SCALE], 0.0
+        dt, map_scale, shift = epochs.interval_s[t], scalars[MAP_LOG_VARIANCE], 0.0
         if measured:
-            write_variances(epochs, t, memory, rows, work.variance)
-            shift = _update(epochs, t, course, parameters, active, memory, rows, work)
-        if not possible(parameters, memory, rows, work, dt, measured):
+            write_variances(epochs, t, state, rows, work.variance)
+            shift = _update(epochs, t, line, parameters, active, state, rows, work)
+        if not possible(parameters, state, rows, work, dt, measured):
             # What no train can do is not believed: the prediction goes on, made anew as the clocks in it were moved.
             measured = False
             scalars[WEAK_MOTION] += dt
-            write_rows(answers, rows, work, t, 0, 0.0)
+            write_rows(outputs, rows, work, t, 0, 0.0)
             if part == WHOLE:
-                _predict_all(epochs, t, course, parameters, active, memory, work)
+                _predict_all(epochs, t, line, parameters, active, state, work)
         if measured:
             best = _measure(
-                epochs, t, course, parameters, active, memory, bank, answers, rows, work, shift, map_scale, code_s
+                epochs, t, line, parameters, active, state, bank, outputs, rows, work, shift, map_scale, code_s
             )
         else:
-            _coast(epochs, t, course, parameters, active, memory, bank, work, room)
-            best = most_probable(memory.log_probability, int(scalars[HYPOTHESES]), SWITCH)
+            _coast(epochs, t, line, parameters, active, state, bank, work, room)
+            best = most_probable(state.log_probability, int(scalars[HYPOTHESES]), SWITCH)
             scalars[WITHHELD] = max(scalars[WITHHELD] - dt, 0.0)
         aided = measured and rows.counts[0] > 0
         lost = part == REST_LOST
-        _finish(t, best, aided, measured, lost, dt, course, parameters, active, memory, bank, answers, work)
-        if not math.isfinite(memory.mean[0, PLACE]):
+        _finish(t, best, aided, measured, lost, dt, line, parameters, active, state, bank, outputs, work)
+        if not math.isfinite(state.mean[0, ARC]):
             return t + 1
     return last
