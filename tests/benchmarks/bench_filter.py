@@ -16,7 +16,7 @@ from unittest import mock
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
 import tracking_cases
 from railfix import kernels
 from railfix.io.rinex import read_navigation, read_observations

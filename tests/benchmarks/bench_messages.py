@@ -29,7 +29,7 @@ from railfix.gnss.observations import Observations
 from railfix.io.train_message import MessageStatus, decode
 from railfix.simulate.demo_data import demo_files
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 from ubx_made import rawx
 
 PERIOD_S = 0.1

@@ -25,7 +25,6 @@ from typing import Any, Final
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import bench_run
-
 import railfix
 from railfix.kernels import kernels_in_use
 

@@ -43,7 +43,7 @@ class MapOffsetLimits(Settings):
     note_risk, risk : float
         Probability that noise alone passes the test (chi-square, two degrees of freedom): of the note, of the status.
         The nominal sigmas are assumptions; on the recordings, with a right map and all screens, the statistic
-        stays below the threshold of the status, 13.8 (``tests/integrity_tables.py``).
+        stays below the threshold of the status, 13.8 (``tests/studies/integrity_tables.py``).
     missed : float
         Probability that the status misses an offset of the smallest detectable size.
     """

@@ -5,7 +5,7 @@ epoch and one ambiguity per arc of phase. The unknowns of the epochs are elimina
 normal matrix has one row per arc, whatever the number of epochs.
 
 `phase_positions` in `filtered` uses each epoch and those before it. The tests compare it with one least
-squares over all epochs of a run (`tests/phase_run.py`).
+squares over all epochs of a run (`tests/helpers/phase_run.py`).
 """
 
 from __future__ import annotations

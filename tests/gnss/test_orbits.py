@@ -1,0 +1,293 @@
+"""Satellite positions, velocities and clocks against second formulas; NaN, chunks and masks."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+import orbit_cases
+from orbit_cases import HOUR, KINDS, TOE, glonass, kepler, navigation
+from railfix.core.arrays import read_only
+from railfix.core.constants import (
+    EARTH_ROTATION_RATE,
+    EARTH_ROTATION_RATE_BEIDOU,
+    EARTH_ROTATION_RATE_GLONASS,
+    GM_GALILEO,
+    GM_GLONASS,
+    GM_GPS,
+    PZ90_J2,
+    PZ90_SEMI_MAJOR_AXIS,
+    SPEED_OF_LIGHT,
+)
+from railfix.gnss.navigation import KeplerRecords, Navigation
+from railfix.gnss.orbits import SatelliteStates, satellite_states
+from railfix.gnss.orbits.kepler import Orbits, eccentric_anomaly, kepler_state
+
+REFERENCES = json.loads((Path(__file__).parents[1] / "references" / "orbits.json").read_text())
+CODE = 23_456_789.012
+ALL = (*KINDS, "R07")
+
+
+def at(after_toe_s: Any) -> np.ndarray:
+    return TOE + np.rint(np.atleast_1d(after_toe_s) * 1e9).astype("timedelta64[ns]")
+
+
+def states(
+    nav: Navigation, after_toe_s: Any, satellite: str = "G05", signal: str = "1C", code_m: float = CODE, **more: Any
+) -> SatelliteStates:
+    time = at(after_toe_s)
+    code = read_only(np.full((len(time), 1), code_m))
+    return satellite_states(read_only(time), read_only(np.array([satellite])), np.array([signal]), code, nav, **more)
+
+
+def textbook(record: KeplerRecords, t: float) -> tuple[np.ndarray, float]:
+    """IS-GPS-200 table 20-IV and BDS-SIS-ICD 5.2.4.12, one line a step with the math library: position, sin E."""
+    r = {item.name: getattr(record, item.name)[0] for item in fields(record)}
+    beidou, gps = r["satellite"][0] == "C", r["satellite"][0] in "GJ"
+    gm, turn = (GM_GPS if gps else GM_GALILEO), (EARTH_ROTATION_RATE_BEIDOU if beidou else EARTH_ROTATION_RATE)
+    a, e = r["sqrt_a"] ** 2, r["eccentricity"]
+    mean = r["m0"] + (math.sqrt(gm / a**3) + r["delta_n"]) * t
+    big_e = mean
+    for _ in range(200):
+        big_e = mean + e * math.sin(big_e)
+    true = 2.0 * math.atan2(math.sqrt(1 + e) * math.sin(big_e / 2), math.sqrt(1 - e) * math.cos(big_e / 2))
+    phi = true + r["omega"]
+    u = phi + r["cus"] * math.sin(2 * phi) + r["cuc"] * math.cos(2 * phi)
+    radius = a * (1 - e * math.cos(big_e)) + r["crs"] * math.sin(2 * phi) + r["crc"] * math.cos(2 * phi)
+    i = r["i0"] + r["i_dot"] * t + r["cis"] * math.sin(2 * phi) + r["cic"] * math.cos(2 * phi)
+    geo = r["satellite"] in ("C03",)
+    node = r["omega0"] + (r["omega_dot"] - (0.0 if geo else turn)) * t - turn * r["toe_sow_s"]
+    in_plane = radius * np.array([math.cos(u), math.sin(u), 0.0])
+    place = about_z(-node) @ about_x(-i) @ in_plane
+    if geo:
+        place = about_z(turn * t) @ about_x(math.radians(-5.0)) @ place
+    return place, math.sin(big_e)
+
+
+def about_x(angle: float) -> np.ndarray:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
+
+
+def about_z(angle: float) -> np.ndarray:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+
+
+@pytest.mark.requirement("A7")
+@pytest.mark.parametrize("satellite", list(KINDS))
+def test_position_is_that_of_the_interface_document(satellite: str) -> None:
+    records = kepler({"satellite": satellite})
+    for t in (-7200.0, -1.5, 0.0, 3333.25, 7200.0):
+        position, _, relativity = kepler_state(Orbits.from_records(records), np.array([t]))
+        expected, sin_e = textbook(records, t)
+        assert np.linalg.norm(np.array(position)[:, 0] - expected) < 1e-5
+        gm = GM_GPS if satellite[0] in "GJ" else GM_GALILEO
+        f = -2.0 * math.sqrt(gm) / SPEED_OF_LIGHT**2
+        expected_s = f * records.eccentricity[0] * records.sqrt_a[0] * sin_e
+        assert relativity[0] == pytest.approx(expected_s, abs=1e-18)
+
+
+@pytest.mark.requirement("A7")
+@pytest.mark.parametrize("satellite", ALL)
+def test_states_agree_with_an_independent_program(satellite: str) -> None:
+    """Micrometres: the same formulas in C (see the generator beside the numbers)."""
+    nav = navigation({"satellite": satellite})
+    rows = [row for row in REFERENCES["states"] if row["satellite"] == satellite]
+    assert len(rows) >= 6
+    found = states(nav, [r["after_toe_s"] for r in rows], satellite, code_m=REFERENCES["code_m"])
+    expected = np.array([r["position_ecef_m"] for r in rows])
+    assert np.linalg.norm(found.position_ecef_m[:, 0] - expected, axis=-1).max() < 1e-5
+    assert np.abs(found.clock_m[:, 0] - [r["clock_m"] for r in rows]).max() < 1e-6
+
+
+@pytest.mark.requirement("A7")
+@pytest.mark.parametrize("satellite", ALL)
+def test_velocity_is_the_derivative_of_position(satellite: str) -> None:
+    nav = navigation({"satellite": satellite, "af1": 0.0} if satellite != "R07" else {"satellite": satellite})
+    step = 0.5
+    t = np.array([-1500.0, -30.0, 0.25, 700.0, 1500.0])
+    found, before, after = (states(nav, t + d, satellite) for d in (0.0, -step, step))
+    numeric = (after.position_ecef_m - before.position_ecef_m) / (2 * step)
+    assert np.abs(numeric - found.velocity_ecef_mps).max() < 1e-5
+
+
+def test_kepler_equation_holds_to_the_last_digit() -> None:
+    mean, e = np.meshgrid(np.linspace(-7.0, 7.0, 1001), [0.0, 0.002, 0.02, 0.075, 0.17])
+    anomaly, sine, cosine = eccentric_anomaly(mean, e)
+    assert np.abs(anomaly - e * np.sin(anomaly) - mean).max() < 2e-13
+    assert np.abs(sine - np.sin(anomaly)).max() < 1e-15
+    assert np.abs(cosine - np.cos(anomaly)).max() < 1e-15
+
+
+def test_energy_of_an_unperturbed_orbit_is_conserved() -> None:
+    zero = dict.fromkeys(("delta_n", "omega_dot", "i_dot", "cuc", "cus", "crc", "crs", "cic", "cis"), 0.0)
+    records = kepler({"satellite": "J02", **zero})
+    t = np.linspace(-7000.0, 7000.0, 57)
+    position, velocity, relativity = (np.array(x) for x in kepler_state(Orbits.from_records(records), t))
+    turning = np.array([-position[1], position[0], 0.0 * position[2]]) * EARTH_ROTATION_RATE
+    inertial = velocity + turning
+    energy = 0.5 * (inertial**2).sum(axis=0) - GM_GPS / np.linalg.norm(position, axis=0)
+    np.testing.assert_allclose(energy, -GM_GPS / (2 * records.sqrt_a[0] ** 2), rtol=1e-13)
+    # The eccentricity form of the relativistic correction and -2 r.v / c^2 are one.
+    dot = -2.0 * (position * inertial).sum(axis=0) / SPEED_OF_LIGHT**2
+    np.testing.assert_allclose(relativity, dot, atol=1e-19)
+
+
+def test_geostationary_satellite_stays_in_its_box() -> None:
+    """The tilt of 5 deg and the turn out of it leave a satellite that stands still over the Equator."""
+    still = {"i0": math.radians(5.0), "omega0": math.pi, "omega": 0.0, "m0": 2.0, "delta_n": 0.0, "eccentricity": 0.0}
+    still |= dict.fromkeys(("omega_dot", "i_dot", "cuc", "cus", "crc", "crs", "cic", "cis"), 0.0)
+    a = (GM_GALILEO / EARTH_ROTATION_RATE_BEIDOU**2) ** (1 / 3)
+    nav = navigation({"satellite": "C03", "sqrt_a": math.sqrt(a), "toe_sow_s": 0.0, **still})
+    found = states(nav, np.linspace(-20_000, 20_000, 41), "C03", "2I")
+    place = found.position_ecef_m[:, 0]
+    assert np.abs(place - place[20]).max() < 1.0
+    assert np.abs(place[:, 2]).max() < 1.0
+    assert np.linalg.norm(place, axis=-1) == pytest.approx(a)
+    assert np.abs(found.velocity_ecef_mps).max() < 1e-4
+    # The same record read as that of a satellite in a medium orbit would be 3000 km off.
+    other = navigation({"satellite": "C30", "sqrt_a": math.sqrt(a), "toe_sow_s": 0.0, **still})
+    assert np.linalg.norm(states(other, 0.0, "C30", "2I").position_ecef_m[0, 0] - place[20]) > 3e6
+
+
+def test_glonass_is_the_solution_of_the_equations_of_motion() -> None:
+    """Against an adaptive integrator of order 8 in another form: the potential's gradient, inertial frame of toe."""
+    records = glonass({"satellite": "R07"})
+    omega = np.array([0.0, 0.0, EARTH_ROTATION_RATE_GLONASS])
+    fixed = records.acceleration_ecef_mps2[0]
+
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
+        x, v = y[:3], y[3:]
+        r = np.linalg.norm(x)
+        down = np.array([0.0, 0.0, 1.0])
+        oblate = 1.5 * PZ90_J2 * GM_GLONASS * PZ90_SEMI_MAJOR_AXIS**2 / r**4
+        unit = x / r
+        sine = unit @ down
+        gravity = -GM_GLONASS / r**2 * unit + oblate * ((5 * sine**2 - 1) * unit - 2 * sine * down)
+        turn = about_z(EARTH_ROTATION_RATE_GLONASS * t)
+        return np.concatenate([v, gravity + turn.T @ fixed])
+
+    start = np.concatenate(
+        [
+            records.position_ecef_m[0],
+            records.velocity_ecef_mps[0] + np.cross(omega, records.position_ecef_m[0]),
+        ]
+    )
+    nav = navigation({"satellite": "R07", "clock_bias_s": 0.0, "relative_frequency": 0.0})
+    for t in (-1750.0, -30.0, 61.0, 900.0, 1750.0):
+        solution = solve_ivp(rate, (0.0, t), start, method="DOP853", rtol=1e-13, atol=1e-6).y[:, -1]
+        turn = about_z(EARTH_ROTATION_RATE_GLONASS * t)
+        place = turn @ solution[:3]
+        speed = turn @ solution[3:] - np.cross(omega, place)
+        found = states(nav, t, "R07", code_m=0.0)
+        # 1.3 mm after half an hour: the fourth order with steps of 60 s, as the ICD has it.
+        assert np.linalg.norm(found.position_ecef_m[0, 0] - place) < 2e-3
+        assert np.linalg.norm(found.velocity_ecef_mps[0, 0] - speed) < 2e-6
+
+
+def test_instant_of_transmission_needs_the_satellite_clock_and_not_the_receivers() -> None:
+    """The same signal tagged by a receiver 1 ms fast: tag and code move together, the satellite does not."""
+    nav = navigation({"satellite": "E11"})
+    exact = states(nav, 1000.0, "E11", code_m=2.4e7)
+    fast = states(nav, 1000.0 + 1e-3, "E11", code_m=2.4e7 + 1e-3 * SPEED_OF_LIGHT)
+    assert np.abs(fast.position_ecef_m - exact.position_ecef_m).max() < 1e-5
+    slow_clock = states(navigation({"satellite": "E11", "af0_s": 0.0, "af1": 0.0}), 1000.0, "E11", code_m=2.4e7)
+    moved = np.linalg.norm(slow_clock.position_ecef_m - exact.position_ecef_m)
+    assert moved == pytest.approx(2.5e-4 * np.linalg.norm(exact.velocity_ecef_mps), rel=1e-3)
+
+
+def test_clock_is_polynomial_plus_relativity() -> None:
+    nav = navigation({"satellite": "G05", "af2": 1e-17, "toc": TOE - HOUR})
+    found = states(nav, 600.0, code_m=0.0)
+    t = 4200.0 - (-2.5e-4)
+    t = 4200.0 - (-2.5e-4 + 3.1e-12 * t + 1e-17 * t * t)
+    _, sin_e = textbook(nav.kepler, t - 3600.0)
+    relativity = -4.442807633e-10 * 0.0059 * 5153.65 * sin_e
+    expected = SPEED_OF_LIGHT * (-2.5e-4 + 3.1e-12 * t + 1e-17 * t * t + relativity)
+    assert found.clock_m[0, 0] == pytest.approx(expected, abs=1e-5)
+
+
+def mixed() -> tuple[Navigation, np.ndarray, np.ndarray]:
+    rows: list[dict[str, Any]] = []
+    for name in ALL:
+        for hour in range(-2, 3):
+            toe = TOE + hour * (HOUR if name != "R07" else HOUR // 2)
+            rows.append({"satellite": name, "toe": toe, "transmitted": toe - HOUR // 3})
+    channels = [(name, "2I" if name[0] == "C" else "1C") for name in ALL] + [
+        ("G05", "2W"),
+        ("E11", "5Q"),
+        ("G31", "1C"),
+    ]
+    return navigation(*rows), np.array([c[0] for c in channels]), np.array([c[1] for c in channels])
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.sampled_from([1, 2, 7, 95, 96, 150]), min_size=1, max_size=6), st.integers(0, 2**32 - 1))
+def test_any_cutting_into_chunks_gives_the_same_bits(lengths: list[int], seed: int) -> None:
+    nav, satellite, signal = mixed()
+    rng = np.random.default_rng(seed)
+    total = sum(lengths)
+    time = read_only(at(np.sort(rng.uniform(-7000, 7000, total))))
+    code = rng.uniform(2e7, 4e7, (total, len(satellite)))
+    code[rng.random(code.shape) < 0.2] = np.nan
+    whole = satellite_states(time, satellite, signal, read_only(code), nav)
+    begin = 0
+    for length in lengths:
+        part = slice(begin, begin + length)
+        piece = satellite_states(time[part], satellite, signal, read_only(code[part]), nav)
+        begin += length
+        for item in fields(whole):
+            np.testing.assert_array_equal(getattr(piece, item.name), getattr(whole, item.name)[part], item.name)
+
+
+def test_channels_do_not_depend_on_each_other_or_on_order_of_time() -> None:
+    nav, satellite, signal = mixed()
+    time = at(np.linspace(-5000, 5000, 300))
+    code = np.full((300, len(satellite)), CODE)
+    whole = satellite_states(time, satellite, signal, code, nav)
+    shuffled = np.random.default_rng(1).permutation(300)
+    for m in range(len(satellite)):
+        alone = satellite_states(time[shuffled], satellite[m : m + 1], signal[m : m + 1], code[:, :1], nav)
+        for item in fields(whole):
+            expected = getattr(whole, item.name)[shuffled, m : m + 1]
+            np.testing.assert_array_equal(getattr(alone, item.name), expected, item.name)
+
+
+def test_absent_codes_give_nan_and_no_mask() -> None:
+    nav, satellite, signal = mixed()
+    code = np.full((120, len(satellite)), np.nan)
+    found = satellite_states(at(np.arange(120.0)), satellite, signal, code, nav)
+    for name in ("position_ecef_m", "velocity_ecef_mps", "clock_m", "age_s", "accuracy_m"):
+        assert np.isnan(getattr(found, name)).all(), name
+    assert not found.too_old.any()
+    assert not found.unhealthy.any()
+    assert found.no_record.all(axis=0).tolist() == [s == "G31" for s in satellite]
+
+
+def test_results_are_read_only_and_shapes_are_checked() -> None:
+    nav = navigation({"satellite": "G05"})
+    assert not states(nav, 0.0).clock_m.flags.writeable
+    with pytest.raises(ValueError, match="code_m"):
+        satellite_states(at([0.0, 1.0]), np.array(["G05"]), np.array(["1C"]), np.zeros((1, 1)), nav)
+    with pytest.raises(ValueError, match="signal"):
+        satellite_states(at([0.0]), np.array(["G05"]), np.array(["1C", "2W"]), np.zeros((1, 1)), nav)
+
+
+def test_no_epochs_and_no_records_are_allowed() -> None:
+    nav = navigation({"satellite": "G05"})
+    none = satellite_states(at([0.0])[:0], np.array(["G05"]), np.array(["1C"]), np.empty((0, 1)), nav)
+    assert none.position_ecef_m.shape == (0, 1, 3)
+    empty = replace(nav, kepler=orbit_cases.kepler())
+    found = states(empty, 0.0)
+    assert found.no_record.all()
+    assert np.isnan(found.position_ecef_m).all()

@@ -1,0 +1,172 @@
+"""Generated networks of tracks: stations with loops along lines, switches with their legs, on a grid of lines.
+
+``python tests/helpers/network_made.py 10 1000 100000`` prints memory and time per position on networks of that many km.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from pyproj import CRS, Transformer
+
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.track.network import Link, Network
+from railfix.track.network_match import PlanLog, match
+from railfix.track.segment import ATTRIBUTES, NO_HEIGHTS, Segment
+from railfix.track.track import UNNAMED, Track
+from railfix.track.trajectory import Trajectory
+
+#: A unit of 2 km: the main track to a switch, two parallel tracks 3.6 m apart over 1 km, the main track again.
+UNIT_M = 2000.0
+SPACING_M = 3.6
+_RAMP_M = 60.0
+
+
+def segment(name: str, latitude: np.ndarray, longitude: np.ndarray) -> Segment:
+    return Segment(
+        source=name,
+        file="made",
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=np.full(len(latitude), np.nan),
+        crs=UNNAMED,
+        height_datum=NO_HEIGHTS,
+        geoid="",
+        metadata={"name": name},
+        **{key: np.full(len(latitude), np.nan) for key in ATTRIBUTES},
+    )
+
+
+def to_degrees(east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Plain degrees of a local grid about 50 N, 5 E: a scale per axis, the same for all points."""
+    axes = enu_axes(50.0, 5.0)
+    origin = ecef_from_geodetic(50.0, 5.0, 0.0)
+    metre_lat = geodetic_from_ecef(origin + axes[1])[0] - 50.0
+    metre_lon = geodetic_from_ecef(origin + axes[0])[1] - 5.0
+    return 50.0 + north * metre_lat, 5.0 + east * metre_lon
+
+
+def made_network(length_km: float, *, line_km: float = 200.0) -> Network:
+    """Lines beside each other, 500 m apart, each of units of `UNIT_M`; about `length_km` of track."""
+    units = max(1, round(length_km * 1e3 / (UNIT_M + 1120.0)))
+    per_line = max(1, round(line_km * 1e3 / UNIT_M))
+    tracks, links = [], []
+    plain = np.linspace(0.0, 440.0, 23)
+    loop = np.linspace(0.0, 1120.0, 57)
+    bend = np.clip(np.minimum(loop, 1120.0 - loop) / _RAMP_M, 0.0, 1.0)
+    aside = SPACING_M * (3.0 * bend**2 - 2.0 * bend**3)
+    for unit in range(units):
+        line, at = divmod(unit, per_line)
+        east, north = at * UNIT_M, line * 500.0
+        for name, x, y in (
+            ("a", plain, 0.0 * plain),
+            ("1", 440.0 + loop, 0.0 * loop),
+            ("2", 440.0 + loop, aside),
+            ("b", 1560.0 + plain, 0.0 * plain),
+        ):
+            tracks.append(segment(f"{unit}{name}", *to_degrees(east + x, north + y)))
+        k = 4 * unit
+        for a, ea, b, eb in ((k, 1, k + 1, 0), (k, 1, k + 2, 0), (k + 1, 1, k + 3, 0), (k + 2, 1, k + 3, 0)):
+            links.append(Link(first=a, first_end=ea, second=b, second_end=eb))
+        links.append(Link(first=k + 1, first_end=0, second=k + 2, second_end=0, navigable=False))
+        if at:
+            links.append(Link(first=k - 1, first_end=1, second=k, second_end=0))
+    return Network(tracks=tuple(tracks), links=tuple(links))
+
+
+def made_run(
+    network: Network, route: list[int], *, rng: np.random.Generator, sigma_m: float, step_m: float = 10.0
+) -> tuple[PlanLog, np.ndarray]:
+    """Positions each second along a route with errors that persist for 30 s, and the track of each."""
+    latitude, longitude, truth = [], [], []
+    for k in route:
+        track = network.tracks[k]
+        way = network.chainage_m[network.first_point[k] : network.first_point[k + 1]]
+        place = np.arange(step_m / 2, way[-1], step_m)
+        latitude.append(np.interp(place, way, track.latitude_deg))
+        longitude.append(np.interp(place, way, track.longitude_deg))
+        truth.append(np.full(len(place), k))
+    lat, lon, on = np.concatenate(latitude), np.concatenate(longitude), np.concatenate(truth)
+    keep = np.exp(-1.0 / 30.0)
+    error = np.zeros((len(lat), 2))
+    error[0] = rng.normal(0.0, sigma_m, 2)
+    for i in range(1, len(lat)):
+        error[i] = keep * error[i - 1] + np.sqrt(1.0 - keep**2) * rng.normal(0.0, sigma_m, 2)
+    north, east = to_degrees(error[:, 0], error[:, 1])
+    start = np.datetime64("2024-01-01T00:00:00", "ns")
+    seconds = np.arange(len(lat)) * np.timedelta64(1, "s")
+    log = PlanLog(
+        path="made",
+        time=start + seconds,
+        latitude_deg=lat + north - 50.0,
+        longitude_deg=lon + east - 5.0,
+        sigma_m=np.full(len(lat), np.nan),
+    )
+    return log, on
+
+
+def write_stations(
+    path: Path, track: Track, *, crs: str = "EPSG:4326", loops_m: list[tuple[float, float]], aside_m: float
+) -> None:
+    """A GeoPackage of a line with loops beside it: tracks "line 0", "main 0", "loop 0", "line 1", ..., 3-D."""
+    import pyogrio
+    import shapely
+
+    line = Trajectory.from_track(track)
+    bounds = [b for loop in loops_m for b in loop]
+    places = np.unique(np.concatenate([track.chainage_m, bounds]))
+    points = line.at_arc(places)
+    right = line.across[line.segment_at(places)[0]]
+    to_map = Transformer.from_crs("EPSG:4979", CRS(crs).to_3d(), always_xy=True)
+    parts: dict[str, np.ndarray] = {}
+    start = 0
+    for k, loop in enumerate(loops_m):
+        first, last = np.searchsorted(places, loop)
+        ramp = np.clip(np.minimum(places - loop[0], loop[1] - places) / _RAMP_M, 0.0, 1.0)
+        aside = points + (aside_m * (3.0 * ramp**2 - 2.0 * ramp**3))[:, None] * right
+        parts[f"line {k}"] = points[start : first + 1]
+        parts[f"main {k}"], parts[f"loop {k}"] = points[first : last + 1], aside[first : last + 1]
+        start = last
+    parts[f"line {len(loops_m)}"] = points[start:]
+    shapes = []
+    for own in parts.values():
+        latitude, longitude, height = geodetic_from_ecef(own)
+        shapes.append(shapely.LineString(np.stack(to_map.transform(longitude, latitude, height), axis=-1)))
+    pyogrio.raw.write(
+        path,
+        np.array([shapely.to_wkb(shape) for shape in shapes]),
+        [np.array([*parts], dtype=object)],
+        ["name"],
+        geometry_type="LineString Z",
+        crs=crs,
+    )
+
+
+def main() -> None:
+    for text in sys.argv[1:]:
+        begin = time.process_time()
+        network = made_network(float(text))
+        log, on = made_run(network, [0, 2, 3], rng=np.random.default_rng(1), sigma_m=0.8)
+        network.near(log.latitude_deg[:1], log.longitude_deg[:1])
+        _ = network.graph
+        built = time.process_time() - begin
+        begin = time.process_time()
+        network.near(log.latitude_deg, log.longitude_deg)
+        searched = time.process_time() - begin
+        begin = time.process_time()
+        matched = match(network, log)
+        spent = time.process_time() - begin
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+        print(
+            f"{network.length_m.sum() / 1e3:.0f} km, {len(network.tracks)} tracks: built in {built:.1f} s, "
+            f"search {1e6 * searched / len(on):.0f} us, match {1e6 * spent / len(on):.0f} us a position, "
+            f"{(matched.track == on).mean():.3f} on the right track, peak memory {memory:.0f} MB"
+        )
+
+
+if __name__ == "__main__":
+    main()

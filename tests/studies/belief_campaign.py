@@ -1,0 +1,493 @@
+"""Cold starts and faults: what the filter states against what is true.
+
+``python tests/studies/belief_campaign.py`` runs the recordings beside the checkout; ``python
+tests/studies/belief_campaign.py FOLDER ...`` runs folders with a ``case.toml`` that names ``log``, ``nav``, ``track``
+and ``truth`` (a track map and a reference as ``railfix evaluate`` reads them). Every trial is the pipeline with its
+defaults from a cold start; ``--mask`` changes the elevation mask, ``--set`` a setting of the filter.
+
+Whole recordings first (``--whole``), then a cold start every ``--every`` seconds, ``--length`` seconds each; with
+``--faults`` instead faults of one satellite, one constellation, all Dopplers, all phases, a step of all codes, the map,
+pairs, and few satellites, in windows ``--fault-every`` seconds apart. ``--verbose`` lists the trials that fail.
+
+An epoch is *exceeded* where its level is finite and the error is larger: by straight distance on the ground, and by
+chainage, where another lap of the same road counts as wrong. *Sure and wrong* are epochs with the status `tracking`
+and an error of more than four standard deviations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+import paths
+import recordings_score
+import recordings_truth
+from posterior_score import arc_of, bounds
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.timescale import seconds
+from railfix.evaluate import interpolate_reference, straight_distance
+from railfix.gnss.navigation import Navigation, glonass_channels
+from railfix.gnss.observations import Observations
+from railfix.gnss.signals import carrier_frequency_hz
+from railfix.io.reference_log import read_reference
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.along_track import on_line_m
+from railfix.pipeline.config import parse_config
+from railfix.run.processor import processor_of
+from railfix.track import Track, read_track
+from railfix.track.trajectory import Trajectory
+from railfix.tracking import Line, Tracked, TrackStatus
+
+#: Faults that no measurement of this receiver contradicts: codes, phases and Dopplers agree on another motion.
+UNDETECTED: Final = ("pull 0.5 m/s, all", "pull 0.5 m/s, all, from the start")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A log, its navigation records, the line and the reference at every epoch of the log."""
+
+    name: str
+    observations: Observations
+    navigation: Navigation
+    trajectory: Trajectory
+    reference_ecef_m: np.ndarray
+    reference_arc_m: np.ndarray
+
+    def part(self, first: int, end: int) -> Case:
+        """Some epochs of it."""
+        return replace(
+            self,
+            observations=self.observations[first:end],
+            reference_ecef_m=self.reference_ecef_m[first:end],
+            reference_arc_m=self.reference_arc_m[first:end],
+        )
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What one trial stated and what was true, at the epochs with a reference."""
+
+    time_s: np.ndarray
+    status: np.ndarray
+    probability: np.ndarray
+    sigma_m: np.ndarray
+    level_m: np.ndarray
+    ground_level_m: np.ndarray
+    straight_m: np.ndarray
+    chainage_m: np.ndarray
+
+    @property
+    def bounded(self) -> np.ndarray:
+        return np.isfinite(self.level_m)
+
+    @property
+    def over(self) -> np.ndarray:
+        """Exceeded by straight distance: the level along the line, or that of the straight distance."""
+        either = np.where(self.bounded, self.level_m, self.ground_level_m)
+        return np.isfinite(either) & (self.straight_m > either)
+
+    @property
+    def over_chainage(self) -> np.ndarray:
+        return self.bounded & (self.chainage_m > self.level_m)
+
+    @property
+    def tracking(self) -> np.ndarray:
+        return self.status == TrackStatus.TRACKING
+
+    @property
+    def sure_and_wrong(self) -> np.ndarray:
+        return self.tracking & (self.straight_m > 4.0 * self.sigma_m)
+
+
+def joined(parts: list[Judged]) -> Judged:
+    return Judged(*(np.concatenate([getattr(p, n) for p in parts]) for n in Judged.__dataclass_fields__))
+
+
+def made(name: str, log: Path, nav: list[Path], truth: recordings_truth.Truth, trajectory: Trajectory | None) -> Case:
+    """A case; without a line it is made from the reference."""
+    time, ecef = truth
+    trajectory = recordings_score.trajectory_of(time, ecef) if trajectory is None else trajectory
+    observations = read_observations(log)
+    reference = interpolate_reference(observations.time, time, ecef)
+    # The vehicle's own lap and strand: followed through the whole reference, which may begin before the log.
+    whole = arc_of(ecef, seconds(time - time[0]), trajectory)
+    since = seconds(observations.time - time[0])
+    arc = np.where(np.isfinite(reference[:, 0]), np.interp(since, seconds(time - time[0]), whole), np.nan)
+    return Case(name, observations, read_navigation(nav), trajectory, reference, arc)
+
+
+def smartloc_rinex_truth(folder: Path) -> recordings_truth.Truth:
+    """The drive at Potsdamer Platz as recorded: seconds since the first epoch, ECEF."""
+    lines = (folder / "Berlin_Potsdamer_Platz_RTK_GT.txt").read_text(encoding="ascii").splitlines()
+    rows = np.array([line.split()[1:5] for line in lines if line.strip()], dtype=np.float64)
+    start = np.datetime64("2016-06-06T11:10:41.700", "ns")
+    return start + (np.round(rows[:, 0], 3) * 1e9).astype("timedelta64[ns]"), rows[:, 1:]
+
+
+def _recordings(data: Path) -> dict[str, Callable[[], Case]]:
+    road = data / "kinematic"
+    tst, pixel, japan = road / "urbannav_tst", road / "gsdc_pixel5_a", next(iter(road.glob("japan_mosaic*")))
+    berlin = road / "smartloc_berlin_rinex"
+    urban = recordings_truth.urbannav_truth
+    return {
+        "m8t": lambda: made(
+            "m8t", tst / "20210517.light-urban.tste.ublox.m8t.GC.obs", [tst / "hksc137c.nav"], urban(tst), None
+        ),
+        "f9p": lambda: made(
+            "f9p", tst / "20210517.light-urban.tste.ublox.f9p.obs", [tst / "hksc137c.nav"], urban(tst), None
+        ),
+        "pixel": lambda: made(
+            "pixel", pixel / "Pixel5_a.21o", [pixel / "hour1180.21n"], recordings_truth.gsdc_truth(pixel), None
+        ),
+        "japan": lambda: made(
+            "japan", japan / "SEPT265G.21O", [japan / "SEPT2650.21P"], recordings_truth.japan_truth(japan), None
+        ),
+        "berlin": lambda: made(
+            "berlin",
+            berlin / "Berlin_Potsdamer_Platz.obs.gz",
+            [berlin / "brdc1580.16n.gz", berlin / "brdc1580.16g.gz"],
+            smartloc_rinex_truth(berlin),
+            None,
+        ),
+    }
+
+
+def case_of_folder(folder: Path) -> Case:
+    """The case that a folder's ``case.toml`` names."""
+    given = tomllib.loads((folder / "case.toml").read_text(encoding="utf-8"))
+    missing = sorted({"log", "nav", "track", "truth"} - set(given))
+    if missing:
+        raise SystemExit(f"{folder / 'case.toml'}: {', '.join(missing)} missing; expected log, nav, track and truth")
+    nav = [given["nav"]] if isinstance(given["nav"], str) else given["nav"]
+    reference = read_reference(folder / given["truth"], ["front"])["front"]
+    trajectory = Trajectory.from_track(read_track(folder / given["track"]))
+    truth = (reference.time, reference.ecef_m)
+    return made(folder.name, folder / given["log"], [folder / n for n in nav], truth, trajectory)
+
+
+def run(case: Case, settings: dict[str, Any], *, first: int = 0) -> Judged:
+    """Judge the pipeline on a case from a cold start, epochs from `first` on."""
+    config = parse_config({"filter": "track", **settings})
+    processor = processor_of(config, case.navigation, {"front": case.trajectory})
+    result, _ = processor.process({"front": case.observations})
+    return judged(case, result.fusion["front"].tracked, first)
+
+
+def judged(case: Case, found: Tracked, first: int = 0) -> Judged:
+    """Compare what was found with the reference."""
+    place = on_line_m(found, case.trajectory)
+    straight = straight_distance(place, case.reference_ecef_m, case.trajectory)
+    chainage = np.abs(found.arc_m - case.reference_arc_m)
+    known = np.isfinite(case.reference_ecef_m[:, 0])
+    known[:first] = False
+    # A place off the map has no straight distance: it is as wrong as its arc length.
+    straight = np.where(np.isfinite(straight), straight, chainage)
+    time = seconds(case.observations.time - case.observations.time[0])
+    columns = (
+        time,
+        found.status,
+        found.probability,
+        found.sigma_m,
+        found.level_m,
+        found.ground_level_m,
+        straight,
+        chainage,
+    )
+    return Judged(*(np.asarray(column)[known] for column in columns))
+
+
+def starts(case: Case, every_s: float, length_s: float) -> Iterator[tuple[float, Case]]:
+    """Cold starts: seconds after the first epoch with a reference, and the part of the case."""
+    t = seconds(case.observations.time - case.observations.time[0])
+    known = np.flatnonzero(np.isfinite(case.reference_ecef_m[:, 0]))
+    for begin in np.arange(t[known[0]], t[known[-1]] - 60.0, every_s):
+        first, end = (int(k) for k in np.searchsorted(t, [begin, begin + length_s]))
+        if end - first >= 30:
+            yield float(begin), case.part(first, end)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault as it is added to a case: what it changes a range by [m] and the rate of change [m/s], T epochs by M."""
+
+    name: str
+    code_m: np.ndarray
+    phase_m: np.ndarray
+    rate_mps: np.ndarray
+
+
+def with_fault(case: Case, fault: Fault) -> Case:
+    """A case with ranges, phases and range rates changed."""
+    obs = case.observations
+    channel = {**glonass_channels(case.navigation), **obs.header.glonass_channel}
+    wavelength = SPEED_OF_LIGHT / carrier_frequency_hz(obs.satellite, obs.signal, channel)
+    changed = replace(
+        obs,
+        code_m=obs.code_m + fault.code_m,
+        phase_cycles=obs.phase_cycles + fault.phase_m / wavelength,
+        doppler_hz=obs.doppler_hz - fault.rate_mps / wavelength,
+    )
+    return replace(case, observations=changed)
+
+
+def moved(case: Case, metres: float) -> Case:
+    """A case whose map lies so far to the right of the true line."""
+    at = case.trajectory
+    points = np.asarray(at.ecef_m)
+    tangent = np.gradient(points, axis=0)
+    up = points / np.linalg.norm(points, axis=1, keepdims=True)
+    right = np.cross(tangent, up)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return on_line(case, points + metres * right)
+
+
+def stretched(case: Case, share: float) -> Case:
+    """A case whose map is too long by a share, right where the run begins."""
+    points = np.asarray(case.trajectory.ecef_m)
+    known = np.flatnonzero(np.isfinite(case.reference_ecef_m[:, 0]))
+    centre = case.reference_ecef_m[known[0]]
+    return on_line(case, centre + (1.0 + share) * (points - centre))
+
+
+def on_line(case: Case, ecef_m: np.ndarray) -> Case:
+    """The case on another line with the same vertices."""
+    other = Trajectory.from_track(Track.from_ecef(ecef_m))
+    arc = np.interp(case.reference_arc_m, np.asarray(case.trajectory.arc_m), np.asarray(other.arc_m))
+    return replace(case, trajectory=other, reference_arc_m=np.where(np.isfinite(case.reference_arc_m), arc, np.nan))
+
+
+def sights(case: Case) -> tuple[np.ndarray, np.ndarray]:
+    """Change of each range by a metre along the line at the reference, shape (T, M), 0 where unknown; and the speed."""
+    processor = processor_of(parse_config({"filter": "off"}), case.navigation, {"front": case.trajectory})
+    found = processor.process({"front": case.observations})[0].antennas["front"]
+    known = np.isfinite(case.reference_arc_m)
+    arc = np.where(known, case.reference_arc_m, 0.0)
+    tangent = Line.of(case.trajectory).at(arc)[1][:, 0]
+    sat = found.satellites.position_ecef_m
+    sight = sat - np.where(known[:, None], case.reference_ecef_m, 0.0)[:, None, :]
+    sight /= np.linalg.norm(sight, axis=2, keepdims=True)
+    along = np.zeros(case.observations.code_m.shape)
+    # Every signal of a satellite has the sight of its channel that the pipeline used.
+    names = case.observations.satellite
+    for k, column in enumerate(found.columns):
+        change = np.where(known & np.isfinite(sat[:, k, 0]), -(sight[:, k] * tangent).sum(axis=1), 0.0)
+        along[:, names == names[column]] = change[:, None]
+    return along, np.gradient(arc)
+
+
+def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterator[tuple[str, Case]]:
+    """Every kind of fault once, of random satellites and sizes; from the first epoch or from 45 s on."""
+    obs = case.observations
+    t = seconds(obs.time - obs.time[0])
+    nothing = np.zeros(obs.code_m.shape)
+    names = np.unique(obs.satellite[np.isfinite(obs.code_m).sum(axis=0) > 0.5 * len(t)])
+    if not len(names):
+        return
+
+    def of(*satellites: str) -> np.ndarray:
+        return np.isin(obs.satellite, satellites)[None, :]
+
+    def since(start: float) -> np.ndarray:
+        return np.maximum(t - start, 0.0)[:, None], (t >= start)[:, None]
+
+    one, other = (str(x) for x in random.choice(names, 2, replace=len(names) < 2))
+    seen = np.abs(along).max(axis=0) > 0.0
+    letters = sorted({str(name)[0] for name in obs.satellite[seen]})
+    letter = str(random.choice(letters))
+    start = 45.0 if random.random() < 0.6 else 0.0
+    after, on = since(start)
+    listed: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = []
+    for size in (20.0, -50.0, 100.0):
+        listed.append((f"code {size:+.0f} m", size * (of(one) & on), nothing, nothing))
+    for rate in (0.1, 1.0):
+        listed.append((f"code {rate:g} m/s", rate * after * of(one), nothing, nothing))
+    whole = -100.0 * (of(one) & on)
+    listed.append(("clock -100 m", whole, whole, nothing))
+    drift = -1.0 * after * of(one)
+    listed.append(("clock -1 m/s", drift, drift, -1.0 * (of(one) & on)))
+    if len(letters) > 1:
+        own = np.char.startswith(obs.satellite.astype(str), letter)[None, :]
+        tilt = np.where(own & on, 30.0 * along, 0.0)
+        listed.append(("constellation 30 m along", tilt, nothing, nothing))
+    _, short = since(45.0)
+    short = short & (t < 65.0)[:, None]
+    listed.append(("Dopplers +5 m/s", nothing, nothing, 5.0 * along * short))
+    listed.append(("Dopplers common +5 m/s", nothing, nothing, 5.0 * short))
+    slide = np.clip(t - 45.0, 0.0, 20.0)[:, None]
+    listed.append(("phases +2 m/s", nothing, 2.0 * along * slide, nothing))
+    listed.append(("step of all codes 30 m", 30.0 * along * (t >= 45.0)[:, None], nothing, nothing))
+    listed.append(("pull 0.5 m/s, all", *(x * along for x in (0.5 * after, 0.5 * after, 0.5 * on))))
+    pair = of(one, other)
+    listed.append(("pair +30 m", 30.0 * (pair & on), nothing, nothing))
+    listed.append(("pair +20, -20 m", 20.0 * ((of(one) & on).astype(float) - (of(other) & on)), nothing, nothing))
+    for name, code, phase, rate in listed:
+        label = name if start or name.startswith(("Dopp", "phases", "step")) else f"{name}, from the start"
+        yield label, with_fault(case, Fault(name, code, phase, rate))
+    few = [str(x) for x in random.choice(names, min(3, len(names)), replace=False)]
+    for count in (3, 2):
+        left = {
+            f: np.where(of(*few[:count]), getattr(obs, f), np.nan) for f in ("code_m", "phase_cycles", "doppler_hz")
+        }
+        full = t[:, None] < 45.0
+        some = {name: np.where(full, getattr(obs, name), values) for name, values in left.items()}
+        yield f"{count} satellites", replace(case, observations=replace(obs, **left))
+        yield f"{count} satellites after 45 s", replace(case, observations=replace(obs, **some))
+    yield "map 20 m aside", moved(case, 20.0)
+    yield "map 5 m aside", moved(case, 5.0)
+    yield "map 2 % long", stretched(case, 0.02)
+
+
+def over(label: str, found: Judged) -> np.ndarray:
+    """Epochs over their level; on a wrong map the chainage of a place is not defined."""
+    return found.over if label.startswith("map") else found.over | found.over_chainage
+
+
+def first_of(found: Judged, bad: np.ndarray) -> str:
+    """The first epoch of some, in words."""
+    k = int(np.flatnonzero(bad)[0])
+    return (
+        f"{int(bad.sum())} epochs, first at {found.time_s[k]:.0f} s: error {found.straight_m[k]:.1f} m "
+        f"({found.chainage_m[k]:.0f} m by chainage), sigma {found.sigma_m[k]:.1f} m, level {found.level_m[k]:.1f} m, "
+        f"on the ground {found.ground_level_m[k]:.1f} m, probability {found.probability[k]:.4f}; largest error "
+        f"{np.nanmax(found.straight_m):.0f} m"
+    )
+
+
+def show_faults(case: Case, args: argparse.Namespace) -> None:
+    """Print faults by kind: trials, epochs over the level and trials with any, availability, errors."""
+    random = np.random.default_rng(args.seed)
+    settings = {"elevation": {"mask_deg": args.mask[0]}, **args.settings}
+    along, _ = sights(case)
+    found: dict[str, list[Judged]] = {}
+    t = seconds(case.observations.time - case.observations.time[0])
+    known = np.flatnonzero(np.isfinite(case.reference_ecef_m[:, 0]))
+    for begin in np.arange(t[known[0]], t[known[-1]] - 90.0, args.fault_every):
+        first, end = (int(k) for k in np.searchsorted(t, [begin, begin + args.length]))
+        for label, faulty in faults(case.part(first, end), along[first:end], random):
+            trial = run(faulty, settings)
+            bad = over(label, trial)
+            if args.verbose and bad.any():
+                print(f"    start {begin:.0f} s, {label}: {first_of(trial, bad)}", flush=True)
+            found.setdefault(label, []).append(trial)
+    print(f"| {case.name}: fault | trials | epochs over the level | level, on the ground, % | p95, largest error |")
+    print("|---|---:|---:|---|---|")
+    total = 0
+    for label, parts in found.items():
+        whole, failed = joined(parts), sum(bool(over(label, part).any()) for part in parts)
+        count = int(over(label, whole).sum())
+        total += count if label not in UNDETECTED else 0
+        error = whole.straight_m[np.isfinite(whole.straight_m)]
+        size = f"{np.percentile(error, 95):.1f}, {error.max():.0f}" if len(error) else "no place"
+        print(
+            f"| {label} | {len(parts)} | {count} in {failed} | {100 * whole.bounded.mean():.0f}, "
+            f"{100 * np.isfinite(whole.ground_level_m).mean():.0f} | {size} |"
+        )
+    print(f"{case.name}: {sum(map(len, found.values()))} faults, {total} epochs over their level", flush=True)
+
+
+def counts(label: str, found: Judged, *, trials: int, failed: int) -> str:
+    """Return a row of the table of cold starts."""
+    tracking, on_ground = found.tracking, np.isfinite(found.ground_level_m)
+    error = found.straight_m[np.isfinite(found.straight_m)]
+    ratio = (found.straight_m / found.sigma_m)[np.isfinite(found.straight_m)]
+    medians = [
+        f"{100 * mask.mean():.0f} % {np.median(level[mask]):.1f} m" if mask.any() else "none"
+        for mask, level in ((found.bounded, found.level_m), (on_ground, found.ground_level_m))
+    ]
+    return (
+        f"| {label} | {trials} | {len(found.status)} | {100 * tracking.mean():.0f} | {medians[0]} | {medians[1]} | "
+        f"{int(found.over.sum())} | {int(found.over_chainage.sum())} | {failed} | "
+        f"{100 * found.sure_and_wrong.sum() / max(int(tracking.sum()), 1):.2f} | "
+        f"{np.median(error):.2f} / {np.percentile(error, 95):.2f} / {error.max():.1f} | "
+        f"{np.percentile(ratio, 95):.2f} |"
+    )
+
+
+HEAD: Final = (
+    "| recording, mask | trials | epochs | tracking % | level along | level on the ground | over it | by chainage | "
+    "trials with any | sure and wrong % | p50 / p95 / largest | error over sigma p95 |\n"
+    "|---|---:|---:|---:|---|---|---:|---:|---:|---:|---|---:|"
+)
+
+
+def calibration(found: Judged) -> list[str]:
+    """Return the stated probability of the branch against the share that is right by chainage."""
+    right = found.chainage_m < np.fmax(10.0, 4.0 * found.sigma_m)
+    lines = []
+    for low, high in ((0.0, 0.5), (0.5, 0.9), (0.9, 0.99), (0.99, 0.999), (0.999, 1.1)):
+        mine = (found.probability >= low) & (found.probability < high) & np.isfinite(found.chainage_m)
+        if mine.any():
+            count, hits = int(mine.sum()), int(right[mine].sum())
+            least, most = bounds(hits, count)
+            lines.append(
+                f"    stated {low:.3f} to {min(high, 1.0):.3f}: right {hits} of {count}, {hits / count:.4f} "
+                f"({least:.4f} to {most:.4f})"
+            )
+    return lines
+
+
+def show_starts(case: Case, args: argparse.Namespace) -> None:
+    """Print a row for each mask, and the calibration of the branches."""
+    for mask in args.mask:
+        settings = {"elevation": {"mask_deg": mask}, **args.settings}
+        parts, failed = [], 0
+        for begin, part in starts(case, args.every, args.length):
+            found = run(part, settings)
+            parts.append(found)
+            bad = found.over | found.over_chainage
+            failed += bool(bad.any())
+            if args.verbose and (bad | found.sure_and_wrong).any():
+                print(f"    start {begin:.0f} s: {first_of(found, bad | found.sure_and_wrong)}", flush=True)
+        print(counts(f"{case.name} {mask:g}", joined(parts), trials=len(parts), failed=failed), flush=True)
+        if args.calibration:
+            print("\n".join(calibration(joined(parts))), flush=True)
+
+
+def show_whole(case: Case, args: argparse.Namespace) -> None:
+    """Print a row for the recording as a whole, from its first epoch."""
+    for mask in args.mask:
+        found = run(case, {"elevation": {"mask_deg": mask}, **args.settings})
+        bad = bool((found.over | found.over_chainage).any())
+        print(counts(f"{case.name} {mask:g}, whole", found, trials=1, failed=int(bad)), flush=True)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="*", help="folders with a case.toml, or names of recordings")
+    parser.add_argument("--every", type=float, default=10.0)
+    parser.add_argument("--length", type=float, default=150.0)
+    parser.add_argument("--mask", type=float, nargs="*", default=[20.0])
+    parser.add_argument("--set", dest="sets", nargs="*", default=[], help="settings of the filter, name=value")
+    parser.add_argument("--faults", action="store_true")
+    parser.add_argument("--fault-every", type=float, default=90.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--whole", action="store_true")
+    parser.add_argument("--no-starts", action="store_true")
+    parser.add_argument("--calibration", action="store_true")
+    parser.add_argument("--verbose", action="store_true")
+    args = parser.parse_args()
+    given = "\n".join(args.sets)
+    args.settings = {"tracking": tomllib.loads(given)} if given else {}
+    known = _recordings(paths.DATA) if paths.DATA.is_dir() else {}
+    if not args.faults:
+        print(HEAD)
+    for name in args.folders or list(known):
+        case = known[name]() if name in known else case_of_folder(Path(name))
+        if args.whole:
+            show_whole(case, args)
+        if args.faults:
+            show_faults(case, args)
+        elif not args.no_starts:
+            show_starts(case, args)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,457 @@
+"""Scores of the filter along the track on the real recordings: ``python tests/studies/filter_score.py [TABLE ...]``.
+
+Tables: ``figures`` (single epochs beside, and smoothed), ``codes`` (whether their errors are common), ``ablation``
+(without each kind of measurement), ``gaps`` (windows without satellites, with and without a wheel), ``levels``,
+``terms`` (what decides them), ``faults`` (of each satellite in turn, a quarter of an hour; only when asked for),
+``systems`` (one constellation alone), ``cost``. One setting for all recordings; distances are straight ones on the map.
+"""
+
+from __future__ import annotations
+
+import sys
+import time as clock
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+from scipy.special import ndtr
+
+import paths
+import recordings_score
+import recordings_truth
+from railfix.core.constants import CLOCK_GROUP
+from railfix.core.geodesy import range_with_rotation
+from railfix.core.timescale import seconds
+from railfix.evaluate import interpolate_reference, straight_distance
+from railfix.pipeline import along_track
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.smoothing import Replay, SmoothedTrack, smooth
+from railfix.ranges.weights import code_sigma_m
+from railfix.track.trajectory import Trajectory
+from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
+from railfix.tracking.bank import budget, kind_of
+
+CONFIG = parse_config({"filter": "track"})
+#: Noise of the smartLoc receiver's codes against the weights, as a variance (docs/recordings: about 8).
+SMARTLOC_SCALE = float(np.sqrt(8.0))
+
+
+@dataclass(frozen=True)
+class Case:
+    """One recording as measurements of the filter."""
+
+    name: str
+    epochs: GnssEpochs
+    trajectory: Trajectory
+    reference: np.ndarray
+    observed: np.ndarray
+    single_arc_m: np.ndarray
+    wheel: SensorEpochs | None = None
+
+    def run(self, epochs: GnssEpochs | None = None, **changes: object) -> Tracked:
+        sensors, levels = changes.pop("sensors", None), bool(changes.pop("levels", False))
+        assert sensors is None or isinstance(sensors, SensorEpochs)
+        limits = TrackingLimits.model_validate(changes)
+        return track(
+            self.epochs if epochs is None else epochs,
+            Line.of(self.trajectory),
+            limits=limits,
+            sensors=sensors,
+            levels=levels,
+        )[0]
+
+    def smoothed(self, sensors: SensorEpochs | None = None) -> SmoothedTrack:
+        """Places from both directions."""
+        limits = TrackingLimits()
+        replay = Replay(epochs=self.epochs, sensors=sensors or SensorEpochs(), before=None)
+        return smooth([replay], Line.of(self.trajectory), limits)
+
+    def part(self, first: int, end: int) -> Case:
+        """Some epochs of it."""
+        rows = slice(first, end)
+        return replace(
+            self,
+            epochs=self.epochs.take(rows),
+            reference=self.reference[rows],
+            observed=self.observed[rows],
+            single_arc_m=self.single_arc_m[rows],
+        )
+
+    def error(self, found: Tracked | SmoothedTrack) -> np.ndarray:
+        arc = along_track.on_line_m(found, self.trajectory)
+        return straight_distance(arc, self.reference, self.trajectory)
+
+
+def rinex_case(name: str, run: Callable[..., recordings_score.Outcome], data: Path) -> Case:
+    kept: list[GnssEpochs] = []
+    tracked = along_track._tracked
+
+    def keeping(epochs: GnssEpochs, *args: object) -> object:
+        kept.append(epochs)
+        return tracked(epochs, *args)  # type: ignore[arg-type]
+
+    with mock.patch.object(along_track, "_tracked", keeping):
+        outcome = run(data, CONFIG)
+    assert outcome.result is not None
+    reading = {"m8t": "urbannav", "f9p": "urbannav", "pixel": "gsdc", "japan": "japan"}[name]
+    reference = interpolate_reference(outcome.result.time, *recordings_truth.TRUTHS[reading](data))
+    observed = np.isfinite(reference[:, 0]) & np.any((outcome.result.reason & 1) == 0, axis=1)
+    return Case(name, kept[0], outcome.trajectory, reference, observed, outcome.result.arc_m)
+
+
+def smartloc_case(data: Path) -> Case:
+    """Codes and odometry alone: the recording has neither Dopplers nor phases."""
+    folder = data / "kinematic" / "smartloc_berlin"
+    log = recordings_score.smartloc_ranges(folder)
+    truth = recordings_truth.smartloc_truth(folder)
+    trajectory = recordings_score.trajectory_of(*truth)
+    single = recordings_score.smartloc(data, CONFIG)
+    sigma = SMARTLOC_SCALE * code_sigma_m(log.cn0_dbhz, log.elevation_deg, noise=CONFIG.noise)
+    nothing = np.full(log.code_m.shape, np.nan)
+    epochs = GnssEpochs(
+        time=log.time,
+        satellite=log.satellite,
+        clock=np.array([CLOCK_GROUP[str(s)[0]] for s in log.satellite]),
+        sat_ecef_m=log.sat_ecef_m,
+        sat_velocity_mps=np.zeros_like(log.sat_ecef_m),
+        code_m=np.where(log.elevation_deg >= 15.0, log.code_m, np.nan),
+        code_sigma_m=sigma,
+        phase_m=nothing,
+        phase_joined=np.zeros(nothing.shape, dtype=bool),
+        rate_mps=nothing,
+        cn0_dbhz=log.cn0_dbhz,
+        off_map=np.zeros(len(log.time), dtype=bool),
+    )
+    lines = (folder / "Berlin_Potsdamer_Platz_Input.txt").read_text(encoding="ascii").splitlines()
+    odometry = np.array([[float(x) for x in line.split()[1:3]] for line in lines if line.startswith("odom3")])
+    t = seconds(log.time - recordings_truth.SMARTLOC_START)
+    way = np.concatenate([[0.0], np.cumsum(np.diff(odometry[:, 0]) * 0.5 * (odometry[1:, 1] + odometry[:-1, 1]))])
+    step = np.diff(np.interp(t, odometry[:, 0], way), prepend=np.nan)
+    wheel = SensorEpochs(wheel_m=step, wheel_sigma_m=np.full(len(t), 0.03))
+    reference = interpolate_reference(log.time, *truth)
+    observed = np.isfinite(reference[:, 0]) & np.isfinite(log.code_m).any(axis=1)
+    arc = np.full(len(t), np.nan)
+    case = Case("smartloc", epochs, trajectory, reference, observed, arc, wheel)
+    print(f"smartloc single epochs: p50 {single.constrained.p50_m:.2f}, p95 {single.constrained.p95_m:.2f} m")
+    return case
+
+
+def cases(data: Path) -> Iterator[Case]:
+    for name, run in (
+        ("m8t", recordings_score.urbannav_m8t),
+        ("f9p", recordings_score.urbannav_f9p),
+        ("pixel", recordings_score.gsdc),
+        ("japan", recordings_score.japan),
+    ):
+        yield rinex_case(name, run, data)
+
+
+def figures_of(error: np.ndarray) -> str:
+    known = np.isfinite(error)
+    return (
+        f"rate {100 * known.mean():6.2f} %  p50 {np.nanmedian(error):5.2f}  p95 {np.nanpercentile(error, 95):6.2f}  "
+        f"max {np.nanmax(error):6.1f}  over 50 m {np.count_nonzero(error > 50.0)}"
+    )
+
+
+def ratio_of(case: Case, found: Tracked | SmoothedTrack) -> str:
+    """95th percentile of error over sigma, and its 95 % interval by drawing blocks of 60 s with replacement."""
+    ratio = case.error(found) / found.sigma_m
+    known = case.observed & np.isfinite(ratio)
+    block = seconds(case.epochs.time - case.epochs.time[0])[known] // 60.0
+    blocks = [ratio[known][block == k] for k in np.unique(block)]
+    random = np.random.default_rng(0)
+    drawn = [
+        np.percentile(np.concatenate([blocks[k] for k in random.integers(0, len(blocks), len(blocks))]), 95)
+        for _ in range(1000)
+    ]
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    p95 = np.percentile(ratio[known], 95)
+    return f"error/sigma p95 {p95:4.1f} ({low:.1f} to {high:.1f}, {len(blocks)} blocks)"
+
+
+def show_codes(all_cases: list[Case]) -> None:
+    """Codes alone against the reference: whether they share an error, and how long their errors last.
+
+    The place along the line by the codes of one epoch with Student's t errors; its error over the sigma that
+    independent errors of the codes give, beside the residuals over theirs; how both are correlated over time.
+    """
+    lags = (1, 10, 30, 60, 120)
+    for case in all_cases:
+        epochs, line = case.epochs, Line.of(case.trajectory)
+        known = np.isfinite(case.reference[:, 0])
+        arc, _ = case.trajectory.nearest(np.where(known[:, None], case.reference, case.reference[known][0]))
+        distance, sight = range_with_rotation(epochs.sat_ecef_m, case.reference[:, None, :])
+        along = -np.einsum("tki,ti->tk", sight, line.at(arc)[1][:, 0])
+        sigma = epochs.code_sigma_m * np.sqrt(1.0 + TrackingLimits().code_white_share ** 2)
+        groups = epochs.clock[:, None] == np.unique(epochs.clock)
+        ratio, residual = np.full(len(epochs), np.nan), np.full(sigma.shape, np.nan)
+        for t in np.flatnonzero(case.observed):
+            ok = np.isfinite(epochs.code_m[t]) & np.isfinite(sigma[t])
+            design = np.column_stack([along[t, ok], groups[ok][:, groups[ok].any(axis=0)]])
+            if ok.sum() < design.shape[1] + 1:
+                continue
+            value, information = (epochs.code_m - distance)[t, ok], sigma[t, ok] ** -2.0
+            value = value - np.median(value)
+            weight = information
+            for _ in range(8):
+                change = np.linalg.solve(design.T @ (weight[:, None] * design), design.T @ (weight * value))
+                left = value - design @ change
+                weight = 5.0 * information / (4.0 + left**2 * information)
+            spread = np.linalg.inv(design.T @ (information[:, None] * design))[0, 0]
+            ratio[t], residual[t, ok] = change[0] / np.sqrt(spread), left / sigma[t, ok]
+        place, codes = np.clip(ratio, -4.0, 4.0)[:, None], np.clip(residual, -4.0, 4.0)
+        lasting = [
+            " ".join(f"{np.nanmean(x[lag:] * x[:-lag]) / np.nanmean(x**2):5.2f}" for lag in lags)
+            for x in (place, codes)
+        ]
+        print(
+            f"{case.name:9s} error/sigma p95 {np.nanpercentile(np.abs(ratio), 95):.1f}, rms of place "
+            f"{np.sqrt(np.nanmean(place**2)):.2f} and of residuals {np.sqrt(np.nanmean(codes**2)):.2f}; correlation "
+            f"after {lags} s: place {lasting[0]}, residuals {lasting[1]}",
+            flush=True,
+        )
+
+
+def show_figures(all_cases: list[Case]) -> None:
+    for case in all_cases:
+        if np.isfinite(case.single_arc_m).any():
+            error = straight_distance(case.single_arc_m, case.reference, case.trajectory)
+            print(f"{case.name:9s} single epochs  {figures_of(error[case.observed])}")
+        for label, sensors in (("filter", None), ("with wheel", case.wheel)):
+            if label == "filter" or sensors is not None:
+                found = case.run(sensors=sensors)
+                error = case.error(found)[case.observed]
+                print(f"{case.name:9s} {label:13s}  {figures_of(error)}  {ratio_of(case, found)}")
+                both = case.smoothed(sensors)
+                text = figures_of(case.error(both)[case.observed])
+                print(f"{case.name:9s} {'  smoothed':13s}  {text}  {ratio_of(case, both)}", flush=True)
+
+
+def show_ablation(all_cases: list[Case]) -> None:
+    for case in all_cases:
+        nothing = np.full(case.epochs.code_m.shape, np.nan)
+        variants = {
+            "all": case.epochs,
+            "without phases": replace(case.epochs, phase_m=nothing),
+            "without Dopplers": replace(case.epochs, rate_mps=nothing),
+            "codes alone": replace(case.epochs, phase_m=nothing, rate_mps=nothing),
+        }
+        for label, epochs in variants.items():
+            found = case.run(epochs)
+            error = case.error(found)[case.observed]
+            print(f"{case.name:9s} {label:17s}  {figures_of(error)}  {ratio_of(case, found)}")
+        found = case.run(degrees_of_freedom=1e6, late_degrees_of_freedom=1e6)
+        error = case.error(found)[case.observed]
+        print(f"{case.name:9s} {'not robust':17s}  {figures_of(error)}  {ratio_of(case, found)}")
+
+
+def show_gaps(all_cases: list[Case]) -> None:
+    """Windows without satellites every 100 s, 60 s after a cold start; a wheel 1 % off by the reference."""
+    for case in all_cases:
+        t = seconds(case.epochs.time - case.epochs.time[0])
+        for length in (30.0, 60.0):
+            leaving: dict[str, list[float]] = {"no sensor": [], "wheel": []}
+            ratio: dict[str, list[float]] = {"no sensor": [], "wheel": []}
+            for begin in np.arange(100.0, t[-1] - length - 30.0, 100.0):
+                first, start, end = (int(k) for k in np.searchsorted(t, [begin - 60.0, begin, begin + length]))
+                piece = case.part(first, end)
+                gap = np.arange(first, end) >= start
+                if not piece.observed.all() or not gap.any():
+                    continue
+                blank = {
+                    name: np.where(gap[:, None], np.nan, getattr(piece.epochs, name))
+                    for name in ("code_m", "phase_m", "rate_mps")
+                }
+                way = 0.99 * np.linalg.norm(np.diff(piece.reference, axis=0, prepend=np.nan), axis=1)
+                wheel = SensorEpochs(wheel_m=way, wheel_sigma_m=np.full(len(way), 0.05), wheel_sign="unknown")
+                for label, sensors in (("no sensor", None), ("wheel", wheel)):
+                    found = piece.run(replace(piece.epochs, **blank), sensors=sensors)
+                    leaving[label].append(float(piece.error(found)[-1]))
+                    ratio[label].append(leaving[label][-1] / float(found.sigma_m[-1]))
+            for label, errors in leaving.items():
+                known = np.isfinite(errors)
+                if known.any():
+                    print(
+                        f"{case.name:9s} {length:3.0f} s {label:10s} {len(errors)} windows, {known.sum()} placed: "
+                        f"p50 {np.nanmedian(errors):5.1f}  p95 {np.nanpercentile(errors, 95):5.1f} m  "
+                        f"error/sigma p95 {np.nanpercentile(ratio[label], 95):4.1f}",
+                        flush=True,
+                    )
+
+
+def _levelled(found: Tracked) -> np.ndarray:
+    """Epochs with a level: finite, and neither lost nor expired."""
+    return np.isfinite(found.level_m) & ~np.isin(found.status, (TrackStatus.LOST, TrackStatus.EXPIRED))
+
+
+def show_levels(all_cases: list[Case]) -> None:
+    """Levels without a fault put in, and errors over them."""
+    for whole in all_cases:
+        found = whole.run(levels=True)
+        told = _levelled(found)
+        ok = whole.observed & told
+        level, error, noise = found.level_m[ok], whole.error(found)[ok], np.median(found.level_noise_m[ok])
+        print(
+            f"{whole.name:9s} level p50 {np.median(level):.1f}, p95 {np.percentile(level, 95):.1f} m; without the "
+            f"sub-filters {noise:.1f} m; under 10 m {100.0 * np.mean(level < 10.0):.0f} %; alarms "
+            f"{np.count_nonzero(whole.observed & ~told)} of {whole.observed.sum()}; over it "
+            f"{np.count_nonzero(error > level)}, of them with several branches "
+            f"{np.count_nonzero((error > level) & (found.status[ok] == TrackStatus.SEVERAL_BRANCHES))}",
+            flush=True,
+        )
+
+
+def show_terms(all_cases: list[Case]) -> None:
+    """Which hypothesis spends most of the risk at the level, and how it differs; levels by other priors."""
+    for case in all_cases:
+        limits, line = TrackingLimits(), Line.of(case.trajectory)
+        given, state = budget(limits), None
+        named: dict[str, list[tuple[float, float, float]]] = {}
+        for t in range(len(case.epochs)):
+            found, state = track(case.epochs.take(slice(t, t + 1)), line, state, limits=limits, levels=True)
+            if state.bank is None or not len(state.bank.without) or not np.isfinite(found.level_m[0]):
+                continue
+            apart = np.abs(state.bank.mean[:, 0] - state.mean[0, 0])
+            sigma = np.sqrt(state.bank.covariance[:, 0, 0])
+            prior = np.array([given.prior[kind_of(name)] for name in state.bank.without])
+            spent = prior * (ndtr((apart - found.level_m) / sigma) + ndtr((-apart - found.level_m) / sigma))
+            own = 2.0 * ndtr(-found.level_m[0] / found.sigma_m[0])
+            k = int(np.argmax(spent))
+            name = state.bank.without[k] if spent[k] > own else "noise"
+            named.setdefault(name, []).append((max(float(spent[k]), own) / given.risk, sigma[k], apart[k]))
+        for name, rows in sorted(named.items(), key=lambda item: -len(item[1]))[:2]:
+            share, sigma_m, apart_m = np.median(rows, axis=0)
+            print(
+                f"{case.name:9s} {name:5s} at {len(rows)} of {sum(map(len, named.values()))} epochs: "
+                f"{100 * share:.0f} % of the risk, sigma {sigma_m:.1f} m, {apart_m:.1f} m apart"
+            )
+        for label, changes in (
+            ("without faults of constellations", {"level_constellation_prior": 0.0}),
+            ("6 independent errors an hour", {"level_samples_per_hour": 6.0}),
+        ):
+            found = case.run(levels=True, **changes)
+            ok = case.observed & _levelled(found)
+            print(f"{case.name:9s} {label}: level p50 {np.median(found.level_m[ok]):.1f} m", flush=True)
+
+
+#: Faults by name: metres of a range so many seconds after they began.
+FAULTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    **{f"ramp {rate:g} m/s": (lambda t, rate=rate: rate * t) for rate in (0.02, 0.1, 0.5, 1.0)},
+    **{f"step {size:g} m": (lambda t, size=size: np.full(len(t), size)) for size in (10.0, 20.0, 50.0, 100.0)},
+}
+
+
+def show_faults(all_cases: list[Case]) -> None:
+    """Every satellite faulty in turn, in the 5 min after it is first measured, from 60 s on; errors over the level.
+
+    The code alone comes late (multipath), or code, phase and Doppler are together too short (satellite clock). An alarm
+    is an epoch without a level. A vehicle that covers its own course several times has laps as branches, at the same
+    place: levels of the status `several_branches` count, errors over them are listed apart too.
+    """
+    print("| recording | fault | trials | level p50 | largest error | least level less error | alarms % | over it |")
+    for whole in all_cases:
+        t = seconds(whole.epochs.time - whole.epochs.time[0])
+        seen = np.isfinite(whole.epochs.code_m)
+        for label, size in FAULTS.items():
+            for whole_channel in (False, True):
+                level, margin, error, alarms, several, trials = [], [], [], 0, 0, 0
+                for k in np.flatnonzero(seen.sum(axis=0) > 120):
+                    first = int(np.argmax(seen[:, k]))
+                    case = whole.part(first, int(np.searchsorted(t, t[first] + FAULT_WINDOW_S)))
+                    found = case.run(with_fault(case.epochs, k, size, whole=whole_channel), levels=True)
+                    faulty = case.observed & (seconds(case.epochs.time - case.epochs.time[0]) > FAULT_FROM_S)
+                    told = faulty & _levelled(found)
+                    off = case.error(found)
+                    level.append(found.level_m[told])
+                    margin.append((found.level_m - off)[told])
+                    error.append(off[told])
+                    alarms += int(np.count_nonzero(faulty & ~told))
+                    branches = found.status == TrackStatus.SEVERAL_BRANCHES
+                    several += int(np.count_nonzero(told & branches & (off > found.level_m)))
+                    trials += 1
+                over = np.concatenate(margin)
+                print(
+                    f"| {whole.name} | {label}{', clock' if whole_channel else ', late'} | {trials} | "
+                    f"{np.median(np.concatenate(level)):.1f} | {np.concatenate(error).max():.1f} | {over.min():.1f} | "
+                    f"{100.0 * alarms / (len(over) + alarms):.1f} | "
+                    f"{np.count_nonzero(over < 0.0)} ({several}) of {len(over)} |",
+                    flush=True,
+                )
+
+
+#: A fault begins so long after a cold start, and is looked at for the rest of the window [s].
+FAULT_FROM_S, FAULT_WINDOW_S = 60.0, 300.0
+
+
+def with_fault(epochs: GnssEpochs, k: int, size: Callable[[np.ndarray], np.ndarray], *, whole: bool) -> GnssEpochs:
+    """Epochs with one channel's code late from `FAULT_FROM_S` on, or all that it measures too short."""
+    since = seconds(epochs.time - epochs.time[0]) - FAULT_FROM_S
+    bias = np.where(since > 0.0, size(since), 0.0)
+    code, phase, rate = epochs.code_m.copy(), epochs.phase_m.copy(), epochs.rate_mps.copy()
+    if not whole:
+        code[:, k] += bias
+        return replace(epochs, code_m=code)
+    code[:, k] -= bias
+    phase[:, k] -= bias
+    rate[:, k] -= np.where(since > 0.0, size(since + 1.0) - size(since), 0.0)
+    return replace(epochs, code_m=code, phase_m=phase, rate_mps=rate)
+
+
+def show_systems(all_cases: list[Case]) -> None:
+    """With one constellation alone: those with three codes at half of the epochs."""
+    for case in all_cases:
+        letter = case.epochs.satellite.astype("<U1")
+        for name in np.unique(letter).tolist():
+            own = letter == name
+            codes = int(np.median(np.isfinite(case.epochs.code_m[:, own]).sum(axis=1)))
+            if codes < 3 or own.all():
+                continue
+            part = {
+                field: np.where(own, getattr(case.epochs, field), np.nan) for field in ("code_m", "phase_m", "rate_mps")
+            }
+            found = case.run(epochs=replace(case.epochs, **part))
+            text = figures_of(case.error(found)[case.observed])
+            print(f"{case.name:9s} {name} {codes:2d} codes  {text}  {ratio_of(case, found)}", flush=True)
+
+
+def show_cost(all_cases: list[Case]) -> None:
+    for case in all_cases:
+        for label, levels in (("off", False), ("on", True)):
+            began = clock.process_time()
+            found = case.run(levels=levels)
+            spent = clock.process_time() - began
+            counts = {s.text: int((found.status == s).sum()) for s in TrackStatus if (found.status == s).any()}
+            print(f"{case.name:9s} level {label:3s} {1e3 * spent / len(found):5.2f} ms an epoch  {counts}")
+
+
+TABLES = {
+    "figures": show_figures,
+    "codes": show_codes,
+    "ablation": show_ablation,
+    "gaps": show_gaps,
+    "levels": show_levels,
+    "terms": show_terms,
+    "faults": show_faults,
+    "systems": show_systems,
+    "cost": show_cost,
+}
+
+
+def main() -> int:
+    data = paths.DATA
+    if not data.is_dir():
+        print(f"the real recordings are not at {data}", file=sys.stderr)
+        return 1
+    asked = sys.argv[1:] or [name for name in TABLES if name != "faults"]
+    listed = list(cases(data))
+    for name in asked:
+        print(f"\n{name}")
+        TABLES[name](listed if name in ("ablation", "gaps", "cost") else [*listed, smartloc_case(data)])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

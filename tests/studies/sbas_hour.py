@@ -1,0 +1,316 @@
+"""Protection levels along a line over Japan for an hour of MSAS messages: geometry alone, no receiver.
+
+``python tests/studies/sbas_hour.py [FOLDER]`` with the recordings beside the checkout prints the tables of
+``docs/integrity-recordings.md``, and writes a picture of each line to the folder. The lines are great circles with a
+point a kilometre; every ten seconds each satellite of the navigation file that MSAS corrects (issues of data
+matched) gives a range of its own sigma, and the level is that of a train at the point.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+import paths
+from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, geodetic_from_ecef, range_with_rotation
+from railfix.gnss.orbits import satellite_states
+from railfix.integrity.protection import along_track_level
+from railfix.integrity.raim import constrained_model
+from railfix.io.rinex import read_navigation
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
+from railfix.pipeline.level_stage import risk_of
+from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.ranges.atmosphere import rtca_troposphere_sigma_m
+from railfix.ranges.error_model import ErrorModel, read_error_model
+from railfix.ranges.sbas import IonosphereState, SatelliteCorrections, SatelliteState, SbasCorrections, read_sbas
+from railfix.ranges.sbas_delays import corrected_satellites
+from railfix.ranges.weights import CodeNoise, code_sigma_m
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
+from sbas_levels import sbas_level
+
+#: Latitude, longitude [deg] of the ends.
+LINES: Final = {
+    "Tokyo to Osaka": ((35.681, 139.767), (34.733, 135.500)),
+    "Kyoto northward": ((34.986, 135.758), (35.886, 135.758)),
+}
+HEIGHT_M: Final = 50.0
+GPS: Final = np.array([f"G{number:02d}" for number in range(1, 33)])
+MASKS_DEG: Final = (5.0, 15.0, 20.0)
+ALARM_LIMITS_M: Final = (10.0, 20.0, 40.0)
+#: The messages have to come first: masks, types 7 and 10, grid [s].
+WARM_UP_S: Final = 600.0
+#: C/N0 that an error model is asked with: an open sky [dB-Hz].
+OPEN_SKY_DBHZ: Final = 42.0
+
+#: Sigma and largest bias of what multipath and receiver add, by elevation and azimuth from the direction of travel.
+Local = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def by_noise(elevation_deg: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Default noise settings at their reference C/N0: 1 m at the zenith by 1/sin(elevation), and a floor of 1 m."""
+    sigma = code_sigma_m(np.full(elevation_deg.shape, np.nan), elevation_deg, noise=CodeNoise())
+    return sigma, np.zeros(sigma.shape)
+
+
+def by_model(model: ErrorModel) -> Local:
+    """An error model of local errors at the C/N0 of an open sky."""
+    return lambda elevation, azimuth: model.at(elevation, azimuth, OPEN_SKY_DBHZ)
+
+
+@dataclass(frozen=True)
+class Sky:
+    """What MSAS and navigation file give at T epochs for K satellites, wherever the receiver is."""
+
+    engine: SbasCorrections
+    time: np.ndarray
+    satellite: np.ndarray
+    fixes: SatelliteCorrections
+    position_ecef_m: np.ndarray
+    good: np.ndarray  # (T, K) corrected
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Levels of T epochs at P points; NaN without a position."""
+
+    local: str
+    mask_deg: float
+    used: np.ndarray  # (P, T)
+    dilution: np.ndarray  # (P, T) sigma along the line for ranges of 1 m
+    fault_free_m: np.ndarray  # (P, T) K sigma of the whole risk
+    level_m: np.ndarray  # (P, T) with local faults
+    variance_m2: np.ndarray  # (P, T, 5) of the position: flt, ionosphere, troposphere, local, map
+
+
+def great_circle(begin: tuple[float, float], end: tuple[float, float], spacing_m: float = 1000.0) -> Trajectory:
+    """Level line between two places, chainage rising toward the second."""
+    ends = np.array([ecef_from_geodetic(*place, HEIGHT_M) for place in (begin, end)])
+    unit = ends / np.linalg.norm(ends, axis=1, keepdims=True)
+    angle = np.arccos(unit[0] @ unit[1])
+    part = np.linspace(0.0, 1.0, round(angle * 6.371e6 / spacing_m) + 1)[:, None]
+    points = (np.sin((1.0 - part) * angle) * unit[0] + np.sin(part * angle) * unit[1]) / np.sin(angle)
+    latitude, longitude, _ = geodetic_from_ecef(points * 6.371e6)
+    return Trajectory.from_track(Track.from_ecef(ecef_from_geodetic(latitude, longitude, np.full(len(part), HEIGHT_M))))
+
+
+def sky(data: Path, *, step_s: int = 10) -> Sky:
+    """Corrected satellites of the hour."""
+    folder = data / "sbas" / "msas_20250215"
+    log, navigation = read_sbas(folder / "046r_sbas_prn137.txt"), read_navigation(folder / "046r_rnx.nav")
+    engine = SbasCorrections.from_log(log)
+    time = log.time[0] + np.arange(0, 3600, step_s) * np.timedelta64(1, "s")
+    fixes = engine.satellites(time, GPS, navigation)
+    # A range for the time of transmission: its error of a few ms moves a satellite by metres.
+    states = satellite_states(
+        time, GPS, np.full(len(GPS), "1C"), np.full(fixes.state.shape, 2.3e7), navigation, record=fixes.record
+    )
+    states, _ = corrected_satellites(states, fixes)
+    good = (fixes.state == SatelliteState.OK) & ~states.unhealthy & ~states.too_old & ~states.no_record
+    return Sky(engine, time, GPS, fixes, states.position_ecef_m, good)
+
+
+def sigmas_of_sbas(
+    above: Sky, place: np.ndarray, elevation: np.ndarray, azimuth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sigma flt, UIRE and of the troposphere at a place, shape (T, K) each (DO-229D J.1)."""
+    latitude, longitude, _ = geodetic_from_ecef(place)
+    grid = above.engine.ionosphere(above.time, latitude, longitude, elevation, azimuth)
+    sight = above.position_ecef_m - place[:, None, :]
+    sight = sight / np.linalg.norm(sight, axis=-1, keepdims=True)
+    flt = above.fixes.sigma_flt_m(above.engine.delta_udre(above.time, above.fixes, sight, latitude, longitude))
+    uire = np.where(grid.state == IonosphereState.OK, grid.sigma_uire_m, np.nan)
+    return flt, uire, rtca_troposphere_sigma_m(elevation)
+
+
+def ranges_at(above: Sky, place: np.ndarray, sigma: np.ndarray, used: np.ndarray) -> Ranges:
+    """The ranges as geometry has them."""
+    satellites = np.where(used[..., None], above.position_ecef_m, SOMEWHERE_ABOVE_M)
+    return Ranges(
+        sat_ecef_m=satellites,
+        code_m=np.where(used, range_with_rotation(satellites, place[:, None, :])[0], 0.0),
+        weight=np.where(used, 1.0 / np.where(used, sigma, 1.0) ** 2, 0.0),
+        groups=clock_groups([name[0] for name in above.satellite.tolist()]),
+    )
+
+
+def levels(
+    above: Sky, line: Trajectory, local: dict[str, Local], masks_deg: tuple[float, ...] = MASKS_DEG
+) -> list[Levels]:
+    """Levels at the points of a line, one point after the other."""
+    found: dict[tuple[str, float], list[tuple[np.ndarray, ...]]] = {}
+    for point, arc in enumerate(line.arc_m):
+        section = min(point, len(line.length_m) - 1)
+        place = np.broadcast_to(line.ecef_m[point], (len(above.time), 3))
+        elevation, azimuth = elevation_azimuth(above.position_ecef_m, place)
+        of_sbas = sigmas_of_sbas(above, place, elevation, azimuth)
+        turned = azimuth - line.body_azimuth_deg(np.array([arc]))[0]
+        for name, of_local in local.items():
+            own, bias = of_local(elevation, turned)
+            sigmas = np.stack([*of_sbas, own], axis=-1)
+            for mask in masks_deg:
+                used = above.good & (elevation >= mask) & np.isfinite(sigmas).all(axis=-1)
+                at_point = _at_point(above, line, (place, float(arc), section), used, sigmas, bias)
+                found.setdefault((name, mask), []).append(at_point)
+    return [Levels(*key, *(np.stack(part) for part in zip(*parts, strict=True))) for key, parts in found.items()]
+
+
+def _at_point(
+    above: Sky,
+    line: Trajectory,
+    where: tuple[np.ndarray, float, int],
+    used: np.ndarray,
+    sigmas: np.ndarray,
+    bias: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """Satellites used, dilution, levels and parts of the variance at one point, T epochs."""
+    place, arc, section = where
+    risk = risk_of(parse_config({"sbas": ["messages"]}))
+    enough = used.sum(axis=1) >= 3
+    ranges = ranges_at(above, place, np.sqrt((sigmas**2).sum(axis=-1)), used)
+    model = constrained_model(ranges, line, np.where(enough, arc, np.nan), section=np.full(len(used), section))
+    systems = [name[0] for name in above.satellite.tolist()]
+    level = along_track_level(model, systems, risk=risk, bias_m=np.where(used, bias, 0.0))
+    gain = np.einsum("tkj,tj->tk", model.design, model.covariance_m2[:, 0]) * model.root_weight
+    parts = (gain[..., None] ** 2 * np.where(used[..., None], sigmas, 0.0) ** 2).sum(axis=1)
+    rest = model.covariance_m2[:, 0, 0] - parts.sum(axis=1)
+    return (
+        used.sum(axis=1),
+        np.sqrt((gain**2).sum(axis=1)),
+        sbas_level(model, k=risk.sample_k),
+        level.level_m,
+        np.concatenate([parts, rest[:, None]], axis=1),
+    )
+
+
+# ---- tables and picture -------------------------------------------------------------------------------------
+
+
+def warm(above: Sky) -> np.ndarray:
+    """Epochs after the first ten minutes."""
+    return above.time >= above.time[0] + np.timedelta64(int(WARM_UP_S), "s")
+
+
+def row(one: Levels, late: np.ndarray) -> str:
+    """Satellites, levels and availability with one mask."""
+    used, level, alone = one.used[:, late], one.level_m[:, late], one.fault_free_m[:, late]
+    share = " ".join(f"{100.0 * np.mean(level <= limit):5.1f}" for limit in ALARM_LIMITS_M)
+    without = " ".join(f"{100.0 * np.mean(alone <= limit):5.1f}" for limit in ALARM_LIMITS_M)
+    return (
+        f"{one.local:18s} {one.mask_deg:4.0f} {used.min():3d} {np.median(used):3.0f} {used.max():3d}  "
+        f"{_three(one.dilution[:, late], 2)}  {_three(alone, 1)}  {without}  {_three(level, 1)}  {share}"
+    )
+
+
+HEAD: Final = (
+    f"{'local errors':18s} mask        used        dilution            K sigma [m]   "
+    "availability %    with local faults   availability %",
+    f"{'':18s}  deg min med max    50   95   max    50   95   max     "
+    "10    20    40    50   95   max     10    20    40",
+)
+
+
+def _three(values: np.ndarray, digits: int) -> str:
+    good = values[np.isfinite(values)]
+    return f"{np.percentile(good, 50):5.{digits}f} {np.percentile(good, 95):5.{digits}f} {good.max():5.{digits}f}"
+
+
+def parts_row(one: Levels, late: np.ndarray) -> str:
+    """What the variance of the position consists of, and of the worst twentieth of the levels."""
+    variance, level = one.variance_m2[:, late].reshape(-1, 5), one.level_m[:, late].ravel()
+    worst = level >= np.nanpercentile(np.where(np.isfinite(level), level, np.nan), 95)
+    words = []
+    for which in (np.isfinite(level), worst & np.isfinite(level)):
+        share = 100.0 * variance[which].sum(axis=0) / variance[which].sum()
+        words.append(" ".join(f"{s:5.1f}" for s in share) + f"   {one.used[:, late].ravel()[which].mean():4.1f}")
+    return f"{one.local:18s} {one.mask_deg:4.0f}  {words[0]}    {words[1]}"
+
+
+def states_text(above: Sky, line: Trajectory, late: np.ndarray) -> str:
+    """Satellites above 5 degrees at the middle of the line, by what MSAS says of them and of the grid."""
+    place = np.broadcast_to(line.ecef_m[len(line.ecef_m) // 2], (len(above.time), 3))
+    elevation, azimuth = elevation_azimuth(above.position_ecef_m, place)
+    up = (elevation >= MASKS_DEG[0]) & late[:, None]
+    latitude, longitude, _ = geodetic_from_ecef(place)
+    grid = above.engine.ionosphere(above.time, latitude, longitude, elevation, azimuth).state
+    said = [f"{SatelliteState(s).name} {n}" for s, n in Counter(above.fixes.state[up].tolist()).most_common()]
+    of_grid = [f"{IonosphereState(s).name} {n}" for s, n in Counter(grid[up & above.good].tolist()).most_common()]
+    return f"{', '.join(said)}; grid where they are corrected: {', '.join(of_grid)}"
+
+
+def picture(found: list[Levels], above: Sky, line: Trajectory, path: Path) -> Path:
+    """Levels over time (median and 5 to 95 % of the line) and along the line (of the time)."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, (over_time, along) = plt.subplots(2, 1, figsize=(10, 8), constrained_layout=True)
+    minute = (above.time - above.time[0]) / np.timedelta64(60, "s")
+    chainage = np.linspace(0.0, line.arc_m[-1] / 1000.0, found[0].level_m.shape[0])
+    for one in found:
+        value = np.where(np.isfinite(one.level_m), one.level_m, np.nan)
+        late, some = value[:, warm(above)], np.isfinite(value).any(axis=0)
+        for axis, x, low, middle, high in (
+            (over_time, minute[some], *np.nanpercentile(value[:, some], (5, 50, 95), axis=0)),
+            (along, chainage, *np.nanpercentile(late, (5, 50, 95), axis=1)),
+        ):
+            (drawn,) = axis.plot(x, middle, label=f"mask {one.mask_deg:.0f} deg")
+            axis.fill_between(x, low, high, color=drawn.get_color(), alpha=0.2, linewidth=0)
+    for axis, label in ((over_time, "minute of the log"), (along, "km along the line")):
+        for limit in ALARM_LIMITS_M:
+            axis.axhline(limit, color="black", linewidth=0.6, linestyle=":")
+        axis.set(ylim=(0.0, None), xlabel=label, ylabel="protection level along the line [m]")
+    over_time.legend()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return path
+
+
+def main() -> int:
+    """Print the tables, draw the picture."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path, nargs="?", help="for the picture")
+    parser.add_argument("--model", type=Path, help="error model of local errors, as well")
+    parser.add_argument("--spacing-km", type=float, default=1.0)
+    options = parser.parse_args()
+    data = paths.ROOT.parent / "shared" / "data"
+    if not data.is_dir():
+        print(f"the real recordings are not at {data}", file=sys.stderr)
+        return 1
+    above = sky(data)
+    late = warm(above)
+    print(*above.engine.notes, sep="\n")
+    local = {"noise settings": by_noise}
+    if options.model:
+        local["error model"] = by_model(read_error_model(options.model))
+    for name, ends in LINES.items():
+        line = great_circle(*ends, spacing_m=1000.0 * options.spacing_km)
+        found = levels(above, line, local)
+        print(f"\n{name}: {len(line.ecef_m)} points on {line.arc_m[-1] / 1000.0:.0f} km, {late.sum()} epochs")
+        print(f"satellites above 5 deg in the middle: {states_text(above, line, late)}")
+        print("\n".join(HEAD))
+        print("\n".join(row(one, late) for one in found))
+        print("variance of the position, %: flt, ionosphere, troposphere, local, map; satellites used")
+        print(f"{'local errors':18s} mask  all epochs{'':27s} the 5 % with the largest levels")
+        print("\n".join(parts_row(one, late) for one in found))
+        begin = np.argmax(np.isfinite(found[0].level_m).any(axis=0))
+        print(
+            f"first level {(above.time[begin] - above.time[0]) / np.timedelta64(1, 's'):.0f} s after the first message"
+        )
+        if options.folder:
+            of_noise = [one for one in found if one.local == "noise settings"]
+            print(f"wrote {picture(of_noise, above, line, options.folder / f'{name.split()[0].lower()}.png')}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
