@@ -7,7 +7,7 @@ import pytest
 
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.motion.ranging import radar_speed_mps, two_way_range_m
-from railfix.pipeline.along_track import FilterState, Fixed, _gated_ranges
+from railfix.pipeline.along_track import FilterFix, FilterState, _gated_ranges
 from railfix.pipeline.config import Config
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
@@ -50,7 +50,7 @@ def gated(measured_m: np.ndarray, unit_arc_m: np.ndarray, *, place_m: float, sig
         range_m=measured_m[None], sigma_m=np.full((1, len(measured_m)), sigma_m), age_s=np.zeros((1, len(measured_m))),
         unit_ecef_m=(point + 3.0 * axes[:, 1])[None], lever_m=np.zeros(3),
     )  # fmt: skip
-    state = FilterState(anchor=Fixed(time=time[0], arc_m=place_m, sigma_m=0.01, speed_mps=11.0))
+    state = FilterState(anchor=FilterFix(time=time[0], arc_m=place_m, sigma_m=0.01, speed_mps=11.0))
     return np.isfinite(_gated_ranges(ranges, time, line, state, Config()).range_m[0])
 
 

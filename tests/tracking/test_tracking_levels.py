@@ -16,7 +16,7 @@ from railfix.simulate.demo_data import demo_files
 from railfix.tracking import GnssEpochs, SensorEpochs, Tracked, TrackingLimits, TrackState, TrackStatus, track
 from railfix.tracking import levels as levels_of
 from railfix.tracking.levels import LevelState, carried_levels, track_with_levels
-from railfix.tracking.thinned import Since, thinned
+from railfix.tracking.thinned import AccumulatedIncrement, thinned
 from tracking_cases import Ride, part, ride, wheel
 
 LIMITS = TrackingLimits()
@@ -105,7 +105,7 @@ def test_thinned_epochs_have_what_was_measured_between() -> None:
     sigma = np.full(40, 0.5)
     sensors = SensorEpochs(wheel_m=way, wheel_sigma_m=sigma, force_mps2=force, force_sigma_mps2=sigma)
     epochs = replace(case.epochs, phase_joined=joined, phase_m=phase)
-    taken, some, sensed, since = thinned(epochs, sensors, Since(), 1.0)
+    taken, some, sensed, since = thinned(epochs, sensors, AccumulatedIncrement(), 1.0)
     np.testing.assert_array_equal(taken, [0, 5, 15, 25, 35])
     np.testing.assert_array_equal(some.time, case.epochs.time[taken])
     assert sensed.wheel_m is not None
@@ -132,7 +132,7 @@ def test_the_bound_of_an_epoch_between_by_hand() -> None:
     found = replace(Tracked.empty(epochs.time, 10), arc_m=arc, status=status)
     # 0.2 s before the first: place 100 m, 10 m/s, level 5 m with 3 m and 2 m, bound of the speed 0.5 m/s, amount 7 m
     state = LevelState(
-        since=Since(start=case.epochs.time[0], number=0),
+        since=AccumulatedIncrement(start=case.epochs.time[0], number=0),
         time=case.epochs.time[0],
         values=np.array([100.0, 10.0, 5.0, 6.0, 3.0, 0.5, 2.0, 7.0, 0.0]),
     )
