@@ -3,17 +3,18 @@
 
 from __future__ import annotations
 
-import dataclasses
-import importlib
 import inspect
 import re
 import sys
 from collections.abc import Mapping
 from enum import IntEnum, IntFlag
-from typing import Any, Final
+from typing import Any, Final, get_args
+
+from pydantic.fields import FieldInfo
 
 import paths
 from railfix.core import errors, reasons
+from railfix.core.settings import Settings
 from railfix.pipeline.columns import UNITS, Column
 from railfix.pipeline.config import Config
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
@@ -22,46 +23,6 @@ from railfix.run.route import ON_TRACK_COLUMNS, TRACK_COLUMNS
 from railfix.tracking import TrackStatus
 
 DOCUMENT: Final = paths.ROOT / "docs" / "reference.md"
-
-#: Modules whose public names are listed, in reading order.
-MODULES: Final = (
-    "railfix.io.rinex",
-    "railfix.track",
-    "railfix.track.trajectory",
-    "railfix.track.vehicle",
-    "railfix.pipeline.config",
-    "railfix.pipeline.processor",
-    "railfix.pipeline.results",
-    "railfix.screens",
-    "railfix.integrity.raim",
-    "railfix.integrity.protection",
-    "railfix.integrity.stanford",
-    "railfix.ranges.error_model",
-    "railfix.evaluate.range_errors",
-    "railfix.ranges.sbas",
-    "railfix.ranges.cn0_curve",
-    "railfix.pipeline.columns",
-    "railfix.pipeline.tables",
-    "railfix.pipeline.train_table",
-    "railfix.tracking",
-    "railfix.run",
-    "railfix.io.reference_log",
-    "railfix.reference",
-    "railfix.positioning.doppler_speed",
-    "railfix.evaluate",
-    "railfix.evaluate.ablation",
-    "railfix.report.plots",
-    "railfix.report",
-    "railfix.simulate",
-    "railfix.core.reasons",
-    "railfix.core.timescale",
-    "railfix.core.geodesy",
-)
-
-
-def _first_paragraph(item: object) -> str:
-    text = inspect.getdoc(item) or ""
-    return " ".join(text.split("\n\n")[0].split())
 
 
 def _attribute_docs(item: object) -> dict[str, str]:
@@ -125,52 +86,44 @@ def _members(heading: str, kind: type[IntEnum] | type[IntFlag], head: str) -> li
     return lines + [f"| {value} | `{name.lower()}` | {_cell(comments[name])} |" for value, name in rows]
 
 
-def _setting_rows(prefix: str, item: Any, docs: dict[str, str]) -> list[str]:
-    rows = []
-    for name in docs:
-        if not hasattr(item, name):
+def _bounds(field: FieldInfo) -> str:
+    """Bounds of a setting, or its words: ``> 0``, ``0 to 1``."""
+    if words := [str(word) for word in get_args(field.annotation) if isinstance(word, str)]:
+        return ", ".join(f"`{word}`" for word in words)
+    signs = {"gt": "> {:g}", "ge": ">= {:g}", "lt": "< {:g}", "le": "<= {:g}"}
+    limits = [(sign, getattr(item, sign, None)) for item in field.metadata for sign in signs]
+    return ", ".join(signs[sign].format(limit) for sign, limit in limits if limit is not None)
+
+
+def _setting_rows(prefix: str, group: Settings) -> list[str]:
+    """A row a setting; of a description the first sentence."""
+    docs, rows = _attribute_docs(type(group)), []
+    for name, field in type(group).model_fields.items():
+        value = getattr(group, name)
+        if isinstance(value, Settings):
+            rows += _setting_rows(f"{prefix}{name}.", value)
             continue
-        value = getattr(item, name)
-        if dataclasses.is_dataclass(value):
-            continue
-        rows.append(f"| `{prefix}{name}` | `{_cell(str(value))}` | {_cell(docs[name])} |")
+        unit, text = re.match(r"(?:\[([^\]]+)\]\s*)?(.*)", docs.get(name, ""), flags=re.DOTALL).groups()  # type: ignore[union-attr]
+        sentence = re.split(r"(?<=[a-z)`])[.;:] ", text)[0].rstrip(".")
+        shown = _cell(str(value)) if value not in (None, "", ()) else ""
+        default, unit = f"`{shown}`" if shown else "", unit or _unit_of(name)
+        rows.append(f"| `{prefix}{name}` | {default} | {unit} | {_bounds(field)} | {_cell(sentence)} |")
     return rows
 
 
+def _unit_of(name: str) -> str:
+    """Unit that the name of a setting ends with."""
+    return UNITS.get(name.rsplit("_", 1)[-1], "") if "_" in name else ""
+
+
 def _settings() -> list[str]:
-    config = Config()
-    lines = ["", "## Settings", "", "Keys of the configuration file (TOML) and of `--set`, with their defaults.", ""]
-    lines += ["| key | default | meaning |", "|---|---|---|"]
-    lines += _setting_rows("", config, {k: v for k, v in _attribute_docs(Config).items() if k != "noise"})
-    for name in Config.model_fields:
-        group = getattr(config, name)
-        if dataclasses.is_dataclass(group):
-            docs = _attribute_docs(group) or dict.fromkeys((f.name for f in dataclasses.fields(group)), "")
-            lines += _setting_rows(f"{name}.", group, docs)
-    return lines
-
-
-def _signature(item: Any) -> str:
-    try:
-        text = re.sub(r"(: |-> )(['\"])(.*?)\2", r"\1\3", str(inspect.signature(item)))
-    except (TypeError, ValueError):
-        return ""
-    return text if len(text) < 400 else "(...)"
-
-
-def _module(name: str) -> list[str]:
-    module = importlib.import_module(name)
-    names = getattr(module, "__all__", None) or [
-        n for n, v in vars(module).items() if not n.startswith("_") and getattr(v, "__module__", "") == name
+    lines = ["", "## Settings", "", "Keys of the configuration file (TOML) and of `--set`.", ""]
+    return [
+        *lines,
+        "| key | default | unit | bounds | meaning |",
+        "|---|---|---|---|---|",
+        *_setting_rows("", Config()),
     ]
-    lines = ["", f"## `{name}`", "", _first_paragraph(module), ""]
-    for public in names:
-        item = getattr(module, public)
-        if inspect.isclass(item):
-            lines.append(f"- **`{public}`** {_cell(_first_paragraph(item))}")
-        elif inspect.isroutine(item):
-            lines.append(f"- **`{public}{_signature(item)}`** {_cell(_first_paragraph(item))}")
-    return lines
 
 
 def document() -> str:
@@ -187,8 +140,6 @@ def document() -> str:
     lines += _members("Statuses of the filter along the track", TrackStatus, "number")
     lines += _members("Reasons of an observation", reasons.Reason, "bit")
     lines += _settings()
-    for name in MODULES:
-        lines += _module(name)
     return "\n".join(lines) + "\n"
 
 
