@@ -274,13 +274,15 @@ def start_rows() -> Iterator[str]:
     prior = map_information(case.trajectory, np.maximum(clean.constrained.section[has], 0))
     for name, estimate in ESTIMATORS.items():
         base = estimate(ranges, place, prior)
-        cells = [f"{np.median(base):9.2f}"]
+        known = base > 0.0  # not where too few ranges are left to agree
+        cells = [f"{np.median(base[known]):9.2f}"]
         for size in (10.0, 20.0, 100.0):
             ratios = []
             for channel in np.flatnonzero(used.mean(axis=0) > 0.2).tolist():
                 code = ranges.code_m.copy()
                 code[:, channel] += np.where(used[:, channel], size, 0.0)
-                ratios.append(float(np.median(estimate(replace(ranges, code_m=code), place, prior) / base)))
+                raised = estimate(replace(ranges, code_m=code), place, prior)
+                ratios.append(float(np.median(raised[known] / base[known])))
             cells.append(f"{np.median(ratios):16.2f} {max(ratios):7.2f}")
         yield f"{name:24s} {' '.join(cells)}"
 

@@ -106,7 +106,7 @@ POSITIONED: Final = (Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFF
 #: Reasons of screens that are added to the package, by name in lower case.
 _ADDED: dict[str, Reason] = {}
 #: First free bit, and the last one of the tables' 32-bit column.
-_FIRST_FREE_BIT: Final = 20
+_FIRST_FREE_BIT: Final = 21
 _LAST_BIT: Final = 30
 
 
