@@ -6,22 +6,17 @@ from pathlib import Path
 
 import pytest
 
+from railfix.live.warm_up import prepare_kernels
+
 ROOT = Path(__file__).resolve().parents[1]
-#: Modules whose tests need hardly any of the compiled kernels.
-FEW_KERNELS = ("test_ground", "test_navigation", "test_rinex", "test_simulate")
 
 
-@pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put tests that need few kernels at the middle, where the second of two workers begins.
-
-    With ``--dist worksteal`` each worker has a contiguous share of the tests. In a clean checkout the first compiles
-    the kernels, for minutes; the second finds them on disk when it needs them.
-    """
-    apart = [item for item in items if item.path.name.startswith(FEW_KERNELS)]
-    others = [item for item in items if not item.path.name.startswith(FEW_KERNELS)]
-    middle = len(items) // 2
-    items[:] = others[:middle] + apart + others[middle:]
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile all kernels once, on two cores, before the workers begin: each would compile them for itself."""
+    options = session.config.option
+    if getattr(options, "numprocesses", None) and not options.collectonly:
+        prepare_kernels()
 
 
 @pytest.fixture(scope="session")
