@@ -70,7 +70,7 @@ def test_one_sentence_and_nothing_destroyed(desk: Desk, kind: str, fault: str) -
         assert result.exit_code == 3, result.output
 
 
-@pytest.mark.requirement("G1")
+@pytest.mark.requirement("G4")
 @pytest.mark.parametrize("name", MISTAKES)
 def test_a_mistake_of_the_user_is_one_sentence_with_its_remedy(desk: Desk, name: str) -> None:
     files, command, code, words = MISTAKES[name]

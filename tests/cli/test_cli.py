@@ -132,7 +132,7 @@ def test_the_manual_comes_at_once() -> None:
     assert time.perf_counter() - began < 3.0
 
 
-@pytest.mark.requirement("G1")
+@pytest.mark.requirement("G4")
 def test_a_package_of_an_extra_that_is_missing_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cbor2", None)
     result = RUNNER.invoke(app, ["live", "--front", "a.ubx", "--track", "line.csv", "--channels", "2"])

@@ -128,7 +128,7 @@ def test_a_run_into_the_folder_of_its_inputs_leaves_them(desk: Desk) -> None:
     assert "is an input, which is never overwritten" in " ".join(output.split())
 
 
-@pytest.mark.requirement("G1")
+@pytest.mark.requirement("G4")
 def test_inputs_of_a_run_and_two_outputs_of_one_name_are_left(good: Desk, desk: Desk) -> None:
     """The error model over the run's own inputs; observations and ephemerides in one file; a log over a map."""
     record = desk.folder / "results" / "run.json"
@@ -192,7 +192,7 @@ def test_a_file_in_a_folder_that_cannot_be_used_is_refused(tmp_path: Path) -> No
             check_output_file(target, overwrite="replace", inputs=[])
 
 
-@pytest.mark.requirement("G1")
+@pytest.mark.requirement("G4")
 @pytest.mark.parametrize(
     ("kind", "name", "words"),
     [

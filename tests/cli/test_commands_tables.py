@@ -52,7 +52,7 @@ def on_terminal(words: list[str], columns: int, folder: Path) -> str:
     return re.sub(r"\x1b\[[0-9;]*m", "", b"".join(parts).decode()).replace("\r\n", "\n")
 
 
-@pytest.mark.requirement("G1")
+@pytest.mark.requirement("G4")
 @pytest.mark.parametrize("columns", [80, 100, 120])
 def test_no_digit_is_cut_on_a_terminal(tmp_path: Path, columns: int) -> None:
     shown = on_terminal([sys.executable, "-c", _SCRIPT], columns, tmp_path)

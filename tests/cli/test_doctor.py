@@ -12,7 +12,7 @@ from railfix.cli import app
 from railfix.run.doctor import examine_files
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
-pytestmark = pytest.mark.requirement("G1")
+pytestmark = pytest.mark.requirement("G4")
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from railfix.cli.settings import Choices, settings_of
 from railfix.core.errors import SettingsError
 from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, load_config, parse_config
 
-pytestmark = pytest.mark.requirement("B7")
+pytestmark = pytest.mark.requirement("G4")
 
 RUNNER = CliRunner(env={"COLUMNS": "150", "TERM": "dumb", "NO_COLOR": "1"})
 

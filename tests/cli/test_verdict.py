@@ -14,7 +14,7 @@ from railfix.cli.verdict import verdict_of_evaluation
 from railfix.evaluate import RunAndReference, evaluate_runs
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
-pytestmark = pytest.mark.requirement("G1")
+pytestmark = pytest.mark.requirement("G4")
 
 
 @pytest.fixture(scope="module")

@@ -37,7 +37,7 @@ from railfix.ground.triangle import Verdict
 from railfix.io.train_message import MessageStatus, TrainMessage, decode
 from test_ground_interlocking import RULES, take_out
 
-pytestmark = pytest.mark.requirement("F4")
+pytestmark = pytest.mark.requirement("F4", "F6")
 
 #: A 0 to 400 m, B 6000 to 6400 m.
 LINE = Layout(stations=tuple(LoopStation(name=n, begin_m=m, end_m=m + 400.0) for n, m in (("A", 0.0), ("B", 6000.0))))

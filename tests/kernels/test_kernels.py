@@ -79,7 +79,7 @@ def calls() -> dict[str, list[tuple[Any, ...]]]:
     return found
 
 
-@pytest.mark.requirement("A7")
+@pytest.mark.requirement("A8")
 def test_each_kernel_gives_what_its_reference_gives(calls: dict[str, list[tuple[Any, ...]]]) -> None:
     assert sorted(calls) == sorted(kernels.REGISTERED), "a kernel that no run calls is not compared"
     for name, arguments in calls.items():
@@ -97,7 +97,7 @@ def test_each_kernel_gives_what_its_reference_gives(calls: dict[str, list[tuple[
                     np.testing.assert_array_equal(one, other, err_msg=name)
 
 
-@pytest.mark.requirement("A7")
+@pytest.mark.requirement("A8")
 def test_a_run_is_the_same_with_compiled_kernels() -> None:
     both = {}
     for chosen in ("numpy", "numba"):
@@ -118,7 +118,7 @@ def test_a_run_is_the_same_with_compiled_kernels() -> None:
                     assert one.equals(other, null_equal=True), column
 
 
-@pytest.mark.requirement("A7", "C2")
+@pytest.mark.requirement("C2")
 @pytest.mark.parametrize("systems", ["GGGGG", "GGGEE", "GGGGGEE", "GGGGEEEECCCR", "GGGGGGGGEEEEEEECCCC"])
 @pytest.mark.parametrize(
     ("by_range", "side_prior", "local_prior"),
@@ -199,7 +199,6 @@ print(prepare_kernels(), *kernels.missing())
         assert done.stdout.split() == [expected]
 
 
-@pytest.mark.requirement("A7")
 def test_code_on_disk_is_that_of_all_files_that_it_calls(tmp_path: Path) -> None:
     """numba looks at the file of the function alone; here a change of what it calls compiles anew."""
     room = Path(kernels.__file__).parent
@@ -221,7 +220,7 @@ def test_code_on_disk_is_that_of_all_files_that_it_calls(tmp_path: Path) -> None
         before = after
 
 
-@pytest.mark.requirement("A7", "A8")
+@pytest.mark.requirement("A8")
 def test_arrays_of_a_trajectory_and_records_stay_read_only_in_another_process() -> None:
     """The second channel of a live session gets them pickled; for writable ones each kernel was compiled again."""
     inputs = demo_inputs()
@@ -238,7 +237,6 @@ def test_arrays_of_a_trajectory_and_records_stay_read_only_in_another_process() 
             np.testing.assert_array_equal(vars(got)[name], value)
 
 
-@pytest.mark.requirement("A7")
 def test_code_on_disk_with_types_of_an_older_version_is_compiled_anew(tmp_path: Path) -> None:
     """A table of arguments was renamed since: numba cannot read the index of the code on disk."""
     (tmp_path / "tables.py").write_text("from typing import NamedTuple\nclass Old(NamedTuple):\n    x: float\n")
@@ -265,7 +263,6 @@ else:
         )  # fmt: skip
 
 
-@pytest.mark.requirement("A7")
 @pytest.mark.parametrize("terminal", [True, False])
 def test_a_terminal_is_told_of_compilation_once(terminal: bool) -> None:
     program = """
@@ -287,7 +284,6 @@ for value in (1, 2):
         os.close(end)
 
 
-@pytest.mark.requirement("A7")
 def test_the_variable_chooses_and_what_cannot_be_is_said() -> None:
     assert kernels.choose("") == kernels.choose("numba") == "numba"
     assert kernels.choose("numpy") == "numpy"
@@ -295,7 +291,6 @@ def test_the_variable_chooses_and_what_cannot_be_is_said() -> None:
         kernels.choose("fast")
 
 
-@pytest.mark.requirement("A7")
 def test_a_wrong_choice_ends_a_command_as_a_setting_does() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "railfix", "run", "--help"],

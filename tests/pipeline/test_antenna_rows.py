@@ -220,7 +220,6 @@ def test_rows_are_split_by_antenna() -> None:
     np.testing.assert_array_equal(both.at_arc(arc)[2:], paths["rear"].at_arc(arc[2:]))
 
 
-@pytest.mark.requirement("A7")
 @pytest.mark.parametrize("epochs", [1, 40])
 def test_chunks_are_freed_as_soon_as_they_are_done(monkeypatch: pytest.MonkeyPatch, epochs: int) -> None:
     """Without a search for garbage: the arrays of a chunk would wait for it, and memory grow."""

@@ -36,7 +36,7 @@ from railfix.ranges.weights import CodeNoise, NominalErrors, channel_order, code
 from railfix.run.processor import processor_of
 from recordings_score import straight_line
 
-pytestmark = pytest.mark.requirement("A5")
+pytestmark = pytest.mark.requirement("A4")
 L5_HZ = 1176.45e6
 TIME = np.array(["2024-03-05T03:10:00"], dtype="datetime64[ns]")
 

@@ -45,7 +45,6 @@ def assert_same(one: Line, two: Line) -> None:
         np.testing.assert_array_equal(path.across, two.trajectories[name].across)
 
 
-@pytest.mark.requirement("A7")
 def test_a_line_is_prepared_once(bench: Bench, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = opened(bench)
     assert len(list(folder.glob("*.npz"))) == 3
@@ -65,7 +64,6 @@ def test_a_line_is_prepared_once(bench: Bench, folder: Path, monkeypatch: pytest
         opened(bench)
 
 
-@pytest.mark.requirement("A7")
 def test_another_file_is_another_line(bench: Bench, folder: Path) -> None:
     first = opened(bench)
     lines = bench.track.read_text().splitlines(keepends=True)
@@ -79,7 +77,6 @@ def test_another_file_is_another_line(bench: Bench, folder: Path) -> None:
     assert len(list(folder.glob("*.npz"))) == 8
 
 
-@pytest.mark.requirement("A7")
 @pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "no zip"])
 def test_a_damaged_entry_is_rebuilt_and_said(bench: Bench, folder: Path, damage: str) -> None:
     first = opened(bench)
@@ -96,7 +93,6 @@ def test_a_damaged_entry_is_rebuilt_and_said(bench: Bench, folder: Path, damage:
     assert opened(bench).preparing == ()
 
 
-@pytest.mark.requirement("A7")
 def test_a_folder_that_cannot_be_written_is_said(bench: Bench, folder: Path) -> None:
     folder.write_text("a file")
     line = opened(bench)
@@ -104,7 +100,6 @@ def test_a_folder_that_cannot_be_written_is_said(bench: Bench, folder: Path) -> 
     assert all("could not be kept" in note for note in line.preparing if "damaged" not in note)
 
 
-@pytest.mark.requirement("A7")
 def test_old_entries_go(bench: Bench, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(prepared, "MOST_ENTRIES", 4)
     for sigma in (0.5, 0.6, 0.7):
@@ -112,7 +107,6 @@ def test_old_entries_go(bench: Bench, folder: Path, monkeypatch: pytest.MonkeyPa
     assert len(list(folder.glob("*.npz"))) == 4
 
 
-@pytest.mark.requirement("A7")
 def test_short_lines_and_no_cache_leave_nothing(bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(prepared.VARIABLE, str(tmp_path / "cache"))
     opened(bench)

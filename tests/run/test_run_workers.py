@@ -41,7 +41,6 @@ def railfix_run(files: dict[str, Path], out: Path, *more: str) -> subprocess.Com
 
 
 @with_fork
-@pytest.mark.requirement("A7")
 def test_the_results_are_the_same_bits(bench: Bench, tmp_path: Path) -> None:
     for workers in ("1", "2"):
         done = railfix_run(files_of(bench), tmp_path / workers, "--workers", workers, "--observations", "--chunk", "7")
@@ -53,7 +52,6 @@ def test_the_results_are_the_same_bits(bench: Bench, tmp_path: Path) -> None:
 
 
 @with_fork
-@pytest.mark.requirement("A7")
 def test_an_error_in_the_other_process_is_that_of_the_run(bench: Bench, tmp_path: Path) -> None:
     broken = tmp_path / "rear.rnx"
     broken.write_text("".join([*bench.rear.read_text().splitlines(keepends=True)[:-3], "G07 what is this\n"]))
@@ -71,7 +69,6 @@ def _children(parent: int) -> list[int]:
 
 
 @with_fork
-@pytest.mark.requirement("A7")
 @pytest.mark.parametrize("victim", ["other", "whole"])
 def test_a_killed_process_leaves_no_results_and_no_process(tmp_path: Path, victim: str) -> None:
     inputs = demo_inputs()
@@ -96,7 +93,6 @@ def test_a_killed_process_leaves_no_results_and_no_process(tmp_path: Path, victi
 
 
 @with_fork
-@pytest.mark.requirement("A7")
 def test_a_process_that_cannot_be_forked_says_so(tmp_path: Path) -> None:
     pl.DataFrame({"a": [2, 1]}).sort("a").group_by("a").agg(pl.len())  # starts the threads of polars
     assert processes(0) == processes(1) == 1

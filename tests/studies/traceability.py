@@ -1,80 +1,27 @@
-"""The traceability table: which test proves which row of the requirements.
+"""The traceability table: what each row of the requirements asks, what is reached, and the tests that prove it.
 
-The rows stand here in the project's own words; the tests name the row they prove with
-``@pytest.mark.requirement("A7")``, on a function, a class, or a whole file (``pytestmark``).
-``python tests/studies/traceability.py`` writes ``docs/traceability.md``; a test holds that it is up to date.
+The rows, in the project's own words, are those of ``tests/references/requirements.toml``, with the three tests that
+prove most. Every test that proves a row names it with ``@pytest.mark.requirement("A7")``, on a function, a class, or a
+whole file (``pytestmark``). ``python tests/studies/traceability.py`` writes ``docs/traceability.md``; a test holds that
+it is up to date.
 """
 
 from __future__ import annotations
 
 import ast
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import paths
 
 TABLE: Final = paths.ROOT / "docs" / "traceability.md"
 
-#: Rows of the requirements: heading, then row and what it asks for.
-ROWS: Final[dict[str, dict[str, str]]] = {
-    "Positioning on the track map": {
-        "A1": "3-D track map from several formats, with curve attributes, height datum, routes and a quality report",
-        "A2": "path of the roof antenna from two bogie centres and the cant, or straight from good positions",
-        "A3": "section search without the receiver clock; ambiguous places are reported",
-        "A4": "one-dimensional constrained least squares: place along the section and receiver clocks",
-        "A5": "carrier phase beside code in the constrained model",
-        "A6": "conventional position (3-D single point, nearest point of the trajectory) as the yardstick",
-        "A7": "RINEX 2, 3, 4 observations and navigation of five systems, plain or packed, and SP3",
-        "A8": "live epoch processor at 10 Hz with the code of the batch; receiver streams in, messages out",
-        "A9": "reference frames and epochs of maps: ETRS89, JGD2011, NAD83(2011), GDA2020, ITRF",
-        "A10": "network of tracks with switches; routes over it; positions that name their track",
-    },
-    "Multipath screens": {
-        "B0": "elevation mask, satellite health, age of the ephemeris",
-        "B1": "C/N0 against its mean over elevation, and an absolute floor",
-        "B2": "change of the pseudorange against the Doppler",
-        "B3": "pseudoranges of two antennas against their spacing",
-        "B4": "fault detection and exclusion of up to two satellites",
-        "B5": "positions of two antennas against their spacing along the track",
-        "B6": "chi-square RAIM with detectable bias, slope and protection level",
-        "B7": "every rejected observation and every epoch without a position has its reason; the reasons add up",
-    },
-    "Integrity": {
-        "C1": "SBAS messages and corrections",
-        "C2": "protection level along the track with a railway error model",
-        "C3": "model of the residual multipath and receiver noise from recorded runs",
-        "C4": "Stanford diagram on the along-track axis",
-        "C6": "level of the filter on every branch, and under a wrong map, wrong Dopplers, phases and codes",
-    },
-    "Truth and evaluation": {
-        "D1": "reference position from RTK, axle pulses, Doppler and acceleration",
-        "D2": "figures of merit: signed along-track error, positioning rate, positioning interval",
-        "D3": "one report with the pictures of any run, for a browser",
-        "D4": "simulator of a train on a track with cant, two antennas and satellites; RINEX and ground truth",
-    },
-    "On-board sensors": {
-        "E1": "pitch, slip and slide, low speed and rolling from inertial sensor and tachometer",
-        "E2": "tachometer speed from pulse intervals",
-        "E3": "absolute position from gradient and curvature of the line",
-        "E4": "millimetre-wave speed and ranging",
-        "E5": "one along-track filter that bridges tunnels",
-        "E6": "the track a train stands on at start-up, as a probability",
-    },
-    "Ground side": {
-        "F1": "reference triangle of receivers: circles, shape, cause, stop command",
-        "F2": "control centre: position reports, timeout, simulated running, resynchronisation",
-        "F3": "redundant encrypted links with fail-over",
-        "F4": "running intervals: no two occupied ones ever overlap",
-        "F5": "routes: position reports set and lock points and signals",
-        "F6": "train integrity, length and plausibility of reports; stop of one train and its neighbours",
-    },
-    "Scale and use": {
-        "G1": "campaigns: hundreds of logs on many cores or machines, resumable, one table of results",
-        "G2": "notebooks: stages and results as arrays, polars, pandas, xarray; pictures at hand",
-    },
-}
+ROWS: Final[dict[str, dict[str, Any]]] = tomllib.loads(
+    (paths.ROOT / "tests" / "references" / "requirements.toml").read_text(encoding="utf-8")
+)
 
 
 def _marked_rows(nodes: list[ast.expr]) -> set[str]:
@@ -116,33 +63,38 @@ def proofs() -> dict[str, list[str]]:
     return found
 
 
-def _cell(tests: list[str]) -> str:
-    """Tests by file, or that there are none."""
-    names: dict[str, list[str]] = {}
-    for test in sorted(set(tests)):
-        file, _, name = test.partition("::")
-        names.setdefault(file, []).append(name.removeprefix("test_").replace("_", " "))
-    return "<br>".join(f"`{file}`: {', '.join(of)}" for file, of in names.items()) or "**open**"
+def _cell(row: str, marked: list[str]) -> str:
+    """The tests that prove most, and how many more name the row; or that there are none."""
+    chosen: list[str] = ROWS[row]["tests"]
+    wrong = sorted(set(chosen) - set(marked))
+    if wrong:
+        raise ValueError(f"requirements.toml, {row}: no test with the marker of the row is named {', '.join(wrong)}")
+    names = [f"`{file}`: {name.replace('_', ' ')}" for file, _, name in (test.partition("::test_") for test in chosen)]
+    more = len(set(marked)) - len(chosen)
+    return "<br>".join([*names, f"and {more} more"] if more > 0 else names) or "**open**"
 
 
 def table() -> str:
     """The document as Markdown."""
     proven = proofs()
-    known = {row for rows in ROWS.values() for row in rows}
-    unknown = sorted(set(proven) - known)
+    unknown = sorted(set(proven) - set(ROWS))
     if unknown:
         raise ValueError(f"tests name rows that do not exist: {', '.join(unknown)}")
     lines = [
         "# Traceability",
         "",
-        "Which test proves which requirement. Written by `python tests/studies/traceability.py` from the markers",
-        '`@pytest.mark.requirement("A7")` of the tests (their names without `test_`); a row without a test is open.',
+        "What is asked, where a command prints what is reached, and the three tests that prove most. Written by",
+        "`python tests/studies/traceability.py` from `tests/references/requirements.toml` and the markers",
+        '`@pytest.mark.requirement("A7")` of the tests; a row without a test is open.',
     ]
-    for heading, rows in ROWS.items():
-        lines += ["", f"## {heading}", "", "| row | requirement | tests |", "|---|---|---|"]
-        for row, text in rows.items():
-            tests = proven.get(row, [])
-            lines.append(f"| {row} | {text} | {_cell(tests)} |")
+    heading = ""
+    for row, told in ROWS.items():
+        if told["heading"] != heading:
+            heading = told["heading"]
+            lines += ["", f"## {heading}", "", "| row | requirement | figure asked | reached | tests |"]
+            lines += ["|---|---|---|---|---|"]
+        cells = (row, told["asks"], told.get("figure", ""), told.get("reached", ""), _cell(row, proven.get(row, [])))
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 

@@ -153,7 +153,7 @@ def test_codes_that_come_back_beyond_the_join_count() -> None:
     np.testing.assert_array_equal(np.flatnonzero(refused), [3, 4])
 
 
-@pytest.mark.requirement("C1")
+@pytest.mark.requirement("A2")
 def test_a_vehicle_on_a_ring_has_closed_paths() -> None:
     axes = enu_axes(np.array(LATITUDE), np.array(LONGITUDE))
     angle = np.linspace(0.0, 2.0 * np.pi, POINTS + 1)
