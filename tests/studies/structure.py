@@ -1,12 +1,22 @@
-"""Count rooms, floors, imports, lines and classes of the package: ``python tests/studies/structure.py [SOURCE]``."""
+"""Sizes of the package and its documents: ``python tests/studies/structure.py [SOURCE]``.
+
+Rooms, floors, imports, lines, the longest files and parameter lists, participles as names of functions, names that
+several classes have, and words of the documents.
+"""
 
 from __future__ import annotations
 
 import ast
 import sys
+from collections import Counter
 from pathlib import Path
 
 import paths
+
+DOCUMENTS = paths.ROOT / "docs"
+#: First words of names that end in -ed and are none, and participles that do not.
+NOT_PARTICIPLES = {"need", "feed", "speed", "seed", "embed", "exceed", "bed"}
+IRREGULAR = set("told given taken made found known written left sent held kept drawn chosen".split())
 
 
 def imported_rooms(path: Path) -> set[str]:
@@ -36,6 +46,19 @@ def floors(graph: dict[str, set[str]]) -> int:
     return count
 
 
+def is_participle(name: str) -> bool:
+    """Whether a function is named by a participle: `prepared_line`, `sorted_by`, not `read_line` or `feed`."""
+    first = name.strip("_").split("_")[0]
+    return (first.endswith("ed") and first not in NOT_PARTICIPLES) or first in IRREGULAR
+
+
+def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """How many parameters a function has, but for `self` and `cls`."""
+    given = function.args
+    every = [*given.posonlyargs, *given.args, *given.kwonlyargs, *(a for a in (given.vararg, given.kwarg) if a)]
+    return sum(argument.arg not in ("self", "cls") for argument in every)
+
+
 def main() -> int:
     source = Path(sys.argv[1]) if len(sys.argv) > 1 else paths.ROOT / "src" / "railfix"
     files = [p for p in sorted(source.rglob("*.py")) if p.parent != source or not p.name.startswith("__")]
@@ -43,18 +66,34 @@ def main() -> int:
     for path in files:
         room = room_of(path, source)
         graph.setdefault(room, set()).update(imported_rooms(path) - {room})
-    trees = [ast.parse(p.read_text(encoding="utf-8")) for p in source.rglob("*.py")]
-    nodes = [node for tree in trees for node in ast.walk(tree)]
-    classes = [node for node in nodes if isinstance(node, ast.ClassDef)]
-    functions = [node for node in nodes if isinstance(node, ast.FunctionDef)]
+    trees = {p: ast.parse(p.read_text(encoding="utf-8")) for p in sorted(source.rglob("*.py"))}
+    nodes = [(node, path) for path, tree in trees.items() for node in ast.walk(tree)]
+    classes = [node for node, _ in nodes if isinstance(node, ast.ClassDef)]
+    functions = [(node, path) for node, path in nodes if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    sizes = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in trees}
+    named = Counter(node.name for node in classes)
+    twice = sorted(f"{name} x{count}" for name, count in named.items() if count > 1)
+    participles = [node.name for node, _ in functions if is_participle(node.name)]
     print(f"rooms           {len(graph)}")
     print(f"loose modules   {sum(p.parent == source for p in files)}")
     print(f"floors          {floors(graph)}")
     print(f"import arrows   {sum(len(others & set(graph)) for others in graph.values())}")
     print(f"files           {len(trees)}")
-    print(f"lines           {sum(len(p.read_text(encoding='utf-8').splitlines()) for p in source.rglob('*.py'))}")
+    print(f"lines           {sum(sizes.values())}")
     print(f"dataclasses     {sum('dataclass' in ast.dump(d) for c in classes for d in c.decorator_list)}")
-    print(f"__post_init__   {sum(f.name == '__post_init__' for f in functions)}")
+    print(f"__post_init__   {sum(node.name == '__post_init__' for node, _ in functions)}")
+    print(f"participles     {len(participles)} of {len(functions)} functions")
+    print(f"class names     {len(twice)} in several files: {', '.join(twice)}")
+    print("longest files")
+    for path, size in sorted(sizes.items(), key=lambda item: -item[1])[:8]:
+        print(f"  {size:6d}  {path.relative_to(source)}")
+    print("longest parameter lists")
+    for node, path in sorted(functions, key=lambda item: -parameters(item[0]))[:8]:
+        print(f"  {parameters(node):6d}  {node.name} ({path.relative_to(source)}:{node.lineno})")
+    documents = {path: len(path.read_text(encoding="utf-8").split()) for path in sorted(DOCUMENTS.rglob("*.md"))}
+    print(f"words           {sum(documents.values())} in {len(documents)} documents")
+    for path, words in sorted(documents.items(), key=lambda item: -item[1])[:8]:
+        print(f"  {words:6d}  {path.relative_to(DOCUMENTS)}")
     return 0
 
 
