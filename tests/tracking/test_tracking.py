@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -281,3 +281,27 @@ def test_codes_count_at_once_when_they_come_back() -> None:
     late = case.epochs.code_m + np.where(np.arange(400) >= 200, 300.0, 0.0)[:, None] * np.linspace(-1, 1, 10)
     _, state = track(part(replace(case.epochs, code_m=late), slice(0, 225)), case.line)
     assert state.weak_code_s == pytest.approx(3.0)
+
+
+@pytest.mark.requirement("E5")
+def test_nothing_learnt_outlives_a_reset() -> None:
+    """Every field of the state but the times, the satellites and what withholds a level is that of an empty one."""
+    kept = {"time", "satellite", "seen", "previous", "measured", "withheld_s", "open_s"}
+    case = ride(60)
+    _, state = track(case.epochs, case.line, levels=True)
+    learnt = [item.name for item in fields(TrackState) if item.name not in kept]
+    for name in learnt:
+        value = getattr(state, name)
+        if isinstance(value, float):
+            setattr(state, name, 1.5)
+        elif isinstance(value, tuple):
+            setattr(state, name, (0.25, 0.5))
+    state.reset()
+    empty = TrackState.empty()
+    for name in learnt:
+        value, begun = getattr(state, name), getattr(empty, name)
+        if isinstance(value, np.ndarray):
+            assert not value.any(), name
+        else:
+            assert value == begun or str(value) == str(begun) == "NaT", name
+    assert state.time == case.epochs.time[-1]
