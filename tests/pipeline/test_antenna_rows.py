@@ -154,7 +154,7 @@ def test_recordings_as_two_receivers_give_the_results_of_each_alone() -> None:
     for name, case in integrity_tables.cases().items():
         if name == "demo":  # two antennas of one train are compared with each other
             continue
-        obs = case.observations[:400]
+        obs = case.observations[:160]
         logs = {"front": obs, "rear": _without(obs, tuple(sorted(set(obs.satellite.tolist()))[::5]))}
         paths = dict.fromkeys(logs, case.trajectory)
         processor = EpochProcessor(integrity_tables.SETTINGS, paths, navigation=case.navigation)
