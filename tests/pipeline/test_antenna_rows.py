@@ -147,6 +147,7 @@ def test_rows_of_two_antennas_give_the_results_of_each_alone(settings: str, chan
         _assert_same(cut[name], expected)
 
 
+@pytest.mark.slow
 @pytest.mark.requirement("A8")
 @pytest.mark.usefixtures("recordings")
 def test_recordings_as_two_receivers_give_the_results_of_each_alone() -> None:

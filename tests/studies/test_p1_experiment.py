@@ -27,6 +27,7 @@ def printed(part: str, folder: Path) -> list[str]:
     return "\n".join(p1_experiment.report(part, folder)).rstrip().splitlines()
 
 
+@pytest.mark.slow
 @pytest.mark.requirement("D2")
 def test_the_first_minutes_are_as_they_were(tmp_path: Path) -> None:
     assert_same(printed("short", tmp_path), shown("short"))
