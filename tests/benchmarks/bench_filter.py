@@ -12,13 +12,11 @@ import os
 import sys
 import time
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
 import tracking_cases
-from railfix import kernels
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.run.processor import processor_of
@@ -78,7 +76,7 @@ def chain(rounds: int) -> None:
         run = lambda config=config: processor_of(config, navigation, paths).process(logs)  # noqa: E731
         run()
         spent = median_us(run, epochs, rounds)
-        print(f"{kernels.CHOSEN:6s} demonstration, filter {which:10s}     {spent:8.1f} us an antenna-epoch", flush=True)
+        print(f"demonstration, filter {which:10s}     {spent:8.1f} us an antenna-epoch", flush=True)
 
 
 def main() -> int:
@@ -87,9 +85,7 @@ def main() -> int:
     rounds = parser.parse_args().rounds
     print(f"{os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}")
     filter_alone(rounds)
-    for chosen in ("numpy", "numba"):
-        with mock.patch.object(kernels, "CHOSEN", chosen):
-            chain(rounds)
+    chain(rounds)
     return 0
 
 

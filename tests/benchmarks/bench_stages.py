@@ -1,8 +1,7 @@
 """Where the time of `railfix run` goes, stage by stage, in one process.
 
 The two logs of an hour at 10 Hz of `bench_run.py` are simulated first, or taken from ``--run``. Each stage's own time
-without the stages inside it, the least of the rounds; threads that polars starts count as everything else.
-``RAILFIX_KERNELS`` chooses the kernels::
+without the stages inside it, the least of the rounds; threads that polars starts count as everything else::
 
     python tests/benchmarks/bench_stages.py [--run FOLDER] [--rounds 3] [--filter off|track] [--level on|off]
 """
@@ -26,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import bench_run
 import railfix
-from railfix.kernels import kernels_in_use
+from railfix.kernels import numba_version
 
 #: Stages: name, module in which the function is looked up when it is called, function.
 STAGES: Final = (
@@ -157,7 +156,7 @@ def main() -> None:
             spent = {**stages.spent, "all": whole, "everything else": whole - sum(stages.spent.values())}
             if number:  # the first round warms up
                 least = {name: min(value, least.get(name, value)) for name, value in spent.items()}
-        print(f"{epochs} antenna-epochs, kernels: {kernels_in_use()}; least of {options.rounds} rounds")
+        print(f"{epochs} antenna-epochs, kernels: {numba_version()}; least of {options.rounds} rounds")
         for name, value in least.items():
             print(f"{name:32s} {value:6.3f} s  {1e6 * value / epochs:6.1f} us")
 

@@ -1,4 +1,4 @@
-"""The kernels of the filter as plain Python, and their arrays made by hand."""
+"""Kernels as plain Python, and the arrays of the filter's made by hand."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numba
 import numpy as np
 import pytest
 
+from railfix import kernels
 from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits
 from railfix.tracking.bank import SENSORS, budget, kind_of
@@ -27,12 +28,15 @@ def _compiled_modules() -> list[str]:
 
 @cache
 def plain(name: str) -> ModuleType:
-    """A module of `railfix.kernels.tracking` that the compiler has left alone."""
+    """A module of `railfix.kernels` that the compiler has left alone."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(numba.config, "DISABLE_JIT", True)
+        for attribute, value in list(vars(kernels).items()):
+            if isinstance(value, ModuleType):
+                patch.setattr(kernels, attribute, value)  # an import sets it
         for module in _compiled_modules():
             patch.delitem(sys.modules, module)
-        found = import_module(f"railfix.kernels.tracking.{name}")
+        found = import_module(f"railfix.kernels.{name}")
         for module in _compiled_modules():
             del sys.modules[module]
     return found

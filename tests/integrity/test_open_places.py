@@ -12,6 +12,7 @@ from scipy.stats import norm
 
 import integrity_tables
 from integrity_recordings import ranges_of
+from plain_kernels import plain
 from railfix import kernels
 from railfix.core.geodesy import elevation_azimuth, range_with_rotation
 from railfix.core.reasons import Status
@@ -163,7 +164,7 @@ def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPa
         AntennaRows.of(SearchIndex(path)), arc, model, level, scale, systems, RiskBudget(), sides, rows
     )
     assert 0 < sum(looked_at) < 0.3 * len(rows)
-    monkeypatch.setattr(open_places, "risk_off_tangent", lambda _, scale, *__: np.full(len(scale), 1.0))
+    monkeypatch.setattr(kernels.off_tangent, "risk_off_tangent", lambda _, scale, *__: np.full(len(scale), 1.0))
     every = places_beyond_the_level(
         AntennaRows.of(SearchIndex(path)), arc, model, level, scale, systems, RiskBudget(), sides, rows
     )
@@ -183,14 +184,15 @@ def test_bounds_are_the_same_compiled(
         calls.append(arrays)
         return np.zeros(len(arrays[1]))
 
-    monkeypatch.setattr(open_places, "risk_off_tangent", recorded)
+    compiled = kernels.off_tangent.risk_off_tangent
+    monkeypatch.setattr(kernels.off_tangent, "risk_off_tangent", recorded)
     pixel.solved(integrity_tables.SETTINGS.model_copy(update={"risk": RiskBudget(side_prior=1e-2)}))
     assert calls
     for *arrays, clear_m, plan, height, _ in calls:
         clear_m = np.linspace(20.0, 200.0, len(clear_m))
         one, other = (
             function(*arrays, clear_m, plan, height, enough)
-            for function in (kernels.REGISTERED["risk_off_tangent"][0], kernels.compiled("risk_off_tangent"))
+            for function in (plain("off_tangent").risk_off_tangent, compiled)
         )
         assert 0.1 * len(one) < np.count_nonzero((one > 1e-12) & (one < 1e-2))
         np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-15)

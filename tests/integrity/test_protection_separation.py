@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 import protection_oracle
 import raim_oracle as oracle
 from railfix.integrity.protection import RiskBudget, along_track_level
-from railfix.integrity.protection.separation import (
+from railfix.integrity.raim import constrained_model
+from railfix.positioning.normal_equations import UNTIED_M
+from separation_oracle import (
     AllInView,
     Separations,
     all_in_view,
     without_group,
     without_map,
 )
-from railfix.integrity.raim import constrained_model
-from railfix.positioning.normal_equations import UNTIED_M
 
 pytestmark = pytest.mark.requirement("C2")
 

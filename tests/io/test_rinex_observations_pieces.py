@@ -250,9 +250,6 @@ def test_fields_equal_float_of_their_text(texts: list[tuple[str, str]], cut: int
     data = np.frombuffer(line.encode() + b"\n9" + b" " * observations_fields.PADDING, dtype=np.uint8)
     arguments = (data, np.zeros(1, dtype=np.int64), np.array([len(line)]), np.arange(len(texts)), np.ones(len(texts)))
     fields = observations_fields.read_fields(*arguments)
-    reference = observations_fields.decoded_fields.__wrapped__(*arguments)  # type: ignore[attr-defined]
-    for compiled, expected in zip(observations_fields.decoded_fields(*arguments), reference, strict=True):
-        np.testing.assert_array_equal(compiled, expected)
     for k in range(len(texts)):
         text = f"{line[16 * k : 16 * k + 16]:<16}"
         good = (not text[:14].strip() or NUMBER.fullmatch(text[:14])) and re.fullmatch("[ 0-9]{2}", text[14:])

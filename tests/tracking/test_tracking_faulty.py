@@ -21,7 +21,7 @@ from tracking_cases import part, ride
 
 @pytest.mark.requirement("E5")
 def test_the_mean_of_clipped_innovations_by_hand() -> None:
-    bias, update = np.array([0.0, 0.345, 0.5]), plain("learning").update_bias
+    bias, update = np.array([0.0, 0.345, 0.5]), plain("tracking.learning").update_bias
     found = [update(bias, slot, innovation, 1.0) for slot, innovation in ((0, -4.0), (1, 3.0), (2, 3.0))]
     share = 1.0 - np.exp(-1.0 / 60.0)
     np.testing.assert_allclose(bias, [-share, 0.345 + share * 0.655, 0.5 + share * 0.5])

@@ -92,7 +92,7 @@ def test_as_plain_python_the_recursion_gives_the_same(name: str, first: int, mon
     _, state = track(part(epochs, before), line, sensors=_sensors_of(sensors, before), levels=True)
     own = _sensors_of(sensors, cut)
     compiled, _ = track(part(epochs, cut), line, state, sensors=own, levels=True)
-    monkeypatch.setattr("railfix.tracking.recursion._kernel", lambda: plain("recursion").advance)
+    monkeypatch.setattr("railfix.tracking.recursion._kernel", lambda: plain("tracking.recursion").advance)
     found, _ = track(part(epochs, cut), line, state, sensors=own, levels=True)
     for field in fields(Tracked):
         one, other = getattr(found, field.name), getattr(compiled, field.name)
@@ -219,7 +219,7 @@ def test_what_is_no_number_in_a_sub_filter_bounds_nothing_and_in_the_filter_begi
 @pytest.mark.requirement("E5")
 @pytest.mark.parametrize("size", range(1, 12))
 def test_factors_and_products_by_four_rows_at_a_time_are_those_of_numpy(size: int) -> None:
-    algebra: Any = plain("algebra")
+    algebra: Any = plain("tracking.algebra")
     random = np.random.default_rng(size)
     root, right = random.normal(size=(size, size)), random.normal(size=(size, 5))
     matrix = np.stack([np.full((size, size), np.nan), root @ root.T + np.eye(size)])

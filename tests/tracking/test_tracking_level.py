@@ -42,7 +42,7 @@ def level_of(
     bank = subfilters(names, place_m, sigma_m, LIMITS, weak_s)
     fields = ("level_m", "ground_level_m", "level_noise_m", "separation_m")
     answers = named_tuple(layout.Outputs, **{name: np.full(1, np.nan) for name in fields})
-    plain("level").write_level(held, count, far, bank, parameters(LIMITS), work, answers, 0)
+    plain("tracking.level").write_level(held, count, far, bank, parameters(LIMITS), work, answers, 0)
     return {name: float(getattr(answers, name)[0]) for name in fields}
 
 

@@ -87,7 +87,7 @@ def judged(
     held.log_code[:] = log_code
     work = work_space(count)
     work.evidence[:count], work.code_evidence[:count], work.places[:count] = motion, code, places
-    plain("branches").judge(parameters(TrackingLimits()), held, work, count, 1.0)
+    plain("tracking.branches").judge(parameters(TrackingLimits()), held, work, count, 1.0)
     return held.log_probability, held.log_code
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing
+import os
 import re
 import sys
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from numba.core.options import DefaultOptions
 from numba.core.typed_passes import NativeLowering
 
 from railfix.core.errors import SettingsError
+from railfix.kernels import FILTER_ALONE
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 #: Compiled functions of the modules that are imported.
@@ -91,14 +93,14 @@ def kernel(function: Function) -> Function:
     SettingsError
         None of these folders can be written.
     """
-    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+    if numba.config.DISABLE_JIT or _is_left(function):  # type: ignore[attr-defined]
         return function
     try:
         made = numba.njit(cache=True, **_OPTIONS)(function)
     except RuntimeError as error:
         raise SettingsError(
             f"compiled kernels cannot be kept on disk ({error}); set NUMBA_CACHE_DIR to a folder that can be "
-            "written, or RAILFIX_KERNELS=numpy"
+            "written, or NUMBA_DISABLE_JIT=1 (a hundred times slower)"
         ) from error
     module = function.__module__.removeprefix("railfix.kernels.")
     cache = made._cache
@@ -123,9 +125,19 @@ class _Index(IndexDataCacheFile):
         return index
 
 
+def _is_left(function: Callable[..., Any]) -> bool:
+    """Whether a function stays plain Python, in the process that compiles the filter alone."""
+    shared = ("railfix.kernels.tracking", "railfix.kernels.sight")
+    return FILTER_ALONE in os.environ and not function.__module__.startswith(shared)
+
+
 def inner(function: Function) -> Function:
     """Compile a function that kernels alone call: it is part of their code, and python cannot call it."""
-    return cast(Function, numba.njit(**_OPTIONS, **_INNER)(function))
+    if _is_left(function):
+        return function
+    # Python calls those that both have, where the kernels of single epochs are left as Python.
+    options = _INNER if FILTER_ALONE not in os.environ else {}
+    return cast(Function, numba.njit(**_OPTIONS, **options)(function))
 
 
 def borrowing(function: Function) -> Function:

@@ -1,4 +1,4 @@
-"""Compiled function of `railfix.integrity.protection`: what each fault hypothesis does to the position."""
+"""What each fault hypothesis does to the position."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner, kernel
+from railfix.kernels.layout import LEAST_REDUNDANCY
 
-#: `LEAST_REDUNDANCY` of `railfix.integrity.raim.exclusion`, `NO_EFFECT` of `separation`, `_SAME` of `level`.
-_LEAST_REDUNDANCY, _NO_EFFECT, _SAME = 1e-9, 1e-6, 1e-9
+#: Effect on the position, in its own sigmas, below which a satellite has none.
+_NO_EFFECT = 1e-6
+#: Separations below this share of sigma are none.
+_SAME = 1e-9
 
 
 @inner
@@ -53,7 +56,7 @@ def _leave_out(rows: Floats, member: Masks, every: bool, limit: float, work: Flo
         if not member[k]:
             continue
         share = work[k, k]
-        if share > _LEAST_REDUNDANCY:
+        if share > LEAST_REDUNDANCY:
             for c in range(4):
                 gone[c] += work[n, k] * work[n + c, k] / share
             for i in range(n + 4):
@@ -91,7 +94,7 @@ def _with_each_later(
     """  # fmt: skip
     n = rows.shape[1]
     share, of_first = rows[i, i], rows[n, i]
-    inverse = 1.0 / share if share > _LEAST_REDUNDANCY else 0.0
+    inverse = 1.0 / share if share > LEAST_REDUNDANCY else 0.0
     weight = inverse * of_first
     blind = blind or (inverse == 0.0 and abs(of_first) > limit)
     square, distance = gone[0] + weight * of_first, gone[1] + weight * rows[n + 1, i]
@@ -107,8 +110,8 @@ def _with_each_later(
         coupling = inverse * first[at]
         of_gain = gains[at] - coupling * of_first
         rest = rests[at] - coupling * first[at]
-        last = of_gain / rest if rest > _LEAST_REDUNDANCY else 0.0
-        lost |= not rest > _LEAST_REDUNDANCY
+        last = of_gain / rest if rest > LEAST_REDUNDANCY else 0.0
+        lost |= not rest > LEAST_REDUNDANCY
         offset[at], sigma[at], ratio[at] = _separated(
             square + last * of_gain,
             distance + last * (residuals[at] - coupling * residual),
@@ -124,7 +127,7 @@ def _with_each_later(
         coupling = inverse * rows[i, j]
         of_gain = rows[n, j] - coupling * of_first
         rest = rows[j, j] - coupling * rows[i, j]
-        last = of_gain / rest if rest > _LEAST_REDUNDANCY else 0.0
+        last = of_gain / rest if rest > LEAST_REDUNDANCY else 0.0
         if by_range:
             for m in range(n):
                 own[m] = left[m] - weight * rows[i, m] - last * (rows[j, m] - coupling * rows[i, m])
@@ -136,13 +139,23 @@ def _with_each_later(
                 _of_ranges(own, gain, range_bias, beyond),
                 common,
             )
-        if blind or (not rest > _LEAST_REDUNDANCY and abs(of_gain) > limit):
+        if blind or (not rest > LEAST_REDUNDANCY and abs(of_gain) > limit):
             offset[at], sigma[at], ratio[at] = 0.0, np.inf, 0.0
 
 
 @kernel
-def hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, Floats, Floats, Floats, Floats]:
-    """Return the used channels, offset, sigma and weight of all hypotheses, and the separation."""
+def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, Floats, Floats, Floats, Floats]:
+    """Return the tails of all hypotheses of a block of epochs.
+
+    Returns
+    -------
+    channel : ndarray of int, shape (T, n)
+        Channels in use, side by side.
+    offset_m, sigma_m, weight : ndarray, shape (T, K)
+        As `tails.solve_level` takes them: threshold and bias, sigma (infinite where nothing bounds a fault), prior.
+    separation : ndarray, shape (T,)
+        `ProtectionLevel.separation`.
+    """
     root_weight, clock, clock_covariance_m2 = model.root_weight, model.clock, model.clock_covariance_m2
     design, map_prior, scale = model.design, model.prior, errors.scale
     least_sigma_m, bias_m, information = errors.least_sigma_m, errors.bias_m, errors.map_information
@@ -280,7 +293,7 @@ def hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, Floats, Fl
             weight[t, at] = of_base * (2.0 if at == 0 else 1.0)
             at = first[1]
             for i in range(n if order > 0 else 0):
-                checked = system[i, i] > _LEAST_REDUNDANCY
+                checked = system[i, i] > LEAST_REDUNDANCY
                 w = system[n, i] / system[i, i] if checked else 0.0
                 if by_range:
                     for m in range(n):

@@ -1,4 +1,4 @@
-"""Compiled function of `railfix.integrity.protection`: the level that the tails of all hypotheses leave."""
+"""The level at which Gaussian tails of many hypotheses together keep within a risk."""
 
 from __future__ import annotations
 
@@ -9,8 +9,18 @@ import numpy as np
 from railfix.core.arrays import Codes, Floats, Indices
 from railfix.kernels.compiling import inner, kernel
 
-#: Of `railfix.integrity.protection.tails`.
-_CLOSE, _STEPS, _HALVING, _AIM, _ALIKE, _MILLS = 5e-4, 60, 8, 0.002, 1e-9, (0.339, 5.510)
+#: Share of the level, up to which a step is exact to a millionth of it: the last one.
+_CLOSE = 5e-4
+#: Steps at most; a level that they do not come close to stays at the lowest one found within the risk.
+_STEPS = 60
+#: From this step on every other one halves the bracket: steps between two points would go on for ever.
+_HALVING = 8
+#: Share of the risk that is left over.
+_AIM = 0.002
+#: Share of the largest part within which two hypotheses ask for the same: the first is named.
+_ALIKE = 1e-9
+#: Q(x) is the density at x over ``(1 - a) x + a sqrt(x^2 + b)`` to 0.3 %, x >= 0 (Borjesson and Sundberg 1979).
+_MILLS = (0.339, 5.510)
 _TINY = float(np.finfo(np.float64).tiny)
 _ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
 _ROOT_HALF = math.sqrt(0.5)
@@ -81,7 +91,33 @@ def _quantile(probability: float) -> float:
 def solve_level(
     offset_m: Floats, sigma_m: Floats, weight: Floats, bounds: Indices, share: Floats, reserved: Floats
 ) -> tuple[Floats, Codes, Floats, Floats, Indices]:
-    """Return the fields of `Levels`, epoch by epoch."""
+    """Find the level at which the tails of all hypotheses keep within the risk: ``weight Q((L - offset)/sigma)`` each.
+
+    What nothing bounds goes into the risk with its whole weight; the rest of it is for what is checked. The largest
+    part is a level within the risk, as the parts have shares of it. From there it is lowered as far as the sum of the
+    tails allows, to 0.998 of the risk.
+
+    Parameters
+    ----------
+    offset_m, sigma_m, weight : ndarray, shape (T, K)
+        Hypotheses, kind after kind; `sigma_m` is infinite where nothing bounds a fault, `weight` 0 for none.
+    bounds : ndarray of int, shape (kinds + 1,)
+        First hypothesis of each kind, and K.
+    share : ndarray, shape (T, kinds)
+        Risk that each kind may use.
+    reserved : ndarray, shape (T,)
+        Risk taken off their sum beforehand.
+
+    Returns
+    -------
+    level_m : ndarray, shape (T,) [m]
+    spender : ndarray of int8, shape (T,)
+        The kind that uses up most of the risk at that level.
+    part_m, k : ndarray, shape (T, kinds)
+        The largest ``offset + k sigma`` of a kind; 0 where its hypotheses fit into its share unchecked, then k is -inf.
+    worst : ndarray of int, shape (T, kinds)
+        The hypothesis that asks for it, counted within its kind; -1: none.
+    """
     (epochs, width), kinds = weight.shape, len(bounds) - 1
     level, spender = np.zeros(epochs), np.zeros(epochs, dtype=np.int8)
     part, k_of = np.zeros((epochs, kinds)), np.full((epochs, kinds), -np.inf)

@@ -1,4 +1,4 @@
-"""Compiled functions of `railfix.integrity.protection`: distance to parts of a line off a tangent, risk there."""
+"""Distance to parts of a line off a tangent, risk there."""
 
 from __future__ import annotations
 
@@ -9,19 +9,26 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner, kernel
-
-#: `railfix.integrity.raim.exclusion.LEAST_REDUNDANCY`.
-_LEAST_REDUNDANCY = 1e-9
-#: Of `railfix.integrity.protection.open_places`.
-_ALONG, _CLEAR_M, _ON_TANGENT_M = 0.9945, 200.0, 1e-3
+from railfix.kernels.layout import ALONG, CLEAR_M, LEAST_REDUNDANCY, ON_TANGENT_M
 
 
 @kernel
 def clear_of_sections(
     ecef_m: Floats, tangent: Floats, across: Floats, length_m: Floats, section: Indices, count: Indices, vertex: Indices
 ) -> Floats:
-    """Return a distance within which no part of a line lies off the tangents of its sections."""
-    clear, first = np.full(len(section), _CLEAR_M), 0
+    """Return a distance within which no part of a line lies off the tangents of its sections, shape (S,) [m].
+
+    Parameters
+    ----------
+    ecef_m, tangent, across, length_m : ndarray
+        Of the line: points (P, 3), the others of its sections.
+    section : ndarray of int, shape (S,)
+    count : ndarray of int, shape (S,)
+        Numbers of points around each of them.
+    vertex : ndarray of int, shape (sum of `count`,)
+        These points, section after section.
+    """
+    clear, first = np.full(len(section), CLEAR_M), 0
     for s in range(len(section)):
         here, length = section[s], length_m[section[s]]
         for v in vertex[first : first + count[s]]:
@@ -38,9 +45,9 @@ def clear_of_sections(
                     square += (ecef_m[end, a] - ecef_m[here, a] - ahead * tangent[here, a]) ** 2
                 beside, least = math.sqrt(square), max(max(ahead - length, -ahead), 0.0)
                 nearest = min(nearest, math.hypot(least, aside))
-                off |= least < _ALONG * math.hypot(least, beside) and beside > _ON_TANGENT_M
+                off |= least < ALONG * math.hypot(least, beside) and beside > ON_TANGENT_M
                 low, high = min(low, ahead), max(high, ahead)
-            if off or min(high, length) - max(low, 0.0) > _ON_TANGENT_M:
+            if off or min(high, length) - max(low, 0.0) > ON_TANGENT_M:
                 clear[s] = min(clear[s], nearest - length_m[v])
         clear[s] = max(clear[s], 0.0)
         first += count[s]
@@ -125,7 +132,7 @@ def _of_sides(
             for b in range(3):
                 work[a, count + 1 + b] = rows[member[a], b]
         for a in range(count):
-            if not work[a, a] > _LEAST_REDUNDANCY:
+            if not work[a, a] > LEAST_REDUNDANCY:
                 continue
             for b in range(3):
                 left[b] = work[a, count + 1 + b] / work[a, a]
@@ -153,7 +160,36 @@ def risk_off_tangent(
     sigma_height_m: float,
     enough: float,
 ) -> Floats:
-    """Return an upper bound of the probability that the true place lies off the tangent beyond a distance."""
+    """Return an upper bound of the probability that the true place lies off the tangent beyond a distance.
+
+    At a distance D along and across a form exceeds its value at the position by ``(D - |c|)^2 / trace(C) - c . s`` at
+    least: c its lowest place and C the inverse of its matrix, both along and across, and s its slope. Without the
+    channels J the matrix is at least ``1 - tau`` times that of all, ``tau = trace(F_J C F_J^T S_JJ^-1)`` with their
+    rows F_J of the design: the largest tau of one channel and of two decides most epochs. In the others each subset has
+    its own bound.
+
+    Parameters
+    ----------
+    model : ModelArrays
+        T epochs by M channels.
+    scale : ndarray, shape (T,)
+    likely : ndarray, shape (M,)
+        Probability of a fault of each channel.
+    sides : ndarray of bool, shape (T, S, M)
+        Channels that are faulty together.
+    side_prior : float
+        Probability of that.
+    clear_m : ndarray, shape (T,) [m]
+        Distance within which no place is off the tangent.
+    sigma_plan_m, sigma_height_m : float [m]
+    enough : float
+        Probability up to which a loose bound will do.
+
+    Returns
+    -------
+    ndarray, shape (T,)
+        Summed over no fault, one faulty satellite, two and those of a side.
+    """
     root_weight, clock, clock_covariance_m2, design, covariance_m2, map_prior, misfit = model
     epochs, channels = root_weight.shape
     clocks, total = clock_covariance_m2.shape[1], np.empty(epochs)
@@ -231,7 +267,7 @@ def risk_off_tangent(
             leverage[i] = effect[i, i]
             singles += prior[i]
             squares += prior[i] * prior[i]
-            if projector[i, i] > _LEAST_REDUNDANCY:
+            if projector[i, i] > LEAST_REDUNDANCY:
                 one = max(one, leverage[i] / projector[i, i])
         for i in range(n):
             a = projector[i, i]
@@ -239,7 +275,7 @@ def risk_off_tangent(
                 b, c = projector[i, j], projector[j, j]
                 det = a * c - b * b
                 tau = (c * leverage[i] + a * leverage[j] - 2.0 * b * effect[i, j]) / det
-                regular = det > _LEAST_REDUNDANCY * a * c and min(a, c) > _LEAST_REDUNDANCY
+                regular = det > LEAST_REDUNDANCY * a * c and min(a, c) > LEAST_REDUNDANCY
                 two = max(two, tau if regular else 0.0)
         root = math.sqrt(max(constant, 0.0))
         of_sides = _of_sides(used, n, sides[t], side_prior, projector, residual, rows, slope, matrix, clear_m[t])
@@ -269,7 +305,7 @@ def risk_off_tangent(
                     a = projector[i, i]
                     fx, fy, fz = rows[i, 0], rows[i, 1], rows[i, 2]
                     if j < 0:
-                        w = 1.0 / a if a > _LEAST_REDUNDANCY else 0.0
+                        w = 1.0 / a if a > LEAST_REDUNDANCY else 0.0
                         own = w * residual[i]
                         sx -= own * fx
                         sy -= own * fy
@@ -284,7 +320,7 @@ def risk_off_tangent(
                         b, c = projector[j, i], projector[j, j]
                         gx, gy, gz = rows[j, 0], rows[j, 1], rows[j, 2]
                         det = a * c - b * b
-                        if min(a, c) > _LEAST_REDUNDANCY and det > _LEAST_REDUNDANCY * a * c:
+                        if min(a, c) > LEAST_REDUNDANCY and det > LEAST_REDUNDANCY * a * c:
                             w = 1.0 / det
                             a, b, c = a * w, b * w, c * w
                             one, two = residual[i], residual[j]

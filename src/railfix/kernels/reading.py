@@ -1,4 +1,4 @@
-"""Compiled functions of `railfix.io.rinex`: lines of a text, fields of observation lines, their places in arrays."""
+"""Lines of a text, fields of observation lines, their places in arrays."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LOW_PAIR, _HIGH_PAIR = _U(100 + (1_000_000 << 32)), _U(1 + (10_000 << 32))
 
 @inner
 def _eight_digits(word: np.uint64) -> np.uint64:
-    """See the reference."""
+    """Compute the value of eight digits, the lowest byte the most significant."""
     word = word * _10 + (word >> _8)
     return ((word & _PAIRS) * _LOW_PAIR + ((word >> _16) & _PAIRS) * _HIGH_PAIR) >> _32
 
@@ -42,7 +42,11 @@ def _word(data: Bytes, at: np.uintp) -> np.uint64:
 def decoded_fields(
     data: Bytes, start: Integers, length: Integers, index: Indices, divisor: Floats
 ) -> tuple[Floats, Bytes, Masks]:
-    """Decode fields of lines as two words each; field by field."""
+    """Decode the fields of the usual form, shape (n, k); the arguments are those of `read_fields`.
+
+    Values, NaN where blank or of another form; loss-of-lock digits (uint8), 255 where the last two characters are
+    neither blanks nor digits; and which fields have another form.
+    """
     rows, columns = len(start), len(index)
     value, lock = np.empty((rows, columns)), np.zeros((rows, columns), dtype=np.uint8)
     odd = np.zeros((rows, columns), dtype=np.bool_)
@@ -92,7 +96,19 @@ def decoded_fields(
 def placed_fields(
     kinds: Floats, lock: Bytes, cell: Integers, kind: Indices, signal: Indices, value: Floats, digit: Bytes
 ) -> tuple[Floats, Bytes]:
-    """Put fields in their places of the dense arrays; row by row."""
+    """Put fields in their places of the dense arrays, which are filled in place and returned; zeros are absent.
+
+    Parameters
+    ----------
+    kinds, lock : ndarray, shape (4, T, M), and of uint8, (T, M)
+        By kind of observable.
+    cell : ndarray of int, shape (n,)
+        Epoch times M plus the first channel of the satellite, of each line.
+    kind, signal : ndarray of int, shape (k,)
+        Of each field: its kind of observable, and its channel among those of the satellite.
+    value, digit : ndarray, shape (n, k)
+        Values, and loss-of-lock digits.
+    """
     flat, flat_lock = kinds.reshape(len(kinds), -1), lock.reshape(-1)
     for r in range(len(cell)):
         for j in range(len(kind)):
@@ -106,7 +122,7 @@ def placed_fields(
 
 @kernel
 def line_ends(data: Bytes) -> Integers:
-    """Return the places of the line feeds in a text; eight characters at a time."""
+    """Return the places of the line feeds in a text."""
     ends, found = np.empty(1024, dtype=np.int64), 0
     for at in range(0, len(data), 8):
         if at + 8 <= len(data):

@@ -1,4 +1,4 @@
-"""Compiled function of `railfix.positioning.robust_fit`: robust weights."""
+"""Robust weights."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from railfix.core.arrays import Floats, Masks
 from railfix.kernels.compiling import kernel
 from railfix.kernels.sight import sight
 
-#: `railfix.positioning.robust_fit._LEAST_SCALE`.
+#: Least scale of whitened residuals: ranges do not agree better than that by their own merit.
 _LEAST_SCALE = 0.05
 
 
@@ -25,7 +25,27 @@ def reweighted(
     reject: float,
     iterations: int,
 ) -> tuple[Masks, Floats, Masks]:
-    """Reweight ranges by their residuals; epoch by epoch, directions and misfits computed once."""
+    """Reweight ranges by their residuals.
+
+    Parameters
+    ----------
+    ranges : RangeArrays
+    place_ecef_m : ndarray, shape (T, 3) [m]
+        In C order.
+    information : ndarray, shape (T, 3, 3) [1/m^2], or (0, 3, 3)
+    correction : ndarray, shape (T,)
+        Scale of the residuals over their median.
+    keep, reject : float
+    iterations : int
+
+    Returns
+    -------
+    kept : ndarray of bool, shape (T, M)
+    wsse : ndarray, shape (T,)
+        Weighted sum of the squared residuals of the kept ranges.
+    solved : ndarray of bool, shape (T,)
+        False where the last step was not determined.
+    """
     sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     epochs, channels = weight.shape
     groups = len(starts)

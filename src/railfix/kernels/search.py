@@ -1,4 +1,4 @@
-"""Compiled functions of `railfix.positioning.line_points`: points near a position, and the best of them."""
+"""Points near a position, and the best of them."""
 
 from __future__ import annotations
 
@@ -8,15 +8,18 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import inner, kernel
+from railfix.kernels.layout import FAN_OUT, ROTATION_GRADIENT
 
-#: `railfix.positioning.line_points`: error of the linear model of a range, children of a stretch, slack of a radius.
-_CURVATURE, _TURNING, _FAN_OUT, _SLACK_M = 1.0 / (2.0 * 1.9e7), 1.1e-5, 8, 1e-6
+#: Half the inverse of the shortest range to a navigation satellite, rounded down (GLONASS at the zenith) [1/m].
+_CURVATURE = 1.0 / (2.0 * 1.9e7)
+#: Rounding allowed for in the radius of a stretch [m].
+_SLACK_M = 1e-6
 
 
 @inner
 def _bend_m(distance_m: float) -> float:
     """Return the largest error of the linear model of a range at a distance from its expansion point [m]."""
-    return distance_m * distance_m * _CURVATURE + _TURNING * distance_m
+    return distance_m * distance_m * _CURVATURE + ROTATION_GRADIENT * distance_m
 
 
 @kernel
@@ -30,7 +33,23 @@ def radii_of_balls(
     freedom: Integers,
     limit: float,
 ) -> Floats:
-    """Return the radius of the ball that holds every point worth looking at, epoch by epoch."""
+    """Return the radius of the ball around each 3-D position that holds every point worth looking at, shape (n,) [m].
+
+    NaN where errors of the linear model leave it open.
+
+    Parameters
+    ----------
+    distance_m, away_m : ndarray, shapes (n,), (n, 3) [m]
+        To the nearest point of the line.
+    matrix, covariance_m2, wsse : ndarray, shapes (n, 3, 3), (n, 3, 3), (n,)
+        Of the 3-D positions.
+    weight_norm : ndarray, shape (n,)
+        Root of the summed weights.
+    freedom : ndarray of int, shape (n,)
+        Redundancy on the line, 1 at least.
+    limit : float
+        `SectionLimits.reach`.
+    """
     result = np.empty(len(distance_m))
     for t in range(len(distance_m)):
         form, norm, q0 = 0.0, weight_norm[t], max(wsse[t], 0.0)
@@ -60,11 +79,32 @@ def points_in_balls(
     least: Floats,
     weight_norm: Floats,
 ) -> tuple[Indices, Indices, Floats, Floats, Masks]:
-    """Return the points in the ball of each epoch with their q by the quadratic form; epoch by epoch."""
+    """Find the points of a line in one ball an epoch, and their q by the quadratic form around its centre.
+
+    Parameters
+    ----------
+    points_m : ndarray, shape (V, 3) [m]
+    middle, reach_m, first
+        Of `SearchIndex.stretches`.
+    centre_m, radius_m : ndarray, shapes (n, 3), (n,) [m]
+    matrix, least : ndarray, shapes (n, 3, 3), (n,)
+        The quadratic form: normal matrix, and q at the centre.
+    weight_norm : ndarray, shape (n,)
+        Root of the summed weights.
+
+    Returns
+    -------
+    count : ndarray of int, shape (n,)
+    vertex : ndarray of int, shape (p,)
+        Sorted by epoch and point.
+    q, half_gradient : ndarray, shapes (p,), (p, 3)
+    unsure : ndarray of bool, shape (p,)
+        The error of the quadratic form leaves open which point of the epoch is the best, and this may be it.
+    """
     epochs, top = len(radius_m), len(first) - 2
     count, found = np.zeros(epochs, dtype=np.intp), 0
     vertex, values, unsure = np.empty(1024, dtype=np.intp), np.empty((1024, 6)), np.empty(1024, dtype=np.bool_)
-    nodes, below = np.empty(len(points_m) + _FAN_OUT, dtype=np.intp), np.empty(len(points_m) + _FAN_OUT, dtype=np.intp)
+    nodes, below = np.empty(len(points_m) + FAN_OUT, dtype=np.intp), np.empty(len(points_m) + FAN_OUT, dtype=np.intp)
     for t in range(epochs):
         x, y, z = centre_m[t, 0], centre_m[t, 1], centre_m[t, 2]
         held = first[top + 1] - first[top]
@@ -82,7 +122,7 @@ def points_in_balls(
                 if not level:
                     below[kept] = nodes[i]
                     kept += 1
-                for child in range(_FAN_OUT * nodes[i], min(_FAN_OUT * nodes[i] + _FAN_OUT, size)):
+                for child in range(FAN_OUT * nodes[i], min(FAN_OUT * nodes[i] + FAN_OUT, size)):
                     below[kept] = child
                     kept += 1
             nodes, below, held = below, nodes, kept
@@ -145,7 +185,25 @@ def best_points(
     separation_m: float,
     turn_m: float,
 ) -> tuple[Indices, Floats, Floats, Indices]:
-    """Return the best point of each epoch, and the best of the other places; epoch by epoch."""
+    """Select the best point of each epoch, and the best of the other places.
+
+    Parameters
+    ----------
+    count, vertex, q, half_gradient, matrix, matrix_of
+        Of `_Candidates`.
+    freedom : ndarray of int, shape (n,)
+    arc_m, tangent, length_m
+        Of the trajectory.
+    separation_m : float
+        Places nearer than this along the line are one.
+    turn_m : float
+        Once round a closed line; infinite for others.
+
+    Returns
+    -------
+    vertex, q, excess, other_vertex : ndarray, shape (n,)
+        As in `Section`.
+    """
     epochs, begin = len(count), 0
     chosen, other = np.empty(epochs, dtype=np.intp), np.full(epochs, -1, dtype=np.intp)
     least, excess = np.empty(epochs), np.full(epochs, np.inf)

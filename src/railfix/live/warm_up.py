@@ -11,8 +11,11 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final, TypeAlias
 
+import hatanaka
 import numpy as np
 
 from railfix import kernels
@@ -31,8 +34,8 @@ _STAGES: Final[_Settings] = (
     ({"filter": "off"}, 60),
     ({"filter": "off", "systems": ["G"], "elevation": {"mask_deg": 45.0}, "protection": "off"}, 5),
 )
-_FILTER: Final[_Settings] = (({"filter": "track"}, 8),)
-#: Runs the filter with the stages in numpy: another process compiles those.
+_FILTER: Final[_Settings] = (({"filter": "track", "protection": "off"}, 8),)
+#: Runs the filter with the stages as plain Python: another process compiles those.
 _PROGRAM = "from railfix.live.warm_up import compile_filter; compile_filter()"
 
 
@@ -50,7 +53,7 @@ def prepare_kernels() -> bool:
     begin = time.monotonic()
     kernels.announced()
     _say("compiling for this processor, once: about 40 s on two cores")
-    environment = {**os.environ, kernels.VARIABLE: "numpy"}
+    environment = {**os.environ, kernels.FILTER_ALONE: "1"}
     if kernels.FILTER in missing:
         with subprocess.Popen([sys.executable, "-c", _PROGRAM], env=environment, stderr=subprocess.PIPE) as other:
             _run(_STAGES)
@@ -79,7 +82,8 @@ def _run(settings: _Settings) -> None:
     inputs = demo_inputs()
     assert inputs.vehicle is not None
     track, vehicle = read_track(inputs.track), read_vehicle(inputs.vehicle)
-    logs = {"front": read_observations(inputs.front), "rear": read_observations(inputs.rear)}
+    longest = max(epochs for _, epochs in settings)
+    logs = {"front": _first_epochs(inputs.front[0], longest), "rear": _first_epochs(inputs.rear[0], longest)}
     strongest = str(logs["front"].satellite[np.nan_to_num(logs["front"].cn0_dbhz[0]).argmax()])
     logs = {name: _faulty(log, strongest) for name, log in logs.items()}
     paths = {name: antenna_trajectory(track, vehicle, name) for name in ("front", "rear")}
@@ -89,6 +93,16 @@ def _run(settings: _Settings) -> None:
         processor.process({name: log[:epochs] for name, log in logs.items()})
         for epoch in range(epochs):
             _, state = processor.process({name: log[epoch : epoch + 1] for name, log in logs.items()}, state)
+
+
+def _first_epochs(log: Path, count: int) -> Observations:
+    """Read the first epochs of a compact RINEX 3 log: plain Python would read the whole of it for long."""
+    lines = hatanaka.decompress(log).decode("ascii").splitlines(keepends=True)
+    begins = [number for number, line in enumerate(lines) if line.startswith(">")]
+    with TemporaryDirectory() as folder:
+        short = Path(folder) / "log.rnx"
+        short.write_text("".join(lines[: begins[count]]), encoding="ascii")
+        return read_observations(short)
 
 
 def _faulty(log: Observations, satellite: str) -> Observations:

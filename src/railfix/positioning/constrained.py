@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
+from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.settings import Settings
-from railfix.kernels import compiled_by
-from railfix.positioning.normal_equations import RangeArrays, Ranges, after_step, inverse_3x3, reduced_equations
+from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
 
 
@@ -74,32 +74,6 @@ class Constrained:
     wsse: Floats
     residual_m: Floats
     iterations: Integers
-
-
-def _along(system: Floats, axes: Floats, plan_m: float, height_m: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """Step and sigma (also of an exact map) along the section, and the least WSSE, map error allowed for."""
-    matrix = axes @ system[:, :3, :3] @ axes.swapaxes(1, 2)
-    matrix[:, 1, 1] += 1.0 / plan_m**2
-    matrix[:, 2, 2] += 1.0 / height_m**2
-    vector = np.einsum("tij,tj->ti", axes, system[:, :3, 3])
-    # Schur complement of the map error: what remains depends on the distance along the line alone.
-    coupling = matrix[:, 0, 1:]
-    a, b, c = matrix[:, 1, 1], matrix[:, 1, 2], matrix[:, 2, 2]
-    determinant = a * c - b * b
-    solve = (
-        np.stack([(c * coupling[:, 0] - b * coupling[:, 1]), (a * coupling[:, 1] - b * coupling[:, 0])], axis=1)
-        / np.where(determinant > 0, determinant, np.nan)[:, None]
-    )
-    information = matrix[:, 0, 0] - np.einsum("ti,ti->t", coupling, solve)
-    gradient = vector[:, 0] - np.einsum("ti,ti->t", solve, vector[:, 1:])
-    exact = 1.0 / np.sqrt(np.where(matrix[:, 0, 0] > 0, matrix[:, 0, 0], np.nan))
-    observable = information > 1e-12 * matrix[:, 0, 0]
-    safe = np.where(observable, information, 1.0)
-    step = np.where(observable, gradient / safe, np.nan)
-    sigma = np.where(observable, 1.0 / np.sqrt(safe), np.nan)
-    whole = np.einsum("tij,tj->ti", inverse_3x3(matrix), vector)
-    least = system[:, 3, 3] - np.einsum("ti,ti->t", whole, vector)
-    return step, sigma, exact, least
 
 
 def constrained_position(
@@ -160,7 +134,7 @@ def _from(
     vertex: Indices, ranges: Ranges, trajectory: Trajectory, limits: ConstrainedLimits
 ) -> tuple[Indices, Floats, Floats, Floats, Integers]:
     """`iterated_along` of a trajectory, from points of it."""
-    return iterated_along(
+    return kernels.ranges.iterated_along(
         ranges.arrays,
         SectionArrays(
             trajectory.ecef_m[:-1],
@@ -187,81 +161,3 @@ class SectionArrays(NamedTuple):
     length_m: Floats  # (S,)
     plan_m: float
     height_m: float
-
-
-@compiled_by("ranges")
-def iterated_along(
-    ranges: RangeArrays, line: SectionArrays, vertex: Indices, tolerance_m: float, most: int
-) -> tuple[Indices, Floats, Floats, Floats, Integers]:
-    """Iterate positions along the line.
-
-    Parameters
-    ----------
-    ranges : RangeArrays
-    line : SectionArrays
-    vertex : ndarray of int, shape (T,)
-        Point to start from; -1: none.
-    tolerance_m, most
-        Last step, and number of steps.
-
-    Returns
-    -------
-    section : ndarray of int, shape (T,)
-    solved : ndarray, shape (6, T)
-        Distance along the section [m]; `sigma_m`, `exact_map_sigma_m`, `wsse`, `overshoot_m` and `dilution` of
-        `Constrained`.
-    clock_m, residual_m, iterations
-        Of `Constrained`.
-    """
-    start_ecef_m, tangent, across, up, length_m, plan_m, height_m = line
-    epochs, channels = ranges.code_m.shape
-    chosen, iterations = np.full(epochs, -1, dtype=np.intp), np.zeros(epochs, dtype=np.int64)
-    clock, residual = np.full((epochs, len(ranges.starts)), np.nan), np.full((epochs, channels), np.nan)
-    solved = np.full((6, epochs), np.nan)
-    solved[4] = 0.0
-    last = len(length_m) - 1
-
-    active = np.flatnonzero(vertex >= 0)
-    section = np.minimum(vertex[active], last)
-    along = np.where(vertex[active] > last, length_m[section], 0.0)
-    entered = np.zeros(len(active), dtype=np.int8)  # -1 through the lower end, +1 through the upper, 0 not just now
-    for _ in range(most):
-        if not len(active):
-            break
-        some = slice(None) if len(active) == epochs else active
-        place = start_ecef_m[section] + along[:, None] * tangent[section]
-        system, means, rows, seen = reduced_equations(ranges.take(some), place)
-        axes = np.stack([tangent[section], across[section], up[section]], axis=1)
-        step, deviation, exact, least = _along(system, axes, plan_m, height_m)
-        target = along + step
-        below, above = target < 0.0, target > length_m[section]
-        inside = ~below & ~above  # NaN targets are inside and settle as "no position"
-        ended = (below & (section == 0) & (along == 0.0)) | (above & (section == last) & (along == length_m[section]))
-        turned = (below & (entered < 0)) | (above & (entered > 0))
-        settled = (inside & ~(np.abs(step) > tolerance_m)) | ended | turned
-
-        iterations[active] += 1
-        done = active[settled]
-        final = np.where(inside, target, along)
-        chosen[done] = np.where(np.isfinite(final), section, -1)[settled]
-        results = (final, deviation, exact, least, np.where(ended, np.abs(step), 0.0))
-        solved[:5, done] = np.stack(results)[:, settled]
-        last_step = (np.where(inside, step, 0.0)[:, None] * tangent[section])[settled]
-        clock[done], residual[done] = after_step(means[settled], rows[settled], seen[settled], last_step)
-
-        down, upward = below & (section > 0), above & (section < last)
-        section = section - down + upward
-        along = np.where(down, length_m[section], np.where(upward, 0.0, np.clip(target, 0.0, length_m[section])))
-        entered = np.where(down, 1, np.where(upward, -1, 0)).astype(np.int8)
-        going = ~settled
-        active, section, along, entered = active[going], section[going], along[going], entered[going]
-
-    # Sigma along the line for ranges of unit sigma and an exact map: geometry alone.
-    at = np.flatnonzero(chosen >= 0)
-    place = start_ecef_m[chosen[at]] + solved[0, at, None] * tangent[chosen[at]]
-    unit = ranges.take(at)
-    system = reduced_equations(unit._replace(weight=(unit.weight > 0).astype(np.float64)), place)[0]
-    information = np.einsum("ti,tij,tj->t", tangent[chosen[at]], system[:, :3, :3], tangent[chosen[at]])
-    with np.errstate(divide="ignore"):
-        solved[5, at] = 1.0 / np.sqrt(np.maximum(information, 0.0))
-    return chosen, solved, clock, residual, iterations

@@ -17,11 +17,12 @@ import numpy as np
 from pydantic import Field
 from scipy.special import chdtri, chndtrinc
 
+from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.forgetting import correlated_sums
-from railfix.positioning.normal_equations import RangeArrays, Ranges, reduced_equations
+from railfix.positioning.normal_equations import RangeArrays, Ranges
 from railfix.positioning.single_point import SinglePoint
 from railfix.track.trajectory import Trajectory
 
@@ -251,7 +252,9 @@ def terms_of_epochs(
         Unit vectors across and up there.
     """
     offset = np.einsum("tij,tj->ti", axes, ecef_m - place_ecef_m)
-    gain = (axes @ covariance_m2) @ (reduced_equations(ranges, ecef_m)[2][:, :3] * ranges.weight[:, None])
+    gain = (axes @ covariance_m2) @ (
+        kernels.ranges.reduced_equations(ranges, ecef_m)[2][:, :3] * ranges.weight[:, None]
+    )
     nominal = gain * np.where(ranges.weight > 0, np.fmax(nominal_m, 0.0), 0.0)[:, None]
     bias = nominal @ nominal.swapaxes(1, 2)
     information = _inverse_2x2((axes @ covariance_m2 @ axes.swapaxes(1, 2)) * variance[:, None, None])

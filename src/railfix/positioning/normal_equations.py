@@ -21,10 +21,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings
 from railfix.core.constants import CLOCK_GROUP
-from railfix.core.geodesy import range_with_rotation
-from railfix.kernels import compiled_by
 
 #: Sigma of an offset between clocks of which nothing is known [m].
 UNTIED_M: Final = 1e6
@@ -208,7 +207,9 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     -------
     NormalEquations
     """
-    system, means, rows, seen = reduced_equations(ranges.arrays, np.ascontiguousarray(place_ecef_m, dtype=np.float64))
+    system, means, rows, seen = kernels.ranges.reduced_equations(
+        ranges.arrays, np.ascontiguousarray(place_ecef_m, dtype=np.float64)
+    )
     return NormalEquations(
         matrix=system[:, :3, :3],
         vector=system[:, :3, 3],
@@ -218,103 +219,6 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
         clock_slope=means[:, :3],
         design=rows[:, :3],
     )
-
-
-@compiled_by("ranges")
-def reduced_equations(ranges: RangeArrays, place_ecef_m: Floats) -> tuple[Floats, Floats, Floats, Masks]:
-    """Compute the normal equations of place and residual with the clocks eliminated.
-
-    Parameters
-    ----------
-    ranges : RangeArrays
-        T epochs.
-    place_ecef_m : ndarray, shape (T, 3) [m]
-        In C order.
-
-    Returns
-    -------
-    system : ndarray, shape (T, 4, 4)
-        Normal matrix of the three axes and the residual.
-    means : ndarray, shape (T, 4, G)
-        Weighted means of the groups.
-    rows : ndarray, shape (T, 4, M)
-        Design, and residual, less the mean of the group; 0 where the weight is 0.
-    seen : ndarray of bool, shape (T, G)
-        Groups with weight.
-    """
-    weight, starts = ranges.weight, ranges.starts
-    distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
-    used = (weight > 0)[:, None]
-    sizes = np.diff(np.append(starts, weight.shape[1]))
-    # Rows: the design -u (three) and the residual; channels side by side, as sums run over them.
-    rows = np.empty((len(weight), 4, weight.shape[1]))
-    np.negative(los.swapaxes(1, 2), out=rows[:, :3])
-    np.subtract(ranges.code_m, distance, out=rows[:, 3])
-    weighted = rows * weight[:, None]
-    totals = np.add.reduceat(weight, starts, axis=1)
-    seen = totals > 0
-    means = np.add.reduceat(weighted, starts, axis=2) / np.where(seen, totals, 1.0)[:, None]
-    rows -= np.repeat(means, sizes, axis=2)
-    rows *= used
-    np.multiply(rows, weight[:, None], out=weighted)
-    system = np.matmul(weighted, rows.swapaxes(1, 2))
-    if ranges.tied:
-        apart, mass = _between_clocks(means, totals, ranges.offset_m, ranges.sigma_m)
-        system += np.matmul(apart * mass[:, None], apart.swapaxes(1, 2))
-        # A clock lies between the estimates from its own satellites and from the others.
-        shift = apart / (totals * ranges.sigma_m**2 + 1.0)[:, None]
-        means -= shift
-        rows += np.repeat(shift, sizes, axis=2) * used
-    return system, means, rows, seen
-
-
-def after_step(means: Floats, rows: Floats, seen: Masks, step_m: Floats) -> tuple[Floats, Floats]:
-    """Return clocks and residuals after a step from the places of `reduced_equations`, to first order.
-
-    A step of 5 m leaves 0.03 mm (the gradient of the Earth's turning, which the design leaves out).
-
-    Parameters
-    ----------
-    means, rows, seen
-        From `reduced_equations`, n epochs.
-    step_m : ndarray, shape (n, 3) [m]
-
-    Returns
-    -------
-    clock_m : ndarray, shape (n, G) [m]
-        NaN where the group has no satellite.
-    residual_m : ndarray, shape (n, M) [m]
-    """
-    step = step_m[:, None]
-    clock = np.where(seen, means[:, 3], np.nan) - np.matmul(step, means[:, :3])[:, 0]
-    return clock, rows[:, 3] - np.matmul(step, rows[:, :3])[:, 0]
-
-
-def _between_clocks(means: Floats, totals: Floats, offset_m: Floats, sigma_m: Floats) -> tuple[Floats, Floats]:
-    """Means of the groups (last row: residual) less the common clock, and the weight of each.
-
-    Parameters
-    ----------
-    means : ndarray, shape (T, C, G)
-    totals : ndarray, shape (T, G) [1/m^2]
-        Weight of each mean, 0 where the group has no satellite.
-    offset_m, sigma_m : ndarray, shape (T, G) [m]
-        Of `ClockTies`.
-
-    Returns
-    -------
-    apart : ndarray, shape (T, C, G)
-    mass : ndarray, shape (T, G) [1/m^2]
-    """
-    apart = means.copy()
-    apart[:, -1] -= offset_m
-    seen = totals > 0
-    mass = np.where(seen, 1.0 / (1.0 / np.where(seen, totals, 1.0) + sigma_m**2), 0.0)
-    total = mass.sum(axis=1)
-    common = np.matmul(apart, mass[..., None]) / np.where(total > 0, total, 1.0)[:, None, None]
-    apart -= common
-    apart *= seen[:, None]
-    return apart, mass
 
 
 def fit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> Floats:
@@ -335,24 +239,7 @@ def fit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> 
     ndarray, shape (n,)
     """
     place = np.ascontiguousarray(place_ecef_m, dtype=np.float64)
-    return misfits(ranges.arrays, place, np.arange(len(ranges)) if epochs is None else epochs)
-
-
-@compiled_by("ranges")
-def misfits(ranges: RangeArrays, place_ecef_m: Floats, epochs: Indices) -> Floats:
-    """Compute `fit` of arrays in C order, with a place for each of `epochs`."""
-    some = ranges.take(epochs)
-    weight, starts = some.weight, some.starts
-    distance, _ = range_with_rotation(some.sat_ecef_m, place_ecef_m[:, None, :])
-    residual = some.code_m - distance
-    totals = np.add.reduceat(weight, starts, axis=1)
-    means = np.add.reduceat(weight * residual, starts, axis=1) / np.where(totals > 0, totals, 1.0)
-    residual -= np.repeat(means, np.diff(np.append(starts, weight.shape[1])), axis=1)
-    result = np.einsum("pm,pm,pm->p", weight, residual, residual)
-    if ranges.tied:
-        apart, mass = _between_clocks(means[:, None], totals, some.offset_m, some.sigma_m)
-        result += (mass * apart[:, 0] ** 2).sum(axis=1)
-    return np.asarray(result)
+    return kernels.ranges.misfits(ranges.arrays, place, np.arange(len(ranges)) if epochs is None else epochs)
 
 
 def inverse_3x3(matrix: Floats) -> Floats:

@@ -14,17 +14,14 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
+from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers, Masks
-from railfix.core.geodesy import range_with_rotation
 from railfix.core.settings import Settings
-from railfix.kernels import compiled_by
-from railfix.positioning.normal_equations import RangeArrays, Ranges, inverse_3x3, reduced_equations
+from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
 
 #: Median of the absolute value of a standard normal variable.
 _NORMAL_MEDIAN: Final = 0.6745
-#: Least scale of whitened residuals: ranges do not agree better than that by their own merit.
-_LEAST_SCALE: Final = 0.05
 
 
 class RobustFitLimits(Settings):
@@ -102,7 +99,7 @@ def robust_fit(
         nothing = np.zeros(len(ranges), dtype=np.int64)
         return RobustFit(kept=used, variance=np.full(len(ranges), np.nan), freedom=nothing)
     freedom = ranges.n_used - ranges.n_clocks - (3 if information is None else 1)
-    kept, wsse, solved = reweighted(
+    kept, wsse, solved = kernels.robust.reweighted(
         ranges.arrays,
         np.ascontiguousarray(place_ecef_m, dtype=np.float64),
         np.empty((0, 3, 3)) if information is None else np.ascontiguousarray(information),
@@ -116,60 +113,3 @@ def robust_fit(
     return RobustFit(
         kept=kept, variance=np.where(some, wsse / np.maximum(left, 1), np.nan), freedom=np.where(some, left, 0)
     )
-
-
-@compiled_by("robust")
-def reweighted(
-    ranges: RangeArrays,
-    place_ecef_m: Floats,
-    information: Floats,
-    correction: Floats,
-    keep: float,
-    reject: float,
-    iterations: int,
-) -> tuple[Masks, Floats, Masks]:
-    """Reweight ranges by their residuals.
-
-    Parameters
-    ----------
-    ranges : RangeArrays
-    place_ecef_m : ndarray, shape (T, 3) [m]
-        In C order.
-    information : ndarray, shape (T, 3, 3) [1/m^2], or (0, 3, 3)
-    correction : ndarray, shape (T,)
-        Scale of the residuals over their median.
-    keep, reject : float
-    iterations : int
-
-    Returns
-    -------
-    kept : ndarray of bool, shape (T, M)
-    wsse : ndarray, shape (T,)
-        Weighted sum of the squared residuals of the kept ranges.
-    solved : ndarray of bool, shape (T,)
-        False where the last step was not determined.
-    """
-    weight, starts = ranges.weight, ranges.starts
-    used, prior = weight > 0, information if len(information) == len(weight) else 0.0
-    n_used = np.count_nonzero(used, axis=1)
-    distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
-    root, misfit = np.sqrt(weight), ranges.code_m - distance
-    sizes = np.diff(np.append(starts, weight.shape[1]))
-    middle = np.minimum(n_used // 2, used.shape[1] - 1)[:, None]
-    factor = used.astype(np.float64)
-    for _ in range(iterations):
-        system, means, _, seen = reduced_equations(ranges._replace(weight=weight * factor), place_ecef_m)
-        step = np.einsum("tij,tj->ti", inverse_3x3(system[:, :3, :3] + prior), system[:, :3, 3])
-        clock = np.where(seen, means[:, 3], np.nan) - np.matmul(step[:, None, :], means[:, :3])[:, 0]
-        residual = misfit + np.einsum("tmi,ti->tm", los, step) - np.repeat(clock, sizes, axis=1)
-        whitened = root * np.abs(np.nan_to_num(residual))
-        spread = np.sort(np.where(used, whitened, np.inf), axis=1)
-        median = np.take_along_axis(spread, middle, axis=1)[:, 0]
-        scale = np.maximum(np.where(np.isfinite(median), median, 0.0) * correction, _LEAST_SCALE)
-        size = whitened / scale[:, None]
-        decline = ((reject - size) / (reject - keep)) ** 2 * keep / np.maximum(size, 1e-9)
-        before, factor = factor, np.where(used & (size < reject), np.where(size <= keep, 1.0, decline), 0.0)
-        if np.array_equal(factor, before):
-            break  # every further step would be this one
-    kept = used & (size < reject)
-    return kept, np.where(kept, whitened**2, 0.0).sum(axis=1), np.isfinite(step).all(axis=1)

@@ -25,9 +25,10 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
+from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.settings import Settings
-from railfix.positioning.line_points import FAN_OUT, ROTATION_GRADIENT, best_points, points_in_balls, radii_of_balls
+from railfix.kernels.layout import FAN_OUT, ROTATION_GRADIENT
 from railfix.positioning.normal_equations import Ranges, fit, normal_equations
 from railfix.positioning.single_point import SinglePoint
 from railfix.track.trajectory import Trajectory
@@ -225,7 +226,7 @@ def _ball(
         return radius
     nearest_m, vertex = index.tree.query(point.ecef_m[at])
     distance = np.asarray(nearest_m, dtype=np.float64)
-    radius[at] = radii_of_balls(
+    radius[at] = kernels.search.radii_of_balls(
         distance,
         index.trajectory.ecef_m[vertex] - point.ecef_m[at],
         point.matrix[at],
@@ -247,7 +248,7 @@ def _in_ball(
     radius: Floats,
 ) -> _Candidates:
     """Points in the ball of each epoch with q from the quadratic form; exact where that leaves a choice."""
-    count, vertex, q, half_gradient, unsure = points_in_balls(
+    count, vertex, q, half_gradient, unsure = kernels.search.points_in_balls(
         index.trajectory.ecef_m,
         *index.stretches,
         point.ecef_m[epochs],
@@ -315,7 +316,7 @@ def _decide(
     q, excess = np.full(epochs, np.nan), np.full(epochs, np.inf)
     for part in parts:
         at = part.at
-        vertex[at], q[at], excess[at], other[at] = best_points(
+        vertex[at], q[at], excess[at], other[at] = kernels.search.best_points(
             part.count,
             part.vertex,
             part.q,

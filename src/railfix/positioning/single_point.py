@@ -11,10 +11,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Indices, Masks
+from railfix import kernels
+from railfix.core.arrays import Floats, Indices
 from railfix.core.settings import Settings
-from railfix.kernels import compiled_by
-from railfix.positioning.normal_equations import RangeArrays, Ranges, after_step, inverse_3x3, reduced_equations
+from railfix.positioning.normal_equations import Ranges
 
 
 class SinglePointLimits(Settings):
@@ -77,7 +77,7 @@ def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLim
     SinglePoint
     """
     limits = limits or SinglePointLimits()
-    place, clock, matrix, covariance, wsse, residual = iterated_points(
+    place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterated_points(
         ranges.arrays,
         np.ascontiguousarray(start_ecef_m, dtype=np.float64),
         np.asarray(ranges.n_used - ranges.n_clocks >= 3),
@@ -87,49 +87,3 @@ def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLim
     return SinglePoint(
         ecef_m=place, clock_m=clock, matrix=matrix, covariance_m2=covariance, wsse=wsse, residual_m=residual
     )
-
-
-@compiled_by("ranges")
-def iterated_points(
-    ranges: RangeArrays, start_ecef_m: Floats, enough: Masks, tolerance_m: float, most: int
-) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Iterate 3-D positions.
-
-    Parameters
-    ----------
-    ranges : RangeArrays
-    start_ecef_m : ndarray, shape (T, 3) [m]
-    enough : ndarray of bool, shape (T,)
-        Epochs with satellites for a position; the others are NaN.
-    tolerance_m, most
-        Last step, and number of steps.
-
-    Returns
-    -------
-    ecef_m, clock_m, matrix, covariance_m2, wsse, residual_m
-        Of `SinglePoint`.
-    """
-    epochs, channels = ranges.code_m.shape
-    groups = len(ranges.starts)
-    place, clock = np.full((epochs, 3), np.nan), np.full((epochs, groups), np.nan)
-    matrix, covariance = np.full((2, epochs, 3, 3), np.nan)
-    wsse, residual = np.full(epochs, np.nan), np.full((epochs, channels), np.nan)
-    active = np.flatnonzero(enough)
-    current = start_ecef_m[active]
-    for _ in range(most):
-        if not len(active):
-            break
-        some = slice(None) if len(active) == epochs else active
-        system, means, rows, seen = reduced_equations(ranges.take(some), current)
-        vector, inverse = system[:, :3, 3], inverse_3x3(system[:, :3, :3])
-        step = np.einsum("tij,tj->ti", inverse, vector)
-        length = np.sqrt(np.einsum("ti,ti->t", step, step))
-        settled = length < tolerance_m
-        done = active[settled]
-        place[done] = current[settled] + step[settled]
-        clock[done], residual[done] = after_step(means[settled], rows[settled], seen[settled], step[settled])
-        matrix[done], covariance[done] = system[settled, :3, :3], inverse[settled]
-        wsse[done] = system[settled, 3, 3] - np.einsum("ti,ti->t", step, vector)[settled]
-        going = ~settled & (length < 1e8)
-        current, active = (current + step)[going], active[going]
-    return place, clock, matrix, covariance, wsse, residual

@@ -14,7 +14,7 @@ import polars as pl
 from railfix import __version__
 from railfix.core.reasons import Status
 from railfix.gnss.navigation import Navigation
-from railfix.kernels import kernels_in_use
+from railfix.kernels import numba_version
 from railfix.run.output import OutputFolder
 from railfix.run.tally import Tally
 from railfix.tracking import TrackStatus
@@ -157,7 +157,7 @@ def run_record(
     return {
         "versions": {"railfix": __version__, "python": platform.python_version(), **packages},
         "platform": platform.platform(),
-        "kernels": kernels_in_use(),
+        "kernels": numba_version(),
         "command": list(command),
         "inputs": list(files),
         "settings_asked": dict(asked),

@@ -28,14 +28,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import comb
 
+from railfix import kernels
 from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings
 from railfix.integrity.protection.allocation import FEW, Allocation, allocate
 from railfix.integrity.protection.risk import MOST_TOGETHER, RiskBudget
-from railfix.integrity.protection.separation import all_in_view, without_group, without_map
-from railfix.integrity.protection.tails import solve_level
 from railfix.integrity.raim import LinearModel
-from railfix.integrity.raim.model import ModelArrays
-from railfix.kernels import compiled_by
 
 #: Numbers of a pair array that a block of epochs holds.
 _BLOCK_SIZE: Final = 80_000
@@ -266,9 +263,13 @@ def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: 
     """Return the fields of `ProtectionLevel` of a block of epochs with positions."""
     of_block = Errors(*(np.ascontiguousarray(each[rows]) for each in given))
     n = int(np.count_nonzero(model.used, axis=1).max())
-    channel, offset, sigma, weight, separation = hypotheses(model.arrays, of_block, asked := _asked(plan, rows, n))
+    channel, offset, sigma, weight, separation = kernels.hypotheses.tails_of_hypotheses(
+        model.arrays, of_block, asked := _asked(plan, rows, n)
+    )
     share = np.stack([each[rows] for each in (plan.fault_free, plan.one, plan.two, plan.more)], axis=1)
-    level, spender, part, k, worst = solve_level(offset, sigma, weight, asked.bounds, share, plan.reserved[rows])
+    level, spender, part, k, worst = kernels.level.solve_level(
+        offset, sigma, weight, asked.bounds, share, plan.reserved[rows]
+    )
 
     one, two = worst[:, 1], worst[:, 2]
     # After the channels: constellations, then the sides, a wrong map, and none.
@@ -354,50 +355,3 @@ def _channels(channel: Indices, place: Indices) -> Indices:
 def _sets(n: int, size: int) -> Indices:
     """Return all sets of places, shape (size, K)."""
     return np.array(list(combinations(range(n), size)), dtype=np.intp).reshape(math.comb(n, size), size).T
-
-
-@compiled_by("hypotheses")
-def hypotheses(model: ModelArrays, errors: Errors, asked: Asked) -> tuple[Indices, Floats, Floats, Floats, Floats]:
-    """Return the tails of all hypotheses of a block of epochs.
-
-    Returns
-    -------
-    channel : ndarray of int, shape (T, n)
-        Channels in use, side by side.
-    offset_m, sigma_m, weight : ndarray, shape (T, K)
-        As `tails.solve_level` takes them: threshold and bias, sigma (infinite where nothing bounds a fault), prior.
-    separation : ndarray, shape (T,)
-        `ProtectionLevel.separation`.
-    """
-    epochs = len(errors.scale)
-    whole = LinearModel.on_line(model)
-    full = all_in_view(whole, errors.scale, errors.least_sigma_m, errors.bias_m, errors.map_bias_m)
-    n = full.channel.shape[1]
-    prior = np.take_along_axis(asked.prior, full.channel, axis=1) * full.used
-    offset, sigma, weight = (np.zeros((epochs, int(asked.bounds[-1]))) for _ in range(3))
-    separation = np.zeros(epochs)
-    free = without_map(full, whole, errors.map_seen_m, errors.map_information) if asked.wrong_map.any() else None
-    for b, first in enumerate(asked.first.tolist()):
-        if first[0] < 0:
-            continue
-        members = np.take_along_axis(asked.members[:, b], full.channel, axis=1) & full.used
-        apart = free if free is not None and asked.wrong_map[b] else None
-        rest = without_group(full if apart is None else apart.of_ranges, members if members.any() else None)
-        others = prior * ~members
-        for k, start in enumerate(first):
-            if start < 0:
-                continue
-            sets = _sets(n, k)
-            got = rest.without(sets) if apart is None else apart.apart(rest.without(sets))
-            here = slice(start, start + sets.shape[1])
-            # Noise passes on either side.
-            of_group = asked.shared_prior[:, b] * (asked.order[:, b] >= k) * (2.0 if start == 0 else 1.0)
-            weight[:, here] = of_group[:, None] * others[:, sets].prod(axis=1)
-            threshold = asked.k_false_alarm[:, None] * got.separation_sigma_m
-            likely = weight[:, here] > 0.0
-            offset[:, here] = np.where(likely, threshold + got.bias_m, 0.0)
-            sigma[:, here] = np.where(likely, got.sigma_m, 1.0)
-            moving = likely & (got.separation_sigma_m > _SAME * sigma[:, :1])
-            ratio = np.abs(got.moved_m) / np.where(moving, threshold, np.inf)
-            separation = np.maximum(separation, ratio.max(axis=1, initial=0.0))
-    return full.channel, offset, sigma, weight, separation

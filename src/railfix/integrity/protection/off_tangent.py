@@ -6,20 +6,16 @@ residuals is a quadratic form in the place.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
-from scipy.special import ndtr
 
 from railfix.core.arrays import Floats, Indices, Masks
-from railfix.integrity.protection.risk import one_sided_k, pair_sum
-from railfix.integrity.protection.separation import one_after_the_other
+from railfix.integrity.protection.risk import one_sided_k
 from railfix.integrity.raim import LinearModel
-from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
-from railfix.integrity.raim.model import Compact, ModelArrays, compact
-from railfix.kernels import compiled_by
+from railfix.integrity.raim.model import Compact, compact
+from railfix.kernels.layout import LEAST_REDUNDANCY
 from railfix.positioning.normal_equations import inverse_3x3
 
 #: Furthest places looked at [m]: the linear model of a range is off by 0.7 m there.
@@ -113,64 +109,6 @@ def whitened(model: LinearModel, plan: float, height: float, scale: Floats) -> t
     return parts, design, none
 
 
-@compiled_by("off_tangent")
-def risk_off_tangent(
-    model: ModelArrays,
-    scale: Floats,
-    likely: Floats,
-    sides: Masks,
-    side_prior: float,
-    clear_m: Floats,
-    sigma_plan_m: float,
-    sigma_height_m: float,
-    enough: float,
-) -> Floats:
-    """Return an upper bound of the probability that the true place lies off the tangent beyond a distance.
-
-    At a distance D along and across a form exceeds its value at the position by ``(D - |c|)^2 / trace(C) - c . s`` at
-    least: c its lowest place and C the inverse of its matrix, both along and across, and s its slope. Without the
-    channels J the matrix is at least ``1 - tau`` times that of all, ``tau = trace(F_J C F_J^T S_JJ^-1)`` with their
-    rows F_J of the design: the largest tau of one channel and of two decides most epochs. In the others each subset has
-    its own bound.
-
-    Parameters
-    ----------
-    model : ModelArrays
-        T epochs by M channels.
-    scale : ndarray, shape (T,)
-    likely : ndarray, shape (M,)
-        Probability of a fault of each channel.
-    sides : ndarray of bool, shape (T, S, M)
-        Channels that are faulty together.
-    side_prior : float
-        Probability of that.
-    clear_m : ndarray, shape (T,) [m]
-        Distance within which no place is off the tangent.
-    sigma_plan_m, sigma_height_m : float [m]
-    enough : float
-        Probability up to which a loose bound will do.
-
-    Returns
-    -------
-    ndarray, shape (T,)
-        Summed over no fault, one faulty satellite, two and those of a side.
-    """
-    parts, rows, none = whitened(LinearModel.on_line(model), sigma_plan_m, sigma_height_m, scale)
-    prior = np.where(parts.used, likely[parts.channel], 0.0)
-    side = without_sides(parts, rows, none, sides, side_prior)
-    of_sides = _bounded(
-        side.prior,
-        [side.slope[..., a] for a in range(3)],
-        {(a, b): side.matrix[..., a, b] for a in range(3) for b in range(a, 3)},
-        clear_m,
-    )
-    bound = of_sides + _loose(parts.projector, rows, prior, none, clear_m)
-    near = np.flatnonzero(~(bound <= enough))
-    if len(near):
-        bound[near] = of_sides[near] + _tight(parts.take(near), rows[near], prior[near], none.take(near), clear_m[near])
-    return bound
-
-
 def without_sides(parts: Compact, design: Floats, none: Forms, sides: Masks, prior: float) -> Forms:
     """Return the forms with the channels of each side left out, K = S; prior 0 where fewer than two are in use.
 
@@ -199,89 +137,30 @@ def without_sides(parts: Compact, design: Floats, none: Forms, sides: Masks, pri
     return empty.beside(*forms)
 
 
-def _loose(projector: Floats, design: Floats, prior: Floats, none: Forms, clear_m: Floats) -> Floats:
-    """Return the bound of `risk_off_tangent` by the largest tau of one channel and of two, shape (T,)."""
-    covariance, slope = inverse_3x3(none.matrix[:, 0]), none.slope[:, 0]
-    spread = covariance[:, 0, 0] + covariance[:, 1, 1]
-    start = np.sqrt(np.maximum(np.einsum("ti,tij,tj->t", slope, covariance, slope), 0.0))
-    effect = design @ covariance @ design.swapaxes(1, 2)
-    share, own = np.einsum("tii->ti", projector), np.einsum("tii->ti", effect)
-    checked = share > LEAST_REDUNDANCY
-    of_one = np.where(checked, own / np.where(checked, share, 1.0), 0.0).max(axis=1)
-    product = share[:, :, None] * share[:, None, :]
-    determinant = product - projector * projector
-    size = share[:, :, None] * own[:, None, :]
-    size = size + size.swapaxes(1, 2) - 2.0 * projector * effect
-    regular = checked[:, :, None] & checked[:, None, :] & (determinant > LEAST_REDUNDANCY * product)
-    of_two = np.max(size / np.where(regular, determinant, np.inf), axis=(1, 2))
-    # No subset takes more off the sum of squares than there is.
-    misfit, total = np.sqrt(np.maximum(none.constant[:, 0], 0.0)), np.zeros(len(clear_m))
-    for weight, tau in ((2.0, np.zeros(len(clear_m))), (prior.sum(axis=1), of_one), (pair_sum(prior), of_two)):
-        left = np.where(tau < 1.0, 1.0 - tau, np.nan)
-        form = (start + np.sqrt(np.maximum(tau, 0.0)) * misfit) ** 2 / left
-        gap = np.maximum(clear_m - np.sqrt(spread / left * form), 0.0)
-        excess = gap * gap * left / spread - form
-        total += weight * np.where(excess > 0.0, ndtr(-np.sqrt(np.maximum(excess, 0.0))), 1.0)
-    return total
+def one_after_the_other(columns: Floats, members: Masks) -> tuple[Floats, Floats, Masks]:
+    """Leave out a group of channels, each from what those before it leave.
 
+    Parameters
+    ----------
+    columns : ndarray, shape (T, n, n + c)
+        Projector of the residuals, and beside it what changes alike.
+    members : ndarray of bool, shape (T, n)
 
-def _tight(parts: Compact, design: Floats, prior: Floats, none: Forms, clear_m: Floats) -> Floats:
-    """Return the bound of `risk_off_tangent` with each hypothesis by itself, shape (T,)."""
-    projector, residual, slope, matrix = parts.projector, parts.residual, none.slope[:, 0], none.matrix[:, 0]
-    share = np.einsum("tii->ti", projector)
-    s = [slope[:, a, None] for a in range(3)]
-    entries = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    m = {(a, b): matrix[:, a, b, None] for a, b in entries}
-    f = [design[..., a] for a in range(3)]
-    total = _bounded(np.full((len(clear_m), 1), 2.0), s, m, clear_m)
-
-    checked = share > LEAST_REDUNDANCY
-    inverse = np.where(checked, 1.0 / np.where(checked, share, 1.0), 0.0)
-    own = inverse * residual
-    scaled = [inverse * f[a] for a in range(3)]
-    total += _bounded(
-        prior, [s[a] - own * f[a] for a in range(3)], {(a, b): m[a, b] - scaled[a] * f[b] for a, b in entries}, clear_m
-    )
-
-    n = prior.shape[1]
-    i, j = np.triu_indices(n, 1)
-    a_i, b_ij, c_j = share[:, i], np.take(projector.reshape(-1, n * n), i * n + j, axis=1), share[:, j]
-    product = a_i * c_j
-    determinant = product - b_ij * b_ij
-    checked = (np.minimum(a_i, c_j) > LEAST_REDUNDANCY) & (determinant > LEAST_REDUNDANCY * product)
-    inverse = np.where(checked, 1.0 / np.where(checked, determinant, 1.0), 0.0)
-    a_i, b_ij, c_j = a_i * inverse, b_ij * inverse, c_j * inverse
-    one, two = residual[:, i], residual[:, j]
-    own_one, own_two = c_j * one - b_ij * two, a_i * two - b_ij * one
-    first, second = [f[a][:, i] for a in range(3)], [f[a][:, j] for a in range(3)]
-    move_one = [c_j * first[a] - b_ij * second[a] for a in range(3)]
-    move_two = [a_i * second[a] - b_ij * first[a] for a in range(3)]
-    return total + _bounded(
-        prior[:, i] * prior[:, j],
-        [s[a] - own_one * first[a] - own_two * second[a] for a in range(3)],
-        {(a, b): m[a, b] - move_one[a] * first[b] - move_two[a] * second[b] for a, b in entries},
-        clear_m,
-    )
-
-
-def _bounded(
-    prior: Floats, slope: Sequence[Floats], matrix: Mapping[tuple[int, int], Floats], clear_m: Floats
-) -> Floats:
-    """Return the bound of `risk_off_tangent` over K hypotheses, shape (T,): prior (T, K), parts of slope and matrix."""
-    xx, xy, xz, yy, yz, zz = (matrix[key] for key in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
-    s, t, u = slope
-    c_xx, c_yy, c_zz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
-    c_xy, c_xz, c_yz = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
-    determinant = xx * c_xx + xy * c_xy + xz * c_xz
-    regular = determinant > 1e-12 * ((xx + yy + zz) / 3.0) ** 3
-    inverse = 1.0 / np.where(regular, determinant, 1.0)
-    x, y, z = (
-        (c_xx * s + c_xy * t + c_xz * u) * inverse,
-        (c_xy * s + c_yy * t + c_yz * u) * inverse,
-        (c_xz * s + c_yz * t + c_zz * u) * inverse,
-    )
-    gap = np.maximum(clear_m[:, None] - np.sqrt(x * x + y * y), 0.0)
-    spread = np.where(regular, (c_xx + c_yy) * inverse, np.inf)
-    excess = gap * gap / spread - np.maximum(x * s + y * t + z * u, 0.0)
-    tail = np.where(excess > 0.0, ndtr(-np.sqrt(np.maximum(excess, 0.0))), 1.0)
-    return np.asarray((prior * tail).sum(axis=1))
+    Returns
+    -------
+    rows, scaled : ndarray, shape (T, m, n + c)
+        Row of each member, and that over its part of the projector; 0 where nothing checks it. Without the group the
+        columns are less by ``rows[..., :n]^T scaled``.
+    checked : ndarray of bool, shape (T, m)
+    """
+    at = np.arange(len(columns))
+    place = np.argsort(~members, axis=1, kind="stable")[:, : int(np.count_nonzero(members, axis=1).max(initial=0))]
+    rows = columns[at[:, None], place] * members[at[:, None], place][..., None]
+    scaled, checked = np.empty_like(rows), np.empty(place.shape, dtype=bool)
+    for k in range(place.shape[1]):
+        row, later = rows[:, k], rows[:, k + 1 :]
+        share = row[at, place[:, k]]
+        checked[:, k] = share > LEAST_REDUNDANCY
+        scaled[:, k] = row / np.where(checked[:, k], share, np.inf)[:, None]
+        later -= np.take_along_axis(later, place[:, None, k, None], axis=2) * scaled[:, k, None]
+    return rows, scaled, checked

@@ -16,22 +16,16 @@ from typing import Final
 import numpy as np
 from scipy.special import ndtr
 
+from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Masks
-from railfix.integrity.protection.off_tangent import Forms, risk_off_tangent, whitened, without_sides
+from railfix.integrity.protection.off_tangent import Forms, whitened, without_sides
 from railfix.integrity.protection.risk import RiskBudget
 from railfix.integrity.raim import LinearModel
-from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
 from railfix.integrity.raim.model import Compact
-from railfix.kernels import compiled_by
+from railfix.kernels.layout import ALONG, CLEAR_M, LEAST_REDUNDANCY
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.section_search import SearchIndex
 
-#: Cosine of the angle off the tangent (6 deg) within which the linear model of the level holds.
-_ALONG: Final = 0.9945
-#: Distance up to which the line is looked over for parts off the tangent before anything else [m].
-_CLEAR_M: Final = 200.0
-#: Points this near to a tangent are not off it beyond any level [m].
-_ON_TANGENT_M: Final = 1e-3
 #: Numbers that a block of epochs by pairs of satellites, or of sections by hypotheses holds.
 _BLOCK_SIZE: Final = 300_000
 #: Numbers that a block of epochs by channels squared holds.
@@ -113,7 +107,7 @@ def places_beyond_the_level(
     for first in range(0, len(rows), size):
         block = rows[first : first + size]
         part, noise = model.take(block), np.maximum(scale[block], 1.0)
-        bound = risk_off_tangent(
+        bound = kernels.off_tangent.risk_off_tangent(
             part.arrays,
             noise,
             likely,
@@ -137,59 +131,21 @@ def places_beyond_the_level(
 def _off_tangent_m(index: SearchIndex, arc_m: Floats) -> Floats:
     """Return a distance within which no part of the line lies off the tangent, at positions on it, shape (T,) [m].
 
-    Along and across, without the height. The same for all positions on a section; at most `_CLEAR_M`.
+    Along and across, without the height. The same for all positions on a section; at most `CLEAR_M`.
     """
     line = index.trajectory
     section = line.segment_at(arc_m)[0]
     new = np.unique(section[np.isnan(index.off_tangent_m[section])])
     if len(new):
         middle = line.ecef_m[new] + 0.5 * line.length_m[new, None] * line.tangent[new]
-        reach = _CLEAR_M + 0.5 * line.length_m[new] + line.length_m.max()
+        reach = CLEAR_M + 0.5 * line.length_m[new] + line.length_m.max()
         lists = index.tree.query_ball_point(middle, reach)
         count = np.fromiter(map(len, lists), dtype=np.intp, count=len(lists))
         vertex = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=int(count.sum()))
-        index.off_tangent_m[new] = clear_of_sections(
+        index.off_tangent_m[new] = kernels.off_tangent.clear_of_sections(
             line.ecef_m, line.tangent, line.across, line.length_m, new.astype(np.intp), count, vertex
         )
     return np.asarray(index.off_tangent_m[section])
-
-
-@compiled_by("off_tangent")
-def clear_of_sections(
-    ecef_m: Floats, tangent: Floats, across: Floats, length_m: Floats, section: Indices, count: Indices, vertex: Indices
-) -> Floats:
-    """Return a distance within which no part of a line lies off the tangents of its sections, shape (S,) [m].
-
-    Parameters
-    ----------
-    ecef_m, tangent, across, length_m : ndarray
-        Of the line: points (P, 3), the others of its sections.
-    section : ndarray of int, shape (S,)
-    count : ndarray of int, shape (S,)
-        Numbers of points around each of them.
-    vertex : ndarray of int, shape (sum of `count`,)
-        These points, section after section.
-    """
-    row = np.repeat(np.arange(len(section)), count)
-    other = (vertex < len(length_m)) & (vertex != section[row])
-    row, vertex = row[other], vertex[other]
-    length, own_tangent, own_across = length_m[section[row]], tangent[section[row]], across[section[row]]
-    along, distance, off = [], [], np.zeros(len(row), dtype=bool)
-    for end in (vertex, vertex + 1):
-        away = ecef_m[end] - ecef_m[section[row]]
-        ahead = np.einsum("pi,pi->p", away, own_tangent)
-        # Of all places on the section, the one abeam or nearest sees the end furthest off the tangent.
-        least = np.maximum(np.maximum(ahead - length, -ahead), 0.0)
-        beside = np.linalg.norm(away - ahead[:, None] * own_tangent, axis=1)
-        distance.append(np.hypot(least, np.einsum("pi,pi->p", away, own_across)))
-        off |= (least < _ALONG * np.hypot(least, beside)) & (beside > _ON_TANGENT_M)
-        along.append(ahead)
-    # A section that passes by has ends in both directions, and a middle off the tangent.
-    passing = np.minimum(np.maximum(*along), length) - np.maximum(np.minimum(*along), 0.0) > _ON_TANGENT_M
-    near = np.where(off | passing, np.minimum(*distance) - length_m[vertex], _CLEAR_M)
-    clear = np.full(len(section), _CLEAR_M)
-    np.minimum.at(clear, row, near)
-    return np.asarray(np.maximum(clear, 0.0))
 
 
 def _risk_of_block(
@@ -272,7 +228,7 @@ def _around(index: SearchIndex, arc_m: Floats, level_m: Floats, radius_m: Floats
     pair, piece = np.nonzero(np.diff(edges, axis=1) > 0)
     low, high = edges[pair, piece], edges[pair, piece + 1]
     ends = start[pair, None] + np.stack([low, high], axis=1)[..., None] * tangent[pair, None]
-    off = (np.abs(ends[..., 0]) < _ALONG * np.linalg.norm(ends, axis=2)).any(axis=1)
+    off = (np.abs(ends[..., 0]) < ALONG * np.linalg.norm(ends, axis=2)).any(axis=1)
     beyond = (piece != 1) & off
     turning = np.zeros(len(arc_m), dtype=bool)
     turning[epoch[pair[beyond]]] = True

@@ -18,9 +18,8 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Codes, Floats, Indices, Masks
 from railfix.integrity.raim.detection import Detection, RaimLimits, detect, threshold
 from railfix.integrity.raim.model import Compact, LinearModel, compact
+from railfix.kernels.layout import LEAST_REDUNDANCY
 
-#: Least redundancy number of a range whose error can be estimated.
-LEAST_REDUNDANCY: Final = 1e-9
 #: Share of a WSSE within which two are the same number.
 _ROUNDING: Final = 1e-9
 #: Numbers of a subset array that a block of epochs holds: about what a core's cache does.

@@ -23,8 +23,8 @@ from scipy.special import chdtri, chndtrinc, ndtri
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.integrity.raim.detection import RaimLimits
-from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
 from railfix.integrity.raim.model import LinearModel, compact
+from railfix.kernels.layout import LEAST_REDUNDANCY
 
 #: Effect on the position, in its own sigmas, below which a satellite has none.
 _NO_EFFECT: Final = 1e-6

@@ -8,7 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks, Strings
+from railfix import kernels
+from railfix.core.arrays import Bytes, Floats, Integers, Masks, Strings
 from railfix.gnss.observations import channels_with_data
 from railfix.io.rinex.fault_log import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, FaultLog
 from railfix.io.rinex.header import RinexHeader
@@ -16,7 +17,6 @@ from railfix.io.rinex.observations_epochs import Epochs
 from railfix.io.rinex.observations_fields import FIELD_WIDTH, Fields, gather, joined, read_fields
 from railfix.io.rinex.observations_lines import Lines
 from railfix.io.rinex.observations_signals import KINDS, SYSTEMS, Column
-from railfix.kernels import compiled_by
 
 _BLANK: Final = ord(" ")
 _ZERO: Final = ord("0")
@@ -231,7 +231,7 @@ def _scatter(parts: list[tuple[str, Rows, Fields, tuple[Column, ...]]], epochs: 
     for base, rows, fields, columns, names in placed:
         cell = rows.epoch * shape[1] + base
         kind, signal = np.array([c.kind for c in columns]), np.array([names.index(c.signal) for c in columns])
-        placed_fields(kinds, lock, cell, kind, signal, fields.value, fields.lock)
+        kernels.reading.placed_fields(kinds, lock, cell, kind, signal, fields.value, fields.lock)
     used = channels_with_data(kinds, lock)
     keep = np.flatnonzero(used) if not used.all() else slice(None)
     code, phase, doppler, cn0 = kinds[:, :, keep]
@@ -241,29 +241,3 @@ def _scatter(parts: list[tuple[str, Rows, Fields, tuple[Column, ...]]], epochs: 
         kinds=(code, phase, doppler, cn0),
         lock=lock[:, keep],
     )
-
-
-@compiled_by("reading")
-def placed_fields(
-    kinds: Floats, lock: Bytes, cell: Integers, kind: Indices, signal: Indices, value: Floats, digit: Bytes
-) -> tuple[Floats, Bytes]:
-    """Put fields in their places of the dense arrays, which are filled in place and returned; zeros are absent.
-
-    Parameters
-    ----------
-    kinds, lock : ndarray, shape (4, T, M), and of uint8, (T, M)
-        By kind of observable.
-    cell : ndarray of int, shape (n,)
-        Epoch times M plus the first channel of the satellite, of each line.
-    kind, signal : ndarray of int, shape (k,)
-        Of each field: its kind of observable, and its channel among those of the satellite.
-    value, digit : ndarray, shape (n, k)
-        Values, and loss-of-lock digits.
-    """
-    flat, flat_lock = kinds.reshape(len(kinds), -1), lock.reshape(-1)
-    for j in range(len(kind)):
-        at = cell + signal[j]
-        flat[kind[j], at] = np.where(value[:, j] == 0.0, np.nan, value[:, j])
-        if KINDS[kind[j]] == "L":
-            flat_lock[at] = digit[:, j]
-    return kinds, lock

@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
+from railfix import kernels
 from railfix.core.arrays import Bytes, Integers, Masks
-from railfix.kernels import compiled_by
 
 _BLANK: Final = ord(" ")
 _ZERO: Final = ord("0")
@@ -65,7 +65,7 @@ def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
     Empty lines are kept for RINEX 2, where they are satellites without observations.
     """
     data = np.frombuffer(text, dtype=np.uint8)
-    end = line_ends(data)
+    end = kernels.reading.line_ends(data)
     start = np.concatenate([np.zeros(min(len(end), 1), dtype=np.int64), end[:-1] + 1])
     length = end - start
     length -= (length > 0) & (data[end - 1] == ord("\r"))
@@ -75,12 +75,6 @@ def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
         return lines
     kept = length > 0
     return Lines(data, start[kept], length[kept], end[kept] + 1, number[kept])
-
-
-@compiled_by("reading")
-def line_ends(data: Bytes) -> Integers:
-    """Return the places of the line feeds in a text."""
-    return np.flatnonzero(data == ord("\n"))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,6 @@
-"""How far, and how surely, the position moves without some satellites, those of a shared fault, or the map.
+"""The level's hypotheses in numpy, all sets of channels side by side: what the compiled loop is held against.
+
+How far, and how surely, the position moves without some satellites, those of a shared fault, or the map.
 
 With the whitened model of `raim` (residuals ``nu``, their projector S, gains g of the along-track
 position x) leaving out the channels J moves the position by ``x_J - x = -g_J^T S_JJ^-1 nu_J``, with
@@ -12,17 +14,23 @@ with a the response of the position to one sigma across and up, is therefore tak
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
-from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
-from railfix.integrity.raim.model import LinearModel, compact, regular_inverse
+from railfix.integrity.protection.level import Asked, Errors
+from railfix.integrity.protection.off_tangent import one_after_the_other
+from railfix.integrity.raim.model import LinearModel, ModelArrays, compact, regular_inverse
+from railfix.kernels.layout import LEAST_REDUNDANCY
 
 #: Effect on the position, in its own sigmas, below which a satellite has none.
 NO_EFFECT: Final = 1e-6
+#: Separations below this share of sigma are none.
+_SAME: Final = 1e-9
 
 
 @dataclass(frozen=True)
@@ -219,35 +227,6 @@ def without_group(full: AllInView, members: Masks | None) -> Remaining:
     return Remaining(full, columns - rows[..., :n].swapaxes(1, 2) @ scaled, gone, blind)
 
 
-def one_after_the_other(columns: Floats, members: Masks) -> tuple[Floats, Floats, Masks]:
-    """Leave out a group of channels, each from what those before it leave.
-
-    Parameters
-    ----------
-    columns : ndarray, shape (T, n, n + c)
-        Projector of the residuals, and beside it what changes alike.
-    members : ndarray of bool, shape (T, n)
-
-    Returns
-    -------
-    rows, scaled : ndarray, shape (T, m, n + c)
-        Row of each member, and that over its part of the projector; 0 where nothing checks it. Without the group the
-        columns are less by ``rows[..., :n]^T scaled``.
-    checked : ndarray of bool, shape (T, m)
-    """
-    at = np.arange(len(columns))
-    place = np.argsort(~members, axis=1, kind="stable")[:, : int(np.count_nonzero(members, axis=1).max(initial=0))]
-    rows = columns[at[:, None], place] * members[at[:, None], place][..., None]
-    scaled, checked = np.empty_like(rows), np.empty(place.shape, dtype=bool)
-    for k in range(place.shape[1]):
-        row, later = rows[:, k], rows[:, k + 1 :]
-        share = row[at, place[:, k]]
-        checked[:, k] = share > LEAST_REDUNDANCY
-        scaled[:, k] = row / np.where(checked[:, k], share, np.inf)[:, None]
-        later -= np.take_along_axis(later, place[:, None, k, None], axis=2) * scaled[:, k, None]
-    return rows, scaled, checked
-
-
 def without_map(full: AllInView, model: LinearModel, seen_m: Floats, information: Floats) -> WithoutMap:
     """The map left out.
 
@@ -319,3 +298,51 @@ def _separations(full: AllInView, gone: Floats, left: Floats | None, blind: Mask
     if blind.any():
         sigma[blind], separation[blind], moved[blind], bias[blind] = np.inf, 0.0, 0.0, 0.0
     return Separations(sigma_m=sigma, separation_sigma_m=separation, moved_m=moved, bias_m=bias)
+
+
+def tails_of_hypotheses(
+    model: ModelArrays, errors: Errors, asked: Asked
+) -> tuple[Indices, Floats, Floats, Floats, Floats]:
+    """Return the tails of all hypotheses of a block of epochs.
+
+    Returns
+    -------
+    channel : ndarray of int, shape (T, n)
+        Channels in use, side by side.
+    offset_m, sigma_m, weight : ndarray, shape (T, K)
+        As `tails.solve_level` takes them: threshold and bias, sigma (infinite where nothing bounds a fault), prior.
+    separation : ndarray, shape (T,)
+        `ProtectionLevel.separation`.
+    """
+    epochs = len(errors.scale)
+    whole = LinearModel.on_line(model)
+    full = all_in_view(whole, errors.scale, errors.least_sigma_m, errors.bias_m, errors.map_bias_m)
+    n = full.channel.shape[1]
+    prior = np.take_along_axis(asked.prior, full.channel, axis=1) * full.used
+    offset, sigma, weight = (np.zeros((epochs, int(asked.bounds[-1]))) for _ in range(3))
+    separation = np.zeros(epochs)
+    free = without_map(full, whole, errors.map_seen_m, errors.map_information) if asked.wrong_map.any() else None
+    for b, first in enumerate(asked.first.tolist()):
+        if first[0] < 0:
+            continue
+        members = np.take_along_axis(asked.members[:, b], full.channel, axis=1) & full.used
+        apart = free if free is not None and asked.wrong_map[b] else None
+        rest = without_group(full if apart is None else apart.of_ranges, members if members.any() else None)
+        others = prior * ~members
+        for k, start in enumerate(first):
+            if start < 0:
+                continue
+            sets = np.array(list(combinations(range(n), k)), dtype=np.intp).reshape(math.comb(n, k), k).T
+            got = rest.without(sets) if apart is None else apart.apart(rest.without(sets))
+            here = slice(start, start + sets.shape[1])
+            # Noise passes on either side.
+            of_group = asked.shared_prior[:, b] * (asked.order[:, b] >= k) * (2.0 if start == 0 else 1.0)
+            weight[:, here] = of_group[:, None] * others[:, sets].prod(axis=1)
+            threshold = asked.k_false_alarm[:, None] * got.separation_sigma_m
+            likely = weight[:, here] > 0.0
+            offset[:, here] = np.where(likely, threshold + got.bias_m, 0.0)
+            sigma[:, here] = np.where(likely, got.sigma_m, 1.0)
+            moving = likely & (got.separation_sigma_m > _SAME * sigma[:, :1])
+            ratio = np.abs(got.moved_m) / np.where(moving, threshold, np.inf)
+            separation = np.maximum(separation, ratio.max(axis=1, initial=0.0))
+    return full.channel, offset, sigma, weight, separation
