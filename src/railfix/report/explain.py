@@ -1,0 +1,318 @@
+"""One epoch of a run explained: its place, each satellite and its fate, what set sigma and level, what would change it.
+
+Everything is read from the tables of the run. What the position would be without a satellite is computed from them:
+weighted least squares of the residuals in the place along, across and above the line, the map's error as a prior, and
+one free clock a constellation, linear around the position (P1 2.2(3)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import polars as pl
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from railfix.core.arrays import Floats, Strings
+from railfix.core.constants import CLOCK_GROUP
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.files import write_whole
+from railfix.core.geodesy import enu_axes
+from railfix.evaluate.run_folder import RunFolder, read_run
+from railfix.run.folder import reading_table
+from railfix.track import read_track
+
+#: What the status of a single epoch says.
+SINGLE_STATUS: Final[Mapping[str, str]] = {
+    "ok": "passed every check",
+    "ambiguous": "another place on the line fits the ranges as well",
+    "off_map": "at an end of the map, or too far from the position without the map",
+    "too_few_satellites": "no position: too few usable satellites",
+    "unobservable": "no position: the satellites do not determine the place along the line",
+    "no_convergence": "no position: the iteration did not converge",
+    "no_observation": "no position: the antenna has no observation",
+    "inconsistent": "the ranges contradict each other, and no exclusion mends it",
+    "antennas_disagree": "the positions of the two antennas are not as far apart as the antennas are",
+    "uncertain": "its standard deviation is over the limit",
+    "map_offset": "positions of the last minutes lie beside the line: the map is wrong here, or it is another track",
+}
+#: What the status of the filter says.
+FILTER_STATUS: Final[Mapping[str, str]] = {
+    "tracking": "one place, from measurements of this epoch",
+    "several_branches": "several places are possible; the most probable one is given",
+    "coasting": "predicted: no measurement of this epoch is believed",
+    "lost": "measurements contradict the track: places are sought again",
+    "expired": "no place: predicted too far",
+    "not_started": "no place yet: no epoch so far had redundant codes",
+    "off_map": "no place: the satellites have put the train away from the line for some time",
+    "map_offset": "positions of the last minutes lie beside the line: the map is wrong here, or it is another track",
+    "antennas_disagree": "not as far from the other antenna's place as the antennas are apart",
+    "doubtful": "measurements contradict the place, or what bounds it: nothing bounds its error",
+}
+#: Columns of `Explanation.satellites` that are computed here.
+WITHOUT: Final = ("without_shift_m", "without_sigma_m")
+_COLUMNS: Final = (
+    "satellite", "signal", "elevation_deg", "azimuth_deg", "cn0_dbhz", "sigma_m", "residual_m", "reason_text",
+    "weight_code", "innovation_code_m", "innovation_doppler_mps",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explanation:
+    """One epoch of one antenna.
+
+    Attributes
+    ----------
+    run : Path
+    antenna : str
+    time : numpy.datetime64
+        GPS time of the epoch.
+    asked : str
+        The time that was asked for.
+    single, track : mapping
+        Rows of ``positions`` and ``train``; `track` is empty where the filter was off.
+    satellites : polars.DataFrame
+        Every observation, those used first, with its elevation, residual and fate, the weight and innovation that the
+        filter gave it, and for those used how far the single position would move along the line without it, and its
+        standard deviation then [m]; null where it would have none.
+    sentences : tuple of str
+        Where, how sure, and what set sigma, level and status.
+    """
+
+    run: Path
+    antenna: str
+    time: np.datetime64
+    asked: str
+    single: Mapping[str, Any]
+    track: Mapping[str, Any]
+    satellites: pl.DataFrame
+    sentences: tuple[str, ...]
+
+
+def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanation:
+    """Explain the epoch of a run nearest to a time.
+
+    Parameters
+    ----------
+    run : Path
+        Folder that `railfix run --observations` wrote.
+    at : str
+        GPS time as ``hh:mm:ss``, of the first day of the run on which it has epochs, or ``yyyy-mm-dd hh:mm:ss``.
+    antenna : str, optional
+        The first of the run unless given.
+
+    Raises
+    ------
+    InputFileError
+        The folder lacks a table.
+    SettingsError
+        `at` is no time, or `antenna` none of the run's.
+    MismatchError
+        The run has no epoch within a minute of the time.
+    """
+    folder = read_run(run)
+    if not (run / "observations.parquet").is_file():
+        raise InputFileError(run / "observations.parquet", "there is no such file; repeat the run with --observations")
+    if antenna is not None and antenna not in folder.antennas:
+        raise SettingsError(f"antenna is {antenna!r}, the run has {' and '.join(folder.antennas)}")
+    antenna = antenna or folder.antennas[0]
+    rows = folder.positions.filter(antenna=antenna)
+    row = _nearest(rows["time_gpst"].to_numpy().astype("datetime64[ns]"), at)
+    single = rows.row(row, named=True)
+    here = (pl.col("time_gpst") == single["time_gpst"]) & (pl.col("antenna") == antenna)
+    with reading_table(run / "observations.parquet"):
+        seen = pl.scan_parquet(run / "observations.parquet").filter(here).collect()
+    track: Mapping[str, Any] = {}
+    if (run / "train.parquet").is_file():
+        with reading_table(run / "train.parquet"):
+            of_filter = pl.scan_parquet(run / "train.parquet").filter(here).collect()
+        track = of_filter.row(0, named=True) if len(of_filter) else {}
+    satellites = seen.select(name for name in _COLUMNS if name in seen.columns)
+    shift, sigma = np.full((2, len(satellites)), np.nan)
+    if single["x_m"] is not None and len(satellites):
+        shift, sigma = _without_each(satellites, single, _axes(folder, single), _map_sigma_m(folder))
+    satellites = satellites.with_columns(
+        pl.Series(name, values).fill_nan(None) for name, values in zip(WITHOUT, (shift, sigma), strict=True)
+    ).sort(pl.col("reason_text") != "used", "reason_text", -pl.col("elevation_deg"), nulls_last=True)
+    return Explanation(
+        run=run, antenna=antenna, time=rows["time_gpst"].to_numpy().astype("datetime64[ns]")[row], asked=at,
+        single=single, track=track, satellites=satellites, sentences=tuple(_sentences(single, track, satellites)),
+    )  # fmt: skip
+
+
+def _nearest(times: Any, at: str) -> int:
+    """Return the row whose time is the nearest to what was asked for."""
+    text = at.strip().replace("T", " ")
+    days = np.unique(times.astype("datetime64[D]")) if ":" in text and "-" not in text else [None]
+    try:
+        asked = [np.datetime64(text.replace(" ", "T") if day is None else f"{day}T{text}", "ns") for day in days]
+    except ValueError:
+        raise SettingsError(f"time is {at!r}, expected hh:mm:ss or 'yyyy-mm-dd hh:mm:ss' in GPS time") from None
+    rows = [int(np.argmin(np.abs(times - one))) for one in asked]
+    away = [abs(times[row] - one) / np.timedelta64(1, "s") for row, one in zip(rows, asked, strict=True)]
+    best = int(np.argmin(away))
+    if not away[best] <= 60.0:
+        first, last = (str(time)[:19].replace("T", " ") for time in (times[0], times[-1]))
+        raise MismatchError(f"the run has no epoch within a minute of {at}; it goes from {first} to {last} GPS time")
+    return rows[best]
+
+
+def _axes(folder: RunFolder, single: Mapping[str, Any]) -> Floats:
+    """Return the unit vectors along, across and above the line at the position, in ECEF, from the nearest section."""
+    ecef_m = read_track(folder.tracks).ecef_m
+    place = np.array([single[name] for name in ("x_m", "y_m", "z_m")])
+    sections = np.diff(ecef_m, axis=0)
+    length = np.linalg.norm(sections, axis=1, keepdims=True)
+    tangent = sections / np.where(length > 0, length, np.nan)
+    away = place - ecef_m[:-1]
+    along = np.clip(np.einsum("si,si->s", away, tangent)[:, None], 0.0, length)
+    distance = np.linalg.norm(away - along * tangent, axis=1)
+    along_line = tangent[np.nanargmin(distance)]
+    vertical = enu_axes(single["latitude_deg"], single["longitude_deg"])[2]
+    across = np.cross(along_line, vertical)
+    across /= np.linalg.norm(across)
+    return np.stack([along_line, across, np.cross(across, along_line)])
+
+
+def _map_sigma_m(folder: RunFolder) -> tuple[float, float]:
+    """Return the standard deviations of the map across and above the line."""
+    settings, facts = folder.record.get("settings_used") or {}, folder.track_facts
+    return tuple(  # type: ignore[return-value]
+        float(settings.get(f"map_{name}_sigma_m") or facts[f"sigma_{name}_m"]) for name in ("plan", "height")
+    )
+
+
+def _without_each(
+    satellites: pl.DataFrame, single: Mapping[str, Any], axes: Floats, map_sigma_m: tuple[float, float]
+) -> tuple[Floats, Floats]:
+    """Return how far the position moves along the line without each used satellite, and its sigma then."""
+    used = (satellites["reason_text"] == "used").to_numpy() & satellites["residual_m"].is_not_null().to_numpy()
+    elevation, azimuth = (np.radians(satellites[name].to_numpy()) for name in ("elevation_deg", "azimuth_deg"))
+    local = np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], 1)
+    design = -local @ enu_axes(single["latitude_deg"], single["longitude_deg"]) @ axes.T
+    scale = single["noise_scale"] or 1.0
+    sigma, residual = satellites["sigma_m"].to_numpy() * scale, satellites["residual_m"].to_numpy()
+    clocks: Strings = np.array([CLOCK_GROUP[name[0]] for name in satellites["satellite"]])
+    whole = _solved(design[used], sigma[used], residual[used], clocks[used], map_sigma_m)
+    shift, after = np.full((2, len(satellites)), np.nan)
+    for row in np.flatnonzero(used):
+        rest = used & (np.arange(len(used)) != row)
+        moved = _solved(design[rest], sigma[rest], residual[rest], clocks[rest], map_sigma_m)
+        if moved is not None and whole is not None:
+            shift[row], after[row] = moved[0] - whole[0], moved[1]
+    return shift, after
+
+
+def _solved(
+    design: Floats, sigma_m: Floats, residual_m: Floats, clocks: Strings, map_sigma_m: tuple[float, float]
+) -> tuple[float, float] | None:
+    """Return step along the line and its sigma; None where the ranges do not determine it."""
+    groups = np.unique(clocks)
+    if len(residual_m) < len(groups) + 1:
+        return None
+    matrix = np.concatenate([design, (clocks[:, None] == groups).astype(np.float64)], axis=1) / sigma_m[:, None]
+    normal = matrix.T @ matrix
+    normal[[1, 2], [1, 2]] += np.array(map_sigma_m) ** -2.0
+    if np.linalg.cond(normal) > 1e14:
+        return None
+    covariance = np.linalg.inv(normal)
+    return float(covariance[0] @ matrix.T @ (residual_m / sigma_m)), float(np.sqrt(covariance[0, 0]))
+
+
+def _sentences(single: Mapping[str, Any], track: Mapping[str, Any], satellites: pl.DataFrame) -> list[str]:
+    """Say where, how sure, and what set sigma, level and status."""
+    lines = []
+    if track:
+        text = f"filter: {_place(track)}; {track['status']}: {FILTER_STATUS.get(track['status'], 'see the reference')}"
+        lines.append(f"{text}; from {track['sources'] or 'the prediction alone'}")
+        if track["hypotheses"]:
+            count = track["hypotheses"]
+            places = "one place is possible" if count == 1 else f"{count} places are possible"
+            lines.append(f"filter: {places}, this one with a probability of {track['branch_probability']:.3f}")
+        lines.append(f"filter's level: {_level_of_filter(track)}")
+    status = single["status"]
+    lines.append(f"single epoch: {_place(single)}; {status}: {SINGLE_STATUS.get(status, 'see the reference')}")
+    if single["along_sigma_m"] is not None and single["noise_scale"] is not None:
+        own, whole = single["own_sigma_m"], single["along_sigma_m"]
+        lines.append(
+            f"sigma: {own:.2f} m from the codes of the epoch alone, whose noise is {single['noise_scale']:.2f} of that "
+            f"of the weights so far; {whole:.2f} m with satellites, atmosphere, the map and other places"
+        )
+    if "protection_level_m" in single:
+        lines.append(f"single epoch's level: {_level_of_single(single)}")
+    if single.get("raim_outcome"):
+        text = f"RAIM: {single['raim_outcome']}"
+        if single["raim_statistic"] is not None:
+            text += f", statistic {single['raim_statistic']:.1f} against a threshold of {single['raim_threshold']:.1f}"
+        lines.append(text)
+    fates = satellites.group_by("reason_text").len().sort("len", "reason_text", descending=[True, False])
+    lines.append("satellites: " + ", ".join(f"{count} {fate}" for fate, count in fates.iter_rows()))
+    weighty = satellites.filter(pl.col(WITHOUT[0]).is_not_null()).sort(pl.col(WITHOUT[0]).abs(), descending=True)
+    if len(weighty):
+        name, shift, sigma = (weighty[column][0] for column in ("satellite", *WITHOUT))
+        lines.append(f"most weight: without {name} the single position moves by {shift:+.2f} m, sigma {sigma:.2f} m")
+    return lines
+
+
+def _place(row: Mapping[str, Any]) -> str:
+    if row["chainage_m"] is None:
+        return "no place"
+    return f"chainage {row['chainage_m']:.2f} m, standard deviation {row['along_sigma_m']:.2f} m"
+
+
+def _level_of_filter(track: Mapping[str, Any]) -> str:
+    level, noise, apart = (track[f"protection_{name}_m"] for name in ("level", "noise", "separation"))
+    if noise is None:
+        return "none"
+    parts = f"noise alone asks for {noise:.1f} m"
+    if apart is not None:
+        parts += f", the sub-filters without one source each lie up to {apart:.1f} m away"
+    if level is None or not np.isfinite(level):
+        ground = track["protection_level_ground_m"]
+        held = "" if ground is None or not np.isfinite(ground) else f"; on the ground {ground:.1f} m"
+        return f"none along the line{held} ({parts})"
+    return f"{level:.1f} m: {parts}"
+
+
+def _level_of_single(single: Mapping[str, Any]) -> str:
+    level, cause = single["protection_level_m"], single["protection_cause"]
+    if level is None or not np.isfinite(level):
+        return f"none ({cause or 'a fault is left'})"
+    parts = ", ".join(
+        f"{name.replace('_', ' ')} {single[f'protection_{name}_m']:.1f} m"
+        for name in ("fault_free", "one_fault", "two_faults")
+        if single[f"protection_{name}_m"] is not None
+    )
+    return f"{level:.1f} m, set by {cause.replace('_', ' ')} (by themselves: {parts})"
+
+
+def write_explanation(explanation: Explanation, path: Path) -> Path:
+    """Write an explanation as one HTML page with the sky of the epoch; return its path.
+
+    Raises
+    ------
+    OutputError
+        The page cannot be written.
+    """
+    environment = Environment(
+        loader=PackageLoader("railfix.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True,
+    )  # fmt: skip
+    sky = []
+    for row in explanation.satellites.drop_nulls(("elevation_deg", "azimuth_deg")).iter_rows(named=True):
+        radius, azimuth = max(90.0 - row["elevation_deg"], 0.0), np.radians(row["azimuth_deg"])
+        sky.append({"x": radius * np.sin(azimuth), "y": -radius * np.cos(azimuth), **row})
+    page = environment.get_template("explain.html.j2").render(
+        title=f"{explanation.antenna} antenna, {time_text(explanation.time)} GPS time",
+        explanation=explanation, sky=sky, rows=explanation.satellites.to_dicts(),
+    )  # fmt: skip
+    write_whole(path, page, what="page")
+    return path
+
+
+def time_text(time: np.datetime64) -> str:
+    """Return a time to milliseconds, as people write it."""
+    return str(time)[:23].replace("T", " ")
