@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import railfix
+import ubx_made
 from pipeline_cases import demo_observations
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.errors import InputFileError, MismatchError
@@ -462,3 +463,50 @@ def test_messages_without_measurements_are_counted(satellites: int, what: str) -
     piece, _ = decode(message, StreamState(time=np.datetime64("2025-08-11", "ns")), at_end=True)
     assert piece.measurements.skipped == {what: 1}
     assert len(piece.measurements.code_m) == 0
+
+
+@pytest.mark.parametrize("first", ["raw", "msm"])
+def test_one_kind_of_observations_is_taken_however_the_stream_is_cut(first: str) -> None:
+    """The receiver's own epochs with MSM of the same instants between; the kind that is dated first is taken whole."""
+    log = demo_observations()["front"][:12]
+    week, second = np.datetime64("2024-03-03", "ns"), np.timedelta64(10**9, "ns")
+    tow_ms = np.rint((log.time - week) / second * 1000).astype(np.int64)
+    own = [ubx_made.rawx(log, epoch) for epoch in range(len(log))]
+    msm = [msm4(1074, int(tow)) for tow in tow_ms]
+    pairs = zip(own, msm, strict=True) if first == "raw" else zip(msm, own, strict=True)
+    data = b"".join(part for pair in pairs for part in pair)
+    state = StreamState(time=np.datetime64("2024-03-05", "ns"))
+    alone, _ = in_fragments(b"".join(own if first == "raw" else msm), [], state)
+    for seed in range(8):
+        cuts = sorted(np.random.default_rng(seed).integers(1, len(data), 4 * seed).tolist())
+        mixed, _ = in_fragments(data, cuts, state)
+        assert channels(mixed) == channels(alone)
+        assert np.array_equal(mixed.time, alone.time)
+        assert np.array_equal(mixed.code_m, alone.code_m, equal_nan=True)
+        [count] = [n for what, n in mixed.skipped.items() if "which is taken" in what]
+        assert count == 12
+    if first == "raw":  # without a date those before the first epoch of the receiver have none
+        undated, _ = in_fragments(b"".join(msm[:3]) + data, [])
+        assert channels(undated) == channels(alone)
+
+
+def test_a_flipped_bit_of_a_subframe_is_found_by_its_parity(recordings: Path) -> None:
+    """One bit of every GPS subframe, data or parity, the checksum of the message put right again."""
+    data = bytearray(gzip.decompress((recordings / "live" / COLD_START).read_bytes())[:1_500_000])
+    frames = find_frames(np.frombuffer(data, np.uint8))
+    _, true = in_fragments(bytes(data), [])
+    rng, flipped = np.random.default_rng(4), 0
+    for row in frames.of("ubx", 0x0213).tolist():
+        start, end = int(frames.start[row]), int(frames.end[row])
+        if data[start] or data[start + 2]:  # GPS, L1 C/A
+            continue
+        bit = int(rng.integers(0, 30))
+        data[start + 8 + 4 * int(rng.integers(0, 10)) + bit // 8] ^= 1 << bit % 8
+        payload = bytes(data[start:end])
+        data[int(frames.frame_start[row]) : end + 2] = ubx_made.frame(0x0213, payload)
+        flipped += 1
+    piece, _ = decode(bytes(data), StreamState(), at_end=True)
+    assert flipped > 200
+    assert piece.ephemerides.skipped["G subframes with wrong parity"] == flipped
+    assert not [record for record in piece.ephemerides.records if record.satellite.startswith("G")]
+    assert [record for record in true if "'G" in str(record)], "there were some to lose"

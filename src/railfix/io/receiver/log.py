@@ -18,10 +18,14 @@ from railfix.gnss.observations import Observations
 from railfix.io.receiver import rtcm, sbf, ubx
 from railfix.io.receiver.ephemerides import Assembled, Unfinished, assembled, assembled_rtcm, merged, navigation_of
 from railfix.io.receiver.framing import Frames, find_frames
-from railfix.io.receiver.measurements import Measurements, Tracking, joined, observations_of
+from railfix.io.receiver.measurements import Measurements, Tracking, observations_of
 from railfix.io.receiver.subframes import SbasFrames, joined_subframes, sbas_frames
 
 _BLOCK_BYTES: Final = 1 << 22
+#: Kinds of messages with observations.
+_RAWX: Final = "UBX RXM-RAWX"
+_MEAS_EPOCH: Final = "SBF MeasEpoch"
+_MSM: Final = "RTCM 3 MSM"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +45,8 @@ class StreamState:
     """What the bytes so far left: the start of a frame, unfinished ephemerides, the last known time.
 
     `glonass_channels` are the frequency channels by satellite number that 1020 messages gave; `observed`: whether there
-    was an epoch of the receiver's own format; `clock`: the last time that it gave, of an epoch or another message.
+    was an epoch of the receiver's own format; `kind`: the messages that the observations are taken from; `clock`: the
+    last time that it gave, of an epoch or another message.
     """
 
     rest: bytes = b""
@@ -50,6 +55,7 @@ class StreamState:
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     glonass_channels: Mapping[int, int] = field(default_factory=dict)
     observed: bool = False
+    kind: str = ""
     clock: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
 
 
@@ -65,16 +71,21 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
         unfinished = rtcm.unfinished_epoch(frames)
         if unfinished is not None:  # the rest of its messages is still to come: kept for the next block
             frames = replace(find_frames(buffer[:unfinished]), data=buffer)
-    raw = _raw_measurements(frames)
-    time = raw.time[0] if np.isnat(state.time) and len(raw.time) else state.time
     channels = rtcm.glonass_channels(frames, state.glonass_channels)
-    msm, msm_places = rtcm.msm_measurements(frames, time, channels)
-    parts = [part for part in (raw, msm) if len(part.time) or part.skipped]
-    measurements = joined(parts) if parts else raw
-    measurements = replace(measurements, skipped={**measurements.skipped, **_of_old_kinds(frames)})
-    dated = _dated(frames, raw, observed=state.observed)
+    msm, msm_places = rtcm.msm_measurements(frames, state.time, channels)
+    own = {_RAWX: ubx.rawx_measurements(frames)}
+    if len(_places(frames, _MEAS_EPOCH)):
+        own[_MEAS_EPOCH] = sbf.meas_epoch_measurements(frames)
+    kind = state.kind or _first_kind(frames, own, msm_places)
+    native = kind if kind in own else max(own, key=lambda name: len(own[name].time))
+    raw = own[native]
+    taken = {**own, _MSM: msm, "": own[_RAWX]}
+    measurements = taken[kind] if kind in taken else ubx.rawx_measurements(find_frames(buffer[:0]))
+    unused = _of_other_kinds(frames, kind) if kind else {**raw.skipped, **msm.skipped}
+    measurements = replace(measurements, skipped={**measurements.skipped, **unused, **_of_old_kinds(frames)})
+    dated = _dated(frames, raw, _places(frames, native), observed=state.observed)
     records, sbas, subframes, messages = _navigation(frames, dated, _Dated(msm_places, msm.time), state)
-    last = measurements.time[-1] if len(measurements.time) else time
+    last = measurements.time[-1] if len(measurements.time) else state.time
     piece = Piece(
         measurements=measurements,
         ephemerides=records,
@@ -91,6 +102,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
         time=last,
         glonass_channels=channels.latest(),
         observed=state.observed or len(raw.time) > 0,
+        kind=kind,
         clock=dated.times[-1] if len(dated.times) else state.clock,
     )
     return piece, after
@@ -103,13 +115,31 @@ def _of_old_kinds(frames: Frames) -> dict[str, int]:
     return {what: number for what, number in counts.items() if number}
 
 
-def _raw_measurements(frames: Frames) -> Measurements:
-    """Measurements of the receiver's own format: RXM-RAWX, or MeasEpoch where there is none of these."""
-    return (
-        ubx.rawx_measurements(frames)
-        if not len(frames.of("sbf", sbf.MEAS_EPOCH))
-        else sbf.meas_epoch_measurements(frames)
-    )
+def _places(frames: Frames, kind: str) -> Integers:
+    """Where the messages of one kind with observations begin in the stream."""
+    chosen = {
+        _RAWX: frames.of("ubx", ubx.RXM_RAWX),
+        _MEAS_EPOCH: frames.of("sbf", sbf.MEAS_EPOCH),
+        _MSM: frames.of("rtcm3", *rtcm.MSM_NUMBERS),
+    }[kind]
+    return frames.frame_start[chosen]
+
+
+def _first_kind(frames: Frames, own: Mapping[str, Measurements], msm_places: Integers) -> str:
+    """Return the kind of the first epoch that has a date, empty without any: a receiver sends its ranges once.
+
+    Two kinds of one instant would be one epoch or two by how the stream is cut.
+    """
+    begins = {kind: _places(frames, kind)[-len(part.time)] for kind, part in own.items() if len(part.time)}
+    if len(msm_places):
+        begins[_MSM] = msm_places[0]
+    return min(begins, key=lambda kind: int(begins[kind]), default="")
+
+
+def _of_other_kinds(frames: Frames, kind: str) -> dict[str, int]:
+    """Messages with observations of other kinds than the one taken, counted by kind."""
+    counts = {other: len(_places(frames, other)) for other in (_RAWX, _MEAS_EPOCH, _MSM) if other != kind}
+    return {f"{other} messages beside {kind}, which is taken": n for other, n in counts.items() if n}
 
 
 class _Dated(NamedTuple):
@@ -126,10 +156,8 @@ class _Dated(NamedTuple):
         return np.where(index < 0, before, self.times[np.maximum(index, 0)])
 
 
-def _dated(frames: Frames, raw: Measurements, *, observed: bool) -> _Dated:
-    """The receiver's epochs; before the first one, its other messages with a date."""
-    blocks = frames.of("ubx", ubx.RXM_RAWX)
-    epochs_at = frames.frame_start[blocks if len(blocks) else frames.of("sbf", sbf.MEAS_EPOCH)]
+def _dated(frames: Frames, raw: Measurements, epochs_at: Integers, *, observed: bool) -> _Dated:
+    """The receiver's epochs, of messages at places; before the first one, its other messages with a date."""
     epochs_at = epochs_at[len(epochs_at) - len(raw.time) :]
     if observed:
         return _Dated(epochs_at, raw.time)

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Integers, Strings
+from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, Strings
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week, nearest_week
 from railfix.io.receiver.framing import Frames
@@ -36,6 +36,9 @@ SIGNALS: Final[Mapping[int, Mapping[int, str]]] = {
     6: {0: "1C", 2: "2C"},
     7: {0: "5A"},
 }
+#: Data bits of a word of LNAV that its parity bits D25 to D30 sum, and which of these sum bit 29 of the word before.
+_LNAV_PARITY: Final = (0xEC7CD2, 0x763E69, 0xBB1F34, 0x5D8F9A, 0xAEC7CD, 0x2DEA27)
+_LNAV_WITH_D29: Final = (0, 2, 5)
 #: One measurement of RXM-RAWX.
 _MEASUREMENT: Final = np.dtype(
     [
@@ -171,7 +174,10 @@ def gathered(data: Bytes, start: np.ndarray, layout: np.dtype) -> np.ndarray:
 
 
 def sfrbx_subframes(frames: Frames) -> Subframes:
-    """Navigation subframes of all RXM-SFRBX messages, words as received (32 bits, right-aligned as u-blox has them)."""
+    """Navigation subframes of all RXM-SFRBX messages, words as received (32 bits, right-aligned as u-blox has them).
+
+    Those of GPS L1 C/A with a wrong parity are left out and counted: the checksum of the message is of its bytes alone.
+    """
     chosen = frames.of("ubx", RXM_SFRBX)
     length = frames.end[chosen] - frames.start[chosen]
     chosen, length = chosen[length >= 8], length[length >= 8]
@@ -185,14 +191,35 @@ def sfrbx_subframes(frames: Frames) -> Subframes:
         place = first[has] + 8 + 4 * k
         block = frames.data[place[:, None] + np.arange(4)] if len(place) else np.zeros((0, 4), np.uint8)
         words[has, k] = np.ascontiguousarray(block).view("<u4")[:, 0]
-    system = frames.data[first].astype(np.int64)
-    return Subframes(
+    system, signal = frames.data[first].astype(np.int64), frames.data[first + 2].astype(np.int64)
+    wrong = (system == 0) & (signal == 0) & ~has_lnav_parity(words)
+    subframes = Subframes(
         satellite=_NAMES[system, frames.data[first + 1]],
-        signal=frames.data[first + 2].astype(np.int64),
+        signal=signal,
         glonass_channel=frames.data[first + 3].astype(np.int64) - 7,
         words=words,
         order=frames.frame_start[chosen],
+        skipped={"G subframes with wrong parity": int(wrong.sum())} if wrong.any() else {},
     )
+    return subframes.take(np.flatnonzero(~wrong))
+
+
+def has_lnav_parity(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> Masks:
+    """Whether the parity of all ten words of LNAV subframes is right, shape (N,) (IS-GPS-200, table 20-XIV).
+
+    u-blox inverts a word whose predecessor ends in 1, data and parity, as if it ended in 0; the bit before that one is
+    then the exclusive or of the predecessor's last two.
+    """
+    data, parity = words >> np.uint32(6) & np.uint32(0xFFFFFF), words & np.uint32(63)
+    before = np.zeros_like(parity)
+    before[:, 1:] = (parity[:, :-1] >> np.uint32(1) ^ parity[:, :-1]) & np.uint32(1)
+    right = np.ones(words.shape, dtype=np.bool_)
+    for place, mask in enumerate(_LNAV_PARITY):
+        bits = np.unpackbits((data & np.uint32(mask)).astype(">u4").view(np.uint8).reshape(*words.shape, 4), axis=2)
+        odd = np.bitwise_xor.reduce(bits, axis=2).astype(np.uint32)
+        expected = odd ^ before if place in _LNAV_WITH_D29 else odd
+        right &= (parity >> np.uint32(5 - place) & np.uint32(1)) == expected
+    return np.asarray(right.all(axis=1))
 
 
 def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
