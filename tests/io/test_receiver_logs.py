@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import gzip
 import shutil
+import struct
 import subprocess
 import time as clock
 from collections.abc import Iterator
@@ -12,10 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import railfix
 import ubx_made
 from pipeline_cases import demo_observations
+from railfix.cli import app
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.gnss.observations import Observations, concatenate
@@ -510,3 +513,25 @@ def test_a_flipped_bit_of_a_subframe_is_found_by_its_parity(recordings: Path) ->
     assert piece.ephemerides.skipped["G subframes with wrong parity"] == flipped
     assert not [record for record in piece.ephemerides.records if record.satellite.startswith("G")]
     assert [record for record in true if "'G" in str(record)], "there were some to lose"
+
+
+def test_impossible_weeks_and_numbers_are_counted(tmp_path: Path) -> None:
+    """Under right checksums: week 65535, a code of 1e300, an infinite one, a negative one."""
+    log = demo_observations()["front"][:6]
+
+    def changed(epoch: int, place: int, kind: str, value: float) -> bytes:
+        payload = bytearray(ubx_made.rawx(log, epoch)[6:-2])
+        payload[place : place + struct.calcsize(kind)] = struct.pack(kind, value)
+        return ubx_made.frame(0x0215, bytes(payload))
+
+    parts = [ubx_made.rawx(log, 0), changed(1, 8, "<H", 65535), changed(2, 16, "<d", 1e300)]
+    parts += [changed(3, 16, "<d", np.inf), changed(4, 16, "<d", -5.0), ubx_made.rawx(log, 5)]
+    (tmp_path / "bad.ubx").write_bytes(b"".join(parts))
+    read = railfix.read_observations(tmp_path / "bad.ubx")
+    assert read.time.tolist() == np.delete(log.time, 1).tolist()
+    assert read.skipped == {"RXM-RAWX without time": 1, "RXM-RAWX measurements with impossible numbers": 2}
+    assert np.isnan(read.code_m[:, 0]).tolist() == [False, True, True, True, False]
+    done = CliRunner().invoke(app, ["convert", str(tmp_path / "bad.ubx"), "--out", str(tmp_path / "bad.obs")])
+    assert done.exit_code == 0, done.output
+    assert "1 RXM-RAWX without time" in done.output
+    assert np.nanmax(railfix.read_observations(tmp_path / "bad.obs").code_m) < 1e8

@@ -83,6 +83,7 @@ def test_logs_that_begin_apart(epochs: dict[str, Observations], tmp_path: Path) 
     assert "no_input" not in said
 
 
+@pytest.mark.slow
 def test_logs_of_different_rates(
     epochs: dict[str, Observations], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -47,7 +47,7 @@ def test_errors_of_the_filter_on_a_recording(recordings: Path, name: str) -> Non
 @pytest.mark.parametrize(
     ("azimuth_deg", "end"),
     [
-        (0.0, "04:00"),
+        (0.0, "02:30"),
         pytest.param(0.0, "12:00", marks=pytest.mark.slow),
         pytest.param(90.0, "12:00", marks=pytest.mark.slow),
     ],

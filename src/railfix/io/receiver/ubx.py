@@ -39,6 +39,10 @@ SIGNALS: Final[Mapping[int, Mapping[int, str]]] = {
 #: Data bits of a word of LNAV that its parity bits D25 to D30 sum, and which of these sum bit 29 of the word before.
 _LNAV_PARITY: Final = (0xEC7CD2, 0x763E69, 0xBB1F34, 0x5D8F9A, 0xAEC7CD, 0x2DEA27)
 _LNAV_WITH_D29: Final = (0, 2, 5)
+#: Last GPS week that a log may have: 2079. A date beyond it would put every later epoch out of order.
+_LAST_WEEK: Final = 5200
+#: Codes [m], phases [cycles] and Dopplers [Hz] from here on are no measurements; RINEX has no place for them.
+_LARGEST: Final = 1e10
 #: One measurement of RXM-RAWX.
 _MEASUREMENT: Final = np.dtype(
     [
@@ -128,7 +132,8 @@ def rawx_measurements(frames: Frames) -> Measurements:
     header = gathered(frames.data, frames.start[chosen][length >= 16], _RAWX_HEADER)
     chosen, length = chosen[length >= 16], length[length >= 16]
     whole = length == 16 + 32 * header["count"].astype(np.int64)
-    plausible = whole & (header["week"] > 0) & (header["tow"] >= 0) & (header["tow"] < 604_800)
+    plausible = whole & (header["week"] > 0) & (header["week"] <= _LAST_WEEK)
+    plausible &= (header["tow"] >= 0) & (header["tow"] < 604_800)
     undated = whole & ~plausible
     skipped = {"broken RXM-RAWX": int((~whole).sum()), "RXM-RAWX without time": int(undated.sum())}
     chosen, header = chosen[plausible], header[plausible]
@@ -140,15 +145,21 @@ def rawx_measurements(frames: Frames) -> Measurements:
     signal = _signal_table()[np.minimum(system, 7), np.minimum(rows["signal"], 15)]
     phase_valid = (tracking & _PHASE_VALID != 0) & (rows["phase"] != 0) & (rows["phase"] != -0.5)
     phase_valid &= rows["phase_std"] & 15 <= _LARGEST_PHASE_STD
+    code_valid = (tracking & _CODE_VALID != 0) & (rows["code"] > 0)
+    code, phase, doppler = (
+        np.where(np.abs(rows[name]) < _LARGEST, rows[name], np.nan) for name in ("code", "phase", "doppler")
+    )
+    lost = (np.isnan(code) & code_valid) | (np.isnan(phase) & phase_valid)
+    skipped["RXM-RAWX measurements with impossible numbers"] = int(np.count_nonzero(lost))
     leap = header["leap"][header["status"] & 1 == 1]
     return Measurements(
         time=from_week(header["week"].astype(np.int64), header["tow"]),
         epoch=epoch,
         satellite=_NAMES[system, rows["sv"]],
         signal=signal,
-        code_m=np.where((tracking & _CODE_VALID != 0) & (rows["code"] > 0), rows["code"], np.nan),
-        phase_cycles=np.where(phase_valid, rows["phase"], np.nan),
-        doppler_hz=np.where(np.isfinite(rows["doppler"]), rows["doppler"].astype(np.float64), np.nan),
+        code_m=np.where(code_valid, code, np.nan),
+        phase_cycles=np.where(phase_valid, phase, np.nan),
+        doppler_hz=doppler.astype(np.float64),
         cn0_dbhz=np.where(rows["cn0"] > 0, rows["cn0"].astype(np.float64), np.nan),
         lock_s=rows["lock"] * 1e-3,
         half_cycle=phase_valid & (tracking & _HALF_CYCLE_KNOWN == 0),
