@@ -25,7 +25,7 @@ position files               `run_files` with `RunInputs`
 stages by hand               `ranges.corrected_ranges`, `positioning.find_section`,
                              `positioning.position_on_line`, `integrity.exclude_faults`,
                              `integrity.protection_level`, the screens of `screens`
-tables                       `positions_table`, `observations_table` (polars), `to_xarray`
+tables                       `train_table` (the filter), `positions_table`, `observations_table`, `to_xarray`
 evaluate and report          `evaluate_runs`, `write_report`
 from and to georinex         `observations_from_xarray`, `observations_to_xarray`,
                              `navigation_from_xarray`, `navigation_to_xarray`

@@ -54,6 +54,7 @@ from .pipeline import (
     observations_table,
     positions_table,
     to_xarray,
+    train_table,
 )
 from .ranges.sbas import SbasMessages, read_sbas
 from .report import write_report
@@ -142,6 +143,7 @@ __all__ = [
     "simulate",
     "to_xarray",
     "track",
+    "train_table",
     "write_evaluation",
     "write_navigation",
     "write_observations",

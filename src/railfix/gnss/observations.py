@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Masks, Strings, freeze_arrays
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, freeze_arrays
 from railfix.core.display import NotebookTable, plural, time_span_text
 
 #: Largest number of messages about single faults; further faults are only counted.
@@ -137,20 +137,58 @@ class Observations(NotebookTable):
         """Constellation letter of each channel, shape (M,)."""
         return self.satellite.astype("<U1")
 
-    def __getitem__(self, epochs: slice) -> Observations:
-        """Select a range of epochs (a view) with all channels."""
+    def __getitem__(self, key: slice | tuple[slice, str | Sequence[str]]) -> Observations:
+        """Select epochs (a view), or epochs and satellites: ``log[:60]``, ``log["06:34":"06:35", "G06"]``.
+
+        Bounds are numbers of epochs, or times: ``datetime64``, "2021-05-17T06:34:12", or a time of day from the log's
+        first epoch on. As with numbers the upper bound is no part of the range. Satellites are names ("G06") or
+        constellations ("G"), one or several.
+
+        Raises
+        ------
+        KeyError
+            A satellite or constellation that the log does not have, or a bound that is no time.
+        """
+        rows, names = key if isinstance(key, tuple) else (key, None)
+        start, stop = (
+            self._epoch_at(bound) if isinstance(bound, str | np.datetime64) else bound
+            for bound in (rows.start, rows.stop)
+        )
+        epochs = slice(start, stop, rows.step)
+        channels = slice(None) if names is None else self._channels_of([names] if isinstance(names, str) else names)
+        arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
         return Observations(
             time=self.time[epochs],
-            satellite=self.satellite,
-            signal=self.signal,
-            code_m=self.code_m[epochs],
-            phase_cycles=self.phase_cycles[epochs],
-            doppler_hz=self.doppler_hz[epochs],
-            cn0_dbhz=self.cn0_dbhz[epochs],
-            loss_of_lock=self.loss_of_lock[epochs],
+            satellite=self.satellite[channels],
+            signal=self.signal[channels],
+            **{name: getattr(self, name)[epochs][:, channels] for name in arrays},
             break_before=self.break_before[epochs],
             header=self.header,
         )
+
+    def _epoch_at(self, bound: str | np.datetime64) -> int:
+        """Return the number of the first epoch at or after a time."""
+        text = str(bound).replace(" ", "T")
+        try:
+            if "-" in text or not len(self):
+                time = np.datetime64(text, "ns")
+            else:
+                day = self.time[0].astype("datetime64[D]")
+                time = np.datetime64(f"{day}T{text}", "ns")
+                time += np.timedelta64(1, "D") if time < self.time[0] - np.timedelta64(12, "h") else np.timedelta64(0)
+        except ValueError:
+            raise KeyError(f"{bound!r} is no time; expected hh:mm, hh:mm:ss or yyyy-mm-ddThh:mm:ss") from None
+        return int(np.searchsorted(self.time, time))
+
+    def _channels_of(self, names: Sequence[str]) -> Indices:
+        """Return the channels of satellites or constellations."""
+        found = np.zeros(len(self.satellite), dtype=np.bool_)
+        for name in names:
+            own = (self.system if len(name) == 1 else self.satellite) == name
+            if not own.any():
+                raise KeyError(f"no {name} among the satellites {' '.join(np.unique(self.satellite).tolist())}")
+            found |= own
+        return np.flatnonzero(found)
 
 
 def channels_with_data(kinds: Iterable[Floats], loss_of_lock: Bytes) -> Masks:

@@ -4,6 +4,7 @@ from .config import Config, load_config
 from .processor import EpochProcessor
 from .results import AntennaResult, AntennaState, Result, State
 from .tables import observations_table, positions_table, to_xarray
+from .train_table import train_table
 
 __all__ = [
     "AntennaResult",
@@ -16,4 +17,5 @@ __all__ = [
     "observations_table",
     "positions_table",
     "to_xarray",
+    "train_table",
 ]

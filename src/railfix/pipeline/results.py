@@ -271,6 +271,10 @@ class Result(NotebookTable):
     notes: tuple[str, ...]
     fusion: Mapping[str, AlongTrack] = field(default_factory=dict)
 
+    def __getitem__(self, antenna: str) -> AntennaResult:
+        """Return the single-epoch results of an antenna; KeyError where there is none of that name."""
+        return self.antennas[antenna]
+
     def __repr__(self) -> str:
         parts = (f"{name} {result.status_text()}" for name, result in self.antennas.items())
         return f"<Result: {'; '.join(parts)}>"
