@@ -232,6 +232,7 @@ CASES: dict[Reason, Callable[[], tuple[AntennaResult, int, int]]] = {
     Reason.NOT_OBSERVED: lambda: (front_alone(one_wrong(np.nan), MASK_ONLY), top_channel(), 0),
     Reason.IMPLAUSIBLE_CODE: lambda: (front_alone(one_wrong(-1.8e7), MASK_ONLY), top_channel(), 0),
     Reason.SYSTEM_NOT_SELECTED: lambda: (front_alone(front(), MASK_ONLY | {"systems": ["E"]}), top_channel(), 0),
+    Reason.EXCLUDED_BY_SETTING: lambda: (front_alone(front(), MASK_ONLY | {"exclude": [top()]}), top_channel(), 0),
     Reason.OTHER_SIGNAL_TAKEN: lambda: (front_alone(second_signal(), MASK_ONLY), len(front().satellite), 0),
     Reason.NO_EPHEMERIS: lambda: (
         front_alone(front(), MASK_ONLY, navigation=changed_records(top(), satellite="G31")),

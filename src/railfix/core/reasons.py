@@ -61,6 +61,8 @@ class Reason(IntFlag):
     FAULT_EXCLUDED = 1 << 19
     #: Left out: the residuals have had one sign and size for a minute (`railfix.pipeline.lasting_errors`).
     LASTING_ERROR = 1 << 20
+    #: Left out by the setting `exclude`, by its own name or that of its constellation.
+    EXCLUDED_BY_SETTING = 1 << 21
 
 
 class Status(IntEnum):
@@ -106,7 +108,7 @@ POSITIONED: Final = (Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFF
 #: Reasons of screens that are added to the package, by name in lower case.
 _ADDED: dict[str, Reason] = {}
 #: First free bit, and the last one of the tables' 32-bit column.
-_FIRST_FREE_BIT: Final = 21
+_FIRST_FREE_BIT: Final = 22
 _LAST_BIT: Final = 30
 
 

@@ -92,10 +92,13 @@ class ChannelBook:
     def _selected(self, obs: Observations, glonass: Mapping[str, int]) -> Channels:
         systems = self._config.systems
         columns = channel_order(obs.satellite, obs.signal, systems=systems, signals=self._config.signals)
+        unwanted = np.isin(obs.satellite, self._config.exclude) | np.isin(obs.system, self._config.exclude)
+        columns = columns[~unwanted[columns]]
         satellite, signal = obs.satellite[columns], obs.signal[columns]
         groups = clock_groups(satellite.astype("<U1"))
         left_out = np.where(np.isin(obs.system, systems), Reason.OTHER_SIGNAL_TAKEN, Reason.SYSTEM_NOT_SELECTED)
         left_out[columns] = Reason.USED
+        left_out[unwanted] = Reason.EXCLUDED_BY_SETTING
         names, which = np.unique(obs.satellite, return_inverse=True)
         frequency = carrier_frequency_hz(obs.satellite, obs.signal, glonass)
         letters = [CLOCK_GROUP[name[0]] for name in satellite.tolist()]

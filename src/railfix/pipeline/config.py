@@ -22,7 +22,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from pydantic import Field, create_model, field_validator, model_validator
 
@@ -108,6 +108,8 @@ class Config(ScreenSettings):
     systems : tuple of str
         Constellations used. GLONASS is left out by default: its channels have code biases of
         metres between them.
+    exclude : tuple of str
+        Satellites ("G07") and constellations ("C") that are left out altogether.
     signals : mapping of str to tuple of str
         Signals of each constellation in order of preference; the first one observed is used.
     screens : tuple of str
@@ -197,6 +199,7 @@ class Config(ScreenSettings):
 
     preset: Literal["default", "strict", "p1"] = "default"
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
+    exclude: tuple[Annotated[str, Field(pattern=r"^[GJECR]([0-9]{2})?$")], ...] = ()
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
     screens: tuple[str, ...] = SCREEN_NAMES
     cn0_curve: Path | None = None

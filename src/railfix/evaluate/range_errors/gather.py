@@ -29,6 +29,7 @@ NO_RANGE: Final = (
     | Reason.IMPLAUSIBLE_CODE
     | Reason.SYSTEM_NOT_SELECTED
     | Reason.OTHER_SIGNAL_TAKEN
+    | Reason.EXCLUDED_BY_SETTING
     | Reason.NO_EPHEMERIS
     | Reason.EPHEMERIS_TOO_OLD
     | Reason.UNHEALTHY
