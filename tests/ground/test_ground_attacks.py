@@ -21,7 +21,6 @@ from railfix.ground.interlocking import (
     Interlocking,
     InterlockingLimits,
     extended,
-    interval_of,
     overlaps_stopped,
     release_train,
     report_received,
@@ -166,7 +165,7 @@ def test_a_train_beyond_its_authority_occupies_where_it_is(state: Interlocking) 
     state = replace(state, trains={**state.trains, 1: replace(state.trains[1], end_m=3020.0)})
     found = after(state, report(1, 3060.0))
     assert found.trains[1].stop == "the train is beyond its authority"
-    assert interval_of(found.trains[1]) == (2795.0, 3065.0)
+    assert found.trains[1].interval_m == (2795.0, 3065.0)
 
 
 def test_the_first_report_is_of_where_the_train_stands(state: Interlocking) -> None:

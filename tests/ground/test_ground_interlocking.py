@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import random
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,23 +19,25 @@ from railfix.ground.authority import Authority
 from railfix.ground.interlocking import (
     Interlocking,
     InterlockingLimits,
+    NearbyTrains,
     PointState,
     TrainInterval,
     _limit_m,
     extended,
-    interval_of,
     points_reported,
     released,
     report_received,
     route_requested,
+    stop_trains,
+    stopped_trains,
 )
-from railfix.ground.interlocking_text import from_json, to_json
+from railfix.ground.interlocking_text import from_documents, to_documents
 from railfix.ground.layout import Layout, LoopStation, overlap
 from railfix.ground.layout_network import layout_of
 from railfix.ground.on_board import OnBoard, OnBoardLimits
 from railfix.ground.plausibility import compute_contradiction
 from railfix.ground.supervision import Supervision
-from railfix.ground.traffic import SimulatedTrain
+from railfix.ground.traffic import SimulatedTrain, line_with_loops
 from railfix.io.train_message import MessageError, MessageStatus, TrainMessage
 
 pytestmark = [pytest.mark.requirement("F4"), pytest.mark.requirement("F5")]
@@ -63,9 +66,9 @@ RULES: dict[str, dict[Callable[..., Any], dict[str, str]]] = {
         Supervision.report: {"reason is None": "True"},
     },
     "direction": {route_requested: {"other.direction != direction and _uses_section": "False and _uses_section"}},
-    "points locked": {route_requested: {"point.locked or _under_interval(state, name, layout)": "False"}},
+    "points locked": {route_requested: {"point.locked or _under_interval(state, name, layout, nearby)": "False"}},
     "points detected": {_limit_m: {"== point.detected": ""}},
-    "persistence": {DisturbedTraffic.restored: {"from_json(to_json(": "without_grants(("}},
+    "persistence": {DisturbedTraffic.restored: {"from_documents(to_documents(": "without_grants(("}},
     "supervision": {
         SimulatedTrain.step: {
             "min(wanted, (lag**2 + 2.0 * BRAKING_MPS2 * max(room, 0.0)) ** 0.5 - lag)": "0.0 if room <= 0.0 else wanted"
@@ -204,16 +207,16 @@ def test_reports_that_change_nothing(state: Interlocking) -> None:
 
 def test_an_interval_reaches_to_the_front_where_that_is_beyond_the_authority() -> None:
     train = interval(1, 1, 330.0, 1, 0)
-    assert interval_of(replace(train, end_m=300.0)) == (220.0, 335.0)
-    assert interval_of(replace(train, end_m=360.0)) == (220.0, 360.0)
+    assert replace(train, end_m=300.0).interval_m == (220.0, 335.0)
+    assert replace(train, end_m=360.0).interval_m == (220.0, 360.0)
     down = interval(1, -1, 330.0, 1, 0)
-    assert interval_of(replace(down, end_m=360.0)) == (440.0, 325.0)
-    assert interval_of(replace(down, end_m=300.0)) == (440.0, 300.0)
+    assert replace(down, end_m=360.0).interval_m == (440.0, 325.0)
+    assert replace(down, end_m=300.0).interval_m == (440.0, 300.0)
 
 
 def test_stored_text_gives_the_same_state(state: Interlocking) -> None:
     routed, _, _ = route_requested(state, 2, LAYOUT)
-    assert from_json(to_json(routed)) == routed
+    assert from_documents(to_documents(routed)) == routed
 
 
 def violations(seeds: range, steps: int) -> tuple[Counter[str], int]:
@@ -368,3 +371,43 @@ def test_a_route_over_the_layout_of_a_network() -> None:
         run.step()
     assert run.violations == Counter()
     assert run.centre.routes_set > 2
+
+
+def test_trains_nearby_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step that looks at the trains nearby ends as one that looks at every train, over 400 s of disturbed traffic."""
+
+    def course() -> list[Interlocking]:
+        run, states = traffic(3, trains=10, layout=line_with_loops(8)), []
+        for _ in range(400):
+            run.step()
+            states.append(run.centre.state)
+        return states
+
+    nearby = course()
+    assert any(train.stop is None and train.end_m > 0.0 for train in nearby[-1].trains.values())
+    monkeypatch.setattr(NearbyTrains, "between", lambda _self, state, _low, _high: iter(state.trains.values()))
+    assert course() == nearby
+
+
+def neighbours_of_stopped(state: Interlocking) -> set[int]:
+    """Trains ordered to stop, train by train."""
+    found = {number for number, train in state.trains.items() if train.stop is not None}
+    for number in set(found):
+        low, high = state.trains[number].span_m
+        others = [(n, *train.span_m) for n, train in state.trains.items() if n != number]
+        above = min((first for _, first, _ in others if first >= high), default=None)
+        below = max((last for _, _, last in others if last <= low), default=None)
+        upper = max((last for _, first, last in others if first == above), default=high)
+        lower = min((first for _, first, last in others if last == below), default=low)
+        found |= {n for n, first, last in others if first <= upper and last >= lower}
+    return found
+
+
+def test_neighbours_of_stopped_trains() -> None:
+    run, rng, kinds = traffic(5, trains=12, layout=line_with_loops(8)), random.Random(2), set()
+    for _ in range(300):
+        run.step()
+        stopped = stop_trains(run.centre.state, rng.sample(sorted(run.trains), rng.randint(0, 4)), "by hand")
+        assert set(stopped_trains(stopped)) == neighbours_of_stopped(stopped)
+        kinds.add(len(stopped_trains(stopped)))
+    assert len(kinds) > 4

@@ -18,6 +18,7 @@ from railfix.ground.keys import write_keys
 from railfix.ground.link_figure import coverage
 from railfix.ground.link_quality import LinkChoice, LinkLimits, LinkMeter
 from railfix.ground.links import BEARERS, CentreLinks, TrainLinks
+from railfix.ground.quic import LinkProtocol
 from railfix.ground.relay import Disturbance, Relay, RelaySettings
 
 pytestmark = pytest.mark.requirement("F3")
@@ -368,7 +369,7 @@ def test_a_wrong_certificate_is_rejected(keys: Path, tmp_path: Path, kind: str) 
 def test_spare_mode_switches_and_sends_the_newest_when_both_were_gone(keys: Path) -> None:
     async def work() -> None:
         got: list[bytes] = []
-        centre = CentreLinks(keys, HOSTS, received=lambda _, payload: got.append(payload))
+        centre = CentreLinks(keys, HOSTS, received=lambda _, payload: got.append(payload), wait_s=0.0)
         await centre.start()
         relays = {name: Relay(centre.addresses[name], RelaySettings(delay_s=0.005)) for name in BEARERS}
         for name in BEARERS:
@@ -392,3 +393,36 @@ def test_spare_mode_switches_and_sends_the_newest_when_both_were_gone(keys: Path
             relay.close()
 
     run(work())
+
+
+def test_a_frame_and_its_answer_are_a_packet_each(keys: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Answers and acknowledgements of QUIC travel with frames: 20 frames are 20 packets a link each way, not 60."""
+    packets: Counter[bool] = Counter()
+    taken = LinkProtocol.datagram_received
+
+    def counted(self: LinkProtocol, data: bytes, addr: Any) -> None:
+        packets[self._quic.configuration.is_client] += self.peer is not None
+        taken(self, data, addr)
+
+    async def work() -> None:
+        got: list[bytes] = []
+        centre = CentreLinks(keys, HOSTS, received=lambda train, _: centre.send(train, b"x"))
+        await centre.start()
+        train = TrainLinks(7, keys, centre.addresses, LOCAL, received=got.append)
+        await train.start()
+        assert await _until(lambda: len(train.protocols) == 2, 5.0) < 5.0
+        await asyncio.sleep(0.3)
+        packets.clear()
+        for _ in range(20):
+            train.send(b"place")
+            await asyncio.sleep(0.05)
+        assert await _until(lambda: len(got) >= 20, 5.0) < 5.0
+        await asyncio.sleep(0.3)
+        assert all(meter.response_rate > 0.99 for meter in train.meters.values())
+        await train.stop()
+        await centre.stop()
+
+    monkeypatch.setattr(LinkProtocol, "datagram_received", counted)
+    run(work())
+    assert 40 <= packets[False] <= 48
+    assert 40 <= packets[True] <= 88

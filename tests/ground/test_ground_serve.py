@@ -23,13 +23,13 @@ from railfix.cli.ground import app
 from railfix.ground.authority import Authority
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import Interlocking, TrainInterval
-from railfix.ground.interlocking_text import from_json
+from railfix.ground.interlocking_text import HEAD, from_documents
 from railfix.ground.keys import write_keys
 from railfix.ground.link_quality import LinkLimits
 from railfix.ground.links import BEARERS, TrainLinks, first_sequence
 from railfix.ground.monitor import MonitorLimits
 from railfix.ground.on_board import OnBoard, OnBoardLimits
-from railfix.ground.serve import STEP_S, run_centre
+from railfix.ground.serve import run_centre
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
@@ -128,7 +128,7 @@ def test_a_killed_centre_keeps_what_its_trains_know(folder: Path, tmp_path: Path
             process.send_signal(signal.SIGKILL)
             process.communicate()
             with Store(f"sqlite:///{database}") as store:
-                stored, state = store.records()[1], from_json(store.document("interlocking") or "")
+                stored, state = store.records()[1], from_documents(store.documents(HEAD))
                 last = store.log(last=10_000)
             assert stored.sequence >= newest[-1].report
             assert stored.sequence in sent
@@ -303,7 +303,6 @@ def test_a_centre_counts_what_does_not_count(centre: tuple[ControlCentre, list[A
     control.report(9, encode(good.replaced(train=9)))
     assert control.reports == 1
     assert sorted(control.rejected.values()) == [1, 1, 1, 1]
-    assert STEP_S == 1.0
 
 
 @pytest.mark.parametrize(

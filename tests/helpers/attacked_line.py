@@ -15,8 +15,8 @@ from functools import partial
 from typing import Any
 
 from railfix.ground.authority import Authority
-from railfix.ground.interlocking import InterlockingLimits, interval_of
-from railfix.ground.interlocking_text import from_json, to_json
+from railfix.ground.interlocking import InterlockingLimits
+from railfix.ground.interlocking_text import from_documents, to_documents
 from railfix.ground.layout import Layout, LoopStation, PointName, overlap
 from railfix.ground.on_board import OnBoard
 from railfix.ground.supervision import Supervision, at_start, standing_train
@@ -113,7 +113,7 @@ class AttackedLine:
             self.act(train)
         self.deliver()
         if self.rng.random() < 0.03:
-            self.centre.state = from_json(to_json(self.centre.state))
+            self.centre.state = from_documents(to_documents(self.centre.state))
             self.seen["restart"] += 1
         for point in self.moving:
             if self.rng.random() < 0.6:
@@ -202,7 +202,7 @@ class AttackedLine:
         """No train on board holds an authority beyond its interval."""
         for number, train in self.trains.items():
             known = self.centre.state.trains[number]
-            end = interval_of(known)[1]
+            end = known.interval_m[1]
             held = end if train.held_m is None else train.held_m
             if train.direction == known.direction and train.direction * (held - end) > 0.02:
                 self.violations["train beyond its authority"] += 1

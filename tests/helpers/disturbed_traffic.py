@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 from railfix.ground.interlocking import Interlocking
-from railfix.ground.interlocking_text import from_json, to_json
+from railfix.ground.interlocking_text import from_documents, to_documents
 from railfix.ground.layout import Layout
 from railfix.ground.on_board import OnBoard
 from railfix.ground.supervision import Supervision, at_start
@@ -72,7 +72,7 @@ class DisturbedTraffic(Traffic):
                 train.error_m = rng.uniform(-train.bound_m, train.bound_m)
 
     def restored(self) -> Interlocking:
-        return from_json(to_json(self._stored or self.centre.state))
+        return from_documents(to_documents(self._stored or self.centre.state))
 
     def send_report(self, message: TrainMessage) -> None:
         self._send(message.train, partial(self._report, message))

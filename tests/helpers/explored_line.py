@@ -13,8 +13,8 @@ from copy import copy, deepcopy
 from dataclasses import dataclass, field, replace
 
 from railfix.ground.authority import Authority
-from railfix.ground.interlocking import InterlockingLimits, interval_of
-from railfix.ground.interlocking_text import from_json, to_json
+from railfix.ground.interlocking import InterlockingLimits
+from railfix.ground.interlocking_text import from_documents, to_documents
 from railfix.ground.layout import Layout, LoopStation, overlap
 from railfix.ground.on_board import OnBoard
 from railfix.ground.supervision import Supervision, at_start, standing_train
@@ -76,7 +76,7 @@ class World:
         trains = {n: replace(t, on_board=deepcopy(t.on_board)) for n, t in self.trains.items()}
         centre = copy(self.centre)
         centre.records, centre.refusals, moved = dict(centre.records), Counter(), []
-        centre.command = moved.append
+        centre.command, centre.heard, centre.sent = moved.append, set(), {}
         return World(trains=trains, centre=centre, now_s=self.now_s, moved=moved)
 
     def report(self, train: ModelTrain, speed_mps: float, **changes: object) -> TrainMessage:
@@ -157,14 +157,14 @@ class World:
                 train.receive(authority)
         for number, train in self.trains.items():
             known = self.centre.state.trains[number]
-            held = interval_of(known)[1] if train.held_m is None else train.held_m
-            if train.direction == known.direction and train.direction * (held - interval_of(known)[1]) > 0.02:
+            held = known.interval_m[1] if train.held_m is None else train.held_m
+            if train.direction == known.direction and train.direction * (held - known.interval_m[1]) > 0.02:
                 self.violation = "train beyond its authority"
 
     def restarted(self) -> World:
         """The world after a restart of the centre from its document."""
         world = self.copied()
-        world.centre.state = from_json(to_json(world.centre.state))
+        world.centre.state = from_documents(to_documents(world.centre.state))
         return world
 
     def pieces(self, number: int) -> list[tuple[int, float, float]]:

@@ -29,10 +29,11 @@ class Settings(BaseModel):
     @classmethod
     def _no_switch_for_a_number(cls, value: Any, info: ValidationInfo) -> Any:
         """Reject true and false where a number is expected; pydantic takes them for 1 and 0."""
-        kind = cls.model_fields[str(info.field_name)].annotation
-        parts = (kind, *get_args(kind))
-        if isinstance(value, bool) and bool not in parts and (int in parts or float in parts):
-            raise ValueError("a number was expected")
+        if isinstance(value, bool):
+            kind = cls.model_fields[str(info.field_name)].annotation
+            parts = (kind, *get_args(kind))
+            if bool not in parts and (int in parts or float in parts):
+                raise ValueError("a number was expected")
         return value
 
     def replaced(self, **changes: Any) -> Self:

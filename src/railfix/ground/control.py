@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from railfix.ground.centre import CentreLimits, TrainRecord, TrainState, time_passed
-from railfix.ground.interlocking import interval_of, release_train, stop_trains, stopped_trains
-from railfix.ground.interlocking_text import from_json, to_json
+from railfix.ground.interlocking import Interlocking, release_train, stop_trains, stopped_trains
+from railfix.ground.interlocking_text import HEAD, from_documents, to_documents
 from railfix.ground.layout import PointName
 from railfix.ground.monitor import MonitorLimits, MonitorState, advance, release
 from railfix.ground.monitor import Order as MonitorOrder
@@ -24,8 +24,8 @@ from railfix.ground.triangle import STOPPING, Verdict
 from railfix.ground.web import Order
 from railfix.io.train_message import MessageError, decode
 
-#: Names of the stored documents.
-INTERLOCKING, _CAUSE = "interlocking", "cause of the stop"
+#: Name of the stored document.
+_CAUSE = "cause of the stop"
 
 
 def _severity(verdict: Verdict) -> int:
@@ -72,6 +72,8 @@ class ControlCentre:
     _routes: dict[int, int] = field(init=False)
     _verdict: tuple[Verdict, int] | None = None
     _judged: Verdict | None = None
+    _saved: Interlocking | None = None
+    _saved_sequences: dict[int, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._routes = {n: train.station for n, train in self.supervision.state.trains.items()}
@@ -83,10 +85,9 @@ class ControlCentre:
         Trains are unknown until they are heard, and points that were moving are moved again. Where a triangle judges
         satellite positioning, the first start is a stop, to be released by hand.
         """
-        text, monitor = store.document(INTERLOCKING), MonitorState() if judged else None
-        if text is not None:
-            state = from_json(text)
-            supervision.state = state
+        texts, monitor = store.documents(HEAD), MonitorState() if judged else None
+        if texts:
+            supervision.state = state = from_documents(texts)
             supervision.records = store.records()
             if judged:
                 cause = store.document(_CAUSE)
@@ -98,7 +99,7 @@ class ControlCentre:
         for name, point in supervision.state.points.items():
             if point.detected is None:
                 supervision.command(name)
-        centre.log("centre started" if text is None else "centre started again; every train is unknown")
+        centre.log("centre started again; every train is unknown" if texts else "centre started")
         return centre
 
     def log(self, text: str, *, train: int | None = None) -> None:
@@ -163,12 +164,18 @@ class ControlCentre:
             if after.state is not record.state:
                 self.log(f"train {number}: {after.state.value}", train=number)
             self.supervision.records[number] = after
-        cause = None if self.monitor is None or self.monitor.cause is None else self.monitor.cause.name
-        self.store.save(
-            *self.supervision.records.values(), documents={INTERLOCKING: to_json(state), _CAUSE: cause or ""}
-        )
+        self._save()
         for authority in authorities:
             self.send(authority.train, authority.encode())
+
+    def _save(self) -> None:
+        """Commit what has changed since the last time."""
+        state, records = self.supervision.state, self.supervision.records
+        cause = "" if self.monitor is None or self.monitor.cause is None else self.monitor.cause.name
+        changed = [record for n, record in records.items() if self._saved_sequences.get(n) != record.sequence]
+        self.store.save(*changed, documents={**to_documents(state, self._saved), _CAUSE: cause})
+        self._saved = state
+        self._saved_sequences.update((record.train, record.sequence) for record in changed)
 
     @property
     def limits(self) -> CentreLimits:
@@ -226,7 +233,7 @@ class ControlCentre:
         trains, stopped = [], stopped_trains(state)
         for number, train in state.trains.items():
             record = self.supervision.records.get(number, TrainRecord(train=number))
-            rear, front = interval_of(train)
+            rear, front = train.interval_m
             pieces = layout.pieces(rear, front, train.tracks)
             speed = 0 if record.message is None else record.message.speed_cmps or 0
             trains.append({

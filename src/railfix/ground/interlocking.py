@@ -9,9 +9,12 @@ overlaps behind signals, no level crossings, no degraded working by hand.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
+import numpy as np
 from pydantic import Field
 
 from railfix.core.settings import Settings
@@ -97,6 +100,17 @@ class TrainInterval:
     speed_mps: float | None = None
     stop: str | None = None
 
+    @cached_property
+    def interval_m(self) -> tuple[float, float]:
+        """Rear end and furthest end of the occupied interval [m]."""
+        return self.rear_m, max(self.end_m * self.direction, self.front_m * self.direction) * self.direction
+
+    @cached_property
+    def span_m(self) -> tuple[float, float]:
+        """Ends of the occupied interval, lower first [m]."""
+        low, high = sorted(self.interval_m)
+        return low, high
+
 
 @dataclass(frozen=True, kw_only=True)
 class PointState:
@@ -137,9 +151,27 @@ class Interlocking:
     granted: int = 0
 
 
-def interval_of(train: TrainInterval) -> tuple[float, float]:
-    """Return rear end and furthest end of the occupied interval [m]."""
-    return train.rear_m, max(train.end_m * train.direction, train.front_m * train.direction) * train.direction
+class NearbyTrains:
+    """Trains by where their intervals and routes are, or come to be by one more route.
+
+    Made once for a step, so that the cost of a step is that of its trains and not of their pairs.
+    """
+
+    def __init__(self, state: Interlocking, layout: Layout) -> None:
+        self._layout = layout
+        self._blocks: dict[int, list[int]] = defaultdict(list)
+        last = len(layout.stations) - 1
+        for number, train in state.trains.items():
+            ahead = layout.stations[min(max(train.station + train.direction, 0), last)]
+            furthest = ahead.end_m if train.direction > 0 else ahead.begin_m
+            low, high = train.span_m
+            for block in layout.blocks_between(min(low, furthest), max(high, furthest)):
+                self._blocks[block].append(number)
+
+    def between(self, state: Interlocking, low_m: float, high_m: float) -> Iterator[TrainInterval]:
+        """Return the trains, as they are now, that may share some chainage with an interval."""
+        numbers = {n: None for block in self._layout.blocks_between(low_m, high_m) for n in self._blocks.get(block, ())}
+        return (state.trains[number] for number in numbers)
 
 
 def report_received(
@@ -217,7 +249,7 @@ def _contradicted(known: TrainInterval, reason: str, rear: float, ahead: float, 
 
 def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
     """Return the state with the trains stopped whose intervals overlap: of trains at rest whose bounds have grown."""
-    spans = sorted((min(interval_of(t)), max(interval_of(t)), number) for number, t in state.trains.items())
+    spans = sorted((*train.span_m, number) for number, train in state.trains.items())
     for k, (_, high, number) in enumerate(spans):
         for low, _, other in spans[k + 1 :]:
             if low >= high:
@@ -225,7 +257,7 @@ def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
             first, second = state.trains[number], state.trains[other]
             if first.stop and second.stop:
                 continue
-            one, two = (layout.pieces(*interval_of(train), train.tracks) for train in (first, second))
+            one, two = (layout.pieces(*train.span_m, train.tracks) for train in (first, second))
             if overlap(one, two):
                 state = _with(state, replace(first, stop=first.stop or f"its interval meets that of train {other}"))
                 state = _with(state, replace(second, stop=second.stop or f"its interval meets that of train {number}"))
@@ -234,22 +266,22 @@ def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
 
 def stopped_trains(state: Interlocking) -> dict[int, str]:
     """Return the trains that are ordered to stop, and why: those stopped themselves, and the nearest on either side."""
-    stopped = {number: train.stop for number, train in state.trains.items() if train.stop is not None}
-    if not stopped:
+    found = {number: train.stop for number, train in state.trains.items() if train.stop is not None}
+    if not found:
         return {}
-    span = {n: (min(interval_of(train)), max(interval_of(train))) for n, train in state.trains.items()}
-    found = dict(stopped)
-    for number in stopped:
-        low, high = span[number]
-        others = [(n, first, last) for n, (first, last) in span.items() if n != number]
-        above = min((first for _, first, _ in others if first >= high), default=None)
-        below = max((last for _, _, last in others if last <= low), default=None)
+    numbers = list(state.trains)
+    low, high = np.array([train.span_m for train in state.trains.values()]).T
+    free = np.array([number not in found for number in numbers])
+    for k in np.flatnonzero(~free):
+        number, first, last = numbers[k], low[k], high[k]
         # those beside it, the nearest on either side, and those beside the nearest: on other tracks of its station
-        reach_high = max((last for _, first, last in others if first == above), default=high)
-        reach_low = min((first for _, first, last in others if last == below), default=low)
-        for other, first, last in others:
-            if first <= reach_high and last >= reach_low:
-                found.setdefault(other, f"train {number} is stopped beside it")
+        above, below = low >= last, high <= first
+        above[k] = below[k] = False
+        reach_high = np.max(high[above & (low == np.min(low, where=above, initial=np.inf))], initial=last)
+        reach_low = np.min(low[below & (high == np.max(high, where=below, initial=-np.inf))], initial=first)
+        beside = np.flatnonzero(free & (low <= reach_high) & (high >= reach_low))
+        free[beside] = False
+        found.update((numbers[k], f"train {number} is stopped beside it") for k in beside)
     return found
 
 
@@ -280,21 +312,30 @@ def points_reported(state: Interlocking, point: PointName, detected: int | None)
 
 
 def route_requested(
-    state: Interlocking, train: int, layout: Layout
+    state: Interlocking,
+    train: int,
+    layout: Layout,
+    *,
+    nearby: NearbyTrains | None = None,
+    stopped: Mapping[int, str] | None = None,
 ) -> tuple[Interlocking, tuple[PointName, ...], str | None]:
-    """Return the state with a route to the next station, the points to be moved, and the reason of a refusal."""
+    """Return the state with a route to the next station, the points to be moved, and the reason of a refusal.
+
+    With `NearbyTrains` and `stopped_trains` of the step where they are at hand.
+    """
     here = state.trains[train]
     begin, direction = here.station, here.direction
     target = begin + direction
     if state.stopped:
         return state, (), "satellite positioning is suspended"
-    if train in (stops := stopped_trains(state)):
+    if train in (stops := stopped_trains(state) if stopped is None else stopped):
         return state, (), f"the train is stopped: {stops[train]}"
     if not 0 <= target < len(layout.stations):
         return state, (), "there is no station ahead"
     track = 1 if direction > 0 else 2
     section = min(begin, target)
-    for other in state.trains.values():
+    nearby = nearby or NearbyTrains(state, layout)
+    for other in nearby.between(state, layout.stations[section].begin_m, layout.stations[section + 1].end_m):
         if other.train == train:
             continue
         stays = other.station == target or other.direction != direction
@@ -307,7 +348,7 @@ def route_requested(
     for name, wanted in needs.items():
         point = points[name]
         if point.wanted != wanted:
-            if point.locked or _under_interval(state, name, layout):
+            if point.locked or _under_interval(state, name, layout, nearby):
                 return state, (), f"points {layout.stations[name[0]].name} are locked"
             moved.append(name)
             point = replace(point, wanted=wanted, detected=None)
@@ -325,27 +366,27 @@ def _in_station(train: TrainInterval, station: int, layout: Layout) -> bool:
 def _uses_section(train: TrainInterval, section: int, layout: Layout) -> bool:
     """Return whether a train's route or interval lies between a station and the next, their points left out."""
     first, last = layout.stations[section].end_m, layout.stations[section + 1].begin_m
-    low, high = sorted(interval_of(train))
+    low, high = train.span_m
     routed = {section, section + 1} <= set(train.tracks) and (
         train.rear_m < last if train.direction > 0 else train.rear_m > first
     )
     return routed or (low < last and high > first)
 
 
-def _under_interval(state: Interlocking, point: PointName, layout: Layout) -> bool:
+def _under_interval(state: Interlocking, point: PointName, layout: Layout, nearby: NearbyTrains) -> bool:
     """Return whether points lie under a train's interval."""
     low, high = layout.zone_m(point)
     return any(
-        min(interval_of(t)) < high
-        and low < max(interval_of(t))
-        and overlap(layout.pieces(*interval_of(t), t.tracks), [(0, low, high)])
-        for t in state.trains.values()
+        train.span_m[0] < high
+        and low < train.span_m[1]
+        and overlap(layout.pieces(*train.span_m, train.tracks), [(0, low, high)])
+        for train in nearby.between(state, low, high)
     )
 
 
 def released(state: Interlocking, now_s: float, layout: Layout, *, limits: InterlockingLimits) -> Interlocking:
     """Return the state with the points released that safe rear ends have passed long enough ago."""
-    points = dict(state.points)
+    points: dict[PointName, PointState] = {}
     for name, point in state.points.items():
         if not point.locked:
             continue
@@ -359,25 +400,41 @@ def released(state: Interlocking, now_s: float, layout: Layout, *, limits: Inter
                 locked[train] = due
         if locked != point.locked:
             points[name] = replace(point, locked=locked)
-    return replace(state, points=points)
+    return replace(state, points={**state.points, **points}) if points else state
 
 
-def extended(state: Interlocking, layout: Layout, *, limits: InterlockingLimits) -> Interlocking:
-    """Return the state with every authority extended as far as it may be."""
+def extended(
+    state: Interlocking,
+    layout: Layout,
+    *,
+    limits: InterlockingLimits,
+    trains: Iterable[int] | None = None,
+    nearby: NearbyTrains | None = None,
+    stopped: Mapping[int, str] | None = None,
+) -> Interlocking:
+    """Return the state with the authorities of trains, of all without `trains`, extended as far as they may be.
+
+    With `NearbyTrains` and `stopped_trains` of the step where they are at hand.
+    """
     if state.stopped:
         return state
-    stopped = stopped_trains(state)
-    for number in state.trains:
+    stopped = stopped_trains(state) if stopped is None else stopped
+    nearby = nearby or NearbyTrains(state, layout)
+    after = dict(state.trains)
+    state = replace(state, trains=after)
+    for number in list(after) if trains is None else trains:
         if number in stopped:
             continue
-        train = state.trains[number]
-        end = _limit_m(state, train, layout, limits=limits)
+        train = after[number]
+        end = _limit_m(state, train, layout, nearby, limits=limits)
         if train.direction * (end - train.end_m) > 0.0:
-            state = replace(state, trains={**state.trains, number: replace(train, end_m=end)})
+            after[number] = replace(train, end_m=end)
     return state
 
 
-def _limit_m(state: Interlocking, train: TrainInterval, layout: Layout, *, limits: InterlockingLimits) -> float:
+def _limit_m(
+    state: Interlocking, train: TrainInterval, layout: Layout, nearby: NearbyTrains, *, limits: InterlockingLimits
+) -> float:
     """Return the furthest end of a train's authority [m]."""
     direction = train.direction
     inner = layout.stations[train.station].inner_m
@@ -394,11 +451,10 @@ def _limit_m(state: Interlocking, train: TrainInterval, layout: Layout, *, limit
             end = min(end, near)
     path = layout.pieces(train.rear_m, direction * end, train.tracks)
     first_m, last_m = sorted((train.rear_m, direction * end))
-    for other in state.trains.values():
-        low, high = sorted(interval_of(other))
-        if other.train == train.train or low >= last_m or high <= first_m:
+    for other in nearby.between(state, first_m, last_m):
+        if other.train == train.train or other.span_m[0] >= last_m or other.span_m[1] <= first_m:
             continue
-        for lane, low, high in layout.pieces(*interval_of(other), other.tracks):
+        for lane, low, high in layout.pieces(*other.span_m, other.tracks):
             for mine, first, last in path:
                 if mine == lane and low < last and first < high:
                     end = min(end, direction * (low if direction > 0 else high))

@@ -1,36 +1,51 @@
-"""State of the interlocking as JSON, for the store."""
+"""State of the interlocking as named texts of JSON for the store: its head, a text a train, a text a pair of points."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, Final
 
 from railfix.ground.interlocking import Interlocking, PointState, TrainInterval
 
-
-def to_json(state: Interlocking) -> str:
-    """Return the state as a line of JSON."""
-    return json.dumps(
-        {
-            "trains": [asdict(train) for train in state.trains.values()],
-            "points": [[*name, asdict(point)] for name, point in state.points.items()],
-            "stopped": state.stopped,
-            "granted": state.granted,
-        }
-    )
+#: Name of the text without trains and points, and beginnings of the names of theirs.
+HEAD: Final = "interlocking"
+_TRAIN, _POINTS = f"{HEAD} train ", f"{HEAD} points "
 
 
-def from_json(text: str) -> Interlocking:
-    """Return the state from its JSON. Times of release begin again: the clock of the process before is not known."""
-    values = json.loads(text)
-    trains = {}
-    for item in values["trains"]:
-        tracks = {int(station): track for station, track in item.pop("tracks").items()}
-        trains[item["train"]] = TrainInterval(**item, tracks=tracks)
-    points = {
-        (station, side): PointState(
-            wanted=item["wanted"], detected=item["detected"], locked={int(train): None for train in item["locked"]}
-        )
-        for station, side, item in values["points"]
-    }
-    return Interlocking(trains=trains, points=points, stopped=values["stopped"], granted=values["granted"])
+def to_documents(state: Interlocking, before: Interlocking | None = None) -> dict[str, str]:
+    """Return the texts by name; with a state before only those that may have changed since."""
+    texts = {HEAD: json.dumps({"stopped": state.stopped, "granted": state.granted})}
+    trains, points = (before.trains, before.points) if before is not None else ({}, {})
+    for number, train in state.trains.items():
+        if train is not trains.get(number):
+            texts[f"{_TRAIN}{number}"] = json.dumps(_values(train))
+    for (station, side), point in state.points.items():
+        if point is not points.get((station, side)):
+            texts[f"{_POINTS}{station} {side}"] = json.dumps(_values(point))
+    return texts
+
+
+def from_documents(texts: Mapping[str, str]) -> Interlocking:
+    """Return the state from its texts. Times of release begin again: the clock of the process before is not known."""
+    trains, points = {}, {}
+    for name, text in texts.items():
+        if name.startswith(_TRAIN):
+            values = json.loads(text)
+            tracks = {int(station): track for station, track in values.pop("tracks").items()}
+            trains[int(name.removeprefix(_TRAIN))] = TrainInterval(**values, tracks=tracks)
+        elif name.startswith(_POINTS):
+            values = json.loads(text)
+            station, side = map(int, name.removeprefix(_POINTS).split())
+            points[station, side] = PointState(**values | {"locked": dict.fromkeys(map(int, values["locked"]))})
+    head = json.loads(texts[HEAD])
+    # in the order of the line, whatever the order of the texts
+    return Interlocking(
+        trains=dict(sorted(trains.items())), points=dict(sorted(points.items())), stopped=head["stopped"],
+        granted=head["granted"],
+    )  # fmt: skip
+
+
+def _values(record: TrainInterval | PointState) -> dict[str, Any]:
+    return {field.name: getattr(record, field.name) for field in fields(record)}

@@ -66,6 +66,10 @@ class Layout(Settings):
     def _ends_m(self) -> list[float]:
         return [station.end_m for station in self.stations]
 
+    @cached_property
+    def _borders_m(self) -> list[float]:
+        return [border for station in self.stations for border in (station.begin_m, station.end_m)]
+
     def stations_between(self, low_m: float, high_m: float) -> range:
         """Return the numbers of the stations that share some chainage with an interval."""
         return range(bisect_right(self._ends_m, low_m), bisect_left(self._begins_m, high_m))
@@ -75,6 +79,10 @@ class Layout(Settings):
         last = len(self.stations) - 1
         between = self.stations_between(low_m, high_m)
         return ((k, side) for k in between for side in (-1, 1) if (k, side) not in ((0, -1), (last, 1)))
+
+    def blocks_between(self, low_m: float, high_m: float) -> range:
+        """Return the numbers of the blocks that an interval touches: 2 k + 1 is station k, 2 k what lies before it."""
+        return range(bisect_left(self._borders_m, low_m), bisect_right(self._borders_m, high_m) + 1)
 
     def zone_m(self, point: PointName) -> tuple[float, float]:
         """Chainages of points, lower first [m]."""

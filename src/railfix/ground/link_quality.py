@@ -18,7 +18,7 @@ class LinkLimits(Settings):
     Attributes
     ----------
     answer_s : float [s]
-        An echo that takes longer counts as none (T).
+        An echo that takes longer counts as none (T); a centre lets one wait up to 0.2 s for an authority to go with.
     misses : int
         Misses in a row after which the spare link is taken.
     good : int

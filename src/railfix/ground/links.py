@@ -7,12 +7,13 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import AsyncExitStack
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
 from railfix.ground.link_quality import LinkChoice, LinkLimits, LinkMeter, LinkName
-from railfix.ground.quic import LinkProtocol, configuration, connected, listen
+from railfix.ground.quic import WAIT_S, LinkProtocol, configuration, connected, listen
 
 #: Identity of the centre as a sender of frames.
 CENTRE = 0
@@ -127,6 +128,7 @@ class CentreLinks:
     """The centre's end: listens at one address a bearer, answers every frame, passes each payload on once.
 
     `received` is called with the train's number and the payload; ports are free ones where none are given.
+    Answers wait up to `wait_s` for a payload to go with.
 
     Attributes
     ----------
@@ -145,13 +147,14 @@ class CentreLinks:
         received: Callable[[int, bytes], None],
         ports: dict[LinkName, int] | None = None,
         limits: ReceiverLimits | None = None,
+        wait_s: float = WAIT_S,
     ) -> None:
         self.addresses: dict[LinkName, tuple[str, int]] = {}
         self.receivers: dict[int, FrameReceiver] = {}
         self.masquerades = 0
         self.heard_s: dict[tuple[int, LinkName], float] = {}
         self._keys, self._hosts, self._ports, self._received = keys, hosts, ports or {}, received
-        self._limits = limits or ReceiverLimits()
+        self._limits, self._wait_s = limits or ReceiverLimits(), wait_s
         self._peers: dict[tuple[int, LinkName], LinkProtocol] = {}
         # of each train alone: `first_sequence` allows 10 frames a second
         self._sequence: dict[tuple[int, FrameKind], int] = {}
@@ -166,6 +169,7 @@ class CentreLinks:
                 settings,
                 received=lambda protocol, data, name=name: self._frame(name, protocol, data),  # type: ignore[misc]
                 rejected=self._masquerade,
+                wait_s=self._wait_s,
             )
             self._stack.callback(server.close)
 
@@ -182,17 +186,25 @@ class CentreLinks:
 
     def send(self, train: int, payload: bytes) -> None:
         """Send a payload to a train on every link it has."""
-        self._put(train, FrameKind.DATA, payload, BEARERS)
+        data = self._encoded(train, FrameKind.DATA, payload)
+        for name in BEARERS:
+            if (protocol := self._peers.get((train, name))) is not None:
+                protocol.send(data)
 
     def _masquerade(self) -> None:
         self.masquerades += 1
 
-    def _put(self, train: int, kind: FrameKind, payload: bytes, names: tuple[LinkName, ...]) -> None:
+    def _encoded(self, train: int, kind: FrameKind, payload: bytes) -> bytes:
         sequence = self._sequence[train, kind] = self._sequence.get((train, kind), first_sequence()) + 1
         frame = Frame(kind=kind, sender=CENTRE, sequence=sequence, time_ns=time.monotonic_ns(), payload=payload)
-        for name in names:
-            if (protocol := self._peers.get((train, name))) is not None:
-                protocol.send(frame.encode())
+        return frame.encode()
+
+    def _echo(self, train: int, answered: Frame, received_ns: int) -> bytes:
+        echo = Echo(
+            sequence=answered.sequence, sent_ns=answered.time_ns, received_ns=received_ns,
+            answered_ns=time.monotonic_ns(),
+        )  # fmt: skip
+        return self._encoded(train, FrameKind.ECHO, echo.encode())
 
     def _frame(self, name: LinkName, protocol: LinkProtocol, data: bytes) -> None:
         kind, _, name_of_train = (protocol.peer or "").partition("-")
@@ -209,9 +221,6 @@ class CentreLinks:
         if answer is None:
             return
         self._peers[train, name], self.heard_s[train, name] = protocol, time.monotonic()
-        echo = Echo(
-            sequence=answer.sequence, sent_ns=answer.time_ns, received_ns=now_ns, answered_ns=time.monotonic_ns()
-        )
-        self._put(train, FrameKind.ECHO, echo.encode(), (name,))
+        protocol.answer(partial(self._echo, train, answer, now_ns))
         if use is not None:
             self._received(train, use.payload)

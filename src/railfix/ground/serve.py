@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import ipaddress
 import json
 import signal
@@ -22,8 +23,9 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import Settings, load_settings
 from railfix.core.timescale import utc_to_gpst
 from railfix.ground.centre import CentreLimits
-from railfix.ground.control import INTERLOCKING, ControlCentre, orders_of
+from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import InterlockingLimits, TrainInterval
+from railfix.ground.interlocking_text import HEAD
 from railfix.ground.keys import check_keys
 from railfix.ground.layout import Layout, LoopStation, PointName
 from railfix.ground.layout_network import layout_of
@@ -40,7 +42,9 @@ from railfix.io import read_navigation
 from railfix.track.network_read import read_network
 
 #: Period of the centre's work [s].
-STEP_S = 1.0
+STEP_S = 0.2
+#: Thresholds of the garbage collection: with a thousand connections a whole one takes 0.3 s, and is made rarely.
+COLLECTION = 10_000, 20, 50
 #: Document with the stations and trains that the database is of.
 _BELONGS_TO = "stations and trains"
 
@@ -277,6 +281,7 @@ async def run_centre(
     keys = path.parent / settings.keys
     check_keys(keys, "centre")
     database = settings.database if "://" in settings.database else f"sqlite:///{path.parent / settings.database}"
+    gc.set_threshold(*COLLECTION)
     end = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -368,7 +373,7 @@ def _heard(control: ControlCentre, links: CentreLinks) -> list[dict[str, Any]]:
 
 
 async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
-    """Work every second."""
+    """Work every `STEP_S`."""
     loop = asyncio.get_running_loop()
     due = loop.time()
     while True:
@@ -403,7 +408,7 @@ def _check_line(settings: CentreFile, store: Store, path: Path) -> None:
     under |= {f"train {t.number}": f"{t.length_m:g} m" for t in settings.trains}
     under |= {"order of the stations": ", ".join(s.name for s in settings.stations)}
     text = store.document(_BELONGS_TO)
-    if text is None and store.document(INTERLOCKING) is not None:
+    if text is None and store.document(HEAD) is not None:
         raise InputFileError(path, "the database is of an older version of railfix; name another database")
     before: dict[str, str] = under if text is None else json.loads(text)
     for name in sorted(before.keys() | under.keys()):

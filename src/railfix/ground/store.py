@@ -43,6 +43,7 @@ LOG: Final = sql.Table(
     sql.Column("train", sql.BigInteger),
     sql.Column("text", sql.Text, nullable=False),
 )
+_KEYS: Final[dict[sql.Table, sql.Column[Any]]] = {TRAINS: TRAINS.c.train, DOCUMENTS: DOCUMENTS.c.name}
 
 
 class Store:
@@ -63,6 +64,8 @@ class Store:
         self._url = url
         self._token: str | None = None
         self._lock: IO[str] | None = None
+        self._notes: list[dict[str, Any]] = []
+        self._known: dict[str, set[Any]] = {}
 
     def take_charge(self) -> None:
         """Make this process the only one that writes: a centre in charge before cannot commit any more.
@@ -80,8 +83,11 @@ class Store:
                 raise InputFileError(database, "is in use by another centre; end that one first") from None
         token = uuid.uuid4().hex
         with self._connection.begin():
-            self._put(DOCUMENTS, {"name": _IN_CHARGE}, {"text": token})
+            charge = DOCUMENTS.update().where(DOCUMENTS.c.name == _IN_CHARGE).values(text=token)
+            if self._connection.execute(charge).rowcount == 0:
+                self._connection.execute(DOCUMENTS.insert().values(name=_IN_CHARGE, text=token))
         self._token = token
+        self._known.clear()  # a centre before may have written until now
 
     def __enter__(self) -> Self:
         return self
@@ -92,33 +98,44 @@ class Store:
         self.close()
 
     def close(self) -> None:
-        """Close the database."""
+        """Commit the lines of the log that are left, and close the database."""
+        if self._notes:
+            self.save()
         if self._lock is not None:
             self._lock.close()
         self._connection.close()
         self._engine.dispose()
 
     def save(self, *records: TrainRecord, documents: Mapping[str, str] | None = None) -> None:
-        """Commit the newest reports of trains and named texts together; afterwards they may be acknowledged.
+        """Commit reports of trains, named texts and the lines of the log together; they may be acknowledged then.
 
         InputFileError: when another centre has taken charge of the database since `take_charge`.
         """
+        trains = [
+            {"train": record.train, "sequence": record.sequence,
+             "message": None if record.message is None else encode(record.message)}
+            for record in records
+        ]  # fmt: skip
         with self._connection.begin():
             if self._token is not None:
                 # written before it is read, so that the row stays locked until the commit
                 mine = (DOCUMENTS.c.name == _IN_CHARGE) & (DOCUMENTS.c.text == self._token)
                 if self._connection.execute(DOCUMENTS.update().where(mine).values(text=self._token)).rowcount != 1:
+                    self._notes.clear()
                     raise InputFileError(self._url, "another centre has taken charge of this database; this one ends")
-            for record in records:
-                message = None if record.message is None else encode(record.message)
-                self._put(TRAINS, {"train": record.train}, {"sequence": record.sequence, "message": message})
-            for name, text in (documents or {}).items():
-                self._put(DOCUMENTS, {"name": name}, {"text": text})
+            added = [
+                self._put(TRAINS, trains),
+                self._put(DOCUMENTS, [{"name": name, "text": text} for name, text in (documents or {}).items()]),
+            ]
+            if self._notes:
+                self._connection.execute(LOG.insert(), self._notes)
+        self._notes.clear()
+        for table, keys in zip((TRAINS, DOCUMENTS), added, strict=True):
+            self._known[table.name] = keys
 
     def note(self, time_ns: int, text: str, *, train: int | None = None) -> None:
-        """Commit a line of the log."""
-        with self._connection.begin():
-            self._connection.execute(LOG.insert().values(time_ns=time_ns, train=train, text=text))
+        """Take a line of the log, to be committed with the next `save` or at the end."""
+        self._notes.append({"time_ns": time_ns, "train": train, "text": text})
 
     def records(self) -> dict[int, TrainRecord]:
         """Return the records of all trains as after a restart."""
@@ -141,18 +158,36 @@ class Store:
         with self._connection.begin():
             return self._connection.execute(sql.select(DOCUMENTS.c.text).where(DOCUMENTS.c.name == name)).scalar()
 
+    def documents(self, beginning: str) -> dict[str, str]:
+        """Return the texts whose names begin so."""
+        named = sql.select(DOCUMENTS.c.name, DOCUMENTS.c.text).where(
+            DOCUMENTS.c.name.startswith(beginning, autoescape=True)
+        )
+        with self._connection.begin():
+            return {row.name: row.text for row in self._connection.execute(named)}
+
     def log(self, *, last: int = 100) -> list[tuple[int, int | None, str]]:
-        """Return the newest lines of the log, oldest first: time [ns], train, text."""
+        """Return the newest lines of the log that are committed, oldest first: time [ns], train, text."""
         query = sql.select(LOG).order_by(LOG.c.number.desc()).limit(last)
         with self._connection.begin():
             rows = self._connection.execute(query).all()
         return [(row.time_ns, row.train, row.text) for row in reversed(rows)]
 
-    def _put(self, table: sql.Table, key: dict[str, Any], values: dict[str, Any]) -> None:
-        where = [table.c[name] == value for name, value in key.items()]
-        done = self._connection.execute(table.update().where(*where).values(**values))
-        if done.rowcount == 0:
-            self._connection.execute(table.insert().values(**key, **values))
+    def _put(self, table: sql.Table, rows: list[dict[str, Any]]) -> set[Any]:
+        """Update the rows that the table has, insert the others; return all keys that it then has."""
+        column = _KEYS[table]
+        if table.name not in self._known:
+            self._known[table.name] = set(self._connection.execute(sql.select(column)).scalars())
+        known = self._known[table.name]
+        old = [{"of": row[column.name], **row} for row in rows if row[column.name] in known]
+        new = [row for row in rows if row[column.name] not in known]
+        if old:
+            names = [name for name in rows[0] if name != column.name]
+            update = table.update().where(column == sql.bindparam("of")).values({n: sql.bindparam(n) for n in names})
+            self._connection.execute(update, old)
+        if new:
+            self._connection.execute(table.insert(), new)
+        return known | {row[column.name] for row in new}
 
 
 def _durable(connection: Any, _record: object) -> None:

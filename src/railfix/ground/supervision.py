@@ -6,10 +6,11 @@ The one path for `railfix.ground.control` (the centre with its store and page) a
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 from railfix.ground.authority import Authority
 from railfix.ground.centre import CentreLimits, Rejection, TrainRecord
@@ -17,6 +18,7 @@ from railfix.ground.centre import report_received as record_received
 from railfix.ground.interlocking import (
     Interlocking,
     InterlockingLimits,
+    NearbyTrains,
     PointState,
     TrainInterval,
     extended,
@@ -32,6 +34,8 @@ from railfix.io.train_message import TrainMessage
 
 #: A train within this distance of the end of its track asks for the next route [m].
 ROUTE_AHEAD_M = 700.0
+#: A train is sent an authority at its report, at a stop, and otherwise this often [s].
+AUTHORITY_S = 1.0
 
 
 @dataclass(kw_only=True)
@@ -49,6 +53,10 @@ class Supervision:
     refusals : Counter of str
         Routes refused, by reason.
     routes_set : int
+    heard : set of int
+        Trains that have reported since the last authorities.
+    sent : dict of int to (float, bool)
+        When a train was sent its last authority [s], and whether it was an order to stop.
     """
 
     layout: Layout
@@ -60,6 +68,8 @@ class Supervision:
     records: dict[int, TrainRecord] = field(default_factory=dict)
     refusals: Counter[str] = field(default_factory=Counter)
     routes_set: int = 0
+    heard: set[int] = field(default_factory=set)
+    sent: dict[int, tuple[float, bool]] = field(default_factory=dict)
 
     def report(self, message: TrainMessage, now_s: float) -> Rejection | None:
         """Take a report; return why it does not count, None where it does."""
@@ -69,17 +79,21 @@ class Supervision:
         self.records[message.train], reason = record_received(record, message, now_s, limits=self.centre)
         if reason is None:
             self.state = report_received(self.state, message, self.layout, limits=self.limits)
+            self.heard.add(message.train)
         return reason
 
     def detected(self, point: PointName) -> None:
         """Take the detection of points in the position they were commanded to."""
         self.state = points_reported(self.state, point, self.state.points[point].wanted)
 
-    def set_route(self, train: int) -> str | None:
-        """Set a route to the next station; return the reason of a refusal."""
+    def set_route(self, train: int, **step: Any) -> str | None:
+        """Set a route to the next station; return the reason of a refusal.
+
+        `step` is what `route_requested` takes of the step at hand.
+        """
         if train not in self.state.trains:
             return f"there is no train {train}"
-        self.state, moved, reason = route_requested(self.state, train, self.layout)
+        self.state, moved, reason = route_requested(self.state, train, self.layout, **step)
         if reason is not None:
             self.refusals[reason] += 1
             return reason
@@ -89,27 +103,43 @@ class Supervision:
         return None
 
     def advance(self, now_s: float) -> list[Authority]:
-        """Release points, set routes, extend authorities; return what is sent once the state is stored."""
+        """Release points, set routes, extend authorities; return what is sent once the state is stored.
+
+        Trains that have reported since the last call, whose stop has changed, or that were sent nothing for
+        `AUTHORITY_S` are looked at; the others wait for their report.
+        """
         self.state = overlaps_stopped(self.state, self.layout)
         self.state = released(self.state, now_s, self.layout, limits=self.limits)
+        nearby, stopped = NearbyTrains(self.state, self.layout), stopped_trains(self.state)
+        due = [number for number in self.state.trains if self._is_due(number, now_s, stopped)]
         if self.routes == "automatic":
-            for number, train in self.state.trains.items():
-                if self._wants_route(train):
-                    self.set_route(number)
-        self.state = extended(self.state, self.layout, limits=self.limits)
-        self.state = replace(self.state, granted=self.state.granted + 1)
+            for number in due:
+                if self._wants_route(self.state.trains[number]):
+                    self.set_route(number, nearby=nearby, stopped=stopped)
+        self.state = extended(self.state, self.layout, limits=self.limits, trains=due, nearby=nearby, stopped=stopped)
         stopped = stopped_trains(self.state)
-        return [
-            Authority(
-                train=number,
-                number=self.state.granted,
-                report=max(self.records[number].sequence, 0) if number in self.records else 0,
-                end_cm=train.direction * int(train.direction * train.end_m * 100.0 // 1.0),
-                direction=1 if train.direction > 0 else -1,
-                stopped=self.state.stopped or number in stopped,
-            )
-            for number, train in self.state.trains.items()
-        ]
+        due = [number for number in self.state.trains if self._is_due(number, now_s, stopped)]
+        if not due:
+            return []
+        self.state = replace(self.state, granted=self.state.granted + 1)
+        self.heard.clear()
+        self.sent.update((number, (now_s, self.state.stopped or number in stopped)) for number in due)
+        return [self._authority(self.state.trains[number], number in stopped) for number in due]
+
+    def _is_due(self, number: int, now_s: float, stopped: Mapping[int, str]) -> bool:
+        sent_s, was_stopped = self.sent.get(number, (-math.inf, False))
+        stop = self.state.stopped or number in stopped
+        return number in self.heard or now_s - sent_s >= AUTHORITY_S - 1e-6 or stop != was_stopped
+
+    def _authority(self, train: TrainInterval, stopped: bool) -> Authority:
+        return Authority(
+            train=train.train,
+            number=self.state.granted,
+            report=max(self.records[train.train].sequence, 0) if train.train in self.records else 0,
+            end_cm=train.direction * int(train.direction * train.end_m * 100.0 // 1.0),
+            direction=1 if train.direction > 0 else -1,
+            stopped=self.state.stopped or stopped,
+        )
 
     def _wants_route(self, train: TrainInterval) -> bool:
         ahead = train.station + train.direction

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from railfix.ground.authority import Authority
-from railfix.ground.interlocking import TrainInterval, interval_of
+from railfix.ground.interlocking import TrainInterval
 from railfix.ground.layout import Layout, LoopStation, PointName, overlap
 from railfix.ground.on_board import OnBoard
 from railfix.ground.supervision import Supervision, standing_train
@@ -229,11 +229,11 @@ class Traffic:
     def _check(self) -> None:
         trains = list(self.trains.values())
         true = {t.number: self.layout.pieces(t.rear_m, t.front_m, t.tracks) for t in trains}
-        known = {n: self.layout.pieces(*interval_of(t), t.tracks) for n, t in self.centre.state.trains.items()}
+        known = {n: self.layout.pieces(*t.interval_m, t.tracks) for n, t in self.centre.state.trains.items()}
         for k, first in enumerate(trains):
             supervised = self.centre.state.trains[first.number]
             if supervised.direction == first.direction:
-                rear, end = interval_of(supervised)
+                rear, end = supervised.interval_m
                 inside = first.direction * (first.rear_m - rear) >= -1e-6
                 inside &= first.direction * (end - first.front_m) >= -1e-6
                 if not inside:
@@ -250,9 +250,7 @@ class Traffic:
         for k in range(len(self.layout.stations) - 1):
             first, last = self.layout.stations[k].end_m, self.layout.stations[k + 1].begin_m
             directions = {
-                t.direction
-                for t in self.centre.state.trains.values()
-                if min(interval_of(t)) < last and max(interval_of(t)) > first
+                t.direction for t in self.centre.state.trains.values() if t.span_m[0] < last and t.span_m[1] > first
             }
             if len(directions) > 1:
                 self.violations["opposing trains in a section"] += 1

@@ -86,10 +86,20 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
     ``done`` in the snapshot ends its events; the orders are ``release`` and ``route``.
     """
     template = (files("railfix.ground") / "page.html").read_text(encoding="utf-8")
+    newest: tuple[float, str, bool] | None = None
+
+    def shared() -> tuple[str, bool]:
+        """The snapshot as JSON, and whether it is the last: made once for all who read within `EVENT_S`."""
+        nonlocal newest
+        now = time.monotonic()
+        if newest is None or now - newest[0] >= 0.9 * EVENT_S:
+            values = snapshot()
+            newest = now, json.dumps(values), bool(values["done"])
+        return newest[1:]
 
     async def page(_: Request) -> Response:
         # "<" in a string would end the script
-        state = json.dumps(snapshot()).replace("<", "\\u003c")
+        state = shared()[0].replace("<", "\\u003c")
         return HTMLResponse(template.replace("/*STATE*/null", state), headers=_HEADERS)
 
     async def state(_: Request) -> Response:
@@ -97,9 +107,9 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
 
     async def stream() -> AsyncIterator[str]:
         while True:
-            values = snapshot()
-            yield f"data: {json.dumps(values)}\n\n"
-            if values["done"]:
+            text, done = shared()
+            yield f"data: {text}\n\n"
+            if done:
                 return
             await asyncio.sleep(EVENT_S)
 
