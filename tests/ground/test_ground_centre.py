@@ -225,6 +225,17 @@ def test_a_killed_centre_loses_no_acknowledged_report(tmp_path: Path, kills: int
             assert record.state is TrainState.UNKNOWN
 
 
+def test_one_number_far_ahead_locks_no_train_out() -> None:
+    """It counts once the next report goes on from there, as after a start on board; right ones go on before that."""
+    record, reasons = TrainRecord(train=7), []
+    for number in (5, 1 << 60, 6, 9_000, 7, 9_000, 9_002, 8):
+        record, reason = report_received(record, message(9, 50.0).replaced(sequence=number), 1.0, limits=LIMITS)
+        reasons.append(reason)
+    far, repeated = Rejection.FAR_AHEAD, Rejection.REPEATED
+    assert reasons == [None, far, None, far, None, far, None, repeated]
+    assert record.sequence == 9_002
+
+
 def test_documents_and_log_are_kept(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path / 'centre.db'}"
     with Store(url) as store:

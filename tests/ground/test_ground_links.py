@@ -61,6 +61,17 @@ def test_each_threat_has_its_counter() -> None:
     assert used("B", frame(7, at_s=7.0), 7.0) is not None
 
 
+def test_one_number_far_ahead_locks_nobody_out() -> None:
+    """It counts once the next goes on from there, as after a start of the sender; right ones go on before that."""
+    receiver = FrameReceiver(sender=7, limits=ReceiverLimits(jump=50))
+    used = [
+        receiver.receive("A", frame(k).encode(), 0)[1] is not None for k in (1, 2, 1 << 60, 3, 9_000, 4, 9_000, 9_001)
+    ]
+    assert used == [True, True, False, True, False, True, False, True]
+    assert receiver.threats[Threat.INSERTION] == 3
+    assert receiver.receive("A", frame(5).encode(), 0)[1] is None
+
+
 def test_the_origin_of_the_senders_clock_does_not_matter() -> None:
     for origin in (-1e6, 0.0, 1e9):
         receiver = FrameReceiver(sender=7, limits=ReceiverLimits(delay_s=2.0))

@@ -209,6 +209,29 @@ def test_positions_go_to_the_centre_and_authorities_come_back(folder: Path, tmp_
     assert lines[-1] == {"brake": True, "reason": "no fresh authority"}
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_train_ends_within_a_second(folder: Path, number: signal.Signals) -> None:
+    """With its input open and silent, and no centre there."""
+    words = [sys.executable, "-m", "railfix", "ground", "train", "1", "--keys", str(folder / "keys")]
+    for host, port in addresses(folder).values():
+        words += ["--centre", f"{host}:{port}"]
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdin is not None
+    assert process.stdout is not None
+    placed = SimulatedTrain(number=1, front_m=300.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=300.0))
+    process.stdin.write(to_json(placed.message(0.0)) + "\n")
+    process.stdin.flush()
+    assert json.loads(process.stdout.readline()) == {"brake": True, "reason": "no fresh authority"}
+    begin = time.monotonic()
+    process.send_signal(number)
+    try:
+        assert process.wait(10.0) == 128 + number
+    finally:
+        process.kill()
+        process.communicate()
+    assert time.monotonic() - begin < 1.0
+
+
 @pytest.fixture
 def centre(tmp_path: Path) -> Iterator[tuple[ControlCentre, list[Authority], list[float]]]:
     """A centre by hand: train 1 up in A, train 2 down in C, routes by hand; what it sends, and its clock."""

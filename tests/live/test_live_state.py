@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import pickle
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -116,6 +119,28 @@ def test_a_state_that_does_not_belong_is_not_used(parts: dict[str, Path], tmp_pa
     path.write_bytes(kept)
     _, _, told = live(parts["first"], tmp_path, "again", "--state", str(path))
     assert "its last epoch is 2.9 s after the first new one, up to 60 s before it (state_age_s) are allowed" in told
+
+
+def test_no_number_is_sent_twice_after_a_crash(parts: dict[str, Path], tmp_path: Path) -> None:
+    """Killed at any moment, also before the first epoch of its receiver and before the first file is due."""
+    files, state, sent = demo_files(), tmp_path / "state", tmp_path / "messages"
+    words = ["--front", str(parts["whole"]), "--track", str(files["track"]), "--nav", str(files["nav"]), "--speed", "1"]
+    words += ["--state", str(state), "--live", "state_every_s=1"]
+    numbers: list[int] = []
+    for kill, least in enumerate((3, 25)):
+        path = Path(f"{sent}{kill}")
+        process = subprocess.Popen(
+            [sys.executable, "-m", "railfix", "live", *words, "--send", f"json@{path}"], stderr=subprocess.DEVNULL
+        )
+        until = time.monotonic() + 60.0
+        while not path.exists() or path.read_text().count("\n") < least:
+            assert time.monotonic() < until
+            time.sleep(0.02)
+        process.kill()
+        process.wait()
+        numbers += [from_json(line).sequence for line in path.read_text().splitlines(keepends=True) if line[-1] == "\n"]
+    assert numbers == sorted(set(numbers))
+    assert len(numbers) >= 28
 
 
 def test_a_file_that_is_no_state_is_not_overwritten(tmp_path: Path) -> None:

@@ -75,7 +75,8 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False) -> d
 
     def observe(_: LiveOutput) -> None:
         counts["outputs"] += 1
-        if counts["outputs"] % 360 == 0 and (saved := engine.saved()) is not None:
+        if counts["outputs"] % 360 == 0:
+            saved = engine.saved()
             counts["saved"] = len(pickle.dumps(SavedSession(engine=saved, streams={})))
         if counts["outputs"] % max(1, round(3600 * rate_hz)) == 0:
             memory.append(resident_mb())

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import signal
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
+from railfix.cli.command import SIGNALLED
 from railfix.cli.options import OverwriteOption, from_models, overwriting
 from railfix.cli.settings import Choices, set_value, settings_of
 from railfix.run.options import LogReading, TrackReading
@@ -114,7 +116,7 @@ def live(
         railfix live --front tcp://127.0.0.1:3001 --rear tcp://127.0.0.1:3002 --track line.csv \
             --vehicle car.toml --send json@- --send cbor@udp://127.0.0.1:4000
 
-    Exit codes as `railfix --help` says; 9 where two channels disagree.
+    Exit codes as `railfix --help` says; 9 where two channels disagree; 143 at the end by SIGTERM.
     """
     from railfix.live.command import LiveInputs, Sensor, run_live
 
@@ -153,5 +155,8 @@ def live(
         out=out,
         overwrite=overwriting(overwrite),
     )
-    for line in asyncio.run(run_live(inputs)):
+    summary, terminated = asyncio.run(run_live(inputs))
+    for line in summary:
         typer.echo(line, err=True)
+    if terminated:
+        raise SystemExit(SIGNALLED + signal.SIGTERM)

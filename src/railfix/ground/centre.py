@@ -42,11 +42,15 @@ class CentreLimits(Settings):
         After this time without a report the train is in error.
     age_s : float [s]
         Largest age of a position when it was sent; older reports are rejected.
+    jump : int
+        A sequence number further ahead of the newest counts once the next report goes on from there: one wrong number
+        does not make all later ones old.
     """
 
     lost_s: float = Field(default=3.0, gt=0)
     error_s: float = Field(default=120.0, gt=0)
     age_s: float = Field(default=5.0, gt=0)
+    jump: int = Field(default=1000, ge=1)
 
     @model_validator(mode="after")
     def _lost_before_error(self) -> Self:
@@ -65,6 +69,8 @@ class TrainRecord:
     state : TrainState
     sequence : int
         Newest sequence number received, -1 without one.
+    ahead : int
+        Number far ahead of it that the next report has to confirm, -1 without one.
     message : TrainMessage or None
         Newest report with a place.
     heard_s : float [s]
@@ -82,6 +88,7 @@ class TrainRecord:
     train: int
     state: TrainState = TrainState.UNKNOWN
     sequence: int = -1
+    ahead: int = -1
     message: TrainMessage | None = None
     heard_s: float = 0.0
     measured_s: float = 0.0
@@ -96,6 +103,7 @@ class Rejection(Enum):
     UNKNOWN_TRAIN = "of a train that is not supervised"
     OTHER_TRAIN = "of another train"
     REPEATED = "repeated or older than the newest"
+    FAR_AHEAD = "number far ahead of the newest, to be confirmed by the next"
     NO_PLACE = "without a place"
     TOO_OLD = "place too old when it was sent, or the train's clock was stepped"
 
@@ -106,6 +114,9 @@ def rejection(record: TrainRecord, message: TrainMessage, *, limits: CentreLimit
         return Rejection.OTHER_TRAIN
     if message.sequence <= record.sequence:
         return Rejection.REPEATED
+    far = record.sequence >= 0 and message.sequence > record.sequence + limits.jump
+    if far and not 0 <= record.ahead < message.sequence <= record.ahead + limits.jump:
+        return Rejection.FAR_AHEAD
     if message.status not in (MessageStatus.POSITION, MessageStatus.COASTING) or message.facing == 0:
         return Rejection.NO_PLACE
     if not 0 <= message.sent_ns - message.time_ns <= limits.age_s * 1e9:
@@ -124,6 +135,9 @@ def report_received(
     reason = rejection(record, message, limits=limits)
     if reason in (Rejection.OTHER_TRAIN, Rejection.REPEATED):
         return record, reason
+    if reason is Rejection.FAR_AHEAD:
+        return replace(record, ahead=message.sequence), reason
+    record = replace(record, ahead=-1)
     if reason is not None:
         return replace(record, sequence=message.sequence), reason
     assert message.chainage_cm is not None

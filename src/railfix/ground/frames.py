@@ -113,12 +113,13 @@ class ReceiverLimits(Settings):
     drift : float
         Largest drift of the clocks against each other; the shortest delay is forgotten at this rate.
     jump : int
-        Largest step of the sequence number.
+        Larger steps of the sequence number count once the next frame goes on from there, so that one wrong number
+        does not make all later ones old.
     """
 
     delay_s: float = Field(default=5.0, gt=0)
     drift: float = Field(default=1e-4, ge=0)
-    jump: int = Field(default=10_000_000, ge=1)
+    jump: int = Field(default=1000, ge=1)
 
 
 @dataclass(kw_only=True)
@@ -127,6 +128,15 @@ class _Seen:
 
     newest: int = -1
     bits: int = 0
+    ahead: int = -1
+
+    def is_alone(self, sequence: int, jump: int) -> bool:
+        """Whether a number is far ahead of the newest, and does not go on from one that was."""
+        if self.newest < 0 or sequence <= self.newest + jump:
+            self.ahead = -1
+            return False
+        before, self.ahead = self.ahead, sequence
+        return not 0 <= before < sequence <= before + jump
 
     def has(self, sequence: int) -> bool:
         behind = self.newest - sequence
@@ -176,7 +186,7 @@ class FrameReceiver:
         on_link = self._links.setdefault((link, frame.kind), _Seen())
         if on_link.has(frame.sequence):
             return self._rejected(Threat.REPETITION)
-        if on_link.newest >= 0 and frame.sequence > on_link.newest + self.limits.jump:
+        if on_link.is_alone(frame.sequence, self.limits.jump):
             return self._rejected(Threat.INSERTION)
         if self._late(frame, now_ns):
             return self._rejected(Threat.DELAY)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
+import stat
 import sys
 import time
 from collections.abc import AsyncIterator, Callable
@@ -21,6 +23,8 @@ from railfix.io.train_message import MessageError, TrainMessage, encode, from_js
 REPORT_S, LOOK_S = 1.0, 0.1
 #: Largest age of what the integrity device has written [s].
 INTEGRITY_S = 2.0
+#: Longest line of a position message [bytes].
+LONGEST_LINE = 100_000
 
 
 async def run_train(
@@ -132,5 +136,16 @@ class _Desk:
 
 
 async def _standard_input() -> AsyncIterator[str]:
-    while line := await asyncio.to_thread(sys.stdin.readline):
-        yield line
+    """Lines as they come; a reader that waits does not hold the end of the program up."""
+    kind = os.fstat(sys.stdin.fileno()).st_mode
+    if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind) or sys.stdin.isatty()):  # a file has all its lines
+        for line in sys.stdin:
+            yield line
+        return
+    reader = asyncio.StreamReader(limit=LONGEST_LINE)
+    await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    try:
+        while data := await reader.readline():
+            yield data.decode(errors="replace")
+    except ValueError:
+        raise MessageError(f"is longer than {LONGEST_LINE} bytes") from None

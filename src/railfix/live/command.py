@@ -104,8 +104,8 @@ class LiveInputs(Settings):
             check_log_file(self.log)
 
 
-async def run_live(inputs: LiveInputs) -> list[str]:
-    """Run a session until its sources end, or SIGINT or SIGTERM; return a summary, a line each.
+async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
+    """Run a session until its sources end, or SIGINT or SIGTERM; return a summary, a line each, and whether by SIGTERM.
 
     SIGHUP reloads nothing: it is logged and counted. RailfixError: when a source, sink, file or setting is not what it
     should be, or two channels disagree.
@@ -168,13 +168,19 @@ async def run_live(inputs: LiveInputs) -> list[str]:
             metrics.hangups += 1
             log.say("SIGHUP: nothing is reloaded; settings, map and vehicle are those of the start; restart to change")
 
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, session.cancel)
+        loop, terminated = asyncio.get_running_loop(), False
+
+        def terminate() -> None:
+            nonlocal terminated
+            terminated = True
+            session.cancel()
+
+        loop.add_signal_handler(signal.SIGINT, session.cancel)
+        loop.add_signal_handler(signal.SIGTERM, terminate)
         loop.add_signal_handler(signal.SIGHUP, hung_up)
         with contextlib.suppress(asyncio.CancelledError):
             await session
-    return metrics.summary()
+    return metrics.summary(), terminated
 
 
 def _hooks(

@@ -62,11 +62,11 @@ class EngineState:
     ----------
     state : State
     done_ns : int [ns]
-        Time tag of the last epoch, GPS time since 1980.
+        Time tag of the last epoch, GPS time since 1980; 0 before the first.
     last_tag : mapping of str to int [ns]
         Last time tag of each antenna.
     sequence : int
-        Number of the last message.
+        Number of the last message, or one that no message has reached when the next state is saved.
     """
 
     state: State
@@ -183,20 +183,23 @@ class LiveEngine:
         """Start the clock: from here on every period has a message, also before the first epoch."""
         self._due_ns = now_ns if self._due_ns is None else self._due_ns
 
-    def saved(self) -> EngineState | None:
-        """What a restarted session continues from; None before the first epoch."""
-        if self._state is None:
-            return None
+    def saved(self, *, reserved: int = 0) -> EngineState:
+        """What a restarted session continues from; `reserved` numbers of messages are left out for a crash."""
+        sequence = self._sequence + reserved
+        if self._saved is not None:  # no epoch has come to continue from it
+            return replace(self._saved, sequence=sequence)
         return EngineState(
-            state=self._state, done_ns=self._done_ns, last_tag=dict(self._last_tag), sequence=self._sequence
-        )
+            state=State() if self._state is None else self._state, done_ns=self._done_ns if self._state else 0,
+            last_tag=dict(self._last_tag), sequence=sequence,
+        )  # fmt: skip
 
     def resume(self, saved: EngineState) -> None:
         """Continue from a saved state, if the first epoch comes within `LiveSettings.state_age_s` of its last one.
 
         Otherwise its navigation records, SBAS messages and sequence number alone are used; `told` says which.
         """
-        self._saved = saved
+        self._sequence = max(self._sequence, saved.sequence)
+        self._saved = saved if saved.done_ns else None
 
     def push(self, antenna: str, epoch: Observations, *, now_ns: int) -> None:
         """Take one epoch of an antenna, at the clock of the computer on which `poll` is called."""
@@ -219,7 +222,6 @@ class LiveEngine:
     def _resume_at(self, tag_ns: int, saved: EngineState) -> None:
         """Take over a saved state where an epoch with this tag may follow it."""
         self._saved = None
-        self._sequence = max(self._sequence, saved.sequence)
         age_s = (tag_ns - saved.done_ns) * 1e-9
         if 0.0 < age_s <= self.settings.state_age_s:
             self._state, self._done_ns, self._last_tag = saved.state, saved.done_ns, dict(saved.last_tag)

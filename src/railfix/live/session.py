@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
+import math
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -141,10 +142,13 @@ class _Session:
     saved: float = field(default_factory=time.monotonic)
     shown: float = 0.0
     since_collection: int = 0
+    reserved_from: int = 0
 
     async def process(self, queue: _Queue, pumps: list[asyncio.Task[None]], *, replay: bool) -> None:
         """Process what the pumps bring until all have ended; a restart can continue from there."""
         read_to_ns = self.read_to_ns
+        self.reserved_from = self.engine.saved().sequence
+        self.save(reserved=self.reserved)
         try:
             while read_to_ns:
                 for pump in pumps:
@@ -262,19 +266,26 @@ class _Session:
         if self.hooks.show is not None and outputs and now - self.shown >= _STATUS_S:
             self.shown = now
             self.hooks.show(status_text(outputs[-1], self.metrics))
-        if outputs and now - self.saved >= self.engine.settings.state_every_s:
-            self.saved = now
-            self.save()
+        used = outputs[-1].message.sequence - self.reserved_from if outputs else 0
+        if outputs and (now - self.saved >= self.engine.settings.state_every_s or 2 * used > self.reserved):
+            self.saved, self.reserved_from = now, outputs[-1].message.sequence
+            self.save(reserved=self.reserved)
         self.since_collection += len(outputs)
         if self.since_collection >= _BETWEEN_COLLECTIONS:
             self.since_collection = 0
             gc.collect()
 
-    def save(self) -> None:
-        """Hand over what a restart needs, where there is something and somebody wants it."""
-        if self.hooks.save is not None and (saved := self.engine.saved()) is not None:
+    @property
+    def reserved(self) -> int:
+        """Numbers of messages for ten times between two states: none is sent twice after a crash."""
+        settings = self.engine.settings
+        return math.ceil(10.0 * settings.state_every_s / settings.period_s)
+
+    def save(self, *, reserved: int = 0) -> None:
+        """Hand over what a restart needs, where somebody wants it."""
+        if self.hooks.save is not None:
             streams = {name: state.after_break() for name, state in self.streams.items()}
-            self.hooks.save(SavedSession(engine=saved, streams=streams))
+            self.hooks.save(SavedSession(engine=self.engine.saved(reserved=reserved), streams=streams))
 
 
 class _Pace:
