@@ -6,10 +6,12 @@ import asyncio
 import json
 import os
 import shutil
+import socket
 import ssl
 import subprocess
 import tempfile
 import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -22,6 +24,7 @@ from starlette.applications import Starlette
 from starlette.responses import HTMLResponse, StreamingResponse
 from starlette.routing import Route
 
+from railfix.ground import web
 from railfix.ground.demo import FAULT_S, run_demo
 from railfix.ground.keys import write_keys
 from railfix.ground.web import MOST_WRONG, SESSION_S, PageServer, Sessions, page_app
@@ -208,7 +211,7 @@ def test_orders_need_a_log_in(demo: tuple[dict[str, Any], dict[str, Any]]) -> No
         desk, stranger = Browser(url), Browser(url)
         for address in ("orders/release", "orders/route"):
             assert desk.post(address, {"train": 1}) == (403, "log in first")
-        for wrong in ("wrong", "", None, 5):
+        for wrong in ("wrong", "", None, 5, "\ud800"):
             assert desk.post("login", {"password": wrong})[0] == 403
         assert desk.post("login", {"password": "secret"}, kind="text/plain")[0] == 403  # as a foreign page would
         assert desk.post("orders/route", {"train": 1})[0] == 403
@@ -232,6 +235,42 @@ def test_orders_need_a_log_in(demo: tuple[dict[str, Any], dict[str, Any]]) -> No
         assert desk.post("login", {"password": "secret"})[0] == 200
         assert desk.post("logout") == (200, None)
         assert desk.post("orders/route", {"train": 2})[0] == 403
+
+
+def test_wrong_passwords_lock_out_their_address_alone() -> None:
+    sessions = Sessions(password="secret", clock=lambda: 0.0)
+    for _ in range(MOST_WRONG):
+        assert sessions.log_in("wrong", "10.0.0.9") is None
+    assert sessions.log_in("secret", "10.0.0.9") is None
+    assert sessions.log_in("secret", "10.0.0.1") is not None
+
+
+def test_a_request_that_does_not_end_is_ended(
+    demo: tuple[dict[str, Any], dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Heads and bodies that come byte by byte; what follows a whole request may wait no longer."""
+    monkeypatch.setattr(web, "REQUEST_S", 0.3)
+    app = page_app(lambda: demo[1], {}, sessions=Sessions(password="secret"))
+    begun = b"POST /login HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n"
+    with served(app) as url:
+        host, port = url.split("/")[2].split(":")
+        for text in (b"", b"GET / HT", begun, b"GET /state HTTP/1.1\r\nHost: x\r\n\r\nGET"):
+            with socket.create_connection((host, int(port)), timeout=5.0) as connection:
+                connection.sendall(text)
+                answer, begin = b"", time.monotonic()
+                while time.monotonic() - begin < 5.0:
+                    try:
+                        if text not in (b"", begun):
+                            connection.sendall(b"x")
+                        part = connection.recv(65_536)
+                    except (ConnectionError, TimeoutError):
+                        break
+                    if not part:
+                        break
+                    answer += part
+                assert time.monotonic() - begin < 2.0, text
+                assert answer.startswith(b"HTTP/1.1 ") or text in (b"", b"GET / HT")
+                assert text != begun or answer.startswith(b"HTTP/1.1 403")
 
 
 def test_beyond_loopback_addresses_the_page_is_served_by_tls(

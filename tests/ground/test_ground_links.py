@@ -7,6 +7,7 @@ import random
 import time
 from collections import Counter
 from collections.abc import Coroutine
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -372,6 +373,50 @@ def test_a_wrong_certificate_is_rejected(keys: Path, tmp_path: Path, kind: str) 
         assert got == []
         assert centre.threats()[Threat.MASQUERADE] > 0
         await train.stop()
+        await centre.stop()
+
+    run(work())
+
+
+@pytest.mark.parametrize("how", ["revoked", "expired"])
+def test_a_certificate_ends_while_connected(tmp_path: Path, how: str) -> None:
+    write_keys(tmp_path / "keys", [7, 8])
+    keys = tmp_path / "keys"
+
+    async def work() -> None:
+        got: Counter[int] = Counter()
+        centre = CentreLinks(keys, HOSTS, received=lambda train, _: got.update([train]))
+        await centre.start()
+        trains = {n: TrainLinks(n, keys, centre.addresses, LOCAL) for n in (7, 8)}
+        for train in trains.values():
+            await train.start()
+
+        async def carried(numbers: set[int]) -> bool:
+            got.clear()
+            for train in trains.values():
+                train.send(b"place")
+            await _until(lambda: set(got) >= numbers, 1.0)
+            return set(got) == numbers
+
+        assert await _until(lambda: all(len(t.protocols) == 2 for t in trains.values()), 5.0) < 5.0
+        assert await carried({7, 8})
+        if how == "revoked":
+            (keys / "revoked.txt").write_text("train-7\n")
+        else:
+            for (number, _), protocol in centre._peers.items():
+                if number == 7:
+                    protocol.ends = datetime(2020, 1, 1, tzinfo=UTC)
+        rejected = centre.masquerades
+        assert await _until(lambda: centre.masquerades >= rejected + 2, 5.0) < 5.0
+        if how == "revoked":
+            for _ in range(3):
+                await asyncio.sleep(0.7)  # it connects again, and is rejected again
+                assert await carried({8})
+            (keys / "revoked.txt").write_bytes(b"\xff\xfe")
+            assert await _until(lambda: centre.alarm is not None, 5.0) < 5.0
+            assert await carried({8})
+        for train in trains.values():
+            await train.stop()
         await centre.stop()
 
     run(work())

@@ -7,6 +7,7 @@ import json
 import random
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 import time
@@ -313,6 +314,38 @@ def test_routes_and_the_release_by_hand(
     again.step()
     assert sent[-1].number > max(numbers)
     assert sent[-1].stopped
+
+
+def test_a_database_that_fails_is_an_alarm(
+    centre: tuple[ControlCentre, list[Authority], list[float]], tmp_path: Path
+) -> None:
+    """Another program holds the file: nothing is granted, said once, and all is stored once it can be."""
+    control, sent, now = centre
+    control.supervision.state = replace(control.supervision.state, stopped=False)
+    control.monitor = None
+    control.step()
+    assert len(sent) == 2
+    placed = SimulatedTrain(number=1, front_m=400.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=400.0))
+    other = sqlite3.connect(tmp_path / "centre.db", isolation_level=None)
+    other.execute("BEGIN EXCLUSIVE")
+    control.report(1, encode(placed.message(0.0)))
+    for _ in range(8):
+        now[0] += 0.3
+        control.step()
+    assert len(sent) == 2
+    assert control.database is not None
+    assert "database is locked" in control.database
+    assert sum("ALARM" in line for line in control.lines) == 1
+    other.execute("ROLLBACK")
+    other.close()
+    now[0] += 1.0
+    control.step()
+    assert control.database is None
+    assert {authority.train: authority.report for authority in sent[2:]} == {1: 1, 2: 0}
+    assert control.store.records()[1].sequence == 1
+    told = [text for _, _, text in control.store.log()]
+    assert "train 1: heard" in told
+    assert "the database is written again" in control.lines[-1]
 
 
 def test_a_centre_counts_what_does_not_count(centre: tuple[ControlCentre, list[Authority], list[float]]) -> None:

@@ -18,12 +18,14 @@ from railfix.ground.layout import PointName
 from railfix.ground.monitor import MonitorLimits, MonitorState, advance, release
 from railfix.ground.monitor import Order as MonitorOrder
 from railfix.ground.reference_curve import ReferenceCurve
-from railfix.ground.store import Store
+from railfix.ground.store import DatabaseError, Store
 from railfix.ground.supervision import Supervision
 from railfix.ground.triangle import STOPPING, Verdict
 from railfix.ground.web import Order
 from railfix.io.train_message import MessageError, decode
 
+#: Time between attempts to write to a database that fails [s].
+RETRY_S = 1.0
 #: Name of the stored document.
 _CAUSE = "cause of the stop"
 
@@ -55,6 +57,8 @@ class ControlCentre:
         Of satellite positioning; None where nothing judges it.
     rejected : Counter of str
         Reports that did not count, by reason.
+    database : str or None
+        Why the database does not take the state: nothing is granted meanwhile, and the trains stop in time.
     """
 
     supervision: Supervision
@@ -69,6 +73,8 @@ class ControlCentre:
     reports: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
     stop_s: float | None = None
+    database: str | None = None
+    _failed_s: float = 0.0
     _routes: dict[int, int] = field(init=False)
     _verdict: tuple[Verdict, int] | None = None
     _judged: Verdict | None = None
@@ -147,8 +153,10 @@ class ControlCentre:
             self._verdict = verdict, receiver
 
     def step(self) -> None:
-        """Judge, release, route, extend; commit; then send. To be called every second."""
+        """Judge, release, route, extend; commit; then send. To be called several times a second."""
         now = self.clock()
+        if self.database is not None and now - self._failed_s < RETRY_S:
+            return
         self._monitor(now)
         authorities = self.supervision.advance(now)
         state = self.supervision.state
@@ -164,18 +172,28 @@ class ControlCentre:
             if after.state is not record.state:
                 self.log(f"train {number}: {after.state.value}", train=number)
             self.supervision.records[number] = after
-        self._save()
+        if not self._saved_whole(now):
+            return
         for authority in authorities:
             self.send(authority.train, authority.encode())
 
-    def _save(self) -> None:
-        """Commit what has changed since the last time."""
+    def _saved_whole(self, now: float) -> bool:
+        """Commit what has changed since the last time; return whether the database has taken it."""
         state, records = self.supervision.state, self.supervision.records
         cause = "" if self.monitor is None or self.monitor.cause is None else self.monitor.cause.name
         changed = [record for n, record in records.items() if self._saved_sequences.get(n) != record.sequence]
-        self.store.save(*changed, documents={**to_documents(state, self._saved), _CAUSE: cause})
-        self._saved = state
+        try:
+            self.store.save(*changed, documents={**to_documents(state, self._saved), _CAUSE: cause})
+        except DatabaseError as error:
+            if self.database is None:
+                self.log(f"ALARM: {error}; nothing is granted until it can")
+            self.database, self._failed_s = f"{error}; nothing is granted", now
+            return False
+        if self.database is not None:
+            self.log("the database is written again")
+        self.database, self._saved = None, state
         self._saved_sequences.update((record.train, record.sequence) for record in changed)
+        return True
 
     @property
     def limits(self) -> CentreLimits:

@@ -20,6 +20,20 @@ def check_keys(folder: Path, name: str) -> None:
             raise InputFileError(folder / file, "is not there; railfix ground keys writes it")
 
 
+def read_revoked(folder: Path) -> frozenset[str]:
+    """Return the names whose certificates do not count any more: the lines of ``revoked.txt``, such as ``train-7``.
+
+    InputFileError: when the file is there and cannot be read.
+    """
+    path = folder / "revoked.txt"
+    try:
+        return frozenset(path.read_text(encoding="utf-8").split())
+    except FileNotFoundError:
+        return frozenset()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputFileError(path, f"cannot be read ({error})") from None
+
+
 def write_keys(folder: Path, trains: list[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
     """Write ``authority.pem``, and certificate and key of ``centre`` and of each ``train-N``; return the files.
 

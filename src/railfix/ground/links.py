@@ -11,7 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from railfix.core.errors import InputFileError
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
+from railfix.ground.keys import read_revoked
 from railfix.ground.link_quality import LinkChoice, LinkLimits, LinkMeter, LinkName
 from railfix.ground.quic import WAIT_S, LinkProtocol, configuration, connected, listen
 
@@ -81,7 +83,7 @@ class TrainLinks:
                         self.receiver.clock_restarted()
                     self.protocols[name] = protocol
                     self._resend(name)
-                    while not protocol.ended:
+                    while not (protocol.ended or protocol.expired):
                         await asyncio.sleep(0.1)
             except (ConnectionError, TimeoutError, OSError):
                 pass  # tried again after a time: the meter counts what is not answered
@@ -137,6 +139,8 @@ class CentreLinks:
         Connections that were rejected for their certificate.
     heard_s : dict of (int, {"A", "B"}) to float
         Monotonic clock when a train's last frame came over a bearer.
+    alarm : str or None
+        What is wrong with the list of revoked certificates.
     """
 
     def __init__(
@@ -159,9 +163,17 @@ class CentreLinks:
         # of each train alone: `first_sequence` allows 10 frames a second
         self._sequence: dict[tuple[int, FrameKind], int] = {}
         self._stack = AsyncExitStack()
+        self.alarm: str | None = None
+        self._revoked: frozenset[str] = frozenset()
 
     async def start(self) -> None:
-        """Listen."""
+        """Listen.
+
+        InputFileError: when the list of revoked certificates cannot be read.
+        """
+        self._revoked = read_revoked(self._keys)
+        watch = asyncio.create_task(self._watch())
+        self._stack.callback(watch.cancel)
         settings = configuration(self._keys, "centre", is_client=False)
         for name in BEARERS:
             server, self.addresses[name] = await listen(
@@ -191,6 +203,18 @@ class CentreLinks:
             if (protocol := self._peers.get((train, name))) is not None:
                 protocol.send(data)
 
+    async def _watch(self) -> None:
+        """End connections whose certificate has expired or is revoked meanwhile."""
+        while True:
+            try:
+                self._revoked, self.alarm = read_revoked(self._keys), None
+            except InputFileError as error:
+                self.alarm = f"{error}; the certificates revoked before are still rejected"
+            for protocol in self._peers.values():
+                if protocol.peer is not None and (protocol.expired or protocol.peer in self._revoked):
+                    protocol.reject()
+            await asyncio.sleep(RETRY_S)
+
     def _masquerade(self) -> None:
         self.masquerades += 1
 
@@ -208,8 +232,8 @@ class CentreLinks:
 
     def _frame(self, name: LinkName, protocol: LinkProtocol, data: bytes) -> None:
         kind, _, name_of_train = (protocol.peer or "").partition("-")
-        if kind != "train" or not name_of_train.isdigit():
-            self._masquerade()
+        if kind != "train" or not name_of_train.isdigit() or protocol.peer in self._revoked:
+            protocol.reject()
             return
         train, now_ns = int(name_of_train), time.monotonic_ns()
         receiver = self.receivers.setdefault(train, FrameReceiver(sender=train, limits=self._limits))

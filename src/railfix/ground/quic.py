@@ -12,6 +12,7 @@ import asyncio
 import ssl
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -56,6 +57,8 @@ class LinkProtocol(QuicConnectionProtocol):
     ----------
     peer : str or None
         Common name of the other end's certificate, None before it was verified.
+    ends : datetime or None
+        When that certificate ends to be valid.
     """
 
     def __init__(
@@ -69,6 +72,7 @@ class LinkProtocol(QuicConnectionProtocol):
     ) -> None:
         super().__init__(quic, stream_handler)
         self.peer: str | None = None
+        self.ends: datetime | None = None
         self.ended = False
         self._received = received
         self._rejected = rejected
@@ -100,12 +104,22 @@ class LinkProtocol(QuicConnectionProtocol):
                 raise ValueError("no certificate")
             verify_certificate(certificate, cadata=self._quic.configuration.cadata)
             names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
-            self.peer = str(names[0].value)
+            self.peer, self.ends = str(names[0].value), certificate.not_valid_after_utc
             self._quic._ack_delay = ACKNOWLEDGE_S
             self._quic._loss.max_ack_delay = 2.0 * ACKNOWLEDGE_S
         except (Alert, ValueError, IndexError):
-            self._rejected()
-            self.close(error_code=_REJECTED, reason_phrase="certificate")
+            self.reject()
+
+    def reject(self) -> None:
+        """End the connection because of its certificate."""
+        self.peer = None
+        self._rejected()
+        self.close(error_code=_REJECTED, reason_phrase="certificate")
+
+    @property
+    def expired(self) -> bool:
+        """Whether the other end's certificate was valid and is so no more."""
+        return self.ends is not None and datetime.now(UTC) > self.ends
 
     def datagram_received(self, data: bytes | str, addr: Any) -> None:
         """Take a packet; what a verified peer is owed for it waits, where it may: half the packets, half the work."""

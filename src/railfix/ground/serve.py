@@ -294,7 +294,8 @@ async def run_centre(
         done = False
 
         def snapshot() -> dict[str, Any]:
-            return {**control.snapshot(), "links": _heard(control, links), "done": done}
+            alarms = [text for text in (control.database, links.alarm) if text is not None]
+            return {**control.snapshot(), "links": _heard(control, links), "alarms": alarms, "done": done}
 
         app = page_app(snapshot, orders_of(control), sessions=Sessions(password=password))
         loopback = page[0] == "localhost" or _is_loopback(page[0])

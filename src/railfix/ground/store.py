@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import fcntl
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Final, Self
@@ -15,11 +15,13 @@ from typing import IO, Any, Final, Self
 import sqlalchemy as sql
 from sqlalchemy import event
 
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, RailfixError
 from railfix.ground.centre import TrainRecord, after_restart
 from railfix.io.train_message import decode, encode
 
 _META: Final = sql.MetaData()
+#: Lines of the log that are kept while the database fails.
+MOST_NOTES: Final = 10_000
 #: Document that names the process in charge.
 _IN_CHARGE: Final = "centre in charge"
 TRAINS: Final = sql.Table(
@@ -46,6 +48,10 @@ LOG: Final = sql.Table(
 _KEYS: Final[dict[sql.Table, sql.Column[Any]]] = {TRAINS: TRAINS.c.train, DOCUMENTS: DOCUMENTS.c.name}
 
 
+class DatabaseError(RailfixError):
+    """The database does not take what has to be stored; it may do so later."""
+
+
 class Store:
     """Stored state of a centre in a database (``sqlite:///centre.db``, ``postgresql+psycopg://...``).
 
@@ -54,7 +60,8 @@ class Store:
 
     def __init__(self, url: str) -> None:
         try:
-            self._engine = sql.create_engine(url)
+            waits = {"connect_timeout": 2} if url.startswith(("postgresql", "mysql", "mariadb")) else {}
+            self._engine = sql.create_engine(url, connect_args=waits)
             if self._engine.dialect.name == "sqlite":
                 event.listen(self._engine, "connect", _durable)
             _META.create_all(self._engine)
@@ -99,7 +106,7 @@ class Store:
 
     def close(self) -> None:
         """Commit the lines of the log that are left, and close the database."""
-        if self._notes:
+        if self._notes and not self._connection.invalidated:
             self.save()
         if self._lock is not None:
             self._lock.close()
@@ -109,8 +116,17 @@ class Store:
     def save(self, *records: TrainRecord, documents: Mapping[str, str] | None = None) -> None:
         """Commit reports of trains, named texts and the lines of the log together; they may be acknowledged then.
 
-        InputFileError: when another centre has taken charge of the database since `take_charge`.
+        InputFileError: when another centre has taken charge of the database since `take_charge`. DatabaseError: when
+        the database fails; nothing is stored then, and the lines of the log are kept.
         """
+        try:
+            self._save(records, documents or {})
+        except sql.exc.SQLAlchemyError as error:
+            reason = getattr(error, "orig", None) or error
+            del self._notes[:-MOST_NOTES]
+            raise DatabaseError(f"the database cannot be written ({' '.join(str(reason).split())})") from None
+
+    def _save(self, records: Iterable[TrainRecord], documents: Mapping[str, str]) -> None:
         trains = [
             {"train": record.train, "sequence": record.sequence,
              "message": None if record.message is None else encode(record.message)}
@@ -125,7 +141,7 @@ class Store:
                     raise InputFileError(self._url, "another centre has taken charge of this database; this one ends")
             added = [
                 self._put(TRAINS, trains),
-                self._put(DOCUMENTS, [{"name": name, "text": text} for name, text in (documents or {}).items()]),
+                self._put(DOCUMENTS, [{"name": name, "text": text} for name, text in documents.items()]),
             ]
             if self._notes:
                 self._connection.execute(LOG.insert(), self._notes)
@@ -193,6 +209,6 @@ class Store:
 def _durable(connection: Any, _record: object) -> None:
     """Set a connection of SQLite to write-ahead logging, each commit on the disk before it returns."""
     cursor = connection.cursor()
-    for pragma in ("journal_mode=WAL", "synchronous=FULL", "busy_timeout=5000"):
+    for pragma in ("journal_mode=WAL", "synchronous=FULL", "busy_timeout=1000"):
         cursor.execute(f"PRAGMA {pragma}")
     cursor.close()

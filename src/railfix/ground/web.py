@@ -22,14 +22,19 @@ from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 #: Time between two events of the page [s].
 EVENT_S: Final = 0.5
 #: A log-in ends after this time without an order [s].
 SESSION_S: Final = 1800.0
-#: Wrong passwords within `WRONG_S` after which every log-in is refused for that time.
+#: Wrong passwords of an address within `WRONG_S` after which its log-ins are refused for that time.
 MOST_WRONG: Final = 10
 WRONG_S: Final = 60.0
+#: A connection without a whole request for this time ends, at the latest after twice this time [s].
+REQUEST_S: Final = 10.0
+#: Connections at a time; further ones are refused.
+MOST_CONNECTIONS: Final = 500
 _COOKIE: Final = "railfix-session"
 _LONGEST_BODY: Final = 1000
 _HEADERS: Final = {
@@ -50,17 +55,18 @@ class Sessions:
     password: str
     clock: Callable[[], float] = time.monotonic
     _ends: dict[str, float] = field(default_factory=dict)
-    _wrong: list[float] = field(default_factory=list)
+    _wrong: list[tuple[float, str]] = field(default_factory=list)
 
-    def log_in(self, password: str) -> str | None:
-        """Return the token of a new session; None where the password is wrong, or too many were."""
+    def log_in(self, password: str, address: str = "") -> str | None:
+        """Return the token of a new session; None where the password is wrong, or too many of the address were."""
         now = self.clock()
-        self._wrong = [at for at in self._wrong if now - at < WRONG_S]
+        self._wrong = [(at, of) for at, of in self._wrong if now - at < WRONG_S]
         self._ends = {token: end for token, end in self._ends.items() if end > now}
-        if len(self._wrong) >= MOST_WRONG:
+        if sum(of == address for _, of in self._wrong) >= MOST_WRONG:
             return None
-        if not secrets.compare_digest(password.encode(), self.password.encode()):
-            self._wrong.append(now)
+        given, right = (text.encode(errors="surrogatepass") for text in (password, self.password))
+        if not secrets.compare_digest(given, right):
+            self._wrong.append((now, address))
             return None
         token = secrets.token_urlsafe(32)
         self._ends[token] = now + SESSION_S
@@ -118,7 +124,11 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
 
     async def login(request: Request) -> Response:
         values = await _values(request)
-        token = None if values is None else sessions.log_in(str(values.get("password", "")))
+        token = (
+            None
+            if values is None
+            else sessions.log_in(str(values.get("password", "")), "" if request.client is None else request.client.host)
+        )
         if token is None:
             return _answer({"refused": "wrong password, or too many wrong ones within a minute"}, 403)
         answer = _answer({"refused": None})
@@ -166,15 +176,34 @@ async def _values(request: Request) -> dict[str, Any] | None:
     if request.headers.get("content-type") != "application/json":
         return None
     body = b""
-    async for part in request.stream():
-        body += part
-        if len(body) > _LONGEST_BODY:
-            return None
     try:
+        async with asyncio.timeout(REQUEST_S):
+            async for part in request.stream():
+                body += part
+                if len(body) > _LONGEST_BODY:
+                    return None
         values = json.loads(body)
-    except (ValueError, RecursionError):
+    except (ValueError, RecursionError, TimeoutError):
         return None
     return values if isinstance(values, dict) else None
+
+
+class _TimedProtocol(H11Protocol):
+    """HTTP whose connections end without a whole request, however slowly its bytes come."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to look at the connection every `REQUEST_S`."""
+        super().connection_made(transport)
+        self._look(waited=False)
+
+    def _look(self, *, waited: bool) -> None:
+        if self.transport.is_closing():
+            return
+        idle = self.cycle is None or self.cycle.response_complete
+        if idle and waited:
+            self.transport.close()
+        else:
+            self.loop.call_later(REQUEST_S, lambda: self._look(waited=idle))
 
 
 class _Server(uvicorn.Server):
@@ -199,6 +228,7 @@ class PageServer:
         address = "{}:{}".format(*self._socket.getsockname()[:2])
         self.url = f"{'https' if secured else 'http'}://{address}/"
         settings: dict[str, Any] = {"log_level": "error", "lifespan": "off", "timeout_graceful_shutdown": 1, **secured}
+        settings |= {"http": _TimedProtocol, "limit_concurrency": MOST_CONNECTIONS}
         self._server = _Server(uvicorn.Config(app, **settings))
         self._task: asyncio.Task[None] | None = None
 
