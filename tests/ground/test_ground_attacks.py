@@ -17,18 +17,11 @@ from railfix.core.settings import load_settings
 from railfix.ground import interlocking, plausibility
 from railfix.ground.authority import Authority
 from railfix.ground.control import ControlCentre, orders_of
-from railfix.ground.interlocking import (
-    Interlocking,
-    InterlockingLimits,
-    extended,
-    overlaps_stopped,
-    release_train,
-    report_received,
-    stopped_trains,
-)
+from railfix.ground.interlocking import Interlocking, InterlockingLimits, extended, report_received, stopped_trains
 from railfix.ground.layout import Layout, LoopStation
 from railfix.ground.on_board import OnBoard, OnBoardLimits
 from railfix.ground.serve import CentreFile, _check_line
+from railfix.ground.stops import overlaps_stopped, release_train
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.ground.train import _Desk, is_complete
@@ -237,9 +230,9 @@ def test_a_train_is_stopped_and_released_from_the_page(tmp_path: Path) -> None:
         orders = orders_of(control)
         assert orders["stop"]({"train": 9}) == "there is no train 9"
         assert orders["stop"]({"train": 1}) is None
-        assert control.snapshot()["trains"][0]["stop"] == "stopped by hand"
+        assert control.snapshot()["trains"][0]["stop"] == "stopped by hand; not sent"
         control.step()
-        assert centre(store, judged=False).snapshot()["trains"][0]["stop"] == "stopped by hand"
+        assert centre(store, judged=False).snapshot()["trains"][0]["stop"] == "stopped by hand; not sent"
         assert orders["release-train"]({"train": 1}) is None
         assert orders["release-train"]({"train": 1}) == "train 1 is not stopped"
         assert orders["stop-all"]({}) is None

@@ -28,7 +28,6 @@ from railfix.ground.interlocking import (
     released,
     report_received,
     route_requested,
-    stop_trains,
     stopped_trains,
 )
 from railfix.ground.interlocking_text import from_documents, to_documents
@@ -36,6 +35,7 @@ from railfix.ground.layout import Layout, LoopStation, overlap
 from railfix.ground.layout_network import layout_of
 from railfix.ground.on_board import OnBoard, OnBoardLimits
 from railfix.ground.plausibility import compute_contradiction
+from railfix.ground.stops import close_section, open_section, release_train, stop_trains
 from railfix.ground.supervision import Supervision
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
 from railfix.io.train_message import MessageError, MessageStatus, TrainMessage
@@ -73,6 +73,10 @@ RULES: dict[str, dict[Callable[..., Any], dict[str, str]]] = {
         SimulatedTrain.step: {
             "min(wanted, (lag**2 + 2.0 * BRAKING_MPS2 * max(room, 0.0)) ** 0.5 - lag)": "0.0 if room <= 0.0 else wanted"
         }
+    },
+    "closed": {
+        _limit_m: {"far > direction * train.rear_m": "False"},
+        route_requested: {"state.closed & {2 * target + 1, 2 * section + 2}": "False"},
     },
     "freshness": {SimulatedTrain.step: {"self.on_board.brake_reason(now_s) is not None": "self.on_board.stopped"}},
 }
@@ -411,3 +415,58 @@ def test_neighbours_of_stopped_trains() -> None:
         assert set(stopped_trains(stopped)) == neighbours_of_stopped(stopped)
         kinds.add(len(stopped_trains(stopped)))
     assert len(kinds) > 4
+
+
+def closed_course(seed: int) -> tuple[int, int]:
+    """Extensions into a closed section in 500 s in which sections are closed and opened, and trains that it stopped."""
+    run, rng = traffic(seed, trains=6, layout=line_with_loops(6)), random.Random(seed)
+    layout, into, stopped = run.layout, 0, set()
+    for _ in range(500):
+        if rng.random() < 0.05:
+            closed = run.centre.state.closed
+            if closed:
+                run.centre.state = open_section(run.centre.state, min(closed))
+                for number in run.trains:
+                    run.centre.state, _ = release_train(run.centre.state, number, layout)
+            else:
+                block = rng.choice(sorted(layout.sections.values()))
+                run.centre.state = close_section(run.centre.state, block, layout, "closed")
+        before = run.centre.state
+        run.step()
+        for number, train in run.centre.state.trains.items():
+            stopped |= {number} if train.stop == "closed" else set()
+            old = before.trains[number]
+            grows = train.direction == old.direction and train.direction * (train.end_m - old.end_m) > 0.0
+            for block in before.closed if grows else ():
+                low, high = layout.block_m(block)
+                into += train.span_m[0] < high and train.span_m[1] > low
+    assert not run.violations
+    return into, len(stopped)
+
+
+def test_no_authority_is_extended_into_a_closed_section(monkeypatch: pytest.MonkeyPatch) -> None:
+    courses = [closed_course(seed) for seed in range(4)]
+    assert [into for into, _ in courses] == [0, 0, 0, 0]
+    assert sum(stopped for _, stopped in courses) > 5
+    take_out(monkeypatch, "closed")
+    assert sum(closed_course(seed)[0] for seed in range(4)) > 0
+
+
+def test_a_closed_section_stops_its_trains_until_it_is_open() -> None:
+    """Train 1 in A with an authority up to 340 m; the section A to B is closed, then A itself."""
+    state = Interlocking(
+        trains={1: interval(1, 1, 300.0, 1, 0)}, points={name: PointState() for name in LAYOUT.points()}
+    )
+    assert LAYOUT.sections == {"A": 1, "B": 3, "A to B": 2}
+    assert [LAYOUT.block_m(block) for block in (1, 2, 3)] == [(0.0, 400.0), (400.0, 2000.0), (2000.0, 2400.0)]
+    between = close_section(state, 2, LAYOUT, "A to B is closed")
+    assert between.trains[1].stop is None
+    assert route_requested(between, 1, LAYOUT)[2] == "the section ahead is closed"
+    both = close_section(between, 1, LAYOUT, "A is closed")
+    assert both.trains[1].stop == "A is closed"
+    assert from_documents(to_documents(both)) == both
+    assert release_train(both, 1, LAYOUT)[1] == "the section where train 1 is or may run is closed"
+    opened = open_section(both, 1)
+    free, reason = release_train(opened, 1, LAYOUT)
+    assert reason is None
+    assert route_requested(open_section(free, 2), 1, LAYOUT)[2] is None

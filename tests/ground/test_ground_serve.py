@@ -316,6 +316,44 @@ def test_routes_and_the_release_by_hand(
     assert sent[-1].stopped
 
 
+def test_an_order_to_stop_is_acknowledged_and_timed(
+    centre: tuple[ControlCentre, list[Authority], list[float]],
+) -> None:
+    """A section is closed from the page: the train in it has the order, says so, and comes to rest."""
+    control, sent, now = centre
+    control.supervision.state, control.monitor = replace(control.supervision.state, stopped=False), None
+    train = SimulatedTrain(number=1, front_m=400.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=400.0))
+    train.speed_mps = 5.0
+
+    def second(*, delivered: bool) -> dict[str, Any]:
+        now[0] += 1.0
+        control.report(1, encode(train.message(now[0])))
+        control.step()
+        if delivered:
+            train.on_board.receive(next(a for a in reversed(sent) if a.train == 1))
+        found = control.snapshot()
+        return {**found["trains"][0], "sections": found["sections"]}
+
+    second(delivered=True)
+    orders = orders_of(control)
+    assert orders["close-section"]({"section": "Q"}) == "there is no section 'Q'"
+    assert orders["open-section"]({"section": "A"}) == "'A' is not closed"
+    assert orders["close-section"]({"section": "A"}) is None
+    assert second(delivered=False)["stop"] == "A is closed; not acknowledged"
+    assert second(delivered=True)["stop"] == "A is closed; not acknowledged"
+    assert second(delivered=True)["stop"] == "A is closed; acknowledged after 2.0 s"
+    train.speed_mps = 0.0
+    shown = second(delivered=True)
+    assert shown["stop"] == "A is closed; acknowledged after 2.0 s, at rest after 3.0 s"
+    assert [section["name"] for section in shown["sections"] if section["closed"]] == ["A"]
+    assert any("order to stop acknowledged after 2.0 s, at rest after 3.0 s" in line for line in control.lines)
+    assert orders["release-train"]({"train": 1}) == "the section where train 1 is or may run is closed"
+    assert orders["open-section"]({"section": "A"}) is None
+    assert orders["release-train"]({"train": 1}) is None
+    assert second(delivered=True)["stop"] is None
+    assert control.stops == {}
+
+
 def test_a_database_that_fails_is_an_alarm(
     centre: tuple[ControlCentre, list[Authority], list[float]], tmp_path: Path
 ) -> None:

@@ -12,17 +12,18 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from railfix.ground.centre import CentreLimits, TrainRecord, TrainState, time_passed
-from railfix.ground.interlocking import Interlocking, release_train, stop_trains, stopped_trains
+from railfix.ground.interlocking import Interlocking, stopped_trains
 from railfix.ground.interlocking_text import HEAD, from_documents, to_documents
 from railfix.ground.layout import PointName
 from railfix.ground.monitor import MonitorLimits, MonitorState, advance, release
 from railfix.ground.monitor import Order as MonitorOrder
 from railfix.ground.reference_curve import ReferenceCurve
+from railfix.ground.stops import close_section, open_section, release_train, stop_trains
 from railfix.ground.store import DatabaseError, Store
 from railfix.ground.supervision import Supervision
 from railfix.ground.triangle import STOPPING, Verdict
 from railfix.ground.web import Order
-from railfix.io.train_message import MessageError, decode
+from railfix.io.train_message import MessageError, TrainMessage, decode
 
 #: Time between attempts to write to a database that fails [s].
 RETRY_S = 1.0
@@ -35,6 +36,31 @@ def _severity(verdict: Verdict) -> int:
     if verdict in (Verdict.MONITOR_LOST, Verdict.JAMMING):
         return 2  # a fix is absent: that stops only once it is late
     return 3 if verdict in STOPPING else int(verdict is not Verdict.HEALTHY)
+
+
+@dataclass(kw_only=True)
+class StopOrder:
+    """Order to stop that a train has: how long until it was acknowledged, and until the train was at rest [s]."""
+
+    number: int
+    sent_s: float
+    acknowledged_s: float | None = None
+    rest_s: float | None = None
+
+    def reported(self, message: TrainMessage, now_s: float) -> bool:
+        """Take a report; return whether the train has come to rest by it."""
+        taken = message.authority is not None and message.authority >= self.number
+        if taken and self.acknowledged_s is None:
+            self.acknowledged_s = now_s - self.sent_s
+        rests = message.standstill and self.rest_s is None and (taken or message.authority is None)
+        if rests:
+            self.rest_s = now_s - self.sent_s
+        return rests
+
+    def __str__(self) -> str:
+        """The times in words."""
+        taken = "not acknowledged" if self.acknowledged_s is None else f"acknowledged after {self.acknowledged_s:.1f} s"
+        return taken if self.rest_s is None else f"{taken}, at rest after {self.rest_s:.1f} s"
 
 
 @dataclass(kw_only=True)
@@ -57,6 +83,8 @@ class ControlCentre:
         Of satellite positioning; None where nothing judges it.
     rejected : Counter of str
         Reports that did not count, by reason.
+    stops : dict of int to StopOrder
+        Trains that are ordered to stop.
     database : str or None
         Why the database does not take the state: nothing is granted meanwhile, and the trains stop in time.
     """
@@ -73,6 +101,7 @@ class ControlCentre:
     reports: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
     stop_s: float | None = None
+    stops: dict[int, StopOrder] = field(default_factory=dict)
     database: str | None = None
     _failed_s: float = 0.0
     _routes: dict[int, int] = field(init=False)
@@ -134,6 +163,8 @@ class ControlCentre:
         if after_stop is not None and after_stop != stop:
             self.rejected["contradicts what is known of the train"] += 1
             self.log(f"train {number}: stopped, {after_stop}", train=number)
+        if (order := self.stops.get(number)) is not None and order.reported(message, self.clock()):
+            self.log(f"train {number}: order to stop {order}", train=number)
         self.reports += 1
         after = self.supervision.records[number]
         if before.state in (TrainState.SIMULATED, TrainState.ERROR):
@@ -175,6 +206,10 @@ class ControlCentre:
         if not self._saved_whole(now):
             return
         for authority in authorities:
+            if not authority.stopped:
+                self.stops.pop(authority.train, None)
+            elif authority.train not in self.stops:
+                self.stops[authority.train] = StopOrder(number=authority.number, sent_s=now)
             self.send(authority.train, authority.encode())
 
     def _saved_whole(self, now: float) -> bool:
@@ -219,6 +254,25 @@ class ControlCentre:
         self.log("every train stopped by hand" if train is None else f"train {train}: stopped by hand", train=train)
         return None
 
+    def close_section(self, name: str) -> str | None:
+        """Close a station or a section by hand: its trains are stopped, others stay out; return a refusal's reason."""
+        block = self.supervision.layout.sections.get(name)
+        if block is None:
+            return f"there is no section {name!r}"
+        layout, reason = self.supervision.layout, f"{name} is closed"
+        self.supervision.state = close_section(self.supervision.state, block, layout, reason)
+        self.log(f"{name}: closed by hand")
+        return None
+
+    def open_section(self, name: str) -> str | None:
+        """Open a station or a section that was closed by hand; return the reason of a refusal."""
+        block = self.supervision.layout.sections.get(name)
+        if block not in self.supervision.state.closed or block is None:
+            return f"{name!r} is not closed"
+        self.supervision.state = open_section(self.supervision.state, block)
+        self.log(f"{name}: opened by hand; its trains are released one by one")
+        return None
+
     def release_train(self, train: int) -> str | None:
         """Release the stop of a train by hand; return the reason of a refusal."""
         self.supervision.state, reason = release_train(self.supervision.state, train, self.supervision.layout)
@@ -257,7 +311,7 @@ class ControlCentre:
             trains.append({
                 "number": number, "state": record.state.value, "shown": record.shown_m, "speed": abs(speed) / 100.0,
                 "direction": train.direction, "rear": rear, "front": front, "end": train.end_m, "jump": record.jump_m,
-                "stop": stopped.get(number),
+                "stop": None if number not in stopped else f"{stopped[number]}; {self.stops.get(number, 'not sent')}",
                 "pieces": [[0 if lane == 0 else 2 - lane % 2, low, high] for lane, low, high in pieces],
             })  # fmt: skip
         points = [
@@ -269,6 +323,11 @@ class ControlCentre:
             "now": self.clock(), "trains": trains, "points": points, "log": self.lines[:-25:-1],
             "stations": [{"name": s.name, "begin": s.begin_m, "end": s.end_m, "points": s.points_m}
                          for s in layout.stations],
+            "sections": [
+                {"name": name, "low": layout.block_m(block)[0], "high": layout.block_m(block)[1],
+                 "closed": block in state.closed}
+                for name, block in layout.sections.items()
+            ],
             "monitor": self._monitor_values(), "routes": self.supervision.routes, "rejected": dict(self.rejected),
         }  # fmt: skip
 
@@ -296,7 +355,12 @@ def orders_of(centre: ControlCentre) -> dict[str, Order]:
 
         return given
 
+    def of_section(order: Callable[[str], str | None]) -> Order:
+        return lambda values: order(str(values.get("section", "")))
+
     return {
+        "close-section": of_section(centre.close_section),
+        "open-section": of_section(centre.open_section),
         "release": lambda _: centre.release(),
         "route": of_train(centre.set_route),
         "stop": of_train(centre.stop),

@@ -143,12 +143,15 @@ class Interlocking:
         True while no authority is extended and no route set: satellite positioning is suspended.
     granted : int
         Number of the last authorities that were sent.
+    closed : frozenset of int
+        Blocks (`Layout.sections`) that no authority reaches into.
     """
 
     trains: Mapping[int, TrainInterval]
     points: Mapping[PointName, PointState]
     stopped: bool = False
     granted: int = 0
+    closed: frozenset[int] = frozenset()
 
 
 class NearbyTrains:
@@ -201,7 +204,7 @@ def report_received(
         return state
     contradiction = compute_contradiction(known, message, layout, limits=limits or InterlockingLimits())
     if contradiction is not None:
-        return _with(state, _contradicted(known, contradiction, rear, ahead, message.sequence))
+        return with_train(state, _contradicted(known, contradiction, rear, ahead, message.sequence))
     confirmed = confirms_rear(known, message)
     known = replace(
         known,
@@ -218,7 +221,7 @@ def report_received(
             # one wrong report alone moves no rear end, and a wider bound moves none back
             both = min(facing * rear, facing * before.claimed_m)
             known = replace(known, rear_m=facing * max(both, facing * before.rear_m))
-        return _with(state, replace(known, front_m=ahead))
+        return with_train(state, replace(known, front_m=ahead))
     if not confirmed:
         return state
     turned = replace(
@@ -229,10 +232,11 @@ def report_received(
         end_m=facing * max(facing * ahead, facing * before.rear_m),
         tracks={known.station: known.tracks[known.station]},
     )
-    return _with(state, turned)
+    return with_train(state, turned)
 
 
-def _with(state: Interlocking, train: TrainInterval) -> Interlocking:
+def with_train(state: Interlocking, train: TrainInterval) -> Interlocking:
+    """Return the state with the newer interval of a train."""
     return replace(state, trains={**state.trains, train.train: train})
 
 
@@ -245,23 +249,6 @@ def _contradicted(known: TrainInterval, reason: str, rear: float, ahead: float, 
     if reason == "the train is beyond its authority":
         return replace(stopped, front_m=direction * max(direction * ahead, direction * known.front_m))
     return stopped
-
-
-def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
-    """Return the state with the trains stopped whose intervals overlap: of trains at rest whose bounds have grown."""
-    spans = sorted((*train.span_m, number) for number, train in state.trains.items())
-    for k, (_, high, number) in enumerate(spans):
-        for low, _, other in spans[k + 1 :]:
-            if low >= high:
-                break
-            first, second = state.trains[number], state.trains[other]
-            if first.stop and second.stop:
-                continue
-            one, two = (layout.pieces(*train.span_m, train.tracks) for train in (first, second))
-            if overlap(one, two):
-                state = _with(state, replace(first, stop=first.stop or f"its interval meets that of train {other}"))
-                state = _with(state, replace(second, stop=second.stop or f"its interval meets that of train {number}"))
-    return state
 
 
 def stopped_trains(state: Interlocking) -> dict[int, str]:
@@ -283,27 +270,6 @@ def stopped_trains(state: Interlocking) -> dict[int, str]:
         free[beside] = False
         found.update((numbers[k], f"train {number} is stopped beside it") for k in beside)
     return found
-
-
-def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Interlocking, str | None]:
-    """Return the state with the stop of one train released by hand, and the reason of a refusal."""
-    known = state.trains.get(train)
-    if known is None or known.stop is None:
-        return state, f"train {train} is not stopped"
-    if not known.standstill:
-        return state, f"train {train} does not stand still"
-    released_state = _with(state, replace(known, stop=None))
-    if overlaps_stopped(released_state, layout) != released_state:
-        return state, f"the interval of train {train} meets another one"
-    return released_state, None
-
-
-def stop_trains(state: Interlocking, trains: Iterable[int], reason: str) -> Interlocking:
-    """Return the state with trains stopped by order."""
-    for number in trains:
-        known = state.trains[number]
-        state = _with(state, replace(known, stop=known.stop or reason))
-    return state
 
 
 def points_reported(state: Interlocking, point: PointName, detected: int | None) -> Interlocking:
@@ -334,6 +300,8 @@ def route_requested(
         return state, (), "there is no station ahead"
     track = 1 if direction > 0 else 2
     section = min(begin, target)
+    if state.closed & {2 * target + 1, 2 * section + 2}:
+        return state, (), "the section ahead is closed"
     nearby = nearby or NearbyTrains(state, layout)
     for other in nearby.between(state, layout.stations[section].begin_m, layout.stations[section + 1].end_m):
         if other.train == train:
@@ -448,6 +416,11 @@ def _limit_m(
         wanted = train.tracks.get(name[0])
         # points that the train stands on, locked by its passage, do not limit it
         if not (train.train in point.locked and point.wanted == wanted == point.detected):
+            end = min(end, near)
+    for block in state.closed:
+        low, high = layout.block_m(block)
+        near, far = (low, high) if direction > 0 else (-high, -low)
+        if far > direction * train.rear_m:
             end = min(end, near)
     path = layout.pieces(train.rear_m, direction * end, train.tracks)
     first_m, last_m = sorted((train.rear_m, direction * end))

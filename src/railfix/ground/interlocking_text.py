@@ -16,7 +16,7 @@ _TRAIN, _POINTS = f"{HEAD} train ", f"{HEAD} points "
 
 def to_documents(state: Interlocking, before: Interlocking | None = None) -> dict[str, str]:
     """Return the texts by name; with a state before only those that may have changed since."""
-    texts = {HEAD: json.dumps({"stopped": state.stopped, "granted": state.granted})}
+    texts = {HEAD: json.dumps({"stopped": state.stopped, "granted": state.granted, "closed": sorted(state.closed)})}
     trains, points = (before.trains, before.points) if before is not None else ({}, {})
     for number, train in state.trains.items():
         if train is not trains.get(number):
@@ -43,7 +43,7 @@ def from_documents(texts: Mapping[str, str]) -> Interlocking:
     # in the order of the line, whatever the order of the texts
     return Interlocking(
         trains=dict(sorted(trains.items())), points=dict(sorted(points.items())), stopped=head["stopped"],
-        granted=head["granted"],
+        granted=head["granted"], closed=frozenset(head["closed"]),
     )  # fmt: skip
 
 

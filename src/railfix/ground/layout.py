@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping
 from functools import cached_property
+from itertools import pairwise
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -83,6 +84,17 @@ class Layout(Settings):
     def blocks_between(self, low_m: float, high_m: float) -> range:
         """Return the numbers of the blocks that an interval touches: 2 k + 1 is station k, 2 k what lies before it."""
         return range(bisect_left(self._borders_m, low_m), bisect_right(self._borders_m, high_m) + 1)
+
+    @cached_property
+    def sections(self) -> dict[str, int]:
+        """Blocks by name: stations, and the sections between them."""
+        names = [station.name for station in self.stations]
+        between = {f"{one} to {other}": 2 * k + 2 for k, (one, other) in enumerate(pairwise(names))}
+        return {name: 2 * k + 1 for k, name in enumerate(names)} | between
+
+    def block_m(self, block: int) -> tuple[float, float]:
+        """Chainages of a block of `sections`, lower first [m]."""
+        return self._borders_m[block - 1], self._borders_m[block]
 
     def zone_m(self, point: PointName) -> tuple[float, float]:
         """Chainages of points, lower first [m]."""

@@ -22,7 +22,6 @@ from railfix.ground.interlocking import (
     PointState,
     TrainInterval,
     extended,
-    overlaps_stopped,
     points_reported,
     released,
     report_received,
@@ -30,6 +29,7 @@ from railfix.ground.interlocking import (
     stopped_trains,
 )
 from railfix.ground.layout import Layout, PointName
+from railfix.ground.stops import overlaps_stopped
 from railfix.io.train_message import TrainMessage
 
 #: A train within this distance of the end of its track asks for the next route [m].

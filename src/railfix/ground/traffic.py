@@ -90,6 +90,7 @@ class SimulatedTrain:
             "time_ns": time,
             "sent_ns": time,
             "line": 1,
+            "authority": self.on_board.number if self.on_board.number >= 0 else None,
         }
         if now_s < self.blind_until_s:
             return TrainMessage(**head)

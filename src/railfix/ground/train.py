@@ -107,7 +107,8 @@ class _Desk:
         # numbers go on rising where the source of the positions is started again
         self._sequence += 1
         complete = message.complete if self._integrity is None else is_complete(self._integrity)
-        message = message.replaced(train=self._train, sequence=self._sequence, complete=complete)
+        taken = None if self._on_board is None or self._on_board.number < 0 else self._on_board.number
+        message = message.replaced(train=self._train, sequence=self._sequence, complete=complete, authority=taken)
         if message.facing != 0 and message.chainage_cm is not None:
             front = message.chainage_cm / 100.0
             if self._on_board is None:

@@ -97,6 +97,8 @@ class TrainMessage(Settings):
         Train integrity confirmed.
     sigma_cm : int or None [cm]
         Standard deviation of the place along the line, rounded up.
+    authority : int or None
+        Number of the newest authority that the train has taken: its acknowledgement to the ground side.
     """
 
     train: Unsigned
@@ -119,6 +121,7 @@ class TrainMessage(Settings):
     length_cm: Unsigned = 0
     complete: bool = False
     sigma_cm: Unsigned | None = None
+    authority: Unsigned | None = None
 
     @model_validator(mode="after")
     def _place_with_bounds(self) -> Self:
