@@ -179,6 +179,32 @@ def test_one_message_a_period_however_epochs_come(logs: dict[str, tuple[Observat
     assert engine.counts["superseded"] == 60 - len(tags) > 0
 
 
+def test_a_session_that_falls_behind_says_so_and_skips_to_the_present(
+    logs: dict[str, tuple[Observations, ...]],
+) -> None:
+    """The computer stands still for 3 s, then takes what waits at once; and tags that step by 3 s are no delay."""
+    epochs, settings = logs["front"][:60], LiveSettings(behind_s=1.0)
+    engine, start = LiveEngine(processor("front"), settings), tag_ns(logs["front"][0])
+    held = [
+        max(tag_ns(epoch), start + 3000 * MS) if tag_ns(epoch) > start + 500 * MS else tag_ns(epoch) for epoch in epochs
+    ]
+    outputs = played(engine, [(at, "front", epoch) for at, epoch in zip(held, epochs, strict=True)])
+    late = [k for k, epoch in enumerate(epochs) if held[k] - tag_ns(epoch) > 250 * MS]
+    skipped = engine.counts["skipped, behind the receivers"]
+    assert skipped == len(late) == 22
+    assert sum(output.result is not None for output in outputs) == 60 - skipped
+    told = [text for text in engine.told if "behind" in text or "skipped" in text]
+    assert told == [
+        "2.4 s behind the receivers: epochs are skipped up to the present",
+        "at the present again, 22 epochs were skipped",
+    ]
+    stepped = LiveEngine(processor("front"), settings)
+    times = [tag_ns(epoch) + (3000 * MS if k >= 10 else 0) for k, epoch in enumerate(epochs)]
+    played(stepped, [(at, "front", epoch) for at, epoch in zip(times, epochs, strict=True)])
+    assert stepped.counts["skipped, behind the receivers"] == 11
+    assert any("the receivers' time is 3.0 s later than before" in text for text in stepped.told)
+
+
 def test_duplicates_order_and_restart(logs: dict[str, tuple[Observations, ...]]) -> None:
     engine = LiveEngine(processor("front"), LiveSettings(restart_epochs=3))
     first = list(logs["front"][60:90])

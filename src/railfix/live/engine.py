@@ -19,6 +19,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.train_message import TrainMessage
 from railfix.kernels import load
+from railfix.live.lag import Lag
 from railfix.live.message import message_of, no_input_message
 from railfix.live.sensor_lines import FOREVER, Sensed
 from railfix.live.settings import LiveSettings
@@ -115,7 +116,8 @@ class LiveEngine:
     counts : Counter of str
         Epochs by what became of them: "paired", "front alone", "rear alone", "duplicate", "late", "out of order",
         "tag step", "restart", "no input", "superseded" (processed, but a newer one had the message of the period),
-        "dropped, too many waiting", "tachometer silent" and the like (not heard up to the epoch in time).
+        "skipped, behind the receivers", "dropped, too many waiting", "tachometer silent" and the like (not heard up to
+        the epoch in time).
     told : deque of str
         Sentences for the log on what happened: what is used in place of what was asked for, and when that ends,
         restarts, what became of a saved state.
@@ -133,6 +135,7 @@ class LiveEngine:
         self._waiting: dict[str, deque[_Waiting]] = {name: deque() for name in self._antennas}
         self._last_tag: dict[str, int] = {}
         self._backward: dict[str, list[int]] = {name: [] for name in self._antennas}
+        self.lag = Lag(behind_s=settings.behind_s)
         self._done_ns = -1
         self._state: State | None = None
         self._saved: EngineState | None = None
@@ -213,6 +216,12 @@ class LiveEngine:
             self._due_ns = now_ns
         if not self._in_order(antenna, waiting.tag_ns):
             return
+        skips = self.lag.skips(waiting.tag_ns, now_ns)
+        self.told += self.lag.told
+        self.lag.told.clear()
+        if skips:
+            self.counts["skipped, behind the receivers"] += 1
+            return
         queue = self._waiting[antenna]
         if len(queue) >= _LONGEST_QUEUE:
             queue.popleft()
@@ -266,6 +275,7 @@ class LiveEngine:
     def _restart(self) -> None:
         """Begin anew after a receiver's restart: only what was received from satellites is kept."""
         self.counts["restart"] += 1
+        self.lag.reset()
         self.told.append("a receiver came back with older time tags: positioning begins anew")
         self._state = None if self._state is None else State(received=self._state.received)
         self._done_ns = -1

@@ -104,6 +104,8 @@ async def run_session(
     gc.disable()  # collections come in idle time
     if not replay:
         engine.start(now_ns=time.monotonic_ns())
+    if any(is_file(source) for source in sources.values()):
+        engine.lag.behind_s = math.inf
     session.read_to_ns = dict.fromkeys(sources, -1)
     files = [name for name, source in sources.items() if is_file(source)]
     turn: _Pace | _InTurn | None = None if speed is None else _Pace(speed, files)

@@ -33,6 +33,9 @@ class LiveSettings(Settings):
         A connection without a byte for so long counts as broken.
     waiting : int
         Messages that may wait for a slow target; further ones are dropped for it and counted.
+    behind_s : float [s]
+        Delay above the shortest one seen with which epochs are skipped up to the present, said in the log; not where
+        the epochs are recorded ones.
     state_every_s : float [s]
         How often the state file is written.
     state_age_s : float [s]
@@ -65,6 +68,7 @@ class LiveSettings(Settings):
     reconnect_longest_s: float = Field(default=30.0, gt=0.0, le=3600.0)
     silence_s: float = Field(default=30.0, gt=0.0, le=3600.0)
     waiting: int = Field(default=100, ge=1, le=100_000)
+    behind_s: float = Field(default=5.0, ge=0.5, le=3600.0)
     state_every_s: float = Field(default=5.0, gt=0.0, le=3600.0)
     state_age_s: float = Field(default=60.0, gt=0.0, le=3600.0)
     log_bytes: int = Field(default=1_000_000, ge=1000)
