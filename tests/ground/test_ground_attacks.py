@@ -14,7 +14,7 @@ import pytest
 from attacked_line import run_sequence
 from railfix.core.errors import InputFileError
 from railfix.core.settings import load_settings
-from railfix.ground import interlocking, plausibility
+from railfix.ground import interlocking, plausibility, shortening
 from railfix.ground.authority import Authority
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import Interlocking, InterlockingLimits, extended, report_received, stopped_trains
@@ -54,6 +54,12 @@ RULES["way"] = {
 RULES["roll-back"] = {
     plausibility.compute_contradiction: {
         "direction * front + under < direction * known.rear_m + known.length_m": "False"
+    }
+}
+RULES["agreed"] = {
+    shortening.answer_received: {
+        "message.authority < known.asked_number": "False",
+        "direction * (message.authority_end_cm / 100.0 - known.asked_m) > ROUNDING_M": "False",
     }
 }
 RULES["turns"] = {OnBoard.receive: {"authority.report <= self.before_turn": "False"}}

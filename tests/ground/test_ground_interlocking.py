@@ -327,7 +327,7 @@ def test_the_age_of_an_authority_is_that_of_the_report_it_answers() -> None:
 def test_bytes_of_an_authority() -> None:
     data = authority(9, report=3, end_m=-12.34, direction=-1).encode()
     assert Authority.decode(data) == authority(9, report=3, end_m=-12.34, direction=-1)
-    for wrong in (data[:-1], data + b"x", b"\x02" + data[1:], data[:-2] + b"\x05" + data[-1:]):
+    for wrong in (data[:-1], data + b"x", b"\x01" + data[1:], data[:-3] + b"\x05" + data[-2:]):
         with pytest.raises(MessageError):
             Authority.decode(wrong)
 
@@ -470,3 +470,68 @@ def test_a_closed_section_stops_its_trains_until_it_is_open() -> None:
     free, reason = release_train(opened, 1, LAYOUT)
     assert reason is None
     assert route_requested(open_section(free, 2), 1, LAYOUT)[2] is None
+
+
+def test_a_route_is_taken_back_where_the_train_agrees() -> None:
+    """Train 1 at 300 m in A with a route to B: asked for it, it holds 330 m, and A is its station again."""
+    state = Interlocking(
+        trains={1: interval(1, 1, 300.0, 1, 0)}, points={name: PointState() for name in LAYOUT.points()}
+    )
+    centre = Supervision(layout=LAYOUT, state=state, limits=LIMITS)
+    assert centre.ask_route_back(1) == "the train has no route to take back"
+    assert centre.set_route(1) is None
+    (given,) = centre.advance(0.0)
+    assert (given.end_cm, given.shortens) == (233_000, False)
+    fast, slow = (OnBoard(direction=1, end_m=2330.0, number=given.number) for _ in range(2))
+    fast.moved(305.0, 20.0)
+    slow.moved(305.0, 3.0)
+    before = slow.acknowledgement()
+    assert centre.ask_route_back(1) is None
+    assert centre.set_route(1) == "a shorter authority is being agreed with the train"
+    (asked,) = centre.advance(1.0)
+    assert (asked.end_cm, asked.shortens) == (33_000, True)
+    assert Authority.decode(asked.encode()) == asked
+    for on_board in (fast, slow):
+        assert on_board.receive(asked)
+        assert not on_board.receive(given)
+    assert (fast.end_m, slow.end_m) == (2330.0, 330.0)
+    held = replace(centre.state)
+    for answer, end, station in (
+        (before, 2330.0, 1),
+        (fast.acknowledgement(), 2330.0, 1),
+        (slow.acknowledgement(), 330.0, 0),
+    ):
+        centre.state = held
+        centre.records.clear()
+        assert centre.report(message(1, 1, 300.0, **answer), 2.0) is None
+        train = centre.state.trains[1]
+        assert (train.end_m, train.station) == (end, station)
+        assert (train.asked_m is None) == (answer is not before)
+    assert centre.state.points[0, 1].locked == {}
+    assert centre.state.trains[1].tracks == {0: 1}
+    (after,) = centre.advance(3.0)
+    assert (after.end_cm, after.shortens) == (33_000, False)  # no route by itself
+    assert centre.set_route(1) is None
+    assert centre.advance(4.0)[0].end_cm == 233_000
+
+
+def test_routes_are_taken_back_in_disturbed_traffic() -> None:
+    """Asked at random under loss, delays and restarts: no invariant breaks, some trains agree and some do not."""
+    answers: Counter[bool] = Counter()
+    for seed in range(6):
+        run, rng = traffic(seed), random.Random(seed)
+        for _ in range(600):
+            number = rng.choice(sorted(run.trains))
+            if rng.random() < 0.2:
+                run.centre.ask_route_back(number)
+            elif rng.random() < 0.1:
+                run.centre.set_route(number)
+            before = run.centre.state
+            run.step()
+            for train in run.centre.state.trains.values():
+                old = before.trains[train.train]
+                if old.asked_m is not None and train.asked_m is None and train.direction == old.direction:
+                    answers[train.held] += 1
+        assert not run.violations
+    assert answers[True] > 10
+    assert answers[False] > 2

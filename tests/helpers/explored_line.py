@@ -28,7 +28,7 @@ LINE = Layout(
 #: What may happen to a train in a step.
 EVENTS = (
     "runs", "stays", "runs, report lost", "runs, report late", "place ahead", "place behind", "length 0", "splits",
-    "rolls back", "turns", "stays, authority late", "late report comes", "late authority comes",
+    "rolls back", "turns", "stays, authority late", "asked back", "late report comes", "late authority comes",
 )  # fmt: skip
 
 
@@ -56,9 +56,12 @@ class ModelTrain:
         return self.front_m - self.direction * self.length_m
 
     def receive(self, authority: Authority) -> None:
+        self.on_board.stops_at_m = self.front_m + self.direction * (BOUND_M + 1.0)
         if self.on_board.receive(authority):
             ends = [authority.end_cm / 100.0, *([] if self.held_m is None else [self.held_m])]
-            self.held_m = max(ends, key=lambda end: end * self.direction)
+            self.held_m = (
+                max(ends, key=lambda end: end * self.direction) if not authority.shortens else self.on_board.end_m
+            )
 
 
 @dataclass(kw_only=True)
@@ -89,7 +92,7 @@ class World:
             chainage_cm=round(100 * train.front_m), over_cm=500, under_cm=500,
             speed_cmps=round(train.direction * speed_mps * 100), direction=train.direction if speed_mps else 0,
             facing=train.direction, standstill=speed_mps == 0.0, status=MessageStatus.POSITION, length_cm=8000,
-            complete=train.wagons_m is None,
+            complete=train.wagons_m is None, **train.on_board.acknowledgement(),
         )  # fmt: skip
         return whole.replaced(**changes) if changes else whole
 
@@ -119,6 +122,8 @@ class World:
             front = train.rear_m
             train.on_board.turned(-train.direction, front)
             train.front_m, train.held_m = front, None
+        if event == "asked back" and world.centre.ask_route_back(number) is not None:
+            return None
         if event == "late report comes":
             if train.late_report is None:
                 return None
@@ -191,6 +196,7 @@ class World:
             age = None if known.measured_ns is None else origin_ns - known.measured_ns
             parts.append((
                 known.direction, known.rear_m, known.front_m, known.end_m, known.claimed_m, known.stop,
+                known.asked_m, known.held, None if known.asked_m is None else state.granted - known.asked_number,
                 known.standstill,
                 known.speed_mps, known.station, tuple(sorted(known.tracks.items())), known.sequence - train.sequence,
                 age,
@@ -201,6 +207,7 @@ class World:
                 state.granted - train.on_board.number, self._late_report(train, origin_ns),
                 None if train.late_authority is None else (
                     train.late_authority.end_cm, train.late_authority.direction, train.late_authority.stopped,
+                    train.late_authority.shortens,
                     train.late_authority.report - train.sequence, state.granted - train.late_authority.number,
                 ),
             ))  # fmt: skip

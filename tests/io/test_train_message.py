@@ -88,7 +88,8 @@ def test_size_and_keys_of_a_message() -> None:
     assert KEYS["complete"] == 19
     assert KEYS["sigma_cm"] == 20
     assert KEYS["authority"] == 21
-    assert len(KEYS) == 21
+    assert KEYS["authority_end_cm"] == 22
+    assert len(KEYS) == 22
 
 
 def test_a_key_sent_twice_is_damage() -> None:

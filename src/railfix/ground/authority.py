@@ -11,8 +11,8 @@ from railfix.core.settings import Settings
 from railfix.io.train_message import MessageError
 
 #: Version of the message; a receiver rejects others.
-VERSION: Final = 1
-_FORM: Final = struct.Struct("!BIQQqb?")
+VERSION: Final = 2
+_FORM: Final = struct.Struct("!BIQQqb??")
 
 
 class Authority(Settings):
@@ -31,6 +31,8 @@ class Authority(Settings):
     direction : {-1, 1}
     stopped : bool
         Satellite positioning is suspended, the train stops.
+    shortens : bool
+        The end is one that the train is asked to take in place of a further one, where it can stop before it.
     """
 
     train: Annotated[int, Field(ge=0, lt=1 << 32)]
@@ -39,11 +41,12 @@ class Authority(Settings):
     end_cm: Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)]
     direction: Literal[-1, 1]
     stopped: bool
+    shortens: bool = False
 
     def encode(self) -> bytes:
         """Return the bytes of the message."""
         return _FORM.pack(
-            VERSION, self.train, self.number, self.report, self.end_cm, self.direction, self.stopped
+            VERSION, self.train, self.number, self.report, self.end_cm, self.direction, self.stopped, self.shortens
         )  # fmt: skip
 
     @classmethod

@@ -153,7 +153,8 @@ class ControlCentre:
         if message.train != number:
             self.rejected["of another train"] += 1
             return
-        stop = None if (train := self.supervision.state.trains.get(number)) is None else train.stop
+        known = self.supervision.state.trains.get(number)
+        stop = None if known is None else known.stop
         before = self.supervision.records.get(number, TrainRecord(train=number))
         reason = self.supervision.report(message, self.clock())
         if reason is not None:
@@ -163,6 +164,9 @@ class ControlCentre:
         if after_stop is not None and after_stop != stop:
             self.rejected["contradicts what is known of the train"] += 1
             self.log(f"train {number}: stopped, {after_stop}", train=number)
+        if known is not None and known.asked_m is not None and self.supervision.state.trains[number].asked_m is None:
+            agreed = self.supervision.state.trains[number].held
+            self.log(f"train {number}: {'has given its route back' if agreed else 'keeps its route'}", train=number)
         if (order := self.stops.get(number)) is not None and order.reported(message, self.clock()):
             self.log(f"train {number}: order to stop {order}", train=number)
         self.reports += 1
@@ -192,8 +196,8 @@ class ControlCentre:
         authorities = self.supervision.advance(now)
         state = self.supervision.state
         for number, train in state.trains.items():
-            if train.station != self._routes[number]:
-                self._routes[number] = train.station
+            before, self._routes[number] = self._routes[number], train.station
+            if train.direction * (train.station - before) > 0:
                 station = self.supervision.layout.stations[train.station].name
                 self.log(f"train {number}: route to {station}, track {train.tracks[train.station]}", train=number)
         for number, record in self.supervision.records.items():
@@ -285,6 +289,12 @@ class ControlCentre:
         self.log(f"train {train}: route asked for by hand{'' if reason is None else f', refused: {reason}'}")
         return reason
 
+    def ask_route_back(self, train: int) -> str | None:
+        """Ask a train by hand to give its route to the next station back; return the reason of a refusal."""
+        reason = self.supervision.ask_route_back(train)
+        self.log(f"train {train}: asked for its route back{'' if reason is None else f', refused: {reason}'}")
+        return reason
+
     def _monitor(self, now: float) -> None:
         if self.monitor is None:
             return
@@ -363,6 +373,7 @@ def orders_of(centre: ControlCentre) -> dict[str, Order]:
         "open-section": of_section(centre.open_section),
         "release": lambda _: centre.release(),
         "route": of_train(centre.set_route),
+        "route-back": of_train(centre.ask_route_back),
         "stop": of_train(centre.stop),
         "stop-all": lambda _: centre.stop(None),
         "release-train": of_train(centre.release_train),

@@ -1,7 +1,7 @@
 """Intervals, authorities, routes and points of a single line with passing loops.
 
 A pure state machine. Occupied by a train is the interval from its last safe rear end to the end of its authority.
-Authorities are only ever extended, up to the nearest of: another train's interval, points that are not locked and
+Authorities are extended (shortened by agreement alone, `railfix.ground.shortening`) up to the nearest of: another train's interval, points that are not locked and
 detected for the train, the end of its route; less a margin. A report that contradicts what is known of its train
 (`railfix.ground.plausibility`) stops that train and its neighbours. It is not a national rule book: no shunting, no
 overlaps behind signals, no level crossings, no degraded working by hand.
@@ -82,6 +82,12 @@ class TrainInterval:
         Newest speed.
     stop : str or None
         Why the train is stopped, until it is released by hand.
+    asked_m : float or None [m]
+        Shorter end of the authority that the train is asked to agree to.
+    asked_number : int
+        Number of the first authority that asks for it.
+    held : bool
+        A route was taken back: the next one is set by hand.
     """
 
     train: int
@@ -99,6 +105,9 @@ class TrainInterval:
     measured_ns: int | None = None
     speed_mps: float | None = None
     stop: str | None = None
+    asked_m: float | None = None
+    asked_number: int = 0
+    held: bool = False
 
     @cached_property
     def interval_m(self) -> tuple[float, float]:
@@ -231,6 +240,7 @@ def report_received(
         front_m=facing * max(facing * ahead, facing * before.rear_m),
         end_m=facing * max(facing * ahead, facing * before.rear_m),
         tracks={known.station: known.tracks[known.station]},
+        asked_m=None,
     )
     return with_train(state, turned)
 
@@ -292,6 +302,8 @@ def route_requested(
     here = state.trains[train]
     begin, direction = here.station, here.direction
     target = begin + direction
+    if here.asked_m is not None:
+        return state, (), "a shorter authority is being agreed with the train"
     if state.stopped:
         return state, (), "satellite positioning is suspended"
     if train in (stops := stopped_trains(state) if stopped is None else stopped):
@@ -321,7 +333,7 @@ def route_requested(
             moved.append(name)
             point = replace(point, wanted=wanted, detected=None)
         points[name] = replace(point, locked={**point.locked, train: None})
-    routed = replace(here, tracks={**here.tracks, target: track}, station=target)
+    routed = replace(here, tracks={**here.tracks, target: track}, station=target, held=False)
     return replace(state, trains={**state.trains, train: routed}, points=points), tuple(moved), None
 
 
@@ -391,9 +403,9 @@ def extended(
     after = dict(state.trains)
     state = replace(state, trains=after)
     for number in list(after) if trains is None else trains:
-        if number in stopped:
-            continue
         train = after[number]
+        if number in stopped or train.asked_m is not None:
+            continue
         end = _limit_m(state, train, layout, nearby, limits=limits)
         if train.direction * (end - train.end_m) > 0.0:
             after[number] = replace(train, end_m=end)

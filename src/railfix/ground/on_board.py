@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Final
@@ -22,9 +23,15 @@ class OnBoardLimits(Settings):
     ----------
     fresh_s : float [s]
         Time limit of authorities: the train brakes where the newest one answers a report that was sent longer ago.
+    braking_mps2 : float [m/s^2]
+        Deceleration with which the train can stop before a shorter authority.
+    reaction_s : float [s]
+        Time before the brakes act, with that since the newest report.
     """
 
     fresh_s: float = Field(default=15.0, gt=0)
+    braking_mps2: float = Field(default=0.5, gt=0)
+    reaction_s: float = Field(default=3.0, ge=0)
 
 
 @dataclass(kw_only=True)
@@ -38,7 +45,7 @@ class OnBoard:
     ----------
     direction : {-1, 1}
     end_m : float [m]
-        End of the authority; it is only ever extended.
+        End of the authority; it is extended, and shortened where the centre asks for it and the train can stop before.
     number : int
         Of the newest authority, -1 before the first.
     stopped : bool
@@ -46,6 +53,8 @@ class OnBoard:
     before_turn : int
         Newest report from before the last turn, or from before this start: what answers
         it or an older one is refused.
+    stops_at_m : float or None [m]
+        Where the train's safe front end would come to rest if it braked now; None: it agrees to no shorter end.
     answered_s : float or None [s]
         When the newest report was sent that an authority has answered; None before the first.
     """
@@ -55,6 +64,7 @@ class OnBoard:
     limits: OnBoardLimits = field(default_factory=OnBoardLimits)
     number: int = -1
     stopped: bool = False
+    stops_at_m: float | None = None
     answered_s: float | None = None
     before_turn: int = -1
     _newest: int = -1
@@ -67,6 +77,11 @@ class OnBoard:
         if len(self._sent) > REMEMBERED:
             self._sent.popitem(last=False)
 
+    def moved(self, safe_front_m: float, speed_mps: float) -> None:
+        """Note where the train's safe front end is, and its speed."""
+        way = speed_mps * self.limits.reaction_s + 0.5 * speed_mps**2 / self.limits.braking_mps2
+        self.stops_at_m = safe_front_m + self.direction * way
+
     def receive(self, authority: Authority) -> bool:
         """Take an authority; return whether it counts: it is newer, for this direction, and of this side of a turn.
 
@@ -78,10 +93,19 @@ class OnBoard:
         if authority.report <= self.before_turn:
             return False
         self.number, self.stopped = authority.number, authority.stopped
-        self.end_m = self.direction * max(self.direction * authority.end_cm / 100.0, self.direction * self.end_m)
+        end = self.direction * authority.end_cm / 100.0
+        agrees = authority.shortens and self.stops_at_m is not None and self.direction * self.stops_at_m <= end
+        self.end_m = self.direction * (end if agrees else max(end, self.direction * self.end_m))
         if (sent_s := self._sent.get(authority.report)) is not None:
             self.answered_s = sent_s
         return True
+
+    def acknowledgement(self) -> dict[str, int]:
+        """What a report says of the authority that the train holds: nothing before the first."""
+        if self.number < 0:
+            return {}
+        end_cm = self.direction * math.ceil(self.direction * self.end_m * 100.0)
+        return {"authority": self.number, "authority_end_cm": end_cm}
 
     def age_s(self, now_s: float) -> float:
         """Age of the newest authority at most [s]; infinite before the first."""

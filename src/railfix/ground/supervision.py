@@ -29,6 +29,7 @@ from railfix.ground.interlocking import (
     stopped_trains,
 )
 from railfix.ground.layout import Layout, PointName
+from railfix.ground.shortening import answer_received, ask_route_back
 from railfix.ground.stops import overlaps_stopped
 from railfix.io.train_message import TrainMessage
 
@@ -79,6 +80,7 @@ class Supervision:
         self.records[message.train], reason = record_received(record, message, now_s, limits=self.centre)
         if reason is None:
             self.state = report_received(self.state, message, self.layout, limits=self.limits)
+            self.state = answer_received(self.state, message)
             self.heard.add(message.train)
         return reason
 
@@ -101,6 +103,11 @@ class Supervision:
         for point in moved:
             self.command(point)
         return None
+
+    def ask_route_back(self, train: int) -> str | None:
+        """Ask a train to give its route to the next station back; return the reason of a refusal."""
+        self.state, reason = ask_route_back(self.state, train, self.layout, limits=self.limits)
+        return reason
 
     def advance(self, now_s: float) -> list[Authority]:
         """Release points, set routes, extend authorities; return what is sent once the state is stored.
@@ -132,17 +139,21 @@ class Supervision:
         return number in self.heard or now_s - sent_s >= AUTHORITY_S - 1e-6 or stop != was_stopped
 
     def _authority(self, train: TrainInterval, stopped: bool) -> Authority:
+        end = train.end_m if train.asked_m is None else train.asked_m
         return Authority(
             train=train.train,
             number=self.state.granted,
             report=max(self.records[train.train].sequence, 0) if train.train in self.records else 0,
-            end_cm=train.direction * int(train.direction * train.end_m * 100.0 // 1.0),
+            end_cm=train.direction * int(train.direction * end * 100.0 // 1.0),
             direction=1 if train.direction > 0 else -1,
             stopped=self.state.stopped or stopped,
+            shortens=train.asked_m is not None,
         )
 
     def _wants_route(self, train: TrainInterval) -> bool:
         ahead = train.station + train.direction
+        if train.held or train.asked_m is not None:
+            return False
         if not 0 <= ahead < len(self.layout.stations):
             return False
         inner = self.layout.stations[train.station].inner_m

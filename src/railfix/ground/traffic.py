@@ -90,7 +90,7 @@ class SimulatedTrain:
             "time_ns": time,
             "sent_ns": time,
             "line": 1,
-            "authority": self.on_board.number if self.on_board.number >= 0 else None,
+            **self.on_board.acknowledgement(),
         }
         if now_s < self.blind_until_s:
             return TrainMessage(**head)
@@ -121,6 +121,7 @@ class SimulatedTrain:
         after = 0.0 if after < 0.05 else after
         self.front_m += self.direction * 0.5 * (self.speed_mps + after) * STEP_S
         self.speed_mps = after
+        self.on_board.moved(self.front_m + self.error_m + self.direction * (self.bound_m + STOP_SHORT_M), after)
 
 
 @dataclass(kw_only=True)

@@ -107,8 +107,8 @@ class _Desk:
         # numbers go on rising where the source of the positions is started again
         self._sequence += 1
         complete = message.complete if self._integrity is None else is_complete(self._integrity)
-        taken = None if self._on_board is None or self._on_board.number < 0 else self._on_board.number
-        message = message.replaced(train=self._train, sequence=self._sequence, complete=complete, authority=taken)
+        taken = {} if self._on_board is None else self._on_board.acknowledgement()
+        message = message.replaced(train=self._train, sequence=self._sequence, complete=complete, **taken)
         if message.facing != 0 and message.chainage_cm is not None:
             front = message.chainage_cm / 100.0
             if self._on_board is None:
@@ -119,6 +119,11 @@ class _Desk:
                 self._on_board.turned(message.facing, front)
         if self._on_board is not None:
             self._on_board.reported(self._sequence, now_s)
+            if message.chainage_cm is not None and message.under_cm is not None and message.speed_cmps is not None:
+                ahead = message.chainage_cm + self._on_board.direction * message.under_cm
+                self._on_board.moved(ahead / 100.0, abs(message.speed_cmps) / 100.0)
+            else:
+                self._on_board.stops_at_m = None
         place = None if message.chainage_cm is None else message.chainage_cm / 100.0
         links.send(encode(message), chainage_m=place, direction=message.facing)
 

@@ -99,6 +99,8 @@ class TrainMessage(Settings):
         Standard deviation of the place along the line, rounded up.
     authority : int or None
         Number of the newest authority that the train has taken: its acknowledgement to the ground side.
+    authority_end_cm : int or None [cm]
+        Where the authority ends that the train holds, rounded away from it.
     """
 
     train: Unsigned
@@ -122,6 +124,7 @@ class TrainMessage(Settings):
     complete: bool = False
     sigma_cm: Unsigned | None = None
     authority: Unsigned | None = None
+    authority_end_cm: Signed | None = None
 
     @model_validator(mode="after")
     def _place_with_bounds(self) -> Self:
