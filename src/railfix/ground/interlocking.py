@@ -1,10 +1,11 @@
 """Intervals, authorities, routes and points of a single line with passing loops.
 
 A pure state machine. Occupied by a train is the interval from its last safe rear end to the end of its authority.
-Authorities are extended (shortened by agreement alone, `railfix.ground.shortening`) up to the nearest of: another train's interval, points that are not locked and
-detected for the train, the end of its route; less a margin. A report that contradicts what is known of its train
-(`railfix.ground.plausibility`) stops that train and its neighbours. It is not a national rule book: no shunting, no
-overlaps behind signals, no level crossings, no degraded working by hand.
+Authorities are extended up to the nearest of: another train's interval, points that are not locked and detected for
+the train, the end of its route; less a margin. They are shortened by agreement alone (`railfix.ground.shortening`). A
+report that contradicts what is known of its train (`railfix.ground.plausibility`) stops that train and its neighbours.
+It is not a national rule book: no shunting, no overlaps behind signals, no level crossings, no degraded working by
+hand.
 """
 
 from __future__ import annotations
