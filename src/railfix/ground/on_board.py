@@ -93,9 +93,12 @@ class OnBoard:
         if authority.report <= self.before_turn:
             return False
         self.number, self.stopped = authority.number, authority.stopped
-        end = self.direction * authority.end_cm / 100.0
-        agrees = authority.shortens and self.stops_at_m is not None and self.direction * self.stops_at_m <= end
-        self.end_m = self.direction * (end if agrees else max(end, self.direction * self.end_m))
+        end, held = self.direction * authority.end_cm / 100.0, self.direction * self.end_m
+        if authority.shortens:  # never further than before
+            agrees = self.stops_at_m is not None and self.direction * self.stops_at_m <= end
+            self.end_m = self.direction * (min(end, held) if agrees else held)
+        else:
+            self.end_m = self.direction * max(end, held)
         if (sent_s := self._sent.get(authority.report)) is not None:
             self.answered_s = sent_s
         return True

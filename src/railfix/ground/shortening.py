@@ -30,6 +30,8 @@ def ask_route_back(
         return state, "the train has no route to take back"
     inner = layout.stations[base].inner_m
     end = direction * (inner[1] if direction > 0 else inner[0])
+    if known.stop is not None or direction * (known.front_m - known.end_m) > 0.0:
+        return state, "the train is stopped, or beyond its authority"
     if direction * known.front_m > end:
         return state, f"the train leaves or has left {layout.stations[base].name}"
     asked = direction * max(min(end - limits.margin_m, direction * known.end_m), direction * known.front_m)
