@@ -22,6 +22,8 @@ FILTER: Final = "advance"
 FILTER_ALONE: Final = "RAILFIX_COMPILE_FILTER_ALONE"
 #: Where the recursion of the filter is.
 _FILTER_MODULE: Final = "tracking.recursion"
+#: Where the velocities are that it takes.
+_VELOCITY_MODULE: Final = "tracking.velocity"
 
 
 def __getattr__(name: str) -> Any:
@@ -38,7 +40,7 @@ def numba_version() -> str:
 
 def _import_all() -> Any:
     """Import all kernels, and return the module that compiles them."""
-    for module in (_FILTER_MODULE, *__all__):
+    for module in (_FILTER_MODULE, _VELOCITY_MODULE, *__all__):
         import_module(f"railfix.kernels.{module}")
     return import_module("railfix.kernels.compiling")
 

@@ -15,16 +15,6 @@ from railfix.core.arrays import Floats, Masks
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
 
-#: Standard deviation of the vertical velocity [m/s].
-_CLIMB_MPS: Final = 0.3
-#: Loose prior for conditioning: standard deviations of the velocity and the clock [m/s].
-_PRIOR_MPS: Final = np.array([1e3, 1e3, 1e3, 1e6])
-#: Degrees of freedom of the errors, rounds of reweighting, rows beyond the unknowns that are needed, and least mean
-#: weight: with less the measurements do not agree with each other.
-_DEGREES: Final = 4.0
-_PASSES: Final = 8
-_REDUNDANT: Final = 2
-_AGREEING: Final = 0.9
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 
 
@@ -85,9 +75,9 @@ def compute_velocity(
     gradient[..., 0] -= _TURN * sat[..., 1]
     up = enu_axes(*geodetic_from_ecef(near)[:2])[:, 2]
     dt = interval_s[:, None]
-    by_phase = _solve(-sight, (measured[1] - distance + previous) / dt, variance[1] / dt**2, has[1], up)
+    by_phase = _fitted(-sight, (measured[1] - distance + previous) / dt, variance[1] / dt**2, has[1], up)
     rate = measured[2] - moving / stretch
-    by_doppler = _solve(gradient / stretch[..., None], rate, variance[2], has[2], up)
+    by_doppler = _fitted(gradient / stretch[..., None], rate, variance[2], has[2], up)
     phase = np.asarray(np.isfinite(by_phase[0][:, 0]))
     velocity = np.where(phase[:, None], by_phase[0], by_doppler[0])
     return Velocity(
@@ -97,32 +87,11 @@ def compute_velocity(
     )
 
 
-def _solve(gradient: Floats, value: Floats, variance: Floats, has: Masks, up: Floats) -> tuple[Floats, Floats]:
-    """Velocity and its covariance by rows ``gradient . v + clock``, shapes (T, 3) and (T, 3, 3)."""
-    epochs, channels = has.shape
-    if not has.any():
-        return np.full((epochs, 3), np.nan), np.full((epochs, 3, 3), np.nan)
-    value = np.where(has, value, np.nan)
-    count = has.sum(axis=1)
-    some = np.asarray(count > 0)
-    clock = np.zeros(epochs)
-    clock[some] = np.nanmedian(value[some], axis=1)
-    value = np.where(has, value - clock[:, None], 0.0)
-    information = np.where(has, 1.0 / np.where(has, variance, 1.0), 0.0)
-    design = np.concatenate([gradient, np.ones((epochs, channels, 1))], axis=2)
-    level = np.concatenate([up, np.zeros((epochs, 1))], axis=1)
-    prior = np.diag(_PRIOR_MPS**-2.0) + level[:, :, None] * level[:, None, :] / _CLIMB_MPS**2
-    weight = np.ones_like(value)
-    solved, covariance, square = np.zeros((epochs, 4)), prior, value
-    for _ in range(_PASSES):
-        scaled = np.swapaxes(design * (weight * information)[..., None], 1, 2)
-        covariance = np.linalg.inv(scaled @ design + prior)
-        solved = (covariance @ (scaled @ value[..., None]))[..., 0]
-        square = (value - (design @ solved[..., None])[..., 0]) ** 2 * information
-        weight = (_DEGREES + 1.0) / (_DEGREES + square)
-    freedom = count - 3
-    size = (weight * square).sum(axis=1) / np.maximum(freedom, 1)
-    agreeing = np.where(has, weight, 0.0).sum(axis=1) >= _AGREEING * count
-    enough = np.asarray((freedom >= _REDUNDANT) & agreeing)
-    spread = covariance[:, :3, :3] * np.maximum(size, 1.0)[:, None, None]
-    return np.where(enough[:, None], solved[:, :3], np.nan), np.where(enough[:, None, None], spread, np.nan)
+def _fitted(gradient: Floats, value: Floats, variance: Floats, has: Masks, up: Floats) -> tuple[Floats, Floats]:
+    """Velocities by arrays in C order, so that the kernel is compiled for one kind of them."""
+    from railfix.kernels.tracking.velocity import fitted_velocities
+
+    return fitted_velocities(
+        np.ascontiguousarray(gradient), np.ascontiguousarray(value), np.ascontiguousarray(variance),
+        np.ascontiguousarray(has), np.ascontiguousarray(up),
+    )  # fmt: skip
