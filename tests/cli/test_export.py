@@ -90,6 +90,7 @@ def number(text: object) -> float | None:
 
 def point(values: dict[str, object], place: tuple[float, ...], utc: object) -> Point:
     at = utc if isinstance(utc, datetime) else datetime.fromisoformat(str(utc))
+    assert at.utcoffset() == timedelta(0)
     return Point(
         place=(place[0], place[1], place[2]),
         utc=at.replace(tzinfo=None),

@@ -117,7 +117,8 @@ def _content(points: pl.DataFrame, path: Path, description: str) -> bytes:
         options = {"RFC7946": "YES", "COORDINATE_PRECISION": "9", "DESCRIPTION": description}
         return _features(points, "GeoJSON", layer=path.stem, **options)
     points = points.with_columns(pl.col("time_utc").dt.strftime("%Y-%m-%dT%H:%M:%S%.3fZ"))
-    antennas = {name: points.filter(antenna=name).to_dicts() for name in points["antenna"].unique(maintain_order=True)}
+    names = points["antenna"].unique(maintain_order=True)
+    antennas = {name: points.filter(antenna=name).iter_rows(named=True) for name in names}
     fields = [name for name in points.columns if name not in ("time_utc", *COORDINATES)]
     return _rendered(f"positions{ending}", name=path.stem, description=description, antennas=antennas, fields=fields)
 
@@ -178,4 +179,6 @@ def _rendered(template: str, **values: Any) -> bytes:
         loader=PackageLoader("railfix.io"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,
     )  # fmt: skip
-    return environment.get_template(f"{template}.j2").render(colours=STATUS_COLOURS, **values).encode()
+    file = BytesIO()
+    environment.get_template(f"{template}.j2").stream(colours=STATUS_COLOURS, **values).dump(file, encoding="utf-8")
+    return file.getvalue()
