@@ -1,7 +1,7 @@
 """Write positions of a run as KML, GPX, GeoJSON, GeoPackage or GeoParquet, with a style for QGIS.
 
 Coordinates are longitude and latitude [deg] and height above the ellipsoid [m], WGS 84. GDAL makes GeoJSON and
-GeoPackage. KML and GPX come from templates: GDAL's drivers give points of KML no style, and points of GPX no height.
+GeoPackage. KML and GPX come from templates, because pyogrio can give KML no styles and GPX no description.
 polars writes GeoParquet, of which the wheels of pyogrio have no driver. Every file is made in memory, because GDAL
 does not always report a full disk.
 """
@@ -132,7 +132,7 @@ def _features(points: pl.DataFrame, driver: str, *, layer: str, **options: str) 
     file = BytesIO()
     pyogrio.raw.write(
         file,
-        _wkb(points),
+        _wkb(points, "extended"),  # pyogrio up to 0.10 reads no other
         [value if value.dtype.kind in "fM" else value.astype(object) for value in values],
         np.array([column.name for column in fields]),
         field_mask=[column.is_null().to_numpy() for column in fields],
@@ -156,17 +156,17 @@ def _geoparquet(points: pl.DataFrame, description: str) -> bytes:
         "bbox": [*place.min(axis=0), *place.max(axis=0)],
     }
     geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": column}}
-    table = points.drop(COORDINATES).with_columns(pl.Series("geometry", _wkb(points).tolist(), dtype=pl.Binary))
+    table = points.drop(COORDINATES).with_columns(pl.Series("geometry", _wkb(points, "iso").tolist(), dtype=pl.Binary))
     file = BytesIO()
     table.write_parquet(file, metadata={"geo": json.dumps(geo), "description": description})
     return file.getvalue()
 
 
-def _wkb(points: pl.DataFrame) -> Any:
-    """Return the points as well-known binary of ISO, array of bytes, shape (n,)."""
+def _wkb(points: pl.DataFrame, flavor: str) -> Any:
+    """Return the points as well-known binary, "iso" or "extended", array of bytes, shape (n,)."""
     import shapely
 
-    return shapely.to_wkb(shapely.points(points.select(COORDINATES).to_numpy()), flavor="iso")
+    return shapely.to_wkb(shapely.points(points.select(COORDINATES).to_numpy()), flavor=flavor)
 
 
 def _style() -> bytes:
