@@ -33,9 +33,10 @@ TO_FILE: Final = {
     "cn0-curve {desk}/front.obs --nav {desk}/brdc.nav --out {desk}/new.toml --plot {out}": ("front.obs", "new.toml"),
     "error-model {desk}/results --reference {desk}/truth.csv --out {out}": ("truth.csv", "results/run.json"),
     "report {desk}/results --reference {desk}/truth.csv --out {out}": ("truth.csv", "results/positions.parquet"),
+    "export {desk}/results --out {out}": ("results/positions.parquet", "results/run.json"),
 }
 #: Endings of the outputs, by a word of the command.
-ENDINGS: Final = {"map": ".csv", "--plot": ".png", "report": ".html", "": ".toml"}
+ENDINGS: Final = {"export": ".gpkg", "map": ".csv", "--plot": ".png", "report": ".html", "": ".toml"}
 TO_FOLDER: Final = {
     f"run {_LOG} --out {{out}}": "positions.csv",
     f"ablate {_LOG} --out {{out}}": "ablation.csv",

@@ -36,6 +36,7 @@ def instant(text: str) -> np.datetime64:
 def test_leap_seconds_of_bulletin_c(utc: str, leap: int) -> None:
     assert timescale.gpst_minus_utc(instant(utc)) == leap
     assert timescale.utc_to_gpst(instant(utc)) - instant(utc) == np.timedelta64(leap, "s")
+    assert timescale.gpst_to_utc(instant(utc) + np.timedelta64(leap, "s")) == instant(utc)
 
 
 def test_weeks_against_known_dates() -> None:

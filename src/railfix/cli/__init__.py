@@ -21,6 +21,7 @@ class _Program(LazyCommands):
         "run": "Position receiver logs along the line.",
         "doctor": "Examine files: what they are, whether they fit, the command to run.",
         "explain": "Explain one epoch of a run: its satellites, sigma, level and status.",
+        "export": "Write positions of a run for maps: KML, GPX, GeoJSON, GeoPackage, GeoParquet.",
         "campaign": "Position many logs side by side, resumable.",
         "demo": "Position the demonstration log and compare it with its ground truth.",
         "ablate": "Compare choices of screens on a log: all, none, each alone, all but each.",

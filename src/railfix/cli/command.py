@@ -35,6 +35,8 @@ EXTRAS: Final = {
     "uvicorn": "ground",
     "sqlalchemy": "ground",
     "distributed": "cluster",
+    "pyogrio": "maps",
+    "shapely": "maps",
 }
 #: A signal ends the program with this exit code plus its number, as in a shell.
 SIGNALLED: Final = 128

@@ -110,6 +110,16 @@ def utc_to_gpst(utc: ArrayLike) -> Datetimes:
     return np.asarray(at + leap, dtype="datetime64[ns]")
 
 
+def gpst_to_utc(time: ArrayLike) -> Datetimes:
+    """Convert GPS time to UTC by the table of leap seconds.
+
+    The leap second itself, which ``datetime64`` lacks, becomes the second after it.
+    """
+    at = np.asarray(time, dtype="datetime64[ns]")
+    leap = np.searchsorted(utc_to_gpst(_LEAP_UTC), at, side="right") - 1
+    return np.asarray(at - leap.astype("timedelta64[s]"), dtype="datetime64[ns]")
+
+
 def nearest_week(seconds_of_week: ArrayLike, near: ArrayLike) -> Datetimes:
     """Resolve the week of seconds of week: the GPS time nearest to another time.
 

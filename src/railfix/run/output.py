@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 #: What becomes of files that are already there.
 Overwrite = Literal["refuse", "replace"]
 #: What a single file is, for `check_output_file`.
-FileKind = Literal["page", "csv", "pos", "picture", "png", "any"]
+FileKind = Literal["page", "csv", "pos", "picture", "png", "map", "any"]
 #: Of each kind what it is, how its name ends, and how to come by another form.
 _ENDINGS: Final[Mapping[str, tuple[str, tuple[str, ...], str]]] = {
     "page": ("an HTML page", (".html", ".htm"), "; for a PDF file, print the page in a browser"),
@@ -29,6 +29,7 @@ _ENDINGS: Final[Mapping[str, tuple[str, tuple[str, ...], str]]] = {
     "pos": ("RTKLIB's format of positions", (".pos",), ""),
     "picture": ("a picture in PNG or SVG", (".png", ".svg"), ""),
     "png": ("a picture in PNG", (".png",), ""),
+    "map": ("a file for maps", (".kml", ".gpx", ".geojson", ".gpkg", ".parquet"), ""),
 }
 #: How times are written to CSV: ISO 8601, GPS time, to the nanosecond, no time zone.
 CSV_TIME: Final = "%Y-%m-%dT%H:%M:%S%.9f"

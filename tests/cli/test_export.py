@@ -1,0 +1,313 @@
+"""``railfix export``: every format read back without the program that wrote it, styles, and what goes wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import sqlite3
+import struct
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Final
+from xml.etree import ElementTree
+
+import numpy as np
+import polars as pl
+import pyarrow.parquet
+import pytest
+from pyproj import Transformer
+from typer.testing import CliRunner
+
+from railfix.cli import app
+from railfix.core.reasons import POSITIONED
+from railfix.io.positions_export import STATUS_COLOURS
+from railfix.pipeline.config import parse_config
+from railfix.run import RunOptions, run_files
+from railfix.simulate.demonstration import demo_inputs, demo_truth
+from railfix.tracking import TrackStatus
+
+RUNNER = CliRunner(env={"COLUMNS": "200", "TERM": "dumb", "NO_COLOR": "1"})
+pytestmark = pytest.mark.requirement("G4")
+
+#: GPS time less UTC at the time of the demonstration.
+LEAP: Final = timedelta(seconds=18)
+#: Rows of the filter that get no position, and the row whose level becomes infinite.
+WITHOUT: Final = (5, 6, 150)
+UNBOUNDED: Final = 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """One position as a file has it."""
+
+    place: tuple[float, float, float]
+    utc: datetime
+    antenna: str
+    status: str
+    chainage_m: float
+    level_m: float | None
+    gpst: str
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twenty seconds of the demonstration; some positions of the filter are taken away."""
+    out = tmp_path_factory.mktemp("exported") / "results"
+    first = pl.read_csv(demo_truth(), try_parse_dates=True)["time_gpst"][0]
+    options = RunOptions(end=first + timedelta(seconds=20))
+    run_files(demo_inputs(), parse_config({"filter": "track"}), out=out, options=options)
+    row = pl.int_range(pl.len())
+    place = ("longitude_deg", "latitude_deg", "height_m", "x_m", "y_m", "z_m")
+    pl.read_parquet(out / "train.parquet").with_columns(
+        pl.when(~row.is_in(WITHOUT)).then(pl.col(place)),
+        protection_level_m=pl.when(row == UNBOUNDED).then(math.inf).otherwise("protection_level_m"),
+    ).write_parquet(out / "train.parquet")
+    return out
+
+
+def export(run: Path, out: Path, *more: str) -> str:
+    result = RUNNER.invoke(app, ["export", str(run), "--out", str(out), *more])
+    assert result.exit_code == 0, result.output
+    return " ".join(result.output.split())
+
+
+def refused(run: Path, out: Path, *more: str) -> tuple[int, str]:
+    result = RUNNER.invoke(app, ["export", str(run), "--out", str(out), *more])
+    assert isinstance(result.exception, SystemExit), repr(result.exception)
+    return result.exit_code, " ".join(result.output.split())
+
+
+# -- readers that share nothing with the writers --------------------------------------------------------------
+
+
+def number(text: object) -> float | None:
+    return None if text is None else float(str(text))
+
+
+def point(values: dict[str, object], place: tuple[float, ...], utc: object) -> Point:
+    at = utc if isinstance(utc, datetime) else datetime.fromisoformat(str(utc))
+    assert at.utcoffset() == timedelta(0)
+    return Point(
+        place=(place[0], place[1], place[2]),
+        utc=at.replace(tzinfo=None),
+        antenna=str(values["antenna"]),
+        status=str(values["status"]),
+        chainage_m=float(str(values["chainage_m"])),
+        level_m=number(values.get("protection_level_m")),
+        gpst=str(values["time_gpst"]),
+    )
+
+
+def place_of(wkb: bytes) -> tuple[float, ...]:
+    order, kind, *place = struct.unpack("<BI3d", wkb)
+    assert (order, kind) == (1, 1001)
+    return tuple(place)
+
+
+def read_kml(path: Path) -> list[Point]:
+    name = {"k": "http://www.opengis.net/kml/2.2"}
+    points = []
+    for mark in ElementTree.parse(path).iterfind(".//k:Placemark", name):
+        values = {
+            str(data.get("name")): data.findtext("k:value", None, name) for data in mark.iterfind(".//k:Data", name)
+        }
+        assert mark.findtext("k:styleUrl", None, name) == f"#{values['status']}"
+        place = [float(v) for v in mark.findtext("k:Point/k:coordinates", "", name).split(",")]
+        points.append(point(dict(values), tuple(place), mark.findtext("k:TimeStamp/k:when", None, name)))
+    return points
+
+
+def read_gpx(path: Path) -> list[Point]:
+    name = {"g": "http://www.topografix.com/GPX/1/1"}
+    points = []
+    for track in ElementTree.parse(path).iterfind("g:trk", name):
+        for node in track.iterfind(".//g:trkpt", name):
+            values = {child.tag.partition("}")[2]: child.text for child in node.find("g:extensions", name) or ()}
+            assert values["antenna"] == track.findtext("g:name", None, name)
+            place = float(node.attrib["lon"]), float(node.attrib["lat"]), float(node.findtext("g:ele", "", name))
+            points.append(point(dict(values), place, node.findtext("g:time", None, name)))
+    return points
+
+
+def read_geojson(path: Path) -> list[Point]:
+    features = json.loads(path.read_text(encoding="utf-8"))["features"]
+    return [point(f["properties"], f["geometry"]["coordinates"], f["properties"]["time_utc"]) for f in features]
+
+
+def read_geopackage(path: Path) -> list[Point]:
+    with sqlite3.connect(path) as base:
+        base.row_factory = sqlite3.Row
+        ((table, srs),) = base.execute("select table_name, srs_id from gpkg_geometry_columns").fetchall()
+        codes = base.execute("select organization_coordsys_id from gpkg_spatial_ref_sys where srs_id=?", [srs])
+        assert codes.fetchone()[0] == 4979
+        rows = base.execute(f'select * from "{table}"').fetchall()
+    base.close()
+    points = []
+    for row in rows:
+        assert row["geom"][:2] == b"GP"
+        place = place_of(row["geom"][-29:])  # behind a header with an envelope or without
+        points.append(point(dict(row), place, row["time_utc"]))
+    return points
+
+
+def read_geoparquet(path: Path) -> list[Point]:
+    file = pyarrow.parquet.ParquetFile(path)
+    geo = json.loads(file.metadata.metadata[b"geo"])
+    column = geo["columns"][geo["primary_column"]]
+    assert (column["encoding"], column["geometry_types"]) == ("WKB", ["Point Z"])
+    assert column["crs"]["id"] == {"authority": "EPSG", "code": 4979}
+    rows = file.read().to_pandas()
+    points = [
+        point(row, place_of(row[geo["primary_column"]]), row["time_utc"].to_pydatetime(warn=False))
+        for row in rows.replace({np.nan: None}).to_dict("records")
+    ]
+    box = np.array([p.place for p in points])
+    np.testing.assert_array_equal(column["bbox"], [*box.min(axis=0), *box.max(axis=0)])
+    return points
+
+
+READERS: Final[dict[str, Callable[[Path], list[Point]]]] = {
+    ".kml": read_kml, ".gpx": read_gpx, ".geojson": read_geojson, ".gpkg": read_geopackage, ".parquet": read_geoparquet,
+}  # fmt: skip
+
+
+# -- contents -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("table", ["train", "positions"])
+@pytest.mark.parametrize("ending", READERS)
+def test_positions_read_back_to_a_millimetre(results: Path, tmp_path: Path, ending: str, table: str) -> None:
+    out = tmp_path / f"run{ending}"
+    said = export(results, out, *(["--single"] if table == "positions" else []))
+    rows = pl.read_parquet(results / f"{table}.parquet").drop_nulls("x_m").sort("antenna", "time_gpst")
+    assert len(rows) == (400 - len(WITHOUT) if table == "train" else 400)
+    assert f"{len(rows)} positions of 400 epochs and antennas" in said
+    assert "WGS 84 (ITRF2020 at 2024.18), heights above the ellipsoid" in said
+    points = sorted(READERS[ending](out), key=lambda p: (p.antenna, p.utc))
+    assert [p.antenna for p in points] == rows["antenna"].to_list()
+    assert [p.status for p in points] == rows["status"].cast(pl.String).to_list()
+    assert [p.utc for p in points] == [time - LEAP for time in rows["time_gpst"].dt.cast_time_unit("us")]
+    gpst = rows["time_gpst"].dt.strftime("%F %H:%M:%S%.3f").to_list()
+    assert [f"{p.gpst}.000".replace("T", " ")[:23] for p in points] == gpst
+    to_ecef = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    ecef = to_ecef.transform(*np.array([p.place for p in points]).T)
+    np.testing.assert_allclose(np.array(ecef).T, rows.select("x_m", "y_m", "z_m").to_numpy(), rtol=0.0, atol=1e-3)
+    np.testing.assert_allclose([p.chainage_m for p in points], rows["chainage_m"].to_numpy(), rtol=0.0, atol=1e-3)
+    level = rows["protection_level_m"]
+    assert level.is_infinite().any() == (table == "train")
+    expected = [None if v is None or math.isinf(v) else pytest.approx(v, abs=1e-3) for v in level]
+    assert [p.level_m for p in points] == expected
+
+
+def test_the_frame_is_stated_in_every_file(results: Path, tmp_path: Path) -> None:
+    for ending in READERS:
+        export(results, tmp_path / f"run{ending}", "--overwrite")
+        assert b"WGS 84 (ITRF2020 at 2024.18), heights above the ellipsoid" in (tmp_path / f"run{ending}").read_bytes()
+
+
+def test_a_run_without_parquet_files_is_exported_from_its_tables(results: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(results, tmp_path / "results", ignore=shutil.ignore_patterns("*.parquet"))
+    for ending in READERS:
+        export(run, tmp_path / f"run{ending}", "--overwrite")
+        assert len(READERS[ending](tmp_path / f"run{ending}")) == 400
+
+
+def test_tracks_of_a_network_are_attributes(results: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(results, tmp_path / "results")
+    rows = pl.read_parquet(run / "train.parquet")
+    name = pl.when(pl.int_range(pl.len()) > 100).then(pl.lit("L36 <B> & 'C'"))
+    rows.with_columns(track=name, track_chainage_m=pl.lit(12.5)).write_parquet(run / "train.parquet")
+    for ending in (".geojson", ".kml"):
+        export(run, tmp_path / f"run{ending}")
+    features = json.loads((tmp_path / "run.geojson").read_text(encoding="utf-8"))["features"]
+    assert {f["properties"]["track"] for f in features} == {None, "L36 <B> & 'C'"}
+    assert features[0]["properties"]["track_chainage_m"] == 12.5
+    texts = [node.text for node in ElementTree.parse(tmp_path / "run.kml").iter() if node.tag.endswith("}value")]
+    assert texts.count("L36 <B> & 'C'") == sum(f["properties"]["track"] is not None for f in features)
+
+
+# -- styles ---------------------------------------------------------------------------------------------------
+
+
+def test_every_status_with_a_position_has_its_colour_in_the_style(results: Path, tmp_path: Path) -> None:
+    export(results, tmp_path / "run.gpkg")
+    renderer = ElementTree.parse(tmp_path / "run.qml").find("renderer-v2")
+    assert renderer is not None
+    assert (renderer.get("type"), renderer.get("attr")) == ("categorizedSymbol", "status")
+    symbol = {c.get("value"): c.get("symbol") for c in renderer.iterfind("categories/category")}
+    colour = {
+        s.get("name"): next(o.get("value") for o in s.iter("Option") if o.get("name") == "color")
+        for s in renderer.iterfind("symbols/symbol")
+    }
+    drawn = {status: colour[name] for status, name in symbol.items()}
+    assert {status or "other": shown for status, shown in drawn.items()} == STATUS_COLOURS
+    no_place = {"expired", "not_started"}
+    assert {s.text for s in POSITIONED} | {s.text for s in TrackStatus} - no_place == set(STATUS_COLOURS) - {"other"}
+
+
+def test_formats_share_a_style_and_a_style_of_the_user_is_kept(results: Path, tmp_path: Path) -> None:
+    for ending in READERS:
+        export(results, tmp_path / f"run{ending}")
+    assert len(list(tmp_path.iterdir())) == len(READERS) + 1
+    style = tmp_path / "run.qml"
+    style.write_text("mine")
+    (tmp_path / "run.gpkg").unlink()
+    code, said = refused(results, tmp_path / "run.gpkg")
+    assert (code, style.read_text()) == (8, "mine")
+    assert "run.qml: the file exists already" in said
+    assert not (tmp_path / "run.gpkg").exists()
+    export(results, tmp_path / "run.gpkg", "--overwrite")
+    assert style.read_text() != "mine"
+
+
+# -- what goes wrong ------------------------------------------------------------------------------------------
+
+
+def test_another_ending_is_refused_with_those_there_are(results: Path, tmp_path: Path) -> None:
+    code, said = refused(results, tmp_path / "run.shp")
+    assert code == 8
+    assert "name a file that ends in .kml or .gpx or .geojson or .gpkg or .parquet" in said
+
+
+@pytest.mark.parametrize("package", ["pyogrio", "shapely"])
+def test_a_missing_extra_is_one_sentence(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    code, said = refused(results, tmp_path / "run.gpkg")
+    assert (code, list(tmp_path.iterdir())) == (4, [])
+    assert f"this needs {package}, which is not installed; pip install 'railfix[maps]'" in said
+    export(results, tmp_path / "run.kml")
+
+
+def test_a_full_disk_leaves_nothing(results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write = Path.write_bytes
+
+    def full(path: Path, content: bytes) -> int:
+        if ".qml" in path.name:
+            write(path, content[:10])
+            raise OSError(28, "No space left on device")
+        return write(path, content)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    code, said = refused(results, tmp_path / "run.gpkg")
+    assert (code, list(tmp_path.iterdir())) == (8, [])
+    assert "No space left on device" in said
+
+
+def test_a_run_without_the_filter_or_without_a_position(results: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(results, tmp_path / "results", ignore=shutil.ignore_patterns("train.*"))
+    code, said = refused(run, tmp_path / "run.kml", "--filter")
+    assert code == 3
+    assert "has no positions of the filter" in said
+    assert "single epochs" in export(run, tmp_path / "run.kml")
+    nothing = pl.read_parquet(run / "positions.parquet").with_columns(pl.lit(None, pl.Float64).alias("height_m"))
+    nothing.write_parquet(run / "positions.parquet")
+    code, said = refused(run, tmp_path / "other.gpkg")
+    assert code == 7
+    assert "no epoch has a position" in said
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["results", "run.kml"]
