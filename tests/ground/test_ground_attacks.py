@@ -373,6 +373,12 @@ def test_no_sequence_leads_to_an_authority_into_a_train(seeds: range) -> None:
     assert seen["extension"] > 3 * len(seeds)
 
 
+@pytest.mark.parametrize("seed", [10137, 13528, 18835, 19765, 25490])
+def test_sequences_that_once_led_into_a_train(seed: int) -> None:
+    """A train that had changed ends and rolled out of its interval was passed over, as it was in no station."""
+    assert not run_sequence(seed).violations
+
+
 @pytest.mark.parametrize(("rule", "seed"), [("integrity", 84), ("length", 27), ("way", 102), ("roll-back", 45)])
 def test_without_a_rule_a_sequence_leads_into_a_train(rule: str, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     take_out(monkeypatch, rule)

@@ -210,11 +210,11 @@ def report_received(
     rear = front - facing * (over_cm / 100.0 + known.length_m)
     ahead = front + facing * under_cm / 100.0
     turns = facing != known.direction
-    if turns and not (message.standstill and layout.station_at(*sorted((rear, ahead))) == known.station):
-        return state
     contradiction = compute_contradiction(known, message, layout, limits=limits or InterlockingLimits())
     if contradiction is not None:
         return with_train(state, _contradicted(known, contradiction, rear, ahead, message.sequence))
+    if turns and not (message.standstill and layout.station_at(*sorted((rear, ahead))) == known.station):
+        return state
     confirmed = confirms_rear(known, message)
     known = replace(
         known,
@@ -231,7 +231,9 @@ def report_received(
             # one wrong report alone moves no rear end, and a wider bound moves none back
             both = min(facing * rear, facing * before.claimed_m)
             known = replace(known, rear_m=facing * max(both, facing * before.rear_m))
-        return with_train(state, replace(known, front_m=ahead))
+        # of a stopped train the interval only grows
+        front = ahead if before.stop is None else facing * max(facing * ahead, facing * before.front_m)
+        return with_train(state, replace(known, front_m=front))
     if not confirmed:
         return state
     turned = replace(
@@ -255,6 +257,10 @@ def _contradicted(known: TrainInterval, reason: str, rear: float, ahead: float, 
     """Return a train that is stopped; where it may really be outside its interval, the interval grows."""
     stopped = replace(known, stop=known.stop or reason, sequence=sequence, claimed_m=None)
     direction = known.direction
+    if reason.startswith("the train has changed ends"):
+        ends = direction * rear, direction * ahead
+        back, front = min(*ends, direction * known.rear_m), max(*ends, direction * known.front_m)
+        return replace(stopped, rear_m=direction * back, front_m=direction * front)
     if reason in ("the train has rolled back", "the train runs backward"):
         return replace(stopped, rear_m=direction * min(direction * rear, direction * known.rear_m))
     if reason == "the train is beyond its authority":
