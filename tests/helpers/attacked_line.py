@@ -2,7 +2,8 @@
 
 Lighter than `disturbed_traffic`: trains have a place and no dynamics, so that a sequence takes milliseconds. It checks
 what the interlocking promises about authorities: none is extended into a train or its standing wagons, and no train
-holds one beyond its interval.
+holds one beyond its interval. A sequence ends where what the document assumes is broken: two wrong places in a row that
+nothing contradicts, as after an outage in which the train could have run so far.
 """
 
 from __future__ import annotations
@@ -93,6 +94,8 @@ class AttackedLine:
         )  # fmt: skip
         self.mail: list[tuple[float, int, Callable[[], Any]]] = []
         self.posted = 0
+        self.believed: Counter[int] = Counter()
+        self.broken = False
 
     def post(self, deliver: Callable[[], Any], *, certain: bool = False) -> None:
         if not certain and self.rng.random() < 0.15:
@@ -139,6 +142,7 @@ class AttackedLine:
         elif event < 0.02:
             self.seen["roll-back"] += 1
             train.front_m -= train.direction * rng.uniform(60.0, 300.0)
+            train.lies = 0  # the report of a roll-back is right
             self.report(train, 0.0, certain=True)
             return
         elif event < 0.08 and station is not None and train.wagons_m is None:
@@ -180,7 +184,16 @@ class AttackedLine:
             complete=train.wagons_m is None,
         )  # fmt: skip
         message = whole.replaced(**train.lie) if lied and train.lie else whole
-        self.post(partial(self.centre.report, message, self.now_s), certain=certain)
+        self.post(partial(self.received, message, wrong=lied and abs(train.offset_m) > 0.0), certain=certain)
+
+    def received(self, message: TrainMessage, *, wrong: bool) -> None:
+        """Hand a report to the centre; of wrong places that nothing contradicts the second breaks the assumption."""
+        number = message.train
+        reason = self.centre.report(message, self.now_s)
+        taken = reason is None and self.centre.state.trains[number].stop is None
+        if taken:
+            self.believed[number] = self.believed[number] + 1 if wrong else 0
+            self.broken |= self.believed[number] > 1
 
     def pieces(self, number: int) -> list[tuple[int, float, float]]:
         train, tracks = self.trains[number], self.centre.state.trains[number].tracks
@@ -208,11 +221,14 @@ class AttackedLine:
                 self.violations["train beyond its authority"] += 1
 
 
-def run_sequence(seed: int, *, steps: int = 40) -> AttackedLine:
-    """Return a line after a random sequence."""
+def run_sequence(seed: int, *, steps: int = 40, assumed: bool = True) -> AttackedLine:
+    """Return a line after a random sequence, which ends where an assumption is broken unless `assumed` is false."""
     line = AttackedLine(seed=seed)
     for _ in range(steps):
         line.step()
-        if line.violations:
+        if line.broken and assumed:
+            line.violations.clear()
+            line.seen["assumption broken"] += 1
+        if line.violations or (line.broken and assumed):
             break
     return line
