@@ -20,7 +20,7 @@ from pydantic import Field
 
 from railfix.core.settings import Settings
 from railfix.ground.layout import Layout, PointName, overlap
-from railfix.ground.plausibility import compute_contradiction, confirms_rear
+from railfix.ground.plausibility import compute_contradiction, confirms_rear, stop_contradicted
 from railfix.io.train_message import MessageStatus, TrainMessage
 
 
@@ -212,7 +212,7 @@ def report_received(
     turns = facing != known.direction
     contradiction = compute_contradiction(known, message, layout, limits=limits or InterlockingLimits())
     if contradiction is not None:
-        return with_train(state, _contradicted(known, contradiction, rear, ahead, message.sequence))
+        return with_train(state, stop_contradicted(known, contradiction, rear, ahead, message.sequence))
     if turns and not (message.standstill and layout.station_at(*sorted((rear, ahead))) == known.station):
         return state
     confirmed = confirms_rear(known, message)
@@ -251,21 +251,6 @@ def report_received(
 def with_train(state: Interlocking, train: TrainInterval) -> Interlocking:
     """Return the state with the newer interval of a train."""
     return replace(state, trains={**state.trains, train.train: train})
-
-
-def _contradicted(known: TrainInterval, reason: str, rear: float, ahead: float, sequence: int) -> TrainInterval:
-    """Return a train that is stopped; where it may really be outside its interval, the interval grows."""
-    stopped = replace(known, stop=known.stop or reason, sequence=sequence, claimed_m=None)
-    direction = known.direction
-    if reason.startswith("the train has changed ends"):
-        ends = direction * rear, direction * ahead
-        back, front = min(*ends, direction * known.rear_m), max(*ends, direction * known.front_m)
-        return replace(stopped, rear_m=direction * back, front_m=direction * front)
-    if reason in ("the train has rolled back", "the train runs backward"):
-        return replace(stopped, rear_m=direction * min(direction * rear, direction * known.rear_m))
-    if reason == "the train is beyond its authority":
-        return replace(stopped, front_m=direction * max(direction * ahead, direction * known.front_m))
-    return stopped
 
 
 def stopped_trains(state: Interlocking) -> dict[int, str]:

@@ -6,6 +6,7 @@ unseen (errors inside the train's own bounds) is assumed away in ``docs/ground.m
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from railfix.ground.layout import Layout
@@ -60,6 +61,21 @@ def compute_contradiction(
         return "the train has rolled back"
     backward = message.direction == -direction and (speed is None or speed > ROLLING_MPS)
     return "the train runs backward" if backward and not message.standstill else None
+
+
+def stop_contradicted(known: TrainInterval, reason: str, rear: float, ahead: float, sequence: int) -> TrainInterval:
+    """Return a train that is stopped; where it may really be outside its interval, the interval grows."""
+    stopped = replace(known, stop=known.stop or reason, sequence=sequence, claimed_m=None)
+    direction = known.direction
+    if reason.startswith("the train has changed ends"):
+        ends = direction * rear, direction * ahead
+        back, front = min(*ends, direction * known.rear_m), max(*ends, direction * known.front_m)
+        return replace(stopped, rear_m=direction * back, front_m=direction * front)
+    if reason in ("the train has rolled back", "the train runs backward"):
+        return replace(stopped, rear_m=direction * min(direction * rear, direction * known.rear_m))
+    if reason == "the train is beyond its authority":
+        return replace(stopped, front_m=direction * max(direction * ahead, direction * known.front_m))
+    return stopped
 
 
 def _turn_contradiction(known: TrainInterval, facing: int, front: float, over: float, under: float) -> str | None:

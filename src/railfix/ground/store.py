@@ -15,7 +15,7 @@ from typing import IO, Any, Final, Self
 import sqlalchemy as sql
 from sqlalchemy import event
 
-from railfix.core.errors import InputFileError, RailfixError
+from railfix.core.errors import InputFileError, OutputError
 from railfix.ground.centre import TrainRecord, after_restart
 from railfix.io.train_message import decode, encode
 
@@ -48,7 +48,7 @@ LOG: Final = sql.Table(
 _KEYS: Final[dict[sql.Table, sql.Column[Any]]] = {TRAINS: TRAINS.c.train, DOCUMENTS: DOCUMENTS.c.name}
 
 
-class DatabaseError(RailfixError):
+class DatabaseError(OutputError):
     """The database does not take what has to be stored; it may do so later."""
 
 

@@ -89,7 +89,7 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
     """Return the web application: the snapshot's plain values for the page, and orders by the last part of their
     address.
 
-    ``done`` in the snapshot ends its events; the orders are ``release`` and ``route``.
+    ``done`` in the snapshot ends its events.
     """
     template = (files("railfix.ground") / "page.html").read_text(encoding="utf-8")
     newest: tuple[float, str, bool] | None = None
