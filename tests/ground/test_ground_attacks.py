@@ -18,6 +18,7 @@ from railfix.ground import interlocking, plausibility, shortening
 from railfix.ground.authority import Authority
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import Interlocking, InterlockingLimits, extended, report_received, stopped_trains
+from railfix.ground.interlocking_text import from_documents
 from railfix.ground.layout import Layout, LoopStation
 from railfix.ground.on_board import OnBoard, OnBoardLimits
 from railfix.ground.serve import CentreFile, _check_line
@@ -342,6 +343,11 @@ trains = [{ number = 1, station = "A", track = 1, direction = 1, front_m = 300, 
         path.write_text(text.replace(old, new))
         with pytest.raises(InputFileError, match=named):
             _check_line(load_settings(CentreFile, path, what="a file of a centre"), store, path)
+
+
+def test_a_state_of_an_older_version_is_refused() -> None:
+    with pytest.raises(InputFileError, match="older version of railfix; name another database"):
+        from_documents({"interlocking": '{"trains": [], "points": [], "stopped": false, "granted": 3}'})
 
 
 def test_one_centre_has_a_database(tmp_path: Path) -> None:

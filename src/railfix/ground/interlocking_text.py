@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, Final
 
+from railfix.core.errors import InputFileError
 from railfix.ground.interlocking import Interlocking, PointState, TrainInterval
 
 #: Name of the text without trains and points, and beginnings of the names of theirs.
@@ -28,7 +29,13 @@ def to_documents(state: Interlocking, before: Interlocking | None = None) -> dic
 
 
 def from_documents(texts: Mapping[str, str]) -> Interlocking:
-    """Return the state from its texts. Times of release begin again: the clock of the process before is not known."""
+    """Return the state from its texts. Times of release begin again: the clock of the process before is not known.
+
+    InputFileError: when an older version wrote them.
+    """
+    head = json.loads(texts[HEAD])
+    if "closed" not in head:
+        raise InputFileError("the centre's database", "is of an older version of railfix; name another database")
     trains, points = {}, {}
     for name, text in texts.items():
         if name.startswith(_TRAIN):
@@ -39,7 +46,6 @@ def from_documents(texts: Mapping[str, str]) -> Interlocking:
             values = json.loads(text)
             station, side = map(int, name.removeprefix(_POINTS).split())
             points[station, side] = PointState(**values | {"locked": dict.fromkeys(map(int, values["locked"]))})
-    head = json.loads(texts[HEAD])
     # in the order of the line, whatever the order of the texts
     return Interlocking(
         trains=dict(sorted(trains.items())), points=dict(sorted(points.items())), stopped=head["stopped"],
