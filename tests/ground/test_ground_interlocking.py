@@ -535,3 +535,29 @@ def test_routes_are_taken_back_in_disturbed_traffic() -> None:
         assert not run.violations
     assert answers[True] > 10
     assert answers[False] > 2
+
+
+def test_a_stopped_train_gives_no_route_back() -> None:
+    """Its answer may stand in the report that contradicts what is known of it; it counts after the release."""
+    state = Interlocking(
+        trains={1: interval(1, 1, 300.0, 1, 0)}, points={name: PointState() for name in LAYOUT.points()}
+    )
+    centre = Supervision(layout=LAYOUT, state=state, limits=LIMITS)
+    assert centre.set_route(1) is None
+    centre.advance(0.0)
+    assert centre.ask_route_back(1) is None
+    (asked,) = centre.advance(1.0)
+    agreed = {"authority": asked.number, "authority_end_cm": asked.end_cm}
+    assert centre.report(message(1, 1, 300.0, length_cm=0, **agreed), 2.0) is None
+    assert centre.state.trains[1].stop == "the report has no train length"
+    assert (centre.state.trains[1].station, centre.state.trains[1].end_m) == (1, 2330.0)
+    centre.state, reason = release_train(centre.state, 1, LAYOUT)
+    assert reason is None
+    assert centre.report(message(1, 2, 300.0, **agreed), 12.0) is None
+    assert (centre.state.trains[1].station, centre.state.trains[1].end_m) == (0, 330.0)
+
+
+def test_names_of_stations_are_different() -> None:
+    """Sections are closed by them."""
+    with pytest.raises(ValueError, match="two stations have the same name"):
+        Layout(stations=tuple(LoopStation(name="A", begin_m=m, end_m=m + 400.0) for m in (0.0, 2000.0)))

@@ -16,7 +16,7 @@ _FORM: Final = struct.Struct("!BIQQqb??")
 
 
 class Authority(Settings):
-    """One authority message, sent every second.
+    """One authority message, sent after each report of the train, at a stop, and at least every second.
 
     Attributes
     ----------

@@ -54,6 +54,9 @@ class Layout(Settings):
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
+        names = [station.name for station in self.stations]
+        if len(set(names)) < len(names):
+            raise ValueError("two stations have the same name")
         for one, other in zip(self.stations[:-1], self.stations[1:], strict=True):
             if other.begin_m <= one.end_m:
                 raise ValueError(f"{other.name} begins at {other.begin_m} m, before the end of {one.name}")

@@ -39,9 +39,12 @@ def ask_route_back(
 
 
 def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
-    """Return the state after a report that may answer: the route goes where the train agrees, and stays where not."""
+    """Return the state after a report that may answer: the route goes where the train agrees, and stays where not.
+
+    Of a stopped train, whose report may be the contradicted one, no answer counts until it is released.
+    """
     known = state.trains[message.train]
-    if known.asked_m is None or message.sequence != known.sequence:
+    if known.asked_m is None or known.stop is not None or message.sequence != known.sequence:
         return state
     if message.authority is None or message.authority_end_cm is None or message.authority < known.asked_number:
         return state
