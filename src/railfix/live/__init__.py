@@ -10,35 +10,6 @@ and sinks, `run_live` all that ``railfix live`` does::
         print(output.message.chainage_cm, output.result)
 """
 
-from railfix.live.channels import TwoChannels
-from railfix.live.command import LiveInputs, run_live
-from railfix.live.engine import EngineState, LiveEngine, LiveOutput
-from railfix.live.metrics import Metrics
-from railfix.live.session import Hooks, run_session
-from railfix.live.settings import LiveSettings
-from railfix.live.sinks import Sink, open_sink
-from railfix.live.sources import read_source
-from railfix.live.state import SavedSession, load_state, write_state
-from railfix.live.stream import Received, ReceiverState, receive_bytes
+import lazy_loader
 
-__all__ = [
-    "EngineState",
-    "Hooks",
-    "LiveEngine",
-    "LiveInputs",
-    "LiveOutput",
-    "LiveSettings",
-    "Metrics",
-    "Received",
-    "ReceiverState",
-    "SavedSession",
-    "Sink",
-    "TwoChannels",
-    "load_state",
-    "open_sink",
-    "read_source",
-    "receive_bytes",
-    "run_live",
-    "run_session",
-    "write_state",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,18 +9,17 @@ import signal
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
-from pydantic import Field
 
 from railfix import kernels
 from railfix.core.errors import OutputError, SettingsError
-from railfix.core.settings import Settings, validated
 from railfix.io.logs import read_navigation
 from railfix.live.channels import TwoChannels
 from railfix.live.console import SessionLog, check_log_file
 from railfix.live.engine import LiveEngine, LiveOutput
+from railfix.live.inputs import LiveInputs
 from railfix.live.metrics import Metrics, serve_metrics
 from railfix.live.outlets import Outlet
 from railfix.live.place_watch import PlaceWatch
@@ -34,11 +33,9 @@ from railfix.live.sources import check_source, is_file
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
 from railfix.live.warm_up import prepare_kernels
 from railfix.motion.samples import SensorSamples
-from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
 from railfix.run.driver import time_of
-from railfix.run.options import LogReading, TrackReading
 from railfix.run.output import check_not_input
 from railfix.run.processor import processor_of
 from railfix.run.sensors import check_filter, read_sensors, units_of_ranges
@@ -48,60 +45,24 @@ from railfix.run.sources import Line, open_line
 _REACH_OF_REFERENCE_M: Final = 300_000.0
 
 
-#: Sensors on board.
-Sensor = Literal["tachometer", "inertial", "radar", "ranging"]
+def _files_read(inputs: LiveInputs) -> list[Path]:
+    """Every file that the session reads."""
+    sources = [*inputs.sources.values(), *inputs.sensors.values()]
+    logs = [Path(source.removeprefix("file:")) for source in sources if is_file(source)]
+    parameters = [] if inputs.reading.jgd_parameters is None else [inputs.reading.jgd_parameters]
+    return [*inputs.files.values(), *inputs.nav, *logs, *parameters]
 
 
-class LiveInputs(Settings):
-    """Inputs of a live session; see ``railfix live --help``."""
-
-    sources: dict[Literal["front", "rear"], str]
-    track: tuple[Path, ...]
-    vehicle: Path | None = None
-    nav: tuple[Path, ...] = ()
-    sensors: dict[Sensor, str] = Field(default_factory=dict)
-    ranging_units: Path | None = None
-    config: Config = Field(default_factory=lambda: Config(filter="track"))
-    reading: TrackReading = Field(default_factory=TrackReading)
-    logs: LogReading = Field(default_factory=LogReading)
-    live: dict[str, Any] = Field(default_factory=dict)
-    send: tuple[str, ...] = ("json@-",)
-    speed: float | None = None
-    channels: Literal[1, 2] = 1
-    metrics: str | None = None
-    state: Path | None = None
-    log: Path | None = None
-    out: Path | None = None
-    overwrite: Literal["refuse", "replace"] = "refuse"
-
-    @property
-    def files(self) -> dict[str, Path]:
-        """Files that the positions depend on, by their role."""
-        named = {f"track {k}": path for k, path in enumerate(self.track)}
-        given = {
-            "vehicle": self.vehicle, "ranging units": self.ranging_units, "cn0 curve": self.config.cn0_curve,
-            "error model": self.config.error_model,
-        }  # fmt: skip
-        return named | {name: path for name, path in given.items() if path is not None}
-
-    @property
-    def read(self) -> list[Path]:
-        """Every file that the session reads."""
-        sources = [*self.sources.values(), *self.sensors.values()]
-        logs = [Path(source.removeprefix("file:")) for source in sources if is_file(source)]
-        parameters = [] if self.reading.jgd_parameters is None else [self.reading.jgd_parameters]
-        return [*self.files.values(), *self.nav, *logs, *parameters]
-
-    def check_outputs(self) -> None:
-        """Raise OutputError where a file to be written is one that is read, or is written twice."""
-        named = [file_of(text) for text in self.send]
-        written = [path for path in (*named, self.state, self.log) if path is not None]
-        for k, path in enumerate(written):
-            check_not_input(path, self.read)
-            if path.resolve() in [other.resolve() for other in written[:k]]:
-                raise OutputError(f"{path}: is named for two outputs; name another file for one of them")
-        if self.log is not None:
-            check_log_file(self.log)
+def _check_outputs(inputs: LiveInputs) -> None:
+    """Raise OutputError where a file to be written is one that is read, or is written twice."""
+    named = [file_of(text) for text in inputs.send]
+    written = [path for path in (*named, inputs.state, inputs.log) if path is not None]
+    for k, path in enumerate(written):
+        check_not_input(path, _files_read(inputs))
+        if path.resolve() in [other.resolve() for other in written[:k]]:
+            raise OutputError(f"{path}: is named for two outputs; name another file for one of them")
+    if inputs.log is not None:
+        check_log_file(inputs.log)
 
 
 async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
@@ -112,9 +73,9 @@ async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
     """
     for source in (*inputs.sources.values(), *inputs.sensors.values()):
         check_source(source)
-    inputs.check_outputs()
+    _check_outputs(inputs)
     check_filter(inputs.config, inputs.sensors)
-    live = validated(LiveSettings, inputs.live, source="--live")
+    live = inputs.live
     tables = read_sensors(
         **{name: Path(path.removeprefix("file:")) for name, path in inputs.sensors.items() if is_file(path)}
     )
@@ -136,7 +97,7 @@ async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
             sinks.append(await open_sink(text, live, overwrite=inputs.overwrite, full=full))
             held.callback(sinks[-1].close)
         engine = LiveEngine(processor, live, tuple(inputs.sensors))
-        if inputs.channels == 2:
+        if inputs.channels == "2":
             engine = TwoChannels(processor, live, tuple(inputs.sensors))
             held.callback(engine.close)
         metrics = Metrics()
@@ -196,7 +157,7 @@ def _hooks(
     observers: list[Callable[[LiveOutput], None]] = [PlaceWatch(log.say).take]
     sensed, save, streams = None, None, {}
     if inputs.out is not None:
-        tables = held.enter_context(ResultTables(inputs.out, overwrite=inputs.overwrite, inputs=inputs.read))
+        tables = held.enter_context(ResultTables(inputs.out, overwrite=inputs.overwrite, inputs=_files_read(inputs)))
         rows: Outlet[LiveOutput] = Outlet(f"tables {inputs.out}", tables.add, waiting=live.waiting * 10, full=full)
         held.callback(_closed, rows, log)
         observers.append(rows.send)
