@@ -126,7 +126,7 @@ def rounds_of(log: Log, choices: list[Choice], rounds: int) -> None:
 
 def table(title: str, log: Log, choices: list[Choice]) -> None:
     """Times, and what each choice adds to the first one."""
-    used = processor_of(parse_config({}), log.navigation, {"front": log.trajectory}).process(
+    used = processor_of(parse_config({"filter": "off"}), log.navigation, {"front": log.trajectory}).process(
         {"front": log.observations[:3000]}
     )[0]
     print(f"\n{title}: {len(log.observations)} epochs, {np.median(used.antennas['front'].n_used):.0f} satellites used")
@@ -143,7 +143,7 @@ def table(title: str, log: Log, choices: list[Choice]) -> None:
 
 def parts_of_sbas(log: Log, rounds: int) -> None:
     """The engine's own functions on what the run gives them, chunk by chunk: least of the rounds."""
-    config = parse_config({"protection": "off", "sbas": [str(MESSAGES)]})
+    config = parse_config({"filter": "off", "protection": "off", "sbas": [str(MESSAGES)]})
     found = processor_of(config, log.navigation, {"front": log.trajectory}).process({"front": log.observations})[0]
     result, engine = found.antennas["front"], SbasCorrections.from_log(read_sbas(MESSAGES))
     satellite, size = result.satellite[result.columns], RunOptions().chunk_epochs

@@ -63,7 +63,7 @@ def prepared(
     track, vehicle = read_track(files["track"]), read_vehicle(files["vehicle"])
     observations = {name: read_observations(files[name])[:epochs] for name in ("front", "rear")}
     trajectories = {name: antenna_trajectory(track, vehicle, name) for name in observations}
-    return processor_of(config or Config(), read_navigation(files["nav"]), trajectories), observations
+    return processor_of(config or Config(filter="off"), read_navigation(files["nav"]), trajectories), observations
 
 
 def milliseconds(

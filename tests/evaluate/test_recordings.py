@@ -210,7 +210,7 @@ def test_short_faults_on_a_curved_course_are_excluded(recordings: Path, size_m: 
     observations = read_observations(folder / "SEPT265G.21O")
     trajectory = recordings_score.trajectory_of(*recordings_score.recordings_truth.japan_truth(recordings))
     navigation = recordings_score.read_navigation([folder / "SEPT2650.21P"])
-    config = recordings_score.parse_config({"screens": ["elevation", "raim"]})
+    config = recordings_score.parse_config({"filter": "off", "screens": ["elevation", "raim"]})
     processor = processor_of(config, navigation, {"front": trajectory})
     clean = processor.process({"front": observations})[0].antennas["front"]
     epochs = np.arange(60, 360, 20)

@@ -15,8 +15,8 @@ from railfix.core.settings import write_toml
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, SensorSamples
-from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.config import parse_config
+from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import State
 from railfix.run.processor import processor_of
 from railfix.run.sensors import read_sensors, read_units

@@ -140,7 +140,11 @@ def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPa
     assert inputs.vehicle is not None
     path = antenna_trajectory(read_track(inputs.track), read_vehicle(inputs.vehicle), "front")
     log = {"front": read_observations(inputs.front)[::4]}
-    result = processor_of(Config(), read_navigation(inputs.nav), {"front": path}).process(log)[0].antennas["front"]
+    result = (
+        processor_of(Config(filter="off"), read_navigation(inputs.nav), {"front": path})
+        .process(log)[0]
+        .antennas["front"]
+    )
     assert result.protection is not None
     level, arc = share * result.protection.level.level_m, result.constrained.arc_m
     model = constrained_model(ranges_of(result), path, arc, section=np.maximum(result.constrained.section, 0))

@@ -130,6 +130,6 @@ def test_without_a_message_every_satellite_is_rejected(log: dict[str, Path]) -> 
 
 
 def test_the_budget_beside_sbas_is_one_object_so_that_a_live_epoch_finds_its_allocation_kept() -> None:
-    config = parse_config({"sbas": "stream"})
+    config = parse_config({"filter": "off", "sbas": "stream"})
     assert risk_of(config) is risk_of(config)
     assert set(risk_of(config).satellite_prior.values()) == {0.0}

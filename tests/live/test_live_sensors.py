@@ -26,8 +26,8 @@ from railfix.live.sensor_watch import SensorWatch
 from railfix.live.settings import LiveSettings
 from railfix.live.state import SavedSession, load_state, write_state
 from railfix.motion.samples import SENSORS, RadarSpeeds, SensorSamples, StationRanges
-from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.config import parse_config
+from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.results import State
 from railfix.run.processor import processor_of
 from railfix.simulate.run import vehicle_table

@@ -7,8 +7,9 @@ import pytest
 
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.motion.ranging import radar_speed_mps, two_way_range_m
-from railfix.pipeline.along_track import FilterFix, FilterState, _gated_ranges
+from railfix.pipeline.along_track import _gated_ranges
 from railfix.pipeline.config import Config
+from railfix.pipeline.filter_result import FilterFix, FilterState
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line, RangeEpochs

@@ -28,7 +28,7 @@ def with_fault(satellite: str, size_m: float, *, since: int = 0) -> AntennaResul
     change = np.zeros(observations.code_m.shape)
     change[since:, observations.satellite == satellite] = size_m
     lines = {"front": clean_trajectories()["front"]}
-    processor = EpochProcessor(parse_config({}), lines, navigation=read_navigation(demo_files()["nav"]))
+    processor = EpochProcessor(parse_config({"filter": "off"}), lines, navigation=read_navigation(demo_files()["nav"]))
     return processor.process({"front": with_code(observations, change)})[0].antennas["front"]
 
 

@@ -112,7 +112,7 @@ def test_the_filter_says_that_the_map_lies_aside() -> None:
 @pytest.mark.requirement("B6")
 def test_what_was_seen_off_the_map_says_nothing_of_the_map() -> None:
     """Minutes away from the line, then on it: after the 10 s that a return takes no offset of the map is left."""
-    navigation, config = read_navigation(demo_files()["nav"]), parse_config({})
+    navigation, config = read_navigation(demo_files()["nav"]), parse_config({"filter": "off"})
     right = clean_trajectories()["front"]
     log = demo_observations()["front"]
     away = EpochProcessor(config, {"front": moved(right, across_m=200.0)}, navigation=navigation)

@@ -86,7 +86,7 @@ def error_model(bias_m: float) -> ErrorModel:
 @pytest.mark.requirement("C2")
 def test_the_bias_of_the_error_model_is_in_the_level() -> None:
     """Worst signs of all biases: ``sum |gain| b``, at least b itself times the largest share of a range."""
-    config = parse_config({**BASE, "error_model": "named.toml"})
+    config = parse_config({"filter": "off", **BASE, "error_model": "named.toml"})
 
     def level(bias_m: float) -> AntennaResult:
         model = error_model(bias_m)
@@ -157,7 +157,7 @@ def test_no_level_reaches_into_a_stretch_without_one() -> None:
 @pytest.mark.requirement("C2")
 def test_sigmas_of_the_level_are_the_larger_of_model_and_receiver() -> None:
     """A model below the receiver's own noise changes nothing; above it the level grows, whatever the weights."""
-    config = parse_config({**BASE, "error_model": "named.toml"})
+    config = parse_config({"filter": "off", **BASE, "error_model": "named.toml"})
 
     def level(sigma_m: float) -> np.ndarray:
         model = error_model(0.0)
@@ -251,7 +251,7 @@ def test_antennas_sampled_at_other_instants_are_compared_at_one() -> None:
     rear, later = parts["rear"], 8_000_000
     rate = -SPEED_OF_LIGHT / carrier_frequency_hz(rear.satellite, rear.signal) * rear.doppler_hz
     moved = replace(rear, time=rear.time + np.timedelta64(later, "ns"), code_m=rear.code_m + rate * later * 1e-9)
-    config = parse_config({"screens": ["antenna_pair"]})
+    config = parse_config({"filter": "off", "screens": ["antenna_pair"]})
     processor = EpochProcessor(config, clean_trajectories(), navigation=clean_navigation())
     together, _ = processor.process(parts)
     apart, _ = processor.process({"front": parts["front"], "rear": moved})

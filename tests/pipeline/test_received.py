@@ -50,7 +50,7 @@ def test_records_given_as_they_are_received_give_the_same() -> None:
     letter = navigation.kepler.satellite.astype("<U1")
     first = rows(navigation, letter == "G")
     later = rows(navigation, letter != "G")
-    empty = EpochProcessor(parse_config({}), clean_trajectories())
+    empty = EpochProcessor(parse_config({"filter": "off"}), clean_trajectories())
     alone = processor({}, navigation=first)
     state, arrived = None, []
     for k, piece in enumerate(cut(parts, [40, 80])):
@@ -71,7 +71,7 @@ def test_records_given_as_they_are_received_give_the_same() -> None:
 def test_all_records_one_chunk_before_their_use_equal_all_at_the_start() -> None:
     navigation, parts = clean_navigation(), {name: log[:90] for name, log in clean_observations().items()}
     expected, _ = in_pieces(processor({}), parts, [30, 60])
-    empty, state = EpochProcessor(parse_config({}), clean_trajectories()), None
+    empty, state = EpochProcessor(parse_config({"filter": "off"}), clean_trajectories()), None
     found: dict[str, list[dict[str, np.ndarray]]] = {name: [] for name in ANTENNAS}
     half = np.arange(len(navigation.kepler)) % 2 == 0
     nothing = {name: part[:0] for name, part in parts.items()}
@@ -100,7 +100,7 @@ def test_sbas_messages_given_as_they_are_received_equal_all_at_the_start(recordi
     navigation = read_navigation([folder / "cres_20080526.bin.nav"])
     messages = read_sbas(folder / "cres_20080526.bin.sbs")
     log = read_observations(folder / "cres_20080526.bin.obs")[:360]
-    config = parse_config({"sbas_prn": 137, "elevation": {"mask_deg": 10.0}})
+    config = parse_config({"filter": "off", "sbas_prn": 137, "elevation": {"mask_deg": 10.0}})
     line = {"front": straight_line(log.header.approximate_ecef_m, 45.0)}
     whole, _ = EpochProcessor(config, line, navigation=navigation, messages=messages).process({"front": log})
     live, state, statuses, taken = EpochProcessor(config, line, navigation=navigation), None, [], 0
@@ -118,11 +118,13 @@ def test_sbas_messages_given_as_they_are_received_equal_all_at_the_start(recordi
     np.testing.assert_allclose(np.concatenate(statuses), expected.chainage_m, rtol=0, atol=1e-6)
     assert np.isfinite(expected.chainage_m).any()
     with pytest.raises(SettingsError, match="give its PRN"):
-        EpochProcessor(parse_config({}), line, navigation=navigation).process({"front": log[:1]}, messages=messages)
+        EpochProcessor(parse_config({"filter": "off"}), line, navigation=navigation).process(
+            {"front": log[:1]}, messages=messages
+        )
 
 
 def test_nothing_new_is_the_same_value() -> None:
-    config, time = parse_config({}), np.datetime64("2024-03-05T03:10:00", "ns")
+    config, time = parse_config({"filter": "off"}), np.datetime64("2024-03-05T03:10:00", "ns")
     start = known_from_start(config, navigation=clean_navigation())
     assert receive(start, config, time) is start
     again = receive(start, config, time, navigation=clean_navigation())
@@ -130,7 +132,7 @@ def test_nothing_new_is_the_same_value() -> None:
 
 
 def test_skipped_records_of_all_receptions_are_counted() -> None:
-    config, time = parse_config({}), np.datetime64("2024-03-05T03:10:00", "ns")
+    config, time = parse_config({"filter": "off"}), np.datetime64("2024-03-05T03:10:00", "ns")
     start = known_from_start(config, navigation=replace(clean_navigation(), skipped={"SBAS": 2, "IRNSS": 4}))
     after = receive(start, config, time, navigation=replace(clean_navigation(), skipped={"SBAS": 1, "CNAV": 3}))
     assert after.navigation.skipped == {"SBAS": 3, "IRNSS": 4, "CNAV": 3}
@@ -187,7 +189,7 @@ def test_stages_take_read_only_values(monkeypatch: pytest.MonkeyPatch, carrier: 
 def test_expired_records_are_dropped_but_for_the_newest(recordings: Path) -> None:
     """A day of records, hour by hour: what is kept is what is valid, and the last one of every satellite."""
     day = read_navigation(recordings / "static" / "ESBC_2020177" / "ESBC00DNK_R_20201770000_01D_MN.rnx.gz")
-    config, kept = parse_config({}), known_from_start(parse_config({}))
+    config, kept = parse_config({"filter": "off"}), known_from_start(parse_config({"filter": "off"}))
     start = np.datetime64("2020-06-25T00:00:00", "ns")
     sizes = []
     for hour in range(24):
@@ -225,7 +227,7 @@ def test_coefficients_that_were_not_received_are_named_and_bounded() -> None:
     assert without.ionosphere_sigma_m == 3.0
     assert "no coefficients of GPS or QZSS received" in without.notes[0]
     assert "3 m added" in without.notes[0]
-    off = known_from_start(parse_config({"ionosphere": "off"} | sigma), navigation=bare)
+    off = known_from_start(parse_config({"filter": "off", "ionosphere": "off"} | sigma), navigation=bare)
     assert (off.klobuchar, off.ionosphere_sigma_m, off.notes) == (None, 0.0, ())
     own = known_from_start(parse_config(sigma), navigation=replace(bare, klobuchar={"C": navigation.klobuchar["G"]}))
     assert own.ionosphere_sigma_m == 3.0  # BeiDou's are for a model of its own
@@ -266,7 +268,7 @@ def test_an_accuracy_worse_than_usual_is_believed() -> None:
     def solved(accuracy_m: float) -> AntennaResult:
         kepler = navigation.kepler
         accuracy = np.where(kepler.satellite == name, accuracy_m, kepler.accuracy_m)
-        config = parse_config({"screens": ["elevation"]})
+        config = parse_config({"filter": "off", "screens": ["elevation"]})
         known = replace(navigation, kepler=replace(kepler, accuracy_m=accuracy))
         return EpochProcessor(config, clean_trajectories(), navigation=known).process(parts)[0].antennas["front"]
 

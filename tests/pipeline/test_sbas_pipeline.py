@@ -53,7 +53,7 @@ class Recording:
         self.nav = folder / "cres_20080526.bin.nav"
         self.observations: Observations = read_observations(self.front)
         self.navigation: Navigation = read_navigation([self.nav])
-        without = processor_of(parse_config({}), self.navigation, {"front": self.line_at(None)})
+        without = processor_of(parse_config({"filter": "off"}), self.navigation, {"front": self.line_at(None)})
         found = without.process({"front": self.observations[:200]})[0].antennas["front"]
         self.parked = np.nanmedian(found.conventional_ecef_m, axis=0)
         self.line = self.line_at(self.parked)
@@ -62,7 +62,7 @@ class Recording:
         return straight_line(self.observations.header.approximate_ecef_m if place is None else place, 45.0)
 
     def config(self, **settings: object) -> Config:
-        return parse_config({**SETTINGS, "sbas": [str(self.sbas)], **settings})
+        return parse_config({"filter": "off", **SETTINGS, "sbas": [str(self.sbas)], **settings})
 
     def process(self, config: Config, observations: Observations | None = None) -> AntennaResult:
         processor = processor_of(config, self.navigation, {"front": self.line})
@@ -145,7 +145,7 @@ def test_any_cutting_gives_the_same(recording: Recording, corrected: AntennaResu
 
 def test_the_parked_antenna_stays_where_it_is(recording: Recording, corrected: AntennaResult) -> None:
     """Corrections of metres move a position by metres, not by more: it agrees with the uncorrected one within 15 m."""
-    plain = recording.process(parse_config({"elevation": {"mask_deg": 10.0}}))
+    plain = recording.process(parse_config({"filter": "off", "elevation": {"mask_deg": 10.0}}))
     both = np.isfinite(corrected.conventional_ecef_m[:, 0]) & (np.arange(len(plain)) < 200)
     moved = np.linalg.norm(corrected.conventional_ecef_m - plain.conventional_ecef_m, axis=1)[both]
     assert both.sum() > 20
@@ -159,7 +159,7 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     config = recording.config()
     assert level_facts(config)["kind"] == "sbas"
     assert set(level_facts(config)["satellite_prior"].values()) == {0.0}
-    assert level_facts(parse_config({}))["kind"] == "separation"
+    assert level_facts(parse_config({"filter": "off"}))["kind"] == "separation"
     processor = processor_of(config, recording.navigation, {"front": recording.line})
     obs = recording.observations[180:200]
     one = processor.chunks({"front": obs}, State())["front"].screened()
@@ -290,7 +290,7 @@ def test_every_output_names_what_a_level_rests_on() -> None:
         ({"priors": "measured", "local_prior": 2e-5, "side_prior": 5e-6}, False, False),  # measured there
         ({"priors": "measured", "local_prior": 2e-5, "side_prior": 0.0}, False, True),
     ):
-        text = prior_basis_text(level_facts(parse_config({"risk": risk})))
+        text = prior_basis_text(level_facts(parse_config({"filter": "off", "risk": risk})))
         assert ("indicative" in text, "no risk an hour" in text) == (indicative, indicative)
         assert ("no data supports" in text) == unsupported
     assert prior_basis_text({}) == "not recorded"

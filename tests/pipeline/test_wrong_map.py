@@ -34,7 +34,7 @@ def moved(trajectory: Trajectory, *, across_m: float = 0.0, up_m: float = 0.0) -
 def on_a_map(*, across_m: float = 0.0, up_m: float = 0.0, map_prior: float = 1e-4) -> AntennaResult:
     """The front antenna of the demonstration on a moved map."""
     line = moved(clean_trajectories()["front"], across_m=across_m, up_m=up_m)
-    config = parse_config({"risk": {"map_prior": map_prior}})
+    config = parse_config({"filter": "off", "risk": {"map_prior": map_prior}})
     processor = EpochProcessor(config, {"front": line}, navigation=read_navigation(demo_files()["nav"]))
     return processor.process({"front": demo_observations()["front"]})[0].antennas["front"]
 

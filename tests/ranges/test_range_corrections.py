@@ -279,7 +279,7 @@ def test_a_model_of_local_errors_is_widened_by_the_nominal_errors_and_another_is
     model = uniform_model(3.0, 0.0)
     for covers, extra in (("local", 1.0), ("satellite_and_atmosphere", 0.0)):
         processor = EpochProcessor(
-            parse_config({"error_model": "line.toml", "screens": []}),
+            parse_config({"filter": "off", "error_model": "line.toml", "screens": []}),
             cases.clean_trajectories(),
             navigation=cases.clean_navigation(),
             error_model=replace(model, covers=cast("Any", covers)),
@@ -302,7 +302,7 @@ def test_sigmas_of_the_error_model_are_by_the_direction_from_the_front_of_the_ca
     model = ErrorModel(bins=bins, before=statistics, after=statistics, covers="satellite_and_atmosphere")
     trajectory = cases.clean_trajectories()["front"]
     processor = EpochProcessor(
-        parse_config({"error_model": "line.toml", "screens": []}),
+        parse_config({"filter": "off", "error_model": "line.toml", "screens": []}),
         cases.clean_trajectories(),
         navigation=cases.clean_navigation(),
         error_model=model,
@@ -387,7 +387,7 @@ def test_a_model_of_an_earlier_version_is_noted() -> None:
     for name, more in (("old", {}), ("new", {"side_upper": 1.0})):
         faults = FaultRate.model_validate({**measured, "upper": 0.3, "together": 0.0, **more})
         model = replace(uniform_model(3.0, 0.0), faults=faults)
-        config = parse_config({"error_model": "line.toml", "screens": []})
+        config = parse_config({"filter": "off", "error_model": "line.toml", "screens": []})
         notes[name] = EpochProcessor(config, cases.clean_trajectories(), error_model=model).notes
     assert [note for note in notes["old"] if note not in notes["new"]] == [
         "error model: it does not state how often low satellites of one side are faulty together (faults.side_upper), "
@@ -399,7 +399,7 @@ def test_a_model_of_an_earlier_version_is_noted() -> None:
 def test_a_bias_of_the_error_model_widens_the_protection_level() -> None:
     """An unbiased estimate has sum |s| >= 1: a bias b of any sign in every range adds b to the level at least."""
     observations = {"front": cases.clean_observations()["front"][:30]}
-    config = parse_config({"error_model": "line.toml", "screens": []})
+    config = parse_config({"filter": "off", "error_model": "line.toml", "screens": []})
     results = []
     for bias in (0.0, 2.0):
         processor = EpochProcessor(
@@ -443,7 +443,7 @@ def test_a_run_with_sbas_adds_the_sbas_variance_to_that_of_the_noise_model(recor
     stem = recordings / "sbas" / "msas_20080526_crescent" / "cres_20080526.bin"
     observations, navigation = read_observations(f"{stem}.obs")[150:220], read_navigation([f"{stem}.nav"])
     line = straight_line(observations.header.approximate_ecef_m, 45.0)
-    config = parse_config({"sbas": [f"{stem}.sbs"], "sbas_prn": 137, "screens": []})
+    config = parse_config({"filter": "off", "sbas": [f"{stem}.sbs"], "sbas_prn": 137, "screens": []})
     result = processor_of(config, navigation, {"front": line}).process({"front": observations})[0].antennas["front"]
     columns = result.columns
     used = result.reason[:, columns] == 0

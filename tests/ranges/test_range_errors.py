@@ -82,14 +82,14 @@ def test_a_station_speaks_between_its_epochs_and_of_its_satellites() -> None:
 
 def _demo(config: Config, part: slice = slice(0, 600)) -> tuple[EpochProcessor, Observations, AntennaReference]:
     inputs = demo_inputs()
-    navigation, line, logs = open_inputs(inputs, RunOptions(), Config())
+    navigation, line, logs = open_inputs(inputs, RunOptions(), Config(filter="off"))
     processor = processor_of(config, navigation, line.trajectories)
     reference = read_reference(demo_files()["truth"], ("front", "rear"))["front"]
     return processor, next(logs["front"].parts())[part], reference
 
 
 def test_an_error_put_into_a_code_comes_back_and_touches_no_other_satellite() -> None:
-    config = parse_config({"screens": ["elevation"], "systems": ["G"]})
+    config = parse_config({"filter": "off", "screens": ["elevation"], "systems": ["G"]})
     processor, obs, reference = _demo(config, slice(0, 50))
     found, _ = processor.process({"front": obs})
     used = np.flatnonzero(np.char.startswith(obs.satellite, "G") & (found.antennas["front"].reason == 0).all(axis=0))
@@ -112,7 +112,9 @@ def test_the_errors_of_a_simulated_run_have_the_noise_that_was_put_in() -> None:
     made = Simulation(Scenario(duration_s=60.0))
     (piece,) = made.pieces("front", chunk_epochs=600)
     path = Trajectory.from_track(made.line.track())
-    processor = processor_of(parse_config({"screens": ["elevation"]}), made.navigation, {"front": path})
+    processor = processor_of(
+        parse_config({"filter": "off", "screens": ["elevation"]}), made.navigation, {"front": path}
+    )
     result, _ = processor.process({"front": piece.observations})
     blank, words = np.full(600, np.nan), np.full(600, "")
     reference = AntennaReference(
@@ -135,7 +137,7 @@ def test_the_errors_of_a_simulated_run_have_the_noise_that_was_put_in() -> None:
 
 
 def test_the_car_s_own_front_counts_not_north() -> None:
-    processor, obs, reference = _demo(parse_config({"screens": ["elevation"]}), slice(0, 2))
+    processor, obs, reference = _demo(parse_config({"filter": "off", "screens": ["elevation"]}), slice(0, 2))
     result, _ = processor.process({"front": obs})
     path = processor.trajectories["front"]
     errors = range_errors(result.antennas["front"], path, reference)
@@ -153,7 +155,7 @@ def test_a_station_takes_the_common_errors_away(recordings: Path) -> None:
     time, ecef = recordings_truth.japan_truth(folder)
     navigation = read_navigation([folder / "SEPT2650.21P"])
     path = Trajectory.from_track(from_positions(time, ecef, spacing_m=5.0))
-    config = parse_config({"ionosphere": "off", "troposphere": "off"})
+    config = parse_config({"filter": "off", "ionosphere": "off", "troposphere": "off"})
     result, _ = processor_of(config, navigation, {"front": path}).process(
         {"front": read_observations(folder / "SEPT265G.21O")}
     )
@@ -181,7 +183,7 @@ def test_a_station_takes_the_common_errors_away(recordings: Path) -> None:
 @pytest.fixture(scope="module")
 def done_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
-    run_files(demo_inputs(), parse_config({"min_satellites": 4}), out=folder / "run")
+    run_files(demo_inputs(), parse_config({"filter": "off", "min_satellites": 4}), out=folder / "run")
     return folder / "run"
 
 
@@ -252,7 +254,7 @@ def test_what_cannot_be_is_said_before_the_work(
 
 
 def test_a_reference_that_is_nowhere_good_enough_is_refused() -> None:
-    processor, obs, reference = _demo(parse_config({"screens": ["elevation"]}), slice(0, 20))
+    processor, obs, reference = _demo(parse_config({"filter": "off", "screens": ["elevation"]}), slice(0, 20))
     result, _ = processor.process({"front": obs})
     wide = replace(reference, sigma_m=np.full(len(reference.time), 0.6))
     with pytest.raises(MismatchError, match=r"fewer than two of the .* positions have a sigma of 0\.5 m or less"):
@@ -274,7 +276,7 @@ def test_the_station_is_corrected_as_the_train_is(recordings: Path) -> None:
     config = parse_config(
         {"sbas": [str(folder / "cres_20080526.bin.sbs")], "sbas_prn": 137, "elevation": {"mask_deg": 10.0}}
     )
-    plain = parse_config({"elevation": {"mask_deg": 10.0}})
+    plain = parse_config({"filter": "off", "elevation": {"mask_deg": 10.0}})
     log = read_observations(folder / "cres_20080526.bin.obs")[:200]
     line = straight_line(log.header.approximate_ecef_m, 45.0)
     found, _ = processor_of(plain, navigation, {"front": line}).process({"front": log})
@@ -312,12 +314,14 @@ def test_a_model_says_under_which_conditions_it_holds(done_run: Path, tmp_path: 
     model, _ = error_model_from_runs([ModelInputs(run=done_run, reference=demo_files()["truth"])])
     assert model.conditions == conditions_of(read_record(done_run).config)
     write_error_model(model, tmp_path / "m.toml")
-    same = processor_of(parse_config({"error_model": str(tmp_path / "m.toml")}), *_nothing())
+    same = processor_of(parse_config({"filter": "off", "error_model": str(tmp_path / "m.toml")}), *_nothing())
     assert not any("other conditions" in note for note in same.notes)
-    other = processor_of(parse_config({"error_model": str(tmp_path / "m.toml"), "screens": []}), *_nothing())
+    other = processor_of(
+        parse_config({"filter": "off", "error_model": str(tmp_path / "m.toml"), "screens": []}), *_nothing()
+    )
     assert any("other conditions than this run's: screens: model elevation" in note for note in other.notes)
 
 
 def _nothing() -> tuple[Navigation, dict[str, Trajectory]]:
-    navigation, line, _ = open_inputs(demo_inputs(), RunOptions(), Config())
+    navigation, line, _ = open_inputs(demo_inputs(), RunOptions(), Config(filter="off"))
     return navigation, line.trajectories

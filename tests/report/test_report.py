@@ -252,7 +252,12 @@ def test_the_top_of_the_page_compares_like_with_like(folder: Path, tmp_path: Pat
     """Both kinds of position at the same epochs, the conventional ones of unscreened ranges."""
     first = pl.read_csv(demo_truth(), try_parse_dates=True)["time_gpst"][0]
     options = RunOptions(end=first + timedelta(seconds=60))
-    run_files(demo_inputs(), parse_config({"screens": ["elevation"]}), out=tmp_path / "unscreened", options=options)
+    run_files(
+        demo_inputs(),
+        parse_config({"filter": "off", "screens": ["elevation"]}),
+        out=tmp_path / "unscreened",
+        options=options,
+    )
     runs, evaluation = read_runs([folder], [demo_truth()], conventional=[tmp_path / "unscreened"])
     assert evaluation is not None
     top = report_page(runs, evaluation).split('<section class="overview"')[1].split("</section>")[0]

@@ -90,7 +90,7 @@ def test_a_choice_is_the_run_with_these_screens(
     ablation: tuple[Ablation, list[int]], truth: Path, tmp_path: Path, choice: str
 ) -> None:
     screens = choices(SCREENS)[choice]
-    summary = run_files(demo_inputs(), parse_config({"screens": list(screens)}), out=tmp_path / "out")
+    summary = run_files(demo_inputs(), parse_config({"filter": "off", "screens": list(screens)}), out=tmp_path / "out")
     rows = pl.read_parquet(summary.files["positions.parquet"])
     true = pl.read_csv(truth, schema_overrides={"time_gpst": pl.Datetime("ns")})
     joined = rows.join(true, on=["time_gpst", "antenna"], suffix="_true", maintain_order="left")

@@ -105,10 +105,10 @@ def test_the_sigma_grows_with_the_scatter_of_the_stretches() -> None:
 
 def test_there_is_no_order_of_one_antenna_or_without_a_vehicle() -> None:
     front, rear = paths()
-    assert EpochProcessor(Config(), {"front": front}).antenna_order() is None
+    assert EpochProcessor(Config(filter="off"), {"front": front}).antenna_order() is None
     track = Trajectory.from_track(read_track(demo_files()["track"]))
-    assert EpochProcessor(Config(), {"front": track, "rear": track}).antenna_order() is None
-    assert EpochProcessor(Config(), {"front": front, "rear": rear}).antenna_order() is not None
+    assert EpochProcessor(Config(filter="off"), {"front": track, "rear": track}).antenna_order() is None
+    assert EpochProcessor(Config(filter="off"), {"front": front, "rear": rear}).antenna_order() is not None
 
 
 @pytest.mark.parametrize("exchanged", [False, True])
@@ -128,7 +128,7 @@ def test_the_run_says_unasked_that_its_logs_are_exchanged(tmp_path: Path, exchan
 @pytest.mark.parametrize("exchanged", [False, True])
 def test_the_live_engine_tells_it_once(exchanged: bool) -> None:
     front, rear = paths()
-    engine = LiveEngine(EpochProcessor(Config(), {"front": front, "rear": rear}), LiveSettings())
+    engine = LiveEngine(EpochProcessor(Config(filter="off"), {"front": front, "rear": rear}), LiveSettings())
     engine.told.clear()
     ends = {"front": SPACING_M / 2.0, "rear": -SPACING_M / 2.0}
     for k, middle in enumerate(RISING):

@@ -34,7 +34,7 @@ def demo():
 
 def run(carrier: str, cuts: int):
     observations, navigation, trajectory, _ = demo()
-    processor = processor_of(parse_config({"carrier": carrier}), navigation, {"front": trajectory})
+    processor = processor_of(parse_config({"filter": "off", "carrier": carrier}), navigation, {"front": trajectory})
     state, parts = None, []
     for first in range(0, EPOCHS, cuts):
         result, state = processor.process({"front": observations[first : first + cuts]}, state)

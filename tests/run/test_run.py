@@ -56,7 +56,7 @@ def result() -> Result:
         "front": antenna_trajectory(track, vehicle, "front"),
         "rear": antenna_trajectory(track, vehicle, "rear"),
     }
-    return processor_of(Config(), read_navigation(inputs.nav), trajectories).process(observations)[0]
+    return processor_of(Config(filter="off"), read_navigation(inputs.nav), trajectories).process(observations)[0]
 
 
 def inputs_of(bench: Bench) -> RunInputs:
@@ -133,7 +133,7 @@ def test_the_record_names_what_was_read(record: dict[str, Any]) -> None:
         assert item["sha256"] == hashlib.sha256(content).hexdigest()
     assert record["versions"]["railfix"]
     assert record["versions"]["numpy"] == np.__version__
-    assert record["settings_used"] == Config().as_dict()
+    assert record["settings_used"] == Config(filter="off").as_dict()
     positioned = sum(antenna["epochs_with_position"] for antenna in record["antennas"].values())
     observed = sum(antenna["epochs_with_observations"] for antenna in record["antennas"].values())
     assert record["positioning_rate"] == positioned / observed
@@ -236,7 +236,7 @@ def test_epochs_without_a_position_keep_their_row(bench: Bench, tmp_path: Path) 
 
 def test_errors_of_the_inputs_have_their_classes(bench: Bench, tmp_path: Path) -> None:
     with pytest.raises(NoPositionError, match="too_few_satellites"):
-        run_files(inputs_of(bench), Config(min_satellites=40), out=tmp_path / "out")
+        run_files(inputs_of(bench), Config(filter="off", min_satellites=40), out=tmp_path / "out")
     late = RunOptions(start=datetime(2031, 1, 1))
     with pytest.raises(MismatchError, match="time span"):
         run_files(inputs_of(bench), out=tmp_path / "out", options=late)

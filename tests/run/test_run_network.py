@@ -88,7 +88,7 @@ def test_rows_name_their_track_and_the_probabilities_of_those_near(near: tuple[R
 def test_results_are_those_on_the_route_given_as_a_map(near: tuple[RunInputs, RunSummary], tmp_path: Path) -> None:
     _, summary = near
     given = demo_inputs().replaced(rear=(), vehicle=None)
-    plain = run_files(given, Config(), out=tmp_path / "plain")
+    plain = run_files(given, Config(filter="off"), out=tmp_path / "plain")
     columns = ("time_gpst", "x_m", "y_m", "z_m", "status")
     ours, theirs = (pl.read_parquet(s.files["positions.parquet"]).select(columns) for s in (summary, plain))
     both = ours.join(theirs, on="time_gpst")
@@ -133,7 +133,7 @@ def test_a_map_in_another_frame_is_moved_also_in_a_network(tmp_path: Path) -> No
     for name, crs in (("wgs84", "EPSG:4326"), ("jgd2011", "EPSG:6668")):
         (tmp_path / name).mkdir()
         inputs = _demo_on(tmp_path / name, aside_m=4.5, crs=crs)
-        _, line, _ = open_inputs(inputs, ELLIPSOIDAL, Config())
+        _, line, _ = open_inputs(inputs, ELLIPSOIDAL, Config(filter="off"))
         frames[name] = line
     shift = frames["jgd2011"].frame
     assert shift is not None
@@ -154,7 +154,7 @@ def test_evaluation_of_a_run_on_a_map_that_was_moved(tmp_path: Path) -> None:
     text = inputs.track[0].read_text()
     path = tmp_path / "line.csv"
     path.write_text("# crs: EPSG:6668\n" + "\n".join(x for x in text.splitlines() if not x.startswith("# crs")) + "\n")
-    summary = run_files(inputs.replaced(track=(path,)), Config(), out=tmp_path / "results")
+    summary = run_files(inputs.replaced(track=(path,)), Config(filter="off"), out=tmp_path / "results")
     assert "track.csv" in summary.files
     evaluate_run(tmp_path / "results", demo_truth(), options=EvaluationOptions(method="trajectory"))
 
@@ -169,7 +169,7 @@ def test_a_network_elsewhere_is_a_sentence(tmp_path: Path, recordings: Path) -> 
     folder = recordings / "rail" / "infrabel"
     inputs = demo_inputs().replaced(track=(folder / "network_airport.geojson",))
     with pytest.raises(MismatchError, match=r"the map lies \d+ km from where the log was recorded"):
-        run_files(inputs, Config(), out=tmp_path / "results")
+        run_files(inputs, Config(filter="off"), out=tmp_path / "results")
 
 
 def test_memory_of_the_track_is_kept_without_positions() -> None:

@@ -175,8 +175,8 @@ def roof(recordings: Path) -> dict[str, StandstillCodes]:
     rover = read_observations(folder / "rover.obs")
     origin = place["rover"]
     return {
-        "base": standstill_codes(rover, navigation, Config(), base=base, origin_ecef_m=origin),
-        "alone": standstill_codes(rover, navigation, Config(), origin_ecef_m=origin),
+        "base": standstill_codes(rover, navigation, Config(filter="off"), base=base, origin_ecef_m=origin),
+        "alone": standstill_codes(rover, navigation, Config(filter="off"), origin_ecef_m=origin),
     }
 
 
@@ -266,14 +266,16 @@ def test_command_prints_the_track_and_draws_it(recordings: Path, tmp_path: Path)
 def test_a_moving_train_is_an_error(recordings: Path) -> None:
     folder = recordings / "kinematic" / "japan_mosaic_2021265_with_GEONET3034"
     with pytest.raises(MismatchError, match="standstill"):
-        standstill_codes(read_observations(folder / "SEPT265G.21O"), read_navigation(folder / "SEPT2650.21P"), Config())
+        standstill_codes(
+            read_observations(folder / "SEPT265G.21O"), read_navigation(folder / "SEPT2650.21P"), Config(filter="off")
+        )
 
 
 def test_a_train_that_comes_back_is_a_moving_one() -> None:
     files = demo_files()
     log = read_observations(files["front"])[::10]
     with pytest.raises(MismatchError, match="standstill"):
-        standstill_codes(log, read_navigation(files["nav"]), Config())
+        standstill_codes(log, read_navigation(files["nav"]), Config(filter="off"))
 
 
 # --- what is known beforehand ------------------------------------------------

@@ -205,7 +205,7 @@ def test_the_report_states_both_rates() -> None:
         SimpleNamespace(
             name="a",
             record={"antennas": {"front": facts}},
-            config=Config(),
+            config=Config(filter="off"),
             folder=SimpleNamespace(antennas=("front",)),
         ),
     )

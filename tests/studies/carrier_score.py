@@ -50,7 +50,7 @@ from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
-SETTINGS = parse_config({"elevation": {"mask_deg": 15.0}})
+SETTINGS = parse_config({"filter": "off", "elevation": {"mask_deg": 15.0}})
 #: Phase noise at the zenith [m]: tracking, multipath, delays that the models miss.
 PHASE_SIGMA_M = 0.01
 

@@ -45,9 +45,9 @@ from recordings_score import straight_line, trajectory_of
 #: Sizes of the faults [m].
 SIZES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
 #: No screen but the mask: the ranges as recorded.
-UNSCREENED: Final = parse_config({"screens": ["elevation"], "elevation": {"mask_deg": 15.0}})
+UNSCREENED: Final = parse_config({"filter": "off", "screens": ["elevation"], "elevation": {"mask_deg": 15.0}})
 #: The chain with RAIM.
-WITH_RAIM: Final = parse_config({"screens": ["elevation", "raim"], "elevation": {"mask_deg": 15.0}})
+WITH_RAIM: Final = parse_config({"filter": "off", "screens": ["elevation", "raim"], "elevation": {"mask_deg": 15.0}})
 LIMITS: Final = RaimLimits()
 #: Epochs solved together.
 _BLOCK: Final = 20_000

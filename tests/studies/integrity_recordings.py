@@ -255,7 +255,7 @@ def judged(
     one: Recording, model: str, file: Path | None, *, since: np.datetime64 | None = None, least_scale: float = 1.0
 ) -> Judged:
     """Positions weighted by a model, levels, errors of positions and of ranges; judged from an epoch on."""
-    config = parse_config({**MASK, **({} if file is None else {"error_model": str(file)})})
+    config = parse_config({"filter": "off", **MASK, **({} if file is None else {"error_model": str(file)})})
     processor = processor_of(config, one.navigation, {"front": one.trajectory})
     result = processor.process({"front": one.observations})[0].antennas["front"]
     if least_scale < 1.0:

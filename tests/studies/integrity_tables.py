@@ -47,7 +47,7 @@ from railfix.tracking.student_t import Tails
 from recordings_score import smartloc, trajectory_of
 
 DATA: Final = paths.ROOT.parent / "shared" / "data" / "kinematic"
-SETTINGS: Final = parse_config({"elevation": {"mask_deg": 15.0}})
+SETTINGS: Final = parse_config({"filter": "off", "elevation": {"mask_deg": 15.0}})
 SIZES_M: Final = (20.0, 50.0, 100.0)
 #: Offsets of the map: right of the line and up [m].
 OFFSETS_M: Final = ((0, 0), (5, 0), (10, 0), (20, 0), (50, 0), (200, 0), (2000, 0), (0, 10), (0, 20), (0, 37))
@@ -252,7 +252,7 @@ def start_rows() -> Iterator[str]:
     yield "demonstration, line fit of single epochs; scale with one satellite in turn too long, over that without"
     yield f"{'estimator':24s}     clean" + "".join(f"{f'{size} m: median':>17s}   worst" for size in (10, 20, 100))
     case = cases()["demo"]
-    clean = case.solved(parse_config({"screens": ["elevation"]}))
+    clean = case.solved(parse_config({"filter": "off", "screens": ["elevation"]}))
     has = np.flatnonzero(np.isfinite(clean.constrained.arc_m))[::20]
     columns = clean.columns
     used = (clean.reason[has][:, columns] == 0) & np.isfinite(clean.sigma_m[has][:, columns])
@@ -347,7 +347,7 @@ def prior_rows() -> Iterator[str]:
     for name, case in cases().items():
         for prior, risk in prior_settings().items():
             began = time.process_time()
-            result = case.solved(parse_config({"elevation": {"mask_deg": 15.0}, "risk": risk}))
+            result = case.solved(parse_config({"filter": "off", "elevation": {"mask_deg": 15.0}, "risk": risk}))
             spent = time.process_time() - began
             assert result.protection is not None
             of_all = result.protection.level.level_m[result.status != Status.NO_OBSERVATION]
@@ -381,7 +381,9 @@ def side_rows() -> Iterator[str]:
     for name, case in cases().items():
         for prior in (0.0, 1e-8, 1e-7, 1e-6, 1.3e-5, 1e-4, 1e-2):
             began = time.process_time()
-            result = case.solved(parse_config({"elevation": {"mask_deg": 15.0}, "risk": {"side_prior": prior}}))
+            result = case.solved(
+                parse_config({"filter": "off", "elevation": {"mask_deg": 15.0}, "risk": {"side_prior": prior}})
+            )
             spent = time.process_time() - began
             assert result.protection is not None
             of_all = result.protection.level.level_m[result.status != Status.NO_OBSERVATION]

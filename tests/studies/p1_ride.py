@@ -15,8 +15,8 @@ from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks, Strin
 from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.core.settings import write_toml
 from railfix.motion.samples import SensorSamples
-from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.config import parse_config
+from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
 from railfix.ranges.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
 from railfix.run.processor import processor_of

@@ -39,12 +39,16 @@ from railfix.track.trajectory import Trajectory
 
 #: Settings of the tables: the elevation mask of 15 deg is common to all.
 TABLES = {
-    "health and elevation only": parse_config({"screens": ["elevation"], "elevation": {"mask_deg": 15.0}}),
-    "all screens, failed checks kept": parse_config({"elevation": {"mask_deg": 15.0}}),
-    "all screens, failed checks dropped": parse_config({"failed_checks": "drop", "elevation": {"mask_deg": 15.0}}),
+    "health and elevation only": parse_config(
+        {"filter": "off", "screens": ["elevation"], "elevation": {"mask_deg": 15.0}}
+    ),
+    "all screens, failed checks kept": parse_config({"filter": "off", "elevation": {"mask_deg": 15.0}}),
+    "all screens, failed checks dropped": parse_config(
+        {"filter": "off", "failed_checks": "drop", "elevation": {"mask_deg": 15.0}}
+    ),
     "all screens, and the filter along the track": parse_config({"filter": "track", "elevation": {"mask_deg": 15.0}}),
-    "strict": parse_config({"preset": "strict", "elevation": {"mask_deg": 15.0}}),
-    "p1 (its own mask, 20 deg)": parse_config({"preset": "p1"}),
+    "strict": parse_config({"filter": "off", "preset": "strict", "elevation": {"mask_deg": 15.0}}),
+    "p1 (its own mask, 20 deg)": parse_config({"filter": "off", "preset": "p1"}),
 }
 #: Screens of health and elevation only.
 SETTINGS = TABLES["health and elevation only"]

@@ -210,7 +210,9 @@ def test_clock_steps_of_a_real_receiver_trip_no_screen(recordings, mode):
     in_codes, in_tags = clock_steps(observations)
     assert list(in_codes) == [102, 388]
     stepped = np.union1d(in_codes, in_tags)
-    config = parse_config({"doppler": {"mode": mode, "step_m": 1.5}, "screens": ["elevation", "doppler", "raim"]})
+    config = parse_config(
+        {"filter": "off", "doppler": {"mode": mode, "step_m": 1.5}, "screens": ["elevation", "doppler", "raim"]}
+    )
     assert config.doppler.mode == DopplerLimits(mode=mode).mode
     trajectory = trajectory_of(*recordings_truth.urbannav_truth(folder))
     processor = processor_of(config, read_navigation([folder / "hksc137c.nav"]), {"front": trajectory})

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 import numpy as np
 
 import paths  # noqa: F401
-from railfix.pipeline.along_track import AlongTrack
+from railfix.pipeline.filter_result import AlongTrack
 from sensed_ride import Ride, ride
 
 GNSS = ("code", "phase", "doppler")

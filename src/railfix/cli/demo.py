@@ -50,10 +50,10 @@ def demo(
     prepare_kernels()
     with progress_bar() as progress:
         options = RunOptions(observations="write", overwrite=overwriting(overwrite), chunk_epochs=200)
-        summary = run_files(inputs, Config(filter="track"), out=out, options=options, progress=progress)
+        summary = run_files(inputs, Config(), out=out, options=options, progress=progress)
     show_summary(summary)
     # the conventional positions of P1 use ranges that are not screened
-    unscreened = Config(screens=("elevation",), protection="off")
+    unscreened = Config(filter="off", screens=("elevation",), protection="off")
     run_files(inputs, unscreened, out=out / "unscreened", options=options.replaced(observations="skip"))
     runs, evaluation = read_runs([out], [demo_truth()], conventional=[out / "unscreened"])
     page = write_page(runs, evaluation, out / "report.html", title="railfix demonstration: a simulated run")

@@ -51,9 +51,7 @@ def live(
     if inputs.channels == "2" or any(text.startswith("cbor@") for text in inputs.send):
         import cbor2  # noqa: F401  a missing one is reported before anything is opened
 
-    settings, asked = settings_of(choices)
-    if "filter" not in asked:
-        settings = settings.replaced(filter="track")
+    settings, _ = settings_of(choices)
     values: dict[str, Any] = {}
     for text in live_setting or ():
         set_value(values, text)

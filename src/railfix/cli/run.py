@@ -45,8 +45,6 @@ def run(
     written; 1 a defect of railfix.
     """
     settings, asked = settings_of(choices)
-    if "filter" not in asked:
-        settings = settings.replaced(filter="track")
     inputs = inputs.replaced(config=choices.config)
     prepare_kernels()
     with progress_bar() as progress:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sized
+from collections.abc import Mapping, Sequence, Sized
 from dataclasses import fields, is_dataclass
 from html import escape
 from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes
+from railfix.core.arrays import Datetimes, Floats
 
 _MAX_CHARACTERS: Final = 100
 
@@ -26,6 +26,24 @@ class NotebookTable:
             for item in fields(self)
         )
         return f"<table><caption>{escape(repr(self))}</caption>{rows}</table>"
+
+
+def html_table(rows: Sequence[Mapping[str, str]], *, caption: str) -> str:
+    """Return rows of texts as an HTML table, headed by the keys of the first."""
+    heads = "".join(f"<th>{escape(name)}</th>" for name in rows[0]) if rows else ""
+    body = "".join(f"<tr>{''.join(f'<td>{escape(text)}</td>' for text in row.values())}</tr>" for row in rows)
+    return f"<table><caption>{escape(caption)}</caption><tr>{heads}</tr>{body}</table>"
+
+
+def html_list(lines: Sequence[str]) -> str:
+    """Return lines as an HTML list; empty without any."""
+    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>" if lines else ""
+
+
+def median_text(values: Floats) -> str:
+    """Median of the finite values with two decimals; a dash without any."""
+    finite = values[np.isfinite(values)]
+    return f"{np.median(finite):.2f}" if finite.size else "-"
 
 
 def value_text(value: Any) -> str:

@@ -19,8 +19,8 @@ from railfix.core.reasons import Status
 from railfix.evaluate.along_track import along_track_error, interpolate_reference
 from railfix.evaluate.scores import Score, score
 from railfix.io.reference_log import AntennaReference, read_reference
-from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.config import Config, FilterSource
+from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import AntennaResult, State
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run

@@ -58,7 +58,7 @@ class LiveInputs(Settings):
     log: Path | None = option("Also log into this file, which rotates.", None, metavar="FILE")
     out: Path | None = option("Also write the tables of results into this folder.", None, metavar="DIR")
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
-    config: Config = Field(default_factory=lambda: Config(filter="track"))
+    config: Config = Field(default_factory=Config)
     live: LiveSettings = Field(default_factory=LiveSettings)
     reading: TrackReading = Field(default_factory=TrackReading)
     logs: LogReading = Field(default_factory=LogReading)

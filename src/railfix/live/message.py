@@ -12,7 +12,7 @@ from railfix.core.timescale import GPS_EPOCH
 from railfix.integrity.protection import LevelStatus
 from railfix.io.train_message import MessageStatus, Source, TrainMessage
 from railfix.live.settings import LiveSettings
-from railfix.pipeline.along_track import AlongTrack
+from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
 from railfix.tracking import Kind, TrackStatus

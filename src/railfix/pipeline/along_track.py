@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Reason
@@ -16,15 +16,16 @@ from railfix.core.timescale import seconds
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
+from railfix.pipeline.filter_result import AlongTrack, FilterFix, FilterState, SingleEpochs
 from railfix.pipeline.return_gate import ReturnState, gated_codes
 from railfix.pipeline.sensed_motion import SensedMotion
-from railfix.pipeline.sensor_epochs import LineReferences, SensorState, sensor_epochs
+from railfix.pipeline.sensor_epochs import LineReferences, sensor_epochs
 from railfix.pipeline.smoothing import Replay, SmoothedTrack
 from railfix.positioning.carrier import SlipState, corrected_phase_m, find_slips
 from railfix.screens import Screened
 from railfix.track.trajectory import Trajectory
-from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, Tracked, TrackState, TrackStatus, track
-from railfix.tracking.levels import LevelState, track_with_levels
+from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, Tracked, TrackStatus, track
+from railfix.tracking.levels import track_with_levels
 from railfix.tracking.result import is_bounded
 
 #: Reasons that a code is kept by: the filter weighs multipath and faults itself, with more than one epoch to judge by.
@@ -45,129 +46,6 @@ _END_M: Final = 30.0
 _STRETCH_NS: Final = 5_000_000_000
 #: A direction is given where the speed is beyond this many of its sigmas.
 _DIRECTION_SIGMAS: Final = 3.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class FilterFix:
-    """Place by the filter at its last epoch: what the place by the wheel begins from anew every few seconds.
-
-    Attributes
-    ----------
-    time : datetime64[ns]
-    arc_m, sigma_m, speed_mps : float
-        NaN where the filter has not decided on a place.
-    """
-
-    time: np.datetime64
-    arc_m: float
-    sigma_m: float
-    speed_mps: float
-
-    def arc_at(self, time: np.datetime64) -> float:
-        """Place at a time nearby [m]."""
-        return self.arc_m + self.speed_mps * float(seconds(time - self.time))
-
-
-@dataclass(frozen=True, kw_only=True)
-class SingleEpochs:
-    """Results of single epochs that the filter along the track uses, shape (T,) each.
-
-    Attributes
-    ----------
-    noise_scale : ndarray
-        Noise of the receiver's codes against their sigmas.
-    arc_m, sigma_m : ndarray [m]
-        Position: after an outage codes count again when it agrees with the place that the sensors carried.
-    near_ecef_m : ndarray, shape (T, 3) [m]
-        3-D position without the line.
-    off_map : ndarray of bool
-        The train is away from the line: `railfix.pipeline.off_map`.
-    map_offset : ndarray of bool
-        3-D positions of the last minutes lie beside or above the line.
-    """
-
-    noise_scale: Floats
-    arc_m: Floats
-    sigma_m: Floats
-    near_ecef_m: Floats
-    off_map: Masks
-    map_offset: Masks
-
-
-@dataclass(frozen=True, kw_only=True)
-class FilterState:
-    """State of the filter along the track of one antenna after a chunk.
-
-    Attributes
-    ----------
-    line : Line or None
-        The trajectory as the filter sees it, made once.
-    slips : SlipState or None
-        Of the carrier phases.
-    track : TrackState or None
-    level : LevelState
-        Of the filter that gives the levels.
-    sensors : SensorState
-    fixed, anchor : FilterFix or None
-        Place of the filter at the last epoch, and at the last one before the present stretch.
-    gate : ReturnState
-    disagreed : datetime64[ns]
-        Last epoch at which places or speeds of the two antennas disagreed.
-    """
-
-    line: Line | None = None
-    slips: SlipState | None = None
-    track: TrackState | None = None
-    level: LevelState = field(default_factory=LevelState)
-    sensors: SensorState = field(default_factory=SensorState.empty)
-    fixed: FilterFix | None = None
-    anchor: FilterFix | None = None
-    gate: ReturnState = field(default_factory=ReturnState)
-    disagreed: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-
-
-@dataclass(frozen=True, kw_only=True)
-class AlongTrack:
-    """Positions of one antenna by the filter along the track, T epochs.
-
-    Attributes
-    ----------
-    tracked : Tracked
-        Places along the antenna's trajectory, and what measured them; channels as `AntennaResult.columns`.
-    chainage_m, kilometrage_m : ndarray, shape (T,) [m]
-    ecef_m : ndarray, shape (T, 3) [m]
-    latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
-    direction : ndarray of int8, shape (T,)
-        1 toward rising chainage, -1 toward falling, 0 where the speed does not tell.
-    standstill : ndarray of bool, shape (T,)
-    sensed : SensedMotion
-        Motion since the epoch before and the line under the body, by wheel and inertial unit.
-    spacing_error_m : ndarray, shape (T,) [m]
-        Distance from the place of the other antenna less that of the antennas; NaN where it was not looked at.
-    replay : tuple of Replay
-        What the filter was given, to smooth it (`railfix.pipeline.smoothing`).
-    """
-
-    tracked: Tracked
-    chainage_m: Floats
-    kilometrage_m: Floats
-    ecef_m: Floats
-    latitude_deg: Floats
-    longitude_deg: Floats
-    height_m: Floats
-    direction: Codes
-    standstill: Masks
-    sensed: SensedMotion
-    spacing_error_m: Floats
-    replay: tuple[Replay, ...] = ()
-
-    @property
-    def time(self) -> Datetimes:
-        """Time tags, shape (T,)."""
-        return self.tracked.time
-
-    def __len__(self) -> int:
-        return len(self.tracked)
 
 
 def along_track(

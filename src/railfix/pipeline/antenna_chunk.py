@@ -12,12 +12,13 @@ import numpy as np
 from railfix.core.arrays import Bits, Codes, Floats, changed
 from railfix.gnss.observations import Observations, concatenate
 from railfix.motion.samples import SensorSamples
-from railfix.pipeline.along_track import AlongTrack, FilterState, SingleEpochs, along_track, checked
+from railfix.pipeline.along_track import along_track, checked
 from railfix.pipeline.assemble import antenna_results, with_coordinates
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.compared import PositionVerdict
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
+from railfix.pipeline.filter_result import AlongTrack, FilterState, SingleEpochs
 from railfix.pipeline.results import AntennaResult, AntennaState
 from railfix.pipeline.solution import Solution, solve
 from railfix.positioning.antenna_rows import EVERY, AntennaRows, joined, rows_of

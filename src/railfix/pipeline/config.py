@@ -235,7 +235,7 @@ class Config(ScreenSettings):
     smoothing: SmoothingLimits = SmoothingLimits()
     continuity: ContinuityLimits = ContinuityLimits()
     phase: PhaseLimits = PhaseLimits()
-    filter: Literal["track", "off"] = "off"
+    filter: Literal["track", "off"] = "track"
     filter_sources: tuple[FilterSource, ...] = FILTER_SOURCES
     tracking: TrackingLimits = TrackingLimits()
     sensors: SensorLimits = SensorLimits()

@@ -17,7 +17,6 @@ import numpy as np
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, SensorSamples
-from railfix.pipeline.along_track import FilterState
 from railfix.pipeline.antenna_chunk import AntennaChunk, SolvedTogether, is_short, one_after_the_other
 from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.channels import ChannelBook
@@ -30,6 +29,7 @@ from railfix.pipeline.compared import (
 from railfix.pipeline.config import SCREEN_NAMES, Config
 from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
+from railfix.pipeline.filter_result import FilterState
 from railfix.pipeline.received import Received, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
 from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples

@@ -14,8 +14,9 @@ from railfix.core.arrays import Floats
 from railfix.core.reasons import Status
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
-from railfix.pipeline.along_track import AlongTrack, innovations
+from railfix.pipeline.along_track import innovations
 from railfix.pipeline.columns import Column, by_name
+from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.level_stage import BASES, KINDS
 from railfix.pipeline.results import AntennaResult
 from railfix.screens import SCREENS, ScreenColumn

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Masks, Strings
-from railfix.core.display import NotebookTable, plural, time_span_text
+from railfix.core.display import NotebookTable, html_list, html_table, median_text, plural, time_span_text
 from railfix.core.reasons import Status
 from railfix.gnss.orbits import SatelliteStates
 from railfix.integrity.protection import ProtectionLevel
 from railfix.integrity.raim import Outcome
-from railfix.pipeline.along_track import AlongTrack, FilterState
 from railfix.pipeline.carrier_stage import CarrierState
+from railfix.pipeline.filter_result import AlongTrack, FilterState
 from railfix.pipeline.off_map import OffMapState
 from railfix.pipeline.received import Received
 from railfix.positioning.carrier import PhasePositions
@@ -88,7 +88,7 @@ class ProtectionResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AntennaState:
+class AntennaState(NotebookTable):
     """State of one antenna after a chunk.
 
     Attributes
@@ -117,9 +117,13 @@ class AntennaState:
     screens: Mapping[str, Any] = field(default_factory=dict)
     carrier: CarrierState | None = None
 
+    def __repr__(self) -> str:
+        screens = ", ".join(sorted(self.screens)) or "none"
+        return f"<AntennaState: screens with a state: {screens}>"
+
 
 @dataclass(frozen=True, kw_only=True)
-class State:
+class State(NotebookTable):
     """State after a chunk: everything that the next one needs.
 
     Attributes
@@ -134,6 +138,10 @@ class State:
     antennas: Mapping[str, AntennaState] = field(default_factory=dict)
     received: Received | None = None
     fusion: Mapping[str, FilterState] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        antennas = ", ".join(self.antennas) or "before the first epoch"
+        return f"<State: {antennas}{'; with the filter' if self.fusion else ''}>"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,6 +261,11 @@ class AntennaResult(NotebookTable):
         """How many epochs have the status OK: ``1,827 of 2,000 epochs ok``."""
         return f"{int((self.status == Status.OK).sum()):,} of {plural(self, 'epoch')} ok"
 
+    def summary(self) -> dict[str, str]:
+        """Medians of sigma and level in metres, as texts."""
+        level = np.empty(0) if self.protection is None else self.protection.level.level_m
+        return {"median sigma [m]": median_text(self.along_sigma_m), "median level [m]": median_text(level)}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Result(NotebookTable):
@@ -276,8 +289,22 @@ class Result(NotebookTable):
         return self.antennas[antenna]
 
     def __repr__(self) -> str:
-        parts = (f"{name} {result.status_text()}" for name, result in self.antennas.items())
+        parts = (
+            f"{name} {self.fusion[name].status_text()}, {result.status_text()}"
+            if name in self.fusion
+            else f"{name} {result.status_text()}"
+            for name, result in self.antennas.items()
+        )
         return f"<Result: {'; '.join(parts)}>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            {"antenna": name, "positions": which, "epochs": shown.status_text(), **shown.summary()}
+            for name, result in self.antennas.items()
+            for which, shown in (("filter along the track", self.fusion.get(name)), ("single epochs", result))
+            if shown is not None
+        ]
+        return html_table(rows, caption=time_span_text(next(iter(self.antennas.values())).time)) + html_list(self.notes)
 
 
 def patched(result: Rows, epochs: Indices, part: Rows) -> Rows:

@@ -11,8 +11,9 @@ import polars as pl
 
 from railfix.core.arrays import Floats, Strings
 from railfix.motion.slip import MotionState
-from railfix.pipeline.along_track import AlongTrack, on_line_m
+from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.columns import Column, by_name, float_column, table_of
+from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.results import Result
 from railfix.pipeline.sensed_motion import CARRIED
 from railfix.pipeline.smoothing import SmoothedTrack

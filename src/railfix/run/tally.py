@@ -13,8 +13,8 @@ import polars as pl
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings
 from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.integrity.protection import Cause, LevelStatus
-from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.antenna_order import AntennaOrder
+from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import AntennaResult, Result
 
 _NOT_A_REJECTION = Reason.NOT_OBSERVED

@@ -134,7 +134,8 @@ def _run_errors(
     past.check_inputs()
     navigation, line, logs = open_inputs(past.inputs, past.options, past.config)
     references = read_reference(source.reference, tuple(past.inputs.logs))
-    processor, state = processor_of(past.config, navigation, line.trajectories), State()
+    processor = processor_of(past.config.replaced(filter="off"), navigation, line.trajectories)
+    state = State()
     base: BaseStation | None = None
     if source.base:
         base = base_station_from_files(source.base, processor, position_ecef_m=source.base_position_ecef_m)

@@ -1,0 +1,169 @@
+"""What the filter along the track takes from single epochs, returns, and passes on to the next chunk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from railfix.core.arrays import Codes, Datetimes, Floats, Masks
+from railfix.core.display import NotebookTable, median_text, plural, time_span_text
+from railfix.core.timescale import seconds
+from railfix.pipeline.return_gate import ReturnState
+from railfix.pipeline.sensed_motion import SensedMotion
+from railfix.pipeline.sensor_epochs import SensorState
+from railfix.pipeline.smoothing import Replay
+from railfix.positioning.carrier import SlipState
+from railfix.tracking import Line, Tracked, TrackState
+from railfix.tracking.levels import LevelState
+from railfix.tracking.result import is_bounded
+from railfix.tracking.state import StateIndex
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterFix:
+    """Place by the filter at its last epoch: what the place by the wheel begins from anew every few seconds.
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+    arc_m, sigma_m, speed_mps : float
+        NaN where the filter has not decided on a place.
+    """
+
+    time: np.datetime64
+    arc_m: float
+    sigma_m: float
+    speed_mps: float
+
+    def arc_at(self, time: np.datetime64) -> float:
+        """Place at a time nearby [m]."""
+        return self.arc_m + self.speed_mps * float(seconds(time - self.time))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SingleEpochs:
+    """Results of single epochs that the filter along the track uses, shape (T,) each.
+
+    Attributes
+    ----------
+    noise_scale : ndarray
+        Noise of the receiver's codes against their sigmas.
+    arc_m, sigma_m : ndarray [m]
+        Position: after an outage codes count again when it agrees with the place that the sensors carried.
+    near_ecef_m : ndarray, shape (T, 3) [m]
+        3-D position without the line.
+    off_map : ndarray of bool
+        The train is away from the line: `railfix.pipeline.off_map`.
+    map_offset : ndarray of bool
+        3-D positions of the last minutes lie beside or above the line.
+    """
+
+    noise_scale: Floats
+    arc_m: Floats
+    sigma_m: Floats
+    near_ecef_m: Floats
+    off_map: Masks
+    map_offset: Masks
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterState(NotebookTable):
+    """State of the filter along the track of one antenna after a chunk.
+
+    Attributes
+    ----------
+    line : Line or None
+        The trajectory as the filter sees it, made once.
+    slips : SlipState or None
+        Of the carrier phases.
+    track : TrackState or None
+    level : LevelState
+        Of the filter that gives the levels.
+    sensors : SensorState
+    fixed, anchor : FilterFix or None
+        Place of the filter at the last epoch, and at the last one before the present stretch.
+    gate : ReturnState
+    disagreed : datetime64[ns]
+        Last epoch at which places or speeds of the two antennas disagreed.
+    """
+
+    line: Line | None = None
+    slips: SlipState | None = None
+    track: TrackState | None = None
+    level: LevelState = field(default_factory=LevelState)
+    sensors: SensorState = field(default_factory=SensorState.empty)
+    fixed: FilterFix | None = None
+    anchor: FilterFix | None = None
+    gate: ReturnState = field(default_factory=ReturnState)
+    disagreed: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+
+    def __repr__(self) -> str:
+        if self.track is None or not self.track.hypotheses:
+            return "<FilterState: no place yet>"
+        return f"<FilterState: {plural(self.track.hypotheses, 'place')}, the most probable at {self._place()} m>"
+
+    def _place(self) -> str:
+        """The most probable place with its standard deviation."""
+        track = self.track
+        if track is None:
+            return ""
+        best = int(np.argmax(track.log_probability))
+        place, variance = track.mean[best, StateIndex.ARC], track.covariance[best, StateIndex.ARC, StateIndex.ARC]
+        return f"{place:,.1f} +- {np.sqrt(variance):.1f}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlongTrack(NotebookTable):
+    """Positions of one antenna by the filter along the track, T epochs.
+
+    Attributes
+    ----------
+    tracked : Tracked
+        Places along the antenna's trajectory, and what measured them; channels as `AntennaResult.columns`.
+    chainage_m, kilometrage_m : ndarray, shape (T,) [m]
+    ecef_m : ndarray, shape (T, 3) [m]
+    latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
+    direction : ndarray of int8, shape (T,)
+        1 toward rising chainage, -1 toward falling, 0 where the speed does not tell.
+    standstill : ndarray of bool, shape (T,)
+    sensed : SensedMotion
+        Motion since the epoch before and the line under the body, by wheel and inertial unit.
+    spacing_error_m : ndarray, shape (T,) [m]
+        Distance from the place of the other antenna less that of the antennas; NaN where it was not looked at.
+    replay : tuple of Replay
+        What the filter was given, to smooth it (`railfix.pipeline.smoothing`).
+    """
+
+    tracked: Tracked
+    chainage_m: Floats
+    kilometrage_m: Floats
+    ecef_m: Floats
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    direction: Codes
+    standstill: Masks
+    sensed: SensedMotion
+    spacing_error_m: Floats
+    replay: tuple[Replay, ...] = ()
+
+    @property
+    def time(self) -> Datetimes:
+        """Time tags, shape (T,)."""
+        return self.tracked.time
+
+    def __len__(self) -> int:
+        return len(self.tracked)
+
+    def __repr__(self) -> str:
+        return f"<AlongTrack: {self.status_text()}, {time_span_text(self.time)}>"
+
+    def status_text(self) -> str:
+        """How many epochs have a place with a bound: ``1,890 of 2,000 epochs tracking or coasting``."""
+        return f"{int(is_bounded(self.tracked.status).sum()):,} of {plural(self, 'epoch')} tracking or coasting"
+
+    def summary(self) -> dict[str, str]:
+        """Medians of sigma and level in metres, as texts."""
+        tracked = self.tracked
+        return {"median sigma [m]": median_text(tracked.sigma_m), "median level [m]": median_text(tracked.level_m)}
