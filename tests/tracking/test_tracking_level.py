@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 from plain_kernels import memory, named_tuple, parameters, plain, subfilters, work_space
 from railfix.kernels.tracking import layout
-from railfix.tracking import TrackingLimits, track
+from railfix.tracking import TrackingLimits, TrackStatus, track
 from railfix.tracking.bank import OTHERS, budget
 from tracking_cases import bent_line, part, ride, wheel, without_epochs
 
@@ -98,6 +98,22 @@ def test_only_a_contradiction_that_lasts_takes_the_level_away() -> None:
     assert not np.isfinite(result.level_m[43:45]).any()
     told = np.isfinite(result.level_m)
     assert (np.abs(result.arc_m - case.arc_m) <= result.level_m)[told][5:].all()
+
+
+@pytest.mark.requirement("C2", "C6")
+def test_dopplers_that_agree_on_no_speed_leave_the_place_in_doubt_unless_a_wheel_has_it() -> None:
+    case = ride(75, noise=1.0, seed=5)
+    rate, joined = case.epochs.rate_mps.copy(), np.array(case.epochs.phase_joined)
+    joined[40:55] = False
+    rate[40:55] += np.where(np.arange(10) < 5, 0.0, 0.8 * np.random.default_rng(4).normal(size=(15, 10)))
+    epochs = replace(case.epochs, rate_mps=rate, phase_joined=joined)
+    alone, _ = track(epochs, case.line, limits=LIMITS, levels=True)
+    sensed, _ = track(epochs, case.line, limits=LIMITS, levels=True, sensors=wheel(case))
+    assert (alone.motion_weight[40:55] > LIMITS.lost_motion_weight).all()  # no epoch by itself is that of a lost track
+    assert (alone.status[20:41] == TrackStatus.TRACKING).all()
+    assert (alone.status[48:55] == TrackStatus.DOUBTFUL).all()
+    assert (alone.status[65:] == TrackStatus.TRACKING).all()
+    assert (sensed.status[20:] == TrackStatus.TRACKING).all()
 
 
 @pytest.mark.requirement("C2")

@@ -87,7 +87,7 @@ class Handover:
             state.hypotheses, state.weak_motion_s, state.weak_code_s, *state.log_scale, state.distance_since_code_m,
             state.direction, seconds(state.measured - origin), *state.code_shift, state.map_log_variance,
             *state.speed_range_mps, np.nan_to_num(seconds(state.coded - origin), nan=-np.inf), state.branch_s,
-            state.branch_m, state.across, state.step_s, state.withheld_s, state.open_s,
+            state.branch_m, state.across, state.step_s, state.withheld_s, state.open_s, state.motion_misfit,
         ])  # fmt: skip
         self.memory = layout.KernelState(
             mean=row_major(state.mean[:, full]),
@@ -159,7 +159,7 @@ class Handover:
         state.measured = origin + timedelta(scalars[6])
         state.speed_range_mps, state.coded = (scalars[10], scalars[11]), origin + timedelta(scalars[12])
         state.branch_s, state.branch_m = scalars[13:15]
-        state.across, state.step_s, state.withheld_s, state.open_s = scalars[15:19]
+        state.across, state.step_s, state.withheld_s, state.open_s, state.motion_misfit = scalars[15:20]
 
     def _take_back_bank(self, state: TrackState, mean: Floats, variance: Floats) -> None:
         """Put the sub-filters that there are into the state."""

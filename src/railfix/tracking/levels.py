@@ -126,9 +126,14 @@ def carried_levels(
     bounded = is_bounded(tracked.status)
     level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
     amount = np.fmax(level, amount + SCALE_BOUND * np.abs(speed) * tau)
+    told = _status(tracked.status, status, level)
+    # In doubt the sub-filter furthest off may be the one that is right.
+    doubt = (told == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
+    spread = np.where(doubt, np.nan_to_num(separation), 0.0)
     tracked = replace(
         tracked,
-        status=_status(tracked.status, status, level),
+        status=told,
+        sigma_m=np.hypot(tracked.sigma_m, spread),
         level_m=level,
         ground_level_m=widened(ground, straight),
         level_noise_m=np.where(known, noise, np.nan),

@@ -66,7 +66,8 @@ class Tracked:
     status : ndarray of int8, shape (T,)
         `TrackStatus`.
     arc_m, sigma_m : ndarray, shape (T,) [m]
-        Of the most probable hypothesis; the standard deviation has the straight distance to the others in it.
+        Of the most probable hypothesis; the standard deviation has the straight distance to the others in it,
+        and in doubt the separation.
     speed_mps, speed_sigma_mps, acceleration_mps2 : ndarray, shape (T,)
     probability : ndarray, shape (T,)
         Of the hypothesis given.

@@ -104,6 +104,8 @@ class TrackState:
     step_s, withheld_s, open_s : float [s]
         How long all codes have asked for another place, how long the level is withheld still, and how long that along
         the line, as other places of it were more probable than the risk.
+    motion_misfit : float
+        One less the mean weight of Dopplers and phases lately; 0 with a speed by a sensor.
     code_bias : ndarray, shape (N - SATELLITES,)
         Mean innovation of each satellite's codes (`railfix.kernels.tracking.learning`).
     log_least : ndarray, shape (H,)
@@ -165,6 +167,7 @@ class TrackState:
     step_s: float = 0.0
     withheld_s: float = 0.0
     open_s: float = 0.0
+    motion_misfit: float = 0.0
     branch_s: float = 0.0
     branch_m: float = 0.0
     bank: Bank | None = None
@@ -203,7 +206,7 @@ class TrackState:
         width = SATELLITES + len(self.satellite)
         self.mean, self.covariance = np.empty((0, width)), np.empty((0, width, width))
         self.log_probability = self.log_code = self.log_least = self.origin_m = np.empty(0)
-        self.branch_s = self.branch_m = self.across = self.step_s = 0.0
+        self.branch_s = self.branch_m = self.across = self.step_s = self.motion_misfit = 0.0
         self.offset_known = np.zeros(len(CLOCKS), dtype=np.bool_)
         self.code_bias = np.zeros(len(self.satellite))
         self.weak_motion_s = self.weak_code_s = self.distance_since_code_m = self.direction = 0.0

@@ -141,6 +141,10 @@ ACROSS_TAKEN: Final = 60.0
 #: map, 6 times their error: beyond them codes contradict motion, by a step of all codes, a pull, or a wrong map.
 DRIFT_SIGMAS: Final = 5.0
 DRIFT_LOG: Final = 2.0 * math.log(6.0)
+#: Dopplers and phases that do not agree with each other on a speed: their mean weight over `MOTION_FIT_S`, while no
+#: sensor on board measures the speed. A train beyond a bend that its place has not reached seems to stand.
+MOTION_FIT: Final = 0.6
+MOTION_FIT_S: Final = 2.0
 #: A displacement of the map across, by the sub-filter that lets it be wrong, is real beyond so many of its standard
 #: deviations and metres.
 BESIDE_SIGMAS: Final = 4.5

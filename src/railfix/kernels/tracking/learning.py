@@ -19,10 +19,13 @@ from railfix.kernels.tracking.constants import (
     CODE_LEAK,
     LARGEST_SCALE,
     LEAST_SCALE,
+    MOTION_FIT_S,
     MOTION_LEAK,
     SCALE_S,
 )
 from railfix.kernels.tracking.layout import (
+    FORCE_ROW,
+    MOTION_MISFIT,
     RANGE_ROW,
     SCALE_DOPPLER,
     SCALE_PHASE,
@@ -74,6 +77,11 @@ def learn(
     code, motion = mean_weights(rows, work.variance, work, best)
     weak = motion < parameters.lost_motion_weight
     scalars[WEAK_MOTION] = scalars[WEAK_MOTION] + dt if weak else max(scalars[WEAK_MOTION] - MOTION_LEAK * dt, 0.0)
+    if not math.isnan(motion):
+        misfit = 1.0 - motion
+        for j in range(rows.counts[3]):
+            misfit = 0.0 if rows.sensors[j] < FORCE_ROW else misfit
+        scalars[MOTION_MISFIT] += (1.0 - math.exp(-dt / MOTION_FIT_S)) * (misfit - scalars[MOTION_MISFIT])
     if code_s > 0.0:
         weak = code < parameters.lost_code_weight
         gone = max(scalars[WEAK_CODE] - CODE_LEAK * code_s, 0.0)

@@ -19,6 +19,7 @@ from railfix.kernels.tracking.constants import (
     DRIFT_LOG,
     DRIFT_SIGMAS,
     LARGEST_SQUARE,
+    MOTION_FIT,
     REACH_M,
     REACH_SIGMAS,
     STEP_HELD_S,
@@ -36,6 +37,7 @@ from railfix.kernels.tracking.layout import (
     BRANCH_S,
     HYPOTHESES,
     MAP_LOG_VARIANCE,
+    MOTION_MISFIT,
     RIGHT,
     SHIFT,
     SHIFT_VARIANCE,
@@ -112,6 +114,7 @@ def watch(
         scalars[STEP_TIME] = scalars[STEP_TIME] + code_s if stepped else max(scalars[STEP_TIME] - 0.5 * code_s, 0.0)
     withheld = 0.0
     doubtful = scalars[WEAK_CODE] > parameters.level_doubt_code_s or scalars[WEAK_MOTION] > parameters.level_doubt_s
+    doubtful = doubtful or scalars[MOTION_MISFIT] > 1.0 - MOTION_FIT
     if doubtful or scalars[ACROSS] > ACROSS_DOUBT:
         withheld = parameters.level_hold_s
     if scalars[BRANCH_S] < parameters.level_start_s:
