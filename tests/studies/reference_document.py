@@ -1,13 +1,15 @@
-"""The reference document, from the docstrings: ``python tests/studies/reference_document.py`` writes
-``docs/reference.md``."""
+"""Reference pages from the docstrings: ``python tests/studies/reference_document.py`` writes reference.md, columns.md,
+evaluation-columns.md, settings.md and settings-filter.md in ``docs``."""
 
 from __future__ import annotations
 
 import inspect
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from enum import IntEnum, IntFlag
+from itertools import groupby
+from pathlib import Path
 from typing import Any, Final, get_args
 
 from pydantic.fields import FieldInfo
@@ -15,6 +17,16 @@ from pydantic.fields import FieldInfo
 import paths
 from railfix.core import errors, reasons
 from railfix.core.settings import Settings
+from railfix.evaluate import (
+    BEYOND_COLUMNS,
+    EPOCH_COLUMNS,
+    FIGURE_COLUMNS,
+    INTERVAL_COLUMNS,
+    LEVEL_COLUMNS,
+    STANFORD_COLUMNS,
+)
+from railfix.evaluate.branches import BRANCH_COLUMNS
+from railfix.evaluate.outages import OUTAGE_COLUMNS
 from railfix.pipeline.columns import UNITS, Column
 from railfix.pipeline.config import Config
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
@@ -22,7 +34,23 @@ from railfix.pipeline.train_table import SMOOTHED_COLUMNS, TRAIN_COLUMNS
 from railfix.run.route import ON_TRACK_COLUMNS, TRACK_COLUMNS
 from railfix.tracking import TrackStatus
 
-DOCUMENT: Final = paths.ROOT / "docs" / "reference.md"
+DOCS: Final = paths.ROOT / "docs"
+WRITTEN: Final = "Written by `python tests/studies/reference_document.py` from the docstrings."
+ENDINGS: Final = tuple(f"`_{ending}`" + ("" if ending == unit else f" {unit}") for ending, unit in UNITS.items())
+SIGNS: Final = {"gt": "(", "ge": "[", "lt": ")", "le": "]"}
+#: Prefixes of the settings of the filter along the track.
+FILTER: Final = ("filter", "tracking.", "sensors.")
+#: Columns of the files of `railfix evaluate`, by the heading of their table.
+EVALUATION: Final[Mapping[str, Mapping[str, str]]] = {
+    "`errors.parquet`, a row an epoch, antenna and run; levels, prefixed by their kind, follow": EPOCH_COLUMNS,
+    "`tables.csv`: figures, one row a group": FIGURE_COLUMNS,
+    "`intervals.csv`, after `run`, `configuration`, `line`, `antenna`": INTERVAL_COLUMNS,
+    "`levels.csv`, after `run`, `configuration`, `line`, `antenna`": LEVEL_COLUMNS,
+    "`stanford_KIND.csv`, after `run`, `configuration`, `line`, `antenna`": STANFORD_COLUMNS,
+    "`beyond_KIND.csv`": BEYOND_COLUMNS,
+    "`outages.csv`, after `run`, `configuration`, `line`, `antenna`": OUTAGE_COLUMNS,
+    "`branches.csv`, after `run`, `configuration`, `line`, `antenna`": BRANCH_COLUMNS,
+}
 
 
 def _attribute_docs(item: object) -> dict[str, str]:
@@ -58,16 +86,20 @@ def _exit_codes() -> list[str]:
     return lines + [f"| {c} | {text} | {f'`{raised[c]}`' if c in raised else ''} |" for c, text in rows]
 
 
-def _columns(heading: str, columns: Mapping[str, Column[Any] | str]) -> list[str]:
-    lines = ["", f"## {heading}", "", "| column | unit | meaning |", "|---|---|---|"]
-    for name, column in columns.items():
-        unit, text = (
-            (UNITS.get(name.rsplit("_", 1)[-1], ""), column)
-            if isinstance(column, str)
-            else (column.unit, column.meaning)
-        )
-        lines.append(f"| `{name}` | {unit} | {_cell(text)} |")
-    return lines
+def _rows(cells: Iterable[tuple[str, str, str]]) -> list[str]:
+    """Rows of names, what comes between, and meanings; neighbours with the same meaning are one row."""
+    rows = []
+    for meaning, group in groupby(cells, key=lambda cell: cell[-1]):
+        names, between, _ = zip(*group, strict=True)
+        middle = f" {', '.join(between)} |" if any(between) else ""
+        rows.append(f"| {', '.join(f'`{name}`' for name in names)} |{middle} {_cell(meaning)} |")
+    return rows
+
+
+def _columns(heading: str, columns: Mapping[str, Column[Any] | str], *, without: Iterable[str] = ()) -> list[str]:
+    texts = {name: column if isinstance(column, str) else column.meaning for name, column in columns.items()}
+    cells = [(name, "", text) for name, text in texts.items() if name not in without]
+    return ["", f"## {heading}", "", "| column | meaning |", "|---|---|", *_rows(cells)]
 
 
 def _members(heading: str, kind: type[IntEnum] | type[IntFlag], head: str) -> list[str]:
@@ -87,65 +119,108 @@ def _members(heading: str, kind: type[IntEnum] | type[IntFlag], head: str) -> li
 
 
 def _bounds(field: FieldInfo) -> str:
-    """Bounds of a setting, or its words: ``> 0``, ``0 to 1``."""
+    """Bounds of a setting other than > 0, as an interval, or its other words: ``[0, 1)``, ``or `off` ``."""
     if words := [str(word) for word in get_args(field.annotation) if isinstance(word, str)]:
-        return ", ".join(f"`{word}`" for word in words)
-    signs = {"gt": "> {:g}", "ge": ">= {:g}", "lt": "< {:g}", "le": "<= {:g}"}
-    limits = [(sign, getattr(item, sign, None)) for item in field.metadata for sign in signs]
-    return ", ".join(signs[sign].format(limit) for sign, limit in limits if limit is not None)
+        return f"or {', '.join(f'`{word}`' for word in words if word != field.default)}"
+    limits = {sign: getattr(item, sign) for item in field.metadata for sign in SIGNS if hasattr(item, sign)}
+    if limits in ({"gt": 0}, {}):
+        return "any" if not limits and field.annotation in (float, int) else ""
+    low = next((f"{SIGNS[sign]}{limits[sign]:g}" for sign in ("gt", "ge") if sign in limits), "(-inf")
+    return f"{low}, " + next((f"{limits[sign]:g}{SIGNS[sign]}" for sign in ("lt", "le") if sign in limits), "inf)")
 
 
-def _setting_rows(prefix: str, group: Settings) -> list[str]:
-    """A row a setting; of a description the first sentence."""
-    docs, rows = _attribute_docs(type(group)), []
+def _setting_cells(prefix: str, group: Settings) -> Iterator[tuple[str, str, str]]:
+    """Key, default with bounds, and the first sentence of the description of each setting."""
+    docs = _attribute_docs(type(group))
     for name, field in type(group).model_fields.items():
         value = getattr(group, name)
         if isinstance(value, Settings):
-            rows += _setting_rows(f"{prefix}{name}.", value)
+            yield from _setting_cells(f"{prefix}{name}.", value)
             continue
         unit, text = re.match(r"(?:\[([^\]]+)\]\s*)?(.*)", docs.get(name, ""), flags=re.DOTALL).groups()  # type: ignore[union-attr]
         sentence = re.split(r"(?<=[a-z)`])[.;:] ", text)[0].rstrip(".")
-        shown = _cell(str(value)) if value not in (None, "", ()) else ""
-        default, unit = f"`{shown}`" if shown else "", unit or _unit_of(name)
-        rows.append(f"| `{prefix}{name}` | {default} | {unit} | {_bounds(field)} | {_cell(sentence)} |")
-    return rows
+        default = f"`{_cell(str(value))}`" if value not in (None, "", ()) else "none"
+        known = name.rsplit("_", 1)[-1] in UNITS
+        yield f"{prefix}{name}", " ".join(filter(None, (default, "" if known else unit, _bounds(field)))), sentence
 
 
-def _unit_of(name: str) -> str:
-    """Unit that the name of a setting ends with."""
-    return UNITS.get(name.rsplit("_", 1)[-1], "") if "_" in name else ""
+def settings_page(title: str, text: str, prefixes: tuple[str, ...], *, others: bool) -> str:
+    """Page of the settings whose keys begin with one of the prefixes, or of all others."""
+    cells = [cell for cell in _setting_cells("", Config()) if cell[0].startswith(prefixes) != others]
+    lines = [f"# {title}", "", WRITTEN, "", text, "", "| key | default, bounds | meaning |", "|---|---|---|"]
+    return "\n".join([*lines, *_rows(cells)]) + "\n"
 
 
-def _settings() -> list[str]:
-    lines = ["", "## Settings", "", "Keys of the configuration file (TOML) and of `--set`.", ""]
-    return [
-        *lines,
-        "| key | default | unit | bounds | meaning |",
-        "|---|---|---|---|---|",
-        *_setting_rows("", Config()),
+def reference() -> str:
+    """Page of exit codes, statuses and reasons."""
+    lines = [
+        "# Reference",
+        "",
+        WRITTEN,
+        "[Columns](columns.md) and [settings](settings.md) have pages of their own.",
+        "",
     ]
-
-
-def document() -> str:
-    """The document as Markdown."""
-    lines = ["# Reference", "", "Written by `python tests/studies/reference_document.py` from the docstrings.", ""]
     lines += _exit_codes()
-    lines += _columns("Columns of `positions.csv` and `positions.parquet`", POSITION_COLUMNS)
-    lines += _columns("Columns of `train.csv` and `train.parquet`", TRAIN_COLUMNS)
-    lines += _columns("Further columns of `train.*` with `--smooth`", SMOOTHED_COLUMNS)
-    lines += _columns("Further columns of `positions.*` and `train.*` of a run on a network", ON_TRACK_COLUMNS)
-    lines += _columns("Columns of `tracks.csv` and `tracks.parquet`", TRACK_COLUMNS)
-    lines += _columns("Columns of `observations.parquet`", OBSERVATION_COLUMNS)
     lines += _members("Statuses of an epoch", reasons.Status, "number")
     lines += _members("Statuses of the filter along the track", TrackStatus, "number")
     lines += _members("Reasons of an observation", reasons.Reason, "bit")
-    lines += _settings()
     return "\n".join(lines) + "\n"
 
 
+def run_columns() -> str:
+    """Page of the columns of a run's tables."""
+    lines = ["# Columns", "", WRITTEN, f"Names end with their unit: {', '.join(ENDINGS)}."]
+    common = {
+        name: column for name, column in POSITION_COLUMNS.items() if _meaning(TRAIN_COLUMNS, name) == column.meaning
+    }
+    lines += _columns("Columns of both `positions` and `train`", common)
+    lines += _columns("Columns of `positions.csv` and `positions.parquet`", POSITION_COLUMNS, without=common)
+    lines += _columns("Columns of `train.csv` and `train.parquet`", TRAIN_COLUMNS, without=common)
+    lines += _columns("Further columns of `train.*` with `--smooth`", SMOOTHED_COLUMNS)
+    lines += _columns("Further columns of `positions.*` and `train.*` of a run on a network", ON_TRACK_COLUMNS)
+    lines += _columns("Columns of `tracks.csv` and `tracks.parquet`", TRACK_COLUMNS)
+    lines += _columns("Columns of `observations.parquet`", OBSERVATION_COLUMNS, without=("time_gpst", "antenna"))
+    return "\n".join(lines) + "\n"
+
+
+def _meaning(columns: Mapping[str, Column[Any]], name: str) -> str | None:
+    return columns[name].meaning if name in columns else None
+
+
+def evaluation_columns() -> str:
+    """Page of the columns of `railfix evaluate`."""
+    lines = ["# Columns of the evaluation", "", WRITTEN, "What they mean together: [evaluation](evaluation.md)."]
+    for heading, columns in EVALUATION.items():
+        lines += _columns(heading, columns)
+    return "\n".join(lines) + "\n"
+
+
+def pages() -> dict[Path, str]:
+    """Text of each page by its path."""
+    general = (
+        "Keys of the configuration file (TOML) and of `--set`; names end with their [unit](columns.md). "
+        "Numbers without bounds are above 0; `[0, 1)` includes 0, not 1. "
+    )
+    return {
+        DOCS / "reference.md": reference(),
+        DOCS / "columns.md": run_columns(),
+        DOCS / "evaluation-columns.md": evaluation_columns(),
+        DOCS / "settings.md": settings_page(
+            "Settings",
+            general + "Those of the filter: [settings of the filter](settings-filter.md).",
+            FILTER,
+            others=True,
+        ),
+        DOCS / "settings-filter.md": settings_page(
+            "Settings of the filter and its sensors", "Read as the other [settings](settings.md).", FILTER, others=False
+        ),
+    }
+
+
 def main() -> int:
-    """Write the document."""
-    DOCUMENT.write_text(document(), encoding="utf-8")
+    """Write the pages."""
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")
     return 0
 
 
