@@ -729,7 +729,7 @@ def test_the_document_names_every_column():
     every += (OUTAGE_COLUMNS, BRANCH_COLUMNS)
     for columns in every:
         for name, meaning in columns.items():
-            assert re.search(rf"^\| .*`{name}`.* \| {re.escape(meaning)} \|$", text, re.MULTILINE)
+            assert re.search(rf"^- .*`{name}`.*: {re.escape(meaning)}$", text, re.MULTILINE)
 
 
 def rows_of_document(antenna: str, columns: int) -> list[list[str]]:

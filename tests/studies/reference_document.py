@@ -82,27 +82,30 @@ def _exit_codes() -> list[str]:
     rows = re.findall(r"^(\d)\s+(.*)$", errors.__doc__ or "", flags=re.MULTILINE)
     kinds = errors.RailfixError.__subclasses__()
     raised = {str(kind.exit_code): kind.__name__ for kind in kinds}
-    lines = ["## Exit codes", "", "| code | meaning | error in Python |", "|---:|---|---|"]
-    return lines + [f"| {c} | {text} | {f'`{raised[c]}`' if c in raised else ''} |" for c, text in rows]
+    lines = ["## Exit codes", "", "With the error in Python.", ""]
+    return lines + [f"- {code}: {text}{f' (`{raised[code]}`)' if code in raised else ''}" for code, text in rows]
 
 
 def _rows(cells: Iterable[tuple[str, str, str]]) -> list[str]:
-    """Rows of names, what comes between, and meanings; neighbours with the same meaning are one row."""
+    """Rows of names, values and meanings; neighbours with the same meaning are one row."""
     rows = []
     for meaning, group in groupby(cells, key=lambda cell: cell[-1]):
-        names, between, _ = zip(*group, strict=True)
-        middle = f" {', '.join(between)} |" if any(between) else ""
-        rows.append(f"| {', '.join(f'`{name}`' for name in names)} |{middle} {_cell(meaning)} |")
+        names, values, _ = zip(*group, strict=True)
+        rows.append(f"| {_named(names)} | {', '.join(values)} | {_cell(meaning)} |")
     return rows
+
+
+def _named(names: Iterable[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
 
 
 def _columns(heading: str, columns: Mapping[str, Column[Any] | str], *, without: Iterable[str] = ()) -> list[str]:
     texts = {name: column if isinstance(column, str) else column.meaning for name, column in columns.items()}
-    cells = [(name, "", text) for name, text in texts.items() if name not in without]
-    return ["", f"## {heading}", "", "| column | meaning |", "|---|---|", *_rows(cells)]
+    rows = groupby((name for name in texts if name not in without), key=lambda name: texts[name])
+    return ["", f"## {heading}", "", *(f"- {_named(names)}: {meaning.replace('``', '`')}" for meaning, names in rows)]
 
 
-def _members(heading: str, kind: type[IntEnum] | type[IntFlag], head: str) -> list[str]:
+def _members(heading: str, kind: type[IntEnum] | type[IntFlag]) -> list[str]:
     """Members of an enumeration with the comments above them in the source."""
     comments: dict[str, str] = {}
     comment: list[str] = []
@@ -113,9 +116,14 @@ def _members(heading: str, kind: type[IntEnum] | type[IntFlag], head: str) -> li
         elif found := re.match(r"([A-Z_0-9]+) = ", text):
             comments[found[1]] = " ".join(comment)
             comment = []
-    lines = ["", f"## {heading}", "", f"| {head} | name | meaning |", "|---:|---|---|"]
     rows = [(int(m), str(m.name)) for m in kind if m.name != "USED"]
-    return lines + [f"| {value} | `{name.lower()}` | {_cell(comments[name])} |" for value, name in rows]
+    meanings = (comments[name].replace("``", "`") for _, name in rows)
+    return [
+        "",
+        f"## {heading}",
+        "",
+        *(f"- {n} `{name.lower()}`: {text}" for (n, name), text in zip(rows, meanings, strict=True)),
+    ]
 
 
 def _bounds(field: FieldInfo) -> str:
@@ -161,9 +169,9 @@ def reference() -> str:
         "",
     ]
     lines += _exit_codes()
-    lines += _members("Statuses of an epoch", reasons.Status, "number")
-    lines += _members("Statuses of the filter along the track", TrackStatus, "number")
-    lines += _members("Reasons of an observation", reasons.Reason, "bit")
+    lines += _members("Statuses of an epoch", reasons.Status)
+    lines += _members("Statuses of the filter along the track", TrackStatus)
+    lines += _members("Reasons of an observation", reasons.Reason)
     return "\n".join(lines) + "\n"
 
 
