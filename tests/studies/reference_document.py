@@ -37,7 +37,7 @@ from railfix.tracking import TrackStatus
 DOCS: Final = paths.ROOT / "docs"
 WRITTEN: Final = "Written by `python tests/studies/reference_document.py` from the docstrings."
 ENDINGS: Final = tuple(f"`_{ending}`" + ("" if ending == unit else f" {unit}") for ending, unit in UNITS.items())
-SIGNS: Final = {"gt": "(", "ge": "[", "lt": ")", "le": "]"}
+SIGNS: Final = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 #: Prefixes of the settings of the filter along the track.
 FILTER: Final = ("filter", "tracking.", "sensors.")
 #: Columns of the files of `railfix evaluate`, by the heading of their table.
@@ -74,25 +74,12 @@ def _attribute_docs(item: object) -> dict[str, str]:
     return docs
 
 
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("``", "`")
-
-
 def _exit_codes() -> list[str]:
     rows = re.findall(r"^(\d)\s+(.*)$", errors.__doc__ or "", flags=re.MULTILINE)
     kinds = errors.RailfixError.__subclasses__()
     raised = {str(kind.exit_code): kind.__name__ for kind in kinds}
     lines = ["## Exit codes", "", "With the error in Python.", ""]
     return lines + [f"- {code}: {text}{f' (`{raised[code]}`)' if code in raised else ''}" for code, text in rows]
-
-
-def _rows(cells: Iterable[tuple[str, str, str]]) -> list[str]:
-    """Rows of names, values and meanings; neighbours with the same meaning are one row."""
-    rows = []
-    for meaning, group in groupby(cells, key=lambda cell: cell[-1]):
-        names, values, _ = zip(*group, strict=True)
-        rows.append(f"| {_named(names)} | {', '.join(values)} | {_cell(meaning)} |")
-    return rows
 
 
 def _named(names: Iterable[str]) -> str:
@@ -127,36 +114,51 @@ def _members(heading: str, kind: type[IntEnum] | type[IntFlag]) -> list[str]:
 
 
 def _bounds(field: FieldInfo) -> str:
-    """Bounds of a setting other than > 0, as an interval, or its other words: ``[0, 1)``, ``or `off` ``."""
+    """Bounds of a setting other than > 0, or its other words: ``>=0``, ``[0, 1)``, ``or `off` ``."""
     if words := [str(word) for word in get_args(field.annotation) if isinstance(word, str)]:
         return f"or {', '.join(f'`{word}`' for word in words if word != field.default)}"
     limits = {sign: getattr(item, sign) for item in field.metadata for sign in SIGNS if hasattr(item, sign)}
     if limits in ({"gt": 0}, {}):
         return "any" if not limits and field.annotation in (float, int) else ""
-    low = next((f"{SIGNS[sign]}{limits[sign]:g}" for sign in ("gt", "ge") if sign in limits), "(-inf")
-    return f"{low}, " + next((f"{limits[sign]:g}{SIGNS[sign]}" for sign in ("lt", "le") if sign in limits), "inf)")
+    if len(limits) == 1:
+        ((sign, limit),) = limits.items()
+        return f"{SIGNS[sign]}{limit:g}"
+    opening = f"({limits['gt']:g}" if "gt" in limits else f"[{limits['ge']:g}"
+    return opening + (f", {limits['lt']:g})" if "lt" in limits else f", {limits['le']:g}]")
 
 
-def _setting_cells(prefix: str, group: Settings) -> Iterator[tuple[str, str, str]]:
-    """Key, default with bounds, and the first sentence of the description of each setting."""
+def _setting_cells(prefix: str, group: Settings) -> Iterator[tuple[str, str, str, str]]:
+    """Group, key, default with bounds, and the first sentence of the description of each setting."""
     docs = _attribute_docs(type(group))
     for name, field in type(group).model_fields.items():
         value = getattr(group, name)
         if isinstance(value, Settings):
-            yield from _setting_cells(f"{prefix}{name}.", value)
+            yield from _setting_cells(f"{prefix}.{name}".strip("."), value)
             continue
         unit, text = re.match(r"(?:\[([^\]]+)\]\s*)?(.*)", docs.get(name, ""), flags=re.DOTALL).groups()  # type: ignore[union-attr]
-        sentence = re.split(r"(?<=[a-z)`])[.;:] ", text)[0].rstrip(".")
-        default = f"`{_cell(str(value))}`" if value not in (None, "", ()) else "none"
+        sentence = re.split(r"(?<=[a-z)`])[.;:] ", text)[0].rstrip(".").replace("``", "`")
+        default = f"`{value}`" if value not in (None, "", ()) else "none"
         known = name.rsplit("_", 1)[-1] in UNITS
-        yield f"{prefix}{name}", " ".join(filter(None, (default, "" if known else unit, _bounds(field)))), sentence
+        yield prefix, name, _joined(default, "" if known or not unit else unit, _bounds(field)), sentence
 
 
-def settings_page(title: str, text: str, prefixes: tuple[str, ...], *, others: bool) -> str:
-    """Page of the settings whose keys begin with one of the prefixes, or of all others."""
-    cells = [cell for cell in _setting_cells("", Config()) if cell[0].startswith(prefixes) != others]
-    lines = [f"# {title}", "", WRITTEN, "", text, "", "| key | default, bounds | meaning |", "|---|---|---|"]
-    return "\n".join([*lines, *_rows(cells)]) + "\n"
+def _joined(default: str, unit: str, bounds: str) -> str:
+    value = f"{default} {unit}".rstrip()
+    return f"{value} {bounds}" if bounds.startswith("or ") else ", ".join(filter(None, (value, bounds)))
+
+
+def settings_page(title: str, text: str, settings: Iterable[tuple[str, str, str, str]]) -> str:
+    """Page of settings, by their groups, those without one first; neighbours of one meaning are one entry."""
+    lines = [f"# {title}", "", WRITTEN, "", text]
+    groups: dict[str, list[tuple[str, str, str, str]]] = {"": []}
+    for cell in settings:
+        groups.setdefault(cell[0], []).append(cell)
+    for prefix, group in groups.items():
+        lines += ["", f"## `[{prefix}]`" if prefix else "## Outside of tables", ""]
+        for meaning, cells in groupby(group, key=lambda cell: cell[3]):
+            _, names, values, _ = zip(*cells, strict=True)
+            lines.append(f"- {_named(names)}: {', '.join(values)}. {meaning}")
+    return "\n".join(lines) + "\n"
 
 
 def reference() -> str:
@@ -206,22 +208,19 @@ def evaluation_columns() -> str:
 def pages() -> dict[Path, str]:
     """Text of each page by its path."""
     general = (
-        "Keys of the configuration file (TOML) and of `--set`; names end with their [unit](columns.md). "
-        "Numbers without bounds are above 0; `[0, 1)` includes 0, not 1. "
+        "Keys of the configuration file (TOML), by its tables, each with its default; `--set` takes `table.key=value`. "
+        "Names end with their [unit](columns.md). Numbers are above 0 unless other bounds follow; `[0, 1)` includes 0. "
+        "The filter has [settings of its own](settings-filter.md)."
     )
+    every = list(_setting_cells("", Config()))
+    of_filter = [cell for cell in every if f"{cell[0]}.{cell[1]}".lstrip(".").startswith(FILTER)]
+    title = "Settings of the filter and its sensors"
     return {
         DOCS / "reference.md": reference(),
         DOCS / "columns.md": run_columns(),
         DOCS / "evaluation-columns.md": evaluation_columns(),
-        DOCS / "settings.md": settings_page(
-            "Settings",
-            general + "Those of the filter: [settings of the filter](settings-filter.md).",
-            FILTER,
-            others=True,
-        ),
-        DOCS / "settings-filter.md": settings_page(
-            "Settings of the filter and its sensors", "Read as the other [settings](settings.md).", FILTER, others=False
-        ),
+        DOCS / "settings.md": settings_page("Settings", general, [cell for cell in every if cell not in of_filter]),
+        DOCS / "settings-filter.md": settings_page(title, "Read as the other [settings](settings.md).", of_filter),
     }
 
 
