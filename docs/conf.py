@@ -47,7 +47,7 @@ numpydoc_attributes_as_param_list = True
 
 
 def short_signature(app, what, name, value, options, signature, annotation):  # noqa: ARG001
-    """Return the signature of a settings model without its defaults, which docs/reference.md lists."""
+    """Return the signature of a settings model without its defaults, which docs/settings.md lists."""
     if isinstance(value, type) and issubclass(value, Settings):
         return "(**settings)", annotation
     return None

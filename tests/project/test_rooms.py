@@ -11,7 +11,7 @@ from conftest import ROOT
 
 SOURCE: Final = ROOT / "src" / "railfix"
 
-#: The rooms (the packages below `railfix`), floor by floor. docs/concepts.md draws the same.
+#: The rooms (the packages below `railfix`), floor by floor. CONTRIBUTING.md draws the same.
 FLOORS: Final[tuple[tuple[str, ...], ...]] = (
     ("core",),
     ("kernels",),

@@ -1,13 +1,15 @@
-"""The reference document, from the docstrings: ``python tests/studies/reference_document.py`` writes
-``docs/reference.md``."""
+"""Reference pages from the docstrings: ``python tests/studies/reference_document.py`` writes reference.md, columns.md,
+evaluation-columns.md, settings.md and settings-filter.md in ``docs``."""
 
 from __future__ import annotations
 
 import inspect
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from enum import IntEnum, IntFlag
+from itertools import groupby
+from pathlib import Path
 from typing import Any, Final, get_args
 
 from pydantic.fields import FieldInfo
@@ -15,6 +17,16 @@ from pydantic.fields import FieldInfo
 import paths
 from railfix.core import errors, reasons
 from railfix.core.settings import Settings
+from railfix.evaluate import (
+    BEYOND_COLUMNS,
+    EPOCH_COLUMNS,
+    FIGURE_COLUMNS,
+    INTERVAL_COLUMNS,
+    LEVEL_COLUMNS,
+    STANFORD_COLUMNS,
+)
+from railfix.evaluate.branches import BRANCH_COLUMNS
+from railfix.evaluate.outages import OUTAGE_COLUMNS
 from railfix.pipeline.columns import UNITS, Column
 from railfix.pipeline.config import Config
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
@@ -22,7 +34,23 @@ from railfix.pipeline.train_table import SMOOTHED_COLUMNS, TRAIN_COLUMNS
 from railfix.run.route import ON_TRACK_COLUMNS, TRACK_COLUMNS
 from railfix.tracking import TrackStatus
 
-DOCUMENT: Final = paths.ROOT / "docs" / "reference.md"
+DOCS: Final = paths.ROOT / "docs"
+WRITTEN: Final = "Written by `python tests/studies/reference_document.py` from the docstrings."
+ENDINGS: Final = tuple(f"`_{ending}`" + ("" if ending == unit else f" {unit}") for ending, unit in UNITS.items())
+SIGNS: Final = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+#: Prefixes of the settings of the filter along the track.
+FILTER: Final = ("filter", "tracking.", "sensors.")
+#: Columns of the files of `railfix evaluate`, by the heading of their table.
+EVALUATION: Final[Mapping[str, Mapping[str, str]]] = {
+    "`errors.parquet`, a row an epoch, antenna and run; levels, prefixed by their kind, follow": EPOCH_COLUMNS,
+    "`tables.csv`: figures, one row a group": FIGURE_COLUMNS,
+    "`intervals.csv`, after `run`, `configuration`, `line`, `antenna`": INTERVAL_COLUMNS,
+    "`levels.csv`, after `run`, `configuration`, `line`, `antenna`": LEVEL_COLUMNS,
+    "`stanford_KIND.csv`, after `run`, `configuration`, `line`, `antenna`": STANFORD_COLUMNS,
+    "`beyond_KIND.csv`": BEYOND_COLUMNS,
+    "`outages.csv`, after `run`, `configuration`, `line`, `antenna`": OUTAGE_COLUMNS,
+    "`branches.csv`, after `run`, `configuration`, `line`, `antenna`": BRANCH_COLUMNS,
+}
 
 
 def _attribute_docs(item: object) -> dict[str, str]:
@@ -46,31 +74,25 @@ def _attribute_docs(item: object) -> dict[str, str]:
     return docs
 
 
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("``", "`")
-
-
 def _exit_codes() -> list[str]:
     rows = re.findall(r"^(\d)\s+(.*)$", errors.__doc__ or "", flags=re.MULTILINE)
     kinds = errors.RailfixError.__subclasses__()
     raised = {str(kind.exit_code): kind.__name__ for kind in kinds}
-    lines = ["## Exit codes", "", "| code | meaning | error in Python |", "|---:|---|---|"]
-    return lines + [f"| {c} | {text} | {f'`{raised[c]}`' if c in raised else ''} |" for c, text in rows]
+    lines = ["## Exit codes", "", "With the error in Python.", ""]
+    return lines + [f"- {code}: {text}{f' (`{raised[code]}`)' if code in raised else ''}" for code, text in rows]
 
 
-def _columns(heading: str, columns: Mapping[str, Column[Any] | str]) -> list[str]:
-    lines = ["", f"## {heading}", "", "| column | unit | meaning |", "|---|---|---|"]
-    for name, column in columns.items():
-        unit, text = (
-            (UNITS.get(name.rsplit("_", 1)[-1], ""), column)
-            if isinstance(column, str)
-            else (column.unit, column.meaning)
-        )
-        lines.append(f"| `{name}` | {unit} | {_cell(text)} |")
-    return lines
+def _named(names: Iterable[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
 
 
-def _members(heading: str, kind: type[IntEnum] | type[IntFlag], head: str) -> list[str]:
+def _columns(heading: str, columns: Mapping[str, Column[Any] | str], *, without: Iterable[str] = ()) -> list[str]:
+    texts = {name: column if isinstance(column, str) else column.meaning for name, column in columns.items()}
+    rows = groupby((name for name in texts if name not in without), key=lambda name: texts[name])
+    return ["", f"## {heading}", "", *(f"- {_named(names)}: {meaning.replace('``', '`')}" for meaning, names in rows)]
+
+
+def _members(heading: str, kind: type[IntEnum] | type[IntFlag]) -> list[str]:
     """Members of an enumeration with the comments above them in the source."""
     comments: dict[str, str] = {}
     comment: list[str] = []
@@ -81,71 +103,131 @@ def _members(heading: str, kind: type[IntEnum] | type[IntFlag], head: str) -> li
         elif found := re.match(r"([A-Z_0-9]+) = ", text):
             comments[found[1]] = " ".join(comment)
             comment = []
-    lines = ["", f"## {heading}", "", f"| {head} | name | meaning |", "|---:|---|---|"]
     rows = [(int(m), str(m.name)) for m in kind if m.name != "USED"]
-    return lines + [f"| {value} | `{name.lower()}` | {_cell(comments[name])} |" for value, name in rows]
-
-
-def _bounds(field: FieldInfo) -> str:
-    """Bounds of a setting, or its words: ``> 0``, ``0 to 1``."""
-    if words := [str(word) for word in get_args(field.annotation) if isinstance(word, str)]:
-        return ", ".join(f"`{word}`" for word in words)
-    signs = {"gt": "> {:g}", "ge": ">= {:g}", "lt": "< {:g}", "le": "<= {:g}"}
-    limits = [(sign, getattr(item, sign, None)) for item in field.metadata for sign in signs]
-    return ", ".join(signs[sign].format(limit) for sign, limit in limits if limit is not None)
-
-
-def _setting_rows(prefix: str, group: Settings) -> list[str]:
-    """A row a setting; of a description the first sentence."""
-    docs, rows = _attribute_docs(type(group)), []
-    for name, field in type(group).model_fields.items():
-        value = getattr(group, name)
-        if isinstance(value, Settings):
-            rows += _setting_rows(f"{prefix}{name}.", value)
-            continue
-        unit, text = re.match(r"(?:\[([^\]]+)\]\s*)?(.*)", docs.get(name, ""), flags=re.DOTALL).groups()  # type: ignore[union-attr]
-        sentence = re.split(r"(?<=[a-z)`])[.;:] ", text)[0].rstrip(".")
-        shown = _cell(str(value)) if value not in (None, "", ()) else ""
-        default, unit = f"`{shown}`" if shown else "", unit or _unit_of(name)
-        rows.append(f"| `{prefix}{name}` | {default} | {unit} | {_bounds(field)} | {_cell(sentence)} |")
-    return rows
-
-
-def _unit_of(name: str) -> str:
-    """Unit that the name of a setting ends with."""
-    return UNITS.get(name.rsplit("_", 1)[-1], "") if "_" in name else ""
-
-
-def _settings() -> list[str]:
-    lines = ["", "## Settings", "", "Keys of the configuration file (TOML) and of `--set`.", ""]
+    meanings = (comments[name].replace("``", "`") for _, name in rows)
     return [
-        *lines,
-        "| key | default | unit | bounds | meaning |",
-        "|---|---|---|---|---|",
-        *_setting_rows("", Config()),
+        "",
+        f"## {heading}",
+        "",
+        *(f"- {n} `{name.lower()}`: {text}" for (n, name), text in zip(rows, meanings, strict=True)),
     ]
 
 
-def document() -> str:
-    """The document as Markdown."""
-    lines = ["# Reference", "", "Written by `python tests/studies/reference_document.py` from the docstrings.", ""]
-    lines += _exit_codes()
-    lines += _columns("Columns of `positions.csv` and `positions.parquet`", POSITION_COLUMNS)
-    lines += _columns("Columns of `train.csv` and `train.parquet`", TRAIN_COLUMNS)
-    lines += _columns("Further columns of `train.*` with `--smooth`", SMOOTHED_COLUMNS)
-    lines += _columns("Further columns of `positions.*` and `train.*` of a run on a network", ON_TRACK_COLUMNS)
-    lines += _columns("Columns of `tracks.csv` and `tracks.parquet`", TRACK_COLUMNS)
-    lines += _columns("Columns of `observations.parquet`", OBSERVATION_COLUMNS)
-    lines += _members("Statuses of an epoch", reasons.Status, "number")
-    lines += _members("Statuses of the filter along the track", TrackStatus, "number")
-    lines += _members("Reasons of an observation", reasons.Reason, "bit")
-    lines += _settings()
+def _bounds(field: FieldInfo) -> str:
+    """Bounds of a setting other than > 0, or its other words: ``>=0``, ``[0, 1)``, ``or `off` ``."""
+    if words := [str(word) for word in get_args(field.annotation) if isinstance(word, str)]:
+        return f"or {', '.join(f'`{word}`' for word in words if word != field.default)}"
+    limits = {sign: getattr(item, sign) for item in field.metadata for sign in SIGNS if hasattr(item, sign)}
+    if limits in ({"gt": 0}, {}):
+        return "any" if not limits and field.annotation in (float, int) else ""
+    if len(limits) == 1:
+        ((sign, limit),) = limits.items()
+        return f"{SIGNS[sign]}{limit:g}"
+    opening = f"({limits['gt']:g}" if "gt" in limits else f"[{limits['ge']:g}"
+    return opening + (f", {limits['lt']:g})" if "lt" in limits else f", {limits['le']:g}]")
+
+
+def _setting_cells(prefix: str, group: Settings) -> Iterator[tuple[str, str, str, str]]:
+    """Group, key, default with bounds, and the first sentence of the description of each setting."""
+    docs = _attribute_docs(type(group))
+    for name, field in type(group).model_fields.items():
+        value = getattr(group, name)
+        if isinstance(value, Settings):
+            yield from _setting_cells(f"{prefix}.{name}".strip("."), value)
+            continue
+        unit, text = re.match(r"(?:\[([^\]]+)\]\s*)?(.*)", docs.get(name, ""), flags=re.DOTALL).groups()  # type: ignore[union-attr]
+        sentence = re.split(r"(?<=[a-z)`])[.;:] ", text)[0].rstrip(".").replace("``", "`")
+        default = f"`{value}`" if value not in (None, "", ()) else "none"
+        known = name.rsplit("_", 1)[-1] in UNITS
+        yield prefix, name, _joined(default, "" if known or not unit else unit, _bounds(field)), sentence
+
+
+def _joined(default: str, unit: str, bounds: str) -> str:
+    value = f"{default} {unit}".rstrip()
+    return f"{value} {bounds}" if bounds.startswith("or ") else ", ".join(filter(None, (value, bounds)))
+
+
+def settings_page(title: str, text: str, settings: Iterable[tuple[str, str, str, str]]) -> str:
+    """Page of settings, by their groups, those without one first; neighbours of one meaning are one entry."""
+    lines = [f"# {title}", "", WRITTEN, "", text]
+    groups: dict[str, list[tuple[str, str, str, str]]] = {"": []}
+    for cell in settings:
+        groups.setdefault(cell[0], []).append(cell)
+    for prefix, group in groups.items():
+        lines += ["", f"## `[{prefix}]`" if prefix else "## Outside of tables", ""]
+        for meaning, cells in groupby(group, key=lambda cell: cell[3]):
+            _, names, values, _ = zip(*cells, strict=True)
+            lines.append(f"- {_named(names)}: {', '.join(values)}. {meaning}")
     return "\n".join(lines) + "\n"
 
 
+def reference() -> str:
+    """Page of exit codes, statuses and reasons."""
+    lines = [
+        "# Reference",
+        "",
+        WRITTEN,
+        "[Columns](columns.md) and [settings](settings.md) have pages of their own.",
+        "",
+    ]
+    lines += _exit_codes()
+    lines += _members("Statuses of an epoch", reasons.Status)
+    lines += _members("Statuses of the filter along the track", TrackStatus)
+    lines += _members("Reasons of an observation", reasons.Reason)
+    return "\n".join(lines) + "\n"
+
+
+def run_columns() -> str:
+    """Page of the columns of a run's tables."""
+    lines = ["# Columns", "", WRITTEN, f"Names end with their unit: {', '.join(ENDINGS)}."]
+    common = {
+        name: column for name, column in POSITION_COLUMNS.items() if _meaning(TRAIN_COLUMNS, name) == column.meaning
+    }
+    lines += _columns("Columns of both `positions` and `train`", common)
+    lines += _columns("Columns of `positions.csv` and `positions.parquet`", POSITION_COLUMNS, without=common)
+    lines += _columns("Columns of `train.csv` and `train.parquet`", TRAIN_COLUMNS, without=common)
+    lines += _columns("Further columns of `train.*` with `--smooth`", SMOOTHED_COLUMNS)
+    lines += _columns("Further columns of `positions.*` and `train.*` of a run on a network", ON_TRACK_COLUMNS)
+    lines += _columns("Columns of `tracks.csv` and `tracks.parquet`", TRACK_COLUMNS)
+    lines += _columns("Columns of `observations.parquet`", OBSERVATION_COLUMNS, without=("time_gpst", "antenna"))
+    return "\n".join(lines) + "\n"
+
+
+def _meaning(columns: Mapping[str, Column[Any]], name: str) -> str | None:
+    return columns[name].meaning if name in columns else None
+
+
+def evaluation_columns() -> str:
+    """Page of the columns of `railfix evaluate`."""
+    lines = ["# Columns of the evaluation", "", WRITTEN, "What they mean together: [evaluation](evaluation.md)."]
+    for heading, columns in EVALUATION.items():
+        lines += _columns(heading, columns)
+    return "\n".join(lines) + "\n"
+
+
+def pages() -> dict[Path, str]:
+    """Text of each page by its path."""
+    general = (
+        "Keys of the configuration file (TOML), by its tables, each with its default; `--set` takes `table.key=value`. "
+        "Names end with their [unit](columns.md). Numbers are above 0 unless other bounds follow; `[0, 1)` includes 0. "
+        "The filter has [settings of its own](settings-filter.md)."
+    )
+    every = list(_setting_cells("", Config()))
+    of_filter = [cell for cell in every if f"{cell[0]}.{cell[1]}".lstrip(".").startswith(FILTER)]
+    title = "Settings of the filter and its sensors"
+    return {
+        DOCS / "reference.md": reference(),
+        DOCS / "columns.md": run_columns(),
+        DOCS / "evaluation-columns.md": evaluation_columns(),
+        DOCS / "settings.md": settings_page("Settings", general, [cell for cell in every if cell not in of_filter]),
+        DOCS / "settings-filter.md": settings_page(title, "Read as the other [settings](settings.md).", of_filter),
+    }
+
+
 def main() -> int:
-    """Write the document."""
-    DOCUMENT.write_text(document(), encoding="utf-8")
+    """Write the pages."""
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")
     return 0
 
 

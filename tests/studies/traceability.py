@@ -69,7 +69,7 @@ def _cell(row: str, marked: list[str]) -> str:
     wrong = sorted(set(chosen) - set(marked))
     if wrong:
         raise ValueError(f"requirements.toml, {row}: no test with the marker of the row is named {', '.join(wrong)}")
-    names = [f"`{file}`: {name.replace('_', ' ')}" for file, _, name in (test.partition("::test_") for test in chosen)]
+    names = [f"`{test}`" for test in chosen]
     more = len(set(marked)) - len(chosen)
     return "<br>".join([*names, f"and {more} more"] if more > 0 else names) or "**open**"
 

@@ -28,6 +28,7 @@ class EchoLimits(Settings):
     late_m : float
         Least width of the gate toward long ranges: echoes are late, and separate from 0.3 m on (P2, table 3).
     early_sigmas, late_sigmas : float
+        Width of the gate on both sides.
     """
 
     late_m: float = Field(default=0.6, gt=0)

@@ -61,7 +61,7 @@ class SlipLimits(Settings):
     Attributes
     ----------
     rule : {"map", "p2"}
-        See the module; "p2" has neither latch nor look-back.
+        Reference of the pitch, the line's gradient or P2's limit; "p2" has neither latch nor look-back.
     p2_limit : float
         Sine of the pitch: 35 permille of line (P2 2.1) and 10 permille of body.
     map_limit : float
@@ -87,8 +87,8 @@ class SlipLimits(Settings):
     standing_s : float
         Time without a pulse after which a vehicle at rest stands.
     pitch_s, bias_s : float
-        Time constants with which the pitch by the gyro follows that of the line (or, without a line, that by wheel and
-        accelerometer), and with which the gyro's bias is learnt from their difference.
+        Time constants with which the gyro's pitch follows the line's, and its bias is learnt. Without a line the pitch
+        by wheel and accelerometer takes its place.
     rolling_limit, rolling_s, rolling_mps : float
         Change of the apparent pitch at standstill, its duration, and the speed carried by then, that mean rolling away.
     """

@@ -30,6 +30,7 @@ class TachometerLimits(Settings):
     Attributes
     ----------
     wheel_diameter_m : float
+        As entered on board.
     pulses_per_turn : int
         After multiplication of edges.
     window_s : float

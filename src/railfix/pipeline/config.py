@@ -129,17 +129,19 @@ class Config(ScreenSettings):
     dilution_limit : float
         Largest along-track dilution [m/m] of a position.
     off_map_risk : float
-        A position is off the map where its ranges fit the line worse than the 3-D position by more than noise explains
-        with this probability, the noise judged by the residuals of the 3-D fit.
+        Probability that noise alone makes the ranges fit the line so much worse than the 3-D position that it is off
+        the map; the noise is judged by the residuals of the 3-D fit.
     off_map_s : float [s]
-        The filter along the track gives up its place once every position of this time was off the map, and begins
-        anew once none of this time was. On the recordings, with a right map, no two positions in a row are off it.
+        Time of positions off the map after which the filter gives up its place, and of others after which it begins
+        anew. On the recordings, with a right map, no two positions in a row are off it.
     ionosphere : {"klobuchar", "off"}
+        Model of the delay.
     troposphere : {"saastamoinen", "off"}
+        Model of the delay.
     max_ephemeris_age_s : float or None
         Tighter limit on the age of a record than its own validity.
     map_plan_sigma_m, map_height_sigma_m : float or None
-        In place of the track's own map error (P1 4.1(3): 0.30 m and 0.60 m).
+        In place of the track's own map error, which P1 has as 0.30 m and 0.60 m (4.1(3)).
     noise_scale : NoiseScaleLimits
         Estimation of the receiver's noise from the residuals.
     lasting_errors : LastingErrorLimits
@@ -149,9 +151,8 @@ class Config(ScreenSettings):
     map_offset : MapOffsetLimits
         Test of the map against the 3-D positions of the last minutes.
     sbas : tuple of path, or "stream"
-        Logs of SBAS messages, or "stream" for those that the receivers themselves send (`railfix live`; in
-        `railfix run` those in the receivers' logs): their corrections take the place of the models, and satellites
-        without a valid one are rejected. Empty: no SBAS.
+        Logs of SBAS messages, or "stream" for those that the receivers pass on: their corrections take the place of
+        the models, and satellites without a valid one are rejected. Empty: no SBAS.
     sbas_prn : int or "best"
         GEO whose messages are used; "best" is the one with the most usable fast corrections.
     sbas_limits : SbasLimits
@@ -184,8 +185,8 @@ class Config(ScreenSettings):
     phase_sigma_m : float
         Standard deviation of a phase at the zenith, multipath included.
     filter : {"track", "off"}
-        Whether epochs also go through one filter along the track (codes, Dopplers, changes of the carrier phase and
-        sensors, from this and earlier epochs), into a table of its own. `railfix run` and `railfix demo` ask for it.
+        Whether there is also a table of the filter along the track: codes, Dopplers, changes of the carrier phase and
+        sensors, from this and earlier epochs. `railfix run` and `railfix demo` ask for it.
     filter_sources : tuple of str
         Measurements that the filter uses, where they are there: `code`, `phase` and `doppler` of the satellites, and
         `wheel`, `radar`, `force`, `feature` (of the line, by inertial unit and wheel), `range` of the sensors on board.

@@ -79,8 +79,8 @@ class SensorLimits(Settings):
         Place of the vehicle's ranging unit: ahead of the vehicle's middle (without a vehicle file: of the antenna),
         to the right of the antenna's path and above the antenna.
     return_sigmas, return_s : float
-        After an outage codes count again when three positions in a row lie within so many standard deviations of the
-        place that the sensors carried, or after so long.
+        After an outage codes count again when three positions in a row are within so many sigmas of the carried place,
+        or after so long.
     wheel_sigma_m : float
         Of a way between two epochs beside the pulse: creep of a braked or driven wheel.
     radar_sigma_mps, radar_step_s : float

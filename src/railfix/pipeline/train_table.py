@@ -44,13 +44,8 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("antenna", "`front` or `rear`", lambda _: None, dtype=pl.String()),
         Column(
             "status",
-            "`tracking`; `several_branches`, the most probable place of several; `coasting`, predicted, no "
-            "measurement used; `lost`, measurements contradict the track and places are sought again; `expired`, "
-            "predicted too far; `not_started`; `off_map`, no place, the satellites put the train away from the line; "
-            "`map_offset`, a place on a line that 3-D positions of the last minutes lie beside or above; "
-            "`antennas_disagree`, the places of the two antennas are not as far apart as the antennas, or their "
-            "speeds differ, now or within the last 20 s; `doubtful`, a place that measurements or a sub-filter "
-            "contradict. With levels, `tracking` and `coasting` have a finite one along the line, no other status has",
+            "see `railfix.tracking.TrackStatus`; with levels, `tracking` and `coasting` have a finite one along the "
+            "line, no other status has",
             lambda r: r.tracked.status,
             words=tuple(s.text for s in TrackStatus),
         ),
@@ -107,11 +102,8 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "motion",
-            "by tachometer and inertial unit together: `init` (nothing known), `standing`, `low_speed` (below the "
-            "tachometer's least), `normal` (the wheel rolls), `inertial_spin`, `inertial_slide` (the wheel is faster "
-            "or slower than the train), `rolling` (away, below the tachometer's least), `expired` (carried for too "
-            "long). In `standing`, `low_speed`, `inertial_spin`, `inertial_slide`, `rolling` the way of the wheel is "
-            "not used: inertia carries",
+            "by tachometer and inertial unit together: `init`, `standing`, `low_speed`, `normal`, `inertial_spin`, "
+            "`inertial_slide`, `rolling`, `expired` (see `docs/sensors.md`)",
             lambda r: r.sensed.state,
             words=tuple(state.name.lower() for state in MotionState),
         ),

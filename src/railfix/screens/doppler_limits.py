@@ -53,7 +53,7 @@ class DopplerLimits(Settings):
     Attributes
     ----------
     mode : {"fixed", "receiver", "sigma"}
-        "fixed" is P1's; see the module.
+        Limit as P1 has it, scaled by the receiver's own noise, or by the stated sigmas; see the module.
     step_m : float [m]
         Largest change against the Doppler up to `short_interval_s`; P1 table 6: 1.5.
     short_interval_s : float [s]

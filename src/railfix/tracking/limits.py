@@ -19,8 +19,8 @@ class TrackingLimits(Settings):
         Standard deviation and correlation time of the acceleration along the track (R. A. Singer, 1970). Trains
         brake and accelerate with up to 1.3 m/s2 and hold it for some seconds; cars with more, for shorter.
     service_acceleration_mps2, trusted_satellites : float, int
-        The speed by fewer satellites, without a sensor on board, is not believed where it is beyond this acceleration
-        since the last one that was: one wall, or a station roof, can leave reflections alone, and they then agree with
+        Without a sensor the speed by fewer satellites is not believed beyond this acceleration since the last one that
+        was: one wall, or a station roof, can leave reflections alone, and they then agree with
         each other (`possible_speed`).
     degrees_of_freedom : float
         Of Student's t that measurement errors follow: 4 is the least integer with a finite kurtosis bound of the
@@ -40,9 +40,8 @@ class TrackingLimits(Settings):
         Codes count once in this time where phases or Dopplers of four satellites carry the place on: their errors
         last for a minute, so the epochs between tell nothing new. 0 takes those of every epoch.
     slow_code_m, slow_code_s : float
-        Displacement along the line by errors of orbits and ionosphere, about 1 m a satellite with a dilution of one,
-        and how long it lasts:
-        averaging over epochs does not take it away.
+        Displacement along the line by errors of orbits and ionosphere, and how long it lasts: about 1 m a satellite
+        with a dilution of one; averaging over epochs does not take it away.
     doppler_floor_mps, doppler_zenith_mps : float
         ``sigma^2 = floor^2 + (zenith 10^((45 - C/N0) / 20))^2`` of a Doppler.
     doppler_error_mps, doppler_error_share, doppler_correlation_s : float
@@ -66,8 +65,8 @@ class TrackingLimits(Settings):
     map_scale_m : float
         Error of a length along the map [m per square root of m]; a larger one is learnt where the codes show it.
     map_misfit_sigmas, map_misfit_s, map_misfit_kept_s : float
-        The codes show it where their innovations, averaged over `map_misfit_s`, ask for another place by more than so
-        many standard deviations of that mean; what was learnt is forgotten within `map_misfit_kept_s`.
+        The codes show it where the mean of their innovations over `map_misfit_s` exceeds so many of its sigmas; what
+        was learnt is forgotten within `map_misfit_kept_s`.
     map_absolute_m : float
         Length over which the absolute error of the map changes (sigmas are those of the trajectory).
     map_branch_m : float
@@ -92,8 +91,8 @@ class TrackingLimits(Settings):
     gap_s : float
         Time without measurements after which places are sought again beside the predicted one.
     lost_motion_weight, lost_motion_s, lost_code_weight, lost_code_s : float
-        The track is lost when the mean weight of Dopplers and phases, or of codes, has been below these for so long
-        (1 is the weight of an error of one standard deviation); epochs above them count down.
+        The track is lost when the mean weight of Dopplers and phases, or of codes, was below these for so long; 1 is
+        the weight of an error of one standard deviation. Epochs above them count down.
     bend_m : float
         Where motion contradicts the track at an epoch, places so far before and behind (and twice as far) are tried.
     level : {"on", "off"}
@@ -115,14 +114,13 @@ class TrackingLimits(Settings):
         Probability that a sensor on board is faulty at such a sample. An assumption.
     level_motion_prior : float
         Probability that all Dopplers, or all phases, are wrong together at such a sample. An assumption.
-    level_map_prior, level_map_m : float, float [m]
-        Probability that the map is wrong by more than its standard deviation there, and by how much it may be, across
-        and up. An assumption.
+    level_map_prior, level_map_m : float, float
+        Probability that the map is wrong by more than its sigma there, and by how much, across and up. An assumption.
     level_passes : int
         Rounds of reweighting of the sub-filters.
     level_doubt_s, level_doubt_code_s : float
-        A filter that its own Dopplers and phases, or its codes, contradict (mean weights as of a lost track) for longer
-        bounds nothing. A contradiction of single epochs is noise, which the weights have in the standard deviation.
+        A filter that its own Dopplers and phases, or its codes, contradict for longer bounds nothing; mean weights are
+        those of a lost track. A contradiction of single epochs is noise, which is in the standard deviation.
     level_start_s : float
         After a start no level before one place has a probability of 0.99, for at most so long; none for so long after
         the track was lost.

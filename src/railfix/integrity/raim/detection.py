@@ -36,8 +36,8 @@ class RaimLimits(Settings):
     missed_detection : float
         Probability that a fault of the minimal detectable size stays undetected. P4 gives no value.
     fixed_limit_m2 : float
-        P1 table 6 ("FDE 2 SAT, 100 m2"), on the sum of squared residuals and on the square of an
-        excluded satellite's own error (fixed mode).
+        Mode "fixed": limit on the sum of squared residuals and on the square of an excluded satellite's own error; P1
+        table 6 ("FDE 2 SAT, 100 m2").
     max_excluded : int
         Satellites excluded at an epoch at most: 0, 1 or 2 (P1 2.3(4): 2).
     min_redundancy : int

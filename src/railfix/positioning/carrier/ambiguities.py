@@ -52,10 +52,9 @@ class PhaseLimits(Settings):
         ambiguities is multiplied by correlation / interval, up to that of codes alone. The
         positions do not change. 0 for white noise, such as simulated noise.
     passes : int
-        `phase_positions`: linearisations, each with its own state, so that results do not
-        depend on chunks.
+        Linearisations of `phase_positions`, each with its own state, so that results do not depend on chunks.
     forget_s : float
-        `phase_positions`: an arc not observed for this long starts again.
+        An arc that `phase_positions` has not observed for this long starts again.
     largest_sigma_m : float
         Epochs whose noise along the line is larger have no position.
     """

@@ -71,7 +71,8 @@ class SlipLimits(Settings):
     max_gap_s : float
         Longest interval that is bridged: that of a station's log of 30 s.
     doppler_m, doppler_mps : float
-        On real receivers at 1 Hz the median of the metric is 0.01 to 0.04 m.
+        Limit of the phase against its Doppler, constant and by the interval. On real receivers at 1 Hz the median of
+        the metric is 0.01 to 0.04 m.
     jerk_mps3 : float
         Of the antenna; passenger trains stay below 0.5.
     code_m : float

@@ -154,19 +154,16 @@ class SbasLimits(Settings):
         Time-outs: those of precision approach (shorter, the default), or of en route to non-precision
         approach.
     type0 : {"stop", "as_type2"}
-        A message of type 0 discards all data of its sender and stops its use for 60 s (default), or, as
-        systems under test send it, holds fast corrections of type 2 unless it is empty.
+        Type 0 stops the use of its sender for 60 s, or holds fast corrections unless it is empty (systems under test).
     range_rate : {"mops", "off"}
-        Fast corrections change with the rate of the last two of them (default; DO-229D, A.4.4.3), or
-        stay as sent.
+        Fast corrections change with the rate of the last two of them (DO-229D, A.4.4.3), or stay as sent.
     incomplete : {"reject", "inflate"}
-        A satellite whose degradation data (types 7, 10, and 28 where it is sent) are missing gets no
-        sigma and is rejected (default: precision approach), or has sigma UDRE plus 8 m (DO-229D, J.2.2),
-        and the shortest time-out of fast corrections.
+        Without degradation data (types 7, 10, and 28 where sent) a satellite is rejected, or has sigma UDRE plus 8 m
+        (DO-229D, J.2.2) and the shortest time-out of fast corrections.
     max_udrei : int or None
         Largest UDREI used; None is 11 for precision approach and 13 en route.
     message_s : float
-        From the first bit of a message, to which its corrections refer, to its reception [s].
+        [s] From the first bit of a message, to which its corrections refer, to its reception.
     """
 
     mode: Literal["precision", "en_route"] = "precision"
