@@ -31,6 +31,7 @@ def test_p1_is_table_6_of_the_paper() -> None:
     assert (config.cn0.floor_dbhz, config.cn0.deficit_dbhz) == (30.0, 10.0)
     assert (config.doppler.mode, config.doppler.step_m, config.doppler.hold_s) == ("fixed", 1.5, 0.0)
     assert config.antenna_pair.limit_m == config.antenna_spacing.limit_m == 5.0
+    assert config.antenna_pair.clocks == "common"
     assert (config.raim.mode, config.raim.fixed_limit_m2, config.raim.max_excluded) == ("fixed", 100.0, 2)
     assert (config.min_satellites, config.failed_checks) == (3, "drop")
     assert config.screens == SCREEN_NAMES

@@ -51,9 +51,7 @@ def test_bridged_places_of_recordings(
 
 
 @pytest.mark.slow
-def test_the_kept_table_is_what_the_script_prints(
-    recordings: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_kept_table_is_what_the_script_prints(recordings: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert recordings.is_dir()
     assert reference_gaps.main() == 0
     printed = [line.rstrip() for line in capsys.readouterr().out.splitlines()]

@@ -204,6 +204,21 @@ def test_truth_table(front_m: float, rear_m: float, refused: bool, clocks: str) 
 
 
 @pytest.mark.requirement("B3")
+def test_one_clock_shows_an_error_common_to_all_satellites_of_one_antenna() -> None:
+    """P1 2.3(3): an estimated clock takes the common error for its own; separate clocks are not judged as one."""
+    front, rear, told = two_antennas()
+    rear = rear + 7.0
+    for clocks, rejected in (("common", True), ("median", False)):
+        result = paired(front, rear, told, limits=AntennaPairLimits(clocks=clocks))
+        np.testing.assert_array_equal(result.reject[:, :4], rejected)
+    rear = rear + 93.1
+    result = paired(front, rear, told, limits=AntennaPairLimits(clocks="common"))
+    assert np.isnan(result.metric).all()
+    assert np.isnan(result.clock_m).all()
+    assert not result.reject.any()
+
+
+@pytest.mark.requirement("B3")
 def test_exactly_at_the_limit_is_used() -> None:
     front = np.full((1, 5), 2.0**24)
     rear = front + np.array([5.0, 5.0 + 2.0**-20, -5.0, 0.0, 0.0])

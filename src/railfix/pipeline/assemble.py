@@ -63,6 +63,7 @@ def antenna_results(
         height_m=height,
         n_used=np.count_nonzero(corrected.reason == 0, axis=1),
         n_rejected=satellites_rejected(corrected.channels.member, reason),
+        conventional_status=solution.point_status,
         conventional_ecef_m=point.ecef_m,
         conventional_arc_m=nearest,
         conventional_chainage_m=beside,

@@ -71,7 +71,7 @@ PRESETS: Final[Mapping[str, Mapping[str, Any]]] = {
         "elevation": {"mask_deg": 20.0},
         "cn0": {"floor_dbhz": 30.0, "deficit_dbhz": 10.0},
         "doppler": {"mode": "fixed", "step_m": 1.5, "hold_s": 0.0, "verdict": "reject"},
-        "antenna_pair": {"limit_m": 5.0, "verdict": "reject"},
+        "antenna_pair": {"limit_m": 5.0, "clocks": "common", "verdict": "reject"},
         "raim": {"mode": "fixed", "fixed_limit_m2": 100.0, "max_excluded": 2},
         "antenna_spacing": {"limit_m": 5.0},
     },
@@ -102,9 +102,9 @@ class Config(ScreenSettings):
     ----------
     preset : {"default", "strict", "p1"}
         Base preset; other settings override it. "p1" is table 6 of P1: elevation mask 20 deg, C/N0 floor 30 dB-Hz
-        and 10 dB-Hz below the curve, Doppler 1.5 m (no hold), antenna pair 5 m, RAIM with two satellites and
-        100 m^2, antenna spacing 5 m, failed checks dropped. What P1 does not specify (weights, noise, clock
-        offsets, ambiguous sections, receivers' clocks) is as in "default".
+        and 10 dB-Hz below the curve, Doppler 1.5 m (no hold), antenna pair 5 m with one clock for both receivers
+        (P1 2.3(3)), RAIM with two satellites and 100 m^2, antenna spacing 5 m, failed checks dropped. What P1 does
+        not specify (weights, noise, inter-system biases, ambiguous sections) is as in "default".
     systems : tuple of str
         Constellations used. GLONASS is left out by default: its channels have code biases of
         metres between them.

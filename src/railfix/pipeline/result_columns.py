@@ -16,6 +16,7 @@ from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
 from railfix.pipeline.along_track import innovations
 from railfix.pipeline.columns import Column, by_name
+from railfix.pipeline.conventional import PointStatus
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.level_stage import BASES, KINDS
 from railfix.pipeline.results import AntennaResult
@@ -179,6 +180,13 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             words=tuple(s.name.lower() for s in LevelStatus),
         ),
         *(_position_column(c) for screen in SCREENS for c in screen.columns if c.table == "positions"),
+        Column(
+            "conventional_status",
+            "checks of the 3-D single point: `valid`, `no_position`, `residuals` beyond noise (chi-square test), "
+            "`dilution` over its limit; its columns are kept as they are",
+            lambda r: r.conventional_status,
+            words=tuple(s.name.lower() for s in PointStatus),
+        ),
         Column(
             "conventional_chainage_m",
             "3-D single point, moved to the nearest point of the trajectory",

@@ -174,6 +174,8 @@ class AntennaResult(NotebookTable):
     latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
     n_used, n_rejected : ndarray of int, shape (T,)
         Satellites used; satellites with a code that were not used.
+    conventional_status : ndarray of int8, shape (T,)
+        `railfix.pipeline.conventional.PointStatus` of the conventional position, which is kept as it is.
     conventional_ecef_m : ndarray, shape (T, 3) [m]
         3-D single point from the same ranges.
     conventional_arc_m, conventional_chainage_m, conventional_offset_m : ndarray, shape (T,) [m]
@@ -225,6 +227,7 @@ class AntennaResult(NotebookTable):
     height_m: Floats
     n_used: Integers
     n_rejected: Integers
+    conventional_status: Codes
     conventional_ecef_m: Floats
     conventional_arc_m: Floats
     conventional_chainage_m: Floats

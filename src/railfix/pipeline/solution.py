@@ -15,6 +15,7 @@ from railfix.core.reasons import Reason, Status
 from railfix.integrity.raim import LinearModel
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
+from railfix.pipeline.conventional import validate_point
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
 from railfix.pipeline.lasting_errors import lasting_errors
@@ -50,6 +51,8 @@ class Solution:
     ----------
     point : SinglePoint
         Conventional position: every constellation with a clock of its own.
+    point_status : ndarray of int8, shape (T,)
+        `railfix.pipeline.conventional.PointStatus`.
     place : Place
         Positions from the codes, after exclusions.
     ties : ClockTies
@@ -68,6 +71,7 @@ class Solution:
     """
 
     point: SinglePoint
+    point_status: Codes
     place: Place
     ties: ClockTies
     raim: RaimResult
@@ -106,7 +110,7 @@ def solve(
         time, corrected.clocks, reference, agreeing, free, offset_states,
         parts=antennas.parts, limits=config.clock_offsets,
     )  # fmt: skip
-    tied = point
+    tied, untied = point, ranges
     if len(corrected.groups) > 1:
         ranges = replace(ranges, ties=ties)
         tied = _tied(ranges, ties, point, corrected.anchor_ecef_m, config)
@@ -177,6 +181,7 @@ def solve(
         off_map = _off_map(ranges, antennas, place, arc, config)
     solution = Solution(
         point=point,
+        point_status=validate_point(point, untied, scale, limits=config.single_point),
         place=place,
         ties=ties,
         raim=raim,

@@ -18,17 +18,23 @@ from railfix.positioning.normal_equations import Ranges
 
 
 class SinglePointLimits(Settings):
-    """Convergence limits of the iteration.
+    """Limits of the iteration, and of the validation of its position (`conventional_status`).
 
     Attributes
     ----------
     tolerance_m : float
         The last step: one of 1 m leaves 0.01 mm (`after_step`).
     max_iterations : int
+    false_alarm : float
+        Probability that noise alone fails the chi-square test of the residuals.
+    dilution_limit : float
+        Largest position dilution of precision; 30, as RTKLIB has for the geometric one.
     """
 
     tolerance_m: float = Field(default=1.0, gt=0)
     max_iterations: int = Field(default=12, ge=1)
+    false_alarm: float = Field(default=1e-3, gt=0, lt=0.5)
+    dilution_limit: float = Field(default=30.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)

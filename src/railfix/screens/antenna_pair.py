@@ -5,7 +5,8 @@ spacing that points to it: ``L (cos el cos(az - heading) cos gradient + sin el s
 difference that does not fit has multipath in one of the two, which one is unknown.
 
 Clocks. P1 runs both receivers on one frequency standard, with one-pulse-per-second: then the
-difference has no clock in it. Otherwise the clock difference is the median over the satellites of a
+difference has no clock in it. Receivers whose ranges differ by `SEPARATE_CLOCKS_M` in the median share none: then
+nothing is judged, as P1 6 had the screen off. Otherwise the clock difference is the median over the satellites of a
 constellation, and an error of that median is common to them all. A clock difference also means that
 the two receivers measured at different instants, and so does a difference of the time tags: with range
 rates given, the satellites' motion in between is removed (1 ms is up to 0.8 m).
@@ -42,7 +43,7 @@ from railfix.screens.base import (
     ScreenPicture,
     Verdict,
 )
-from railfix.screens.medians import clock_medians
+from railfix.screens.medians import clock_medians, row_median
 from railfix.screens.pairs import on_pairs, pair_channels
 
 #: Treatments of the receiver clocks, as named in the output.
@@ -50,6 +51,8 @@ CLOCKS: Final = {
     "common": "the receivers' clocks are common by hardware",
     "median": "the difference of the receivers' clocks is estimated by the median of each constellation",
 }
+#: Median difference over all satellites [m] that no multipath makes: the receivers' clocks are separate.
+SEPARATE_CLOCKS_M: Final = 100.0
 
 
 class AntennaPairLimits(Settings):
@@ -62,7 +65,7 @@ class AntennaPairLimits(Settings):
     elevation_error_deg, azimuth_error_deg : float [deg]
         By which the satellite's direction from the car body may be wrong; P1 2.3(3): 3 and 3.5.
     clocks : {"common", "median"}
-        Receiver clocks: common by hardware, or their difference estimated by the median of each constellation.
+        See `CLOCKS`; "common" needs one external clock for both receivers (P1 2.3(3), table 5).
     least_satellites : int
         "median": satellites of a constellation that both antennas need.
     tag_tolerance_s : float [s]
@@ -92,7 +95,7 @@ class AntennaPairScreened(Screened):
     ambiguity_m : ndarray, shape (P, C) [m]
         What the errors of the angles explain; within it nothing is rejected, whatever the limit.
     clock_m : ndarray, shape (P, C) [m]
-        Clock of the rear receiver less that of the front one, as taken out; 0 where common.
+        Clock of the rear receiver less that of the front one, as taken out; 0 where common, NaN where it should be.
     clocks : str
         How the clocks were treated, in words.
     """
@@ -230,8 +233,8 @@ def antenna_pair_screen(
     Returns
     -------
     AntennaPairScreened
-        NaN metric, and no rejection, where a pseudorange is missing at either antenna, and, with
-        clocks "median", where fewer than `least_satellites` of the clock are there.
+        NaN metric, and no rejection, where a pseudorange is missing at either antenna; with clocks "median" where
+        fewer than `least_satellites` of the clock are there, with "common" where the clocks are separate.
     """
     limits = limits or AntennaPairLimits()
     front, rear = np.asarray(code_front_m, dtype=np.float64), np.asarray(code_rear_m, dtype=np.float64)
@@ -241,10 +244,12 @@ def antenna_pair_screen(
     rate = np.zeros(front.shape) if range_rate_mps is None else np.nan_to_num(np.asarray(range_rate_mps))
     later = np.zeros(len(front)) if tag_difference is None else seconds(tag_difference)
     raw = rear - front - expected - rate * later[:, None]
-    clock = np.zeros(raw.shape)
     if limits.clocks == "median":
         clock = _clock_difference(raw, rate, satellite, least=limits.least_satellites)
         raw = raw + rate * clock / SPEED_OF_LIGHT
+    else:
+        separate = np.abs(row_median(raw)) > SEPARATE_CLOCKS_M
+        clock = np.broadcast_to(np.where(separate, np.nan, 0.0), raw.shape)
     metric = raw - clock
     relative = np.asarray(azimuth_deg) - np.asarray(heading_deg, dtype=np.float64)[..., None]
     zone = ambiguity_m(
@@ -275,6 +280,10 @@ class AntennaPairScreen(PairScreen[AntennaPairLimits]):
 
     name = "antenna_pair"
     limits = AntennaPairLimits()
+    needs = (
+        f"{PairScreen.needs}, and one clock for both receivers where `antenna_pair.clocks` is `common`, as in the "
+        "preset `p1` (set it to `median` for separate clocks)"
+    )
     columns = (
         ScreenColumn(
             name="metric_antenna_pair_m",
