@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -21,20 +22,22 @@ from railfix.simulate.demonstration import demo_inputs, demo_truth
 FOLDER: Final = paths.ROOT / "docs" / "pictures"
 _SERIES: Final = (
     ("conventional_error_m", "conventional, unscreened", "#b0b0b0", 2.0),
-    ("error_m", "on the map, passed every check", "#0072b2", 1.2),
+    ("error_m", "filter along the track", "#0072b2", 1.2),
 )
 
 
-def demonstration(folder: Path) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Positions of the front antenna, and its errors beside those of unscreened conventional positions."""
+def demonstration(folder: Path) -> tuple[pl.DataFrame, dict[str, pl.DataFrame]]:
+    """Positions of the front antenna by the filter; their errors, and those of unscreened conventional positions."""
     inputs = demo_inputs()
     run_files(inputs, Config(), out=folder / "run")
-    unscreened = Config(screens=("elevation",), protection="off")
+    unscreened = Config(filter="off", screens=("elevation",), protection="off")
     run_files(inputs, unscreened, out=folder / "unscreened", options=RunOptions())
-    compared = RunAndReference(run=folder / "run", reference=demo_truth(), conventional=folder / "unscreened")
-    errors = evaluate_runs([compared]).epochs.filter(pl.col("antenna") == "front")
-    positions = pl.read_parquet(folder / "run" / "positions.parquet").filter(pl.col("antenna") == "front")
-    return positions, errors
+    single = RunAndReference(run=folder / "run", reference=demo_truth(), conventional=folder / "unscreened")
+    errors = {
+        column: evaluate_runs([compared]).epochs.filter(pl.col("antenna") == "front")
+        for column, compared in (("conventional_error_m", single), ("error_m", replace(single, table="train")))
+    }
+    return pl.read_parquet(folder / "run" / "train.parquet").filter(pl.col("antenna") == "front"), errors
 
 
 def draw_plan(positions: pl.DataFrame) -> Figure:
@@ -46,14 +49,12 @@ def draw_plan(positions: pl.DataFrame) -> Figure:
     return figure
 
 
-def draw_errors(errors: pl.DataFrame) -> Figure:
+def draw_errors(errors: dict[str, pl.DataFrame]) -> Figure:
     """Errors along the line over chainage, beside those of the conventional positions."""
     figure = Figure(figsize=(8.0, 3.4), layout="constrained")
     axes: Axes = figure.subplots()
-    passed = errors.filter(pl.col("status") == "ok")
     for column, label, colour, size in _SERIES:
-        table = errors if column.startswith("conventional") else passed
-        axes.plot(table["chainage_m"], table[column], ".", ms=size, color=colour, label=label)
+        axes.plot(errors[column]["chainage_m"], errors[column][column], ".", ms=size, color=colour, label=label)
     axes.set(xlabel="chainage [m]", ylabel="error along the line [m]")
     axes.set_yscale("symlog", linthresh=5.0)
     axes.set_yticks([-20, -10, -5, 0, 5, 10, 20, 40], ["-20", "-10", "-5", "0", "5", "10", "20", "40"])

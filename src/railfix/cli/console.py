@@ -176,11 +176,10 @@ def show_summary(summary: RunSummary) -> None:
     names = list(summary.tally.antennas)
     show_verdict(console, verdict_of_run(summary))
     if summary.tracks:
-        console.print("Each epoch by itself (positions.csv)")
-    console.print(_positions(summary, names))
-    if summary.tracks:
         console.print("Filter along the track (train.csv)")
         console.print(_filtered(summary.tracks))
+        console.print("Each epoch by itself (positions.csv)")
+    console.print(_positions(summary, names))
     console.print("Rejected pseudoranges by their first reason, and by that reason alone")
     console.print(_reasons(summary, names))
     show_notes(console, summary.notes)

@@ -293,7 +293,7 @@ class Result(NotebookTable):
 
     def __repr__(self) -> str:
         parts = (
-            f"{name} {self.fusion[name].status_text()}, {result.status_text()}"
+            f"{name} {self.fusion[name].status_text()} (single epochs: {result.status_text()})"
             if name in self.fusion
             else f"{name} {result.status_text()}"
             for name, result in self.antennas.items()

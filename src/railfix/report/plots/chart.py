@@ -22,8 +22,8 @@ BLUE, RED, GREEN, PURPLE, BLACK, GREY = "#0072b2", "#d55e00", "#00805e", "#a3487
 CONSTRAINED: Final = BLUE
 FILTERED: Final = GREEN
 CONVENTIONAL: Final = RED
-#: Ordered classes, from small (dark blue) to large (dark red).
-ORDERED: Final = ("#0b559f", "#3d8ec4", "#8a8a8a", "#e0762f", "#b30000")
+#: Ordered classes, from small (dark blue) to large (dark red), none grey as the line is.
+ORDERED: Final = ("#0b559f", "#3d8ec4", "#a88400", "#e0762f", "#b30000")
 #: Classes without an order.
 CYCLE: Final = (BLUE, RED, GREEN, PURPLE, BLACK, "#8c6d00", "#56b4e9", GREY)
 

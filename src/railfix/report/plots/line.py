@@ -85,7 +85,8 @@ def plan(
     kept = np.flatnonzero(near)[one_per_cell(there[near, 0], there[near, 1], cell=cell)]
     layers: list[Layer] = [*_background(background, frame, low - margin, high + margin)]
     layers += _line(track, frame, floats(positions, "chainage_m")[has], here[has], tunnels_m)
-    layers.append(Points(label="conventional", colour=GREY, shape="cross", x=there[kept, 0], y=there[kept, 1]))
+    if len(kept):
+        layers.append(Points(label="conventional", colour=GREY, shape="cross", x=there[kept, 0], y=there[kept, 1]))
     shown, total = len(kept), int(np.isfinite(there[:, 0]).sum())
     epoch = since(positions, start_of(positions))
     classes, coloured = _classes(positions, error_m, level_m)
