@@ -20,7 +20,7 @@ from railfix.report.tables import figures_of
 
 @dataclass(frozen=True, kw_only=True)
 class KeyFigure:
-    """A figure with its name, that of the filter along the track, and the conventional one or a remark."""
+    """A figure of single epochs with its name, that of the filter, and the conventional one or a remark."""
 
     name: str
     value: str
@@ -96,18 +96,19 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compare
         np.percentile(size, [50.0, 95.0]) for size in (compared.on_map_m, compared.conventional_m)
     )
     worst, other_worst = float(compared.on_map_m.max()), float(compared.conventional_m.max())
+    filtered = _filtered(run, antenna)
+    whose = "an epoch by itself" if filtered else "the train"
     verdict = (
-        f"At {share(compared.rate, 1)} of the epochs with satellite signals the train has a position on its line that "
+        f"At {share(compared.rate, 1)} of the epochs with satellite signals {whose} has a position on the line that "
         f"passed every check; 95 % of these are within {number(float(wide), 1)} m of the true place along the line, "
         f"and the worst is {number(worst, 1)} m off (conventional: {number(float(other_wide), 1)} m and "
         f"{number(other_worst, 1)} m)."
     )
-    filtered = _filtered(run, antenna)
     if filtered:
-        verdict += (
-            f" The filter along the track, which joins the epochs, has a position at {share(filtered['rate'], 1)} of "
-            f"all epochs, those without satellites included: 95 % within {number(filtered['p95'], 1)} m, the worst "
-            f"{number(filtered['max'], 1)} m off."
+        verdict = (
+            f"The train has a position at {share(filtered['rate'], 1)} of all epochs, those without satellites "
+            f"included, by the filter along the track: 95 % are within {number(filtered['p95'], 1)} m of the true "
+            f"place along the line, and the worst is {number(filtered['max'], 1)} m off. {verdict}"
         )
     lengths = (
         ("median error", "p50", middle, other_middle),
@@ -204,10 +205,11 @@ def _longest_outage(run: ReportedRun, antenna: str, evaluation: Evaluation) -> I
 
 def _alike(run: ReportedRun, compared: _Compared, filtered: Mapping[str, float]) -> str:
     ranges = "unscreened ranges, as in P1" if run.conventional is not None else "the same screened ranges"
+    large = "Large: the filter along the track, at all epochs. Single epochs" if filtered else "Large"
     return (
-        "Errors along the line. Large: positions on the map, each epoch by itself, that passed every check."
-        f"{' Filtered: the filter along the track, at all epochs.' if filtered else ''} Conventional: 3-D single point "
-        f"from {ranges}, moved to the nearest point of the line, at the same {len(compared.on_map_m):,} epochs."
+        f"Errors along the line. {large}: positions on the map, each epoch by itself, that passed every check. "
+        f"Conventional: 3-D single point from {ranges}, moved to the nearest point of the line, at the same "
+        f"{len(compared.on_map_m):,} epochs."
     )
 
 
@@ -251,11 +253,18 @@ def _without_errors(run: ReportedRun, antenna: str) -> Headline:
     train = run.train_of(antenna)
     tracked = np.empty(0) if train is None else floats(train, "along_sigma_m")
     placed = tracked[np.isfinite(tracked)]
+    shown, of_what = (rate, "of the epochs with satellite signals") if not len(tracked) else (
+        len(placed) / len(tracked), "of all epochs, those without satellites included,"
+    )  # fmt: skip
+    stated = float(np.percentile(placed, 95.0)) if len(placed) else float(wide)
+    verdict = "No epoch has a position on the line."
+    if np.isfinite(stated):
+        verdict = (
+            f"At {share(shown, 1)} {of_what} the train has a position on its line; railfix states a standard deviation "
+            f"of at most {number(stated, 1)} m for 95 % of these."
+        )
     return Headline(
-        verdict=(
-            f"At {share(rate, 1)} of the epochs with satellite signals the train has a position on its line; railfix "
-            f"states a standard deviation of at most {number(float(wide), 1)} m for 95 % of these."
-        ),
+        verdict=verdict,
         figures=(
             KeyFigure(
                 name="epochs with a position",
