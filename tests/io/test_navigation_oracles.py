@@ -90,7 +90,7 @@ def test_kepler_records_against_rtklib(read: tuple[Path, Navigation]) -> None:
     for i in range(nav.n):
         eph = nav.eph[i]
         name = _name(rtk, eph.sat)
-        source = eph.code if name[0] == "E" else 0
+        source = eph.code if name[0] in "EGJ" else 0
         theirs[name, _nanoseconds(eph.toc), eph.M0, eph.f0, eph.tgd[0], source] = eph
     kepler = navigation.kepler
     keys = _kepler_keys(kepler)

@@ -45,7 +45,7 @@ def test_every_field_of_a_gps_record_stands_where_it_belongs(tmp_path: Path) -> 
     assert kepler.toe[0] == after(-16)
     assert kepler.transmitted[0] == after(-3600)
     assert kepler.fit_interval_h[0] == 4.0
-    assert kepler.data_source[0] == 0
+    assert kepler.data_source[0] == 1  # codes on L2
 
 
 def test_galileo_and_beidou_have_their_own_last_lines(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import warnings
 from decimal import Decimal
+from dataclasses import replace
 from pathlib import Path
 
 import georinex
@@ -258,7 +259,9 @@ def navigation() -> Navigation:
         frequency_channel=np.array([1, -4, 6]),
         age_days=np.array([0.0, 1.0, 0.0]),
     )
-    return Navigation(kepler=made.kepler, glonass=glonass, klobuchar=made.klobuchar, leap_seconds=made.leap_seconds)
+    codes = np.where(np.isin(made.kepler.satellite.astype("<U1"), ["G", "J"]), 2, made.kepler.data_source)
+    kepler = replace(made.kepler, data_source=codes)
+    return Navigation(kepler=kepler, glonass=glonass, klobuchar=made.klobuchar, leap_seconds=made.leap_seconds)
 
 
 @pytest.mark.requirement("A7")

@@ -77,7 +77,7 @@ class KeplerRecords(_Records):
     iode, iodc : ndarray of int, shape (n,)
         Issue of data (IODnav of Galileo in both; AODE and AODC of BeiDou).
     data_source : ndarray of int, shape (n,)
-        Galileo data-source bits; 0 elsewhere.
+        Data sources of Galileo, codes on L2 of GPS and QZSS; 0 for BeiDou.
     group_delay_1_s, group_delay_2_s : ndarray, shape (n,) [s]
         GPS/QZSS TGD and NaN; Galileo BGD E5a/E1 and BGD E5b/E1; BeiDou TGD1 and TGD2.
     fit_interval_h : ndarray, shape (n,) [h]

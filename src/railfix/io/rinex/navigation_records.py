@@ -133,7 +133,7 @@ def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
         iode=integers["iode"],
         iodc=_integers(iodc),
         health=integers["health"],
-        data_source=np.where(system == "E", integers["data_source"], 0),
+        data_source=np.where(beidou, 0, integers["data_source"]),
         accuracy_m=column["accuracy_m"],
         group_delay_1_s=column["group_delay_1_s"],
         group_delay_2_s=np.where(gps_like, np.nan, column["group_delay_2_s"]),

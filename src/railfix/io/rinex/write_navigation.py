@@ -184,7 +184,7 @@ def _kepler_fields(records: KeplerRecords) -> tuple[Datetimes, list[Floats]]:
         records.cuc, records.eccentricity, records.cus, records.sqrt_a,
         records.toe_sow_s, records.cic, records.omega0, records.cis,
         records.i0, records.crc, records.omega, records.omega_dot,
-        records.i_dot, np.where(galileo, records.data_source, zero), week, np.where(navstar, zero, blank),
+        records.i_dot, records.data_source, week, np.where(navstar, zero, blank),
         records.accuracy_m, records.health, first, np.where(navstar, records.iodc, second),
         sent, np.where(navstar, fit, np.where(beidou, records.iodc, blank)),
     )  # fmt: skip
