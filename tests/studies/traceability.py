@@ -71,7 +71,7 @@ def _cell(row: str, marked: list[str]) -> str:
         raise ValueError(f"requirements.toml, {row}: no test with the marker of the row is named {', '.join(wrong)}")
     names = [f"`{test}`" for test in chosen]
     more = len(set(marked)) - len(chosen)
-    return "<br>".join([*names, f"and {more} more"] if more > 0 else names) or "**open**"
+    return "<br>".join([*names, f"+{more}"] if more > 0 else names) or "**open**"
 
 
 def table() -> str:
@@ -83,7 +83,7 @@ def table() -> str:
     lines = [
         "# Traceability",
         "",
-        "What is asked, where a command prints what is reached, and the three tests that prove most. Written by",
+        "What is asked, where a command prints what is reached, and the three tests that prove most (+ how many more). Written by",
         "`python tests/studies/traceability.py` from `tests/references/requirements.toml` and the markers",
         '`@pytest.mark.requirement("A7")` of the tests; a row without a test is open.',
     ]
