@@ -83,8 +83,8 @@ def table() -> str:
     lines = [
         "# Traceability",
         "",
-        "What is asked, where a command prints what is reached, and the three tests that prove most (+ how many more). Written by",
-        "`python tests/studies/traceability.py` from `tests/references/requirements.toml` and the markers",
+        "What is asked, where a command prints what is reached, and the three tests that prove most (+ how many more).",
+        "Written by `python tests/studies/traceability.py` from `tests/references/requirements.toml` and the markers",
         '`@pytest.mark.requirement("A7")` of the tests; a row without a test is open.',
     ]
     heading = ""
