@@ -119,10 +119,10 @@ def _bounds(field: FieldInfo) -> str:
         return f"or {', '.join(f'`{word}`' for word in words if word != field.default)}"
     limits = {sign: getattr(item, sign) for item in field.metadata for sign in SIGNS if hasattr(item, sign)}
     if limits in ({"gt": 0}, {}):
-        return "any" if not limits and field.annotation in (float, int) else ""
+        return "(any)" if not limits and field.annotation in (float, int) else ""
     if len(limits) == 1:
         ((sign, limit),) = limits.items()
-        return f"{SIGNS[sign]}{limit:g}"
+        return f"({SIGNS[sign]}{limit:g})"
     opening = f"({limits['gt']:g}" if "gt" in limits else f"[{limits['ge']:g}"
     return opening + (f", {limits['lt']:g})" if "lt" in limits else f", {limits['le']:g}]")
 
@@ -139,12 +139,7 @@ def _setting_cells(prefix: str, group: Settings) -> Iterator[tuple[str, str, str
         sentence = re.split(r"(?<=[a-z)`])[.;:] ", text)[0].rstrip(".").replace("``", "`")
         default = f"`{value}`" if value not in (None, "", ()) else "none"
         known = name.rsplit("_", 1)[-1] in UNITS
-        yield prefix, name, _joined(default, "" if known or not unit else unit, _bounds(field)), sentence
-
-
-def _joined(default: str, unit: str, bounds: str) -> str:
-    value = f"{default} {unit}".rstrip()
-    return f"{value} {bounds}" if bounds.startswith("or ") else ", ".join(filter(None, (value, bounds)))
+        yield prefix, name, " ".join(filter(None, (default, "" if known else unit, _bounds(field)))), sentence
 
 
 def settings_page(title: str, text: str, settings: Iterable[tuple[str, str, str, str]]) -> str:

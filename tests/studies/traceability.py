@@ -63,15 +63,15 @@ def proofs() -> dict[str, list[str]]:
     return found
 
 
-def _cell(row: str, marked: list[str]) -> str:
-    """The tests that prove most, and how many more name the row; or that there are none."""
+def _tests(row: str, marked: list[str]) -> list[str]:
+    """Lines with the tests that prove most, and how many more name the row; or that there are none."""
     chosen: list[str] = ROWS[row]["tests"]
     wrong = sorted(set(chosen) - set(marked))
     if wrong:
         raise ValueError(f"requirements.toml, {row}: no test with the marker of the row is named {', '.join(wrong)}")
-    names = [f"`{test}`" for test in chosen]
     more = len(set(marked)) - len(chosen)
-    return "<br>".join([*names, f"and {more} more"] if more > 0 else names) or "**open**"
+    names = [*(f"`{test}`" for test in chosen), *([f"+{more}"] if more > 0 else [])] or ["**open**"]
+    return [f"  {name}" for name in names]
 
 
 def table() -> str:
@@ -83,18 +83,17 @@ def table() -> str:
     lines = [
         "# Traceability",
         "",
-        "What is asked, where a command prints what is reached, and the three tests that prove most. Written by",
-        "`python tests/studies/traceability.py` from `tests/references/requirements.toml` and the markers",
+        "What is asked, where a command prints what is reached, and the three tests that prove most (+ further ones).",
+        "Written by `python tests/studies/traceability.py` from `tests/references/requirements.toml` and the markers",
         '`@pytest.mark.requirement("A7")` of the tests; a row without a test is open.',
     ]
     heading = ""
     for row, told in ROWS.items():
         if told["heading"] != heading:
             heading = told["heading"]
-            lines += ["", f"## {heading}", "", "| row | requirement | figure asked | reached | tests |"]
-            lines += ["|---|---|---|---|---|"]
-        cells = (row, told["asks"], told.get("figure", ""), told.get("reached", ""), _cell(row, proven.get(row, [])))
-        lines.append(f"| {' | '.join(cells)} |")
+            lines += ["", f"## {heading}", ""]
+        parts = [told["asks"], *(f"{key.title()}: {told[key]}" for key in ("figure", "reached") if key in told)]
+        lines += [f"- **{row}** {'. '.join(parts)}", *_tests(row, proven.get(row, []))]
     return "\n".join(lines) + "\n"
 
 

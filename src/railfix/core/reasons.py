@@ -89,8 +89,8 @@ class Status(IntEnum):
     ANTENNAS_DISAGREE = 8
     #: A position, but its single-epoch sigma exceeds `Config.largest_sigma_m`.
     UNCERTAIN = 9
-    #: A position, but the 3-D positions of the last minutes lie beside or above the line by more than noise,
-    #: satellites, atmosphere and the stated error of the map explain: the map is wrong here, or it is another track.
+    #: A position, but the 3-D positions of the last minutes lie beside or above the line: the map is wrong here, or it
+    #: is another track.
     MAP_OFFSET = 10
 
     @property

@@ -48,7 +48,7 @@ STANFORD_COLUMNS: Final[dict[str, str]] = {
     "levels_of": "`usable`: levels of positions with status ok (of the filter: tracking, coasting) and no alarm, all "
     "others infinite; `all`: every level",
     "alarm_limit_m": "alarm limit AL",
-    "own_limit": "it is the alarm limit of the run (of rows together: of all their runs)",
+    "own_limit": "it is the alarm limit of the run, or of all runs of the row",
     "epochs": "of the run, with a reference; epochs missing in the log included",
     "observed": "those with observations",
     "judged": "those with an error",
@@ -57,7 +57,7 @@ STANFORD_COLUMNS: Final[dict[str, str]] = {
     "hazardously_misleading": "level <= AL < error",
     "unavailable": "AL < level, error <= level",
     "unavailable_misleading": "AL < level < error",
-    "unjudged": "a position, but the standard deviation of the reference exceeds the limit",
+    "unjudged": "a position, but no reference accurate enough",
     "no_position": "neither position nor level",
     "available": "levels within AL, with or without an error",
     "availability": "available / epochs",
@@ -69,8 +69,8 @@ STANFORD_COLUMNS: Final[dict[str, str]] = {
     "kept_15_s": "windows in which every epoch is available and none is missing",
     "continuity_15_s": "kept / windows; not by environment",
     "windows_60_s": "the same for 60 s",
-    "kept_60_s": "the same",
-    "continuity_60_s": "the same",
+    "kept_60_s": "the same for 60 s",
+    "continuity_60_s": "the same for 60 s",
 }
 
 #: Columns of the list of epochs beyond, with their unit and meaning; KIND is that of the level.

@@ -115,8 +115,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_fault_free_m",
-            "what noise without a fault asks for by itself, of its share of the risk; "
-            "`protection_level_m` spends the whole risk on the sum of all and may be smaller than a part",
+            "level for noise without a fault alone, with its share of the risk; may exceed `protection_level_m`",
             lambda r: None if r.protection is None else r.protection.level.fault_free_m,
         ),
         Column(
@@ -158,8 +157,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_basis",
-            "`measured`: the priors of faults were measured on the line; `indicative`: they are assumed, "
-            "the one of a side of the track without support by data, and the level carries no risk an hour",
+            "priors of faults are `measured` on the line, or `indicative`: assumed, the level carries no risk an hour",
             lambda r: None if r.protection is None else r.protection.basis,
             words=BASES,
         ),

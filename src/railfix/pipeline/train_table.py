@@ -74,9 +74,9 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("hypotheses", "places that are possible", lambda r: r.tracked.hypotheses, dtype=pl.Int16()),
         Column(
             "protection_level_m",
-            "the error along the line exceeds it with the stated risk, a fault of one source, a wrong map and other "
-            "branches included; infinite where another place of the line is more probable than the risk or "
-            "measurements contradict the place; empty with `tracking.level` off",
+            "the error along the line exceeds it with the stated risk, faults, a wrong map and other branches "
+            "included; infinite where another place is likelier than the risk or measurements contradict the place; "
+            "empty with `tracking.level` off",
             lambda r: r.tracked.level_m,
         ),
         Column(

@@ -65,7 +65,7 @@ class AntennaPairLimits(Settings):
     elevation_error_deg, azimuth_error_deg : float [deg]
         By which the satellite's direction from the car body may be wrong; P1 2.3(3): 3 and 3.5.
     clocks : {"common", "median"}
-        See `CLOCKS`; "common" needs one external clock for both receivers (P1 2.3(3), table 5).
+        Whether the receivers have one clock by hardware, or its difference is the median of each constellation.
     least_satellites : int
         "median": satellites of a constellation that both antennas need.
     tag_tolerance_s : float [s]
