@@ -86,6 +86,30 @@ def test_rolling_away_on_a_gradient_is_found_below_walking_speed(permille: float
 
 
 @pytest.mark.requirement("E1")
+@pytest.mark.parametrize("permille", [10.0, -15.0])
+def test_a_body_that_comes_to_rest_after_braking_does_not_roll_away(permille: float) -> None:
+    """The nose comes up again over a second after the stop: a change of the pitch, and no motion."""
+    t = np.arange(0.0, 120.0, 1.0 / RATE_HZ)
+    swing = permille / 1e3 * np.exp(-np.maximum(t - 1.0, 0.0) / 0.8)
+    wheel = np.where(t < 0.7, 1.0 - t, np.nan)
+    force = np.where(t < 1.0, -1.0, 0.0) + GRAVITY_MPS2 * swing
+    found, _ = find_slips(t, wheel, np.where(t < 0.7, -1.0, np.nan), force, np.zeros(len(t)))
+    assert (found.state[t > 3.0] == MotionState.STANDING).all()
+    assert found.way_m[-1] == pytest.approx(found.way_m[np.searchsorted(t, 1.1)], abs=0.2)
+
+
+@pytest.mark.requirement("E1")
+def test_rolling_without_a_pulse_expires_as_other_carries_do() -> None:
+    t = np.arange(0.0, 60.0, 1.0 / RATE_HZ)
+    force = np.where(t < 10.0, 0.05, 0.0)
+    found, _ = find_slips(t, np.where(t < 0.5, 0.0, np.nan), np.zeros(len(t)), force, np.full(len(t), np.nan))
+    rolling = t[found.state == MotionState.ROLLING]
+    assert rolling[0] < 12.0
+    assert rolling[-1] - rolling[0] == pytest.approx(30.0, abs=0.1)
+    assert (found.state[t > rolling[-1] + 0.1] == MotionState.STANDING).all()
+
+
+@pytest.mark.requirement("E1")
 def test_noiseless_pitch_is_that_of_the_line() -> None:
     case = motion(300.0, [])
     found = case.run()
