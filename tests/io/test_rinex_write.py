@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import gzip
 import warnings
-from decimal import Decimal
 from dataclasses import replace
+from decimal import Decimal
 from pathlib import Path
 
 import georinex

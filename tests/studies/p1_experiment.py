@@ -42,6 +42,7 @@ from p1_ride import (
     ridden,
     together,
 )
+from p1_rtklib import ABSENT, PROGRAM
 from p1_static import static_report
 from p1_test_line import line_report
 from railfix.core.arrays import Masks
@@ -72,8 +73,12 @@ SYSTEMS: Final = ("G", "GJ", "GJE")
 COMMON: Final = {"preset": "p1", "screens": ["elevation", "cn0"], "cn0": {"deficit_dbhz": None}}
 #: The defaults; what drops failed checks is done afterwards, so that the positions dropped can be looked at.
 DEFAULT: Final = {"preset": "default"}
+#: What rates are compared with: every conventional position, those that fail the usual checks among them.
+YARDSTICK: Final = Way("conventional", COMMON, "conventional")
 WAYS: Final = (
-    Way("conventional", COMMON, "conventional"),
+    YARDSTICK,
+    Way("validated", COMMON, "validated"),
+    Way("RTKLIB", {}, "rtklib"),
     Way("constrained", COMMON),
     Way("p1", {"preset": "p1"}),
     Way("default, drop", DEFAULT, "checked"),
@@ -82,7 +87,7 @@ WAYS: Final = (
 #: The filter along the track beside the conventional position.
 FILTERED: Final = {"preset": "default", "filter": "track"}
 FILTER_WAYS: Final = (
-    WAYS[0],
+    YARDSTICK,
     Way("filter", FILTERED, "filtered"),
     Way("filter, wheel, inertial", FILTERED, "filtered", sensors=True),
 )
@@ -145,9 +150,11 @@ def without_tunnels(passage: Passage) -> Masks:
 
 def main_table(campaign: Campaign, where: Callable[[Passage], Masks]) -> Iterator[str]:
     """Every way of every choice of systems in a line."""
+    if PROGRAM is None:
+        yield ABSENT
     yield from HEAD.splitlines()
     for letters, way in campaign.found:
-        yardstick = campaign.found[letters, WAYS[0].name + (", SBAS" if way.endswith(", SBAS") else "")]
+        yardstick = campaign.found[letters, YARDSTICK.name + (", SBAS" if way.endswith(", SBAS") else "")]
         name = f"{'+'.join(letters):7s} {way}"
         yield row(name, campaign.passages, campaign.found[letters, way], yardstick, where)
 
@@ -156,7 +163,7 @@ def thresholds_table(campaign: Campaign) -> Iterator[str]:
     """What other limits of the own sigma (`Config.largest_sigma_m`) would have made of "default, drop"."""
     yield "systems limit of own sigma [m]: points lost / largest error [m] / errors over 10 m"
     for letters in SYSTEMS:
-        base = np.concatenate([np.isfinite(f.error_m) for f in campaign.found[letters, WAYS[0].name]])
+        base = np.concatenate([np.isfinite(f.error_m) for f in campaign.found[letters, YARDSTICK.name]])
         found = campaign.found[letters, "default, drop"]
         error, own = (np.concatenate([getattr(f, name) for f in found]) for name in ("error_m", "own_sigma_m"))
         observed = sum(np.count_nonzero(p.observed) for p in campaign.passages)
@@ -169,7 +176,7 @@ def thresholds_table(campaign: Campaign) -> Iterator[str]:
 
 
 def lost_table(campaign: Campaign) -> Iterator[str]:
-    """Why positions are lost that the conventional way has, and where, in points of the positioning rate."""
+    """Why positions are lost that the yardstick has, and where, in points of the positioning rate."""
     yield "points lost against the conventional"
     observed = sum(np.count_nonzero(p.observed) for p in campaign.passages)
     for letters in SYSTEMS:
@@ -177,7 +184,7 @@ def lost_table(campaign: Campaign) -> Iterator[str]:
             why: Counter[str] = Counter()
             where: Counter[str] = Counter()
             gained = standing = 0
-            yardstick = campaign.found[letters, WAYS[0].name]
+            yardstick = campaign.found[letters, YARDSTICK.name]
             for passage, base, found in zip(campaign.passages, yardstick, campaign.found[letters, way], strict=True):
                 had, has = np.isfinite(base.error_m), np.isfinite(found.error_m)
                 lost = had & ~has
@@ -204,7 +211,7 @@ def goal_table(campaign: Campaign) -> Iterator[str]:
     runs = list(dict.fromkeys(p.run for p in campaign.passages))
     yield f"{'points lost / largest [m]':27s}" + "".join(f"{run:>18s}" for run in [*runs, "all"])
     for letters in SYSTEMS:
-        yardstick = campaign.found[letters, WAYS[0].name]
+        yardstick = campaign.found[letters, YARDSTICK.name]
         for name in ("p1", "default, drop", "strict"):
             founds = campaign.found[letters, name]
             cells = []

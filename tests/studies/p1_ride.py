@@ -6,16 +6,20 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
 
+from p1_rtklib import PROGRAM, single_points
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.core.settings import write_toml
+from railfix.gnss.observations import Observations
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import parse_config
+from railfix.pipeline.conventional import PointStatus
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
 from railfix.ranges.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
@@ -45,9 +49,10 @@ class Way:
     name : str
     settings : mapping
         Of the run.
-    positions : {"conventional", "constrained", "checked", "filtered"}
-        Which of its positions: 3-D at the nearest point of the line; on the line; of these the ones that no check
-        failed (``failed_checks = "drop"``); those of the filter along the track.
+    positions : {"conventional", "validated", "rtklib", "constrained", "checked", "filtered"}
+        Which of its positions: 3-D at the nearest point of the line; of these the valid ones (`conventional_status`);
+        RTKLIB's, at the nearest point; on the line; of these the ones that no check failed (``failed_checks =
+        "drop"``); those of the filter along the track.
     largest_sigma_m : float
         As `Config.largest_sigma_m` with failed checks dropped, put upon the results of a run with a wider limit.
     sensors : bool
@@ -58,7 +63,7 @@ class Way:
 
     name: str
     settings: Mapping[str, Any]
-    positions: Literal["conventional", "constrained", "checked", "filtered"] = "constrained"
+    positions: Literal["conventional", "validated", "rtklib", "constrained", "checked", "filtered"] = "constrained"
     largest_sigma_m: float = np.inf
     sensors: bool = False
     sbas: bool = False
@@ -165,15 +170,18 @@ class Bench:
             write_toml(path, vehicle_table(scenario.vehicle))
             vehicle = read_vehicle(path)
             self.trajectories = {a: antenna_trajectory(track, vehicle, a) for a in ANTENNAS}
-            self.ways, self.systems = ways, systems
+            self.ways, self.systems = [way for way in ways if way.positions != "rtklib" or PROGRAM], systems
             self.sensors = samples_of(self.simulation) if any(way.sensors for way in ways) else SensorSamples()
             messages = Path(folder) / "messages.sbs"
             if scenario.sbas is not None:
                 write_sbas(sbas_messages(self.simulation, scenario.sbas), messages)
+                self.messages = messages.read_bytes()
             #: One processor for settings that are the same, whichever of their results is looked at.
             self.processors: dict[tuple[str, str], EpochProcessor] = {}
             for letters in systems:
-                for way in ways:
+                for way in self.ways:
+                    if way.positions == "rtklib":
+                        continue
                     common = {"systems": list(letters), "protection": "off", "cn0_curve": curve and str(curve)}
                     if way.sbas:
                         common["sbas"] = [str(messages)]
@@ -213,6 +221,7 @@ def ridden(bench: Bench) -> Campaign:
     states: dict[tuple[str, str], State | None] = dict.fromkeys(bench.processors)
     truths: dict[str, list[Passage]] = {a: [] for a in ANTENNAS}
     parts: dict[tuple[str, str, str], list[Found]] = {}
+    observed: dict[str, list[Observations]] = {a: [] for a in ANTENNAS}
     breaking: dict[tuple[str, str], list[Breaking]] = {}
     before = 0
     received = np.datetime64("NaT", "ns")
@@ -221,6 +230,7 @@ def ridden(bench: Bench) -> Campaign:
         since, received = bench.sensors.between(received, end), end
         for antenna, one in piece.items():
             geometry = one.geometry
+            observed[antenna].append(one.observations)
             truths[antenna].append(
                 Passage(
                     run=bench.name,
@@ -249,8 +259,14 @@ def ridden(bench: Bench) -> Campaign:
                         broken(piece[antenna], got, found, int(t), passage=index, before=before) for t in large
                     )
         before += len(piece[ANTENNAS[0]].observations)
+    passages = [joined(truths[a]) for a in ANTENNAS]
+    for letters, way in product(bench.systems, bench.ways):
+        if way.positions == "rtklib":
+            for antenna, passage in zip(ANTENNAS, passages, strict=True):
+                found = of_rtklib(bench, way, letters, passage, observed[antenna])
+                parts[letters, way.name, antenna] = [found]
     return Campaign(
-        passages=[joined(truths[a]) for a in ANTENNAS],
+        passages=passages,
         found={
             (letters, way.name): [joined(parts[letters, way.name, a]) for a in ANTENNAS]
             for letters in bench.systems
@@ -260,18 +276,39 @@ def ridden(bench: Bench) -> Campaign:
     )
 
 
+def of_rtklib(bench: Bench, way: Way, letters: str, truth: Passage, parts: Sequence[Observations]) -> Found:
+    """Errors of RTKLIB's positions, each at the nearest point of the trajectory."""
+    with tempfile.TemporaryDirectory() as folder:
+        messages = Path(folder) / "messages.sbs"
+        if way.sbas:
+            messages.write_bytes(bench.messages)
+        place = single_points(bench.simulation, parts, letters, messages if way.sbas else None)
+    trajectory = bench.trajectories[truth.antenna]
+    error = trajectory.chainage_at(trajectory.nearest(place)[0]) - truth.chainage_m
+    unknown = np.full(len(place), np.nan)
+    return Found(
+        error_m=error,
+        status=np.where(np.isfinite(error), Status.OK, Status.NO_CONVERGENCE).astype(np.int8),
+        n_used=np.zeros(len(place), dtype=np.int64),
+        own_sigma_m=unknown,
+        horizontal_m=unknown,
+    )
+
+
 def of_result(way: Way, got: AntennaResult, truth: Passage, track: AlongTrack | None) -> Found:
     """Errors of one way out of a result."""
-    conventional = way.positions == "conventional"
+    conventional = way.positions in ("conventional", "validated")
     chainage = got.conventional_chainage_m if conventional else got.chainage_m
     place = got.conventional_ecef_m if conventional else got.ecef_m
     if way.positions == "filtered":
         assert track is not None
         chainage, place = track.chainage_m, track.ecef_m
     kept = np.ones(len(chainage), dtype=np.bool_)
+    if way.positions == "validated":
+        kept = got.conventional_status == PointStatus.VALID
     if way.positions == "checked":
         kept = ~np.isin(got.status, CHECK_FAILED)
-    if way.positions not in ("conventional", "filtered"):
+    if way.positions not in ("conventional", "validated", "filtered"):
         kept &= (got.own_sigma_m <= way.largest_sigma_m) | (got.status == Status.OFF_MAP)
     error = chainage - truth.chainage_m
     away = place - truth.ecef_m

@@ -27,17 +27,35 @@ from railfix.run.processor import processor_of
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: P4: the station is 1433 m along the line from the first point, 2.7 m beside it.
-ALONG_M: Final = 1433.0
-BESIDE_M: Final = 2.7
-#: Length of the line [m].
-LENGTH_M: Final = 2500.0
-#: Direction of the line from north.
-AZIMUTH_DEG: Final = 60.0
+#: P4's table: its station (Otsu 2), first and last point of the line [m], ECEF.
+P4_POINTS_M: Final = np.array(
+    [
+        [-3.7593338022e6, 3.6422632533e6, 3.6324507784e6],
+        [-3.759511635946152e6, 3.641169858205933e6, 3.633360184989581e6],
+        [-3.759150546602499e6, 3.643364066615054e6, 3.631538990822185e6],
+    ]
+)
+
+
+def p4_line(points_m: Floats = P4_POINTS_M) -> tuple[float, float, float, float]:
+    """Length of P4's line, place of its station along it, to the right of it [m], and azimuth of the line [deg]."""
+    station, first, last = points_m
+    length = float(np.linalg.norm(last - first))
+    direction = (last - first) / length
+    along = float((station - first) @ direction)
+    latitude, longitude, _ = geodetic_from_ecef(station)
+    axes = enu_axes(latitude, longitude)
+    east, north, _ = axes @ direction
+    aside = axes @ (station - first - along * direction)
+    right = float(aside @ np.array([north, -east, 0.0]) / np.hypot(east, north))
+    return length, along, right, float(np.degrees(np.arctan2(east, north)) % 360.0)
+
+
+LENGTH_M, ALONG_M, BESIDE_M, AZIMUTH_DEG = p4_line()
 #: Alarm limit: a car length.
 ALARM_LIMIT_M: Final = RaimLimits().alarm_limit_m
-#: How far beside the line, and what the map says of itself across (None: its 0.30 m).
-LINES: Final = ((0.0, None), (BESIDE_M, BESIDE_M), (BESIDE_M, None))
+#: How far right of the line, and what the map says of itself across (None: its 0.30 m).
+LINES: Final = ((0.0, None), (BESIDE_M, abs(BESIDE_M)), (BESIDE_M, None))
 
 
 @dataclass(frozen=True)
@@ -48,17 +66,18 @@ class Station:
     observations: str
     navigation: str
     every: int
+    systems: tuple[str, ...] = ("G", "J", "E", "C")
 
 
+_ESBC: Final = (
+    "ESBC_2020177/ESBC00DNK_R_20201770000_01D_30S_MO.crx.gz",
+    "ESBC_2020177/ESBC00DNK_R_20201770000_01D_MN.rnx.gz",
+)
 STATIONS: Final = (
     Station("GEONET 0759", "rtklib_geonet2005/07590920.05o", "rtklib_geonet2005/07590920.05n", 1),
     Station("GEONET 3040", "rtklib_geonet2005/30400920.05o", "rtklib_geonet2005/30400920.05n", 1),
-    Station(
-        "ESBC",
-        "ESBC_2020177/ESBC00DNK_R_20201770000_01D_30S_MO.crx.gz",
-        "ESBC_2020177/ESBC00DNK_R_20201770000_01D_MN.rnx.gz",
-        10,
-    ),
+    Station("ESBC", *_ESBC, 10),
+    Station("ESBC, GPS", *_ESBC, 1, ("G",)),
 )
 
 
@@ -87,12 +106,13 @@ def two_points(station_ecef_m: Floats, beside_m: float) -> tuple[Floats, Floats]
 
 @dataclass(frozen=True)
 class Day:
-    """One station on one line: positions, errors and RAIM by epoch."""
+    """One station on one line by epoch: errors along it, east and north, those of 3-D least squares, and RAIM."""
 
     observations: Observations
     result: AntennaResult
     along_m: Floats
     east_north_m: Floats
+    least_squares_m: Floats
 
     @property
     def tested(self) -> Masks:
@@ -111,6 +131,7 @@ def play(data: Path, station: Station, beside_m: float, map_sigma_m: float | Non
     trajectory = line_between(*two_points(place, beside_m))
     config = parse_config(
         {
+            "systems": list(station.systems),
             "screens": ["elevation", "raim"],
             "elevation": {"mask_deg": 15.0},
             "map_plan_sigma_m": map_sigma_m,
@@ -121,8 +142,10 @@ def play(data: Path, station: Station, beside_m: float, map_sigma_m: float | Non
     result = processor.process({"front": observations})[0].antennas["front"]
     reference = np.broadcast_to(place, (len(result), 3))
     latitude, longitude, _ = geodetic_from_ecef(place)
-    enu = (result.ecef_m - place) @ enu_axes(latitude, longitude).T
-    return Day(observations, result, along_track_error(result.arc_m, reference, trajectory), enu[:, :2])
+    axes = enu_axes(latitude, longitude)[:2].T
+    along = along_track_error(result.arc_m, reference, trajectory)
+    on_line, in_space = (result.ecef_m - place) @ axes, (result.conventional_ecef_m - place) @ axes
+    return Day(observations, result, along, on_line, in_space)
 
 
 def _percentiles(values: Floats) -> str:
@@ -141,15 +164,16 @@ def row(day: Day) -> str:
         f"{_percentiles(day.east_north_m[:, 0])} {_percentiles(day.east_north_m[:, 1])} "
         f"{day.result.noise_scale[-1]:5.2f} {alarms:5d} "
         f"{np.median(level):6.2f} {level.max():7.2f} {np.count_nonzero(level > ALARM_LIMIT_M):5d} "
-        f"{np.count_nonzero(error > level):5d}"
+        f"{np.count_nonzero(error > level):5d} "
+        + " ".join(f"{value:6.2f}" for value in np.nanquantile(np.abs(day.least_squares_m), 0.95, axis=0))
     )
 
 
 HEAD: Final = (
     "                                           along [m]             east [m]            north [m]"
-    "  noise  over     level [m]   over over\n"
+    "  noise  over     level [m]   over over  3-D p95 [m]\n"
     "station      beside map [m] epochs   p50    p95    max    p50    p95    max    p50    p95    max"
-    "  scale T_D    p50     max   20 m level"
+    "  scale T_D    p50     max   20 m level   east  north"
 )
 
 
@@ -178,9 +202,10 @@ def report(data: Path) -> Iterator[str]:
     for station in STATIONS:
         for beside, sigma in LINES:
             day = play(data, station, beside, sigma)
-            yield f"{station.name:12s} {beside:6.1f} {0.3 if sigma is None else sigma:7.1f} {row(day)}"
+            yield f"{station.name:12s} {abs(beside):6.1f} {0.3 if sigma is None else sigma:7.1f} {row(day)}"
     yield ""
-    yield f"{STATIONS[-1].name}, line {BESIDE_M} m beside, map error {BESIDE_M} m"
+    beside = abs(BESIDE_M)
+    yield f"{STATIONS[-1].name}, line {beside:.1f} m beside, map error {beside:.1f} m"
     yield from hours(play(data, STATIONS[-1], *LINES[1]), step_h=3)
 
 

@@ -31,18 +31,28 @@ def assert_same(printed: list[str], document: list[str]) -> None:
             assert abs(float(a) - float(b)) <= 1.01 * unit, (one, two)
 
 
+def test_the_printed_points_of_p4() -> None:
+    """Two points of a line, and a station that lies 1433 m along its 2874 m, 2.67 m beside it."""
+    length, along, right, azimuth = p4_experiment.p4_line()
+    assert (length, along, right) == pytest.approx((2874.31, 1433.23, -2.67), abs=0.01)
+    latitude, longitude, height = geodetic_from_ecef(p4_experiment.P4_POINTS_M[0])
+    assert (latitude, longitude, height) == pytest.approx((34.9396, 135.9062, 130.37), abs=0.01)
+    # worked by hand: 0.02 deg of latitude and of longitude at 34.94 deg
+    assert azimuth == pytest.approx(180.0 + np.degrees(np.arctan2(1827.1, 2218.8)), abs=0.01)
+
+
 def test_the_station_is_where_p4_has_it() -> None:
     place = np.array([3582105.0, 532589.0, 5232754.0])
     for beside in (0.0, 2.7):
         first, last = p4_experiment.two_points(place, beside)
         trajectory = p4_experiment.line_between(first, last)
         arc, offset = trajectory.nearest(place[None])
-        assert arc[0] == pytest.approx(1433.0, abs=0.01)
+        assert arc[0] == pytest.approx(1433.23, abs=0.01)
         assert offset[0] == pytest.approx(beside, abs=0.02)
-        assert trajectory.arc_m[-1] == pytest.approx(2500.0, abs=0.01)
+        assert trajectory.arc_m[-1] == pytest.approx(2874.31, abs=0.01)
     latitude, longitude, _ = geodetic_from_ecef(first)
     east, north, _ = enu_axes(latitude, longitude) @ (last - first)
-    assert np.degrees(np.arctan2(east, north)) == pytest.approx(60.0, abs=0.1)
+    assert np.degrees(np.arctan2(east, north)) % 360.0 == pytest.approx(219.47, abs=0.1)
 
 
 def test_the_document_shows_what_is_measured(recordings: Path, tmp_path: Path) -> None:

@@ -89,6 +89,8 @@ class SlipLimits(Settings):
     pitch_s, bias_s : float
         Time constants with which the gyro's pitch follows the line's, and its bias is learnt. Without a line the pitch
         by wheel and accelerometer takes its place.
+    settling_s : float
+        After a stop the body comes to rest on its suspension for so long; its pitch then is the one of the standstill.
     rolling_limit, rolling_s, rolling_mps : float
         Change of the apparent pitch at standstill, its duration, and the speed carried by then, that mean rolling away.
     """
@@ -110,6 +112,7 @@ class SlipLimits(Settings):
     standing_s: float = Field(default=1.0, gt=0)
     pitch_s: float = Field(default=20.0, gt=0)
     bias_s: float = Field(default=200.0, gt=0)
+    settling_s: float = Field(default=2.0, ge=0)
     rolling_limit: float = Field(default=0.002, gt=0)
     rolling_s: float = Field(default=0.3, gt=0)
     rolling_mps: float = Field(default=0.05, gt=0)
@@ -417,13 +420,15 @@ class _Automaton:
         elif self.state == MotionState.INIT:
             return  # a sensor that was never heard may be dead
         elif self._silent >= limits.standing_s and not abs(self.speed) > 0.5:
-            self.state, self.speed, self._rest, self._apart = MotionState.STANDING, 0.0, force, 0.0
+            self.state, self.speed, self._rest, self._apart, self._carried = MotionState.STANDING, 0.0, force, 0.0, 0.0
         elif self._carried > limits.longest_carry_s:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _watch(self, dt: float, force: float) -> None:
         """At rest the force is gravity's share; freed, it falls toward zero and the change is the motion."""
         limits = self.limits
+        if self.state == MotionState.STANDING and self._silent < limits.standing_s + limits.settling_s:
+            self._rest = force
         change = force - self._rest
         moved = abs(change) > limits.rolling_limit * GRAVITY_MPS2
         if self.state == MotionState.STANDING:
@@ -437,4 +442,4 @@ class _Automaton:
             if self._apart >= limits.rolling_s and abs(self.speed) > limits.rolling_mps:
                 self.state = MotionState.ROLLING
         else:
-            self.speed += change * dt
+            self._carry(dt, change)

@@ -1,0 +1,76 @@
+"""RTKLIB's single point (`rnx2rtkp`, Debian package rtklib) on the observations of a simulated run.
+
+With the settings that P1 table 6 has for all ways, mask of 20 degrees and 30 dB-Hz, broadcast models, and RTKLIB's own
+checks of each position: chi-square test of the residuals, dilution of precision. One of P1's authors wrote RTKLIB; that
+P1's conventional positions are RTKLIB's is an inference.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats
+from railfix.core.timescale import seconds
+from railfix.gnss.observations import Observations
+from railfix.io.position_log import read_positions
+from railfix.io.rinex import write_navigation, write_observations
+from railfix.simulate import Simulation
+
+#: Path of the program; None where it is not installed.
+PROGRAM: Final = shutil.which("rnx2rtkp")
+ABSENT: Final = "RTKLIB: no row, as rnx2rtkp (Debian package rtklib) is not installed"
+#: RTKLIB's bits of the constellations.
+_SYSTEMS: Final = {"G": 1, "E": 8, "J": 16, "C": 32}
+_MODELS: Final = {False: ("brdc", "saas", "brdc"), True: ("sbas", "sbas", "brdc+sbas")}
+
+
+def single_points(simulation: Simulation, parts: Sequence[Observations], systems: str, messages: Path | None) -> Floats:
+    """Return the positions of one antenna at its epochs, NaN where there is none, shape (T, 3) [m].
+
+    Parameters
+    ----------
+    simulation : Simulation
+    parts : sequence of Observations
+        Of the antenna, one after the other.
+    systems : str
+        Letters of the constellations.
+    messages : path or None
+        SBAS messages that correct the ranges.
+    """
+    assert PROGRAM is not None, ABSENT
+    time = np.concatenate([part.time for part in parts])
+    interval = seconds(time[1] - time[0])
+    ionosphere, troposphere, ephemeris = _MODELS[messages is not None]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_observations(parts, folder / "run.obs")
+        write_navigation(simulation.navigation, folder / "run.nav")
+        (folder / "run.conf").write_text(
+            f"pos1-posmode=single\npos1-frequency=l1\npos1-elmask=20\npos1-snrmask_r=on\n"
+            f"pos1-snrmask_L1={','.join(['30'] * 9)}\npos1-ionoopt={ionosphere}\npos1-tropopt={troposphere}\n"
+            f"pos1-sateph={ephemeris}\npos1-navsys={sum(_SYSTEMS[s] for s in systems)}\n"
+            "out-solformat=xyz\nout-timesys=gpst\nout-timeform=hms\nout-timendec=6\n"
+        )
+        out = folder / "run.pos"
+        files = [folder / "run.obs", folder / "run.nav", *([messages] if messages else [])]
+        subprocess.run([PROGRAM, "-k", folder / "run.conf", "-o", out, *files], check=True, capture_output=True)
+        theirs = read_positions(out)
+    # RTKLIB takes its clock out of the tags
+    return at_epochs(time, float(interval), theirs.time, theirs.ecef_m)
+
+
+def at_epochs(time: Datetimes, interval_s: float, found: Datetimes, ecef_m: Floats) -> Floats:
+    """Return positions at the epochs nearest to their tags, NaN elsewhere, shape (T, 3) [m]."""
+    place = np.full((len(time), 3), np.nan)
+    index = np.clip(np.searchsorted(time, found), 1, len(time) - 1)
+    index -= (found - time[index - 1]) < (time[index] - found)
+    near = np.abs(seconds(found - time[index])) < 0.4 * interval_s
+    place[index[near]] = ecef_m[near]
+    return place
