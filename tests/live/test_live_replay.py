@@ -112,7 +112,7 @@ def test_a_speed_that_is_not_known_is_blank_in_nmea(epochs: dict[str, Observatio
         railfix.read_track([files["track"]]), railfix.read_vehicle(files["vehicle"]), "front"
     )
     processor = railfix.EpochProcessor(
-        railfix.Config(), {"front": line}, navigation=railfix.read_navigation(files["nav"])
+        railfix.Config(filter="off"), {"front": line}, navigation=railfix.read_navigation(files["nav"])
     )
     live = engine.LiveEngine(processor, LiveSettings())
     live.push("front", single_epochs(epochs["front"][:1])[0], now_ns=0)

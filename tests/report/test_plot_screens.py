@@ -26,7 +26,13 @@ SCREENS = ["elevation", "cn0_floor", "doppler", "antenna_pair", "raim", "protect
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
     config = parse_config(
-        {"filter": "off", "preset": "p1", "antenna_spacing": {"limit_m": 1.0}, "raim": {"fixed_limit_m2": 20.0}}
+        {
+            "filter": "off",
+            "preset": "p1",
+            "antenna_pair": {"clocks": "median"},
+            "antenna_spacing": {"limit_m": 1.0},
+            "raim": {"fixed_limit_m2": 20.0},
+        }
     )
     options = RunOptions(observations="write", chunk_epochs=700)
     return run_files(demo_inputs(), config, out=tmp_path_factory.mktemp("run") / "out", options=options)

@@ -36,10 +36,10 @@ STRANGE = "a<b>&'run'"
 def summary(tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
     """The first minute of the demonstration, in a folder whose name is no HTML."""
     first = pl.read_csv(demo_truth(), try_parse_dates=True)["time_gpst"][0]
-    asked = {"preset": "p1", "raim": {"false_alarm": 0.01}}
+    asked = {"preset": "p1", "raim": {"false_alarm": 0.01}, "antenna_pair": {"clocks": "median"}}
     options = RunOptions(observations="write", chunk_epochs=200, end=first + timedelta(seconds=60))
     out = tmp_path_factory.mktemp("run") / STRANGE
-    return run_files(demo_inputs(), parse_config(dict(asked)), out=out, options=options, asked=asked)
+    return run_files(demo_inputs(), parse_config({"filter": "off", **asked}), out=out, options=options, asked=asked)
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +140,7 @@ def test_the_head_tells_what_was_run(document: str, folder: Path) -> None:
     assert record["versions"]["numpy"] in document
     assert '<th scope="row">raim.false_alarm</th><td>0.01</td><td>0.01</td>' in document
     settings = document.split("<summary>Settings asked for and used")[1].split("</details>")[0]
-    assert settings.count("<tr class=asked>") == 2
+    assert settings.count("<tr class=asked>") == 3
     facts = record["antennas"]["front"]
     for reason, count in facts["observations_rejected_by_first_reason"].items():
         assert f'<th scope="row">  {reason}</th><td class="n">{count:,}</td>' in document
@@ -338,15 +338,15 @@ def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tm
     document = report_page(runs, evaluation)
     assert evaluation is not None
     largest = evaluation.figure("max_m", run="run (train)", antenna="front")
-    assert "The filter along the track, which joins the epochs, has a position at" in document
-    assert f"the worst {largest:.1f} m off." in document
-    assert f"filtered {largest:.2f} m</dd>" in document
+    assert "of all epochs, those without satellites included, by the filter along the track" in document
+    assert f"and the worst is {largest:.1f} m off." in document
+    assert f"<dd>{largest:.2f} m</dd>" in document
     assert evaluation.levels is not None
     level = evaluation.levels.filter(run="run (train)", antenna="front", position="constrained_ok")[
         "level_p50_m"
     ].item()
     beyond = len(evaluation.integrity["train"].beyond.filter(pl.col("usable"), antenna="front"))
-    assert f"filtered {level:.1f} m</dd>" in document
+    assert f"<dd>{level:.1f} m</dd>" in document
     assert f", filtered {beyond:,}</dd>" in document
     assert "Stanford diagram, usable levels (filter along the track)" in document
     assert "filter-stanford-by-antenna" in document

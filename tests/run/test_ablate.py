@@ -57,7 +57,9 @@ def ablation(truth: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Abl
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run_sources, "scan_observations", counted)
-        made = ablate_files(inputs_with(truth), out=tmp_path_factory.mktemp("ablation") / "out")
+        made = ablate_files(
+            inputs_with(truth), parse_config({"filter": "off"}), out=tmp_path_factory.mktemp("ablation") / "out"
+        )
     return made, readings
 
 
@@ -147,7 +149,7 @@ def command(out: Path, *options: str) -> list[str]:
 
 
 def test_without_truth_rates_alone_are_told(tmp_path: Path) -> None:
-    result = RUNNER.invoke(app, command(tmp_path / "out", "--without", "doppler"))
+    result = RUNNER.invoke(app, command(tmp_path / "out", "--without", "doppler", "--filter", "off"))
     assert result.exit_code == 0, result.output
     assert "front: 20 epochs" in result.output
     assert "p95" not in result.output
@@ -161,7 +163,7 @@ def test_without_truth_rates_alone_are_told(tmp_path: Path) -> None:
 
 
 def test_the_table_keeps_its_lines_where_the_terminal_is_narrow(truth: Path, tmp_path: Path) -> None:
-    result = RUNNER.invoke(app, command(tmp_path / "out", "--truth", str(truth)))
+    result = RUNNER.invoke(app, command(tmp_path / "out", "--truth", str(truth), "--filter", "off"))
     assert result.exit_code == 0, result.output
     (line,) = [line for line in result.output.splitlines() if line.startswith("without raim")]
     assert len(line.split()) == 2 + 4 + 8
