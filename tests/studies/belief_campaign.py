@@ -2,12 +2,14 @@
 
 ``python tests/studies/belief_campaign.py`` runs the recordings beside the checkout; ``python
 tests/studies/belief_campaign.py FOLDER ...`` runs folders with a ``case.toml`` that names ``log``, ``nav``, ``track``
-and ``truth`` (a track map and a reference as ``railfix evaluate`` reads them). Every trial is the pipeline with its
-defaults from a cold start; ``--mask`` changes the elevation mask, ``--set`` a setting of the filter.
+and ``truth`` (a track map and a reference as ``railfix evaluate`` reads them); shipped scenarios of the simulator by
+their names (``city``, ``commercial-run``) at 1 Hz, with the sensors on board that they have. Every trial is the
+pipeline with its defaults from a cold start; ``--mask`` changes the elevation mask, ``--set`` a setting of the filter.
 
 Whole recordings first (``--whole``), then a cold start every ``--every`` seconds, ``--length`` seconds each; with
 ``--faults`` instead faults of one satellite, one constellation, all Dopplers, all phases, a step of all codes, the map,
-pairs, and few satellites, in windows ``--fault-every`` seconds apart. ``--verbose`` lists the trials that fail.
+pairs, few satellites, and sensors on board where there are any, in windows ``--fault-every`` seconds apart.
+``--verbose`` lists the trials that fail.
 
 An epoch is *exceeded* where its level is finite and the error is larger: by straight distance on the ground, and by
 chainage, where another lap of the same road counts as wrong. *Sure and wrong* are epochs with the status `tracking`
@@ -18,19 +20,23 @@ from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 import tomllib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import polars as pl
 
 import paths
 import recordings_score
 import recordings_truth
+import sensed_ride
 from posterior_score import arc_of, bounds
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.settings import write_toml
 from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference, straight_distance
 from railfix.gnss.navigation import Navigation, glonass_channels
@@ -38,10 +44,13 @@ from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.io.reference_log import read_reference
 from railfix.io.rinex import read_navigation, read_observations
+from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import parse_config
 from railfix.run.processor import processor_of
-from railfix.track import Track, read_track
+from railfix.simulate.run import truth_table, vehicle_table
+from railfix.simulate.scenario_file import load_recipe, shipped_scenarios
+from railfix.track import Track, antenna_trajectory, read_track, read_vehicle
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line, Tracked, TrackStatus
 
@@ -59,6 +68,7 @@ class Case:
     trajectory: Trajectory
     reference_ecef_m: np.ndarray
     reference_arc_m: np.ndarray
+    sensors: SensorSamples | None = None
 
     def part(self, first: int, end: int) -> Case:
         """Some epochs of it."""
@@ -123,6 +133,23 @@ def made(name: str, log: Path, nav: list[Path], truth: recordings_truth.Truth, t
     return Case(name, observations, read_navigation(nav), trajectory, reference, arc)
 
 
+def simulated(name: str, seconds_at_most: float = 1800.0) -> Case:
+    """A shipped scenario at 1 Hz: its front antenna and its sensors on board."""
+    scenario = load_recipe(name).scenario().replaced(rate_hz=1.0)
+    if scenario.epochs > seconds_at_most:
+        scenario = scenario.replaced(duration_s=seconds_at_most)
+    ride = sensed_ride.made(scenario)
+    track = ride.simulation.line.track()
+    with tempfile.TemporaryDirectory() as folder:
+        write_toml(Path(folder) / "vehicle.toml", vehicle_table(scenario.vehicle))
+        trajectory = antenna_trajectory(track, read_vehicle(Path(folder) / "vehicle.toml"), "front")
+    truth = truth_table(ride.simulation).filter(pl.col("antenna") == "front")
+    ecef = truth.select("x_m", "y_m", "z_m").to_numpy()
+    arc = arc_of(ecef, seconds(ride.observations.time - ride.observations.time[0]), trajectory)
+    sensors = ride.samples if any(len(rows) for rows in ride.samples.tables.values()) else None
+    return Case(name, ride.observations, ride.simulation.navigation, trajectory, ecef, arc, sensors)
+
+
 def smartloc_rinex_truth(folder: Path) -> recordings_truth.Truth:
     """The drive at Potsdamer Platz as recorded: seconds since the first epoch, ECEF."""
     lines = (folder / "Berlin_Potsdamer_Platz_RTK_GT.txt").read_text(encoding="ascii").splitlines()
@@ -176,7 +203,11 @@ def run(case: Case, settings: dict[str, Any], *, first: int = 0) -> Judged:
     """Judge the pipeline on a case from a cold start, epochs from `first` on."""
     config = parse_config({"filter": "track", **settings})
     processor = processor_of(config, case.navigation, {"front": case.trajectory})
-    result, _ = processor.process({"front": case.observations})
+    sensors = case.sensors
+    if sensors is not None:
+        time = case.observations.time
+        sensors = sensors.between(time[0] - np.timedelta64(1, "s"), time[-1])
+    result, _ = processor.process({"front": case.observations}, sensors=sensors)
     return judged(case, result.fusion["front"].tracked, first)
 
 
@@ -339,9 +370,34 @@ def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterat
         some = {name: np.where(full, getattr(obs, name), values) for name, values in left.items()}
         yield f"{count} satellites", replace(case, observations=replace(obs, **left))
         yield f"{count} satellites after 45 s", replace(case, observations=replace(obs, **some))
+    if case.sensors is not None:
+        yield from sensor_faults(case, case.sensors)
     yield "map 20 m aside", moved(case, 20.0)
     yield "map 5 m aside", moved(case, 5.0)
     yield "map 2 % long", stretched(case, 0.02)
+
+
+def sensor_faults(case: Case, sensors: SensorSamples) -> Iterator[tuple[str, Case]]:
+    """Every sensor that there is, wrong from 45 s on."""
+    start = case.observations.time[0] + np.timedelta64(45, "s")
+    pulses, unit, radar = sensors.tachometer, sensors.inertial, sensors.radar
+    if len(pulses):
+        slip = (pulses.time > start) & (pulses.time <= start + np.timedelta64(20, "s"))
+        for share in (0.05, 0.3):
+            # a slipping wheel turns too fast: pulses more than there are, numbered on
+            number = pulses.pulse + np.round(share * np.cumsum(slip)).astype(np.int64)
+            wrong = replace(sensors, tachometer=replace(pulses, pulse=number))
+            yield f"wheel slips by {100 * share:.0f} % for 20 s", replace(case, sensors=wrong)
+        kept = ~slip
+        locked = {f.name: getattr(pulses, f.name)[kept] for f in fields(pulses)}
+        locked["pulse"] = locked["pulse"] - np.where(locked["time"] > start, slip.sum(), 0)
+        yield "wheel locked for 20 s", replace(case, sensors=replace(sensors, tachometer=replace(pulses, **locked)))
+    if len(unit):
+        force = unit.force_mps2 + np.where(unit.time > start, 0.3, 0.0)[:, None] * np.array([1.0, 0.0, 0.0])
+        yield "force +0.3 m/s2", replace(case, sensors=replace(sensors, inertial=replace(unit, force_mps2=force)))
+    if len(radar):
+        speed = radar.speed_mps + np.where(radar.time > start, 1.0, 0.0)
+        yield "radar +1 m/s", replace(case, sensors=replace(sensors, radar=replace(radar, speed_mps=speed)))
 
 
 def over(label: str, found: Judged) -> np.ndarray:
@@ -479,7 +535,10 @@ def main() -> int:
     if not args.faults:
         print(HEAD)
     for name in args.folders or list(known):
-        case = known[name]() if name in known else case_of_folder(Path(name))
+        if name in known:
+            case = known[name]()
+        else:
+            case = simulated(name) if name in shipped_scenarios() else case_of_folder(Path(name))
         if args.whole:
             show_whole(case, args)
         if args.faults:
