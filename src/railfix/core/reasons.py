@@ -70,8 +70,8 @@ class Status(IntEnum):
 
     #: A position along the line.
     OK = 0
-    #: A position, but another place on the line fits the ranges equally well; or one beyond the protection level does,
-    #: noise and a fault of one satellite allowed for at the level's risk.
+    #: A position, but another place on the line fits the ranges equally well, or, at the level's risk, one beyond the
+    #: protection level.
     AMBIGUOUS = 1
     #: A position, but at an end of the map, or too far from the unconstrained position.
     OFF_MAP = 2

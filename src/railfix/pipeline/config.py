@@ -125,7 +125,7 @@ class Config(ScreenSettings):
         is compared. P4 takes a car length, 20 m, as acceptable; the preset "strict" uses 10 m and drops failed
         checks.
     min_satellites : int
-        Satellites that a position needs (P1 3.2: 3; 2 is possible and ambiguous on curves).
+        Satellites that a position needs. P1 3.2: 3; 2 is possible and ambiguous on curves.
     dilution_limit : float
         Largest along-track dilution [m/m] of a position.
     off_map_risk : float

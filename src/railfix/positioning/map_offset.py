@@ -42,7 +42,7 @@ class MapOffsetLimits(Settings):
     least_samples : float
         Independent samples needed before a verdict: one minute.
     note_risk, risk : float
-        Probability that noise alone passes the test (chi-square, two degrees of freedom): of the note, of the status.
+        Probability that noise alone passes the test: of the note, of the status (chi-square, two degrees of freedom).
         The nominal sigmas are assumptions; on the recordings, with a right map and all screens, the statistic
         stays below the threshold of the status, 13.8 (``tests/studies/integrity_tables.py``).
     missed : float

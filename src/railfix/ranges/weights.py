@@ -82,7 +82,7 @@ class NominalErrors(Settings):
         Orbit and clock in the range; GPS and Galileo stay near half a metre, their service definitions
         promise 2 m and 95 % of the time less.
     usual_accuracy_m : float
-        Accuracies that records state (URA, SISA) up to this are usual, 2 to 4.85 m, and stand for `satellite_sigma_m`.
+        Accuracies of records (URA, SISA) up to this stand for `satellite_sigma_m`: 2 to 4.85 m are usual.
         A worse one is believed: it is added to the sigma of the satellite's ranges.
     ionosphere_sigma_m : float
         Vertical delay that Klobuchar's model leaves. Mostly common to all satellites, taken as independent.

@@ -40,8 +40,8 @@ class AntennaSpacingLimits(Settings):
         Largest difference of the two speeds by the filter. Antennas of one vehicle have one speed, but for a few cm/s
         where the track curves or its cant changes; a lesser difference of single epochs moves no place by a metre.
     filter_held_s : float [s]
-        A wrong speed leaves a wrong place behind, which codes take back within some 20 s: so long neither of the two
-        places is trusted.
+        Time for which neither place is trusted: a wrong speed leaves a wrong place behind, which codes take back within
+        some 20 s.
     """
 
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)

@@ -93,7 +93,7 @@ class RiskBudget(Settings):
     satellite_prior : mapping of str to float
         Probability that a satellite of a constellation (its letter) is faulty at a time: its own signal.
     local_prior : float
-        Probability that a satellite's range is off at a time by local causes that the screens left, on top of
+        The same of a fault by local causes that the screens left, on top of
         that: multipath, interference. An assumption until measured on the line (P1 7).
     map_prior : float
         Probability that the map at a place is wrong by more than its stated error: the next track, heights without

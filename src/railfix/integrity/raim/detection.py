@@ -41,10 +41,10 @@ class RaimLimits(Settings):
     max_excluded : int
         Satellites excluded at an epoch at most: 0, 1 or 2 (P1 2.3(4): 2).
     min_redundancy : int
-        Degrees of freedom that must be left after an exclusion, so that the rest is checked.
+        Degrees of freedom that must be left after an exclusion.
     separation_risk : float
-        Probability that noise makes the true exclusion fit this much worse than another one
-        (chi-square, one degree of freedom). Another exclusion of as many satellites that passes
+        Probability that noise makes the true exclusion fit this much worse than another one.
+        Chi-square, one degree of freedom. Another exclusion of as many satellites that passes
         and fits nearly as well makes the epoch inseparable.
     same_position_m : float
         Exclusions whose positions differ by less than this do not compete: either

@@ -40,19 +40,19 @@ class PhaseLimits(Settings):
     clocks : {"own", "shared"}
         Whether the phases have a clock of their own or, as P4 writes, that of the codes.
     drift_m : float
-        Random walk of an ambiguity in one second [m/sqrt(s)]: what ionosphere, satellite orbit and
+        [m/sqrt(s)] Random walk of an ambiguity: what ionosphere, satellite orbit and
         clock, and multipath move a phase against the others. Without it, phases that drift by
         centimetres while satellites move by hundredths of a radian bias the position by metres.
         With codes of 1 m at 1 Hz, 0.01 averages over about 100 s. 0 holds ambiguities constant.
     hop_s : float
         The walk is taken in steps at multiples of this time since the GPS epoch.
     correlation_s : float
-        Code errors of a real receiver are correlated over tens of seconds (multipath, delays): epochs nearer
+        Correlation time of code errors: epochs nearer
         to each other than this give the ambiguities no new information. The variance of the
         ambiguities is multiplied by correlation / interval, up to that of codes alone. The
         positions do not change. 0 for white noise, such as simulated noise.
     passes : int
-        Linearisations of `phase_positions`, each with its own state, so that results do not depend on chunks.
+        Linearisations of `phase_positions`; each has its own state, so that results do not depend on chunks.
     forget_s : float
         An arc that `phase_positions` has not observed for this long starts again.
     largest_sigma_m : float
