@@ -44,11 +44,10 @@ from p1_ride import (
 )
 from p1_rtklib import ABSENT, PROGRAM
 from p1_static import static_report
-from p1_test_line import line_report
+from p1_test_line import SERVICE, line_report
 from railfix.core.arrays import Masks
 from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.simulate import Scenario
-from railfix.simulate.sbas import SbasSettings
 from railfix.simulate.scenario_file import load_recipe
 
 #: P1, chapter 5: largest error and positioning rate, conventional and by P1's method.
@@ -96,8 +95,6 @@ FILTER_SYSTEMS: Final = ("GJ", "GJE")
 CORRECTED_WAYS: Final = tuple(
     replace(way, name=f"{way.name}{word}", sbas=sbas) for way in WAYS for word, sbas in (("", False), (", SBAS", True))
 )
-#: The service's own errors, as in the scenario commercial-full.
-SERVICE: Final = SbasSettings(clock_sigma_m=0.1)
 _NONE: Final = (Status.TOO_FEW_SATELLITES, Status.UNOBSERVABLE, Status.NO_CONVERGENCE, Status.NO_OBSERVATION)
 #: Large errors this near in time are one line of the list [epochs].
 BURST_EPOCHS: Final = 50
@@ -255,8 +252,9 @@ def commercial(
     seed: int | None = None,
     ways: Sequence[Way] = WAYS,
     systems: Sequence[str] = SYSTEMS,
+    duration_s: float | None = None,
 ) -> Campaign:
-    """The scenario p1-commercial, or its runs on another line and place."""
+    """The scenario p1-commercial, or its runs on another line and place; whole, or so much from their start."""
     curve, recipe = cn0_curve(folder), load_recipe("p1-commercial")
     campaigns = []
     for number in runs:
@@ -266,6 +264,8 @@ def commercial(
             scenario = scenario.replaced(sensors=None)
         if any(way.sbas for way in ways):
             scenario = scenario.replaced(sbas=SERVICE)
+        if duration_s is not None:
+            scenario = scenario.replaced(duration_s=duration_s)
         name = recipe.names[number] if seed is None else f"seed-{seed}"
         campaigns.append(ridden(Bench(scenario, name, ways, systems, curve)))
     return together(campaigns)
