@@ -5,8 +5,7 @@ Run ``python tests/studies/p1_experiment.py PART`` for the tables of docs/p1-res
 ========== =====================================================================
 short      the first two minutes of that, in seconds
 commercial 145.2 km of the scenario p1-commercial: every configuration beside P1
-others     the same on lines and places of five other seeds
-corrected  GPS alone on the nine lines of both, with and without the corrections of simulated SBAS messages
+corrected  GPS alone on those lines and on five of other seeds, with and without simulated SBAS corrections
 filtered   the filter along the track on the lines of "commercial", without sensors and with two
 test-line  figures 7 and 8 and table 4
 static     two and three satellites, standing at many points of the test line
@@ -305,12 +304,6 @@ def commercial_report(campaign: Campaign) -> Iterator[str]:
     yield from breaking_lines(campaign, "strict")
 
 
-def others_report(folder: Path) -> Iterator[str]:
-    """The same tables for other lines and places."""
-    campaigns = [commercial(folder, (number,), seed) for seed, number in OTHER_RUNS]
-    yield from commercial_report(together(campaigns))
-
-
 def corrected_report(folder: Path) -> Iterator[str]:
     """GPS with and without SBAS corrections, P1's figures beside their like: all data, and ways without tunnels."""
     names = ("commercial lines", "other lines")
@@ -402,15 +395,13 @@ def report(part: str, folder: Path) -> Iterator[str]:
         yield from filtered_report(folder)
     elif part == "corrected":
         yield from corrected_report(folder)
-    elif part == "others":
-        yield from others_report(folder)
     elif part == "test-line":
         yield from line_report()
     else:
         yield from static_report()
 
 
-PARTS: Final = ("short", "commercial", "others", "corrected", "filtered", "test-line", "static")
+PARTS: Final = ("short", "commercial", "corrected", "filtered", "test-line", "static")
 
 
 def main(arguments: Sequence[str]) -> int:

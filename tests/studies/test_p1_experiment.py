@@ -43,7 +43,7 @@ def test_the_first_minutes_are_as_they_were(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.requirement("D2")
 @pytest.mark.requirement("D4")
-@pytest.mark.parametrize("part", ["commercial", "others", "corrected", "test-line"])
+@pytest.mark.parametrize("part", ["commercial", "corrected", "test-line"])
 def test_a_whole_part_is_as_they_were(part: str, tmp_path: Path) -> None:
     assert_same(printed(part, tmp_path), shown(part))
 

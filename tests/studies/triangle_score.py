@@ -1,8 +1,8 @@
-"""P3's triangle by its radius: false stops, and time until faults are found, with code fixes and with CLAS-grade ones.
+"""P3's triangle by its radius: false stops, and time until faults are found, by code fixes and by CLAS-grade ones.
 
 Run ``python tests/studies/triangle_score.py`` (some seconds). Errors of fixes are Gauss-Markov over 100 s, a part of
-them common to the three receivers; the errors of single code fixes are those of ``commercial-run``'s receivers, those
-of CLAS P3 names as the sharper way. The side's limit is the one that `limits_for_false_stops` gives with the radius.
+them common to the three receivers; their sizes (`FIXES`) are assumed. The limit of the sides is the one that
+`limits_for_false_stops` gives with the radius.
 """
 
 from __future__ import annotations
