@@ -69,24 +69,16 @@ def document() -> str:
         "Written by `python tests/studies/papers.py` from `tests/references/papers.toml`.",
         "An item without a test is open.",
         "",
-        *(f"- **{name}**: {title}" for name, title in DATA["papers"].items()),
-        "",
-        "| paper | item | done by | test | asked | reached |",
-        "|---|---|---|---|---|---|",
     ]
-    for item in DATA["item"]:
-        file, _, name = item.get("test", "").partition("::")
-        test = f"`{file}`: {name.removeprefix('test_').replace('_', ' ')}" if name else "**open**"
-        cells = (item["paper"], item["what"], f"`{item['where']}`", test, item.get("asked", ""), reached(item))
-        lines.append(f"| {' | '.join(cells)} |")
-    lines += [
-        "",
-        "## Where we read the papers differently",
-        "",
-        "| paper | it says | here | because |",
-        "|---|---|---|---|",
-    ]
-    lines += [f"| {d['paper']} | {d['says']} | {d['here']} | {d['why']} |" for d in DATA["difference"]]
+    for paper, title in DATA["papers"].items():
+        lines += ["", f"## {paper}: {title}", "", "|item|done by|test|asked|reached|", "|---|---|---|---|---|"]
+        for item in DATA["item"]:
+            if item["paper"] == paper:
+                test = f"`{item['test']}`" if item.get("test") else "**open**"
+                cells = (item["what"], f"`{item['where']}`", test, item.get("asked", ""), reached(item))
+                lines.append(f"|{'|'.join(cells)}|")
+    lines += ["", "## Where we read the papers differently", "", "|paper|it says|here|because|", "|---|---|---|---|"]
+    lines += [f"|{d['paper']}|{d['says']}|{d['here']}|{d['why']}|" for d in DATA["difference"]]
     return "\n".join(lines) + "\n"
 
 
