@@ -6,6 +6,7 @@ import doctest
 import re
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -94,6 +95,13 @@ def test_ci_runs_the_command_of_the_readme() -> None:
     assert found.count("\n") == 1
     assert "pytest" in found
     assert ".venv" in found
+
+
+def test_the_code_of_the_first_page_runs() -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "index.md").read_text(encoding="utf-8"), re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(code, names)
+    assert len(names["railfix"].train_table(names["result"])) == 2000
 
 
 def test_the_example_runs_and_prints_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
