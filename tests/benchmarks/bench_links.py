@@ -34,7 +34,7 @@ import numpy as np
 
 from railfix.ground.keys import write_keys
 from railfix.ground.links import BEARERS, CentreLinks, TrainLinks
-from railfix.ground.relay import Disturbance, RelaySettings
+from railfix.ground.relay import LinkDisturbance, RelaySettings
 
 #: Namespaces, and addresses of both bearers in each.
 TRAIN, CENTRE = f"rf{os.getpid()}t", f"rf{os.getpid()}c"
@@ -80,18 +80,20 @@ def tunnel(namespace: str) -> int:
     return int(made[0])
 
 
-def relayed(devices: tuple[int, int], settings: RelaySettings) -> dict[int, Disturbance]:
+def relayed(devices: tuple[int, int], settings: RelaySettings) -> dict[int, LinkDisturbance]:
     """Begin to pass packets between two devices; return the disturbance of each direction."""
     loop = asyncio.get_running_loop()
     disturbances = {}
     for k, (here, there) in enumerate((devices, devices[::-1])):
-        disturbance = disturbances[here] = Disturbance(settings.replaced(seed=k))
+        disturbance = disturbances[here] = LinkDisturbance(settings.replaced(seed=k))
 
         def write(data: bytes, there: int = there) -> None:
             with contextlib.suppress(BlockingIOError):  # the queue of the device is full: lost, as on a link
                 os.write(there, data)
 
-        def read(here: int = here, disturbance: Disturbance = disturbance, write: Callable[..., None] = write) -> None:
+        def read(
+            here: int = here, disturbance: LinkDisturbance = disturbance, write: Callable[..., None] = write
+        ) -> None:
             for _ in range(64):
                 try:
                     data = os.read(here, 2048)

@@ -20,7 +20,7 @@ from railfix.ground.link_figure import coverage
 from railfix.ground.link_quality import LinkChoice, LinkLimits, LinkMeter
 from railfix.ground.links import BEARERS, CentreLinks, TrainLinks
 from railfix.ground.quic import LinkProtocol
-from railfix.ground.relay import Disturbance, Relay, RelaySettings
+from railfix.ground.relay import LinkDisturbance, Relay, RelaySettings
 
 pytestmark = pytest.mark.requirement("F3")
 
@@ -292,7 +292,7 @@ def test_each_threat_on_the_wire(tmp_path: Path) -> None:
             for k, name in enumerate(BEARERS):
                 relay = relays[number, name] = Relay(centre.addresses[name], RelaySettings())
                 await relay.open(HOSTS[name])
-                relay.disturbance = Disturbance(settings.replaced(seed=settings.seed + 10 * k))
+                relay.disturbance = LinkDisturbance(settings.replaced(seed=settings.seed + 10 * k))
                 relay.disturbance.settings = RelaySettings()  # until it is connected
             local = {"A": f"127.0.1.{40 + number}", "B": f"127.0.2.{40 + number}"}
             trains[number] = TrainLinks(number, tmp_path, {n: relays[number, n].address for n in BEARERS}, local)

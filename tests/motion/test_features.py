@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from railfix.cli import app
-from railfix.motion.features import FeatureLimits, LineSeries, Located, line_series, locate, map_features
+from railfix.motion.features import FeatureLimits, LineSeries, LocatedFeature, line_series, locate, map_features
 from railfix.simulate.demonstration import demo_inputs
 from tracking_cases import bent_line
 
@@ -42,7 +42,7 @@ def _measured(line: LineSeries, place: float, seed: int, *, half: float = 60.0, 
     )
 
 
-def _locate(line: LineSeries, place: float, predicted: float, seed: int, **more: object) -> Located:
+def _locate(line: LineSeries, place: float, predicted: float, seed: int, **more: object) -> LocatedFeature:
     return locate(
         _measured(line, place, seed),
         line,

@@ -7,7 +7,7 @@ import pytest
 
 import carrier_cases
 from railfix.gnss.observations import Observations
-from railfix.positioning.carrier import SlipLimits, SlipReason, find_slips, number_arcs
+from railfix.positioning.carrier import CycleSlipLimits, SlipReason, find_slips, number_arcs
 from railfix.positioning.carrier.arcs import NO_ARC, channel_of
 
 MILLISECOND_M = 299_792.458
@@ -21,7 +21,7 @@ def with_cycles(obs: Observations, epoch: int, channel: int, cycles: float) -> O
 
 def flagged(obs: Observations, **limits: float) -> np.ndarray:
     """Slips after the first epoch."""
-    return find_slips(obs, limits=SlipLimits(**limits))[0].slip[1:]
+    return find_slips(obs, limits=CycleSlipLimits(**limits))[0].slip[1:]
 
 
 @pytest.mark.requirement("A5")
@@ -61,7 +61,7 @@ def test_exactly_at_the_limit_is_no_slip():
     obs = with_cycles(carrier_cases.log(), 20, 3, 1)
     metric = abs(find_slips(obs)[0].doppler_metric_m[20, 3])
     wide = {"doppler_mps": 1e-12, "jerk_mps3": 1e-300}
-    at = find_slips(obs, limits=SlipLimits(doppler_m=metric, **wide))[0].doppler_limit_m[20]
+    at = find_slips(obs, limits=CycleSlipLimits(doppler_m=metric, **wide))[0].doppler_limit_m[20]
     assert flagged(obs, doppler_m=metric + (metric - at) + 1e-9, **wide)[19, 3] == np.False_
     assert flagged(obs, doppler_m=metric - 1e-9, **wide)[19, 3] == np.True_
 
@@ -207,4 +207,4 @@ def test_arcs_have_names_of_their_own():
 @pytest.mark.parametrize("name", ["max_gap_s", "doppler_m", "doppler_mps", "jerk_mps3", "code_m"])
 def test_limits_must_be_positive(name):
     with pytest.raises(ValueError, match=name):
-        SlipLimits(**{name: 0.0})
+        CycleSlipLimits(**{name: 0.0})

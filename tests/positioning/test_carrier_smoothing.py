@@ -7,11 +7,11 @@ import pytest
 
 import carrier_cases
 from railfix.gnss.observations import Observations
-from railfix.positioning.carrier import Smoothed, SmoothingLimits, SmoothingState, find_slips, smooth_codes
+from railfix.positioning.carrier import SmoothedCodes, SmoothingLimits, SmoothingState, find_slips, smooth_codes
 from railfix.positioning.carrier.recursion import linear_recursion
 
 
-def smoothed(obs: Observations, slip: np.ndarray | None = None, **limits: object) -> Smoothed:
+def smoothed(obs: Observations, slip: np.ndarray | None = None, **limits: object) -> SmoothedCodes:
     slips, _ = find_slips(obs)
     begins = slips.slip if slip is None else slip
     return smooth_codes(
@@ -84,7 +84,7 @@ def test_codes_that_jump_together_are_smoothed_all_the_same():
     common = np.random.default_rng(8).normal(0.0, 30.0, (200, 1))
     jumping = carrier_cases.changed(obs, code_m=obs.code_m + common)
 
-    def spread(result: Smoothed) -> float:
+    def spread(result: SmoothedCodes) -> float:
         apart = result.code_m - obs.phase_cycles * carrier_cases.WAVELENGTH_M
         late = (apart - apart.mean(axis=1, keepdims=True))[100:]
         return float(np.std(late - late.mean(axis=0)))

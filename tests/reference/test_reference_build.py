@@ -18,10 +18,10 @@ from railfix.positioning.doppler_speed import Dopplers, dopplers_of_log
 from railfix.reference import (
     Acceleration,
     Built,
+    FixRejection,
     Pulses,
     ReferenceData,
     ReferenceSettings,
-    Rejection,
     build_references,
 )
 from railfix.simulate import AntennaTruth, antenna_truth
@@ -322,10 +322,10 @@ def test_each_refusal_has_its_reason_and_they_add_up() -> None:
         "travel": 4,
     }
     assert sum(fixes.counts().values()) == len(fixes) == 200
-    np.testing.assert_array_equal(np.flatnonzero(fixes.rejection & Rejection.TRAVEL), [80, 81, 82, 83])
+    np.testing.assert_array_equal(np.flatnonzero(fixes.rejection & FixRejection.TRAVEL), [80, 81, 82, 83])
     np.testing.assert_allclose(fixes.lateral_m[40:42], 1.5, atol=0.1)
     np.testing.assert_allclose(fixes.height_m[50:55], 3.0, atol=0.1)
-    assert Rejection(int(fixes.rejection[40])).text == "off_track"
+    assert FixRejection(int(fixes.rejection[40])).text == "off_track"
 
 
 def test_two_antennas_must_be_as_far_apart_as_on_the_vehicle() -> None:
@@ -349,11 +349,11 @@ def test_two_antennas_must_be_as_far_apart_as_on_the_vehicle() -> None:
     built = build_references(data)
     for name in ("front", "rear"):
         fixes = built[name].fixes
-        assert np.flatnonzero(fixes.rejection & Rejection.SPACING).tolist() == [20]
+        assert np.flatnonzero(fixes.rejection & FixRejection.SPACING).tolist() == [20]
         assert fixes.spacing_m[20] == pytest.approx(0.07, abs=0.003)
         assert fixes.spacing_m[30] == pytest.approx(0.03, abs=0.003)
-    assert np.flatnonzero(built["front"].fixes.rejection & Rejection.UNPAIRED).tolist() == [40]
-    assert np.flatnonzero(built["rear"].fixes.rejection & Rejection.NOT_FIXED).tolist() == [40]
+    assert np.flatnonzero(built["front"].fixes.rejection & FixRejection.UNPAIRED).tolist() == [40]
+    assert np.flatnonzero(built["rear"].fixes.rejection & FixRejection.NOT_FIXED).tolist() == [40]
     kept = build_references(data, ReferenceSettings(unpaired="keep"))["front"].fixes
     assert kept.rejection[40] == 0
     with pytest.raises(MismatchError, match="name a vehicle"):

@@ -16,7 +16,7 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.reasons import Reason
 from railfix.integrity.stanford import stanford as sorted_epochs
 from railfix.report import plots
-from railfix.report.plots.chart import Band, Bars, Cells, Chart, Line, Marks, Points, Ranges, SkyEpochs
+from railfix.report.plots.chart import Band, Bars, Cells, Chart, Line, Marks, Points, RangeBars, SkyEpochs
 from railfix.report.plots.columns import nice_step
 from railfix.report.plots.thinning import extremes, one_per_cell, spread
 from railfix.screens import Cn0Limits
@@ -122,7 +122,7 @@ def test_a_few_huge_errors_do_not_press_the_rest_flat() -> None:
 
 def test_ranges_of_runs(errors: pl.DataFrame) -> None:
     chart = plots.error_ranges({"a": errors, "b": errors.with_columns(error_m=pl.lit(None, dtype=pl.Float64))})
-    on_map, conventional = layer(chart, Ranges, "on the map"), layer(chart, Ranges, "conventional")
+    on_map, conventional = layer(chart, RangeBars, "on the map"), layer(chart, RangeBars, "conventional")
     assert on_map.names == ("a, on the map", "a, conventional", "b, on the map", "b, conventional")
     np.testing.assert_array_equal(on_map.low, [-1.0, np.nan, np.nan, np.nan])
     np.testing.assert_array_equal(on_map.mid, [0.5, np.nan, np.nan, np.nan])

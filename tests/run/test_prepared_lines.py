@@ -11,7 +11,7 @@ import pytest
 from broken_bench import Bench, bench_in
 from railfix.run import prepared, sources
 from railfix.run.options import TrackReading
-from railfix.run.sources import Line, open_line
+from railfix.run.sources import OpenedLine, open_line
 
 EPOCH = np.datetime64("2024-03-05T03:00:00", "ns")
 
@@ -29,12 +29,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-def opened(bench: Bench, reading: TrackReading | None = None) -> Line:
+def opened(bench: Bench, reading: TrackReading | None = None) -> OpenedLine:
     antennas = ("front", "rear")
     return open_line((bench.track,), bench.vehicle, antennas=antennas, reading=reading or TrackReading(), at=EPOCH)
 
 
-def assert_same(one: Line, two: Line) -> None:
+def assert_same(one: OpenedLine, two: OpenedLine) -> None:
     assert one.facts == two.facts
     pairs = [(one.track, two.track), *zip(one.trajectories.values(), two.trajectories.values(), strict=True)]
     for first, second in pairs:

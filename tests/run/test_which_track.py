@@ -17,7 +17,7 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.positioning.which_track import StandstillErrors, StandstillFix, TrackPosterior, track_posterior
-from railfix.run.standstill import BaseStation, StandstillCodes, standstill_codes
+from railfix.run.standstill import StandstillBase, StandstillCodes, standstill_codes
 from railfix.run.track_prior import prior_of_interlocking, prior_of_last_place, write_last_place
 from railfix.run.which_track import decide_track
 from railfix.simulate.demo_data import demo_files
@@ -171,7 +171,7 @@ def roof(recordings: Path) -> dict[str, StandstillCodes]:
         name: ecef_from_geodetic(*(float(v) for v in (folder / f"{name}_position.txt").read_text().split()))
         for name in ("base", "rover")
     }
-    base = BaseStation(observations=read_observations(folder / "base.obs"), ecef_m=place["base"])
+    base = StandstillBase(observations=read_observations(folder / "base.obs"), ecef_m=place["base"])
     rover = read_observations(folder / "rover.obs")
     origin = place["rover"]
     return {

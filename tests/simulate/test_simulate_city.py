@@ -26,7 +26,7 @@ from railfix.simulate.environment.trees import foliage
 from railfix.simulate.environment.vehicles import equipment_amplitude, neighbour_clearance, neighbour_reflection
 from railfix.simulate.environment.walls import Rays
 from railfix.simulate.errors.settings import TrackingSettings
-from railfix.simulate.noise import CodeSmoothing, Tracking
+from railfix.simulate.noise import CodeSmoothing, TrackingNoise
 from railfix.simulate.scenario_file import load_scenario
 from test_simulate_environment import LINE_M, WAVE, rays, section, seen, wall
 from test_simulate_signals import whole
@@ -219,7 +219,7 @@ def test_a_weak_signal_is_tracked_again_only_from_the_higher_threshold() -> None
     expected = [False, False, True, True, True, False, False, False, True, False, True]
     settings = TrackingSettings(threshold_dbhz=10.0, reacquisition_dbhz=15.0)
     for size in (11, 1, 3):
-        tracking = Tracking(settings, key=(1,), channels=1, interval_s=1.0)
+        tracking = TrackingNoise(settings, key=(1,), channels=1, interval_s=1.0)
         weak = np.concatenate([tracking.too_weak(cn0[k : k + size]) for k in range(0, 11, size)])
         assert weak[:, 0].tolist() == expected
 

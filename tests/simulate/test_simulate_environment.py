@@ -14,7 +14,7 @@ from scipy.signal import max_len_seq
 
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, enu_axes
-from railfix.simulate import Disturbance, Geometry, Scenario, Simulation
+from railfix.simulate import Disturbance, Scenario, SightGeometry, Simulation
 from railfix.simulate.environment import (
     CorrelatorSettings,
     ElectrificationSettings,
@@ -50,12 +50,12 @@ def seen(
     *,
     heading_deg: float = 63.0,
     speed_mps: float = 0.0,
-) -> Geometry:
+) -> SightGeometry:
     """One or more GPS satellites at fixed directions from the train's own, over a line north-east."""
     chainage = np.atleast_1d(np.asarray(chainage_m, dtype=np.float64))
     elevation, relative = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in (elevation_deg, relative_deg))
     n, m = len(chainage), len(elevation)
-    return Geometry(
+    return SightGeometry(
         antenna="front",
         time=np.datetime64("2024-03-05T00:00:00", "ns") + np.arange(n) * np.timedelta64(100, "ms"),
         satellite=np.array([f"G{k + 1:02d}" for k in range(m)]),
@@ -488,7 +488,7 @@ def town(seed: int = 1) -> Environment:
     return Environment(CITY, line_length_m=LINE_M, seed=seed)
 
 
-def everywhere(n: int = 400) -> Geometry:
+def everywhere(n: int = 400) -> SightGeometry:
     rng = np.random.default_rng(3)
     return seen(
         np.linspace(20.0, 980.0, n),

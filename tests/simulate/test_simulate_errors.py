@@ -14,11 +14,11 @@ from railfix.gnss.observations import concatenate
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.simulate import (
     Disturbance,
-    Geometry,
     Piece,
     ReceiverSettings,
     RunSettings,
     Scenario,
+    SightGeometry,
     Simulation,
     SkySettings,
 )
@@ -33,7 +33,7 @@ from railfix.simulate.errors import (
 )
 from railfix.simulate.errors.common import CommonErrors, ionosphere_mapping, pierce_point_km, troposphere_mapping
 from railfix.simulate.errors.processes import GaussMarkov
-from railfix.simulate.noise import CarriedNoise, NoiseSettings, Tracking, TrackingSettings
+from railfix.simulate.noise import CarriedNoise, NoiseSettings, TrackingNoise, TrackingSettings
 from railfix.simulate.satellites import links
 
 pytestmark = pytest.mark.requirement("D4")
@@ -433,7 +433,7 @@ def test_carried_noise_is_in_force_from_the_first_epoch_on() -> None:
     assert np.std(first) == pytest.approx(2.0, rel=0.03)
 
 
-def weaker(geometry: Geometry) -> Disturbance:
+def weaker(geometry: SightGeometry) -> Disturbance:
     """10 dB less for the second half of the channels."""
     none = np.zeros(geometry.elevation_deg.shape)
     half = np.arange(none.shape[1]) >= none.shape[1] // 2
@@ -474,7 +474,7 @@ def test_cn0_wanders() -> None:
 def test_a_weak_signal_is_lost_and_comes_back_later_with_another_ambiguity() -> None:
     """Two shadows of G06, of 2 s and 1 s, 40 dB deep; half a second until it is tracked again."""
 
-    def shadow(geometry: Geometry) -> Disturbance:
+    def shadow(geometry: SightGeometry) -> Disturbance:
         none = np.zeros(geometry.elevation_deg.shape)
         since = (geometry.time - Scenario().start) / np.timedelta64(1, "s")
         dark = ((since > 1.99) & (since < 3.99)) | ((since > 5.99) & (since < 6.99))
@@ -502,10 +502,10 @@ def test_a_weak_signal_is_lost_and_comes_back_later_with_another_ambiguity() -> 
 
 def test_a_satellite_that_rises_has_slipped_nothing() -> None:
     bad = np.array([[1, 0], [1, 0], [0, 1], [0, 0], [0, 0]], dtype=bool)
-    made = Tracking(TrackingSettings(slips="after_loss"), key=(1,), channels=2, interval_s=1.0).follow(bad)
+    made = TrackingNoise(TrackingSettings(slips="after_loss"), key=(1,), channels=2, interval_s=1.0).follow(bad)
     np.testing.assert_array_equal(made.lost, bad)
     assert np.argwhere(made.loss_of_lock).tolist() == [[3, 1]]
-    delayed = Tracking(TrackingSettings(reacquisition_s=1.0), key=(1,), channels=2, interval_s=1.0).follow(bad)
+    delayed = TrackingNoise(TrackingSettings(reacquisition_s=1.0), key=(1,), channels=2, interval_s=1.0).follow(bad)
     assert (~delayed.lost).astype(int).T.tolist() == [[0, 0, 0, 1, 1], [1, 1, 0, 0, 1]]
 
 

@@ -19,10 +19,10 @@ from railfix.gnss.signals import carrier_frequency_hz
 from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
 from railfix.simulate import (
     Disturbance,
-    Geometry,
     Piece,
     ReceiverSettings,
     Scenario,
+    SightGeometry,
     Simulation,
     SkySettings,
     write_run,
@@ -258,7 +258,7 @@ def test_the_seed_decides() -> None:
 
 
 def test_disturbances_are_added_and_can_take_a_signal_away() -> None:
-    def mast(geometry: Geometry) -> Disturbance:
+    def mast(geometry: SightGeometry) -> Disturbance:
         shape = geometry.elevation_deg.shape
         low = geometry.elevation_deg < 30.0
         code = np.where(low, 7.0, 0.0)

@@ -33,7 +33,7 @@ from railfix.positioning.carrier import (
     Phases,
     SlipReason,
     Slips,
-    Smoothed,
+    SmoothedCodes,
     TrackJumps,
     corrected_phase_m,
     find_slips,
@@ -75,7 +75,7 @@ class Carried:
     result: AntennaResult
     slips: Slips
     jumps: TrackJumps
-    smoothed: Smoothed
+    smoothed: SmoothedCodes
     code_ranges: Ranges
     hatch_arc_m: np.ndarray
     live: PhasePositions

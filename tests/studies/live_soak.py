@@ -31,7 +31,7 @@ from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
 from railfix.live.sinks import open_sink
 from railfix.live.state import SavedSession
-from railfix.live.stream import Received, ReceiverState, single_epochs
+from railfix.live.stream import ReceivedData, ReceiverState, single_epochs
 from railfix.ranges.sbas import SbasMessages, read_sbas
 from railfix.simulate import LineSettings, RunSettings, Scenario, write_run
 
@@ -82,7 +82,7 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False) -> d
             memory.append(resident_mb())
             print(f"{len(memory):3d} h  {memory[-1]:7.1f} MB  state {counts['saved'] / 1e3:.0f} kB", flush=True)
 
-    async def arrivals(source: str, state: ReceiverState, _: object) -> AsyncIterator[Received]:
+    async def arrivals(source: str, state: ReceiverState, _: object) -> AsyncIterator[ReceivedData]:
         last, front = start, source == str(files["front"])
         for piece in railfix.scan_observations(source, epochs=100):
             for epoch in single_epochs(piece):
@@ -93,7 +93,7 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False) -> d
                 last = now
                 if heard is not None:
                     engine.add_sbas(heard)
-                yield Received(epochs=(epoch,), navigation=new, after=state)
+                yield ReceivedData(epochs=(epoch,), navigation=new, after=state)
                 await asyncio.sleep(0)
 
     async def run() -> None:

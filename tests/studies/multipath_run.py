@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from railfix.simulate import Scenario, write_run
-from railfix.simulate.disturbance import Disturbance, Geometry
+from railfix.simulate.disturbance import Disturbance, SightGeometry
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class Wall:
     top_deg: float
     loss_db: float
 
-    def __call__(self, geometry: Geometry) -> Disturbance:
+    def __call__(self, geometry: SightGeometry) -> Disturbance:
         """The reflection in place of the hidden signal: its detour, and its loss."""
         elevation = np.radians(geometry.elevation_deg)
         behind = np.radians(geometry.azimuth_deg - geometry.heading_deg[:, None] - self.side_deg)

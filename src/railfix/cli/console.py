@@ -177,7 +177,7 @@ def show_summary(summary: RunSummary) -> None:
     show_verdict(console, verdict_of_run(summary))
     if summary.tracks:
         console.print("Filter along the track (train.csv)")
-        console.print(_filtered(summary.tracks))
+        console.print(_filter(summary.tracks))
         console.print("Each epoch by itself (positions.csv)")
     console.print(_positions(summary, names))
     console.print("Rejected pseudoranges by their first reason, and by that reason alone")
@@ -216,7 +216,7 @@ def _positions(summary: RunSummary, names: list[str]) -> Table:
     return table
 
 
-def _filtered(tracks: Mapping[str, Filtered]) -> Table:
+def _filter(tracks: Mapping[str, Filtered]) -> Table:
     table = _by_antenna(tracks)
     for status in dict.fromkeys(word for found in tracks.values() for word in found.status):
         if any(found.status[status] for found in tracks.values()):

@@ -107,7 +107,7 @@ def evaluate(
         raise SettingsError(f"--table {unknown[0]}: no such table; known are {', '.join(TABLES)}")
     pairs = [
         replace(pair, table=name, conventional=conventional)
-        for pair in _paired(runs, reference, label)
+        for pair in _pair(runs, reference, label)
         for name in table or tables_of(pair.run) or [POSITIONS_TABLE]
     ]
     written: dict[str, Path] = {}
@@ -122,7 +122,7 @@ def evaluate(
     show_evaluation(evaluation, written, beside="p1" if beside_p1 else "nothing")
 
 
-def _paired(runs: list[Path], reference: list[str], label: list[str] | None) -> list[RunAndReference]:
+def _pair(runs: list[Path], reference: list[str], label: list[str] | None) -> list[RunAndReference]:
     """Each run with its reference and label."""
     references: list[str] = reference * len(runs) if len(reference) == 1 else reference
     if len(references) != len(runs):

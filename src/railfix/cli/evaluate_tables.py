@@ -99,7 +99,7 @@ def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: L
         if rows.is_empty() or rows["group"].unique().to_list() == [trivial]:
             continue
         console.print(head)
-        console.print(_grouped(rows))
+        console.print(_group(rows))
         if grouping == "section" and rows.n_unique(["run", "antenna", "group"]) > _MOST_SECTIONS:
             console.print(f"  the first {_MOST_SECTIONS}; all are in tables.csv (--out)")
     if beside == "p1":
@@ -112,7 +112,7 @@ _OF: Final[tuple[Column, ...]] = (("of", "of", str), ("antenna", "antenna", str)
 _signed: Final = partial(metres, sign="+")
 
 
-def _named(rows: pl.DataFrame) -> pl.DataFrame:
+def _add_names(rows: pl.DataFrame) -> pl.DataFrame:
     """Rows with the words for their kind of position."""
     return rows.with_columns(pl.col("position").replace({name: text.strip() for name, text in _NAMES.items()}))
 
@@ -169,7 +169,7 @@ def _limits(rows: pl.DataFrame) -> Table:
     return table
 
 
-def _grouped(rows: pl.DataFrame) -> Table:
+def _group(rows: pl.DataFrame) -> Table:
     """Constrained and conventional of each group in one row."""
     keys = ["run", "configuration", "line", "antenna", "group"]
     left = rows.filter(pl.col("position") == "constrained")
@@ -202,7 +202,7 @@ def _intervals(rows: pl.DataFrame) -> Table:
         ("p95 s", "gap_p95_s", metres),
         ("longest s", "gap_max_s", metres),
     )
-    return listed(_named(rows).with_columns(RUN_OR_CONFIGURATION).iter_rows(named=True), columns)
+    return listed(_add_names(rows).with_columns(RUN_OR_CONFIGURATION).iter_rows(named=True), columns)
 
 
 def _levels(rows: pl.DataFrame) -> Table:
@@ -217,7 +217,7 @@ def _levels(rows: pl.DataFrame) -> Table:
         ("errors", "errors", count),
         ("over level", "over_level", count),
     )
-    return listed(_named(rows).iter_rows(named=True), columns)
+    return listed(_add_names(rows).iter_rows(named=True), columns)
 
 
 def outages(rows: pl.DataFrame) -> Table:

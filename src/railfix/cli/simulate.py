@@ -86,7 +86,7 @@ def simulate(
     if scenario is None or out is None:
         raise typer.BadParameter("give a SCENARIO and --out DIR, or --list")
     recipe = load_recipe(scenario)
-    numbers = _chosen(recipe, only or [])
+    numbers = _choose_runs(recipe, only or [])
     replacing = overwriting(overwrite)
     folders = {number: out / recipe.names[number] for number in numbers}
     for folder in folders.values():
@@ -147,7 +147,7 @@ def _simulate(
     typer.echo(f"{done:,} antenna-epochs")
 
 
-def _chosen(recipe: Recipe, only: list[str]) -> list[int]:
+def _choose_runs(recipe: Recipe, only: list[str]) -> list[int]:
     """Numbers of the runs to make, from 0."""
     if not only:
         return list(range(len(recipe.names)))

@@ -81,7 +81,7 @@ def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
         pl.col("run") != "all", pl.col("antenna") != "all",
     ).sort("p95_m", descending=True, nulls_last=False)  # fmt: skip
     room = _MOST - 1
-    texts = [_judged(row) for row in rows.iter_rows(named=True)]
+    texts = [_judge(row) for row in rows.iter_rows(named=True)]
     if len(texts) > room:
         texts = [*texts[: room - 1], f"and {len(texts) - room + 1} better ones, in the tables below"]
     paths, references = ({str(getattr(run, what)) for run in evaluation.runs} for what in ("path", "reference"))
@@ -91,7 +91,7 @@ def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
     return [*texts, "next: railfix report draws runs beside each other, with the same references"]
 
 
-def _judged(row: Mapping[str, Any]) -> str:
+def _judge(row: Mapping[str, Any]) -> str:
     """One run and antenna in a sentence."""
     from railfix.evaluate.scores import WRONG_PLACE_M
 

@@ -15,7 +15,7 @@ from railfix.core.timescale import seconds
 from railfix.evaluate.bracket import bracket
 from railfix.evaluate.integrity import PARTS, STATED
 from railfix.evaluate.options import EvaluationOptions
-from railfix.evaluate.place import Answers, Errors, TrackFiles, errors_of
+from railfix.evaluate.place import Answers, PlaceErrors, TrackFiles, errors_of
 from railfix.evaluate.run_folder import RunFolder, floats
 from railfix.evaluate.sections import Sections
 from railfix.io.reference_log import AntennaReference
@@ -70,7 +70,7 @@ class AntennaEpochs:
     ----------
     table : polars.DataFrame
         `EPOCH_COLUMNS` without run, configuration and line; the run's protection levels with their parts.
-    errors : Errors
+    errors : PlaceErrors
     speed_from : {"reference", "places"}
     outside, from_sections : int
         Epochs of the log outside the reference; epochs with a reference whose environment is that of the sections.
@@ -79,7 +79,7 @@ class AntennaEpochs:
     """
 
     table: pl.DataFrame
-    errors: Errors
+    errors: PlaceErrors
     speed_from: str
     outside: int
     step_s: float

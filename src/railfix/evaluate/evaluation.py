@@ -247,7 +247,7 @@ def evaluate_runs(
         part.tables = []
     epochs = below(tables)
     del tables
-    evaluated = tuple(_evaluated(*item) for item in zip(parts, names, labels, strict=True))
+    evaluated = tuple(_evaluate(*item) for item in zip(parts, names, labels, strict=True))
     levelled = [
         LevelledRun(name=name, kind=part.level[0], alarm_limit_m=part.level[1])
         for part, name in zip(parts, names, strict=True)
@@ -396,7 +396,7 @@ def short_names(paths: Sequence[Path]) -> list[str]:
     return ["/".join(part[-depth:]) for part in parts]
 
 
-def _evaluated(part: _Part, name: str, label: str) -> EvaluatedRun:
+def _evaluate(part: _Part, name: str, label: str) -> EvaluatedRun:
     return EvaluatedRun(
         name=name,
         configuration=label,

@@ -200,10 +200,10 @@ def figures_by(parts: Iterable[pl.DataFrame], groupings: Sequence[str], options:
                 limited = epochs_of == "own" and grouping in WITH_LIMITS
                 tables[grouping][kind].append(_with_limits(table, part if limited else None, by, options))
     whole = {grouping: pl.concat([table for kind in found for table in kind]) for grouping, found in tables.items()}
-    return pl.concat([_ordered(table, grouping, options) for grouping, table in whole.items()], how="vertical")
+    return pl.concat([_order(table, grouping, options) for grouping, table in whole.items()], how="vertical")
 
 
-def _ordered(table: pl.DataFrame, grouping: str, options: EvaluationOptions) -> pl.DataFrame:
+def _order(table: pl.DataFrame, grouping: str, options: EvaluationOptions) -> pl.DataFrame:
     """The table of one grouping in the order of its groups, with the columns of `FIGURE_COLUMNS`."""
     rank, group = f"{grouping}_rank", f"{grouping}_group"
     columns = [name for name in FIGURE_COLUMNS if not name.startswith("over_5_m")]

@@ -169,10 +169,10 @@ def epochs_diagram(
     """
     columns = (level_name(kind), f"{kind}_protection_status")
     spanned = epochs.select(*_JUDGED, *(name for name in columns if name in epochs.columns)).filter("in_reference")
-    return _sorted(spanned, *_judged(spanned, kind, levels_of), alarm_limit_m, options)
+    return _sort(spanned, *_judge(spanned, kind, levels_of), alarm_limit_m, options)
 
 
-def _judged(spanned: pl.DataFrame, kind: str, levels_of: LevelsOf) -> tuple[Floats, Floats]:
+def _judge(spanned: pl.DataFrame, kind: str, levels_of: LevelsOf) -> tuple[Floats, Floats]:
     """Errors and levels as counted of epochs inside the reference, NaN where there is none."""
     has = spanned["positioned"].to_numpy()
     error = np.where(has & spanned["reference_good"].to_numpy(), floats(spanned, "error_m"), np.nan)
@@ -200,10 +200,10 @@ def positions_diagram(
         _words(positions, "protection_status"),
         levels_of=levels_of,
     )
-    return _sorted(positions, np.full(len(positions), np.nan), level, alarm_limit_m, options)
+    return _sort(positions, np.full(len(positions), np.nan), level, alarm_limit_m, options)
 
 
-def _sorted(
+def _sort(
     table: pl.DataFrame, error_m: Floats, level_m: Floats, alarm_limit_m: float, options: EvaluationOptions
 ) -> Stanford:
     return stanford(
@@ -232,12 +232,12 @@ def integrity_of(epochs: pl.DataFrame, runs: Sequence[LevelledRun], options: Eva
         slim = epochs.select(*KEYS, "environment", "observed", *(name for name in needed if name in epochs.columns))
         for run in mine:
             for part in slim.filter(pl.col("run") == run.name).partition_by("antenna", maintain_order=True):
-                rows += _counted(part, run, limits, options)
-        by_kind[kind] = Integrity(stanford=_pooled(rows), beyond=_beyond(epochs, [run.name for run in mine], kind))
+                rows += _count(part, run, limits, options)
+        by_kind[kind] = Integrity(stanford=_pool(rows), beyond=_beyond(epochs, [run.name for run in mine], kind))
     return by_kind
 
 
-def _counted(
+def _count(
     part: pl.DataFrame, run: LevelledRun, limits: Sequence[float], options: EvaluationOptions
 ) -> Iterator[dict[str, Any]]:
     """Counts of one antenna of a run: all epochs, then by environment."""
@@ -249,9 +249,9 @@ def _counted(
     for grouping, group, spanned in groups:
         observed = spanned["observed"].to_numpy()
         for levels_of in LEVELS_OF:
-            error, level = _judged(spanned, run.kind, levels_of)
+            error, level = _judge(spanned, run.kind, levels_of)
             for limit in limits:
-                diagram = _sorted(spanned, error, level, limit, options)
+                diagram = _sort(spanned, error, level, limit, options)
                 regions = {name: diagram.counts[region] for region, name in _REGIONS.items()}
                 row = {
                     **keys,
@@ -277,7 +277,7 @@ def _counted(
                 yield row
 
 
-def _pooled(rows: list[dict[str, Any]]) -> pl.DataFrame:
+def _pool(rows: list[dict[str, Any]]) -> pl.DataFrame:
     """Rows with their sums over both antennas and over all runs of a configuration; with shares."""
     parts = [pl.DataFrame(rows, schema_overrides={"alarm_limit_m": pl.Float64})]
     if parts[0]["antenna"].n_unique() > 1:

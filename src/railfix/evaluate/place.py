@@ -69,7 +69,7 @@ class Answers:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Errors:
+class PlaceErrors:
     """Signed errors of one antenna, T epochs, + toward the end of the line.
 
     Attributes
@@ -101,7 +101,7 @@ def errors_of(
     *,
     method: Literal["auto", "chainage", "trajectory"],
     files: TrackFiles,
-) -> Errors:
+) -> PlaceErrors:
     """Errors of one antenna of a run.
 
     By chainage if the reference has one at every epoch, the run's chainage is that of the antenna, and both
@@ -120,7 +120,7 @@ def errors_of(
         if against is None:
             if files.track or files.vehicle is not None:
                 find_trajectory(run, antenna, answers, files)  # what was given is that of the run
-            return Errors(
+            return PlaceErrors(
                 method="chainage",
                 error_m=short_way_m(answers.chainage_m - answers.reference_chainage_m, turn),
                 conventional_error_m=short_way_m(answers.conventional_chainage_m - answers.reference_chainage_m, turn),
@@ -139,7 +139,7 @@ def errors_of(
     if not trusted:
         place = trajectory.chainage_at(trajectory.nearest(answers.reference_ecef_m)[0])
     error = along_track_error(arc, answers.reference_ecef_m, trajectory)
-    return Errors(
+    return PlaceErrors(
         method="trajectory",
         error_m=error,
         conventional_error_m=along_track_error(other, answers.reference_ecef_m, trajectory),

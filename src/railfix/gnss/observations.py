@@ -254,15 +254,15 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         signal=np.array([k[1] for k in keys], dtype="<U2"),
         loss_of_lock=lock,
         break_before=np.concatenate([p.break_before for p in parts]),
-        header=_joined_header(parts),
-        problems=_joined_problems(parts),
+        header=_join_header(parts),
+        problems=_join_problems(parts),
         problem_count=sum(p.problem_count for p in parts),
-        skipped=_joined_counts(parts),
+        skipped=_join_counts(parts),
         **floats,
     )
 
 
-def _joined_header(parts: Sequence[Observations]) -> ObservationHeader:
+def _join_header(parts: Sequence[Observations]) -> ObservationHeader:
     first = parts[0].header
     signals = {system: set(names) for system, names in first.signals.items()}
     channels = dict(first.glonass_channel)
@@ -274,7 +274,7 @@ def _joined_header(parts: Sequence[Observations]) -> ObservationHeader:
     return replace(first, signals=joined, glonass_channel=channels)
 
 
-def _joined_problems(parts: Sequence[Observations]) -> tuple[str, ...]:
+def _join_problems(parts: Sequence[Observations]) -> tuple[str, ...]:
     return capped_problems(
         chain.from_iterable(p.problems[:MAX_PROBLEMS] for p in parts), count=sum(p.problem_count for p in parts)
     )
@@ -286,7 +286,7 @@ def capped_problems(messages: Iterable[str], *, count: int) -> tuple[str, ...]:
     return (*kept, f"and {count - len(kept)} more problems") if count > len(kept) else kept
 
 
-def _joined_counts(parts: Sequence[Observations]) -> dict[str, int]:
+def _join_counts(parts: Sequence[Observations]) -> dict[str, int]:
     counts: dict[str, int] = {}
     for part in parts:
         for kind, number in part.skipped.items():

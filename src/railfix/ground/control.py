@@ -207,7 +207,7 @@ class ControlCentre:
             if after.state is not record.state:
                 self.log(f"train {number}: {after.state.value}", train=number)
             self.supervision.records[number] = after
-        if not self._saved_whole(now):
+        if not self._save_whole(now):
             return
         for authority in authorities:
             if not authority.stopped:
@@ -216,7 +216,7 @@ class ControlCentre:
                 self.stops[authority.train] = StopOrder(number=authority.number, sent_s=now)
             self.send(authority.train, authority.encode())
 
-    def _saved_whole(self, now: float) -> bool:
+    def _save_whole(self, now: float) -> bool:
         """Commit what has changed since the last time; return whether the database has taken it."""
         state, records = self.supervision.state, self.supervision.records
         cause = "" if self.monitor is None or self.monitor.cause is None else self.monitor.cause.name

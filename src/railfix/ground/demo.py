@@ -174,7 +174,7 @@ async def run_demo(
             await links.start()
             held.push_async_callback(links.stop)
         announce(page.url)
-        await _connected(trains)
+        await _connect(trains)
         await _run(traffic, relays, speed)
         done = True
         figures = _figures(traffic, trains, centre)
@@ -200,7 +200,7 @@ def _number(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-async def _connected(trains: dict[int, TrainLinks]) -> None:
+async def _connect(trains: dict[int, TrainLinks]) -> None:
     for _ in range(500):
         if all(len(links.protocols) == len(BEARERS) for links in trains.values()):
             return

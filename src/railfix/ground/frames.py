@@ -180,16 +180,16 @@ class FrameReceiver:
 
         A second copy is answered, so that both links are measured, but not used.
         """
-        frame = self._decoded(data)
+        frame = self._decode(data)
         if frame is None:
             return None, None
         on_link = self._links.setdefault((link, frame.kind), _Seen())
         if on_link.has(frame.sequence):
-            return self._rejected(Threat.REPETITION)
+            return self._reject(Threat.REPETITION)
         if on_link.is_alone(frame.sequence, self.limits.jump):
-            return self._rejected(Threat.INSERTION)
+            return self._reject(Threat.INSERTION)
         if self._late(frame, now_ns):
-            return self._rejected(Threat.DELAY)
+            return self._reject(Threat.DELAY)
         on_link.add(frame.sequence)
         if frame.kind is not FrameKind.DATA:
             return frame, None
@@ -208,7 +208,7 @@ class FrameReceiver:
         """Forget the shortest delay: the sender was started again, its clock has another origin."""
         self._shortest_ns = None
 
-    def _decoded(self, data: bytes) -> Frame | None:
+    def _decode(self, data: bytes) -> Frame | None:
         if not _HEAD.size + _CHECK.size <= len(data) <= _HEAD.size + _CHECK.size + LONGEST_PAYLOAD:
             self.threats[Threat.CORRUPTION] += 1
             return None
@@ -235,6 +235,6 @@ class FrameReceiver:
         self._at_ns = now_ns
         return took - self._shortest_ns > self.limits.delay_s * 1e9
 
-    def _rejected(self, threat: Threat) -> tuple[None, None]:
+    def _reject(self, threat: Threat) -> tuple[None, None]:
         self.threats[threat] += 1
         return None, None

@@ -198,7 +198,7 @@ class CentreLinks:
 
     def send(self, train: int, payload: bytes) -> None:
         """Send a payload to a train on every link it has."""
-        data = self._encoded(train, FrameKind.DATA, payload)
+        data = self._encode(train, FrameKind.DATA, payload)
         for name in BEARERS:
             if (protocol := self._peers.get((train, name))) is not None:
                 protocol.send(data)
@@ -218,7 +218,7 @@ class CentreLinks:
     def _masquerade(self) -> None:
         self.masquerades += 1
 
-    def _encoded(self, train: int, kind: FrameKind, payload: bytes) -> bytes:
+    def _encode(self, train: int, kind: FrameKind, payload: bytes) -> bytes:
         sequence = self._sequence[train, kind] = self._sequence.get((train, kind), first_sequence()) + 1
         frame = Frame(kind=kind, sender=CENTRE, sequence=sequence, time_ns=time.monotonic_ns(), payload=payload)
         return frame.encode()
@@ -228,7 +228,7 @@ class CentreLinks:
             sequence=answered.sequence, sent_ns=answered.time_ns, received_ns=received_ns,
             answered_ns=time.monotonic_ns(),
         )  # fmt: skip
-        return self._encoded(train, FrameKind.ECHO, echo.encode())
+        return self._encode(train, FrameKind.ECHO, echo.encode())
 
     def _frame(self, name: LinkName, protocol: LinkProtocol, data: bytes) -> None:
         kind, _, name_of_train = (protocol.peer or "").partition("-")

@@ -103,18 +103,18 @@ def advance(
         state = replace(state, healthy_since_s=None)
         if now_s - state.complete_s <= limits.late_s:
             return state, ()
-        return _stopped(state, now_s, verdict or Verdict.MONITOR_LOST, -1, limits)
+        return _stop(state, now_s, verdict or Verdict.MONITOR_LOST, -1, limits)
     assert verdict is not None
     state = replace(state, complete_s=now_s, warning=receiver if verdict is Verdict.RECEIVER_DRIFTING else -1)
     if verdict in STOPPING:
-        return _stopped(replace(state, healthy_since_s=None), now_s, verdict, receiver, limits)
+        return _stop(replace(state, healthy_since_s=None), now_s, verdict, receiver, limits)
     if verdict is not Verdict.HEALTHY:
         return replace(state, healthy_since_s=None), ()
     since = now_s if state.healthy_since_s is None else state.healthy_since_s
     return replace(state, healthy_since_s=since), ()
 
 
-def _stopped(
+def _stop(
     state: MonitorState, now_s: float, cause: Verdict, receiver: int, limits: MonitorLimits
 ) -> tuple[MonitorState, tuple[Order, ...]]:
     if state.stopped and state.cause is not None:

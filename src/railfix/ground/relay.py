@@ -42,7 +42,7 @@ class RelaySettings(Settings):
     seed: int = 0
 
 
-class Disturbance:
+class LinkDisturbance:
     """Seeded disturbance of packets of any kind.
 
     Attributes
@@ -91,7 +91,7 @@ class Relay(asyncio.DatagramProtocol):
     """Relay between one client and a target."""
 
     def __init__(self, target: tuple[str, int], settings: RelaySettings) -> None:
-        self.disturbance = Disturbance(settings)
+        self.disturbance = LinkDisturbance(settings)
         self.address: tuple[str, int] = ("", 0)
         self._target = target
         self._here: asyncio.DatagramTransport | None = None

@@ -17,7 +17,7 @@ from railfix.gnss.observations import Observations
 from railfix.ground.station_fixes import FALLEN_DBHZ, StationFixes, no_fixes, rounded, station_fixes
 from railfix.live.arrivals import arrivals, fresh_state, next_arrival
 from railfix.live.settings import LiveSettings
-from railfix.live.stream import Received
+from railfix.live.stream import ReceivedData
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received as Known
 from railfix.pipeline.received import known_from_start, receive
@@ -115,11 +115,11 @@ async def stream_fixes(
     """
     settings = settings or LiveSettings()
     stations = StationStreams(points_ecef_m, navigation=navigation, config=config, period_s=period_s)
-    queue: asyncio.Queue[tuple[int, Received | None]] = asyncio.Queue(2 * len(sources))
+    queue: asyncio.Queue[tuple[int, ReceivedData | None]] = asyncio.Queue(2 * len(sources))
 
     async def pump(receiver: int, source: str) -> None:
         async for item in arrivals(source, fresh_state(source), settings):
-            if isinstance(item, Received):
+            if isinstance(item, ReceivedData):
                 await queue.put((receiver, item))
         await queue.put((receiver, None))
 

@@ -215,10 +215,10 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
 
         logs = [name for name, is_log in zip(names, receiver, strict=True) if is_log]
         parts.append(read_receiver_navigation(logs, date=_instant(date)))
-    return parts[0] if len(parts) == 1 else _joined(parts)
+    return parts[0] if len(parts) == 1 else _join(parts)
 
 
-def _joined(parts: list[Navigation]) -> Navigation:
+def _join(parts: list[Navigation]) -> Navigation:
     """Records of several sources; ionosphere and leap seconds of the first that has them."""
 
     def rows(kind: str, table: type[KeplerRecords] | type[GlonassRecords]) -> dict[str, np.ndarray]:

@@ -120,7 +120,7 @@ def _content(points: pl.DataFrame, path: Path, description: str) -> bytes:
     names = points["antenna"].unique(maintain_order=True)
     antennas = {name: points.filter(antenna=name).iter_rows(named=True) for name in names}
     fields = [name for name in points.columns if name not in ("time_utc", *COORDINATES)]
-    return _rendered(f"positions{ending}", name=path.stem, description=description, antennas=antennas, fields=fields)
+    return _render(f"positions{ending}", name=path.stem, description=description, antennas=antennas, fields=fields)
 
 
 def _features(points: pl.DataFrame, driver: str, *, layer: str, **options: str) -> bytes:
@@ -171,10 +171,10 @@ def _wkb(points: pl.DataFrame, flavor: str) -> Any:
 
 def _style() -> bytes:
     """Return the style for QGIS: a dot for each position, coloured by status."""
-    return _rendered("positions.qml")
+    return _render("positions.qml")
 
 
-def _rendered(template: str, **values: Any) -> bytes:
+def _render(template: str, **values: Any) -> bytes:
     environment = Environment(
         loader=PackageLoader("railfix.io"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,

@@ -183,7 +183,7 @@ def decode(data: bytes) -> TrainMessage:
         expected = bool if name in _TRUTHS else int
         if type(value) is not expected:
             raise MessageError(f"{name}: {type(value).__name__} instead of {expected.__name__}")
-    return _validated(named)
+    return _validate(named)
 
 
 def _entries(data: bytes) -> int:
@@ -192,7 +192,7 @@ def _entries(data: bytes) -> int:
     return size if size < 24 else int.from_bytes(data[1 : 1 + (1 << (size - 24))], "big") if size < 28 else -1
 
 
-def _validated(values: dict[str, Any]) -> TrainMessage:
+def _validate(values: dict[str, Any]) -> TrainMessage:
     try:
         return TrainMessage.model_validate(values, strict=False)
     except ValidationError as error:
@@ -231,7 +231,7 @@ def from_json(line: str) -> TrainMessage:
         values["sources"] = sources
     except (KeyError, TypeError):
         raise MessageError("has an unknown status or source") from None
-    return _validated(values)
+    return _validate(values)
 
 
 #: Largest value of a length of packet 0; one more means unknown.

@@ -29,7 +29,7 @@ def _of_ranges(left: Floats, gain: Floats, range_bias: Floats, beyond: Floats) -
 
 
 @inner
-def _separated(
+def _separate(
     square: float, distance: float, across: float, up: float, more: tuple[float, float, float], common: Floats
 ) -> tuple[float, float, float]:
     """Return offset, sigma, and the distance over its threshold, of what a set takes with it."""
@@ -112,7 +112,7 @@ def _with_each_later(
         rest = rests[at] - coupling * first[at]
         last = of_gain / rest if rest > LEAST_REDUNDANCY else 0.0
         lost |= not rest > LEAST_REDUNDANCY
-        offset[at], sigma[at], ratio[at] = _separated(
+        offset[at], sigma[at], ratio[at] = _separate(
             square + last * of_gain,
             distance + last * (residuals[at] - coupling * residual),
             across + last * (of_across[at] - coupling * map_across),
@@ -131,7 +131,7 @@ def _with_each_later(
         if by_range:
             for m in range(n):
                 own[m] = left[m] - weight * rows[i, m] - last * (rows[j, m] - coupling * rows[i, m])
-            offset[at], sigma[at], ratio[at] = _separated(
+            offset[at], sigma[at], ratio[at] = _separate(
                 square + last * of_gain,
                 distance + last * (rows[n + 1, j] - coupling * residual),
                 across + last * (rows[n + 2, j] - coupling * map_across),
@@ -234,7 +234,7 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
         common[4], common[5] = errors.map_bias_m[t, 0] * root_across, errors.map_bias_m[t, 1] * root_up
         common[6] = asked.k_false_alarm[t]
         more = _of_ranges(rows[n], rows[n], range_bias, beyond)
-        common[7] = common[6] * _SAME * _separated(0.0, 0.0, 0.0, 0.0, more, common)[1]
+        common[7] = common[6] * _SAME * _separate(0.0, 0.0, 0.0, 0.0, more, common)[1]
 
         # The place without the map: its distance counts whole, and nothing is tested.
         determined = False
@@ -286,7 +286,7 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
             left = system[n]
             more = _of_ranges(left, gain, range_bias, beyond) if by_range else (0.0, 0.0, 0.0)
             at = first[0]
-            offset[t, at], sigma[t, at], ratio[at] = _separated(gone[0], gone[1], gone[2], gone[3], more, known)
+            offset[t, at], sigma[t, at], ratio[at] = _separate(gone[0], gone[1], gone[2], gone[3], more, known)
             if blind:
                 offset[t, at], sigma[t, at], ratio[at] = 0.0, np.inf, 0.0
             # Noise passes on either side.
@@ -299,7 +299,7 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
                     for m in range(n):
                         own[m] = left[m] - w * system[i, m]
                     more = _of_ranges(own, gain, range_bias, beyond)
-                offset[t, at], sigma[t, at], ratio[at] = _separated(
+                offset[t, at], sigma[t, at], ratio[at] = _separate(
                     gone[0] + w * system[n, i], gone[1] + w * system[n + 1, i],
                     gone[2] + w * system[n + 2, i], gone[3] + w * system[n + 3, i], more, known,
                 )  # fmt: skip

@@ -10,7 +10,7 @@ from .settings import LiveSettings
 from .sinks import Sink, open_sink
 from .sources import read_source
 from .state import SavedSession, load_state, write_state
-from .stream import Received, ReceiverState, receive_bytes
+from .stream import ReceivedData, ReceiverState, receive_bytes
 
 __all__ = [
     "EngineState",
@@ -20,7 +20,7 @@ __all__ = [
     "LiveOutput",
     "LiveSettings",
     "Metrics",
-    "Received",
+    "ReceivedData",
     "ReceiverState",
     "SavedSession",
     "Sink",

@@ -14,7 +14,7 @@ from railfix.io.receiver.recognise import head_of, is_receiver_log
 from railfix.io.rinex import scan_observations
 from railfix.live.settings import LiveSettings
 from railfix.live.sources import Connected, Lost, is_file, read_source
-from railfix.live.stream import Received, ReceiverState, receive_bytes, single_epochs
+from railfix.live.stream import ReceivedData, ReceiverState, receive_bytes, single_epochs
 
 Item = TypeVar("Item")
 
@@ -28,13 +28,13 @@ def fresh_state(source: str, date: np.datetime64 | None = None) -> ReceiverState
 
 async def arrivals(
     source: str, state: ReceiverState, settings: LiveSettings
-) -> AsyncIterator[Received | Connected | Lost]:
+) -> AsyncIterator[ReceivedData | Connected | Lost]:
     """What a source's data complete, item by item, and the breaks of its connection."""
     path = source.removeprefix("file:")
     if source != "-" and is_file(source) and not is_receiver_log(head_of(path)):
         for piece in scan_observations(path, epochs=200):
             for epoch in single_epochs(piece):
-                yield Received(epochs=(epoch,), after=state)
+                yield ReceivedData(epochs=(epoch,), after=state)
                 await asyncio.sleep(0)
         return
     async for part in read_source(source, settings):

@@ -39,7 +39,7 @@ from railfix.run.driver import time_of
 from railfix.run.output import check_not_input
 from railfix.run.processor import processor_of
 from railfix.run.sensors import check_filter, read_sensors, units_of_ranges
-from railfix.run.sources import Line, open_line
+from railfix.run.sources import OpenedLine, open_line
 
 #: Longest distance from the reference location that a position report of ETCS can say, doubts apart [m].
 _REACH_OF_REFERENCE_M: Final = 300_000.0
@@ -79,7 +79,7 @@ async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
     tables = read_sensors(
         **{name: Path(path.removeprefix("file:")) for name, path in inputs.sensors.items() if is_file(path)}
     )
-    line, processor = _prepared(inputs, tables)
+    line, processor = _prepare(inputs, tables)
     if any(text.startswith("etcs@") for text in inputs.send):
         _check_reference(line, live)
     listened = {str(name): source for name, source in inputs.sensors.items() if not is_file(source)}
@@ -159,13 +159,13 @@ def _hooks(
     if inputs.out is not None:
         tables = held.enter_context(ResultTables(inputs.out, overwrite=inputs.overwrite, inputs=_files_read(inputs)))
         rows: Outlet[LiveOutput] = Outlet(f"tables {inputs.out}", tables.add, waiting=live.waiting * 10, full=full)
-        held.callback(_closed, rows, log)
+        held.callback(_close, rows, log)
         observers.append(rows.send)
     if inputs.sensors:
         watch = SensorWatch(engine.processor, log.say)
         held.callback(watch.judge)
         watched: Outlet[LiveOutput | Sensed] = Outlet("watch of the sensors", watch.take, waiting=1000, full=full)
-        held.callback(_closed, watched, log)
+        held.callback(_close, watched, log)
         observers.append(watched.send)
         sensed = watched.send
     if inputs.state is not None:
@@ -183,7 +183,7 @@ def _hooks(
         states: Outlet[SavedSession] = Outlet(
             f"state file {path}", lambda session: write_state(path, session, under), waiting=1
         )
-        held.callback(_closed, states, log)
+        held.callback(_close, states, log)
         save = states.send
 
     def observe(output: LiveOutput) -> None:
@@ -194,14 +194,14 @@ def _hooks(
     return Hooks(observe=observe, sensed=sensed, save=save, show=show), streams
 
 
-def _closed(outlet: Outlet[Any], log: SessionLog) -> None:
+def _close(outlet: Outlet[Any], log: SessionLog) -> None:
     """Close an outlet; what it lacks is logged."""
     outlet.close()
     if outlet.dropped or outlet.failed:
         log.say(f"{outlet.name}: {outlet.dropped} items dropped, {outlet.failed} refused {outlet.failure}")
 
 
-def _prepared(inputs: LiveInputs, tables: SensorSamples) -> tuple[Line, EpochProcessor]:
+def _prepare(inputs: LiveInputs, tables: SensorSamples) -> tuple[OpenedLine, EpochProcessor]:
     """The line, and the epoch processor with everything known from the start."""
     config = inputs.config
     if config.sbas and config.sbas != "stream":
@@ -220,7 +220,7 @@ def _prepared(inputs: LiveInputs, tables: SensorSamples) -> tuple[Line, EpochPro
     return line, processor_of(config, navigation, line.trajectories, track=line.track, units=units)
 
 
-def _check_reference(line: Line, live: LiveSettings) -> None:
+def _check_reference(line: OpenedLine, live: LiveSettings) -> None:
     ends = (0.0, float(line.track.chainage_m[-1]))
     if max(abs(end - live.reference_m) for end in ends) > _REACH_OF_REFERENCE_M:
         raise SettingsError(

@@ -290,9 +290,9 @@ class LiveEngine:
         message goes out a period, that of the newest epoch. Without it (recorded epochs, the clock is that of their
         tags) every epoch has its message; at `END_NS` all that wait are due, and no period without input follows.
         """
-        outputs = [self._processed(epochs) for epochs in self._pairs(now_ns)]
+        outputs = [self._process_epochs(epochs) for epochs in self._pairs(now_ns)]
         if sent_ns is None:
-            numbered = [self._sent(output, self._tag_of(output)) for output in outputs]
+            numbered = [self._send(output, self._tag_of(output)) for output in outputs]
             if outputs:
                 self._due_ns, self._silent = now_ns, False
         else:
@@ -305,7 +305,7 @@ class LiveEngine:
             self._silent = True
             last = max(self._last_tag.values(), default=sent_ns or 0)
             message = no_input_message(self.settings, sequence=0, time_ns=last, sent_ns=last)
-            numbered.append(self._sent(LiveOutput(message=message, result=None), last if sent_ns is None else sent_ns))
+            numbered.append(self._send(LiveOutput(message=message, result=None), last if sent_ns is None else sent_ns))
         return numbered
 
     def _patience_ns(self) -> int:
@@ -332,10 +332,10 @@ class LiveEngine:
             return rows
         self._due_ns, self._silent = now_ns, False
         if outputs:
-            return [*rows[:-1], self._sent(newest, sent_ns)]
-        return [replace(self._sent(newest, sent_ns), part="message")]
+            return [*rows[:-1], self._send(newest, sent_ns)]
+        return [replace(self._send(newest, sent_ns), part="message")]
 
-    def _sent(self, output: LiveOutput, sent_ns: int) -> LiveOutput:
+    def _send(self, output: LiveOutput, sent_ns: int) -> LiveOutput:
         """An output with the next sequence number and the time of sending."""
         self._sequence += 1
         return replace(output, message=output.message.replaced(sequence=self._sequence, sent_ns=sent_ns))
@@ -379,7 +379,7 @@ class LiveEngine:
                 self.counts["paired" if len(together) > 1 else f"{next(iter(together))} alone"] += 1
             yield together
 
-    def _processed(self, heads: dict[str, _Waiting]) -> LiveOutput:
+    def _process_epochs(self, heads: dict[str, _Waiting]) -> LiveOutput:
         heard, news = max(head.heard for head in heads.values()), _FromSatellites(heard=0)
         while self._from_satellites and self._from_satellites[0].heard <= heard:
             news = news.with_later(self._from_satellites.popleft())

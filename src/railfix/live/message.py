@@ -57,7 +57,7 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
         if other.n_used[-1] > 0:
             sources |= _SOURCE_OF_ANTENNA.get(used, Source(0))
     place, status = _place_and_status(antenna, track)
-    sigma_m = float(antenna.along_sigma_m[-1] if not _filtered(track) else track.tracked.sigma_m[-1])
+    sigma_m = float(antenna.along_sigma_m[-1] if not _filter(track) else track.tracked.sigma_m[-1])
     values: dict[str, object] = {}
     level = _level_m(antenna)
     single = float(antenna.chainage_m[-1])
@@ -76,7 +76,9 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
         elif status is MessageStatus.POSITION:
             status = MessageStatus.DOUBTFUL
     # The bound of a position that failed a check is none for the place that the sensors carry.
-    if status is MessageStatus.COASTING and not ("over_cm" in values and (math.isfinite(amount) or _passed(antenna))):
+    if status is MessageStatus.COASTING and not (
+        "over_cm" in values and (math.isfinite(amount) or _has_passed(antenna))
+    ):
         status = MessageStatus.DOUBTFUL
     if status is MessageStatus.DOUBTFUL:  # no bound is promised, so none is sent
         values = {key: value for key, value in values.items() if key not in _BOUNDS}
@@ -85,7 +87,7 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
         if math.isfinite(speed):
             values["speed_cmps"], values["speed_bound_cmps"] = round(speed * 100.0), _up_cm(_SPEED_K * sigma)
         values["direction"], values["standstill"] = int(track.direction[-1]), bool(track.standstill[-1])
-        sources |= _measured_with(track)
+        sources |= _name_sources(track)
         probability = float(track.tracked.probability[-1])
         if math.isfinite(probability):
             values["track_permille"] = int(min(max(probability, 0.0), 1.0) * 1000.0)
@@ -103,7 +105,7 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
     )
 
 
-def _measured_with(track: AlongTrack) -> Source:
+def _name_sources(track: AlongTrack) -> Source:
     """What the filter measured the last epoch with, beside codes."""
     sources = Source(0)
     for kind in np.flatnonzero(track.tracked.used[-1]).tolist():
@@ -118,7 +120,7 @@ def antenna_of(result: Result) -> str:
 
     def worth(name: str) -> tuple[bool, float]:
         antenna, track = result.antennas[name], result.fusion.get(name)
-        if not _filtered(track):
+        if not _filter(track):
             return not math.isfinite(float(antenna.chainage_m[-1])), _level_m(antenna)
         level = float(track.tracked.level_m[-1])
         return False, level if math.isfinite(level) else _level_m(antenna)
@@ -126,7 +128,7 @@ def antenna_of(result: Result) -> str:
     return min(result.antennas, key=worth)
 
 
-def _filtered(track: AlongTrack | None) -> TypeGuard[AlongTrack]:
+def _filter(track: AlongTrack | None) -> TypeGuard[AlongTrack]:
     """Whether the filter along the track has a place."""
     return track is not None and len(track) > 0 and math.isfinite(float(track.chainage_m[-1]))
 
@@ -134,21 +136,21 @@ def _filtered(track: AlongTrack | None) -> TypeGuard[AlongTrack]:
 def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple[float, MessageStatus]:
     """Place [m], NaN without one, and what it is worth."""
     place = float(antenna.chainage_m[-1])
-    if not _filtered(track):
+    if not _filter(track):
         if not math.isfinite(place):
             return place, MessageStatus.NO_POSITION
         on_map = track is None or not len(track) or track.tracked.status[-1] != TrackStatus.OFF_MAP
-        good = _passed(antenna) and on_map
+        good = _has_passed(antenna) and on_map
         return place, MessageStatus.POSITION if good else MessageStatus.DOUBTFUL
     filtered = float(track.chainage_m[-1])
     status = TrackStatus(int(track.tracked.status[-1]))
     if status is TrackStatus.COASTING or (status is TrackStatus.TRACKING and not math.isfinite(place)):
         return filtered, MessageStatus.COASTING
-    good = status is TrackStatus.TRACKING and _passed(antenna)
+    good = status is TrackStatus.TRACKING and _has_passed(antenna)
     return filtered, MessageStatus.POSITION if good else MessageStatus.DOUBTFUL
 
 
-def _passed(antenna: AntennaResult) -> bool:
+def _has_passed(antenna: AntennaResult) -> bool:
     """Whether the last single epoch passed every check and raises no alarm."""
     alarm = antenna.protection is not None and antenna.protection.status[-1] == LevelStatus.ALARM
     return int(antenna.status[-1]) == Status.OK and not alarm

@@ -80,7 +80,7 @@ class SensorWatch:
         if sensed.samples and not self._judged:
             self._samples.append(sensed.samples)
             if len(self._samples) == _PIECES:  # a stream gives row by row, and each takes the room of a hundred
-                self._blocks.append(_joined(self._samples))
+                self._blocks.append(_join(self._samples))
                 self._samples = []
             self._begin = np.fmin(self._begin, sensed.until)
             if not table and sensed.until - self._begin > 2 * np.timedelta64(WATCHED_NS, "ns"):
@@ -116,7 +116,7 @@ class SensorWatch:
         if self._place_ns and self._speeds and (parts := [*self._blocks, *self._samples]):
             speeds = pl.DataFrame({"time_gpst": _times(self._speed_ns), "speed_mps": self._speeds})
             places = pl.DataFrame({"time_gpst": _times(self._place_ns), "chainage_m": self._places_m})
-            samples = _joined(parts).between(_NEVER, _times(self._speed_ns)[-1])
+            samples = _join(parts).between(_NEVER, _times(self._speed_ns)[-1])
             checks, processor = SensorChecks(places=[places], speeds=[speeds]), self._processor
             for note in checks.notes(samples, processor.units, self._trajectory, processor.config.sensors):
                 self._say(note)
@@ -132,7 +132,7 @@ def _times(time_ns: list[int]) -> Datetimes:
     return GPS_EPOCH + np.array(time_ns).astype("timedelta64[ns]")
 
 
-def _joined(parts: list[SensorSamples]) -> SensorSamples:
+def _join(parts: list[SensorSamples]) -> SensorSamples:
     """All parts as one, neighbours first: each sample is copied a few times, not once a part."""
     while len(parts) > 1:
         pairs = zip(parts[::2], parts[1::2], strict=False)

@@ -21,7 +21,7 @@ from railfix.live.sensor_lines import FOREVER, Sensed, SensorLines
 from railfix.live.sinks import Sink
 from railfix.live.sources import Connected, Lost, hidden, is_file, read_source
 from railfix.live.state import SavedSession
-from railfix.live.stream import Received, ReceiverState
+from railfix.live.stream import ReceivedData, ReceiverState
 from railfix.ranges.sbas import from_receiver
 
 #: Items that may wait for the processor before a source is held back.
@@ -32,7 +32,7 @@ _BETWEEN_COLLECTIONS: Final = 100
 _STATUS_S: Final = 0.5
 
 _LOG: Final = logging.getLogger("railfix.live")
-_Queue = asyncio.Queue[tuple[str, Received | None] | Sensed]
+_Queue = asyncio.Queue[tuple[str, ReceivedData | None] | Sensed]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,10 +207,10 @@ class _Session:
                 self.tell(sensor, source, part)
         await queue.put(Sensed(sensor=sensor, until=FOREVER))
 
-    async def received(self, name: str, source: str) -> AsyncIterator[Received]:
+    async def received(self, name: str, source: str) -> AsyncIterator[ReceivedData]:
         """What a source's data complete, item by item; breaks of its connection are logged and counted."""
         async for item in arrivals(source, self.streams[name], self.engine.settings):
-            if isinstance(item, Received):
+            if isinstance(item, ReceivedData):
                 yield item
             else:
                 self.tell(name, source, item)
@@ -224,7 +224,7 @@ class _Session:
             again = f", after {item.broken} breaks" if item.broken else ""
             _LOG.info("%s: connected to %s%s", name, hidden(source), again)
 
-    def take(self, name: str, received: Received, now_ns: int | None) -> int:
+    def take(self, name: str, received: ReceivedData, now_ns: int | None) -> int:
         """Hand what one source has completed to the engine; without a clock the epochs arrive at their tags.
 
         Returns the tag of the last epoch [ns], -1 without one.

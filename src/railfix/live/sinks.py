@@ -189,9 +189,9 @@ class TcpServerSink:
 
     async def start(self, host: str, port: int) -> None:
         """Listen."""
-        self.server = await asyncio.start_server(self._connected, host, port)
+        self.server = await asyncio.start_server(self._connect, host, port)
 
-    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _connect(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._readers.add(writer)
         try:
             while await reader.read(1024):

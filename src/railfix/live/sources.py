@@ -99,11 +99,11 @@ async def read_source(source: str, settings: LiveSettings) -> AsyncIterator[byte
             "ntrip": lambda: _ntrip(source, settings.silence_s),
             "serial": lambda: _serial(source, settings.silence_s),
         }
-        async for part in _kept_open(opened[parts.scheme], settings):
+        async for part in _keep_open(opened[parts.scheme], settings):
             yield part
 
 
-async def _kept_open(
+async def _keep_open(
     opened: Callable[[], AsyncIterator[bytes]], settings: LiveSettings
 ) -> AsyncIterator[bytes | Connected | Lost]:
     """Bytes of a connection, opened again with growing waits where it breaks; empty bytes say that it is open."""
@@ -200,10 +200,10 @@ async def _ntrip(source: str, silence_s: float) -> AsyncIterator[bytes]:
         elif first.startswith(b"HTTP/") and b"\r\n\r\n" in answer:
             header, rest = answer.split(b"\r\n\r\n", 1)
             if b" 200" not in first:
-                raise _refused(source, first)
+                raise _refuse(source, first)
             body = _Chunks() if b"transfer-encoding: chunked" in header.lower() else None
         elif b"\r\n" in answer and not first.startswith((b"HTTP/", b"ICY 200")):
-            raise _refused(source, first)
+            raise _refuse(source, first)
         elif len(answer) > _HEADER_BYTES:
             raise InputFileError(hidden(source), "the caster's answer has no end of its header")
         else:
@@ -216,7 +216,7 @@ async def _ntrip(source: str, silence_s: float) -> AsyncIterator[bytes]:
         raise InputFileError(hidden(source), "the caster has closed the connection without an answer")
 
 
-def _refused(source: str, first: bytes) -> InputFileError:
+def _refuse(source: str, first: bytes) -> InputFileError:
     text = first[:80].decode("latin-1")
     hint = "; is the mount point right?" if "SOURCETABLE" in text else ""
     hint = "; are user and password right?" if "401" in text else hint

@@ -113,7 +113,7 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
     except FileNotFoundError:
         return Loaded(session=None, outcome=f"state file {path}: there is none yet, positioning begins anew")
     except OSError as error:
-        return _refused(path, f"cannot be read ({error.strerror})")
+        return _refuse(path, f"cannot be read ({error.strerror})")
     line, _, content = data.partition(b"\n")
     try:
         head = json.loads(line)
@@ -123,24 +123,24 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
     if data and not form.startswith("railfix live state "):
         raise OutputError(f"{path}: is no state file of railfix live, which would overwrite it; name another file")
     if form != _FORM:
-        return _refused(path, "is no state file of this version")
+        return _refuse(path, "is no state file of this version")
     for name, value in under.items():
         if head.get(name) != value:
-            return _refused(path, f"was made with another {name}")
+            return _refuse(path, f"was made with another {name}")
     if {name for name in head if name not in ("form", "bytes", "sha256")} != set(under):
-        return _refused(path, "was made with other files")
+        return _refuse(path, "was made with other files")
     if len(content) != head.get("bytes") or hashlib.sha256(content).hexdigest() != head.get("sha256"):
-        return _refused(path, "is damaged or cut off")
+        return _refuse(path, "is damaged or cut off")
     try:
         session = _Plain(io.BytesIO(content)).load()
     except (pickle.UnpicklingError, AttributeError, ImportError, TypeError, ValueError, EOFError) as error:
-        return _refused(path, f"holds no state ({error})")
+        return _refuse(path, f"holds no state ({error})")
     if not isinstance(session, SavedSession):
-        return _refused(path, "holds no state of a session")
+        return _refuse(path, "holds no state of a session")
     return Loaded(session=session, outcome=f"state file {path}: belongs to this map, vehicle and settings")
 
 
-def _refused(path: Path, why: str) -> Loaded:
+def _refuse(path: Path, why: str) -> Loaded:
     return Loaded(session=None, outcome=f"state file {path}: not used, because it {why}; positioning begins anew")
 
 

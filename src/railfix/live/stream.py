@@ -31,7 +31,7 @@ class ReceiverState:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Received:
+class ReceivedData:
     """What some bytes completed.
 
     Attributes
@@ -55,11 +55,11 @@ class Received:
     after: ReceiverState = field(default_factory=ReceiverState)
 
 
-def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[Received]:
+def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:
     """What some bytes of a receiver complete, in the order of the stream; any cutting of the stream gives the same.
 
     Each item ends with the message that completes an epoch, so that its navigation records came before its epoch.
-    The state to go on with is that of the last item, `Received.after`; there is always one. Epochs with repeated or
+    The state to go on with is that of the last item, `ReceivedData.after`; there is always one. Epochs with repeated or
     older time tags are kept: `LiveEngine.push` judges them.
     """
     kept = len(state.stream.rest)
@@ -81,13 +81,13 @@ def epoch_ends(buffer: Bytes) -> Indices:
     )
 
 
-def _receive(data: bytes, state: ReceiverState) -> Received:
+def _receive(data: bytes, state: ReceiverState) -> ReceivedData:
     piece, stream = decode(data, state.stream)
     observations, tracking = observations_of(
         piece.measurements, replace(state.tracking, last=np.datetime64("NaT", "ns"))
     )
     records = piece.ephemerides
-    return Received(
+    return ReceivedData(
         epochs=single_epochs(observations),
         navigation=navigation_of(records) if records.records or records.klobuchar else None,
         sbas=piece.sbas if len(piece.sbas) else None,

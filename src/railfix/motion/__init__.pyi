@@ -1,6 +1,6 @@
 # The names of `railfix.motion`, imported at their first use (lazy-loader).
 
-from .features import Feature, FeatureLimits, LineSeries, Located, line_series, locate, map_features
+from .features import Feature, FeatureLimits, LineSeries, LocatedFeature, line_series, locate, map_features
 from .ranging import EchoLimits, radar_speed_mps, two_way_range_m
 from .samples import InertialSamples, RadarSpeeds, SensorSamples, StationRanges, TachometerPulses
 from .slip import MotionState, SlipLimits, SlipResult, find_slips
@@ -21,7 +21,7 @@ __all__ = [
     "FeatureLimits",
     "InertialSamples",
     "LineSeries",
-    "Located",
+    "LocatedFeature",
     "MotionState",
     "PulseSpeeds",
     "RadarSpeeds",

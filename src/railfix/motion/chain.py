@@ -90,11 +90,11 @@ class Chain:
         numpy.linalg.LinAlgError
             An unknown is not determined.
         """
-        value, covariance, _ = _reduced(self.diagonal, self.upper, self.right)
+        value, covariance, _ = _reduce(self.diagonal, self.upper, self.right)
         return value, covariance
 
 
-def _reduced(diagonal: Floats, upper: Floats, right: Floats) -> tuple[Floats, Floats, Floats]:
+def _reduce(diagonal: Floats, upper: Floats, right: Floats) -> tuple[Floats, Floats, Floats]:
     """Values, covariances, and covariances of neighbours."""
     count = len(diagonal)
     if count == 1:
@@ -119,7 +119,7 @@ def _reduced(diagonal: Floats, upper: Floats, right: Floats) -> tuple[Floats, Fl
     driven[1 : m + 1] -= np.einsum("kji,kj->ki", rightward[:m], part[:m])
     joined = -(left[:m] @ to_right[:m])
     fewer = 0.5 * (fewer + np.swapaxes(fewer, 1, 2))
-    value_even, covariance_even, across = _reduced(fewer, joined[: evens - 1], driven)
+    value_even, covariance_even, across = _reduce(fewer, joined[: evens - 1], driven)
     # Back: x = D^-1 b - (D^-1 U_l^T) x_l - (D^-1 U_r) x_r. Beyond the end x_r has no part.
     value = np.empty_like(right)
     covariance, beside = np.empty_like(diagonal), np.empty_like(upper)

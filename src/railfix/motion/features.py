@@ -146,7 +146,7 @@ def map_features(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Located:
+class LocatedFeature:
     """Where a measured series lies on the line.
 
     Attributes
@@ -176,7 +176,7 @@ def locate(
     noise: tuple[float, float],
     last: tuple[float, float, float] | None = None,
     limits: FeatureLimits | None = None,
-) -> Located:
+) -> LocatedFeature:
     """Return the place of a measured stretch by maximum likelihood within four sigmas of the predicted one.
 
     A constant offset of the quantity is free: a bias of the sensor does not matter.
@@ -208,25 +208,31 @@ def locate(
     information = float(((slope - slope.mean()) ** 2).sum()) / spread**2
     best = int(np.argmax(likelihood))
     if information < 16.0 / sigma_m**2:
-        return Located(verdict="none", arc_m=np.nan, sigma_m=np.nan, reason="no change sharper than the prediction")
+        return LocatedFeature(
+            verdict="none", arc_m=np.nan, sigma_m=np.nan, reason="no change sharper than the prediction"
+        )
     sigma = float(1.0 / np.sqrt(information))
     place = predicted_m + float(offsets[best]) + _vertex(likelihood, best) * 0.25 * limits.step_m
     apart = np.abs(offsets - offsets[best]) > max(5.0 * sigma, 2.0 * limits.step_m)
     if best in (0, len(offsets) - 1):
-        return Located(verdict="ambiguous", arc_m=np.nan, sigma_m=sigma, reason="best at the edge of the window")
+        return LocatedFeature(verdict="ambiguous", arc_m=np.nan, sigma_m=sigma, reason="best at the edge of the window")
     if apart.any() and likelihood[best] - likelihood[apart].max() < np.log(limits.likelihood_ratio):
-        return Located(verdict="ambiguous", arc_m=np.nan, sigma_m=sigma, reason="another place fits nearly as well")
+        return LocatedFeature(
+            verdict="ambiguous", arc_m=np.nan, sigma_m=sigma, reason="another place fits nearly as well"
+        )
     other: Quantity = QUANTITIES[1 - QUANTITIES.index(quantity)]
     rest = measured.of(other) - np.interp(place + measured.arc_m, line.arc_m, line.of(other))
     misfit = float(((rest - rest.mean()) ** 2).mean()) / noise[QUANTITIES.index(other)] ** 2
     if misfit > limits.fit_limit:
-        return Located(verdict="none", arc_m=np.nan, sigma_m=sigma, reason=f"the {other} does not fit there")
+        return LocatedFeature(verdict="none", arc_m=np.nan, sigma_m=sigma, reason=f"the {other} does not fit there")
     if last is not None:
         gap = place - last[0]
         allowed = limits.gap_sigmas * np.sqrt(sigma**2 + last[1] ** 2 + (limits.scale_sigma * last[2]) ** 2)
         if abs(gap - last[2]) > allowed:
-            return Located(verdict="none", arc_m=np.nan, sigma_m=sigma, reason="distance to the last feature disagrees")
-    return Located(verdict="accepted", arc_m=place, sigma_m=sigma)
+            return LocatedFeature(
+                verdict="none", arc_m=np.nan, sigma_m=sigma, reason="distance to the last feature disagrees"
+            )
+    return LocatedFeature(verdict="accepted", arc_m=place, sigma_m=sigma)
 
 
 def _vertex(values: Floats, best: int) -> float:

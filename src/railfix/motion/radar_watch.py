@@ -104,7 +104,7 @@ class RadarWatch:
         found = []
         for window, of_window in zip(windows.tolist(), sums, strict=True):
             if window != self._open:
-                found += self._closed()
+                found += self._close()
                 self._open, self._sums = window, np.zeros(4)
             self._sums = self._sums + of_window
         return found
@@ -120,7 +120,7 @@ class RadarWatch:
         near = np.minimum(late, early) <= _NEAR_S
         return self.take(time, np.where(near, radar.speed_mps[nearest], np.nan), right_mps)
 
-    def _closed(self) -> list[RadarAlarm]:
+    def _close(self) -> list[RadarAlarm]:
         """End a window; the alarm that it completes."""
         moving, count, product, square = self._sums.tolist()
         if moving >= _LEAST_SPEEDS:

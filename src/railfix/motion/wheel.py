@@ -64,10 +64,10 @@ class Wheel:
             rising = np.sign(np.nansum(np.diff(run) * sign))
             return run if rising >= 0 else -run
         step = np.diff(run) * sign
-        return _cumulated(run, step)
+        return _cumulate(run, step)
 
 
-def _cumulated(run: Floats, step: Floats) -> Floats:
+def _cumulate(run: Floats, step: Floats) -> Floats:
     """Sum of signed steps; NaN where an unknown step separates an instant from the next."""
     known = np.isfinite(step)
     total = np.concatenate([[0.0], np.cumsum(np.where(known, step, 0.0))])
@@ -91,12 +91,12 @@ def _direction(run: Floats, hint: Floats) -> Floats:
     turning = np.flatnonzero(known[at[1:]] != known[at[:-1]])
     for k in turning.tolist():
         first, last = int(at[k]), int(at[k + 1])
-        sign[first:last] = _turned(np.diff(run[first : last + 1]), float(known[first]), float(known[last]))
+        sign[first:last] = _turn(np.diff(run[first : last + 1]), float(known[first]), float(known[last]))
     sign[: at[0]] = known[at[after[: at[0]]]]
     return sign
 
 
-def _turned(step: Floats, before: float, after: float) -> Floats:
+def _turn(step: Floats, before: float, after: float) -> Floats:
     """Direction within a stretch in which it changes: at the longest stop, or open."""
     standing = np.abs(np.nan_to_num(step, nan=1.0)) < 1e-9
     if not standing.any():
@@ -129,7 +129,7 @@ def wheel_of(pulses: Pulses, pulse_m: float | None, time: Datetimes, arc_m: Floa
     if pulses.kind == "distance":
         pulse_m, source = 1.0, "metres in the table"
     elif pulse_m is None:
-        pulse_m, source = _estimated(pulses, time, arc_m), "estimated from the fixes"
+        pulse_m, source = _estimate(pulses, time, arc_m), "estimated from the fixes"
     speed = np.abs(np.diff(pulses.count)) * pulse_m / seconds(np.diff(pulses.time))
     if speed.max() > _FASTEST_MPS:
         row = int(np.argmax(speed))
@@ -140,7 +140,7 @@ def wheel_of(pulses: Pulses, pulse_m: float | None, time: Datetimes, arc_m: Floa
     return Wheel(pulses=pulses, pulse_m=pulse_m, source=source)
 
 
-def _estimated(pulses: Pulses, time: Datetimes, arc_m: Floats) -> float:
+def _estimate(pulses: Pulses, time: Datetimes, arc_m: Floats) -> float:
     count = pulses.at(time)
     t = seconds(time - time[0])
     end = np.searchsorted(t, t + _WINDOW_S)

@@ -21,7 +21,7 @@ from railfix.pipeline.return_gate import ReturnState, gated_codes
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import LineReferences, sensor_epochs
 from railfix.pipeline.smoothing import Replay, SmoothedTrack
-from railfix.positioning.carrier import SlipState, corrected_phase_m, find_slips
+from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.screens import Screened
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, Tracked, TrackStatus, track
@@ -171,7 +171,7 @@ def _tracked(
         if sensors.ranges is not None:
             sensors = replace(sensors, ranges=_gated_ranges(sensors.ranges, part.time, line, state, config))
         if sensing and len(part):
-            part, gate = _gated(part, sensors, alone[0][first:last], alone[1][first:last], line, state, config)
+            part, gate = _gate(part, sensors, alone[0][first:last], alone[1][first:last], line, state, config)
             state = replace(state, gate=gate)
         replays.append(Replay(epochs=part, sensors=sensors, before=state.track))
         level = state.level
@@ -183,10 +183,10 @@ def _tracked(
         state = replace(state, track=after, level=level, sensors=kept, fixed=fixed)
         parts.append(tracked)
         motions.append(sensed)
-    return _joined(parts), SensedMotion.joined(motions), tuple(replays), state
+    return _join(parts), SensedMotion.joined(motions), tuple(replays), state
 
 
-def _gated(
+def _gate(
     epochs: GnssEpochs,
     sensors: SensorEpochs,
     place_m: Floats,
@@ -253,7 +253,7 @@ def _fixed(tracked: Tracked) -> FilterFix:
     return FilterFix(time=tracked.time[-1], arc_m=arc if decided else np.nan, sigma_m=sigma, speed_mps=speed)
 
 
-def _joined(parts: list[Tracked]) -> Tracked:
+def _join(parts: list[Tracked]) -> Tracked:
     """Places of one stretch after the other."""
     if len(parts) == 1:
         return parts[0]
@@ -272,8 +272,8 @@ def on_line_m(tracked: Tracked | SmoothedTrack, trajectory: Trajectory) -> Float
 
 
 def gnss_epochs(
-    ranges: CorrectedRanges, noise_scale: Floats, config: Config, state: SlipState | None
-) -> tuple[GnssEpochs, SlipState | None]:
+    ranges: CorrectedRanges, noise_scale: Floats, config: Config, state: CycleSlipState | None
+) -> tuple[GnssEpochs, CycleSlipState | None]:
     """Return the measurements of the filter, and the state of the slip detection.
 
     The drift of a satellite's clock and the change of the troposphere, below 5 mm/s above 10 degrees, are left in

@@ -12,11 +12,11 @@ from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.positioning.carrier import (
     ArcState,
     ContinuityState,
+    CycleSlipState,
     PhasePositions,
     Phases,
     PhaseState,
     Slips,
-    SlipState,
     SmoothingState,
     corrected_phase_m,
     find_slips,
@@ -36,7 +36,7 @@ LOWEST_WEIGHTED_DEG = 5.0
 class CarrierState:
     """State of the carrier-phase stages of one antenna; None before the first epoch."""
 
-    slips: SlipState | None = None
+    slips: CycleSlipState | None = None
     smoothing: SmoothingState | None = None
     continuity: ContinuityState | None = None
     arcs: ArcState | None = None

@@ -86,10 +86,10 @@ class ChannelBook:
         if channels is None:
             while len(self._known) >= _REMEMBERED:
                 self._known.pop(next(iter(self._known)))
-            channels = self._known[key] = self._selected(obs, glonass)
+            channels = self._known[key] = self._select(obs, glonass)
         return channels
 
-    def _selected(self, obs: Observations, glonass: Mapping[str, int]) -> Channels:
+    def _select(self, obs: Observations, glonass: Mapping[str, int]) -> Channels:
         systems = self._config.systems
         columns = channel_order(obs.satellite, obs.signal, systems=systems, signals=self._config.signals)
         unwanted = np.isin(obs.satellite, self._config.exclude) | np.isin(obs.system, self._config.exclude)

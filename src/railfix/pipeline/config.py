@@ -29,7 +29,7 @@ from pydantic import Field, create_model, field_validator, model_validator
 from railfix.core.settings import Settings, load_settings, validated
 from railfix.integrity.protection import RiskBudget
 from railfix.pipeline.sensor_epochs import SensorLimits
-from railfix.positioning.carrier import ContinuityLimits, PhaseLimits, SlipLimits, SmoothingLimits
+from railfix.positioning.carrier import ContinuityLimits, CycleSlipLimits, PhaseLimits, SmoothingLimits
 from railfix.positioning.constrained import ConstrainedLimits
 from railfix.positioning.intersystem_bias import ClockOffsetLimits
 from railfix.positioning.map_offset import MapOffsetLimits
@@ -232,7 +232,7 @@ class Config(ScreenSettings):
     raim_protection: Literal["on", "off"] = "off"
     carrier: Literal["off", "smoothed", "float"] = "off"
     phase_sigma_m: float = Field(default=0.01, gt=0)
-    slips: SlipLimits = SlipLimits()
+    slips: CycleSlipLimits = CycleSlipLimits()
     smoothing: SmoothingLimits = SmoothingLimits()
     continuity: ContinuityLimits = ContinuityLimits()
     phase: PhaseLimits = PhaseLimits()

@@ -9,7 +9,15 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.timescale import seconds
-from railfix.motion.features import Feature, FeatureLimits, LineSeries, Located, line_series, locate, map_features
+from railfix.motion.features import (
+    Feature,
+    FeatureLimits,
+    LineSeries,
+    LocatedFeature,
+    line_series,
+    locate,
+    map_features,
+)
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
@@ -141,12 +149,12 @@ class FeatureFix:
     tick : int
         After which of the ticks it was passed.
     feature : Feature
-    located : Located
+    located : LocatedFeature
     """
 
     tick: int
     feature: Feature
-    located: Located
+    located: LocatedFeature
 
     @property
     def correction_m(self) -> float:
@@ -222,7 +230,7 @@ def feature_fixes(
             tick = begin + 1 + int(np.argmax(sense * (behind - feature.arc_m) >= 0.0))
             shift = float(body[tick - begin - 1] - ways[tick + 1])  # from ways to places of the body's middle
             until_tick = sense * (metre - ways[tick + 1]) <= 0.0
-            located = _compared(
+            located = _compare(
                 metre[until_tick], headings[until_tick], pitches[until_tick], shift, feature, line, facing, sense,
                 sigma_m, last, noise, limits,
             )  # fmt: skip
@@ -249,7 +257,7 @@ def _whole_metres(way_m: Floats) -> Integers:
     return np.arange(np.ceil(first) - 1, np.ceil(last) - 1, -1).astype(np.int64)
 
 
-def _compared(
+def _compare(
     metre: Integers,
     heading_rad: Floats,
     pitch_rad: Floats,
@@ -262,7 +270,7 @@ def _compared(
     last: tuple[float, float, float] | None,
     noise: tuple[float, float],
     limits: FeatureLimits,
-) -> Located | None:
+) -> LocatedFeature | None:
     """Verdict on one feature; None where the way about it was not passed without a break."""
     order = slice(None) if sense > 0 else slice(None, None, -1)
     about = metre[order] + shift_m - feature.arc_m

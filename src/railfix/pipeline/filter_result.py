@@ -13,7 +13,7 @@ from railfix.pipeline.return_gate import ReturnState
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import SensorState
 from railfix.pipeline.smoothing import Replay
-from railfix.positioning.carrier import SlipState
+from railfix.positioning.carrier import CycleSlipState
 from railfix.tracking import Line, Tracked, TrackState
 from railfix.tracking.levels import LevelState
 from railfix.tracking.result import is_bounded
@@ -75,7 +75,7 @@ class FilterState(NotebookTable):
     ----------
     line : Line or None
         The trajectory as the filter sees it, made once.
-    slips : SlipState or None
+    slips : CycleSlipState or None
         Of the carrier phases.
     track : TrackState or None
     level : LevelState
@@ -89,7 +89,7 @@ class FilterState(NotebookTable):
     """
 
     line: Line | None = None
-    slips: SlipState | None = None
+    slips: CycleSlipState | None = None
     track: TrackState | None = None
     level: LevelState = field(default_factory=LevelState)
     sensors: SensorState = field(default_factory=SensorState.empty)

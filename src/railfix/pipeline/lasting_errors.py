@@ -80,7 +80,7 @@ def lasting_errors(
             turn: int = turn,
         ) -> tuple[Floats, Floats]:  # fmt: skip
             share = np.minimum(steps_s(time[rows], state.time), 1.0) / limits.memory_s
-            start = _arranged(state.sums[:, turn : turn + 1], state.channel, channel).sum(axis=1)
+            start = _arrange(state.sums[:, turn : turn + 1], state.channel, channel).sum(axis=1)
             return decayed_sums(of_antenna, share[:, None] * values[rows], start, state.age)
 
         mean, after = antennas.each_with_state(mean_error, age, states)
@@ -121,7 +121,7 @@ def _own_errors(model: LinearModel, noise: Floats, clipped: float) -> Floats:
     return np.asarray(np.clip(own, -clipped, clipped) / clipped)
 
 
-def _arranged(sums: Floats, of_channel: Strings, channel: Strings) -> Floats:
+def _arrange(sums: Floats, of_channel: Strings, channel: Strings) -> Floats:
     """Return sums by channel, in rows, for other channels: 0 for new ones; those that are gone are forgotten."""
     start = np.zeros((len(channel), sums.shape[1]))
     _, here, there = np.intersect1d(channel, of_channel, return_indices=True)

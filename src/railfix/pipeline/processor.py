@@ -243,9 +243,9 @@ class EpochProcessor:
         """
         received = state.received or self.received
         if self._joinable(observations):
-            together = dict.fromkeys(observations, self._corrected(observations, received))
+            together = dict.fromkeys(observations, self._correct(observations, received))
         else:
-            together = {name: self._corrected({name: own}, received) for name, own in observations.items()}
+            together = {name: self._correct({name: own}, received) for name, own in observations.items()}
         return {
             name: AntennaChunk(
                 self,
@@ -264,7 +264,7 @@ class EpochProcessor:
         sigmas = {(t.sigma_plan_m, t.sigma_height_m) for t in (self.trajectories[name] for name in observations)}
         return self.config.carrier == "off" and len(sigmas) == 1 and is_short(list(observations.values()))
 
-    def _corrected(self, observations: Mapping[str, Observations], received: Received) -> SolvedTogether:
+    def _correct(self, observations: Mapping[str, Observations], received: Received) -> SolvedTogether:
         """Return the corrected ranges of one antenna, or of the rows of several."""
         indices = tuple(self.indices[name] for name in observations)
         obs, parts = one_after_the_other(list(observations.values()))

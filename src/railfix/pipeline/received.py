@@ -175,12 +175,12 @@ def _current(navigation: Navigation, time: np.datetime64) -> Navigation:
     kepler, glonass = navigation.kepler, navigation.glonass
     return replace(
         navigation,
-        kepler=_unexpired(kepler, np.char.add(kepler.satellite, kepler.message), validity_s(kepler), time),
-        glonass=_unexpired(glonass, glonass.satellite, np.full(len(glonass), VALIDITY_S["R"]), time),
+        kepler=_drop_expired(kepler, np.char.add(kepler.satellite, kepler.message), validity_s(kepler), time),
+        glonass=_drop_expired(glonass, glonass.satellite, np.full(len(glonass), VALIDITY_S["R"]), time),
     )
 
 
-def _unexpired(table: Records, label: Strings, validity: Floats, time: np.datetime64) -> Records:
+def _drop_expired(table: Records, label: Strings, validity: Floats, time: np.datetime64) -> Records:
     """Return the rows of a table that are valid at `time` or later, and the newest one of each label."""
     kept = table.toe + timedelta(validity) >= time
     if kept.all():
@@ -193,8 +193,8 @@ def _unexpired(table: Records, label: Strings, validity: Floats, time: np.dateti
 def merged_navigation(old: Navigation, new: Navigation) -> Navigation:
     """Return old and new navigation data together."""
     return Navigation(
-        kepler=_united(old.kepler, new.kepler, _KEPLER_KEY),
-        glonass=_united(old.glonass, new.glonass, _GLONASS_KEY),
+        kepler=_unite(old.kepler, new.kepler, _KEPLER_KEY),
+        glonass=_unite(old.glonass, new.glonass, _GLONASS_KEY),
         klobuchar={**old.klobuchar, **new.klobuchar},
         leap_seconds=old.leap_seconds if new.leap_seconds is None else new.leap_seconds,
         skipped={kind: old.skipped.get(kind, 0) + new.skipped.get(kind, 0) for kind in {**old.skipped, **new.skipped}},
@@ -204,7 +204,7 @@ def merged_navigation(old: Navigation, new: Navigation) -> Navigation:
     )
 
 
-def _united(old: Records, new: Records, key: tuple[str, ...]) -> Records:
+def _unite(old: Records, new: Records, key: tuple[str, ...]) -> Records:
     """Return the rows of two tables, those of the second without the ones that the first has."""
     known = set(zip(*(getattr(old, name).tolist() for name in key), strict=True))
     rows = zip(*(getattr(new, name).tolist() for name in key), strict=True)

@@ -250,7 +250,7 @@ def sensor_epochs(
     if len(ranging) and "range" in sources and surroundings is not None and surroundings.units is not None:
         values["ranges"] = _ranges(ranging, edges, surroundings.units, ranging_lever_m(trajectory, limits), limits)
     kept = SensorSamples(
-        tachometer=_latest(pulses, _needed(pulses, edges[-1] - REACH, limits)),
+        tachometer=_latest(pulses, _find_first_needed(pulses, edges[-1] - REACH, limits)),
         inertial=_latest(inertial, np.searchsorted(inertial.time, edges[-1] - REACH, side="right") - 1),
         radar=_latest(radar, np.searchsorted(radar.time, edges[-1], side="right") - 1),
         ranging=_latest(ranging, np.searchsorted(ranging.time, edges[-1], side="right")),
@@ -320,7 +320,7 @@ def _slow(way: Floats, span: Floats, limits: SensorLimits) -> Masks:
     return np.asarray(np.abs(way) < limits.tachometer.least_speed_mps * np.maximum(span, 1e-9))
 
 
-def _needed(pulses: TachometerPulses, end: np.datetime64, limits: SensorLimits) -> int:
+def _find_first_needed(pulses: TachometerPulses, end: np.datetime64, limits: SensorLimits) -> int:
     """First pulse that speeds after an instant may need."""
     last = int(np.searchsorted(pulses.time, end, side="right")) - 1
     if last < 1:

@@ -113,7 +113,7 @@ def solve(
     tied, untied = point, ranges
     if len(corrected.groups) > 1:
         ranges = replace(ranges, ties=ties)
-        tied = _tied(ranges, ties, point, corrected.anchor_ecef_m, config)
+        tied = _tie(ranges, ties, point, corrected.anchor_ecef_m, config)
     place = antennas.each(lambda index, rows: place_on_line(rows_of(ranges, rows), index, rows_of(tied, rows), config))
     corrected = corrected.rejected(alone_on_their_clocks(corrected, ties), Reason.ALONE_ON_ITS_CLOCK)
     ages = antennas.apart(lambda _, rows, state: noise_age(time[rows], state.noise, limits=config.noise_scale), states)
@@ -211,7 +211,7 @@ def solve(
     return corrected, solution, after
 
 
-def _tied(ranges: Ranges, ties: ClockTies, point: SinglePoint, anchor_ecef_m: Floats, config: Config) -> SinglePoint:
+def _tie(ranges: Ranges, ties: ClockTies, point: SinglePoint, anchor_ecef_m: Floats, config: Config) -> SinglePoint:
     """Return the 3-D positions with the clocks tied; those with free clocks where no bias is known yet."""
     rows = np.flatnonzero(np.count_nonzero(ties.sigma_m < UNTIED_M, axis=1) > 1)
     if not len(rows):

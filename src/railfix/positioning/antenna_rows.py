@@ -106,11 +106,11 @@ def joined(values: Sequence[Value]) -> Value:
     if len(values) == 1:
         return values[0]
     if type(first) is tuple:
-        return cast(Value, tuple(_joined(column) for column in zip(*cast(Any, values), strict=True)))
-    return cast(Value, _joined(values))
+        return cast(Value, tuple(_join(column) for column in zip(*cast(Any, values), strict=True)))
+    return cast(Value, _join(values))
 
 
-def _joined(values: Sequence[Any]) -> Any:
+def _join(values: Sequence[Any]) -> Any:
     first = values[0]
     if isinstance(first, np.ndarray):
         return np.concatenate(values)
@@ -120,8 +120,8 @@ def _joined(values: Sequence[Any]) -> Any:
     members = {name: item for name, item in of_each[0].items() if name in _OF_CHANNELS}
     for name in names:
         column = [own[name] for own in of_each]
-        members[name] = np.concatenate(column) if type(column[0]) is np.ndarray else _joined(column)
-    return _made(type(first), members)
+        members[name] = np.concatenate(column) if type(column[0]) is np.ndarray else _join(column)
+    return _make(type(first), members)
 
 
 def rows_of(value: Value, rows: slice) -> Value:
@@ -139,10 +139,10 @@ def _rows_of(value: Any, rows: slice) -> Any:
     for name in names:
         item = own[name]
         members[name] = item[rows] if type(item) is np.ndarray else _rows_of(item, rows)
-    return _made(type(value), members)
+    return _make(type(value), members)
 
 
-def _made(kind: Any, members: dict[str, Any]) -> Any:
+def _make(kind: Any, members: dict[str, Any]) -> Any:
     """Return a dataclass with given members, which have been checked before."""
     instance = object.__new__(kind)
     vars(instance).update(members)

@@ -30,7 +30,7 @@ class IntegerSearch:
     def __init__(self, covariance: Floats) -> None:
         lower, variance = _lower_factor(covariance)
         #: Transformed unknowns are `transform.T @ N`; their covariance is `lower.T @ diag(variance) @ lower`.
-        self._transform, self._lower, self._variance = _decorrelated(lower, variance)
+        self._transform, self._lower, self._variance = _decorrelate(lower, variance)
         self._back = np.round(np.linalg.inv(self._transform)).astype(np.int64)
 
     def nearest(self, cycles: Floats, count: int, *, below: float = np.inf) -> tuple[Integers, Floats]:
@@ -61,7 +61,7 @@ def _lower_factor(covariance: Floats) -> tuple[Floats, Floats]:
     return np.asarray(upper / diagonal[:, None]), np.asarray(diagonal**2)
 
 
-def _decorrelated(lower: Floats, variance: Floats) -> tuple[Integers, Floats, Floats]:
+def _decorrelate(lower: Floats, variance: Floats) -> tuple[Integers, Floats, Floats]:
     """Integer transformation that makes the unknowns nearly uncorrelated, ordered by falling precision."""
     n = len(variance)
     lower, variance, transform = lower.copy(), variance.copy(), np.eye(n, dtype=np.int64)

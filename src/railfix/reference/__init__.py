@@ -7,13 +7,14 @@ from railfix.io.sensor_log import Acceleration, Pulses, read_acceleration, read_
 from railfix.reference.assemble import Built, Gap
 from railfix.reference.build import ReferenceData, build_references
 from railfix.reference.driver import ReferenceSummary, reference_files
-from railfix.reference.fixes import Fixes, Rejection
+from railfix.reference.fixes import Fixes, FixRejection
 from railfix.reference.inputs import ReferenceInputs, ReferenceOptions
 from railfix.reference.settings import ReferenceSettings
 
 __all__ = [
     "Acceleration",
     "Built",
+    "FixRejection",
     "Fixes",
     "Gap",
     "Pulses",
@@ -22,7 +23,6 @@ __all__ = [
     "ReferenceOptions",
     "ReferenceSettings",
     "ReferenceSummary",
-    "Rejection",
     "build_references",
     "read_acceleration",
     "read_pulses",

@@ -12,7 +12,7 @@ from railfix.core.timescale import seconds
 from railfix.io.reference_log import AntennaReference
 from railfix.reference.fixes import Fixes
 from railfix.reference.settings import ReferenceSettings
-from railfix.reference.smoother import Evidence, Smoothed
+from railfix.reference.smoother import Evidence, SmoothedReference
 from railfix.track.trajectory import Trajectory
 
 
@@ -54,7 +54,7 @@ class Built:
 
 def assembled(
     evidence: Evidence,
-    smoothed: Smoothed,
+    smoothed: SmoothedReference,
     fixes: Fixes,
     excess: Floats,
     *,
@@ -112,12 +112,12 @@ def assembled(
             "long_gap": int(long.sum()),
             "uncertain": int(uncertain.sum()),
         },
-        bridged_by=_bridged_by(evidence, keep[~is_fix[keep]]),
+        bridged_by=_name_bridges(evidence, keep[~is_fix[keep]]),
         facts=facts,
     )
 
 
-def _bridged_by(evidence: Evidence, rows: Indices) -> dict[str, int]:
+def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
     """Bridged instants by the sensors that have a number there, or a second or so from there."""
     t = seconds(evidence.time - evidence.time[0])
     measured = {

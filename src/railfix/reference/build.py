@@ -30,7 +30,7 @@ from railfix.reference.smoother import (
     WINDOWS,
     Closings,
     Evidence,
-    Smoothed,
+    SmoothedReference,
     closings,
     lasting_error_mps,
     slip_m,
@@ -113,8 +113,8 @@ class _Builder:
         wheel = self._wheel(fixes.time[good], fixes.arc_m[good])
         if self.data.acceleration is not None:
             _check_time(self.data.acceleration.path, self.data.acceleration.time, fixes.time[good])
-        judged, (settings, _) = fixes, self._calibrated(speeds, wheel, fixes)
-        fixes = judge_travel(judged, lambda time: self._travelled(time, speeds, wheel, judged, settings), settings)
+        judged, (settings, _) = fixes, self._calibrate(speeds, wheel, fixes)
+        fixes = judge_travel(judged, lambda time: self._travel(time, speeds, wheel, judged, settings), settings)
         good = self._good(fixes)
         span = fixes.time[(fixes.time >= fixes.time[good[0]]) & (fixes.time <= fixes.time[good[-1]])]
         time = instants(np.unique(span), [d.time for d in self._sources().values()])
@@ -122,7 +122,7 @@ class _Builder:
         place = np.interp(_since(time, time), _since(fixes.time[good], time), fixes.arc_m[good])
         for _ in range(_ROUNDS if self.data.dopplers else 1):
             speeds = self._speeds(time, place)
-            settings, calibrated = self._calibrated(speeds, wheel, fixes)
+            settings, calibrated = self._calibrate(speeds, wheel, fixes)
             evidence = self._evidence(time, at, fixes, good, speeds, wheel, place)
             smoothed = smooth(evidence, settings)
             place = np.clip(smoothed.arc_m, 0.0, self.trajectory.arc_m[-1])
@@ -142,7 +142,7 @@ class _Builder:
         self,
         speeds: Mapping[str, tuple[Speeds, DopplerSpeed]],
         wheel: Wheel | None,
-        smoothed: Smoothed,
+        smoothed: SmoothedReference,
         time: Datetimes,
         fixes: Fixes,
         settings: ReferenceSettings,
@@ -153,7 +153,7 @@ class _Builder:
         variance = np.full(len(moved), np.inf)
         closing = np.zeros(len(moved))
         duration, both = seconds(np.diff(fix_time)), fixes.sigma_m[good[1:]] ** 2 + fixes.sigma_m[good[:-1]] ** 2
-        joined = self._joined(speeds)
+        joined = self._join(speeds)
         if joined is not None and len(joined.time) > 1:
             way, white = (np.diff(part) for part in joined.way(fix_time))
             tau = settings.doppler_bias_s
@@ -176,12 +176,12 @@ class _Builder:
         _check_time(pulses.path, pulses.time, time)
         return wheel_of(pulses, self.settings.pulse_m, time, arc_m)
 
-    def _calibrated(
+    def _calibrate(
         self, speeds: Mapping[str, tuple[Speeds, DopplerSpeed]], wheel: Wheel | None, fixes: Fixes
     ) -> tuple[ReferenceSettings, dict[str, Any]]:
         """Return the settings with sensor errors estimated from the log's own fixes, and where each came from."""
         settings, sources, good = self.settings, {}, fixes.good
-        joined = self._joined(speeds)
+        joined = self._join(speeds)
         if joined is not None and len(joined.time) > 1:
             misclosures = self._closings(fixes, *joined.way(fixes.time[good]))
             settings = settings.replaced(doppler_bias_mps=lasting_error_mps(misclosures, settings))
@@ -240,7 +240,7 @@ class _Builder:
             speeds_of[name] = (speeds, solved)
         return speeds_of
 
-    def _joined(self, speeds: Mapping[str, tuple[Speeds, DopplerSpeed]]) -> Speeds | None:
+    def _join(self, speeds: Mapping[str, tuple[Speeds, DopplerSpeed]]) -> Speeds | None:
         """All receivers' speeds as one."""
         if not speeds:
             return None
@@ -253,7 +253,7 @@ class _Builder:
         rows = np.flatnonzero(np.isfinite(speed))
         return Speeds(time=time[rows], speed_mps=speed[rows], sigma_mps=sigma[rows])
 
-    def _travelled(
+    def _travel(
         self,
         time: Datetimes,
         speeds: Mapping[str, tuple[Speeds, DopplerSpeed]],
@@ -262,7 +262,7 @@ class _Builder:
         settings: ReferenceSettings,
     ) -> tuple[Floats, Floats]:
         """Way travelled up to instants and its variance: by the wheel where there is one, else by Dopplers."""
-        joined = self._joined(speeds)
+        joined = self._join(speeds)
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))
             step = np.abs(np.diff(way, prepend=way[:1]))
@@ -303,7 +303,7 @@ class _Builder:
         fix[at], sigma[at] = fixes.arc_m[good], fixes.sigma_m[good]
         doppler, doppler_sigma = fused(time, [part for part, _ in speeds.values()])
         if wheel is not None:
-            way = wheel.distance_m(time, self._hint(time, self._joined(speeds), fixes))
+            way = wheel.distance_m(time, self._hint(time, self._join(speeds), fixes))
         acceleration = np.full(len(time) - 1, np.nan)
         if self.data.acceleration is not None:
             acceleration = self.data.facing * self.data.acceleration.mean_over(time)
@@ -327,7 +327,7 @@ class _Builder:
         self,
         speeds: Mapping[str, tuple[Speeds, DopplerSpeed]],
         wheel: Wheel | None,
-        smoothed: Smoothed,
+        smoothed: SmoothedReference,
         sources: Mapping[str, Mapping[str, Any]],
     ) -> dict[str, Any]:
         """Return the estimated parameters as plain values."""

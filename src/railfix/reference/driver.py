@@ -30,7 +30,7 @@ from railfix.reference.record import antenna_record, fixes_table
 from railfix.reference.settings import ReferenceSettings
 from railfix.run.inputs import Antenna
 from railfix.run.output import OutputFolder
-from railfix.run.sources import Line, Log, open_line
+from railfix.run.sources import Log, OpenedLine, open_line
 
 #: Constellations whose Dopplers are used.
 SYSTEMS: Final = ("G", "J", "E", "C", "R")
@@ -111,7 +111,7 @@ def reference_files(
     return ReferenceSummary(built=built, notes=tuple(notes), files=files)
 
 
-def _read(inputs: ReferenceInputs, line: Line, options: ReferenceOptions) -> tuple[ReferenceData, list[str]]:
+def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) -> tuple[ReferenceData, list[str]]:
     """Read all files except those of the line."""
     day = None if options.date is None else np.datetime64(options.date, "D")
     logs: dict[str, PositionLog] = {

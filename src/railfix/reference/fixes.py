@@ -13,7 +13,7 @@ from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Mask
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
-from railfix.reference.matching import Matched, match
+from railfix.reference.matching import MatchedReference, match
 from railfix.reference.settings import ReferenceSettings
 from railfix.track.trajectory import Trajectory
 
@@ -26,7 +26,7 @@ _TRAVEL_SIGMAS: Final = 3.0
 _FIX: Final = 1
 
 
-class Rejection(IntFlag):
+class FixRejection(IntFlag):
     """Reasons to reject a position as a reference; 0: accepted."""
 
     NONE = 0
@@ -43,7 +43,7 @@ class Rejection(IntFlag):
     @property
     def text(self) -> str:
         """Names of the bits that are set, as in the output."""
-        return " ".join(flag.name.lower() for flag in Rejection if flag and flag in self and flag.name)
+        return " ".join(flag.name.lower() for flag in FixRejection if flag and flag in self and flag.name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class Fixes:
     sigma_enu_m : ndarray, shape (n, 3) [m]
         East, north, up; NaN where the log has none.
     rejection : ndarray of int64, shape (n,)
-        `Rejection` bits; a row that is rejected at one stage is not checked at the next.
+        `FixRejection` bits; a row that is rejected at one stage is not checked at the next.
     spacing_m : ndarray, shape (n,) [m]
         Distance to the other antenna minus that on the vehicle; NaN where it was not checked.
     arc_m, lateral_m, height_m : ndarray, shape (n,) [m]
@@ -95,7 +95,7 @@ class Fixes:
     def counts(self) -> dict[str, int]:
         """Number of rows by reason, the good ones first."""
         counted = {"good": int((self.rejection == 0).sum())}
-        for flag in Rejection:
+        for flag in FixRejection:
             if flag:
                 counted[flag.text] = int((self.rejection & flag != 0).sum())
         return counted
@@ -111,14 +111,14 @@ def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
     time, ecef = log.time[rows], log.ecef_m[rows]
     ratio = np.full(len(rows), np.nan) if log.ratio is None else log.ratio[rows]
     rejection = np.zeros(len(rows), dtype=np.int64)
-    _reject(rejection, np.asarray(~np.isfinite(ecef).all(axis=1)), Rejection.NO_POSITION)
+    _reject(rejection, np.asarray(~np.isfinite(ecef).all(axis=1)), FixRejection.NO_POSITION)
     if log.has_quality:
-        _reject(rejection, log.quality[rows] != _FIX, Rejection.NOT_FIXED)
+        _reject(rejection, log.quality[rows] != _FIX, FixRejection.NOT_FIXED)
     with np.errstate(invalid="ignore"):
-        _reject(rejection, np.asarray(ratio < settings.ratio), Rejection.LOW_RATIO)
+        _reject(rejection, np.asarray(ratio < settings.ratio), FixRejection.LOW_RATIO)
     repeated = np.zeros(len(rows), dtype=np.bool_)
     repeated[1:] = np.diff(time) == np.timedelta64(0, "ns")
-    _reject(rejection, repeated, Rejection.REPEATED)
+    _reject(rejection, repeated, FixRejection.REPEATED)
     blank = np.full(len(rows), np.nan)
     return Fixes(
         time=time,
@@ -136,7 +136,7 @@ def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
     )
 
 
-def _reject(rejection: Bits, mask: Masks, reason: Rejection) -> None:
+def _reject(rejection: Bits, mask: Masks, reason: FixRejection) -> None:
     """Give a reason to rows that have none yet."""
     rejection[mask & (rejection == 0)] |= reason
 
@@ -160,9 +160,9 @@ def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: Referenc
         apart = np.linalg.norm(fixes.ecef_m - moved, axis=1) - distance_m
         spacing = np.where(paired, apart, np.nan)
     if settings.unpaired == "reject":
-        _reject(rejection, ~paired, Rejection.UNPAIRED)
+        _reject(rejection, ~paired, FixRejection.UNPAIRED)
     with np.errstate(invalid="ignore"):
-        _reject(rejection, np.abs(spacing) > settings.spacing_m, Rejection.SPACING)
+        _reject(rejection, np.abs(spacing) > settings.spacing_m, FixRejection.SPACING)
     return replace(fixes, rejection=rejection, spacing_m=spacing)
 
 
@@ -174,7 +174,7 @@ def _velocity(time: Datetimes, ecef_m: Floats) -> Floats:
 
 
 #: The other antenna's row counts in a pair whatever this check gave it.
-_OF_THE_PAIR: Final = Rejection.UNPAIRED | Rejection.SPACING
+_OF_THE_PAIR: Final = FixRejection.UNPAIRED | FixRejection.SPACING
 
 
 def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSettings) -> Fixes:
@@ -194,15 +194,15 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
         arc[rows], lateral[rows], height[rows] = matched.arc_m, matched.lateral_m, matched.height_m
         sigma[rows] = _along_sigma(fixes.sigma_enu_m[rows], fixes.ecef_m[rows], trajectory, matched, settings)
         missed = np.isnan(arc) & (rejection == 0)
-        _reject(rejection, missed & ~(np.abs(lateral) <= settings.lateral_m), Rejection.OFF_TRACK)
-        _reject(rejection, missed & ~(np.abs(height) <= settings.height_m), Rejection.OFF_HEIGHT)
+        _reject(rejection, missed & ~(np.abs(lateral) <= settings.lateral_m), FixRejection.OFF_TRACK)
+        _reject(rejection, missed & ~(np.abs(height) <= settings.height_m), FixRejection.OFF_HEIGHT)
         # What is left is beyond an end of the line.
-        _reject(rejection, missed, Rejection.OFF_TRACK)
+        _reject(rejection, missed, FixRejection.OFF_TRACK)
     return replace(fixes, rejection=rejection, arc_m=arc, lateral_m=lateral, height_m=height, sigma_m=sigma)
 
 
 def _along_sigma(
-    sigma_enu_m: Floats, ecef_m: Floats, trajectory: Trajectory, matched: Matched, settings: ReferenceSettings
+    sigma_enu_m: Floats, ecef_m: Floats, trajectory: Trajectory, matched: MatchedReference, settings: ReferenceSettings
 ) -> Floats:
     """Standard deviation along the track from those east, north and up."""
     latitude, longitude, _ = geodetic_from_ecef(ecef_m)
@@ -238,7 +238,7 @@ def judge_travel(
 
     keep = _best_chain(agrees, seconds(fixes.time[rows] - fixes.time[rows[0]]), settings.travel_hold_s)
     rejection, travel = fixes.rejection.copy(), np.full(len(fixes), np.nan)
-    rejection[rows[~keep]] |= Rejection.TRAVEL
+    rejection[rows[~keep]] |= FixRejection.TRAVEL
     kept = np.flatnonzero(keep)
     travel[rows[kept[1:]]] = np.diff(offset[kept])
     return replace(fixes, rejection=rejection, travel_m=travel)

@@ -19,7 +19,7 @@ _JITTER_M = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Matched:
+class MatchedReference:
     """Positions on a trajectory, F of them.
 
     Attributes
@@ -57,7 +57,7 @@ def match(
     lateral_m: float,
     height_m: float,
     max_speed_mps: float,
-) -> Matched:
+) -> MatchedReference:
     """Put F positions on a trajectory, in order of rising time.
 
     Where the line passes a place more than once (a loop, laps), the chain of passes is taken that a train
@@ -75,7 +75,7 @@ def match(
     at = passes.position[chosen]
     arc[at], section[at] = passes.arc_m[chosen], passes.section[chosen]
     lateral[at], height[at] = passes.lateral_m[chosen], passes.height_m[chosen]
-    return Matched(arc_m=arc, lateral_m=lateral, height_m=height, section=section)
+    return MatchedReference(arc_m=arc, lateral_m=lateral, height_m=height, section=section)
 
 
 def _beside(offset: Floats, trajectory: Trajectory, section: Indices) -> tuple[Floats, Floats]:

@@ -8,15 +8,15 @@ import numpy as np
 import polars as pl
 
 from railfix.reference.assemble import Built
-from railfix.reference.fixes import Rejection
+from railfix.reference.fixes import FixRejection
 from railfix.track.trajectory import Trajectory
 
 
 def fixes_table(name: str, part: Built, trajectory: Trajectory) -> pl.DataFrame:
     """Rows of fixes.csv of one antenna."""
     fixes = part.fixes
-    words = {int(code): Rejection(int(code)).text or "good" for code in np.unique(fixes.rejection)}
-    return _rounded(
+    words = {int(code): FixRejection(int(code)).text or "good" for code in np.unique(fixes.rejection)}
+    return _round(
         pl.DataFrame(
             {
                 "time_gpst": fixes.time,
@@ -35,7 +35,7 @@ def fixes_table(name: str, part: Built, trajectory: Trajectory) -> pl.DataFrame:
     )
 
 
-def _rounded(table: pl.DataFrame) -> pl.DataFrame:
+def _round(table: pl.DataFrame) -> pl.DataFrame:
     """Round to tenths of millimetres, blank where there is no number."""
     return table.with_columns(pl.col(pl.Float64).round(4).fill_nan(None))
 

@@ -65,7 +65,7 @@ class Evidence:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Smoothed:
+class SmoothedReference:
     """Position and speed at every instant.
 
     Attributes
@@ -100,7 +100,7 @@ class _Unknowns:
         return self.count - 1
 
 
-def smooth(evidence: Evidence, settings: ReferenceSettings) -> Smoothed:
+def smooth(evidence: Evidence, settings: ReferenceSettings) -> SmoothedReference:
     """Estimate position and speed at every instant from all measurements together, at least one fix among them.
 
     `doppler_bias_mps` and `slip_m` of the settings are those of the log, where it tells them.
@@ -126,7 +126,7 @@ def smooth(evidence: Evidence, settings: ReferenceSettings) -> Smoothed:
             left = np.abs(evidence.doppler_mps - value[:, unknowns.speed] - value[:, unknowns.doppler])[seen]
             relief = np.minimum(1.0, _HUBER * evidence.doppler_sigma_mps[seen] / np.maximum(left, 1e-12))
     spread = np.sqrt(np.maximum(np.einsum("kii->ki", covariance), 0.0))
-    return Smoothed(
+    return SmoothedReference(
         arc_m=nominal + value[:, unknowns.place],
         sigma_m=spread[:, unknowns.place],
         speed_mps=value[:, unknowns.speed],

@@ -80,7 +80,7 @@ class Absent:
 
 
 @dataclass(frozen=True)
-class Command:
+class ReportedCommand:
     """A command line."""
 
     kind: ClassVar[str] = "command"
@@ -105,4 +105,4 @@ class Folded:
     blocks: Sequence[Block]
 
 
-Block = Table | Sentence | Absent | Command | Notes | Folded
+Block = Table | Sentence | Absent | ReportedCommand | Notes | Folded

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railfix.core.timescale import seconds
-from railfix.report.plots.chart import Band, Bars, Cells, Chart, Layer, Line, Marks, Points, Ranges, SkyEpochs
+from railfix.report.plots.chart import Band, Bars, Cells, Chart, Layer, Line, Marks, Points, RangeBars, SkyEpochs
 
 _EPOCH_ZERO: Final = np.datetime64("1970-01-01T00:00:00", "ns")
 #: Unknown value of an unsigned 16-bit number.
@@ -70,7 +70,7 @@ def _layer(layer: Layer) -> dict[str, Any]:
             values["height"] = packed(layer.height)
         case Cells():
             values |= _cells(layer)
-        case Ranges():
+        case RangeBars():
             values |= {"kind": "ranges", "names": list(layer.names)}
             values |= {name: packed(getattr(layer, name)) for name in ("low", "mid", "high")}
         case Marks():

@@ -196,17 +196,17 @@ def _without_each(
     scale = single["noise_scale"] or 1.0
     sigma, residual = satellites["sigma_m"].to_numpy() * scale, satellites["residual_m"].to_numpy()
     clocks: Strings = np.array([CLOCK_GROUP[name[0]] for name in satellites["satellite"]])
-    whole = _solved(design[used], sigma[used], residual[used], clocks[used], map_sigma_m)
+    whole = _solve(design[used], sigma[used], residual[used], clocks[used], map_sigma_m)
     shift, after = np.full((2, len(satellites)), np.nan)
     for row in np.flatnonzero(used):
         rest = used & (np.arange(len(used)) != row)
-        moved = _solved(design[rest], sigma[rest], residual[rest], clocks[rest], map_sigma_m)
+        moved = _solve(design[rest], sigma[rest], residual[rest], clocks[rest], map_sigma_m)
         if moved is not None and whole is not None:
             shift[row], after[row] = moved[0] - whole[0], moved[1]
     return shift, after
 
 
-def _solved(
+def _solve(
     design: Floats, sigma_m: Floats, residual_m: Floats, clocks: Strings, map_sigma_m: tuple[float, float]
 ) -> tuple[float, float] | None:
     """Return step along the line and its sigma; None where the ranges do not determine it."""

@@ -59,7 +59,7 @@ def overview(run: ReportedRun, antenna: str, background: Sequence[Floats] = ()) 
     else:
         beside = levels_over_chainage(positions, _alarm_limit(run))
         beside = interval_over_chainage(positions) if beside.empty else beside
-    charts = _kept(_plan(run, antenna, background), beside)
+    charts = _keep(_plan(run, antenna, background), beside)
     return Group(title="", charts=charts, start=start_of(positions))
 
 
@@ -69,7 +69,7 @@ def _plan(run: ReportedRun, antenna: str, background: Sequence[Floats]) -> Chart
     level = floats(positions, "protection_level_m")
     return plan(
         positions,
-        error_m=None if errors is None else _aligned(positions, errors),
+        error_m=None if errors is None else _align(positions, errors),
         level_m=level if np.isfinite(level).any() else None,
         filtered=run.train_of(antenna),
         track=run.track,
@@ -89,22 +89,22 @@ def antenna_groups(
     """
     positions, errors = run.positions_of(antenna), run.errors_of(antenna)
     start = start_of(positions)
-    yield Group(title="The line", charts=_kept(_plan(run, antenna, background)), start=start)
+    yield Group(title="The line", charts=_keep(_plan(run, antenna, background)), start=start)
     if errors is not None:
         filtered = run.filtered_of(antenna)
-        over = _kept(error_over_time(errors, filtered=filtered), error_over_chainage(errors, filtered=filtered))
+        over = _keep(error_over_time(errors, filtered=filtered), error_over_chainage(errors, filtered=filtered))
         yield Group(title="Errors", charts=over, start=start_of(errors))
     else:
         yield Group(title="Errors", charts=(), start=start, absent=(NO_REFERENCE,))
     limit = _alarm_limit(run)
-    levels = _kept(levels_over_time(positions, limit), levels_over_chainage(positions, limit))
+    levels = _keep(levels_over_time(positions, limit), levels_over_chainage(positions, limit))
     if levels and errors is not None:
-        levels = _kept(*_stanford(run, antenna, errors, limit)) + levels
+        levels = _keep(*_stanford(run, antenna, errors, limit)) + levels
     absent = () if levels else (NO_LEVELS,)
     yield Group(title="Protection level", charts=levels, start=start, absent=absent)
     table = positions if errors is None else errors
     charts = (interval_over_chainage(table), interval_distribution(table), satellites_over_time(positions))
-    yield Group(title="Positioning interval and satellites", charts=_kept(*charts), start=start)
+    yield Group(title="Positioning interval and satellites", charts=_keep(*charts), start=start)
     if run.observations is None:
         yield Group(title="Signals", charts=(), start=start, absent=(NO_OBSERVATIONS,))
         return
@@ -120,7 +120,7 @@ def antenna_groups(
         mask_deg=run.config.elevation.mask_deg if "elevation" in run.config.screens else None,
     )
     absent = () if curves else ("No observation has both an elevation and a C/N0, so there is no chart of them.",)
-    yield Group(title="C/N0 over elevation", charts=_kept(*curves), start=start, absent=absent)
+    yield Group(title="C/N0 over elevation", charts=_keep(*curves), start=start, absent=absent)
     yield _screens(run, antenna, positions, observations, start)
 
 
@@ -139,7 +139,7 @@ def _screens(
         charts.append(screen_over_time(screen.picture, screen.epoch_time, epoch=screen.epoch))
         charts.append(screen_over_chainage(screen.picture, screen.epoch_chainage_m, epoch=screen.epoch))
     absent = () if charts else (f"No active screen of the {antenna} antenna tested anything.",)
-    return Group(title="Screens: each metric against its limit", charts=_kept(*charts), start=start, absent=absent)
+    return Group(title="Screens: each metric against its limit", charts=_keep(*charts), start=start, absent=absent)
 
 
 def run_group(run: ReportedRun) -> Group:
@@ -156,7 +156,7 @@ def run_group(run: ReportedRun) -> Group:
     return Group(title="Processing time", charts=(chart,), start=start)
 
 
-def _kept(*charts: Chart) -> tuple[Chart, ...]:
+def _keep(*charts: Chart) -> tuple[Chart, ...]:
     return tuple(chart for chart in charts if not chart.empty)
 
 
@@ -173,7 +173,7 @@ def _stanford(run: ReportedRun, antenna: str, errors: pl.DataFrame, limit_m: flo
         yield stanford(diagram, title="Stanford diagram, usable levels (filter along the track)")
 
 
-def _aligned(positions: pl.DataFrame, errors: pl.DataFrame) -> Floats:
+def _align(positions: pl.DataFrame, errors: pl.DataFrame) -> Floats:
     """Errors at the rows of the positions."""
     known = errors.select("time_gpst", error_m=pl.Series(good_errors(errors, "error_m"), nan_to_null=True))
     joined = positions.select("time_gpst").join(known, on="time_gpst", how="left", maintain_order="left")

@@ -42,7 +42,7 @@ def headline(run: ReportedRun, antenna: str, evaluation: Evaluation | None) -> H
     """Verdict and key figures of one antenna, against the reference where there is one."""
     errors = run.errors_of(antenna)
     if evaluation is not None and errors is not None:
-        compared = _compared(errors)
+        compared = _compare(errors)
         if len(compared.on_map_m):
             return _with_errors(run, antenna, evaluation, compared)
     return _without_errors(run, antenna)
@@ -75,7 +75,7 @@ class _Compared:
     statuses: list[str]
 
 
-def _compared(errors: pl.DataFrame) -> _Compared:
+def _compare(errors: pl.DataFrame) -> _Compared:
     spanned = errors.filter("in_reference").with_columns(passed=pl.col("positioned") & pl.col("status").is_in(PASSED))
     observed = spanned.filter("observed")
     both = spanned.filter("passed", "conventional_positioned", "reference_good")
@@ -96,7 +96,7 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compare
         np.percentile(size, [50.0, 95.0]) for size in (compared.on_map_m, compared.conventional_m)
     )
     worst, other_worst = float(compared.on_map_m.max()), float(compared.conventional_m.max())
-    filtered = _filtered(run, antenna)
+    filtered = _filter(run, antenna)
     whose = "an epoch by itself" if filtered else "the train"
     verdict = (
         f"At {share(compared.rate, 1)} of the epochs with satellite signals {whose} has a position on the line that "
@@ -135,7 +135,7 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compare
         remarks=(
             *(_longest_outage(run, antenna, evaluation) if filtered else ()),
             *_larger_error(compared),
-            *_marked(compared),
+            *_describe_marked(compared),
         ),
     )
 
@@ -178,7 +178,7 @@ def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, ow
     )
 
 
-def _filtered(run: ReportedRun, antenna: str) -> dict[str, float]:
+def _filter(run: ReportedRun, antenna: str) -> dict[str, float]:
     """Error sizes and rate of the filter along the track over all its epochs; empty without it."""
     table = run.filtered_of(antenna)
     known = pl.DataFrame() if table is None else table.filter("positioned", "reference_good")
@@ -228,7 +228,7 @@ def _larger_error(compared: _Compared) -> list[str]:
     ]
 
 
-def _marked(compared: _Compared) -> list[str]:
+def _describe_marked(compared: _Compared) -> list[str]:
     """A sentence on the positions that failed a check."""
     if not len(compared.marked_m):
         return []

@@ -149,7 +149,7 @@ def report_page(
     antennas = max(sum(len(run.folder.antennas) for run in runs), 1)
     # many antennas share the size that two have
     epochs = max(_LEAST_SKY, min(SKY_EPOCHS, 2 * SKY_EPOCHS // antennas))
-    return _rendered(
+    return _render(
         "page.html.j2",
         title or f"railfix report: {', '.join(run.name for run in runs)}",
         runs=[
@@ -164,10 +164,10 @@ def charts_page(title: str, charts: Sequence[Chart], tables: Sequence[Block]) ->
     """HTML of a page of charts and tables under them."""
     numbers = count()
     figures = _Part(title="", figures=[_figure(chart, numbers) for chart in charts])
-    return _rendered("charts.html.j2", title, charts=figures, tables=tables)
+    return _render("charts.html.j2", title, charts=figures, tables=tables)
 
 
-def _rendered(template: str, title: str, **content: Any) -> str:
+def _render(template: str, title: str, **content: Any) -> str:
     environment = Environment(
         loader=PackageLoader("railfix.report"),
         autoescape=True,

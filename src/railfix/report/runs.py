@@ -164,7 +164,7 @@ def read_runs(
             evaluated[run.path.resolve(), run.table] = run, epochs
         evaluation = replace(evaluation, epochs=evaluation.epochs.clear())
     reported = tuple(
-        _reported(
+        _report(
             name,
             read_run(path, conventional=other, columns=_POSITIONS),
             {table: evaluated[own, table] for table in tables_of(path) if (own, table) in evaluated},
@@ -175,7 +175,7 @@ def read_runs(
     return reported, evaluation
 
 
-def _reported(
+def _report(
     name: str,
     folder: RunFolder,
     evaluated: Mapping[str, tuple[EvaluatedRun, pl.DataFrame]],

@@ -16,9 +16,9 @@ from railfix.report.content import (
     Absent,
     Block,
     Column,
-    Command,
     Folded,
     Notes,
+    ReportedCommand,
     Sentence,
     Table,
     count,
@@ -110,7 +110,7 @@ def provenance(run: ReportedRun) -> list[Block]:
     notes = [*(str(note) for note in record.get("notes") or []), *run.notes]
     return [
         Table(name="run", head=["", "run"], rows=rows),
-        Command(shlex.join(str(word) for word in record.get("command") or [])),
+        ReportedCommand(shlex.join(str(word) for word in record.get("command") or [])),
         Table(name="inputs", head=["input", "file", "bytes", "SHA-256"], rows=inputs, numeric=[2], code=[1, 3]),
         Notes("Notes", notes) if notes else Sentence("The run has no notes."),
     ]

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rows:
+class ResultRows:
     """What a chunk of one antenna gives to the results: tables, None where not wanted, and counts up to its end."""
 
     positions: pl.DataFrame
@@ -57,7 +57,7 @@ class Rows:
     notes: tuple[str, ...]
 
 
-def write_rows(rows: Sequence[Rows], line: sources.Line, folder: OutputFolder) -> None:
+def write_rows(rows: Sequence[ResultRows], line: sources.OpenedLine, folder: OutputFolder) -> None:
     """Write the rows of one chunk of all antennas, in order of time, with their tracks on a route of a network."""
     tables = {}
     for table in ("positions", "train", "observations"):
@@ -143,7 +143,7 @@ class AntennaRun:
         """See `ChunkSteps`."""
         self.chunk.check_filter(spacing)
 
-    def finished(self) -> Rows:
+    def finished(self) -> ResultRows:
         """Return what the chunk gives to the results."""
         result, self._state = self._processor.gathered({self.name: self.chunk}, self._state)
         if self._route is not None:
@@ -151,7 +151,7 @@ class AntennaRun:
         self._tally.add(result.antennas[self.name])
         if self._replays is not None:
             self._replays.keep(result.fusion[self.name].replay)
-        return Rows(
+        return ResultRows(
             positions=positions_table(result),
             train=train_table(result) if result.fusion else None,
             observations=observations_table(result) if self._observations else None,
@@ -286,9 +286,9 @@ class OtherProcess:
         self._ask("check_filter", spacing)
         self._ask("finished")
 
-    def finished(self) -> Rows:
+    def finished(self) -> ResultRows:
         """Return what the chunk gives to the results."""
-        rows: Rows = self._answer()
+        rows: ResultRows = self._answer()
         return rows
 
     def smoothed(self) -> pl.DataFrame:
@@ -351,10 +351,10 @@ def _serve(pipe: Connection, other_end: Connection, make: Callable[[], AntennaRu
         return
     except BaseException as error:  # noqa: BLE001  raised again in the process that asks
         with suppress(BrokenPipeError):
-            pipe.send(("error", _sent(error)))
+            pipe.send(("error", _send(error)))
 
 
-def _sent(error: BaseException) -> tuple[type[BaseException], tuple[Any, ...], dict[str, Any], str]:
+def _send(error: BaseException) -> tuple[type[BaseException], tuple[Any, ...], dict[str, Any], str]:
     """Return an error as values that can be sent, with where it was raised."""
     where = "".join(traceback.format_exception(error))
     if isinstance(error, RailfixError | MemoryError):

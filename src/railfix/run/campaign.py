@@ -120,7 +120,7 @@ def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
         _check_pattern(path, name, pattern)
         if other := sorted(set(_FIELD.findall(pattern)) - set(fields)):
             raise SettingsError(f"{path}: {name} has the field {other[0]}, which front has not")
-    found = {name: _found(folder, pattern) for name, pattern in patterns.items()}
+    found = {name: _find(folder, pattern) for name, pattern in patterns.items()}
     keys = list(dict.fromkeys(tuple(values[name] for name in fields) for _, values in found["front"]))
     if not keys:
         raise InputFileError(path, f"no file matches front = {campaign.front!r}; check the pattern")
@@ -224,7 +224,7 @@ def _row(run: CampaignRun, **values: Any) -> dict[str, Any]:
     return {**run.fields, "status": "done", **absent, **values}
 
 
-def _found(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
+def _find(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
     """Return the files that match a pattern, in order of their names, with the values of its fields.
 
     A name without fields or ``*`` is that file, whether it is there or not: the run says what is wrong with it.

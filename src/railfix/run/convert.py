@@ -39,7 +39,7 @@ def convert_logs(
     version: Literal["3.04", "4.02"] = "3.04" if rinex == "3" else "4.02"
     lines: list[str] = []
     if out is not None:
-        header, epochs, skipped = _scanned(logs, date)
+        header, epochs, skipped = _scan(logs, date)
         pieces = (piece for piece in scan_observations(logs, date=date) if len(piece))
         observables = {
             system: [kind + signal for signal in signals for kind in "CLDS"]
@@ -57,7 +57,7 @@ def convert_logs(
     return lines
 
 
-def _scanned(logs: tuple[Path, ...], date: np.datetime64 | None) -> tuple[ObservationHeader, int, Counter[str]]:
+def _scan(logs: tuple[Path, ...], date: np.datetime64 | None) -> tuple[ObservationHeader, int, Counter[str]]:
     """Header with the signals of the whole log, number of epochs, and what is passed over."""
     signals: dict[str, set[str]] = {}
     channels: dict[str, int] = {}

@@ -28,7 +28,7 @@ _SECOND: Final = np.timedelta64(1, "s")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
+class FileFinding:
     """What one file is: kind, facts in words, span in GPS time and place (ECEF, shape (3,) [m]) where it has them."""
 
     path: Path
@@ -42,7 +42,7 @@ class Finding:
 class Diagnosis:
     """Findings on each file, what does not fit together or is missing, and the command to run (blank: none)."""
 
-    findings: tuple[Finding, ...]
+    findings: tuple[FileFinding, ...]
     problems: tuple[str, ...]
     command: str
 
@@ -58,12 +58,12 @@ def examine_files(paths: Sequence[Path]) -> Diagnosis:
     for path in paths:
         if not path.is_file():
             raise InputFileError(path, "there is no such file; name files, each of them once")
-    findings = tuple(_examined(path) for path in paths)
+    findings = tuple(_examine(path) for path in paths)
     problems = tuple(_problems(findings))
     return Diagnosis(findings=findings, problems=problems, command=_command(findings))
 
 
-def _examined(path: Path) -> Finding:
+def _examine(path: Path) -> FileFinding:
     """Return what a file is; one that is of no kind has the error of each in its facts."""
     errors: list[str] = []
     for kind in _KINDS:
@@ -73,10 +73,10 @@ def _examined(path: Path) -> Finding:
             return _READERS[kind](path)
         except RailfixError as error:
             errors.append(f"no {kind}: {error}")
-    return Finding(path=path, kind="unknown", facts=tuple(errors))
+    return FileFinding(path=path, kind="unknown", facts=tuple(errors))
 
 
-def _observations(path: Path) -> Finding:
+def _observations(path: Path) -> FileFinding:
     """Read a log piece by piece: the facts of the whole, in the memory of a piece."""
     first: Observations | None = None
     epochs, longest_s, steps = 0, 0.0, []
@@ -104,7 +104,7 @@ def _observations(path: Path) -> Finding:
         f"signals: {', '.join(sorted(signals))}",
     ]
     place = first.header.approximate_ecef_m
-    return Finding(
+    return FileFinding(
         path=path,
         kind="observations",
         facts=(*facts, *_place_facts(place)),
@@ -113,16 +113,16 @@ def _observations(path: Path) -> Finding:
     )
 
 
-def _navigation(path: Path) -> Finding:
+def _navigation(path: Path) -> FileFinding:
     navigation = read_navigation([path])
     span = navigation_span(navigation)
     if span is None:
         raise InputFileError(path, "has no ephemeris")
     records = len(navigation.kepler) + len(navigation.glonass)
-    return Finding(path=path, kind="navigation", facts=(f"{records:,} ephemerides",), span=span)
+    return FileFinding(path=path, kind="navigation", facts=(f"{records:,} ephemerides",), span=span)
 
 
-def _track(path: Path) -> Finding:
+def _track(path: Path) -> FileFinding:
     track = read_track([path])
     length = float(track.chainage_m[-1] - track.chainage_m[0])
     low, high = float(np.min(track.height_m)), float(np.max(track.height_m))
@@ -132,10 +132,10 @@ def _track(path: Path) -> Finding:
         f"frame {track.provenance.frame}",
     )
     place = track.ecef_m[len(track.ecef_m) // 2]
-    return Finding(path=path, kind="track", facts=(*facts, *_place_facts(place)), place_ecef_m=place)
+    return FileFinding(path=path, kind="track", facts=(*facts, *_place_facts(place)), place_ecef_m=place)
 
 
-def _positions(path: Path) -> Finding:
+def _positions(path: Path) -> FileFinding:
     log = read_any_positions(path)
     known = log.time[~np.isnat(log.time)]
     if not len(known):
@@ -143,20 +143,20 @@ def _positions(path: Path) -> Finding:
     span = (known.min(), known.max())
     place = np.nanmedian(log.ecef_m, axis=0)
     facts = (f"{len(log.time):,} positions", *_place_facts(place))
-    return Finding(path=path, kind="positions", facts=facts, span=span, place_ecef_m=place)
+    return FileFinding(path=path, kind="positions", facts=facts, span=span, place_ecef_m=place)
 
 
-def _vehicle(path: Path) -> Finding:
+def _vehicle(path: Path) -> FileFinding:
     vehicle = read_vehicle(path)
-    return Finding(path=path, kind="vehicle", facts=(f"antennas: {', '.join(vehicle.antennas)}",))
+    return FileFinding(path=path, kind="vehicle", facts=(f"antennas: {', '.join(vehicle.antennas)}",))
 
 
-def _settings(path: Path) -> Finding:
+def _settings(path: Path) -> FileFinding:
     from railfix.pipeline.config import load_config
 
     config, default = load_config(path).as_dict(), Config().as_dict()
     changed = [name for name, value in config.items() if value != default[name]]
-    return Finding(path=path, kind="settings", facts=(f"changed: {', '.join(changed) or 'nothing'}",))
+    return FileFinding(path=path, kind="settings", facts=(f"changed: {', '.join(changed) or 'nothing'}",))
 
 
 _READERS: Final = {
@@ -176,11 +176,11 @@ def _place_facts(ecef_m: Floats) -> tuple[str, ...]:
     return (f"near latitude {latitude:.4f}, longitude {longitude:.4f}, height {height:.0f} m",)
 
 
-def _of(findings: Sequence[Finding], kind: Kind) -> list[Finding]:
+def _of(findings: Sequence[FileFinding], kind: Kind) -> list[FileFinding]:
     return [finding for finding in findings if finding.kind == kind]
 
 
-def _problems(findings: Sequence[Finding]) -> list[str]:
+def _problems(findings: Sequence[FileFinding]) -> list[str]:
     """Return what does not fit together, and what is missing for a run, a sentence each."""
     problems = [f"{finding.path}: is of no kind that railfix reads" for finding in _of(findings, "unknown")]
     logs, navigation, tracks = (_of(findings, kind) for kind in ("observations", "navigation", "track"))
@@ -217,7 +217,7 @@ def _problems(findings: Sequence[Finding]) -> list[str]:
     return problems
 
 
-def _command(findings: Sequence[Finding]) -> str:
+def _command(findings: Sequence[FileFinding]) -> str:
     """Return the command of a run, blank where a file for it is missing."""
     logs, navigation, tracks = (_of(findings, kind) for kind in ("observations", "navigation", "track"))
     if not (logs and navigation and tracks) or len(logs) > 2:

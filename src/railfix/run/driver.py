@@ -34,7 +34,7 @@ from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filter
 from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sensors import check_filter, read_sensors, units_of_ranges
 from railfix.run.smoothed_columns import add_smoothed
-from railfix.run.sources import TRACK_FILE, Line, Log, open_line
+from railfix.run.sources import TRACK_FILE, Log, OpenedLine, open_line
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
@@ -182,7 +182,9 @@ def run_files(
     )  # fmt: skip
 
 
-def open_inputs(inputs: RunInputs, options: RunOptions, config: Config) -> tuple[Navigation, Line, dict[Antenna, Log]]:
+def open_inputs(
+    inputs: RunInputs, options: RunOptions, config: Config
+) -> tuple[Navigation, OpenedLine, dict[Antenna, Log]]:
     """Read navigation and line, and open the logs, by antenna; find the route in a network of tracks.
 
     Raises
@@ -269,7 +271,7 @@ def sensors_of(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
 
 def _position(
     runs: Mapping[str, AntennaRun | OtherProcess],
-    line: Line,
+    line: OpenedLine,
     processor: EpochProcessor,
     folder: OutputFolder,
     beside: Executor,
@@ -318,7 +320,7 @@ _NAMED: Final = 3
 
 
 def notes_of(
-    line: Line, navigation: Navigation, tally: Tally, logs: Mapping[Antenna, Log], *, note_statistic: float
+    line: OpenedLine, navigation: Navigation, tally: Tally, logs: Mapping[Antenna, Log], *, note_statistic: float
 ) -> tuple[str, ...]:
     """Return the notes of a run, each once; of the map from `MapOffsetLimits.note_threshold` of its test on."""
     notes = [*line.notes, *_map_notes(line), *navigation.notes, *_broken_notes(logs), *tally.all_notes]
@@ -342,7 +344,7 @@ def notes_of(
             doubt = "contradicts the positions" if antenna.status["map_offset"] else "may be wrong"
             notes.append(f"{name}: the map {doubt}: {offset.text}")
         if antenna.positioned:
-            notes.append(f"{name}: {_undetected(antenna.map_detectable_m)}")
+            notes.append(f"{name}: {_describe_detectable(antenna.map_detectable_m)}")
         off = antenna.status["off_map"]
         if off > 0.1 * antenna.positioned:
             which = "every position is" if off == antenna.positioned else f"{off} of {antenna.positioned} positions are"
@@ -350,7 +352,7 @@ def notes_of(
     return tuple(dict.fromkeys(notes))
 
 
-def _undetected(detectable_m: Floats) -> str:
+def _describe_detectable(detectable_m: Floats) -> str:
     """Which offsets of the map the run does not exclude, one clause."""
     if np.isnan(detectable_m).any():
         return "the map was not tested against the positions: there is no minute of 3-D positions with redundant ranges"
@@ -361,7 +363,7 @@ def _undetected(detectable_m: Floats) -> str:
     )
 
 
-def _map_notes(line: Line) -> Iterator[str]:
+def _map_notes(line: OpenedLine) -> Iterator[str]:
     """Result of the check of the track map."""
     quality = check_track(line.track)
     if quality.errors:

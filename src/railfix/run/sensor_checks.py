@@ -158,14 +158,14 @@ def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: Tacho
     right = speeds["speed_mps"].to_numpy()
     notes: list[str] = []
     if len(samples.radar):
-        found = _checked(samples.radar.time, samples.radar.speed_mps, right_time, right)
+        found = _check(samples.radar.time, samples.radar.speed_mps, right_time, right)
         notes += _sentences("radar", found, "its speeds are {:+.1f} % off those by Dopplers")
     if len(samples.tachometer):
         first, last = (int(t.astype(np.int64)) for t in samples.tachometer.time[[0, -1]])
         grid = np.arange(first, last, _STEP_NS).astype("datetime64[ns]")
         wheel = pulse_speeds(samples.tachometer, grid, limits=tachometer)
         heard = np.isfinite(wheel.speed_mps)
-        found = _checked(wheel.time[heard], wheel.speed_mps[heard], right_time, right)
+        found = _check(wheel.time[heard], wheel.speed_mps[heard], right_time, right)
         real = np.nan if found is None else tachometer.wheel_diameter_m / found.ratio
         fits = f"sensors.tachometer.wheel_diameter_m = {real:.3f}"
         if found is not None and abs(found.ratio - 1.0) > _OTHER_TEETH:
@@ -175,7 +175,7 @@ def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: Tacho
     return tuple(notes)
 
 
-def _checked(time: Datetimes, speed_mps: Floats, right_time: Datetimes, right_mps: Floats) -> SpeedCheck | None:
+def _check(time: Datetimes, speed_mps: Floats, right_time: Datetimes, right_mps: Floats) -> SpeedCheck | None:
     """Speeds against those by satellites; None with too few in common."""
     if len(right_time) < 2 or not len(time):
         return None

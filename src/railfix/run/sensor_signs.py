@@ -43,7 +43,7 @@ _GRAVITY_SHARE: Final = 0.12
 
 
 @dataclass(frozen=True)
-class Motion:
+class PositionMotion:
     """Motion of an antenna by its places, M cells of time; NaN where a neighbour is missing.
 
     Attributes
@@ -61,7 +61,7 @@ class Motion:
     heading_rate_radps: Floats
 
 
-def motion_of(places: pl.DataFrame, trajectory: Trajectory) -> Motion:
+def motion_of(places: pl.DataFrame, trajectory: Trajectory) -> PositionMotion:
     """Compute the motion by ``time_gpst`` and ``chainage_m`` of single epochs, from cells of 4 s that have some."""
     time = places["time_gpst"].to_numpy().astype("datetime64[ns]")
     since = seconds(time - time[0])
@@ -79,7 +79,7 @@ def motion_of(places: pl.DataFrame, trajectory: Trajectory) -> Motion:
     rate[1:-1] = np.arctan2(np.sin(turned), np.cos(turned)) / span
     known = count > 0
     gradient = Line.of(trajectory).gradient_at(arc)
-    return Motion(time[0] + timedelta(t[known]), speed[known], gained[known], gradient[known], rate[known])
+    return PositionMotion(time[0] + timedelta(t[known]), speed[known], gained[known], gradient[known], rate[known])
 
 
 def sign_notes(
@@ -115,7 +115,7 @@ def sign_notes(
         if lag:
             yield _late("inertial", lag, time[0])
             return
-        slope = _slope(_centred(expected), _centred(force(time)), _LEAST_FORCE_MPS2)
+        slope = _slope(_centre(expected), _centre(force(time)), _LEAST_FORCE_MPS2)
         if slope < _REVERSED:
             yield (
                 "inertial: its force forward is opposite to the acceleration by satellites; the unit is mounted "
@@ -145,7 +145,7 @@ def _of_speeds(
 
 def _lag_s(time: Datetimes, expected: Floats, measured: Callable[[Datetimes], Floats], least: float) -> float:
     """Lag of the sensor's time tags behind the satellites' [s]; 0 where none of seconds is certain."""
-    x, found = _centred(expected), {}
+    x, found = _centre(expected), {}
     for lag in np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S + 1.0).tolist():
         y = measured(time + timedelta(np.array([lag])))
         both = np.isfinite(x) & np.isfinite(y)
@@ -184,7 +184,7 @@ def _means(time: Datetimes, values: Floats, middle: Datetimes) -> Floats:
     return np.where(whole, (total[last] - total[first]) / np.maximum(last - first, 1), np.nan)
 
 
-def _centred(values: Floats) -> Floats:
+def _centre(values: Floats) -> Floats:
     """Values less their mean: an offset of the unit on the body has no part in what it is compared by."""
     known = np.isfinite(values)
     return values - (values[known].mean() if known.any() else 0.0)

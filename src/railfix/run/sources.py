@@ -36,7 +36,7 @@ TRACK_FILE: Final = "track.csv"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Line:
+class OpenedLine:
     """The line and the path of each antenna on it.
 
     Attributes
@@ -117,7 +117,7 @@ def open_line(
     heights: Path | None = None,
     at: np.datetime64 | None = None,
     find: Callable[[Network], RouteOfLog] | None = None,
-) -> Line:
+) -> OpenedLine:
     """Read the track and the vehicle, and compute the path of each antenna.
 
     With a time `at` the track is moved to the frame of the satellites then (`railfix.track.frames`); without it
@@ -141,7 +141,7 @@ def open_line(
     if at is not None:
         moved, shift = track_at(centreline, at, **reading.motion)
     paths = _paths(moved, vehicle, antennas, reading, prepared)
-    return Line(
+    return OpenedLine(
         track=moved,
         vehicle=paths[0],
         trajectories=paths[1],

@@ -81,7 +81,7 @@ class StandstillCodes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaseStation:
+class StandstillBase:
     """Observations of a base station and its place, ECEF [m]."""
 
     observations: Observations
@@ -93,7 +93,7 @@ def standstill_codes(
     navigation: Navigation,
     config: Config,
     *,
-    base: BaseStation | None = None,
+    base: StandstillBase | None = None,
     origin_ecef_m: Floats | None = None,
 ) -> StandstillCodes:
     """Codes, and beside a base station phases, of an antenna at rest about an origin, by default its mean place.

@@ -66,7 +66,7 @@ def prior_of_last_place(
     for name, share in shares.items():
         if share > 0.0:
             within = 0.0 if moved_m <= _SAME_PLACE_M else moved_m * (1.0 + _ODOMETER_SHARE) + _ODOMETER_M
-            reached = [name] if within == 0.0 else _reached(network, network.names.index(name), within)
+            reached = [name] if within == 0.0 else _find_reachable(network, network.names.index(name), within)
             for other in reached:
                 weights[other] += share / len(reached)
     total, count = sum(weights.values()), len(weights)
@@ -75,7 +75,7 @@ def prior_of_last_place(
     return TrackPrior(weights=weights, unmapped=max(off_map, _LEAST_UNMAPPED))
 
 
-def _reached(network: Network, track: int, within_m: float) -> list[str]:
+def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
     """Tracks that a train from anywhere on a track can stand on after a distance, turns included."""
     ends: nx.Graph[int] = nx.Graph()
     for k, length in enumerate(network.length_m.tolist()):

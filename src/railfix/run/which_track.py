@@ -27,7 +27,7 @@ from railfix.positioning.which_track import (
 from railfix.run.inputs import InputFiles, input_option
 from railfix.run.options import LogReading, TrackReading
 from railfix.run.sources import Log
-from railfix.run.standstill import BaseStation, StandstillCodes, standstill_codes
+from railfix.run.standstill import StandstillBase, StandstillCodes, standstill_codes
 from railfix.run.track_prior import TrackPrior, prior_of_interlocking, prior_of_last_place
 from railfix.track.frames import in_map_frame
 from railfix.track.network import Network
@@ -181,7 +181,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     navigation = read_navigation(inputs.nav, date=options.logs.instant)
     base = None
     if options.base_place is not None:
-        base = BaseStation(observations=_observations(inputs.base, options), ecef_m=_place(options.base_place))
+        base = StandstillBase(observations=_observations(inputs.base, options), ecef_m=_place(options.base_place))
     codes: list[StandstillCodes] = []
     for paths in (inputs.front, inputs.rear):
         if paths:

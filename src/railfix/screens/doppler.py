@@ -156,7 +156,7 @@ def doppler_screen(
     if code_sigma_m is None and limits.mode == "sigma":
         raise ValueError("mode 'sigma' needs code_sigma_m")
     sigma = np.full(code.shape, np.nan) if code_sigma_m is None else np.asarray(code_sigma_m, dtype=np.float64)
-    before = _aligned(state or DopplerState(), satellite, signal)
+    before = _align(state or DopplerState(), satellite, signal)
     if not len(when):
         nothing = np.empty(code.shape)
         empty = DopplerScreened(metric=nothing, reject=nothing.astype(bool), limit_m=nothing, level_m=nothing)
@@ -186,7 +186,7 @@ def doppler_screen(
     return DopplerScreened(metric=metric, reject=reject, limit_m=limit, level_m=level), after
 
 
-def _aligned(state: DopplerState, satellite: Strings, signal: Strings) -> DopplerState:
+def _align(state: DopplerState, satellite: Strings, signal: Strings) -> DopplerState:
     """The state on the channels of this chunk; channels that left have no observation in it anyway."""
     if state.satellite.tobytes() == satellite.tobytes() and state.signal.tobytes() == signal.tobytes():
         return state

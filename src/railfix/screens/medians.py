@@ -29,11 +29,11 @@ def clock_medians(values: Floats, satellite: Strings, *, least: int = 0) -> Floa
     least : int
         NaN where fewer satellites of the clock have a finite value.
     """
-    return medians_of_clocks(np.ascontiguousarray(values), *_numbered(tuple(satellite.tolist())), least)
+    return medians_of_clocks(np.ascontiguousarray(values), *_number(tuple(satellite.tolist())), least)
 
 
 @lru_cache(maxsize=256)
-def _numbered(satellites: tuple[str, ...]) -> tuple[Indices, Indices]:
+def _number(satellites: tuple[str, ...]) -> tuple[Indices, Indices]:
     """Receiver clock and satellite of each channel as numbers, shape (M,) each."""
     clock = np.unique([CLOCK_GROUP[name[0]] for name in satellites], return_inverse=True)[1]
     number = np.unique(list(satellites), return_inverse=True)[1]

@@ -35,7 +35,7 @@ def _rank(screen: Screen[Any]) -> int:
     return next((rank for kind, rank in kinds if isinstance(screen, kind)), 2)
 
 
-def _installed() -> list[Screen[Any]]:
+def _find_installed() -> list[Screen[Any]]:
     """Load the screens of installed packages.
 
     Raises
@@ -62,5 +62,5 @@ def _installed() -> list[Screen[Any]]:
 
 #: All screens, in the order in which they judge.
 SCREENS: Final[tuple[Screen[Any], ...]] = in_order(
-    (*(import_module(f"railfix.screens.{name}").SCREEN for name in _NAMES), *_installed())
+    (*(import_module(f"railfix.screens.{name}").SCREEN for name in _NAMES), *_find_installed())
 )

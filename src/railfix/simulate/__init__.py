@@ -12,7 +12,7 @@ from railfix.simulate.alignment import Alignment, build_alignment
 from railfix.simulate.body import AntennaTruth, antenna_truth
 from railfix.simulate.constellation import simulated_navigation
 from railfix.simulate.demo_data import DEMO_FILES, demo_files, demo_folder
-from railfix.simulate.disturbance import Disturbance, Disturbances, Geometry
+from railfix.simulate.disturbance import Disturbance, Disturbances, SightGeometry
 from railfix.simulate.errors import ErrorSettings
 from railfix.simulate.kinematics import Motion
 from railfix.simulate.line_settings import (
@@ -51,7 +51,6 @@ __all__ = [
     "Element",
     "ErrorSettings",
     "GeneratedLine",
-    "Geometry",
     "Gradient",
     "LineFile",
     "LineSettings",
@@ -63,6 +62,7 @@ __all__ = [
     "RunSettings",
     "Scenario",
     "SensorSettings",
+    "SightGeometry",
     "Simulation",
     "SkySettings",
     "SpeedLimit",

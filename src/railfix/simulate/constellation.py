@@ -173,8 +173,8 @@ def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Gener
         ill = orbit.name in scenario.sky.unhealthy and sent_sow + every > start_sow
         row: dict[str, Any] = {
             "af0_s": bias + rate * dt, "af1": rate, "af2": 0.0, "sqrt_a": sqrt_a, "eccentricity": orbit.eccentricity,
-            "m0": _wrapped(orbit.mean_anomaly + speed * dt), "delta_n": motion, "omega0": _wrapped(node),
-            "i0": orbit.tilt + tilting * dt, "omega": _wrapped(orbit.perigee), "omega_dot": drift, "i_dot": tilting,
+            "m0": _wrap(orbit.mean_anomaly + speed * dt), "delta_n": motion, "omega0": _wrap(node),
+            "i0": orbit.tilt + tilting * dt, "omega": _wrap(orbit.perigee), "omega_dot": drift, "i_dot": tilting,
             **wobble, "toe_sow_s": float(toe_sow), "accuracy_m": 3.12 if system == "E" else 2.0,
             "group_delay_1_s": delay[0], "group_delay_2_s": delay[1] if system in "EC" else np.nan,
             "fit_interval_h": {"G": 4.0, "J": 2.0}.get(system, np.nan),
@@ -197,7 +197,7 @@ def _ill_health(system: str) -> int:
     return {"G": 63, "J": 63, "E": 0b001_000_010 | 0b010_000_000, "C": 1}[system]
 
 
-def _wrapped(angle: float) -> float:
+def _wrap(angle: float) -> float:
     return float((angle + np.pi) % (2.0 * np.pi) - np.pi)
 
 

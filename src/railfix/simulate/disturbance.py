@@ -9,7 +9,7 @@ from railfix.core.arrays import Datetimes, Floats, Strings
 
 
 @dataclass(frozen=True, kw_only=True)
-class Geometry:
+class SightGeometry:
     """Positions of one antenna and directions to its satellites at T epochs, M channels.
 
     Attributes
@@ -61,4 +61,4 @@ class Disturbance:
 
 
 #: A source of disturbances: a function of the geometry alone, so that results do not depend on the chunks.
-Disturbances = Callable[[Geometry], Disturbance]
+Disturbances = Callable[[SightGeometry], Disturbance]

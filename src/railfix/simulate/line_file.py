@@ -128,9 +128,11 @@ def _curvature_and_grade(place: Floats, slope: Floats, bend: Floats) -> tuple[Fl
 def _knots(track: Track, point: Floats, arc: Floats, curvature: Floats, grade: Floats) -> Knots:
     """Curvature of the file where it has radii, else of the spline; lean of the file's cant."""
     bend = (
-        np.interp(arc, point, _known(point, 1.0 / track.radius_m)) if (~np.isnan(track.radius_m)).any() else curvature
+        np.interp(arc, point, _fill_gaps(point, 1.0 / track.radius_m))
+        if (~np.isnan(track.radius_m)).any()
+        else curvature
     )
-    cant = _known(point, track.cant_m) if np.isfinite(track.cant_m).any() else np.zeros(len(point))
+    cant = _fill_gaps(point, track.cant_m) if np.isfinite(track.cant_m).any() else np.zeros(len(point))
     side = np.sign(np.interp(point, arc, bend))
     return Knots(
         knot_m=arc,
@@ -141,7 +143,7 @@ def _knots(track: Track, point: Floats, arc: Floats, curvature: Floats, grade: F
     )
 
 
-def _known(point: Floats, values: Floats) -> Floats:
+def _fill_gaps(point: Floats, values: Floats) -> Floats:
     """Values with NaN filled by their neighbours."""
     known = np.isfinite(values)
     return np.interp(point, point[known], values[known])

@@ -40,7 +40,7 @@ def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
             f"{path}: has no Klobuchar coefficients of GPS, which the simulated ionosphere needs; take another file, "
             "or set sky.ionosphere_scale to 0 and position with `--set ionosphere=off`"
         )
-    records = _believed(navigation.kepler, scenario.sky.systems)
+    records = _select_simulated(navigation.kepler, scenario.sky.systems)
     first = scenario.start
     last = first + np.timedelta64(round(scenario.duration_s * 1e9), "ns")
     kept = [rows for name in np.unique(records.satellite) if len(rows := _serving(records, str(name), first, last))]
@@ -75,7 +75,7 @@ def _rows(records: KeplerRecords, rows: Indices | Masks) -> KeplerRecords:
     return replace(records, **{item.name: getattr(records, item.name)[rows] for item in fields(records)})
 
 
-def _believed(records: KeplerRecords, systems: str) -> KeplerRecords:
+def _select_simulated(records: KeplerRecords, systems: str) -> KeplerRecords:
     """Records of the simulated signals, with plausible transmission times."""
     letter = records.satellite.astype("<U1")
     usable = np.zeros(len(records), dtype=np.bool_)

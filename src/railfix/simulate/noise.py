@@ -99,7 +99,7 @@ class LockState:
     loss_of_lock: Bytes
 
 
-class Tracking:
+class TrackingNoise:
     """Loss of lock and re-acquisition of a receiver's channels; the state is carried from chunk to chunk.
 
     The key is the seed of the slips, another one for each receiver.

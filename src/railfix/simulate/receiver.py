@@ -14,7 +14,7 @@ from railfix.gnss.observations import ObservationHeader
 from railfix.simulate.errors.common import CommonErrors
 from railfix.simulate.errors.processes import satellite_key
 from railfix.simulate.errors.settings import InterSystemSettings
-from railfix.simulate.noise import CarriedNoise, CodeSmoothing, Tracking
+from railfix.simulate.noise import CarriedNoise, CodeSmoothing, TrackingNoise
 from railfix.simulate.satellites import newest_record
 from railfix.simulate.scenario import Scenario
 
@@ -70,7 +70,7 @@ class Receiver:
         self.smoothing = CodeSmoothing(
             scenario.receiver.code_smoothing_s, channels=len(channels), interval_s=scenario.interval_s
         )
-        self.tracking = Tracking(
+        self.tracking = TrackingNoise(
             errors.tracking,
             key=(scenario.seed, _SLIPS, number),
             channels=len(channels),

@@ -24,7 +24,7 @@ def run_readme(simulation: Simulation, files: dict[str, Path], command: str) -> 
     settings = "\n".join(f"| {name} | {value} |" for name, value in _settings(scenario).items())
     return f"""# A simulated run
 
-{_invented(scenario)}
+{_list_inventions(scenario)}
 It is not a recording.
 
 {made}
@@ -37,7 +37,7 @@ The ranges hold the light time, the Earth's rotation, satellite and receiver clo
 ionosphere, Saastamoinen's troposphere (standard atmosphere, 70 % humidity) and white noise; the delays are those
 that a receiver corrects, unless a scale below says otherwise.
 
-{_switched_on(scenario)}
+{_list_effects(scenario)}
 
 | setting | value |
 |---|---|
@@ -45,7 +45,7 @@ that a receiver corrects, unless a scale below says otherwise.
 """
 
 
-def _invented(scenario: Scenario) -> str:
+def _list_inventions(scenario: Scenario) -> str:
     if scenario.line.kind != "file" and not scenario.sky.nav:
         return "Everything in this folder is invented: no such line, train or satellite exists."
     line = "the line is that of a track file" if scenario.line.kind == "file" else "no such line exists"
@@ -77,7 +77,7 @@ def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
     return {path.name: (what | sensors)[name] for name, path in files.items()}
 
 
-def _switched_on(scenario: Scenario) -> str:
+def _list_effects(scenario: Scenario) -> str:
     """One sentence a group of errors: on, or none."""
     usual = Scenario().errors
     names = list(type(usual).model_fields)

@@ -371,13 +371,13 @@ class Scenario(ScenarioSettings):
 
     def describe(self) -> dict[str, Any]:
         """All settings as plain values, by their dotted names; those of a list by their number, from 1."""
-        return _flattened("", self.model_dump() | {"start": str(self.start)})
+        return _flatten("", self.model_dump() | {"start": str(self.start)})
 
 
-def _flattened(name: str, value: Any) -> dict[str, Any]:
+def _flatten(name: str, value: Any) -> dict[str, Any]:
     if isinstance(value, tuple) and any(isinstance(part, Mapping) for part in value):
         value = {str(k): part for k, part in enumerate(value, 1)}
     if not isinstance(value, Mapping) or not value:
         return {name: value}
-    inner = [_flattened(f"{name}.{key}" if name else key, part) for key, part in value.items()]
+    inner = [_flatten(f"{name}.{key}" if name else key, part) for key, part in value.items()]
     return {key: part for table in inner for key, part in table.items()}

@@ -22,7 +22,7 @@ from railfix.simulate.clear_sky import CN0_SECOND_DB
 from railfix.simulate.clocks import ReceiverClocks
 from railfix.simulate.constellation import simulated_navigation
 from railfix.simulate.delays import ionosphere_m, troposphere_m
-from railfix.simulate.disturbance import Disturbances, Geometry
+from railfix.simulate.disturbance import Disturbances, SightGeometry
 from railfix.simulate.environment import Environment
 from railfix.simulate.errors.common import CommonErrors, fault_m
 from railfix.simulate.kinematics import Motion
@@ -51,7 +51,7 @@ class Piece:
     Attributes
     ----------
     observations : Observations
-    geometry : Geometry
+    geometry : SightGeometry
         True positions of antenna and satellites.
     clock_m : ndarray, shape (T,) [m]
         Receiver clock times the speed of light.
@@ -65,7 +65,7 @@ class Piece:
     """
 
     observations: Observations
-    geometry: Geometry
+    geometry: SightGeometry
     clock_m: Floats
     code_sigma_m: Floats
     clean_code_m: Floats
@@ -278,7 +278,7 @@ def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ec
     )
 
 
-def _geometry(simulation: Simulation, antenna: str, time: Datetimes) -> tuple[Geometry, _Instant, Floats, Floats]:
+def _geometry(simulation: Simulation, antenna: str, time: Datetimes) -> tuple[SightGeometry, _Instant, Floats, Floats]:
     """Geometry by satellite, the instant of the epochs, and the rates of path and ionosphere [m/s].
 
     Rates are differences over a hundredth of a second of the true motion; the clock's steps are left out.
@@ -291,7 +291,7 @@ def _geometry(simulation: Simulation, antenna: str, time: Datetimes) -> tuple[Ge
         for d in (-_RATE_S, _RATE_S)
     )
     _, heading = elevation_azimuth((truth.ecef_m + truth.forward)[:, None, :], truth.ecef_m)
-    geometry = Geometry(
+    geometry = SightGeometry(
         antenna=antenna,
         time=time,
         satellite=np.array(simulation.satellites),
@@ -369,7 +369,7 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     )
 
 
-def _of_channels(geometry: Geometry, receiver: Receiver) -> Geometry:
+def _of_channels(geometry: SightGeometry, receiver: Receiver) -> SightGeometry:
     """Geometry of a receiver's channels from that of the satellites."""
     return replace(
         geometry,

@@ -135,7 +135,7 @@ def points_at(
     elif kind == "dynamic":
         moved, method, notes = _from_dynamic(ecef_m, crs, year, epoch, plate)
     elif operation is not None and not (held and (epoch or plate)):
-        moved, method = _transformed(operation, ecef_m, year), f"PROJ: {operation.description}"
+        moved, method = _transform(operation, ecef_m, year), f"PROJ: {operation.description}"
         notes = _realisation_note(frame, operation)
     else:
         assert held is not None
@@ -148,7 +148,7 @@ def points_at(
     return moved, shift
 
 
-def _transformed(operation: Transformer, ecef_m: Floats, year: float) -> Floats:
+def _transform(operation: Transformer, ecef_m: Floats, year: float) -> Floats:
     """Points after a transformation of PROJ at an epoch."""
     latitude, longitude, height = geodetic_from_ecef(ecef_m)
     lon, lat, up, _ = operation.transform(longitude, latitude, height, np.full(len(height), year))
@@ -190,7 +190,7 @@ def _from_dynamic(
 
 def _in_itrf2020(ecef_m: Floats, code: str, year: float) -> Floats:
     """Coordinates of a realisation of the ITRF in ITRF2020, both at an epoch."""
-    return _transformed(Transformer.from_crs(code, WORKING_FRAME, always_xy=True), ecef_m, year)
+    return _transform(Transformer.from_crs(code, WORKING_FRAME, always_xy=True), ecef_m, year)
 
 
 def _from_held(

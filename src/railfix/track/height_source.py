@@ -101,7 +101,7 @@ def _from_raster(
             x, y = (np.asarray(v) for v in to_raster.transform(track.longitude_deg, track.latitude_deg))
             turn = ~raster.transform
             column, row = turn.a * x + turn.b * y + turn.c, turn.d * x + turn.e * y + turn.f
-            heights = _sampled(raster, np.stack([row, column]) - 0.5)
+            heights = _sample(raster, np.stack([row, column]) - 0.5)
     except rasterio.errors.RasterioError as error:
         raise InputFileError(path, f"GDAL cannot read this raster ({str(error).splitlines()[0]})") from None
     missing = np.flatnonzero(np.isnan(heights))
@@ -118,10 +118,10 @@ def _from_raster(
         f"heights of the raster {path}, sigma {sigma_m:.2f} m: those of the ground, which on bridges and in tunnels "
         "are not the track's"
     )
-    return _replaced(track, height, sigma_m, height_datum, model, note)
+    return _replace(track, height, sigma_m, height_datum, model, note)
 
 
-def _sampled(raster: Any, place: Floats) -> Floats:
+def _sample(raster: Any, place: Floats) -> Floats:
     """Values of a raster at rows and columns, shape (2, n), from the middles of its cells; NaN where it has none.
 
     Read in windows about neighbouring points, so that memory does not grow with the raster.
@@ -132,7 +132,7 @@ def _sampled(raster: Any, place: Floats) -> Floats:
     size = np.floor(place.max(axis=1)).astype(np.int64) + 2 - low
     if size.prod() > _WINDOW_CELLS and place.shape[1] > 1:
         half = place.shape[1] // 2
-        return np.concatenate([_sampled(raster, place[:, :half]), _sampled(raster, place[:, half:])])
+        return np.concatenate([_sample(raster, place[:, :half]), _sample(raster, place[:, half:])])
     window = ((low[0], low[0] + size[0]), (low[1], low[1] + size[1]))
     cells = raster.read(1, window=window, boundless=True, masked=True, out_dtype="float64").filled(np.nan)
     return np.asarray(map_coordinates(cells, place - low[:, None], order=1, mode="constant", cval=np.nan))
@@ -173,7 +173,7 @@ def _from_profile(track: Track, table: NamedColumns, geoid: str | None, sigma_m:
     else:
         sigma = float(table.metadata.get("sigma_m", SIGMA_HEIGHT_M))
     note = f"heights of the profile {table.path} by {by}, sigma {sigma:.2f} m"
-    return _replaced(track, height, sigma, datum, model, note)
+    return _replace(track, height, sigma, datum, model, note)
 
 
 def _from_positions(track: Track, path: str | PathLike[str], sigma_m: float | None) -> Track:
@@ -190,7 +190,7 @@ def _from_positions(track: Track, path: str | PathLike[str], sigma_m: float | No
     order = np.argsort(place)
     place, height, sigma = place[order], height[near][order], sigma[near][order]
     target = track.chainage_m
-    fitted, spread = _smoothed(target, place, height, sigma)
+    fitted, spread = _smooth(target, place, height, sigma)
     spread = spread if sigma_m is None else sigma_m
     if np.isnan(fitted).any():
         first = float(target[np.isnan(fitted)][0])
@@ -203,10 +203,10 @@ def _from_positions(track: Track, path: str | PathLike[str], sigma_m: float | No
         f"heights of the antenna positions {path}, sigma {spread:.2f} m: use the map without a vehicle file, or "
         "lower it by the height of that antenna"
     )
-    return _replaced(track, fitted, spread, "ellipsoidal", "", notes)
+    return _replace(track, fitted, spread, "ellipsoidal", "", notes)
 
 
-def _smoothed(target: Floats, place: Floats, height: Floats, sigma: Floats) -> tuple[Floats, float]:
+def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats) -> tuple[Floats, float]:
     """Weighted straight lines through the heights about each target, and their median standard deviation.
 
     Errors of neighbouring positions are common to them, so the standard deviation is that of one position.
@@ -230,6 +230,6 @@ def _smoothed(target: Floats, place: Floats, height: Floats, sigma: Floats) -> t
     return fitted, float(np.median(sigma))
 
 
-def _replaced(track: Track, height: Floats, sigma: float, datum: str, geoid: str, note: str) -> Track:
+def _replace(track: Track, height: Floats, sigma: float, datum: str, geoid: str, note: str) -> Track:
     provenance = replace(track.provenance, height_datum_used=datum, geoid=geoid, notes=(*track.provenance.notes, note))
     return replace(track, height_m=height, sigma_height_m=sigma, provenance=provenance)

@@ -137,8 +137,8 @@ def read_ifc_segments(path: str | PathLike[str], reading: MapReading) -> list[Se
             else ()
         )
         xy, system = _map_conversion(step, scale)
-        placement = _placed(step, alignment, step.at(layouts["IFCALIGNMENTHORIZONTAL"], what="a layout"), scale)
-        plan, profile = _moved(plan, profile, placement)
+        placement = _place(step, alignment, step.at(layouts["IFCALIGNMENTHORIZONTAL"], what="a layout"), scale)
+        plan, profile = _move(plan, profile, placement)
         segments.append(
             segment_of_design(
                 path=str(path),
@@ -203,7 +203,7 @@ def _map_conversion(
     return (east, north, up, a / norm, b / norm, float(scale)), str(system)
 
 
-def _placed(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _Placement:
+def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _Placement:
     """Placement of an alignment; that of its layout in plan where it is relative to the alignment's."""
     own, relative = alignment.values[5], layout.values[5]
     if relative is not None and own is not None and own in _chain(step, relative):
@@ -237,7 +237,7 @@ def _chain(step: _Step, reference: Any) -> list[Any]:
     return found
 
 
-def _moved(
+def _move(
     plan: list[PlanElement], profile: list[ProfileElement], at: _Placement
 ) -> tuple[list[PlanElement], list[ProfileElement]]:
     """Elements in the coordinates of the project."""

@@ -53,7 +53,7 @@ def network_of(
     relations = [relation for path in paths for relation in _relations(path)]
     if relations:
         return _of_relations(tracks, relations, str(paths[0]))
-    divided, cuts = _divided(tracks, tolerance_m)
+    divided, cuts = _divide(tracks, tolerance_m)
     network = Network(tracks=tuple(divided), links=())
     note = f"connections from ends within {tolerance_m:g} m; {cuts} tracks divided where the end of another meets them"
     return replace(network, links=links_of_ends(network, tolerance_m=tolerance_m), notes=(note,))
@@ -129,7 +129,7 @@ def is_route(segments: Sequence[Segment]) -> bool:
     return bool((np.einsum("ij,ij->i", outward[:-1, 1], outward[1:, 0]) < -np.cos(_LARGEST_TURN_RAD)).all())
 
 
-def _divided(tracks: list[Segment], tolerance_m: float) -> tuple[list[Segment], int]:
+def _divide(tracks: list[Segment], tolerance_m: float) -> tuple[list[Segment], int]:
     """Tracks divided at inner points on which the end of another track lies, and how many were divided."""
     whole = Network(tracks=tuple(tracks), links=())
     latitude = np.array([[t.latitude_deg[0], t.latitude_deg[-1]] for t in tracks]).ravel()

@@ -41,10 +41,10 @@ def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list
             f"{max_gap_m:g} m; give the segments in the order of the route, or make a route of a network with "
             "'railfix map route'",
         )
-    return [s.reversed() if turned else s for s, turned in zip(segments, _turned(segments, max_gap_m), strict=True)]
+    return [s.reversed() if turned else s for s, turned in zip(segments, _turn(segments, max_gap_m), strict=True)]
 
 
-def _turned(segments: Sequence[Segment], max_gap_m: float) -> list[bool]:
+def _turn(segments: Sequence[Segment], max_gap_m: float) -> list[bool]:
     """Whether each segment must be reversed to begin at the end of the one before."""
     ends = [_ends(segment) for segment in segments]
     turned = [False] * len(segments)
@@ -59,7 +59,7 @@ def _turned(segments: Sequence[Segment], max_gap_m: float) -> list[bool]:
 
 def first_gap(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> tuple[int, float] | None:
     """The first segment that does not meet the one before, and the gap [m]; None where all meet."""
-    turned = _turned(segments, max_gap_m)
+    turned = _turn(segments, max_gap_m)
     for k in range(1, len(segments)):
         here, there = _ends(segments[k - 1]), _ends(segments[k])
         size = float(np.linalg.norm(there[1 if turned[k] else 0] - here[0 if turned[k - 1] else 1]))

@@ -121,7 +121,7 @@ class _Line:
             i = int(np.argmin(step))
             raise ValueError(f"points {i} and {i + 1} of the track are equal")
         self.tangent = np.diff(self.points, axis=0) / step[:, None]
-        cant, self.notes = _signed_cant(track)
+        cant, self.notes = _sign_cant(track)
         if (np.abs(cant) >= contact_spacing_m).any():
             raise MismatchError(
                 f"{track.name}: a cant of {np.abs(cant).max():g} m exceeds the width of the track; is it in mm?"
@@ -162,7 +162,7 @@ class _Line:
         return np.interp(there, self.chainage, self.roll)
 
 
-def _signed_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
+def _sign_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
     """Return the cant, positive for roll to the right, and notes on assumptions.
 
     The side follows from the sign of the radius; at a canted point of straight track (the foot of a
@@ -258,7 +258,7 @@ def _abeam(line: _Line, body: Body, antenna: Floats, along_m: float) -> Floats:
     raise MismatchError("the line bends so sharply that no point of it is abeam the antenna")
 
 
-def _refined(line: _Line, track: Track, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
+def _refine(line: _Line, track: Track, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
     """Choose chainages of the body's middle: the points of the track, and more where the path bends between them."""
     half = _end_halves(line, track, vehicle)
     first, last = half[0], line.chainage[-1] - half[1]
@@ -349,7 +349,7 @@ def antenna_trajectory(
         )
     offset = vehicle.antennas[antenna]
     line = _Line(track, vehicle.contact_spacing_m)
-    middle = _refined(line, track, vehicle, offset)
+    middle = _refine(line, track, vehicle, offset)
     body = _pose(line, track, vehicle, middle)
     places = _place(body, vehicle, offset)
     rising = vehicle.facing == "rising"

@@ -52,7 +52,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
     groups = [group for group in groups if group.sum() > 1]
     if sum(int(group.sum()) - 1 for group in groups) < 1 + REDUNDANT:
         return np.empty(0), np.empty(0)
-    keep = _thinned(line)
+    keep = _thin(line)
     arc, points = line.arc_m[keep], line.ecef_m[keep]
     likelihood = np.zeros(len(arc))
     tails = limits.tails
@@ -80,7 +80,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
     return arc[chosen], sigma
 
 
-def _thinned(line: Line) -> Indices:
+def _thin(line: Line) -> Indices:
     """Vertices about `_SPACING_M` apart."""
     marks = np.arange(line.arc_m[0], line.arc_m[-1] + _SPACING_M, _SPACING_M)
     return np.unique(np.minimum(np.searchsorted(line.arc_m, marks), len(line.arc_m) - 1))

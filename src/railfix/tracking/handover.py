@@ -122,7 +122,7 @@ class Handover:
         """Put the prediction to an epoch into the state."""
         count, elapsed = state.hypotheses, float(self.recursion.chunk.interval_s[epoch])
         idle = self._idle(state, elapsed)
-        state.mean, state.covariance = _scattered(self.both, self.work.mean[:count], self.work.spread[:count], *idle)
+        state.mean, state.covariance = _scatter(self.both, self.work.mean[:count], self.work.spread[:count], *idle)
         state.code_bias, state.origin_m = self.memory.code_bias, self.memory.origin_m
         self._take_back_bank(state, *idle)
 
@@ -141,7 +141,7 @@ class Handover:
                 getattr(result, name)[placed][known] = idle[0][unknown]
         count, *scalars = memory.scalars.tolist()
         kept = slice(0, int(count))
-        state.mean, state.covariance = _scattered(self.full, memory.mean[kept], memory.covariance[kept], *idle)
+        state.mean, state.covariance = _scatter(self.full, memory.mean[kept], memory.covariance[kept], *idle)
         self._take_back_bank(state, *idle)
         state.log_probability = memory.log_probability[kept].copy()
         state.log_code, state.log_least = memory.log_code[kept].copy(), memory.log_least[kept].copy()
@@ -166,7 +166,7 @@ class Handover:
         if not self.names:
             return
         running = np.flatnonzero(self.subfilters.running)
-        means, covariances = _scattered(
+        means, covariances = _scatter(
             self.full, self.subfilters.mean[running], self.subfilters.covariance[running], mean, variance
         )
         state.bank = Bank(
@@ -194,7 +194,7 @@ class Handover:
         if self.rows.counts[0]:
             cut[:, OFFSETS + self.recursion.chunk.offset[self.rows.codes[0]]] = work.anew[:count, 2]
         size = int(self.rows.counts[0] + layout.COMBINED + self.rows.counts[3])
-        _, prior = _scattered(both, work.mean[:count], work.spread[:count], *self._idle(state, 0.0))
+        _, prior = _scatter(both, work.mean[:count], work.spread[:count], *self._idle(state, 0.0))
         combine = np.zeros((count, size, state.mean.shape[1]))
         at = both[work.unknown[:count, :size]]
         np.add.at(combine, (*np.ogrid[:count, :size, :0][:2], at), work.share[:count, :size])
@@ -220,7 +220,7 @@ def _in_use(state: TrackState, chunk: Chunk, sensed: Masks, first: int, last: in
     return np.asarray(used)
 
 
-def _scattered(
+def _scatter(
     at: Indices, means: Floats, covariances: Floats, idle_mean: Floats, idle_variance: Floats
 ) -> tuple[Floats, Floats]:
     """Gaussians of all unknowns from those `at` some of them; the others are independent."""

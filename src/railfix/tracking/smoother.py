@@ -178,7 +178,7 @@ def smoothed(
     last = steps[-1].mean if size else before.mean
     if later is not None and np.isfinite(later.place_m) and len(last):
         index = int(np.argmin(np.abs(last[:, StateIndex.ARC] - later.place_m)))
-        vector, matrix = _arranged(later, satellite)
+        vector, matrix = _arrange(later, satellite)
     for t in range(size - 1, -1, -1):
         step = steps[t]
         if not len(step.mean):
@@ -214,7 +214,7 @@ def smoothed(
     )
 
 
-def _arranged(later: BackwardInformation, satellite: Strings) -> tuple[Floats, Floats]:
+def _arrange(later: BackwardInformation, satellite: Strings) -> tuple[Floats, Floats]:
     """The vector and matrix for other satellites; those that are not in the state any more said nothing."""
     _, here, there = np.intersect1d(satellite, later.satellite, return_indices=True)
     to = np.concatenate([np.arange(SATELLITES), SATELLITES + here])

@@ -226,9 +226,9 @@ class TrackState:
         new : tuple of str
         """
         index = np.concatenate([np.arange(SATELLITES), SATELLITES + kept]).astype(np.intp)
-        self.mean, self.covariance = _rearranged(self.mean, self.covariance, index, len(new))
+        self.mean, self.covariance = _rearrange(self.mean, self.covariance, index, len(new))
         if self.bank is not None:
-            mean, covariance = _rearranged(self.bank.mean, self.bank.covariance, index, len(new))
+            mean, covariance = _rearrange(self.bank.mean, self.bank.covariance, index, len(new))
             self.bank = replace(self.bank, mean=mean, covariance=covariance)
         self.satellite = np.array([*self.satellite[kept].tolist(), *new], dtype=np.str_)
         self.code_bias = np.concatenate([self.code_bias[kept], np.zeros(len(new))])
@@ -236,7 +236,7 @@ class TrackState:
         self.seen = np.concatenate([self.seen[kept], unseen])
 
 
-def _rearranged(mean: Floats, covariance: Floats, index: Indices, new: int) -> tuple[Floats, Floats]:
+def _rearrange(mean: Floats, covariance: Floats, index: Indices, new: int) -> tuple[Floats, Floats]:
     """Gaussians over some of their unknowns and so many new errors of satellites."""
     count, old, width = len(mean), len(index), len(index) + new
     means, covariances = np.zeros((count, width)), np.zeros((count, width, width))

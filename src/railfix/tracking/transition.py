@@ -21,7 +21,7 @@ def singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Floats, Flo
 singer = lru_cache(maxsize=64)(singer_step)
 
 
-def _kept(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
+def _keep(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
     """Share of each unknown that is left after an interval, shape (H, N)."""
     travel = np.abs(mean[:, StateIndex.SPEED]) * dt
     kept = np.ones(mean.shape)
@@ -36,10 +36,10 @@ def _kept(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
 def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
     """Transition of all unknowns over an interval from a state, shape (N, N); `mean` has shape (N,)."""
     step, _ = singer(dt, limits.acceleration_mps2, limits.acceleration_s)
-    return np.asarray(_moved(np.eye(len(mean))[None], _kept(mean[None], dt, limits), step, dt)[0])
+    return np.asarray(_move(np.eye(len(mean))[None], _keep(mean[None], dt, limits), step, dt)[0])
 
 
-def _moved(rows: Floats, kept: Floats, step: Floats, dt: float) -> Floats:
+def _move(rows: Floats, kept: Floats, step: Floats, dt: float) -> Floats:
     """The transition times a matrix, shape (H, N, ...)."""
     moved = rows * kept[:, :, None]
     moved[:, :3] = step @ rows[:, :3]

@@ -75,9 +75,9 @@ def compute_velocity(
     gradient[..., 0] -= _TURN * sat[..., 1]
     up = enu_axes(*geodetic_from_ecef(near)[:2])[:, 2]
     dt = interval_s[:, None]
-    by_phase = _fitted(-sight, (measured[1] - distance + previous) / dt, variance[1] / dt**2, has[1], up)
+    by_phase = _fit(-sight, (measured[1] - distance + previous) / dt, variance[1] / dt**2, has[1], up)
     rate = measured[2] - moving / stretch
-    by_doppler = _fitted(gradient / stretch[..., None], rate, variance[2], has[2], up)
+    by_doppler = _fit(gradient / stretch[..., None], rate, variance[2], has[2], up)
     phase = np.asarray(np.isfinite(by_phase[0][:, 0]))
     velocity = np.where(phase[:, None], by_phase[0], by_doppler[0])
     return Velocity(
@@ -87,7 +87,7 @@ def compute_velocity(
     )
 
 
-def _fitted(gradient: Floats, value: Floats, variance: Floats, has: Masks, up: Floats) -> tuple[Floats, Floats]:
+def _fit(gradient: Floats, value: Floats, variance: Floats, has: Masks, up: Floats) -> tuple[Floats, Floats]:
     """Velocities by arrays in C order, so that the kernel is compiled for one kind of them."""
     from railfix.kernels.tracking.velocity import fitted_velocities
 

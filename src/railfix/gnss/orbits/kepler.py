@@ -142,11 +142,11 @@ def eccentric_anomaly(mean_anomaly: Floats, eccentricity: Floats) -> tuple[Float
         anomaly = anomaly + step
         sine, cosine = np.sin(anomaly), np.cos(anomaly)
     step = (mean_anomaly - anomaly + eccentricity * sine) / (1.0 - eccentricity * cosine)
-    sine, cosine = _rotated(sine, cosine, step)
+    sine, cosine = _rotate(sine, cosine, step)
     return anomaly + step, sine, cosine
 
 
-def _rotated(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats]:
+def _rotate(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats]:
     """Compute sine and cosine after adding a small angle: exact to rounding below 1e-3 rad."""
     square = angle * angle
     small_sine = angle * (1.0 - square / 6.0)
@@ -178,8 +178,8 @@ def kepler_state(orbits: Orbits, since_toe_s: Floats) -> tuple[Components, Compo
     sin_p = sin_v * el.cos_omega + cos_v * el.sin_omega
     cos_p = cos_v * el.cos_omega - sin_v * el.sin_omega
     sin_2p, cos_2p = 2.0 * sin_p * cos_p, cos_p * cos_p - sin_p * sin_p
-    sin_u, cos_u = _rotated(sin_p, cos_p, el.cus * sin_2p + el.cuc * cos_2p)
-    sin_i, cos_i = _rotated(el.sin_i0, el.cos_i0, el.i_dot * t + el.cis * sin_2p + el.cic * cos_2p)
+    sin_u, cos_u = _rotate(sin_p, cos_p, el.cus * sin_2p + el.cuc * cos_2p)
+    sin_i, cos_i = _rotate(el.sin_i0, el.cos_i0, el.i_dot * t + el.cis * sin_2p + el.cic * cos_2p)
     r = el.a * shrink + el.crs * sin_2p + el.crc * cos_2p
 
     e_rate = el.motion / shrink

@@ -79,12 +79,12 @@ def _state(
     since = seconds(nodes[index] - nodes[windows])
     # Rotate the nodes into the Earth-fixed frame of the first node, an inertial frame, in which the orbit is smooth.
     place = np.moveaxis(ephemeris.position_ecef_m[index], -1, 0)
-    rotated = np.stack(_rotated(EARTH_ROTATION_RATE * since[..., None], place))
+    rotated = np.stack(_rotate(EARTH_ROTATION_RATE * since[..., None], place))
     own = seconds(time - nodes[begin]) + offset_s
     weight, slope = _lagrange_at_zero(since[:, which] - own, _node_products(since)[:, which])
     chosen = rotated[:, :, which, column]
-    position = np.stack(_rotated(-EARTH_ROTATION_RATE * own, _sum(weight * chosen)))
-    velocity = np.stack(_rotated(-EARTH_ROTATION_RATE * own, _sum(slope * chosen)))
+    position = np.stack(_rotate(-EARTH_ROTATION_RATE * own, _sum(weight * chosen)))
+    velocity = np.stack(_rotate(-EARTH_ROTATION_RATE * own, _sum(slope * chosen)))
     velocity[0] += EARTH_ROTATION_RATE * position[1]
     velocity[1] -= EARTH_ROTATION_RATE * position[0]
 
@@ -110,7 +110,7 @@ def _sum_axis0(terms: Floats) -> Floats:
     return np.asarray(terms[0] + terms[1] + terms[2])
 
 
-def _rotated(angle: Floats, vector: Floats) -> tuple[Floats, Floats, Floats]:
+def _rotate(angle: Floats, vector: Floats) -> tuple[Floats, Floats, Floats]:
     """Rotate vectors, components first, about the Earth's axis."""
     cos, sin = np.cos(angle), np.sin(angle)
     return cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1], vector[2]

@@ -196,7 +196,7 @@ def _fill_kepler(
         time.astype("datetime64[ns]").astype(np.int64),
         np.ascontiguousarray(code_m),
         KeplerChannels(channels, rows, usable, plan.signal),
-        KeplerRecords(
+        SelectedKepler(
             table.lookup.toe.astype("datetime64[ns]").astype(np.int64),
             table.orbits.table,
             table.clock,
@@ -219,10 +219,10 @@ class KeplerChannels(NamedTuple):
     channel: Indices  # (K,) which of the M
     row: Integers  # (K, T) of the record
     usable: Masks  # (K, T)
-    signal: Integers  # (K,) row of `KeplerRecords.group_delay_s`
+    signal: Integers  # (K,) row of `SelectedKepler.group_delay_s`
 
 
-class KeplerRecords(NamedTuple):
+class SelectedKepler(NamedTuple):
     """Keplerian records, R of them, as arrays."""
 
     toe_ns: Integers  # (R,) since 1970
@@ -247,7 +247,7 @@ class KeplerStates(NamedTuple):
 
 
 def kepler_channels(
-    time_ns: Integers, code_m: Floats, channels: KeplerChannels, records: KeplerRecords, states: KeplerStates
+    time_ns: Integers, code_m: Floats, channels: KeplerChannels, records: SelectedKepler, states: KeplerStates
 ) -> KeplerStates:
     """Compute the states of channels on Keplerian records.
 
@@ -257,7 +257,7 @@ def kepler_channels(
         Time tags since 1970.
     code_m : ndarray, shape (T, M) [m]
     channels : KeplerChannels
-    records : KeplerRecords
+    records : SelectedKepler
     states : KeplerStates
         Filled in place; its arrays are returned.
     """

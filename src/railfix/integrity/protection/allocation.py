@@ -95,7 +95,7 @@ def allocate(
     if len(used) <= FEW:  # live, where the same satellites are used epoch after epoch
         given = (used.tobytes(), out.tobytes(), (sides & used[:, None]).tobytes())
         return _of_few_epochs(_Same(risk), tuple(systems), *given, sides.shape[1], wrong_map)
-    return _allocated(used, systems, risk, out, sides, wrong_map=wrong_map)
+    return _allocate(used, systems, risk, out, sides, wrong_map=wrong_map)
 
 
 class _Same:
@@ -117,7 +117,7 @@ def _of_few_epochs(
 ) -> Allocation:
     """Allocation of few epochs, kept: nobody writes into it."""
     channels, excluded = len(systems), np.frombuffer(out, dtype=np.int64).copy()
-    return _allocated(
+    return _allocate(
         np.frombuffer(used, dtype=bool).reshape(len(excluded), channels).copy(),
         systems,
         risk.risk,
@@ -127,7 +127,7 @@ def _of_few_epochs(
     )
 
 
-def _allocated(
+def _allocate(
     used: Masks, systems: Sequence[str], risk: RiskBudget, out: Integers, sides: Masks, *, wrong_map: bool
 ) -> Allocation:
     of_channel = risk.prior(systems)

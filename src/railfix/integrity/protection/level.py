@@ -264,7 +264,7 @@ def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: 
     of_block = Errors(*(np.ascontiguousarray(each[rows]) for each in given))
     n = int(np.count_nonzero(model.used, axis=1).max())
     channel, offset, sigma, weight, separation = kernels.hypotheses.tails_of_hypotheses(
-        model.arrays, of_block, asked := _asked(plan, rows, n)
+        model.arrays, of_block, asked := _list_hypotheses(plan, rows, n)
     )
     share = np.stack([each[rows] for each in (plan.fault_free, plan.one, plan.two, plan.more)], axis=1)
     level, spender, part, k, worst = kernels.level.solve_level(
@@ -277,7 +277,7 @@ def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: 
     pairs = np.concatenate([_sets(n, 2).T if asked.first[0, 2] >= 0 else np.empty((0, 2), dtype=np.intp), [[-1, -1]]])
     infinite = np.full(len(rows), Cause.BUDGET)
     if (unchecked := np.isinf(level) & (plan.fault_free[rows] > 0)).any():
-        infinite[unchecked] = _unchecked(plan, asked, np.where(np.isinf(sigma), weight, 0.0), n)[unchecked]
+        infinite[unchecked] = _find_unchecked(plan, asked, np.where(np.isinf(sigma), weight, 0.0), n)[unchecked]
     spent_on = np.where(spender == _OF_MORE, Cause.THREE_FAULTS, spender)
     return {
         "level_m": level,
@@ -299,7 +299,7 @@ def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: 
     }
 
 
-def _unchecked(plan: Allocation, asked: Asked, open_to_faults: Floats, n: int) -> Codes:
+def _find_unchecked(plan: Allocation, asked: Asked, open_to_faults: Floats, n: int) -> Codes:
     """Return the cause (T,): the shared faults that have most of the probability (T, K) that nothing checks."""
     spent, causes = [], []
     for shared, first in zip(plan.shared, asked.first.tolist(), strict=True):
@@ -329,7 +329,7 @@ def _places(kinds: tuple[int, ...], most: tuple[int, ...], n: int) -> tuple[Indi
     return first, np.array([*bounds, place])
 
 
-def _asked(plan: Allocation, rows: Indices, n: int) -> Asked:
+def _list_hypotheses(plan: Allocation, rows: Indices, n: int) -> Asked:
     """Return the hypotheses of some epochs, of n channels in use at most: none, then one fault, two, more."""
     order = plan.order[rows]
     kinds = tuple(shared.kind for shared in plan.shared)

@@ -176,7 +176,7 @@ def _singles(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) ->
         statistic = (wsse[:, None] - drop) / scale[:, None] ** 2
         over = drop > limits.own_error * scale[:, None] ** 2  # own^2 over its variance 1/S_ii
     else:
-        total, linear, square = _unweighted(parts)
+        total, linear, square = _sum_squares(parts)
         statistic = total[:, None] - 2.0 * own * linear + own**2 * np.einsum("tii->ti", square)
         over = (own * parts.sigma_m) ** 2 > limits.fixed_limit_m2
     return _Trial(np.arange(n)[:, None], statistic, drop, (own,), checked & over)
@@ -204,7 +204,7 @@ def _pairs(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) -> _
         bound = limits.own_error * variance * inverse
         over = (own_one**2 > bound * c) & (own_two**2 > bound * a)
     else:
-        total, linear, square = _unweighted(parts)
+        total, linear, square = _sum_squares(parts)
         own_square = np.einsum("tii->ti", square)
         statistic = total[:, None] - 2.0 * (own_one * linear[:, i] + own_two * linear[:, j])
         statistic += own_one**2 * own_square[:, i] + own_two**2 * own_square[:, j]
@@ -214,7 +214,7 @@ def _pairs(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) -> _
     return _Trial(np.stack([i, j], axis=1), statistic, drop, (own_one, own_two), checked & over)
 
 
-def _unweighted(parts: Compact) -> tuple[Floats, Floats, Floats]:
+def _sum_squares(parts: Compact) -> tuple[Floats, Floats, Floats]:
     """``|V nu|^2``, ``S V^2 nu`` and ``S V^2 S`` with V the sigmas: sums of squares in m^2 after any exclusion.
 
     The whitened residuals without E are ``nu - S_E b_E``.

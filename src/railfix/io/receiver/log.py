@@ -29,7 +29,7 @@ _MSM: Final = "RTCM 3 MSM"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Piece:
+class LogPiece:
     """What one block of a receiver log holds, with bytes outside frames, failed checksums, and bytes read."""
 
     measurements: Measurements
@@ -59,7 +59,7 @@ class StreamState:
     clock: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
 
 
-def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Piece, StreamState]:
+def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[LogPiece, StreamState]:
     """Measurements and ephemerides of a block of bytes; a stream cut anywhere gives the same.
 
     The `time` of the state that the block before left (of the last epoch, or a date known otherwise) resolves the week
@@ -83,10 +83,10 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
     measurements = taken[kind] if kind in taken else ubx.rawx_measurements(find_frames(buffer[:0]))
     unused = _of_other_kinds(frames, kind) if kind else {**raw.skipped, **msm.skipped}
     measurements = replace(measurements, skipped={**measurements.skipped, **unused, **_of_old_kinds(frames)})
-    dated = _dated(frames, raw, _places(frames, native), observed=state.observed)
+    dated = _date(frames, raw, _places(frames, native), observed=state.observed)
     records, sbas, subframes, messages = _navigation(frames, dated, _Dated(msm_places, msm.time), state)
     last = measurements.time[-1] if len(measurements.time) else state.time
-    piece = Piece(
+    piece = LogPiece(
         measurements=measurements,
         ephemerides=records,
         sbas=sbas,
@@ -156,7 +156,7 @@ class _Dated(NamedTuple):
         return np.where(index < 0, before, self.times[np.maximum(index, 0)])
 
 
-def _dated(frames: Frames, raw: Measurements, epochs_at: Integers, *, observed: bool) -> _Dated:
+def _date(frames: Frames, raw: Measurements, epochs_at: Integers, *, observed: bool) -> _Dated:
     """The receiver's epochs, of messages at places; before the first one, its other messages with a date."""
     epochs_at = epochs_at[len(epochs_at) - len(raw.time) :]
     if observed:
@@ -187,7 +187,7 @@ def _navigation(
 
 def scan_pieces(
     path: FilePath, *, date: np.datetime64 | None = None, progress: Callable[[float], None] | None = None
-) -> Iterator[Piece]:
+) -> Iterator[LogPiece]:
     """Pieces of a receiver log, plain or packed, block by block.
 
     `date` is some time within half a week of the log's beginning, for RTCM 3, whose observations carry no week;

@@ -108,7 +108,7 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
     ]
     if not parts:
         undated = {UNDATED: len(messages)} if len(messages) else {}
-        skipped = undated if np.isnat(near) else _unused_messages(frames, messages, 0)
+        skipped = undated if np.isnat(near) else _count_unused(frames, messages, 0)
         return replace(_no_measurements(), skipped=skipped), np.zeros(0, dtype=np.int64)
     order = np.concatenate([order for order, _, _ in parts])
     rows = joined([rows for _, rows, _ in parts])
@@ -124,12 +124,12 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
         time=time[starts],
         epoch=epoch_of[rows.epoch],
         receiver="RTCM 3",
-        skipped=_unused_messages(frames, messages, len(order)),
+        skipped=_count_unused(frames, messages, len(order)),
     )
     return measurements, order[by_stream][starts]
 
 
-def _unused_messages(frames: Frames, messages: Indices, used: int) -> dict[str, int]:
+def _count_unused(frames: Frames, messages: Indices, used: int) -> dict[str, int]:
     """Counts of multiple signal messages without measurements: empty, or with masks or a length that do not fit."""
     if len(messages) == used:
         return {}
@@ -250,7 +250,7 @@ def _of_number(
         mask = used[members[0], : len(satellites) * len(signals)].reshape(len(satellites), len(signals)) == 1
         place = frames.frame_start[chosen[members]]
         known = channels.at(place, satellites)
-        yield place, _decoded(number, bits, satellites, signals, mask, near, known)
+        yield place, _decode(number, bits, satellites, signals, mask, near, known)
 
 
 def _bits_needed(kind: int, n_satellites: Integers, n_cells: Integers) -> Integers:
@@ -258,7 +258,7 @@ def _bits_needed(kind: int, n_satellites: Integers, n_cells: Integers) -> Intege
     return n_satellites * (36 if rate else 18) + n_cells * (code + phase + lock + 1 + cn0 + (15 if rate else 0))
 
 
-def _decoded(
+def _decode(
     number: int,
     bits: Bytes,
     satellites: Integers,

@@ -154,7 +154,7 @@ def meas_epoch_measurements(frames: Frames) -> Measurements:
     rows = head[np.array(epochs, dtype=np.intp)]
     main = frames.data[place + np.where(kind == 0, 1, 0)] >> 5 == 0
     skipped["measurements of further antennas of a MeasEpoch"] = int(np.count_nonzero(~main))
-    values = {name: array[main] for name, array in _decoded(frames, place, kind, master).items()}
+    values = {name: array[main] for name, array in _decode(frames, place, kind, master).items()}
     return Measurements(
         time=from_week(rows["week"].astype(np.int64), rows["tow_ms"] * 1e-3),
         epoch=epoch[main],
@@ -191,7 +191,7 @@ def _sub_blocks(frames: Frames, index: int, head: np.void) -> tuple[Indices, Ind
     return np.array(places, dtype=np.intp), np.array(kinds, dtype=np.intp), np.array(masters, dtype=np.intp)
 
 
-def _decoded(frames: Frames, place: Indices, kind: Indices, master: Indices) -> dict[str, Any]:
+def _decode(frames: Frames, place: Indices, kind: Indices, master: Indices) -> dict[str, Any]:
     """Measurements of sub-blocks: those of the first type whole, those of the second as offsets from theirs."""
     first = gathered(frames.data, place[master], _FIRST)
     other = gathered(frames.data, np.where(kind == 1, place, 0), _OTHER) if len(frames.data) >= 12 else first
@@ -206,10 +206,10 @@ def _decoded(frames: Frames, place: Indices, kind: Indices, master: Indices) -> 
     code_main = ((first["misc"] & 15).astype(np.int64) << 32 | first["code"].astype(np.int64)) * 1e-3
     code_main = np.where(code_main == 0, np.nan, code_main)
     doppler_main = np.where(first["doppler"] == -(1 << 31), np.nan, first["doppler"] * 1e-4)
-    code_offset = _signed(other["offsets"] & 7, 3) * 65536 + other["code"].astype(np.int64)
+    code_offset = _read_signed(other["offsets"] & 7, 3) * 65536 + other["code"].astype(np.int64)
     no_code = ((other["offsets"] & 7) == 4) & (other["code"] == 0)
     code = np.where(own, code_main, np.where(no_code, np.nan, code_main + code_offset * 1e-3))
-    doppler_offset = _signed(other["offsets"] >> 3, 5) * 65536 + other["doppler"].astype(np.int64)
+    doppler_offset = _read_signed(other["offsets"] >> 3, 5) * 65536 + other["doppler"].astype(np.int64)
     no_doppler = ((other["offsets"] >> 3) == 16) & (other["doppler"] == 0)
     scaled = doppler_main * frequency / main_frequency + doppler_offset * 1e-4
     doppler = np.where(own, doppler_main, np.where(no_doppler, np.nan, scaled))
@@ -243,7 +243,7 @@ def _signal_number(kind: Integers, info: Integers) -> Integers:
     return np.where(low == 31, np.asarray(info, dtype=np.int64) // 8 + 32, low)
 
 
-def _signed(value: Integers, bits: int) -> Integers:
+def _read_signed(value: Integers, bits: int) -> Integers:
     value = np.asarray(value, dtype=np.int64)
     return np.where(value >= 1 << bits - 1, value - (1 << bits), value)
 

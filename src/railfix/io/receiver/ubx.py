@@ -280,17 +280,17 @@ def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
 
 def date_of(frames: Frames) -> np.datetime64:
     """Day of the last NAV-PVT with a valid date (UTC, which is near enough to resolve weeks); NaT without one."""
-    days, _, _ = _dated(frames)
+    days, _, _ = _date(frames)
     return days[-1] if len(days) else np.datetime64("NaT", "ns")
 
 
 def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
     """Places in the stream of NAV-PVT with a valid date, and their times."""
-    days, rows, places = _dated(frames)
+    days, rows, places = _date(frames)
     return places, nearest_week(rows["tow_ms"] * 1e-3, days)
 
 
-def _dated(frames: Frames) -> tuple[Datetimes, np.ndarray, Integers]:
+def _date(frames: Frames) -> tuple[Datetimes, np.ndarray, Integers]:
     """Days (UTC), rows and places of NAV-PVT with a valid date."""
     chosen = frames.of("ubx", NAV_PVT)
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _PVT.itemsize]

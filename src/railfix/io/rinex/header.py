@@ -14,7 +14,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import ByteStream
 from railfix.gnss.observations import ObservationHeader
-from railfix.io.rinex.observations_signals import SYSTEMS, Column, columns_of
+from railfix.io.rinex.observations_signals import SYSTEMS, SignalColumn, columns_of
 
 #: Time systems of TIME OF FIRST OBS, and the default of files without one by constellation.
 TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
@@ -63,7 +63,7 @@ class RinexHeader:
         """Return the declared types of a constellation, None for an undeclared one."""
         return self.types.get(ALL if self.version < 3.0 else system)
 
-    def columns(self, system: str) -> tuple[Column, ...]:
+    def columns(self, system: str) -> tuple[SignalColumn, ...]:
         """Return the columns of the satellite lines of a constellation."""
         return columns_of(self.types_of(system) or (), system=system, version=self.version, scale=self.scale)
 

@@ -16,7 +16,7 @@ from railfix.gnss.observations import Observations
 from railfix.io.rinex.fault_log import CYCLE_SLIPS, DUPLICATES, EXTERNAL_EVENTS, FaultLog
 from railfix.io.rinex.header import RinexHeader, apply_records, parse_header, read_header_bytes
 from railfix.io.rinex.observations_decode import decode, lines_per_satellite
-from railfix.io.rinex.observations_epochs import Epochs, find_epochs
+from railfix.io.rinex.observations_epochs import EpochHeads, find_epochs
 from railfix.io.rinex.observations_fields import PADDING
 from railfix.io.rinex.observations_lines import Lines, split_lines
 
@@ -132,7 +132,7 @@ class BlockReader:
         piece = self._observations(lines, table, header)
         return piece, after, taken
 
-    def _find(self, lines: Lines, header: RinexHeader, *, at_end: bool, log: FaultLog) -> tuple[Epochs, int]:
+    def _find(self, lines: Lines, header: RinexHeader, *, at_end: bool, log: FaultLog) -> tuple[EpochHeads, int]:
         each = lines_per_satellite(header)
         return find_epochs(lines, version=header.version, lines_per_satellite=each, at_end=at_end, log=log)
 
@@ -145,7 +145,7 @@ class BlockReader:
             self._log.note(note)
         return changed
 
-    def _observations(self, lines: Lines, table: Epochs, header: RinexHeader) -> Observations:
+    def _observations(self, lines: Lines, table: EpochHeads, header: RinexHeader) -> Observations:
         self._log.count(CYCLE_SLIPS, int((table.flag == 6).sum()))
         breaks = np.cumsum((table.flag >= 1) & (table.flag <= 3)) + int(self._break)
         seen = (table.flag == 0) | (table.flag == 1)
@@ -177,7 +177,7 @@ class BlockReader:
             skipped=skipped,
         )
 
-    def _in_order(self, lines: Lines, epochs: Epochs, time_ns: Integers) -> Masks:
+    def _in_order(self, lines: Lines, epochs: EpochHeads, time_ns: Integers) -> Masks:
         """Flag the epochs whose time tags rise; of an outlier ahead of its successors only the outlier is dropped."""
         if not len(time_ns):
             return np.zeros(0, dtype=np.bool_)

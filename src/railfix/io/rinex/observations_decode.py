@@ -13,10 +13,10 @@ from railfix.core.arrays import Bytes, Floats, Integers, Masks, Strings
 from railfix.gnss.observations import channels_with_data
 from railfix.io.rinex.fault_log import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, FaultLog
 from railfix.io.rinex.header import RinexHeader
-from railfix.io.rinex.observations_epochs import Epochs
+from railfix.io.rinex.observations_epochs import EpochHeads
 from railfix.io.rinex.observations_fields import FIELD_WIDTH, Fields, gather, joined, read_fields
 from railfix.io.rinex.observations_lines import Lines
-from railfix.io.rinex.observations_signals import KINDS, SYSTEMS, Column
+from railfix.io.rinex.observations_signals import KINDS, SYSTEMS, SignalColumn
 
 _BLANK: Final = ord(" ")
 _ZERO: Final = ord("0")
@@ -29,7 +29,7 @@ _LETTERS: Final = range(ord("A"), ord("Z") + 1)
 
 
 @dataclass(frozen=True)
-class Rows:
+class DecodedRows:
     """Satellites of a run of epochs, shape (n,) each.
 
     Index of the epoch, constellation letter (uint8), satellite number (-1 where the name cannot be read), and index of
@@ -41,8 +41,8 @@ class Rows:
     number: Integers
     line: Integers
 
-    def __getitem__(self, which: Masks | Integers) -> Rows:
-        return Rows(self.epoch[which], self.letter[which], self.number[which], self.line[which])
+    def __getitem__(self, which: Masks | Integers) -> DecodedRows:
+        return DecodedRows(self.epoch[which], self.letter[which], self.number[which], self.line[which])
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,11 @@ def lines_per_satellite(header: RinexHeader) -> int:
 
 
 def decode(
-    lines: Lines, epochs: Epochs, *, header: RinexHeader, systems: frozenset[str] | None, log: FaultLog
+    lines: Lines, epochs: EpochHeads, *, header: RinexHeader, systems: frozenset[str] | None, log: FaultLog
 ) -> Dense:
     """Decode the observations of epochs (flags 0 and 1) to dense arrays."""
     rows = _rows(lines, epochs, header)
-    rows = _selected(lines, rows, header=header, systems=systems, log=log)
+    rows = _select(lines, rows, header=header, systems=systems, log=log)
     rows = _without_repeats(lines, rows, len(epochs), log)
     parts = []
     for system in SYSTEMS:
@@ -76,7 +76,7 @@ def decode(
     return _scatter(parts, len(epochs))
 
 
-def _rows(lines: Lines, epochs: Epochs, header: RinexHeader) -> Rows:
+def _rows(lines: Lines, epochs: EpochHeads, header: RinexHeader) -> DecodedRows:
     count = epochs.count
     epoch = np.repeat(np.arange(len(epochs)), count)
     order = np.arange(len(epoch)) - np.repeat(np.cumsum(count) - count, count)
@@ -98,10 +98,12 @@ def _rows(lines: Lines, epochs: Epochs, header: RinexHeader) -> Rows:
     fine &= (name[:, 0] >= _LETTERS.start) & (name[:, 0] < _LETTERS.stop)
     number = np.where(fine, tens * 10 + ones, -1)
     number[number == 0] = -1
-    return Rows(epoch, name[:, 0], number, line)
+    return DecodedRows(epoch, name[:, 0], number, line)
 
 
-def _selected(lines: Lines, rows: Rows, *, header: RinexHeader, systems: frozenset[str] | None, log: FaultLog) -> Rows:
+def _select(
+    lines: Lines, rows: DecodedRows, *, header: RinexHeader, systems: frozenset[str] | None, log: FaultLog
+) -> DecodedRows:
     """Select rows with a valid name, of a known, selected constellation whose types the header declares."""
     broken = rows.number < 0
     log.faults(
@@ -133,21 +135,21 @@ def _is_one_of(letter: Bytes, letters: Iterable[str]) -> Masks:
     return np.asarray(table[letter])
 
 
-def _numbered(key: Integers) -> tuple[Integers, Integers]:
+def _number(key: Integers) -> tuple[Integers, Integers]:
     """Return the different small numbers in ascending order, and which of them each one is."""
     occurs = np.zeros(int(key.max(initial=0)) + 1, dtype=np.bool_)
     occurs[key] = True
     return np.flatnonzero(occurs), (np.cumsum(occurs) - 1)[key]
 
 
-def _name(rows: Rows, i: int) -> str:
+def _name(rows: DecodedRows, i: int) -> str:
     return f"{chr(rows.letter[i])}{rows.number[i]:02d}"
 
 
-def _without_repeats(lines: Lines, rows: Rows, epochs: int, log: FaultLog) -> Rows:
+def _without_repeats(lines: Lines, rows: DecodedRows, epochs: int, log: FaultLog) -> DecodedRows:
     """Keep the first row of a satellite that occurs twice in an epoch."""
     key = rows.letter.astype(np.int64) * 100 + rows.number
-    names, name = _numbered(key)
+    names, name = _number(key)
     row = np.arange(len(key))
     last = np.zeros((epochs, len(names)), dtype=np.int64)
     last[rows.epoch, name] = row
@@ -165,8 +167,8 @@ def _without_repeats(lines: Lines, rows: Rows, epochs: int, log: FaultLog) -> Ro
 
 
 def _values(
-    lines: Lines, rows: Rows, system: str, columns: tuple[Column, ...], header: RinexHeader, log: FaultLog
-) -> tuple[Rows, Fields]:
+    lines: Lines, rows: DecodedRows, system: str, columns: tuple[SignalColumn, ...], header: RinexHeader, log: FaultLog
+) -> tuple[DecodedRows, Fields]:
     """Parse the selected columns of the satellite lines; rows with faults are dropped and recorded."""
     count = len(header.types_of(system) or ())
     width, before = (count, 3) if header.version >= 3.0 else (FIELDS_PER_LINE, 0)
@@ -215,13 +217,13 @@ def _continues(data: Bytes, start: Integers, length: Integers, width: int) -> Ma
     return result
 
 
-def _scatter(parts: list[tuple[str, Rows, Fields, tuple[Column, ...]]], epochs: int) -> Dense:
+def _scatter(parts: list[tuple[str, DecodedRows, Fields, tuple[SignalColumn, ...]]], epochs: int) -> Dense:
     """Fill arrays over epochs and channels; channels without any observation are dropped."""
     satellites: list[str] = []
     signals: list[str] = []
     placed = []
     for system, rows, fields, columns in parts:
-        numbers, place = _numbered(rows.number)
+        numbers, place = _number(rows.number)
         names = sorted({c.signal for c in columns})
         placed.append((len(satellites) + place * len(names), rows, fields, columns, names))
         satellites += [f"{system}{n:02d}" for n in numbers.tolist() for _ in names]

@@ -16,7 +16,7 @@ _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 
 
 @dataclass(frozen=True)
-class Epochs:
+class EpochHeads:
     """Epochs and events of a block in the order of the file, shape (n,) each.
 
     `line` is the index of the epoch line, `time_ns` the tag since 1970 in the file's time system (0 for events).
@@ -27,8 +27,8 @@ class Epochs:
     count: Integers
     time_ns: Integers
 
-    def __getitem__(self, which: slice | Masks | Integers) -> Epochs:
-        return Epochs(self.line[which], self.flag[which], self.count[which], self.time_ns[which])
+    def __getitem__(self, which: slice | Masks | Integers) -> EpochHeads:
+        return EpochHeads(self.line[which], self.flag[which], self.count[which], self.time_ns[which])
 
     def __len__(self) -> int:
         return len(self.line)
@@ -36,7 +36,7 @@ class Epochs:
 
 def find_epochs(
     lines: Lines, *, version: float, lines_per_satellite: int, at_end: bool, log: FaultLog
-) -> tuple[Epochs, int]:
+) -> tuple[EpochHeads, int]:
     """Find the complete epochs and events of a block, and the number of lines they and broken lines take.
 
     `lines` are complete ones from the first of a record; where the file does not end with them (`at_end`) the last
@@ -47,7 +47,7 @@ def find_epochs(
     return _find_unmarked(lines, lines_per_satellite=lines_per_satellite, at_end=at_end, log=log)
 
 
-def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -> tuple[Epochs, int]:
+def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -> tuple[EpochHeads, int]:
     """Find epochs of RINEX 3 and 4, whose epoch lines begin with ``>``."""
     n = len(lines)
     line = np.flatnonzero(lines.data[lines.start] == ord(">"))
@@ -77,16 +77,16 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
     if at_end and len(line) and wrong[-1] and head.count[-1] > room[-1]:
         wrong[-1] = False
         broken[-1] = True
-        log.fault(EPOCHS, int(lines.number[-1]), _truncated(int(head.count[-1]), int(room[-1]), lines, int(line[-1])))
+        log.fault(EPOCHS, int(lines.number[-1]), _truncate(int(head.count[-1]), int(room[-1]), lines, int(line[-1])))
     log.faults(
         EPOCHS,
         lines.number[line[wrong]],
         lambda i: f"the epoch declares {head.count[wrong][i]} lines, {room[wrong][i]} follow before the next epoch",
     )
-    return Epochs(line, head.flag, head.count, head.time_ns)[~broken & ~wrong], done
+    return EpochHeads(line, head.flag, head.count, head.time_ns)[~broken & ~wrong], done
 
 
-def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log: FaultLog) -> tuple[Epochs, int]:
+def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log: FaultLog) -> tuple[EpochHeads, int]:
     """Find epochs of RINEX 2 by the decimal point of their seconds and the end of the epoch before.
 
     Column 19 of a line of observations lies among the leading digits of its second field, so that only
@@ -124,7 +124,7 @@ class _Walk:
         self._kept = np.zeros(len(line), dtype=np.bool_)
         self._events: list[tuple[int, int, int]] = []
 
-    def run(self, stop: int, *, at_end: bool) -> tuple[Epochs, int]:
+    def run(self, stop: int, *, at_end: bool) -> tuple[EpochHeads, int]:
         """Walk from line 0 to `stop`; see `find_epochs`."""
         position = 0
         while position < stop:
@@ -155,7 +155,7 @@ class _Walk:
             if not at_end:
                 return position
             needed = end - position - 1
-            message = _truncated(needed, len(self._lines) - position - 1, self._lines, position)
+            message = _truncate(needed, len(self._lines) - position - 1, self._lines, position)
             self._log.fault(EPOCHS, int(self._lines.number[-1]), message)
             return len(self._lines)
         message = (
@@ -175,7 +175,7 @@ class _Walk:
                 return end
             if not at_end:
                 return position
-            message = _truncated(event[1], len(self._lines) - position - 1, self._lines, position)
+            message = _truncate(event[1], len(self._lines) - position - 1, self._lines, position)
             self._log.fault(EPOCHS, int(self._lines.number[-1]), message)
             return len(self._lines)
         rest = self._lines.length[position:]
@@ -186,15 +186,15 @@ class _Walk:
         self._log.fault(EPOCHS, int(self._lines.number[position]), message)
         return int(self._line[k]) if k < len(self._line) else len(self._lines)
 
-    def _table(self) -> Epochs:
+    def _table(self) -> EpochHeads:
         kept = self._kept
-        epochs = Epochs(self._line[kept], self._head.flag[kept], self._head.count[kept], self._head.time_ns[kept])
+        epochs = EpochHeads(self._line[kept], self._head.flag[kept], self._head.count[kept], self._head.time_ns[kept])
         if not self._events:
             return epochs
         extra = np.array(self._events, dtype=np.int64).reshape(-1, 3)
         line = np.concatenate([epochs.line, extra[:, 0]])
         order = np.argsort(line, kind="stable")
-        return Epochs(
+        return EpochHeads(
             line[order],
             np.concatenate([epochs.flag, extra[:, 1]])[order],
             np.concatenate([epochs.count, extra[:, 2]])[order],
@@ -202,9 +202,9 @@ class _Walk:
         )
 
 
-def _none() -> Epochs:
+def _none() -> EpochHeads:
     nothing = np.zeros(0, dtype=np.int64)
-    return Epochs(nothing, nothing, nothing, nothing)
+    return EpochHeads(nothing, nothing, nothing, nothing)
 
 
 def _no_epoch(lines: Lines, line: int, version: float) -> str:
@@ -215,7 +215,7 @@ def _no_epoch(lines: Lines, line: int, version: float) -> str:
     return f"an epoch line was expected, found '{lines.text(line)[:40].rstrip()}'"
 
 
-def _truncated(needed: int, found: int, lines: Lines, line: int) -> str:
+def _truncate(needed: int, found: int, lines: Lines, line: int) -> str:
     return (
         f"the file ends in the middle of an epoch: the one of line {lines.number[line]} needs {needed} lines, "
         f"{found} are there"

@@ -52,7 +52,7 @@ _OWNERS_2: Final[dict[str, tuple[str, ...]]] = {"1": ("C1", "P1"), "2": ("P2", "
 
 
 @dataclass(frozen=True)
-class Column:
+class SignalColumn:
     """Column of an observation type in the satellite lines of a constellation.
 
     Position among the declared types, type as declared ("C1C" or "P2"), position in `KINDS`, signal ("1C"), and divisor
@@ -92,14 +92,14 @@ def signal_of(name: str, *, system: str, version: float, declared: Sequence[str]
 
 def columns_of(
     declared: Sequence[str], *, system: str, version: float, scale: Mapping[tuple[str, str], float]
-) -> tuple[Column, ...]:
+) -> tuple[SignalColumn, ...]:
     """Return the columns of a constellation; of two types with the same meaning the first."""
-    columns: dict[tuple[int, str], Column] = {}
+    columns: dict[tuple[int, str], SignalColumn] = {}
     for index, name in enumerate(declared):
         signal = signal_of(name, system=system, version=version, declared=declared)
         if signal is None:
             continue
         kind = KINDS.index("C" if version < 3.0 and name[0] == "P" else name[0])
         divisor = scale.get((system, name), 1.0)
-        columns.setdefault((kind, signal), Column(index, name, kind, signal, divisor))
+        columns.setdefault((kind, signal), SignalColumn(index, name, kind, signal, divisor))
     return tuple(columns.values())

@@ -138,7 +138,7 @@ def _update(
 
 
 @borrowing
-def _contradicted(rows: Rows, parameters: Parameters, work: Work, h: int) -> bool:
+def _is_contradicted(rows: Rows, parameters: Parameters, work: Work, h: int) -> bool:
     """Return whether the measurements that a sub-filter uses, codes or phases and Dopplers, have lost their weight."""
     code, motion = mean_weights(rows, work.masked, work, h)
     return code < parameters.lost_code_weight or motion < parameters.lost_motion_weight
@@ -210,7 +210,7 @@ def advance_subfilters(
             own = slots + clocks + min(rows.sensors[j], RANGE_ROW)
             work.masked[gnss + j] = math.inf if own == b else work.variance[gnss + j]
         _update(epochs, t, line, parameters, active, rows, best, work, h)
-        if _contradicted(rows, parameters, work, h):
+        if _is_contradicted(rows, parameters, work, h):
             bank.weak_s[b] += dt
         elif nc > 0:
             bank.weak_s[b] = 0.0

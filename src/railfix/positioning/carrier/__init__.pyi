@@ -5,23 +5,23 @@ from .arcs import ArcState, number_arcs
 from .continuity import ContinuityLimits, ContinuityState, TrackJumps, track_jumps
 from .filtered import PhaseState, phase_positions
 from .observation_model import Phases, corrected_phase_m
-from .slips import SlipLimits, SlipReason, Slips, SlipState, find_slips
-from .smoothing import Smoothed, SmoothingLimits, SmoothingState, smooth_codes
+from .slips import CycleSlipLimits, CycleSlipState, SlipReason, Slips, find_slips
+from .smoothing import SmoothedCodes, SmoothingLimits, SmoothingState, smooth_codes
 
 __all__ = [
     "ArcAmbiguities",
     "ArcState",
     "ContinuityLimits",
     "ContinuityState",
+    "CycleSlipLimits",
+    "CycleSlipState",
     "PhaseLimits",
     "PhasePositions",
     "PhaseState",
     "Phases",
-    "SlipLimits",
     "SlipReason",
-    "SlipState",
     "Slips",
-    "Smoothed",
+    "SmoothedCodes",
     "SmoothingLimits",
     "SmoothingState",
     "TrackJumps",

@@ -196,7 +196,7 @@ def _consistent(
     prior = np.zeros((len(change), 4, 4))
     prior[:, 0, 0] = prior[:, 3, 3] = 1e-12
     prior[:, [1, 2], [1, 2]] = aside**-2.0
-    fit = _fitted(design, change, judged, sigma, prior)
+    fit = _fit(design, change, judged, sigma, prior)
     kept = judged.copy()
     decided = np.ones(len(change), dtype=bool)
     at = np.flatnonzero((fit.size > limits.sigmas).any(axis=1))
@@ -204,10 +204,10 @@ def _consistent(
         part = design[at], change[at], sigma[at], prior[at]
         kept[at], decided[at] = _worst_out(*part, judged[at], limits)
         # A channel rejected because of another one is accepted again.
-        back = judged[at] & (_fitted(part[0], part[1], kept[at], part[2], part[3]).size <= limits.sigmas)
+        back = judged[at] & (_fit(part[0], part[1], kept[at], part[2], part[3]).size <= limits.sigmas)
         kept[at], again = _worst_out(*part, back, limits)
         decided[at] &= again & (np.count_nonzero(judged[at] & ~kept[at], axis=1) <= limits.max_rejected)
-        fit = _fitted(design, change, kept, sigma, prior)
+        fit = _fit(design, change, kept, sigma, prior)
     return kept, fit.residual, fit.step, fit.variance, decided
 
 
@@ -221,7 +221,7 @@ class _Fit:
     variance: Floats
 
 
-def _fitted(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floats) -> _Fit:
+def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floats) -> _Fit:
     """Least squares of the kept channels of each epoch."""
     weight = kept / sigma[:, None] ** 2
     inverse = np.linalg.inv(np.matmul((design * weight[..., None]).swapaxes(1, 2), design) + prior)
@@ -243,7 +243,7 @@ def _worst_out(
     kept = kept.copy()
     active = np.arange(len(kept))
     for _ in range(limits.max_rejected + 1):
-        fit = _fitted(design[active], change[active], kept[active], sigma[active], prior[active])
+        fit = _fit(design[active], change[active], kept[active], sigma[active], prior[active])
         size = np.where(kept[active], fit.size, 0.0)
         worst = np.argmax(size, axis=1)
         bad = size[np.arange(len(active)), worst] > limits.sigmas

@@ -125,7 +125,7 @@ def phase_positions(
             places.append(place)
         after.append(memory)
         arc = np.concatenate(places)
-    return _joined(pieces), PhaseState(memories=tuple(after))
+    return _join(pieces), PhaseState(memories=tuple(after))
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def _segment(
     phases = inputs.phases
     used = phases.weight > 0
     lin = linearise(inputs.ranges, phases, trajectory, inputs.arc_m, clocks=limits.clocks)
-    memory = _walked(memory, inputs.time, limits)
+    memory = _walk(memory, inputs.time, limits)
     ids, first, column = np.unique(phases.arc_id[used], return_index=True, return_inverse=True)
     memory = _with_arcs(memory, ids, lin.phase_m[used][first])
     place = np.searchsorted(memory.arc_id, ids)
@@ -177,7 +177,7 @@ def _segment(
     base = np.append(memory.first_m, 0.0)
     lin = shifted(lin, base[index])
 
-    matrix, right, kept = _accumulated(lin, index, memory)
+    matrix, right, kept = _accumulate(lin, index, memory)
     row = np.arange(len(matrix))[:, None]
     held = np.zeros((len(matrix), count + 1))
     held[row, index] = own_clock(lin)
@@ -196,7 +196,7 @@ def _segment(
         np.maximum.at(last_row, column, np.nonzero(used)[0])
         seen[place] = inputs.time[last_row]
     now = inputs.time[-1] if len(inputs.time) else memory.time
-    left = _without(replace(kept, time=now, seen=seen), _superseded(memory.arc_id))
+    left = _without(replace(kept, time=now, seen=seen), _find_superseded(memory.arc_id))
     end = value[-1, :count, 0] if len(value) else np.zeros(count)
     last = covariance[-1, :count, :count] if len(value) else np.zeros((count, count))
     running = np.isin(memory.arc_id, left.arc_id)
@@ -234,7 +234,7 @@ def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
     )
 
 
-def _accumulated(lin: Linearised, index: Indices, memory: Memory) -> tuple[Floats, Floats, Memory]:
+def _accumulate(lin: Linearised, index: Indices, memory: Memory) -> tuple[Floats, Floats, Memory]:
     """Normal equations at each epoch, its own part included, and the memory after the last one."""
     part = reduce(lin)
     epochs, count = len(index), len(memory.arc_id)
@@ -251,7 +251,7 @@ def _accumulated(lin: Linearised, index: Indices, memory: Memory) -> tuple[Float
     return sums[1:, :, :count], sums[1:, :, count:], kept
 
 
-def _walked(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
+def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
     """The memory at a later hop: arcs not seen for long forgotten, the others a little less certain."""
     if not len(time) or not len(memory.arc_id):
         return memory
@@ -268,7 +268,7 @@ def _walked(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
     return replace(memory, matrix=0.5 * (matrix + matrix.T), right=right)
 
 
-def _superseded(arc_id: Integers) -> Masks:
+def _find_superseded(arc_id: Integers) -> Masks:
     """Arcs, sorted, that are not the newest of their channel."""
     older = np.zeros(len(arc_id), dtype=bool)
     older[:-1] = channel_of(arc_id[1:]) == channel_of(arc_id[:-1])
@@ -295,7 +295,7 @@ def _without(memory: Memory, ends: Masks) -> Memory:
     )
 
 
-def _joined(pieces: list[PhasePositions]) -> PhasePositions:
+def _join(pieces: list[PhasePositions]) -> PhasePositions:
     """Segments as a whole; the arcs are those of the last."""
     arrays: dict[str, Any] = {
         item.name: np.concatenate([getattr(p, item.name) for p in pieces])

@@ -58,7 +58,7 @@ class SlipReason(IntFlag):
     CODE = 1 << 7
 
 
-class SlipLimits(Settings):
+class CycleSlipLimits(Settings):
     """Limits of the tests, in metres for an interval dt in seconds.
 
     The Doppler test rejects a change over ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``: noise
@@ -87,7 +87,7 @@ class SlipLimits(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SlipState:
+class CycleSlipState:
     """The last epoch of a chunk, by channel ("G05", "1C"), and the steps so far.
 
     Attributes
@@ -163,11 +163,11 @@ def _before(values: Floats, last: Floats) -> Floats:
 
 def find_slips(
     observations: Observations,
-    state: SlipState | None = None,
+    state: CycleSlipState | None = None,
     *,
     frequency_hz: Floats | None = None,
-    limits: SlipLimits | None = None,
-) -> tuple[Slips, SlipState]:
+    limits: CycleSlipLimits | None = None,
+) -> tuple[Slips, CycleSlipState]:
     """Cycle slips of every channel of a chunk.
 
     A channel's phase starts a new arc after an epoch without it.
@@ -177,20 +177,20 @@ def find_slips(
     ----------
     observations : Observations
         T epochs, M channels.
-    state : SlipState, optional
+    state : CycleSlipState, optional
         Left by the chunk before; None at the start of a log.
     frequency_hz : ndarray, shape (M,), optional [Hz]
         Carrier of each channel; by default from the log's header alone, where GLONASS may lack its
         channels.
-    limits : SlipLimits, optional
+    limits : CycleSlipLimits, optional
 
     Returns
     -------
     Slips
-    SlipState
+    CycleSlipState
         Division into chunks does not change the result.
     """
-    limits, state = limits or SlipLimits(), state or SlipState()
+    limits, state = limits or CycleSlipLimits(), state or CycleSlipState()
     channels = channel_keys(observations.satellite, observations.signal)
     rows = rows_before(state.channels, channels)
     last = {
@@ -233,7 +233,7 @@ def find_slips(
     total_ms = np.cumsum(np.r_[state.step_ms, lag_ms])
     after = state
     if len(observations):
-        after = SlipState(
+        after = CycleSlipState(
             time=observations.time[-1],
             channels=channels,
             code_m=read_only(observations.code_m[-1].copy()),

@@ -74,7 +74,7 @@ class SmoothingState:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Smoothed:
+class SmoothedCodes:
     """Smoothed codes, T epochs by M channels.
 
     Attributes
@@ -91,7 +91,7 @@ class Smoothed:
     sigma_factor: Floats
 
 
-def _held(values: Floats, at: Masks, first: Floats) -> Floats:
+def _hold(values: Floats, at: Masks, first: Floats) -> Floats:
     """Values at the marked epochs held until the next mark, `first` before any; shapes (T, M) and (M,)."""
     rows = np.where(at, np.arange(1, len(values) + 1)[:, None], 0)
     rows = np.maximum.accumulate(rows, axis=0)
@@ -115,7 +115,7 @@ def smooth_codes(
     state: SmoothingState | None = None,
     *,
     limits: SmoothingLimits | None = None,
-) -> tuple[Smoothed, SmoothingState]:
+) -> tuple[SmoothedCodes, SmoothingState]:
     """Codes smoothed by the phase along unbroken arcs.
 
     Weight of the n-th code of an arc: the greater of 1/n and dt / window. A phase times its
@@ -135,7 +135,7 @@ def smooth_codes(
 
     Returns
     -------
-    Smoothed
+    SmoothedCodes
     SmoothingState
         Division into chunks does not change the result beyond rounding (1e-9 m).
     """
@@ -146,13 +146,13 @@ def smooth_codes(
     offset0, variance0 = (np.append(values, 0.0)[rows] for values in (state.offset_m, state.variance))
     count0 = np.append(state.count, 0)[rows]
     if not len(time):
-        return Smoothed(code_m=code_m, sigma_factor=np.ones(code_m.shape)), state
+        return SmoothedCodes(code_m=code_m, sigma_factor=np.ones(code_m.shape)), state
     has_phase = np.isfinite(phase_m)
     has = has_phase & np.isfinite(code_m)
     # An arc ends with its phase: without one, nothing runs into the next epoch.
     begins = slip | ~has_phase
     codes = np.cumsum(has, axis=0)
-    before = _held((codes - has).astype(np.float64), begins, -count0.astype(np.float64))
+    before = _hold((codes - has).astype(np.float64), begins, -count0.astype(np.float64))
     count = np.where(has_phase, codes - before, 0.0)
     difference = np.where(has, code_m - phase_m, np.nan)
     apart = np.full(len(time) + 1, state.clock_m)
@@ -160,7 +160,7 @@ def smooth_codes(
         apart = np.cumsum(np.r_[state.clock_m, _common_change(difference, begins, last0)])
     last, difference = difference[-1], difference - apart[1:, None]
     # The arc's first code may come after its first phase.
-    base = _held(difference, (has & (count == 1)) | begins, base0)
+    base = _hold(difference, (has & (count == 1)) | begins, base0)
 
     dt = seconds(np.diff(np.concatenate([np.asarray([state.time], dtype="datetime64[ns]"), time])))
     fade = np.clip(np.where(np.isnan(dt), 0.0, dt) / limits.window_s, 0.0, 1.0)[:, None]
@@ -186,4 +186,4 @@ def smooth_codes(
         last_m=read_only(last),
         clock_m=float(apart[-1]),
     )
-    return Smoothed(code_m=smoothed, sigma_factor=factor), after
+    return SmoothedCodes(code_m=smoothed, sigma_factor=factor), after

@@ -128,7 +128,7 @@ class SbasCorrections:
         else:
             raise ValueError(f"the log has no SBAS message of PRN {prn}; it has {known}")
         corrections = cls(messages, prn=prn, limits=limits, notes=(*messages.notes, choice))
-        corrections.notes += tuple(corrections._left_out(messages.of(prn)))
+        corrections.notes += tuple(corrections._leave_out(messages.of(prn)))
         return corrections
 
     def _settings_note(self) -> str:
@@ -140,7 +140,7 @@ class SbasCorrections:
             f"{limits.incomplete}"
         )
 
-    def _left_out(self, messages: SbasMessages) -> list[str]:
+    def _leave_out(self, messages: SbasMessages) -> list[str]:
         """Notes on what of a whole log is not used."""
         notes = []
         zeros = int((messages.type == 0).sum())

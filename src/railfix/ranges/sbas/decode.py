@@ -42,7 +42,7 @@ class BitField(NamedTuple):
     step: int | None = None
 
 
-def _signed(first: int, length: int, scale: float | None = None, number: int | None = None) -> BitField:
+def _read_signed(first: int, length: int, scale: float | None = None, number: int | None = None) -> BitField:
     return BitField(first, length, scale, True, number)
 
 
@@ -55,7 +55,7 @@ LAYOUTS: Final[dict[str, Layout]] = {
     "type 2": {
         "iodf": BitField(14, 2),
         "iodp": BitField(16, 2),
-        "prc_m": _signed(18, 12, 0.125, BLOCK),
+        "prc_m": _read_signed(18, 12, 0.125, BLOCK),
         "udrei": BitField(174, 4, number=BLOCK),
     },
     "type 6": {"iodf": BitField(14, 2, number=4), "udrei": BitField(22, 4, number=SLOTS)},
@@ -84,14 +84,14 @@ LAYOUTS: Final[dict[str, Layout]] = {
         "covariance": BitField(138, 7, 0.1),
     },
     "type 12": {
-        "drift": _signed(14, 24, 2.0**-50),
-        "offset_s": _signed(38, 32, 2.0**-30),
+        "drift": _read_signed(14, 24, 2.0**-50),
+        "offset_s": _read_signed(38, 32, 2.0**-30),
         "reference_s": BitField(70, 8, 4096.0),
         "reference_week": BitField(78, 8),
-        "leap_s": _signed(86, 8),
+        "leap_s": _read_signed(86, 8),
         "leap_week": BitField(94, 8),
         "leap_day": BitField(102, 8),
-        "next_leap_s": _signed(110, 8),
+        "next_leap_s": _read_signed(110, 8),
         "utc_standard": BitField(118, 3),
         "time_of_week_s": BitField(121, 20, 1.0),
         "week": BitField(141, 10),
@@ -103,7 +103,7 @@ LAYOUTS: Final[dict[str, Layout]] = {
         "mask": BitField(24, 1, number=201),
     },
     "type 24": {
-        "prc_m": _signed(14, 12, 0.125, 6),
+        "prc_m": _read_signed(14, 12, 0.125, 6),
         "udrei": BitField(86, 4, number=6),
         "iodp": BitField(110, 2),
         "block": BitField(112, 2),
@@ -136,17 +136,17 @@ LAYOUTS: Final[dict[str, Layout]] = {
     "satellite of type 25": {
         "slot": BitField(0, 6),
         "iode": BitField(6, 8),
-        "position_m": _signed(14, 9, 0.125, 3),
-        "clock_s": _signed(41, 10, 2.0**-31),
+        "position_m": _read_signed(14, 9, 0.125, 3),
+        "clock_s": _read_signed(41, 10, 2.0**-31),
     },
     # Half of type 25 with velocity code 1: one satellite.
     "moving satellite of type 25": {
         "slot": BitField(1, 6),
         "iode": BitField(7, 8),
-        "position_m": _signed(15, 11, 0.125, 3),
-        "clock_s": _signed(48, 11, 2.0**-31),
-        "velocity_mps": _signed(59, 8, 2.0**-11, 3),
-        "clock_rate": _signed(83, 8, 2.0**-39),
+        "position_m": _read_signed(15, 11, 0.125, 3),
+        "clock_s": _read_signed(48, 11, 2.0**-31),
+        "velocity_mps": _read_signed(59, 8, 2.0**-11, 3),
+        "clock_rate": _read_signed(83, 8, 2.0**-39),
         "time_of_day_s": BitField(91, 13, 16.0),
         "iodp": BitField(104, 2),
     },
@@ -154,7 +154,7 @@ LAYOUTS: Final[dict[str, Layout]] = {
         "slot": BitField(0, 6),
         "exponent": BitField(6, 3, 1.0),
         "diagonal": BitField(9, 9, number=4),
-        "upper": _signed(45, 10, number=6),
+        "upper": _read_signed(45, 10, number=6),
     },
 }
 
@@ -236,7 +236,7 @@ def fast_corrections(messages: SbasMessages, *, type0: Literal["stop", "as_type2
     ]
     mixed = decode(messages, 24)
     parts.append(_by_slot(mixed.pop("row"), BLOCK * mixed.pop("block"), mixed))
-    return _joined(parts)
+    return _join(parts)
 
 
 def has_data(bits: Bytes) -> Masks:
@@ -255,7 +255,7 @@ def _by_slot(row: Integers, first: Integers, fields: Decoded) -> Decoded:
     }
 
 
-def _joined(parts: Sequence[Decoded], slot: str = "slot") -> Decoded:
+def _join(parts: Sequence[Decoded], slot: str = "slot") -> Decoded:
     """Rows of several decoders in the order of the messages, without those of empty slots."""
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     kept = np.flatnonzero((joined[slot] >= 0) & (joined[slot] < SLOTS)) if slot else np.arange(len(joined["row"]))
@@ -293,7 +293,7 @@ def long_term(messages: SbasMessages) -> Decoded:
         reference = time_near(part.pop("time_of_day_s"), messages.time[moving])
         code = np.ones(len(moving), dtype=np.int64)
         parts.append({"row": moving, **part, "slot": part["slot"] - 1, "velocity_code": code, "reference": reference})
-    return _joined(parts)
+    return _join(parts)
 
 
 def grid_delays(messages: SbasMessages) -> Decoded:
@@ -318,7 +318,7 @@ def covariance(messages: SbasMessages) -> Decoded:
         factor[:, _UPPER[0], _UPPER[1]] = part["upper"]
         slot = part["slot"] - 1
         parts.append({**decoded, "slot": slot, "scale": scale, "factor": factor * scale[:, None, None]})
-    return _joined(parts)
+    return _join(parts)
 
 
 def service(messages: SbasMessages) -> Decoded:

@@ -92,7 +92,7 @@ def _rtklib(path: str, number: int, line: str) -> RawMessage | InputFileError:
     if not (0 < int(week) < 10_000 and 0.0 <= seconds < SECONDS_PER_WEEK):
         return InputFileError(path, f"week {week}, time of week {tow} is no GPS time", line=number)
     time = int(week) * SECONDS_PER_WEEK * 10**9 + round(seconds * 1e9)
-    return _checked_line(path, RawMessage(number, time, int(prn), int(kind), digits))
+    return _check_line(path, RawMessage(number, time, int(prn), int(kind), digits))
 
 
 def _ems(path: str, number: int, line: str) -> RawMessage | InputFileError:
@@ -106,7 +106,7 @@ def _ems(path: str, number: int, line: str) -> RawMessage | InputFileError:
         time = _instant(date, second)
     except ValueError:
         return InputFileError(path, f"{date.strip()} {second} is no date and time", line=number)
-    return _checked_line(path, RawMessage(number, time, int(prn), int(kind), digits))
+    return _check_line(path, RawMessage(number, time, int(prn), int(kind), digits))
 
 
 def _parse_rinex(path: str, lines: Sequence[str]) -> Iterator[RawMessage | InputFileError]:
@@ -146,10 +146,10 @@ def _parse_rinex(path: str, lines: Sequence[str]) -> Iterator[RawMessage | Input
             continue
         # Before 2004 the satellite number was the PRN less 100.
         number_of_geo = int(prn) + (100 if int(prn) < 100 else 0)
-        yield _checked_line(path, RawMessage(number, time, number_of_geo, int(head or -1), digits))
+        yield _check_line(path, RawMessage(number, time, number_of_geo, int(head or -1), digits))
 
 
-def _checked_line(path: str, raw: RawMessage) -> RawMessage | InputFileError:
+def _check_line(path: str, raw: RawMessage) -> RawMessage | InputFileError:
     if raw.prn not in GEO_PRNS:
         return InputFileError(
             path, f"PRN {raw.prn} sends no SBAS; 120 to 158 or 183 to 202 was expected", line=raw.line
@@ -226,7 +226,7 @@ def read_sbas(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines
     sources = tuple(str(path) for path in files)
     if not gathered.raw:
         raise InputFileError(", ".join(sources), "holds no SBAS message that can be read")
-    log = _checked(gathered, sources)
+    log = _check(gathered, sources)
     if not len(log):
         counts = ", ".join(f"{number} by {reason}" for reason, number in sorted(log.rejected.items()))
         raise InputFileError(", ".join(sources), f"has no SBAS message left: rejected {counts}")
@@ -245,7 +245,7 @@ def from_receiver(frames: SbasFrames, *, source: str = "receiver") -> SbasMessag
     """
     gathered = _Gathered()
     _gather_frames(frames, 0, gathered)
-    return _checked(gathered, (source,)) if gathered.raw else SbasMessages.none()
+    return _check(gathered, (source,)) if gathered.raw else SbasMessages.none()
 
 
 def _gather_frames(frames: SbasFrames, number: int, gathered: _Gathered) -> None:
@@ -280,14 +280,14 @@ def _read_file(path: str, number: int, broken_lines: BrokenLines, gathered: _Gat
     gathered.rejected["line"] += broken
 
 
-def _checked(gathered: _Gathered, sources: tuple[str, ...]) -> SbasMessages:
+def _check(gathered: _Gathered, sources: tuple[str, ...]) -> SbasMessages:
     """Parity, preamble and order."""
     raw = gathered.raw
     text = "".join(item.digits.ljust(2 * ROW_BYTES, "0")[: 2 * ROW_BYTES] for item in raw)
     bits = np.frombuffer(bytes.fromhex(text), dtype=np.uint8).reshape(-1, ROW_BYTES).copy()
     bits[:, 31] &= 0xC0
     source = np.array(gathered.source, dtype=np.int64)
-    carried = _carried_bits(np.array([len(item.digits) for item in raw]), source, bits)
+    carried = _read_bits(np.array([len(item.digits) for item in raw]), source, bits)
     wrong = _wrong_parity(bits, carried)
     preamble = preamble_number(bits)
     stray = (preamble < 0) & ~wrong
@@ -315,7 +315,7 @@ def _checked(gathered: _Gathered, sources: tuple[str, ...]) -> SbasMessages:
     return replace(kept, rejected=dict(gathered.rejected), notes=tuple(notes))
 
 
-def _carried_bits(digits: NDArray[np.int_], source: Integers, bits: Bytes) -> Integers:
+def _read_bits(digits: NDArray[np.int_], source: Integers, bits: Bytes) -> Integers:
     """Bits of parity that each message carries: 24 in complete messages, 6 or none in cut ones.
 
     A cut message ends with 6 bits that some programs fill with zero (RTKLIB) and some leave as

@@ -387,14 +387,14 @@ def _inside(values: Decoded, row: int, region: int, latitude_deg: Floats, longit
     north, west, south, east = (
         values[name][row, region] for name in ("latitude_1_deg", "longitude_1_deg", "latitude_2_deg", "longitude_2_deg")
     )
-    height, width = north - south, _wrapped(east - west)
+    height, width = north - south, _wrap(east - west)
     if height == 0.0 or width == 0.0:
         return np.zeros(len(latitude_deg), dtype=bool)
-    up, along = (latitude_deg - south) / height, _wrapped(longitude_deg - west) / width
+    up, along = (latitude_deg - south) / height, _wrap(longitude_deg - west) / width
     inside = (up >= 0.0) & (up <= 1.0) & (along >= 0.0) & (along <= 1.0)
     return np.asarray(inside if values["square"][row, region] else inside & (up + along >= 1.0))
 
 
-def _wrapped(angle_deg: Floats | np.float64) -> Floats:
+def _wrap(angle_deg: Floats | np.float64) -> Floats:
     """Angle in [-180, 180)."""
     return np.asarray((angle_deg + 180.0) % 360.0 - 180.0)

@@ -115,7 +115,7 @@ class Cells(_Layer):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ranges(_Layer):
+class RangeBars(_Layer):
     """A bar from minimum to maximum with a mark at the mean for each name, from the top down.
 
     Attributes
@@ -150,7 +150,7 @@ class Marks(_Layer):
     place: Literal["beside", "on"] = "beside"
 
 
-Layer = Points | Line | Band | Bars | Cells | Ranges | Marks
+Layer = Points | Line | Band | Bars | Cells | RangeBars | Marks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +202,7 @@ class Chart:
     @property
     def empty(self) -> bool:
         """Whether no layer has anything to draw."""
-        return not any(_drawn(layer) for layer in self.layers)
+        return not any(_draw(layer) for layer in self.layers)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,7 +242,7 @@ class SkyEpochs:
         return not len(self.satellite)
 
 
-def _drawn(layer: Layer) -> bool:
+def _draw(layer: Layer) -> bool:
     """Whether a layer has anything to draw; text alone does not count."""
     if isinstance(layer, Marks):
         return False
@@ -252,6 +252,6 @@ def _drawn(layer: Layer) -> bool:
         return bool((layer.height > 0).any())
     if isinstance(layer, Band):
         return bool(np.isfinite(layer.low).any())
-    if isinstance(layer, Ranges):
+    if isinstance(layer, RangeBars):
         return bool(np.isfinite(layer.mid).any())
     return bool((np.isfinite(layer.x) & np.isfinite(layer.y)).any())

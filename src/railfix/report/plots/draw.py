@@ -24,7 +24,7 @@ from railfix.report.plots.chart import (
     Line,
     Marks,
     Points,
-    Ranges,
+    RangeBars,
     SkyEpochs,
 )
 
@@ -77,7 +77,7 @@ def draw_chart(chart: Chart, axes: Axes) -> Axes:
     axes.set_xlabel(chart.x_label)
     axes.set_ylabel(chart.y_label)
     _scales(chart, axes)
-    if not any(isinstance(layer, Ranges) for layer in chart.layers):
+    if not any(isinstance(layer, RangeBars) for layer in chart.layers):
         axes.grid(alpha=0.3)
     if any(text for text in axes.get_legend_handles_labels()[1]):
         axes.legend(fontsize="small", markerscale=2.5, loc="best")
@@ -160,7 +160,7 @@ def _draw(layer: Layer, axes: Axes, chart: Chart) -> None:
             _bars(layer, axes)
         case Cells():
             _cells(layer, axes)
-        case Ranges():
+        case RangeBars():
             _ranges(layer, axes)
         case Marks():
             _marks(layer, axes)
@@ -202,7 +202,7 @@ def _cells(layer: Cells, axes: Axes) -> None:
     axes.pcolormesh(layer.x_edges, layer.y_edges, counts.T, cmap="Greys", norm=LogNorm(vmin=0.3), rasterized=True)
 
 
-def _ranges(layer: Ranges, axes: Axes) -> None:
+def _ranges(layer: RangeBars, axes: Axes) -> None:
     at = np.arange(len(layer.names), dtype=np.float64)
     axes.hlines(at, layer.low, layer.high, color=layer.colour, lw=6, alpha=0.4, label=layer.label)
     axes.plot(layer.mid, at, "|", color=layer.colour, ms=14, mew=2.5)

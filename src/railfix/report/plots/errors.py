@@ -28,7 +28,7 @@ from railfix.report.plots.chart import (
     Layer,
     Line,
     Points,
-    Ranges,
+    RangeBars,
 )
 from railfix.report.plots.columns import floats, nice_step, since, start_of
 from railfix.report.plots.thinning import counts_sentence, spread
@@ -187,7 +187,7 @@ def error_ranges(runs: Mapping[str, pl.DataFrame], *, title: str = "Range of the
     for label, _, colour, _ in reversed(_SERIES):
         mine = [v if name.endswith(f", {label}") else np.empty(0) for name, v in zip(names, values, strict=True)]
         layers.append(
-            Ranges(
+            RangeBars(
                 label=label,
                 colour=colour,
                 names=tuple(names),

@@ -144,7 +144,7 @@ def _levels(
         limit = np.full(2, alarm_limit_m)
         layers.append(Line(label=f"alarm limit {alarm_limit_m:g} m", colour=RED, x=line, y=limit, dash="dashed"))
     infinite = int(np.isinf(floats(positions, "protection_level_m")).sum())
-    caption = [_counted(positions), f"Values beyond {1.2 * largest:.1f} m are cut off"]
+    caption = [_count(positions), f"Values beyond {1.2 * largest:.1f} m are cut off"]
     caption[1] += f", {infinite:,} levels are infinite and not drawn." if infinite else "."
     if any(label in {layer.label for layer in layers} for label, _ in _PARTS[:3]):
         caption.append(
@@ -162,7 +162,7 @@ def _levels(
     )
 
 
-def _counted(positions: pl.DataFrame) -> str:
+def _count(positions: pl.DataFrame) -> str:
     """Epochs by status and cause of the level, in words."""
     sentences = []
     for column, what in (("protection_status", "Epochs"), ("protection_cause", "What sets the level")):

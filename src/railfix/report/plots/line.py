@@ -100,7 +100,7 @@ def plan(
                 Points(label=f"{label} ({len(rows):,})", colour=colour, x=x, y=y, size=4.0, epoch_s=epoch[kept])
             )
     if filtered is not None:
-        layers += _filtered(positions.filter(pl.Series(has)), filtered, frame, cell, start_of(positions))
+        layers += _filter(positions.filter(pl.Series(has)), filtered, frame, cell, start_of(positions))
     layers.append(_kilometrage(positions.filter(pl.Series(has)), here[has]))
     thinned = "" if shown == total else f" Of positions too close to tell apart one is drawn ({shown:,} in all)."
     outside = int(np.isfinite(there[:, 0]).sum() - near.sum())
@@ -117,7 +117,7 @@ def plan(
     )
 
 
-def _filtered(
+def _filter(
     placed: pl.DataFrame, filtered: pl.DataFrame, frame: _LocalFrame, cell: float, start: np.datetime64
 ) -> Iterator[Points]:
     """Filtered positions of the epochs that have none of their own."""

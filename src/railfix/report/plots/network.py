@@ -42,7 +42,7 @@ def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[Pl
     )
     at = (float(np.median(latitude)), float(np.median(longitude)))
     nth = max(1, len(latitude) // _DRAWN)
-    rows, breaks = _thinned(network, nth)
+    rows, breaks = _thin(network, nth)
     layers: list[Layer] = [_line("tracks", BLUE, _local(at, latitude[rows], longitude[rows]), breaks)]
     ends, _ = end_points(network)
     axes = enu_axes(*at)[:2]
@@ -77,7 +77,7 @@ def _local(at: tuple[float, float], latitude_deg: Floats, longitude_deg: Floats)
     return east, north
 
 
-def _thinned(network: Network, nth: int) -> tuple[Indices, Indices]:
+def _thin(network: Network, nth: int) -> tuple[Indices, Indices]:
     """Every n-th point of each track and its last one, and where in them a new track begins."""
     first, last = network.first_point[:-1], network.first_point[1:] - 1
     track = np.repeat(np.arange(len(first)), last - first + 1)

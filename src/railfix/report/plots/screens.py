@@ -92,13 +92,13 @@ def _screen(
             total += int(np.count_nonzero(np.isfinite(along + metric)))
             rows = spread(along, metric)
             parts.append((along[rows], metric[rows]))
-        along, metric = _joined(parts)
+        along, metric = _join(parts)
         rows = spread(along, metric)
         shown += len(rows)
         layers.append(Points(label=label, colour=colour, x=along[rows], y=metric[rows], epoch_s=None))
     limits = [_tightest(*(values[np.isfinite(limit)] for values in (along, limit))) for along, _, _, limit in
               _blocks(picture, x, epoch)]  # fmt: skip
-    at, least = _tightest(*_joined(limits))
+    at, least = _tightest(*_join(limits))
     edges = [(float(np.nanmin(limit)), float(np.nanmax(limit))) for _, _, _, limit in _blocks(picture, x, epoch)
              if np.isfinite(limit).any()]  # fmt: skip
     finite = bool(edges)
@@ -137,7 +137,7 @@ def _blocks(
         yield where.ravel(), metric.ravel(), picture.reject[rows].ravel(), limit[rows].astype(np.float64).ravel()
 
 
-def _joined(parts: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+def _join(parts: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
     """Pairs of arrays end to end."""
     if not parts:
         return np.empty(0), np.empty(0)

@@ -27,7 +27,7 @@ _NARROW_CHIPS: Final = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tracked:
+class TrackedCode:
     """Tracked signals, shapes (N,).
 
     Attributes
@@ -59,7 +59,7 @@ def tracked(
     spacing_chips: float,
     code_loop_hz: float,
     carrier_loop_hz: float,
-) -> Tracked:
+) -> TrackedCode:
     """Code, phase, rate and strength of the sum of P paths, for N signals.
 
     The loops lock to the strongest path; the code error about it stays within half the spacing.
@@ -102,7 +102,7 @@ def tracked(
     passed = triangle / np.sqrt(1.0 + (turning_hz / carrier_loop_hz) ** 2)
     angle, pulled = _carrier(real * passed, imaginary * passed, rate, anchor)
     limit = np.abs(rate * (strength > 0.05 * size)).max(axis=0)
-    return Tracked(
+    return TrackedCode(
         code_m=first + error * chip_m,
         phase_m=first - angle * wavelength_m / (2.0 * np.pi),
         rate_mps=first_rate + np.clip(pulled, -limit, limit),

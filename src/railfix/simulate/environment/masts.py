@@ -92,7 +92,7 @@ class Electrification:
     def __init__(self, settings: ElectrificationSettings) -> None:
         self.settings = settings
 
-    def _numbered(self, chainage_m: Floats, every: int) -> Floats:
+    def _number(self, chainage_m: Floats, every: int) -> Floats:
         """Chainage of the nearest of every n-th mast."""
         spacing = self.settings.spacing_m * every
         return self.settings.first_m + spacing * np.rint((chainage_m - self.settings.first_m) / spacing)
@@ -100,7 +100,7 @@ class Electrification:
     def _mast(self, rays: Rays, sign: Floats, near_m: Floats) -> Conductor:
         s = self.settings
         return Conductor(
-            p=self._numbered(near_m, 1) - rays.chainage_m,
+            p=self._number(near_m, 1) - rays.chainage_m,
             q=sign * s.lateral_m,
             ray_p=rays.x,
             ray_q=rays.y,
@@ -113,7 +113,7 @@ class Electrification:
     def _beam(self, rays: Rays, near_m: Floats) -> Conductor:
         s = self.settings
         return Conductor(
-            p=self._numbered(near_m, s.beam_every) - rays.chainage_m,
+            p=self._number(near_m, s.beam_every) - rays.chainage_m,
             q=np.full(len(near_m), s.beam_height_m - rays.height_m),
             ray_p=rays.x,
             ray_q=rays.z,

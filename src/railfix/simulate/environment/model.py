@@ -13,9 +13,9 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DB
-from railfix.simulate.disturbance import Disturbance, Geometry
+from railfix.simulate.disturbance import Disturbance, SightGeometry
 from railfix.simulate.environment.antenna import cross_polar_gain, received_amplitude
-from railfix.simulate.environment.correlator import Tracked, tracked
+from railfix.simulate.environment.correlator import TrackedCode, tracked
 from railfix.simulate.environment.diffraction import edge_amplitude, roughness_loss
 from railfix.simulate.environment.masts import Electrification
 from railfix.simulate.environment.second_reflections import second_reflection
@@ -110,7 +110,7 @@ class Environment:
         """Kind of section at chainages; "open" outside all sections."""
         return self.structures.kind_at(np.asarray(chainage_m, dtype=np.float64))
 
-    def __call__(self, geometry: Geometry) -> Disturbance:
+    def __call__(self, geometry: SightGeometry) -> Disturbance:
         """Disturbance of every channel and epoch, shapes (T, M)."""
         shape = geometry.elevation_deg.shape
         code, phase, doppler, cn0 = np.zeros((4, *shape))
@@ -141,7 +141,7 @@ class Environment:
                 cn0[e, c] += self.settings.antenna.ripple_sigma_db * self._ripple.at(rays, geometry.antenna)
         return Disturbance(code_m=code, phase_m=phase, doppler_hz=doppler, cn0_db=cn0)
 
-    def _tracked(self, rays: Rays, platform: Masks, speed_mps: Floats, chip_m: Floats, clock_s: Floats) -> Tracked:
+    def _tracked(self, rays: Rays, platform: Masks, speed_mps: Floats, chip_m: Floats, clock_s: Floats) -> TrackedCode:
         receiver, paths = self.settings.receiver, self._paths(rays, platform, clock_s)
         return tracked(
             paths.field,
@@ -262,7 +262,7 @@ class _GainRipple:
         return np.asarray(level * np.sqrt(2.0 / _HARMONICS) * waves.sum(axis=0))
 
 
-def _rays(geometry: Geometry, epoch: Indices, channel: Indices, wavelength_m: Floats, height_m: float) -> Rays:
+def _rays(geometry: SightGeometry, epoch: Indices, channel: Indices, wavelength_m: Floats, height_m: float) -> Rays:
     elevation = np.radians(geometry.elevation_deg[epoch, channel])
     relative = np.radians(geometry.azimuth_deg[epoch, channel] - geometry.heading_deg[epoch])
     level = np.cos(elevation)

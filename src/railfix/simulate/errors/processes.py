@@ -82,11 +82,11 @@ class GaussMarkov(Interpolated):
         count = node_count(duration_s, spacing)
         white = np.stack([np.random.default_rng(list(key)).standard_normal(count) for key in keys], axis=1)
         white[1:] *= np.sqrt(1.0 - rho**2)
-        nodes = sigma / _interpolated_sigma(rho) * np.asarray(lfilter([1.0], [1.0, -rho], white, axis=0))
+        nodes = sigma / _interpolate_sigma(rho) * np.asarray(lfilter([1.0], [1.0, -rho], white, axis=0))
         super().__init__(nodes, spacing)
 
 
-def _interpolated_sigma(rho: float) -> float:
+def _interpolate_sigma(rho: float) -> float:
     """Standard deviation between nodes, root mean square, of a process of standard deviation 1."""
     u = (np.arange(200) + 0.5) / 200.0
     weight = 0.5 * np.stack(

@@ -31,13 +31,13 @@ def wheel_slips(simulation: Simulation, settings: TachometerSettings) -> list[Sl
     scenario = simulation.scenario
     rng = np.random.default_rng([scenario.seed, _SLIPS])
     slips = list(settings.slips)
-    for new in _drawn(simulation.motion, scenario.duration_s, settings.drawn_slips, rng):
+    for new in _draw(simulation.motion, scenario.duration_s, settings.drawn_slips, rng):
         if all(new.start_s >= old.end_s or old.start_s >= new.end_s for old in slips):
             slips.append(new)
     return sorted(slips, key=lambda slip: slip.start_s)
 
 
-def _drawn(motion: Motion, duration_s: float, drawn: DrawnSlips, rng: np.random.Generator) -> list[SlipInterval]:
+def _draw(motion: Motion, duration_s: float, drawn: DrawnSlips, rng: np.random.Generator) -> list[SlipInterval]:
     edges = np.arange(0.0, duration_s + _LOOK_S, _LOOK_S)
     speed = np.abs(motion.at(edges)[1])
     kind = np.sign(np.where(np.abs(np.diff(speed)) > _HARD_MPS2 * _LOOK_S, np.diff(speed), 0.0))
@@ -114,7 +114,7 @@ def _times_at(target_m: Floats, node_s: Floats, turned_m: Floats, speed_mps: Flo
     return np.asarray(node_s[cell] + np.minimum(since, step[cell]))
 
 
-def _miscounted(time_s: Floats, settings: TachometerSettings, seed: int) -> Floats:
+def _miscount(time_s: Floats, settings: TachometerSettings, seed: int) -> Floats:
     """Pulse times with pulses lost and doubled at random; a doubled one comes before the next tooth."""
     if not (settings.lost_chance or settings.doubled_chance) or len(time_s) < 2:
         return time_s
@@ -136,7 +136,7 @@ def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.Data
         teeth = np.clip(settings.tooth_sigma * draw, -0.45, 0.45)
     phase = float(rng.uniform())
     time = pulse_times_s(simulation.motion, settings, slips, scenario.duration_s, phase, tooth_errors=teeth)
-    time = _miscounted(time, settings, scenario.seed)
+    time = _miscount(time, settings, scenario.seed)
     speed = simulation.motion.at(time)[1]
     turning = np.abs(speed) * (1.0 + slip_ratio(slips, time))
     kept = turning >= settings.lowest_mps
