@@ -156,7 +156,11 @@ class Evaluation:
         chosen = {"grouping": ALL, "epochs_of": "own", "position": "constrained"} | where
         rows = self.figures.filter(*(pl.col(key) == value for key, value in chosen.items()))
         if len(rows) != 1:
-            raise LookupError(f"{len(rows)} rows of the figures have {chosen}; name one")
+            words = rows.select(pl.selectors.string())
+            several = {key: words[key].unique().sort().to_list() for key in words.columns if words[key].n_unique() > 1}
+            raise LookupError(
+                f"{len(rows)} rows of the figures have {chosen}; name one{f' of {several}' if several else ''}"
+            )
         return rows[name].item()
 
 
