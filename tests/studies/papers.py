@@ -66,19 +66,20 @@ def document() -> str:
     lines = [
         "# The five papers, item by item",
         "",
-        "Written by `python tests/studies/papers.py` from `tests/references/papers.toml`.",
-        "An item without a test is open.",
-        "",
+        "Written by `python tests/studies/papers.py` from `tests/references/papers.toml`. Each item: what is asked and",
+        "reached, what does it, and the test; one without a test is open.",
     ]
     for paper, title in DATA["papers"].items():
-        lines += ["", f"## {paper}: {title}", "", "|item|done by|test|asked|reached|", "|---|---|---|---|---|"]
-        for item in DATA["item"]:
-            if item["paper"] == paper:
-                test = f"`{item['test']}`" if item.get("test") else "**open**"
-                cells = (item["what"], f"`{item['where']}`", test, item.get("asked", ""), reached(item))
-                lines.append(f"|{'|'.join(cells)}|")
-    lines += ["", "## Where we read the papers differently", "", "|paper|it says|here|because|", "|---|---|---|---|"]
-    lines += [f"|{d['paper']}|{d['says']}|{d['here']}|{d['why']}|" for d in DATA["difference"]]
+        lines += ["", f"## {paper}", "", title, ""]
+        for item in (item for item in DATA["item"] if item["paper"] == paper):
+            figures = {"asked": item.get("asked", ""), "reached": reached(item)}
+            text = "; ".join([item["what"], *(f"{name}: {figure}" for name, figure in figures.items() if figure)])
+            test = f"`{item['test']}`" if "test" in item else "**open**"
+            lines += [f"- {text}", f"  `{item['where']}`", f"  {test}"]
+    lines += ["", "## Where we read the papers differently", ""]
+    for found in DATA["difference"]:
+        why = f" Why: {found['why']}." if found["why"] else ""
+        lines.append(f"- **{found['paper']}** {found['says']} Here: {found['here']}{why}")
     return "\n".join(lines) + "\n"
 
 
