@@ -46,7 +46,7 @@ def test_noise_alone_fails_as_often_as_set(scale: float) -> None:
 
 def test_a_position_that_fails_is_kept_with_its_status() -> None:
     observations = clean_observations()["front"][:120]
-    settings = {"systems": ["G"], "screens": ["elevation"]}
+    settings = {"filter": "off", "systems": ["G"], "screens": ["elevation"]}
     before = front_alone(observations, settings)
     assert np.mean(before.conventional_status == PointStatus.VALID) > 0.98
     step = np.zeros(observations.code_m.shape)

@@ -185,7 +185,7 @@ class Bench:
                     common = {"systems": list(letters), "protection": "off", "cn0_curve": curve and str(curve)}
                     if way.sbas:
                         common["sbas"] = [str(messages)]
-                    settings = {**way.settings, **common}
+                    settings = {"filter": "off", **way.settings, **common}
                     key = (letters, way.key)
                     if key not in self.processors:
                         self.processors[key] = processor_of(

@@ -131,6 +131,7 @@ def play(data: Path, station: Station, beside_m: float, map_sigma_m: float | Non
     trajectory = line_between(*two_points(place, beside_m))
     config = parse_config(
         {
+            "filter": "off",
             "systems": list(station.systems),
             "screens": ["elevation", "raim"],
             "elevation": {"mask_deg": 15.0},
