@@ -27,7 +27,8 @@ from railfix.simulate.demonstration import demo_inputs, demo_truth
 from railfix.track import read_track
 from railfix.track.frames import points_at
 from railfix.track.network import Network
-from railfix.track.network_match import Matched, match, route_of
+from railfix.track.network_match import Matched, match
+from railfix.track.network_route import route_of
 
 pytestmark = pytest.mark.requirement("A10")
 LOOP_M = (250.0, 550.0)

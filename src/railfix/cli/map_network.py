@@ -17,8 +17,9 @@ from railfix.run.options import TrackReading
 from railfix.track import write_track_csv
 from railfix.track.network import Network
 from railfix.track.network_check import check_network
-from railfix.track.network_match import Matched, PlanLog, match, read_plan_positions, route_of
+from railfix.track.network_match import Matched, PlanLog, match, read_plan_positions
 from railfix.track.network_read import TOLERANCE_M, read_network
+from railfix.track.network_route import route_of
 from railfix.track.read import track_of_segments
 
 #: Findings printed before the rest is only counted.

@@ -27,7 +27,8 @@ from railfix.run.options import TrackReading
 from railfix.track import Track
 from railfix.track.frames import in_map_frame
 from railfix.track.network import Network
-from railfix.track.network_match import Matched, PlanLog, match, route_of
+from railfix.track.network_match import Matched, PlanLog, match, plan_log
+from railfix.track.network_route import route_of
 
 #: Interval of the positions that are matched [s].
 _INTERVAL_S: Final = 1.0
@@ -292,15 +293,7 @@ def find_route(
     )
     if not len(times):
         raise MismatchError(f"{path}: the log has no position, so that no route through the network can be found")
-    latitude, longitude, _ = geodetic_from_ecef(ecef)
-    positions = PlanLog(
-        path=path,
-        time=times,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        sigma_m=np.sqrt((sigma[:, :2] ** 2).mean(axis=1)),
-    )
-    positions, _ = positions.in_frame_of(network, **reading.motion)
+    positions, _ = plan_log(path, times, ecef, sigma).in_frame_of(network, **reading.motion)
     matched = match(network, positions)
     tracks, left_out = route_of(network, matched)
     if not tracks:

@@ -134,6 +134,29 @@ class Network:
                 graph.add_edge(b + 1, a, weight=0.0)
         return graph
 
+    @cached_property
+    def height_m(self) -> Floats:
+        """Ellipsoidal height of each point of `points_m`; NaN where the map has none."""
+        return read_only(np.concatenate([t.height_m for t in self.tracks]))
+
+    @cached_property
+    def _way(self) -> tuple[Floats, Floats]:
+        """Place of each point, and of the start of each track, on one way over all tracks, a metre between them."""
+        before = np.concatenate([[0.0], np.cumsum(self.length_m + 1.0)[:-1]])
+        return self.chainage_m + np.repeat(before, np.diff(self.first_point)), before
+
+    def course_on(self, track: Indices, chainage_m: Floats) -> tuple[Floats, Floats, Floats]:
+        """Points in plan, unit vectors along tracks there, both ECEF of shape (n, 3), and heights, shape (n,)."""
+        way, before = self._way
+        at = before[track] + np.clip(chainage_m, 0.0, self.length_m[track])
+        last = self.first_point[track + 1] - 2
+        segment = np.clip(np.searchsorted(way, at, side="right") - 1, self.first_point[track], last)
+        start, step = self.points_m[segment], self.points_m[segment + 1] - self.points_m[segment]
+        length = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
+        share = np.clip((at - way[segment]) / length, 0.0, 1.0)
+        height = self.height_m[segment] + share * (self.height_m[segment + 1] - self.height_m[segment])
+        return start + share[:, None] * step, step / length[:, None], height
+
     @property
     def frame(self) -> str:
         """Geographic CRS of the coordinates; MismatchError when the tracks are in different ones."""
@@ -282,8 +305,7 @@ class Network:
 def end_points(network: Network) -> tuple[Floats, Floats]:
     """Ends of tracks on the ellipsoid and unit vectors out of them, shapes (tracks, 2, 3)."""
     first, last = network.first_point[:-1], network.first_point[1:] - 1
-    before = np.concatenate([[0.0], np.cumsum(network.length_m + 1.0)[:-1]])
-    place = network.chainage_m + np.repeat(before, last - first + 1)
+    place, before = network._way
     inner = np.clip(np.searchsorted(place, before + _DIRECTION_M), first + 1, last)
     outer = np.clip(np.searchsorted(place, before + network.length_m - _DIRECTION_M, side="right") - 1, first, last - 1)
     points = network.points_m

@@ -1,46 +1,55 @@
 """Positions of a run on a network of tracks: the track of each, and how probable it is.
 
-A hidden Markov model over the log (Newson & Krumm 2009, doi:10.1145/1653771.1653818): a state is a track near the
-position or none of them; the likelihood is that of the distance in plan; a train changes to another track only over
-navigable connections whose way fits the distance run. Errors of neighbouring positions are common to them, so each
-position counts for the share of the correlation time that it covers.
+The states of the model and its probabilities are those of `railfix.track.network_decode`: a train changes to another
+track only over navigable connections whose way fits the distance run.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from os import PathLike
 from typing import Any, Final, Unpack
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import ending
-from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.io.named_columns import read_named_columns
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import positions_times, renamed
 from railfix.track.crs import kind_of_frame
 from railfix.track.frames import FrameShift, MapMotion, in_map_frame
 from railfix.track.network import Candidates, Network
+from railfix.track.network_decode import Residuals, Transitions, decode
 from railfix.track.track import ANOTHER_PLACE_M, SIGMA_PLAN_M
 
-#: Negative logarithm of the likelihood of a position on a track that the map does not have, beside one at distance 0.
-_UNMAPPED_COST: Final = 12.0
-#: Cost of passing from one track to another without a connection, and of leaving or entering the map.
-_JUMP_COST: Final = 18.0
-_LEAVE_COST: Final = 6.0
 #: Standard deviation of the distance of a position from its track where its log states none [m].
 SIGMA_M: Final = 2.0
-#: Way by which the connection between two places may exceed their straight distance [m], and its share of it: a bend
-#: between two positions, as in a tunnel.
-_SLACK_M: Final = 30.0
-_SLACK_SHARE: Final = 0.2
+#: Largest standard deviation of the common error of the positions, in plan and in height [m]: satellites, atmosphere,
+#: map and the antenna's height above the rails.
+_COMMON_M: Final = 2.0
+_COMMON_UP_M: Final = 4.0
+#: Share of the stated standard deviation that the common error has where it is smaller.
+_COMMON_SHARE: Final = 0.7
+#: Quantile of the stated standard deviations that the common error has where it is smaller.
+_BEST: Final = 0.1
+#: Least distance to which tracks are looked for [m], and farther ones in standard deviations and metres.
+_WITHIN_M: Final = 30.0
+_WITHIN_SIGMAS: Final = 5.0
+_FARTHEST_M: Final = 100.0
+#: Positions farther from all tracks than this many times that distance, for less than a time [s], are wrong.
+_FAR: Final = 4.0
+_WRONG_S: Final = 60.0
+#: Median of the absolute value of a normal variable.
+_NORMAL_MEDIAN: Final = 0.6745
+#: Tracks near a position that are looked at.
+_MOST_TRACKS: Final = 16
+#: Least difference of heights of two tracks near each other for which heights count [m].
+_APART_UP_M: Final = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +65,8 @@ class PlanLog:
         NaN where a row has no position.
     sigma_m : ndarray, shape (n,) [m]
         Standard deviation of one horizontal axis; NaN where the log has none.
+    height_m, sigma_up_m : ndarray, shape (n,) [m], or None
+        Ellipsoidal heights and their standard deviation, NaN as above; None where the log has no heights.
     """
 
     path: str
@@ -63,6 +74,8 @@ class PlanLog:
     latitude_deg: Floats
     longitude_deg: Floats
     sigma_m: Floats
+    height_m: Floats | None = None
+    sigma_up_m: Floats | None = None
 
     def in_frame_of(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
         """The positions, which are in the frame of the satellites, in that of the network.
@@ -78,10 +91,12 @@ class PlanLog:
                 "frame of the map (--same-frame)"
             )
         time = np.sort(times)[len(times) // 2] if len(times) else np.datetime64("now", "ns")
-        ecef = ecef_from_geodetic(self.latitude_deg, self.longitude_deg, np.zeros(len(self.latitude_deg)))
+        height = np.zeros(len(self.latitude_deg)) if self.height_m is None else self.height_m
+        ecef = ecef_from_geodetic(self.latitude_deg, self.longitude_deg, height)
         moved, shift = in_map_frame(ecef, network.frame, time, named=network.named, **motion)
-        latitude, longitude, _ = geodetic_from_ecef(moved)
-        return replace(self, latitude_deg=latitude, longitude_deg=longitude), shift
+        latitude, longitude, up = geodetic_from_ecef(moved)
+        height_m = None if self.height_m is None else up
+        return replace(self, latitude_deg=latitude, longitude_deg=longitude, height_m=height_m), shift
 
 
 def _check_region(network: Network, log: PlanLog) -> None:
@@ -146,9 +161,21 @@ def read_plan_positions(path: str | PathLike[str], *, columns: Mapping[str, str]
     elif columns:
         raise InputFileError(path, "columns can be renamed in a .csv file only")
     log = read_any_positions(path)
-    latitude, longitude, _ = geodetic_from_ecef(log.ecef_m)
-    sigma = np.sqrt((log.sigma_m[:, :2] ** 2).mean(axis=1))
-    return PlanLog(path=str(path), time=log.time, latitude_deg=latitude, longitude_deg=longitude, sigma_m=sigma)
+    return plan_log(str(path), log.time, log.ecef_m, log.sigma_m)
+
+
+def plan_log(path: str, time: Datetimes, ecef_m: Floats, sigma_m: Floats) -> PlanLog:
+    """Positions in plan with heights, of 3-D ones and their standard deviations north, east and up."""
+    latitude, longitude, height = geodetic_from_ecef(ecef_m)
+    return PlanLog(
+        path=path,
+        time=time,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        sigma_m=np.sqrt((sigma_m[:, :2] ** 2).mean(axis=1)),
+        height_m=height,
+        sigma_up_m=sigma_m[:, 2],
+    )
 
 
 def match(
@@ -156,10 +183,12 @@ def match(
     log: PlanLog,
     *,
     sigma_m: float | None = None,
-    within_m: float = 30.0,
+    within_m: float | None = None,
     correlation_s: float = 20.0,
 ) -> Matched:
     """Match positions of a run to the tracks of a network.
+
+    Heights count where both the log and all tracks have them, and tracks lie above each other.
 
     Parameters
     ----------
@@ -168,10 +197,10 @@ def match(
     sigma_m : float, optional [m]
         Standard deviation of the distance between position and track, map included; by default that of the log
         with `SIGMA_PLAN_M` of the map, and `SIGMA_M` where the log has none.
-    within_m : float [m]
-        Farthest track considered.
+    within_m : float, optional [m]
+        Farthest track considered; by default 30 m, or five standard deviations of nine positions of ten up to 100 m.
     correlation_s : float [s]
-        Time over which position errors persist.
+        Time over which position errors persist that are not common to minutes.
 
     Raises
     ------
@@ -181,31 +210,130 @@ def match(
     given = np.flatnonzero(np.isfinite(log.latitude_deg))
     if not len(given):
         raise MismatchError(f"{log.path}: has no position")
-    latitude, longitude = log.latitude_deg[given], log.longitude_deg[given]
-    candidates = network.near(latitude, longitude, within_m=within_m)
-    n, m = candidates.track.shape
-    point = ecef_from_geodetic(latitude, longitude, np.zeros(n))
+    sigma = np.full(len(given), sigma_m) if sigma_m is not None else np.hypot(log.sigma_m[given], SIGMA_PLAN_M)
+    sigma = np.where(np.isfinite(sigma), sigma, SIGMA_M)
+    if within_m is None:
+        within_m = float(np.clip(_WITHIN_SIGMAS * np.quantile(sigma, 1.0 - _BEST), _WITHIN_M, _FARTHEST_M))
+    candidates = _candidates(network, log.latitude_deg[given], log.longitude_deg[given], within_m)
+    lost = _is_wrong(candidates, log.time[given])
+    given, sigma = given[~lost], sigma[~lost]
+    candidates = Candidates(**{name: values[~lost] for name, values in vars(candidates).items()})
+    most = candidates.track.shape[1]
+    point = ecef_from_geodetic(log.latitude_deg[given], log.longitude_deg[given], np.zeros(len(given)))
     step = np.linalg.norm(np.diff(point, axis=0), axis=1)
-    seconds = np.diff(log.time[given]) / np.timedelta64(1, "s")
-    weight = np.concatenate([[1.0], np.clip(np.where(np.isfinite(seconds), seconds, 0.4) / correlation_s, 1e-3, 1.0)])
-    known = candidates.track >= 0
-    sigma = np.full(n, sigma_m) if sigma_m is not None else np.hypot(log.sigma_m[given], SIGMA_PLAN_M)
-    sigma = np.where(np.isfinite(sigma), sigma, SIGMA_M)[:, None]
-    cost = np.full((n, m + 1), np.inf)
-    cost[:, :m] = np.where(known, 0.5 * (np.where(known, candidates.offset_m, 0.0) / sigma) ** 2, np.inf)
-    cost[:, m] = _UNMAPPED_COST
-    path, gamma = _decode(cost * weight[:, None], _Transitions(network, candidates, step))
-    rows, mapped = np.arange(n), path < m
-    column = np.minimum(path, m - 1)
+    residuals = _residuals(network, log, given, candidates, point, sigma, correlation_s)
+    if sigma_m is None and np.isfinite(log.sigma_m[given]).any():
+        residuals = replace(residuals, sigma_m=sigma * _scale(residuals, candidates.track, correlation_s))
+    path, gamma = decode(residuals, Transitions(network, candidates, step))
+    rows, mapped = np.arange(len(given)), path < most
+    column = np.minimum(path, most - 1)
     found = Matched(
         track=np.where(mapped, candidates.track[rows, column], -1),
         chainage_m=np.where(mapped, candidates.chainage_m[rows, column], np.nan),
         offset_m=np.where(mapped, candidates.offset_m[rows, column], np.nan),
         probability=gamma[rows, path],
         candidates=candidates,
-        probabilities=gamma[:, :m],
+        probabilities=gamma[:, :most],
     )
-    return found if n == len(log.time) else _spread(found, given, len(log.time))
+    return found if len(given) == len(log.time) else _spread(found, given, len(log.time))
+
+
+def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, within_m: float) -> Candidates:
+    """Tracks near each position; farther ones, too, where it lies far from all: the track on which it is still counts.
+
+    Without columns that no row needs.
+    """
+    near = network.near(latitude_deg, longitude_deg, within_m=within_m, most=_MOST_TRACKS)
+    far = np.abs(near.offset_m[:, 0]) > 0.5 * within_m
+    if far.any():
+        more = network.near(latitude_deg[far], longitude_deg[far], within_m=_FAR * within_m, most=_MOST_TRACKS)
+        for name, values in vars(near).items():
+            values[far] = getattr(more, name)
+    most = max(int((near.track >= 0).sum(axis=1).max()), 1)
+    return Candidates(**{name: values[:, :most] for name, values in vars(near).items()})
+
+
+def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
+    """Whether a position far from all tracks is wrong: those before and after it, within `_WRONG_S`, are near some."""
+    near = np.flatnonzero(candidates.track[:, 0] >= 0)
+    if not len(near):
+        return np.zeros(len(time), dtype=np.bool_)
+    after = np.searchsorted(near, np.arange(len(time)))
+    before, after = near[np.maximum(after - 1, 0)], near[np.minimum(after, len(near) - 1)]
+    inside = (before < np.arange(len(time))) & (after > np.arange(len(time)))
+    return np.asarray(inside & ((time[after] - time[before]) / np.timedelta64(1, "s") <= _WRONG_S))
+
+
+def _scale(residuals: Residuals, track: Indices, correlation_s: float) -> float:
+    """How much larger than stated errors are, at least 1.
+
+    By the median change of the distance from the nearest track over the time for which an error persists.
+    """
+    seconds, distance = np.cumsum(residuals.seconds), residuals.offset_m
+    rows = np.arange(len(seconds))
+    later = np.minimum(np.searchsorted(seconds, seconds + correlation_s), len(rows) - 1)
+    same = (track[later] == track[:, :1]) & (track[:, :1] >= 0)
+    row = np.flatnonzero(same.any(axis=1) & (later > rows))
+    after = later[row]
+    change = distance[after, np.argmax(same[row], axis=1)] - distance[row, 0]
+    return _median_scale(change / np.hypot(residuals.sigma_m[after], residuals.sigma_m[row]))
+
+
+def _median_scale(ratio: Floats) -> float:
+    """How much larger than normal, of variance 1, values are by their median, at least 1."""
+    ratio = np.abs(ratio[np.isfinite(ratio)])
+    return max(1.0, float(np.median(ratio)) / _NORMAL_MEDIAN) if len(ratio) else 1.0
+
+
+def _residuals(
+    network: Network,
+    log: PlanLog,
+    given: Indices,
+    candidates: Candidates,
+    point_m: Floats,
+    sigma_m: Floats,
+    correlation_s: float,
+) -> Residuals:
+    """The positions of some rows of a log beside their candidates."""
+    known = candidates.track >= 0
+    row = np.nonzero(known)[0]
+    track, chainage = candidates.track[known], candidates.chainage_m[known]
+    at, ahead, height = network.course_on(track, chainage)
+    axes = enu_axes(log.latitude_deg[given], log.longitude_deg[given])[row, :2]
+    away, along = ((axes @ vector[..., None])[..., 0] for vector in (point_m[row] - at, ahead))
+    right = np.stack([along[:, 1], -along[:, 0]], axis=-1)
+    beyond = np.einsum("ij,ij->i", away, along)
+    outward = np.where(beyond > 0.0, chainage >= network.length_m[track] - 1e-6, chainage <= 1e-6)
+
+    def over(values: Floats, empty: float) -> Floats:
+        full = np.full((*known.shape, *values.shape[1:]), empty)
+        full[known] = values
+        return full
+
+    offset = over(np.einsum("ij,ij->i", away, right), np.inf)
+    above = over(np.full(len(row), np.nan) if log.height_m is None else log.height_m[given[row]] - height, np.nan)
+    spread = np.nanmax(above, axis=1, initial=-np.inf) - np.nanmin(above, axis=1, initial=np.inf)
+    counts = not np.isnan(network.height_m).any() and bool((spread > _APART_UP_M).any())
+    seconds = np.concatenate([[0.0], np.diff(log.time[given]) / np.timedelta64(1, "s")])
+    seconds = np.round(np.where(np.isfinite(seconds), seconds, 0.4), 1).astype(np.float64)
+    weight = np.clip(seconds / correlation_s, 1e-3, 1.0)
+    weight[0] = 1.0
+    sigma_up = np.full(len(given), np.nan) if log.sigma_up_m is None else log.sigma_up_m[given]
+    sigma_up = np.where(np.isfinite(sigma_up), sigma_up, 2.0 * sigma_m)
+    # reflections put heights off to one side for minutes
+    sigma_up = sigma_up * _median_scale(np.nanmin(np.abs(above), axis=1, initial=np.inf) / sigma_up)
+    return Residuals(
+        across=over(right, 0.0),
+        offset_m=offset,
+        beyond_m=over(np.where(outward, beyond, 0.0), 0.0),
+        above_m=above,
+        sigma_m=sigma_m,
+        sigma_up_m=sigma_up,
+        weight=weight,
+        seconds=seconds,
+        common_m=float(min(_COMMON_SHARE * np.quantile(sigma_m, _BEST), _COMMON_M)),
+        common_up_m=max(_COMMON_SHARE * float(np.quantile(sigma_up, _BEST)), _COMMON_UP_M) if counts else 0.0,
+    )
 
 
 def _spread(matched: Matched, rows: Indices, count: int) -> Matched:
@@ -227,139 +355,3 @@ def _spread(matched: Matched, rows: Indices, count: int) -> Matched:
         ),
         probabilities=over(matched.probabilities, np.nan),
     )
-
-
-class _Transitions:
-    """Cost of each passage from the candidates of an epoch to those of the next."""
-
-    def __init__(self, network: Network, candidates: Candidates, step_m: Floats) -> None:
-        self._network = network
-        self._track, self._place = candidates.track, candidates.chainage_m
-        self._reach = (1.0 + _SLACK_SHARE) * step_m + _SLACK_M
-        #: Ways from an end of a track to the ends of others, and how far they were looked for.
-        self._ways: dict[tuple[int, int], tuple[float, dict[int, float]]] = {}
-        self._rest = np.where(self._track >= 0, network.length_m[self._track], np.nan) - self._place
-        to_end = np.fmin(self._place, self._rest)
-        #: Whether an end of the track is within reach, before and after each passage, shapes (n - 1, m).
-        self._leaves = to_end[:-1] <= self._reach[:, None]
-        self._enters = to_end[1:] <= self._reach[:, None]
-
-    def __call__(self, k: int) -> Floats:
-        """Costs from epoch k to k + 1, shape (m + 1, m + 1)."""
-        before, after = self._track[k], self._track[k + 1]
-        m = len(before)
-        same = (before[:, None] == after) & (before[:, None] >= 0)
-        cost = np.full((m + 1, m + 1), _LEAVE_COST)
-        cost[m, m] = 0.0
-        cost[:m, :m] = np.where(same, 0.0, _JUMP_COST)
-        for i, j in np.argwhere(self._leaves[k][:, None] & self._enters[k] & ~same).tolist():
-            if self._connected(k, i, j):
-                cost[i, j] = 0.0
-        return cost
-
-    def _connected(self, k: int, i: int, j: int) -> bool:
-        """Whether a train can have run from one place to the other in the distance between two positions."""
-        a, b, reach = int(self._track[k, i]), int(self._track[k + 1, j]), float(self._reach[k])
-        for end, rest in enumerate((float(self._place[k, i]), float(self._rest[k, i]))):
-            if rest > reach:
-                continue
-            ways = self._from(a, end, reach)
-            for entry, into in enumerate((float(self._place[k + 1, j]), float(self._rest[k + 1, j]))):
-                if rest + ways.get(4 * b + 2 * entry, np.inf) + into <= reach:
-                    return True
-        return False
-
-    def _from(self, track: int, end: int, reach_m: float) -> dict[int, float]:
-        import networkx as nx
-
-        searched, ways = self._ways.get((track, end), (-1.0, {}))
-        node = 4 * track + 2 * end + 1
-        if searched < reach_m and node in self._network.graph:
-            ways = dict(nx.single_source_dijkstra_path_length(self._network.graph, node, cutoff=reach_m))
-            self._ways[track, end] = (reach_m, ways)
-        return ways
-
-
-def _decode(cost: Floats, moves: _Transitions) -> tuple[Indices, Floats]:
-    """Most probable sequence of states (Viterbi) and the probability of each state (forward, backward)."""
-    n, states = cost.shape
-    best, back = cost[0].copy(), np.zeros((n, states), dtype=np.intp)
-    forward = np.zeros((n, states))
-    forward[0] = _normal(np.exp(-(cost[0] - cost[0].min())))
-    passages = []
-    for k in range(1, n):
-        move = moves(k - 1)
-        passages.append(np.exp(-move))
-        total = best[:, None] + move
-        back[k] = np.argmin(total, axis=0)
-        best = total[back[k], np.arange(states)] + cost[k]
-        forward[k] = _normal((forward[k - 1] @ passages[-1]) * np.exp(-(cost[k] - cost[k].min())))
-    backward = np.ones((n, states))
-    for k in range(n - 2, -1, -1):
-        backward[k] = _normal(passages[k] @ (np.exp(-(cost[k + 1] - cost[k + 1].min())) * backward[k + 1]))
-    gamma = forward * backward
-    path = np.zeros(n, dtype=np.intp)
-    path[-1] = int(np.argmin(best))
-    for k in range(n - 1, 0, -1):
-        path[k - 1] = back[k, path[k]]
-    return path, gamma / gamma.sum(axis=1, keepdims=True)
-
-
-def _normal(weights: Floats) -> Floats:
-    return np.asarray(weights / weights.sum())
-
-
-def route_of(network: Network, matched: Matched) -> tuple[list[int], list[int]]:
-    """Tracks that a run passed, in the order of travel, and those that it may have passed but no route can join to
-    them.
-
-    Gaps are filled with the shortest way over navigable connections. A train that runs back over tracks it has
-    passed stays on the same route; where it runs back over others, the map has a gap, or positions jump to a track
-    beside, the less probable ones are left out. The route is empty where no position is on a track.
-    """
-    seen = matched.track[matched.track >= 0]
-    if not len(seen):
-        return [], []
-    passed = [int(t) for t in seen[np.concatenate([[True], np.diff(seen) != 0])]]
-    if (route := network.route_over(passed)) is not None:
-        return route, []
-    share = {t: float(matched.probabilities[matched.candidates.track == t].sum()) for t in set(passed)}
-    # the train turned back, the map has a gap, or positions lay on a track that was not passed
-    routes = [*_legs(network, passed), *(_most_of(network, order, share) for order in (passed, passed[::-1]))]
-    route = max(routes, key=lambda leg: sum(share.get(t, 0.0) for t in set(leg)))
-    return route, [t for t in dict.fromkeys(passed) if t not in route]
-
-
-def _legs(network: Network, passed: list[int]) -> list[list[int]]:
-    """The longest parts of a sequence of tracks that are a route."""
-    legs: list[list[int]] = []
-    start = 0
-    while start < len(passed):
-        rest = passed[start:]
-        # the longest prefix that is a route: every prefix of one is
-        count = bisect_left(range(2, len(rest) + 1), 1, key=partial(_ends_a_leg, network, rest)) + 1
-        legs.append(network.shortest_route(rest[:count]))
-        if count == len(rest):
-            break
-        start += max(count - 1, 1)
-    return legs
-
-
-def _most_of(network: Network, passed: list[int], share: Mapping[int, float]) -> list[int]:
-    """A route over the most probable tracks, in the order in which each first comes: every part of one is a route."""
-    rest, kept = sorted(share, key=lambda track: -share[track]), list[int]()
-
-    def is_none(count: int) -> int:
-        wanted = {*kept, *rest[:count]}
-        return int(network.route_over([t for t in dict.fromkeys(passed) if t in wanted]) is None)
-
-    while rest:
-        count = bisect_left(range(1, len(rest) + 1), 1, key=is_none)
-        kept += rest[:count]
-        rest = rest[count + 1 :]
-    return network.shortest_route([t for t in dict.fromkeys(passed) if t in kept])
-
-
-def _ends_a_leg(network: Network, passed: list[int], count: int) -> int:
-    """1 where no route leads over the first tracks, else 0."""
-    return int(network.route_over(passed[:count]) is None)

@@ -1,0 +1,315 @@
+"""Probability of each track at each position of a log, with an error that the positions have in common.
+
+A hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818) whose state is a track near the position, or
+none of the map, and the common error of the positions, that of satellites, atmosphere and map: it lasts for minutes, so
+that positions beside a track are no new evidence each second. The common error is a first-order Gauss-Markov process
+east, north and, where heights tell tracks apart, up, on a lattice (Ehrenfest's urn, which has its mean and correlation
+exactly; Kac 1947, doi:10.2307/2304386). What is left of each position, multipath above all, has heavy tails
+(Student's t) and lasts for `correlation_s`, of which each position has its share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices, Masks, read_only
+from railfix.track.network import Candidates, Network
+
+#: Negative logarithm of the likelihood of a position on a track that the map does not have, beside one at distance 0:
+#: that of a position 5 standard deviations from its track.
+_UNMAPPED_COST: Final = 5.0
+#: Degrees of freedom of the errors of positions.
+_FREEDOM: Final = 8.0
+#: Negative logarithms of the probability, from a position to the next, of passing to another track without connection,
+#: of leaving the map and of entering it: to a track beside by way of none is as improbable as the jump.
+_JUMP_COST: Final = 17.0
+_LEAVE_COST: Final = 12.0
+_ENTER_COST: Final = 5.0
+#: Way by which the connection between two places may exceed their straight distance [m], and its share of it: a bend
+#: between two positions, as in a tunnel.
+_SLACK_M: Final = 30.0
+_SLACK_SHARE: Final = 0.2
+#: Difference of way and distance at which a joint is half as probably passed as where they agree [m].
+_PASSING_M: Final = 5.0
+#: What a change of track has to gain, in positions on the right track.
+_CHANGE: Final = 0.5
+#: Time over which the common error lasts [s].
+COMMON_S: Final = 600.0
+#: Balls of the urn of one horizontal axis, and of the vertical one: a quarter of them is the variance in steps.
+_BALLS: Final = 12
+_BALLS_UP: Final = 8
+#: Positions whose probabilities are in memory at a time, where heights do not count.
+_BLOCK: Final = 4096
+
+
+@dataclass(frozen=True, kw_only=True)
+class Residuals:
+    """Positions beside their candidates, n rows with up to m candidates each.
+
+    Attributes
+    ----------
+    across : ndarray, shape (n, m, 2)
+        Unit vector across the track at the nearest point, east and north.
+    offset_m : ndarray, shape (n, m)
+        From the track to the position along it; infinite without a candidate.
+    beyond_m : ndarray, shape (n, m)
+        How far the position lies beyond an end of the track, along it; 0 beside the track.
+    above_m : ndarray, shape (n, m)
+        Height of the position above the track; NaN where one has none.
+    sigma_m, sigma_up_m : ndarray, shape (n,)
+        Standard deviation of one horizontal axis and of the height.
+    weight : ndarray, shape (n,)
+        Share of the correlation time that the position covers.
+    seconds : ndarray, shape (n,)
+        Since the position before.
+    common_m, common_up_m : float
+        Standard deviation of the common error, of one horizontal axis and of the height; 0 where heights count not.
+    """
+
+    across: Floats
+    offset_m: Floats
+    beyond_m: Floats
+    above_m: Floats
+    sigma_m: Floats
+    sigma_up_m: Floats
+    weight: Floats
+    seconds: Floats
+    common_m: float
+    common_up_m: float
+
+
+class Transitions:
+    """Probability of each passage from the candidates of an epoch to those of the next."""
+
+    def __init__(self, network: Network, candidates: Candidates, step_m: Floats) -> None:
+        self._network, self._step = network, step_m
+        self._track, self._place = candidates.track, candidates.chainage_m
+        self._reach = (1.0 + _SLACK_SHARE) * step_m + _SLACK_M
+        #: Ways from an end of a track to the ends of others, and how far they were looked for.
+        self._ways: dict[tuple[int, int], tuple[float, dict[int, float]]] = {}
+        self._rest = np.where(self._track >= 0, network.length_m[self._track], np.nan) - self._place
+        to_end = np.fmin(self._place, self._rest)
+        #: Whether an end of the track is within reach, before and after each passage, shapes (n - 1, m).
+        self._leaves = to_end[:-1] <= self._reach[:, None]
+        self._enters = to_end[1:] <= self._reach[:, None]
+
+    @cached_property
+    def changes(self) -> Masks:
+        """Whether each passage is to another track, or to or from none, shape (n - 1, m + 1, m + 1)."""
+        state = np.column_stack([np.where(self._track < 0, -2, self._track), np.full(len(self._track), -1)])
+        return np.asarray(state[:-1, :, None] != state[1:, None, :])
+
+    def __call__(self, k: int) -> Floats:
+        """Probabilities from epoch k to k + 1, shape (m + 1, m + 1), row by row."""
+        before, after = self._track[k], self._track[k + 1]
+        m = len(before)
+        same = (before[:, None] == after) & (before[:, None] >= 0)
+        share = np.full((m + 1, m + 1), np.exp(-_LEAVE_COST))
+        share[m] = np.where(np.arange(m + 1) < m, np.exp(-_ENTER_COST), 1.0)
+        share[:m, :m] = np.where(same, 1.0, np.exp(-_JUMP_COST))
+        for i, j in np.argwhere(self._leaves[k][:, None] & self._enters[k] & ~same).tolist():
+            way = self._way(k, i, j)
+            if way <= self._reach[k]:
+                share[i, j] = 1.0 / (1.0 + ((way - self._step[k]) / _PASSING_M) ** 2)
+        return np.asarray(share / share.sum(axis=1, keepdims=True))
+
+    def _way(self, k: int, i: int, j: int) -> float:
+        """Way between two places over ends of tracks [m], infinite beyond reach: about the distance of the positions
+        where a train passes the joint between them.
+        """
+        a, b, reach = int(self._track[k, i]), int(self._track[k + 1, j]), float(self._reach[k])
+        least = np.inf
+        for end, rest in enumerate((float(self._place[k, i]), float(self._rest[k, i]))):
+            if rest > reach:
+                continue
+            ways = self._from(a, end, reach)
+            for entry, into in enumerate((float(self._place[k + 1, j]), float(self._rest[k + 1, j]))):
+                least = min(least, rest + ways.get(4 * b + 2 * entry, np.inf) + into)
+        return least
+
+    def _from(self, track: int, end: int, reach_m: float) -> dict[int, float]:
+        import networkx as nx
+
+        searched, ways = self._ways.get((track, end), (-1.0, {}))
+        node = 4 * track + 2 * end + 1
+        if searched < reach_m and node in self._network.graph:
+            ways = dict(nx.single_source_dijkstra_path_length(self._network.graph, node, cutoff=reach_m))
+            self._ways[track, end] = (reach_m, ways)
+        return ways
+
+
+@lru_cache(maxsize=256)
+def _urn(balls: int, seconds: float) -> tuple[Floats, Floats]:
+    """Shares of the states of an urn in equilibrium, and its passages after a time, from row to column.
+
+    Each ball is put into either side at the rate of the correlation time's inverse, independently of the others.
+    """
+    change = 0.5 * (1.0 - np.exp(-seconds / COMMON_S))
+    passages = [
+        np.convolve(_binomial(inside, 1.0 - change), _binomial(balls - inside, change)) for inside in range(balls + 1)
+    ]
+    return read_only(_binomial(balls, 0.5)), read_only(np.array(passages))
+
+
+def _binomial(count: int, share: float) -> Floats:
+    values = np.ones(1)
+    for _ in range(count):
+        values = np.convolve(values, [1.0 - share, share])
+    return values
+
+
+@lru_cache(maxsize=64)
+def _passages_in_plan(seconds: float) -> Floats:
+    axis = _urn(_BALLS, seconds)[1]
+    return read_only(np.kron(axis, axis))
+
+
+class _CommonError:
+    """The lattice of the common error: C places in plan by U heights.
+
+    Attributes
+    ----------
+    plan_m : ndarray, shape (C, 2)
+    up_m : ndarray, shape (U,)
+        One place where heights do not count.
+    first : ndarray, shape (C, U)
+        Probabilities before any position.
+    """
+
+    def __init__(self, residuals: Residuals) -> None:
+        self._balls_up = _BALLS_UP if residuals.common_up_m > 0.0 else 0
+        steps = _places(_BALLS, residuals.common_m)
+        self.plan_m = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+        self.up_m = _places(self._balls_up, residuals.common_up_m)
+        plan = _urn(_BALLS, 0.0)[0]
+        self.first = np.outer(np.outer(plan, plan), _urn(self._balls_up, 0.0)[0])
+
+    def later(self, share: Floats, seconds: float) -> Floats:
+        """Probabilities after a time, shape (..., C, U)."""
+        plan = _passages_in_plan(seconds)
+        if not self._balls_up:
+            return np.asarray((share[..., 0] @ plan)[..., None])
+        return np.asarray(np.matmul(plan.T, share) @ _urn(self._balls_up, seconds)[1])
+
+    def earlier(self, value: Floats, seconds: float) -> Floats:
+        """What is expected, a time before, of values of shape (..., C, U)."""
+        plan = _passages_in_plan(seconds)
+        if not self._balls_up:
+            return np.asarray((value[..., 0] @ plan.T)[..., None])
+        return np.asarray(np.matmul(plan, value) @ _urn(self._balls_up, seconds)[1].T)
+
+
+def _places(balls: int, sigma_m: float) -> Floats:
+    """States of an urn in metres."""
+    return np.asarray((np.arange(balls + 1) - balls / 2.0) * (2.0 * sigma_m / np.sqrt(max(balls, 1))))
+
+
+def _student(square: Floats) -> Floats:
+    """Negative logarithm of the likelihood of squares of normalized errors, 0 for none."""
+    return np.asarray(0.5 * (_FREEDOM + 1.0) * np.log1p(square / _FREEDOM))
+
+
+def _likelihood(residuals: Residuals, lattice: _CommonError, k: int) -> Floats:
+    """Of a position given each state, shape (m + 1, C, U), up to a factor."""
+    known = np.flatnonzero(np.isfinite(residuals.offset_m[k]))
+    across, beyond = residuals.across[k, known], residuals.beyond_m[k, known, None]
+    square = (residuals.offset_m[k, known, None] - across @ lattice.plan_m.T) ** 2
+    if beyond.any():
+        # the common error may lie along the track, too: what is left of the way beyond the end counts
+        along = np.stack([-across[:, 1], across[:, 0]], axis=-1) @ lattice.plan_m.T
+        square += np.where(beyond != 0.0, np.maximum(np.abs(beyond) - np.sign(beyond) * along, 0.0), 0.0) ** 2
+    cost = np.full((residuals.offset_m.shape[1] + 1, *lattice.first.shape), np.inf)
+    cost[-1] = _UNMAPPED_COST
+    cost[known] = _student(square / residuals.sigma_m[k] ** 2)[..., None]
+    if len(lattice.up_m) > 1:
+        above = (residuals.above_m[k, known, None] - lattice.up_m) / residuals.sigma_up_m[k]
+        cost[known] += np.where(np.isnan(above), 0.0, _student(above**2))[:, None]
+    return np.asarray(np.exp(-residuals.weight[k] * (cost - cost.min())))
+
+
+def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
+    """Track of each position, and the probability of each track given the whole log.
+
+    The tracks are the sequence of which the most pairs of neighbours are expected to be right.
+
+    Returns
+    -------
+    path : ndarray of int, shape (n,)
+        Column of the candidate; m for none.
+    probability : ndarray, shape (n, m + 1)
+    """
+    n, m = residuals.offset_m.shape
+    lattice = _CommonError(residuals)
+    length = _BLOCK // len(lattice.up_m)
+    # of a long log the first positions of the blocks are kept, and each block is passed again on the way back
+    firsts: dict[int, Floats | None] = {0: None}
+    if n > length:
+        firsts |= {k: at.share for k, at in _forward(residuals, moves, lattice, 0, None, n) if k and k % length == 0}
+    probability, pairs = np.empty((n, m + 1)), np.empty((n - 1, m + 1, m + 1))
+    after = expected = np.ones((m + 1, *lattice.first.shape))
+    move = np.eye(m + 1)
+    for start in reversed(firsts):
+        block = [at for _, at in _forward(residuals, moves, lattice, start, firsts[start], min(start + length, n))]
+        for k in reversed(range(start, start + len(block))):
+            at = block.pop()
+            if k < n - 1:
+                seconds = float(residuals.seconds[k + 1])
+                if k == start + length - 1:
+                    move = moves(k)
+                pairs[k] = move * (lattice.later(at.share, seconds).reshape(m + 1, -1) @ expected.reshape(m + 1, -1).T)
+                after = (move @ lattice.earlier(expected, seconds).reshape(m + 1, -1)).reshape(after.shape)
+                after /= after.max()
+            probability[k] = (at.share * after).sum(axis=(1, 2))
+            expected, move = at.likelihood * after, at.move
+    probability /= probability.sum(axis=1, keepdims=True)
+    return _sequence(probability, pairs, moves.changes), probability
+
+
+@dataclass(frozen=True)
+class _At:
+    """One position going forward: probabilities of all states given the positions so far and its likelihood, shapes
+    (m + 1, C, U), and the passages to it, shape (m + 1, m + 1).
+    """
+
+    share: Floats
+    likelihood: Floats
+    move: Floats
+
+
+def _forward(
+    residuals: Residuals, moves: Transitions, lattice: _CommonError, start: int, first: Floats | None, stop: int
+) -> Iterator[tuple[int, _At]]:
+    """Positions from one, where all states have given probabilities, to before another."""
+    states = residuals.offset_m.shape[1] + 1
+    share, move = first, np.eye(states)
+    for k in range(start, stop):
+        likelihood = _likelihood(residuals, lattice, k)
+        if share is None:
+            entered = np.where(np.arange(states) < states - 1, 1.0, np.exp(-_ENTER_COST))
+            share = entered[:, None, None] * lattice.first * likelihood
+        elif k > start:
+            move = moves(k - 1)
+            passed = lattice.later(share, float(residuals.seconds[k]))
+            share = (move.T @ passed.reshape(states, -1)).reshape(passed.shape) * likelihood
+        share = share / share.sum()
+        yield k, _At(share, likelihood, move)
+
+
+def _sequence(probability: Floats, pairs: Floats, changes: Masks) -> Indices:
+    """The sequence of which the most neighbouring pairs are expected to be right, less `_CHANGE` for each change."""
+    n, states = probability.shape
+    best, back = np.zeros(states), np.zeros((n, states), dtype=np.intp)
+    for k in range(1, n):
+        total = best[:, None] + pairs[k - 1] / pairs[k - 1].sum() - np.where(changes[k - 1], _CHANGE, 0.0)
+        back[k] = np.argmax(total, axis=0)
+        best = total[back[k], np.arange(states)]
+    path = np.zeros(n, dtype=np.intp)
+    path[-1] = int(np.argmax(best if n > 1 else probability[0]))
+    for k in range(n - 1, 0, -1):
+        path[k - 1] = back[k, path[k]]
+    return path
