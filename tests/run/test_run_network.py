@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 from typer.testing import CliRunner
 
-from network_made import made_network, made_run, write_stations
+from network_made import made_network, made_run, segment, to_degrees, write_stations
 from railfix.cli import app
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
@@ -28,6 +28,7 @@ from railfix.track import read_track
 from railfix.track.frames import points_at
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, match
+from railfix.track.network_read import links_of_ends
 from railfix.track.network_route import route_of
 
 pytestmark = pytest.mark.requirement("A10")
@@ -113,11 +114,24 @@ def test_beside_the_route_no_position_is_ok_and_nothing_bounds_it(
     summary = run_files(inputs, Config(filter="track"), out=tmp_path / "results", options=ELLIPSOIDAL)
     for table, passed in (("positions", "ok"), ("train", "tracking")):
         rows = pl.read_parquet(summary.files[f"{table}.parquet"])
-        beside = rows.filter(pl.col("track_probability") < 0.5)
+        beside = rows.filter(pl.col("track_probability") < 1.0 - Config().track_risk)
         assert len(beside) > 20
         assert passed not in beside["status"].to_list()
         assert not beside["protection_level_m"].is_finite().any()
-        assert (rows.filter(pl.col("track_probability") > 0.99)["status"] == passed).any()
+        assert (rows.filter(pl.col("track_probability") > 0.999)["status"] == passed).any()
+
+
+def test_a_loop_that_is_possible_leaves_no_position_ok(near: tuple[RunInputs, RunSummary]) -> None:
+    """The loop is 4.5 m from the track driven: likelier than the risk, less likely than that track."""
+    _, summary = near
+    for table, passed in (("positions", "ok"), ("train", "tracking")):
+        rows = pl.read_parquet(summary.files[f"{table}.parquet"])
+        on_main = rows.filter((pl.col("track") == "main 0") & (pl.col("track_probability") < 0.99))
+        assert len(on_main) > 20
+        assert (on_main["track_probability"] > 0.5).all()
+        assert passed not in on_main["status"].to_list()
+        assert not on_main["protection_level_m"].is_finite().any()
+        assert passed in rows.filter(pl.col("track") == "line 0")["status"].to_list()
 
 
 def test_evaluation_reads_the_track_that_the_run_wrote(near: tuple[RunInputs, RunSummary]) -> None:
@@ -218,6 +232,24 @@ def test_a_jump_to_a_track_beside_cuts_no_connected_route(jump: tuple[int, int, 
         found = replace(matched, track=track[turn])
         route, left_out = route_of(net, found)
         assert (route, left_out) == ([0, 1, 3, 4, 6][turn], [2])
+
+
+def test_a_closed_route_driven_three_times_passes_each_track_once() -> None:
+    """A ring of two halves and a loop beside the second, which the train takes on its second round."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 181)
+    east, north = 500.0 * np.sin(turn), 500.0 * np.cos(turn)
+    wider = 1.0 + 0.03 * np.sin(turn[90:] - np.pi)
+    tracks = (
+        segment("first", *to_degrees(east[:91], north[:91])),
+        segment("second", *to_degrees(east[90:], north[90:])),
+        segment("loop", *to_degrees(east[90:] * wider, north[90:] * wider)),
+    )
+    net = Network(tracks=tracks, links=())
+    net = replace(net, links=links_of_ends(net))
+    log, on = made_run(net, [0, 1, 0, 2, 0, 1, 0], rng=np.random.default_rng(2), sigma_m=0.2)
+    matched = match(net, log)
+    assert (matched.track == on).mean() > 0.98
+    assert route_of(net, matched) == ([0, 1], [2])
 
 
 def test_a_gap_in_the_map_ends_the_route_and_is_said() -> None:

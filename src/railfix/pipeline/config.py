@@ -134,6 +134,9 @@ class Config(ScreenSettings):
     off_map_s : float [s]
         Time of positions off the map after which the filter gives up its place, and of others after which it begins
         anew. On the recordings, with a right map, no two positions in a row are off it.
+    track_risk : float
+        On a network: no position is `ok` or `tracking`, and none has a level, where another track than the route's, or
+        none of the map, is more probable; `railfix which-track` allows the same.
     ionosphere : {"klobuchar", "off"}
         Model of the delay.
     troposphere : {"saastamoinen", "off"}
@@ -210,6 +213,7 @@ class Config(ScreenSettings):
     dilution_limit: float = Field(default=20.0, gt=0)
     off_map_risk: float = Field(default=1e-6, gt=0, lt=1)
     off_map_s: float = Field(default=10.0, gt=0)
+    track_risk: float = Field(default=1e-3, gt=0, lt=1)
     ionosphere: Literal["klobuchar", "off"] = "klobuchar"
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"
     max_ephemeris_age_s: float | None = Field(default=None, gt=0)

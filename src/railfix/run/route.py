@@ -32,8 +32,6 @@ from railfix.track.network_route import route_of
 
 #: Interval of the positions that are matched [s].
 _INTERVAL_S: Final = 1.0
-#: Probability of the route below which another track, or none of the map, is likelier.
-LEAST_OF_ROUTE: Final = 0.5
 #: Least probability of a track beside the route that is written and named.
 _LEAST_WRITTEN: Final = 1e-4
 _LEAST_NAMED: Final = 0.01
@@ -122,9 +120,16 @@ class RouteOfLog:
         """Probability of the route at each matched position, shape (n,)."""
         return np.asarray((self.matched.probabilities * self._on_route).sum(axis=1))
 
-    def is_beside(self, time: Datetimes) -> Masks:
-        """Whether the log was on another track than the route's, or on none of the map, rather than on it."""
-        return np.asarray(self.probability[self._nearest_epoch(time)] < LEAST_OF_ROUTE)
+    def is_uncertain(self, time: Datetimes, *, risk: float) -> Masks:
+        """Whether another track than the route's, or none of the map, is more probable than a risk.
+
+        At the positions matched before and after each time: the track between two that are known may be another.
+        """
+        after = np.searchsorted(self.log.time, time)
+        least = np.fmin(
+            *(self.probability[np.clip(k, 0, len(self.log.time) - 1)] for k in (np.maximum(after - 1, 0), after))
+        )
+        return np.asarray(least < 1.0 - risk)
 
     @cached_property
     def unmapped(self) -> Floats:
@@ -295,6 +300,8 @@ def find_route(
         raise MismatchError(f"{path}: the log has no position, so that no route through the network can be found")
     positions, _ = plan_log(path, times, ecef, sigma).in_frame_of(network, **reading.motion)
     matched = match(network, positions)
+    used = np.flatnonzero(np.isfinite(matched.probability))
+    positions, matched = positions.take(used), matched.take(used)
     tracks, left_out = route_of(network, matched)
     if not tracks:
         raise MismatchError(

@@ -77,6 +77,11 @@ class PlanLog:
     height_m: Floats | None = None
     sigma_up_m: Floats | None = None
 
+    def take(self, rows: Indices) -> PlanLog:
+        """Return some of the positions."""
+        columns: dict[str, Any] = {name: v[rows] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return replace(self, **columns)
+
     def in_frame_of(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
         """The positions, which are in the frame of the satellites, in that of the network.
 
@@ -128,7 +133,8 @@ class Matched:
     chainage_m, offset_m : ndarray, shape (n,)
         On that track, and distance in plan, positive to its right; NaN without a track.
     probability : ndarray, shape (n,)
-        Of that track given the whole log; NaN where there is no position.
+        Of that track given the whole log; NaN where there is no position, or a wrong one: for less than a minute
+        farther from all tracks than four times `within_m`, and near some before and after.
     candidates : Candidates
     probabilities : ndarray, shape (n, m)
         Of each candidate; the rest to 1 is that of no mapped track. NaN where there is no position.
@@ -140,6 +146,12 @@ class Matched:
     probability: Floats
     candidates: Candidates
     probabilities: Floats
+
+    def take(self, rows: Indices) -> Matched:
+        """Return some of the positions."""
+        near = Candidates(**{name: values[rows] for name, values in vars(self.candidates).items()})
+        own = {name: values[rows] for name, values in vars(self).items() if name != "candidates"}
+        return Matched(**own, candidates=near)
 
 
 def read_plan_positions(path: str | PathLike[str], *, columns: Mapping[str, str] | None = None) -> PlanLog:
