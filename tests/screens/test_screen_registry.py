@@ -1,4 +1,4 @@
-"""A screen of one's own is one module and one entry point: the blocks of docs/screens.md, installed beside railfix."""
+"""A screen of one's own is one module and one entry point: those of docs/screens.md, installed beside railfix."""
 
 from __future__ import annotations
 
@@ -49,7 +49,8 @@ def test_reasons_of_added_screens_have_bits_of_their_own() -> None:
 def example(folder: Path) -> Path:
     """The screen of docs/screens.md as an installed package: its module, and its entry point."""
     text = (ROOT / "docs" / "screens.md").read_text(encoding="utf-8").split("## Adding a screen")[1]
-    module, project = re.findall(r"```(?:python|toml)\n(.*?)```", text, flags=re.DOTALL)[:2]
+    (project,) = re.findall(r"```toml\n(.*?)```", text, flags=re.DOTALL)
+    module = (ROOT / "docs" / "examples" / "large_sigma.py").read_text(encoding="utf-8")
     (group, names), *others = tomllib.loads(project)["project"]["entry-points"].items()
     assert not others
     (folder / "my_package").mkdir(parents=True)

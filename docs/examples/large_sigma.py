@@ -1,0 +1,66 @@
+"""Largest standard deviation of a range."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from pydantic import Field
+
+from railfix.core.reasons import screen_reason
+from railfix.core.settings import Settings
+from railfix.screens.base import (
+    AntennaRanges,
+    ObservationScreen,
+    RunTables,
+    ScreenColumn,
+    Screened,
+    ScreenPicture,
+    ScreenSetup,
+    Verdict,
+)
+
+REASON = screen_reason("large_sigma")
+
+
+class LargeSigmaLimits(Settings):
+    """Limits of the screen.
+
+    Attributes
+    ----------
+    limit_m : float [m]
+        Largest standard deviation used.
+    """
+
+    limit_m: float = Field(default=10.0, gt=0)
+
+
+class LargeSigmaScreen(ObservationScreen[LargeSigmaLimits]):
+    """Largest standard deviation of a range."""
+
+    name = "large_sigma"
+    limits = LargeSigmaLimits()
+    needs = "weights"
+    columns = (ScreenColumn(name="metric_large_sigma_m", meaning="assumed sigma", verdict="large_sigma"),)
+
+    def judge(
+        self, antenna: AntennaRanges, limits: LargeSigmaLimits, setup: ScreenSetup, state: Any
+    ) -> tuple[tuple[Verdict, ...], Any]:
+        """Return the verdict on a chunk; the screen has no memory."""
+        screened = Screened(metric=antenna.sigma_m, reject=antenna.sigma_m > limits.limit_m)
+        return (Verdict(name=self.name, reason=REASON, screened=screened),), None
+
+    def pictures(self, tables: RunTables, limits: LargeSigmaLimits) -> Iterator[tuple[str, ScreenPicture]]:
+        """Yield the standard deviations against the limit."""
+        yield (
+            self.name,
+            ScreenPicture(
+                title="assumed standard deviation",
+                label="sigma [m]",
+                metric=tables.channels("metric_large_sigma_m"),
+                reject=tables.rejected(REASON),
+                limit=limits.limit_m,
+                sides="above",
+            ),
+        )
+
+
+SCREEN = LargeSigmaScreen()
