@@ -7,8 +7,6 @@ import math
 from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.algebra import log_sum, most_probable
 from railfix.kernels.tracking.constants import (
-    LEAST_AGREEING,
-    MOST_AGREEING,
     MOST_MOTION,
     MOST_ODDS,
     MOTION_M,
@@ -17,7 +15,7 @@ from railfix.kernels.tracking.constants import (
 )
 from railfix.kernels.tracking.course import point_at
 from railfix.kernels.tracking.layout import ARC, BRANCH_M, BRANCH_S, KernelState, LineArrays, Parameters, Rows, Work
-from railfix.kernels.tracking.update import evidence_of, mean_weights, motion_evidence
+from railfix.kernels.tracking.update import evidence_of, motion_evidence
 
 
 @borrowing
@@ -25,21 +23,14 @@ def reweigh(
     line: LineArrays, parameters: Parameters, rows: Rows, state: KernelState, work: Work, count: int, dt: float
 ) -> None:
     """Update the probabilities of hypotheses by the evidence of an epoch."""
-    counts, other, agreeing = rows.counts, work.mean.shape[0] - 1, 0.0
+    counts, other = rows.counts, work.mean.shape[0] - 1
     for h in range(count):
-        _, motion = mean_weights(rows, work.variance, work, h)
-        if motion > agreeing:
-            agreeing = motion
         joint = evidence_of(rows, work.variance, parameters.degrees, work.log_after[h], work, h, h)
         work.evidence[h] = motion_evidence(rows, parameters, work, h, other)
         work.code_evidence[h] = joint - work.evidence[h] if counts[0] >= MOTION_SATELLITES else 0.0
         if max(counts[1], counts[2]) < MOTION_SATELLITES and counts[3] == 0:
             work.evidence[h] = 0.0
         point_at(line, work.new_mean[h, ARC], work.places, work.place_axes, h)
-    if counts[3] == 0:
-        trust = min(max((agreeing - LEAST_AGREEING) / (MOST_AGREEING - LEAST_AGREEING), 0.0), 1.0)
-        for h in range(count):
-            work.evidence[h] *= trust
     judge(parameters, state, work, count, dt)
 
 

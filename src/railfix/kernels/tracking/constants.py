@@ -109,10 +109,6 @@ SWITCH: Final = 3.0
 MOST_ODDS: Final = 2.25
 #: Largest logarithm of the odds that motion gives in a second: more is a reflection.
 MOST_MOTION: Final = 5.0
-#: Mean weights of Dopplers and phases, at the place where they agree best, up to which they tell nothing of branches
-#: and from which on they count in full: those of a street with reflections agree with each other nowhere.
-LEAST_AGREEING: Final = 0.6
-MOST_AGREEING: Final = 0.9
 #: A hypothesis that leads although its probability was below this within the last seconds (its least logarithm rises
 #: by `LEAST_RISE` a second) has taken over from others that all failed: places are sought again. Not within the first
 #: seconds, when all are young.
