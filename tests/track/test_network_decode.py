@@ -62,7 +62,6 @@ def test_probabilities_are_those_of_one_chain_of_all_states(heights: bool, monke
     n, balls, above = 5, 4, 2 if heights else 0
     monkeypatch.setattr(network_decode, "_BALLS", balls)
     monkeypatch.setattr(network_decode, "_BALLS_UP", 2)
-    network_decode._passages_in_plan.cache_clear()
     residuals = _residuals(np.random.default_rng(3), n, heights=heights)
     net, candidates = _parallel(n)
     moves = Transitions(net, candidates, np.full(n - 1, STEP_M))
@@ -100,7 +99,6 @@ def test_probabilities_are_those_of_one_chain_of_all_states(heights: bool, monke
         backward.insert(0, whole[k - 1] @ (seen[k].ravel() * backward[0]))
     expected = np.array([(a * b).reshape(3, -1).sum(axis=1) for a, b in zip(forward, backward, strict=True)])
     _, probability = decode(residuals, moves)
-    network_decode._passages_in_plan.cache_clear()
     assert probability == pytest.approx(expected / expected.sum(axis=1, keepdims=True), abs=1e-9)
 
 

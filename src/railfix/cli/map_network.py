@@ -229,6 +229,12 @@ def match_command(
         float | None,
         typer.Option(metavar="M", help="Sigma of the distance from the track, map included; else that of LOG, or 2 m."),
     ] = None,
+    within: Annotated[
+        float | None,
+        typer.Option(
+            metavar="M", help="Farthest track considered; else 30 m, farther where LOG states larger sigmas, to 100 m."
+        ),
+    ] = None,
     column: Columns = None,
     same_frame: SameFrame = False,
     reading: Annotated[TrackReading, Without("reference", "height_sigma")],
@@ -245,10 +251,12 @@ def match_command(
     """
     if sigma is not None and not sigma > 0.0:
         raise SettingsError("--sigma must be positive")
+    if within is not None and not within > 0.0:
+        raise SettingsError("--within must be positive")
     check_outputs((out, "csv"), (picture, "picture"), (page, "page"), overwrite=overwrite, inputs=[*maps, log])
     net = _network(maps, reading, tolerance)
     positions, notes = _positions(log, net, column, reading, same_frame=same_frame)
-    matched = match(net, positions, sigma_m=sigma)
+    matched = match(net, positions, sigma_m=sigma, within_m=within)
     if not (matched.track >= 0).any():
         raise MismatchError(f"{log}: no position lies near a track of the network; is it the map of this region?")
     write_whole(out, _matched_csv(net, positions, matched))

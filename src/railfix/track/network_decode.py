@@ -163,12 +163,6 @@ def _binomial(count: int, share: float) -> Floats:
     return values
 
 
-@lru_cache(maxsize=64)
-def _passages_in_plan(seconds: float) -> Floats:
-    axis = _urn(_BALLS, seconds)[1]
-    return read_only(np.kron(axis, axis))
-
-
 class _CommonError:
     """The lattice of the common error: C places in plan by U heights.
 
@@ -191,17 +185,18 @@ class _CommonError:
 
     def later(self, share: Floats, seconds: float) -> Floats:
         """Probabilities after a time, shape (..., C, U)."""
-        plan = _passages_in_plan(seconds)
-        if not self._balls_up:
-            return np.asarray((share[..., 0] @ plan)[..., None])
-        return np.asarray(np.matmul(plan.T, share) @ _urn(self._balls_up, seconds)[1])
+        return self._through(share, _urn(_BALLS, seconds)[1].T, _urn(self._balls_up, seconds)[1].T)
 
     def earlier(self, value: Floats, seconds: float) -> Floats:
         """What is expected, a time before, of values of shape (..., C, U)."""
-        plan = _passages_in_plan(seconds)
-        if not self._balls_up:
-            return np.asarray((value[..., 0] @ plan.T)[..., None])
-        return np.asarray(np.matmul(plan, value) @ _urn(self._balls_up, seconds)[1].T)
+        return self._through(value, _urn(_BALLS, seconds)[1], _urn(self._balls_up, seconds)[1])
+
+    def _through(self, values: Floats, plan: Floats, up: Floats) -> Floats:
+        """Values after the matrices of each axis: small ones, where one for all axes would wait for threads."""
+        axis, heights = len(plan), len(up)
+        east = np.matmul(plan, values.reshape(-1, axis, axis * heights))
+        north = np.matmul(plan, east.reshape(-1, axis, axis, heights))
+        return np.asarray((north @ up.T if heights > 1 else north).reshape(values.shape))
 
 
 def _places(balls: int, sigma_m: float) -> Floats:
