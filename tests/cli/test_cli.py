@@ -29,6 +29,7 @@ COMMANDS = [
     ["map"],
     ["map", "check"],
     ["map", "from-positions"],
+    ["map", "survey"],
     ["ground"],
     ["ground", "monitor"],
     ["ground", "keys"],

@@ -25,8 +25,8 @@ def locate(
 ) -> None:
     """Compute conventional 3-D positions with standard deviations from a log alone, without a track map.
 
-    Ranges that disagree with the others are left out. The file has quality 5 (single); `railfix map from-positions
-    --quality 5` makes a map of it, `railfix map match` puts it on the tracks of a network.
+    Ranges that disagree with the others are left out. The file has quality 5 (single); `railfix map match`
+    puts it on the tracks of a network. `railfix map survey` makes a map of logs, better than of such positions.
 
     Example: `railfix locate --log front.obs --nav brdc.nav --out front.pos`
 

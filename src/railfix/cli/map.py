@@ -13,6 +13,7 @@ from rich.table import Table
 from railfix.cli.command import Command, Commands
 from railfix.cli.console import console_of_tables, show_notes
 from railfix.cli.map_network import MapReading, columns_of, match_command, network, route
+from railfix.cli.map_survey import survey
 from railfix.cli.options import OverwriteOption, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
 from railfix.io.nmea import read_any_positions
@@ -247,6 +248,7 @@ def from_positions_command(
     _print_thinned(track, thinned, len(log), out)
 
 
+app.command("survey", cls=Command)(survey)
 app.command("network", cls=Command)(network)
 app.command("route", cls=Command)(route)
 app.command("match", cls=Command)(match_command)

@@ -10,7 +10,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.gnss.observations import Observations
-from railfix.gnss.orbits import satellite_states
+from railfix.gnss.orbits import SatelliteStates, satellite_states
 from railfix.pipeline.channels import ChannelBook, Channels
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import ANCHOR_SIGMA_M, usable_ranges, without
@@ -56,6 +56,7 @@ class AntennaRanges:
     channels : Channels
     ranges : Ranges
         Weight 0 where a range cannot be used.
+    states : SatelliteStates
     elevation_deg, azimuth_deg : ndarray, shape (T, K)
     place_ecef_m : ndarray, shape (T, 3) [m]
         The approximate place; NaN where the codes give none.
@@ -63,6 +64,7 @@ class AntennaRanges:
 
     channels: Channels
     ranges: Ranges
+    states: SatelliteStates
     elevation_deg: Floats
     azimuth_deg: Floats
     place_ecef_m: Floats
@@ -111,6 +113,7 @@ def antenna_ranges(obs: Observations, received: Received, config: Config, book: 
     return AntennaRanges(
         channels=channels,
         ranges=ranges,
+        states=states,
         elevation_deg=seen.elevation_deg,
         azimuth_deg=seen.azimuth_deg,
         place_ecef_m=place,
@@ -129,7 +132,11 @@ def locate(obs: Observations, received: Received, config: Config, book: ChannelB
     -------
     Located
     """
-    seen = antenna_ranges(obs, received, config, book)
+    return locate_ranges(obs.time, antenna_ranges(obs, received, config, book), config)
+
+
+def locate_ranges(time: Datetimes, seen: AntennaRanges, config: Config) -> Located:
+    """Compute the conventional position of every epoch from corrected ranges; see `locate`."""
     ranges = seen.ranges
     start = np.where(np.isnan(seen.place_ecef_m), _below(ranges), seen.place_ecef_m)
     fit = robust_fit(ranges, start, limits=config.robust_fit)
@@ -137,14 +144,14 @@ def locate(obs: Observations, received: Received, config: Config, book: ChannelB
     point = single_point(ranges, start, limits=config.single_point)
     freedom = ranges.n_used - ranges.n_clocks - 3
     scale = np.where(freedom >= _LEAST_REDUNDANCY, point.wsse / np.maximum(freedom, 1), 1.0)
-    sigma = np.full((len(obs.time), 3), np.nan)
+    sigma = np.full((len(time), 3), np.nan)
     known = np.flatnonzero(np.isfinite(point.ecef_m[:, 0]))
     if len(known):
         latitude, longitude, _ = geodetic_from_ecef(point.ecef_m[known[0]])
         axes = enu_axes(latitude, longitude)[[1, 0, 2]]
         variance = np.einsum("ai,tij,aj->ta", axes, point.covariance_m2, axes)
         sigma = np.sqrt(variance * np.maximum(scale, 1.0)[:, None])
-    return Located(time=obs.time, ecef_m=point.ecef_m, sigma_m=sigma, n_used=ranges.n_used)
+    return Located(time=time, ecef_m=point.ecef_m, sigma_m=sigma, n_used=ranges.n_used)
 
 
 def _below(ranges: Ranges) -> Floats:

@@ -189,7 +189,7 @@ def _problems(findings: Sequence[FileFinding]) -> list[str]:
     if not navigation and logs:
         problems.append("there is no navigation file: give the broadcast ephemerides of the day")
     if not tracks and logs:
-        problems.append("there is no track map: railfix locate and railfix map from-positions make one")
+        problems.append("there is no track map: railfix map survey makes one of runs over the line")
     if len(logs) > 2:
         problems.append("there are more than two logs: give the files of one run")
     for log in logs:

@@ -25,7 +25,11 @@ OPTIONAL_COLUMNS: Final[dict[str, tuple[str, float, float]]] = {
     "radius_m": ("radius_m", 1.0, np.inf),
     "gradient_permille": ("gradient_permille", 1.0, np.nan),
 }
-KNOWN_COLUMNS: Final = ("latitude_deg", "longitude_deg", "height_m", "elevation_m", "geoid_m", *OPTIONAL_COLUMNS)
+#: Standard deviations of each point, for people: positioning takes those of the whole map.
+SIGMA_COLUMNS: Final = ("sigma_plan_m", "sigma_height_m")
+KNOWN_COLUMNS: Final = (
+    "latitude_deg", "longitude_deg", "height_m", "elevation_m", "geoid_m", *OPTIONAL_COLUMNS, *SIGMA_COLUMNS,
+)  # fmt: skip
 #: ``# key: value`` lines above the header that are used; others are ignored.
 KNOWN_METADATA: Final = ("name", "crs", "height_datum", "geoid", "sigma_plan_m", "sigma_height_m", "note")
 
@@ -163,11 +167,11 @@ def _in_frame(crs: str | None, latitude: Floats, longitude: Floats, *, path: str
     return frame_degrees(crs, longitude, latitude, path=path)
 
 
-def write_track_csv(track: Track, path: str | PathLike[str]) -> None:
+def write_track_csv(track: Track, path: str | PathLike[str], *, sigma_m: Floats | None = None) -> None:
     """Write a track as CSV with ellipsoidal heights; a failed write leaves no file.
 
     Attributes without any value are omitted. The file reads back equal to the track within
-    1e-10 degrees and 0.1 mm.
+    1e-10 degrees and 0.1 mm. Standard deviations of each point, plan and height, shape (V, 2) [m], are columns more.
 
     Raises
     ------
@@ -185,6 +189,8 @@ def write_track_csv(track: Track, path: str | PathLike[str]) -> None:
             columns[column] = ["" if np.isnan(v) else f"{v:.10g}" for v in values]
             if column == "radius_m" and np.isnan(values).any():
                 columns[column] = ["nan" if np.isnan(v) else f"{v:.10g}" for v in values]
+    if sigma_m is not None:
+        columns |= {name: [f"{v:.3f}" for v in sigma_m[:, i]] for i, name in enumerate(SIGMA_COLUMNS)}
     lines = [
         f"# name: {track.name}",
         f"# crs: {track.provenance.frame}",

@@ -1,0 +1,1 @@
+"""A track map from several runs of ordinary receivers: adjustment of their positions and steps to one line."""

@@ -1,0 +1,378 @@
+"""The line that the passes of several runs share: its course without repetitions, and where each pass lies on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from railfix.core.arrays import Floats, Indices, Integers
+from railfix.track.survey.runs import SurveyLimits
+
+#: Cosine of the largest angle between passes of one line.
+_SAME_WAY: Final = 0.7
+#: Parts of a leg nearer than this many widths (`same_line_m`) along it are no repetition of each other.
+_APART_WIDTHS: Final = 3.0
+#: Share of the points of a stretch that lie on the line where the stretch does.
+_MOSTLY: Final = 0.8
+#: Distance over which the seam of two passes is evened out [m].
+_SEAM_M: Final = 200.0
+#: Longer without any row a run is not followed [s].
+_GAP_S: Final = 10.0
+#: Neighbouring vertices that a point is compared with.
+_NEIGHBOURS: Final = 24
+
+
+@dataclass(frozen=True, kw_only=True)
+class Leg:
+    """Part of a run without a change of direction, m selected rows at least a spacing apart.
+
+    Attributes
+    ----------
+    run : int
+    row : ndarray of int, shape (m,)
+    arc_m : ndarray, shape (m,) [m]
+    point_m : ndarray, shape (m, 3) [m]
+        East, north, up in the frame of the survey.
+    """
+
+    run: int
+    row: Indices
+    arc_m: Floats
+    point_m: Floats
+
+    def nodes_at(self, arc_m: Floats) -> tuple[Indices, Floats]:
+        """Return four rows about each arc length and their weights, shapes (q, 4): cubic, linear at the ends."""
+        count = len(self.row)
+        k = np.clip(np.searchsorted(self.arc_m, arc_m, side="right") - 1, 0, count - 2)
+        nodes = np.clip(k[:, None] + np.arange(-1, 3), 0, count - 1)
+        at = self.arc_m[nodes]
+        share = (arc_m - at[:, 1]) / (at[:, 2] - at[:, 1])
+        weight = np.zeros((len(arc_m), 4))
+        weight[:, 1], weight[:, 2] = 1.0 - share, share
+        inner = (k > 0) & (k < count - 2)
+        for i in range(4):
+            product = np.ones(int(inner.sum()))
+            for j in range(4):
+                if j != i:
+                    product *= (arc_m[inner] - at[inner, j]) / (at[inner, i] - at[inner, j])
+            weight[inner, i] = product
+        return self.row[nodes], weight
+
+    def at(self, arc_m: Floats) -> Floats:
+        """Interpolate points, shape (q, 3) [m]."""
+        rows, weight = self.nodes_at(arc_m)
+        index = np.searchsorted(self.row, rows)
+        return np.asarray(np.einsum("qi,qij->qj", weight, self.point_m[index]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Course:
+    """The line as a polyline, J points; the last one of a closed line goes on at the first."""
+
+    point_m: Floats
+    closed: bool = False
+
+    def __len__(self) -> int:
+        return len(self.point_m)
+
+    @property
+    def direction(self) -> Floats:
+        """Horizontal direction at each point, unit vectors, shape (J, 2)."""
+        return directions(self.point_m, closed=self.closed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pass:
+    """Piece of a leg that lies on the line.
+
+    Attributes
+    ----------
+    leg : int
+    sign : int
+        1 along the line, -1 against it.
+    arc_m : ndarray, shape (p,) [m]
+        Along the leg, rising.
+    place : ndarray, shape (p,)
+        Number of the point of the line with its fraction, monotone; beyond the last point where a closed line goes on.
+    """
+
+    leg: int
+    sign: int
+    arc_m: Floats
+    place: Floats
+
+
+def directions(point_m: Floats, *, closed: bool = False) -> Floats:
+    """Return the horizontal direction at each point of a polyline by its neighbours, unit vectors, shape (J, 2)."""
+    plan = point_m[:, :2]
+    step = np.roll(plan, -1, axis=0) - np.roll(plan, 1, axis=0) if closed else np.gradient(plan, axis=0)
+    length = np.linalg.norm(step, axis=1, keepdims=True)
+    return np.asarray(step / np.where(length > 0.0, length, 1.0))
+
+
+def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, turn_m: float) -> list[Leg]:
+    """Divide a run where it turns back or was not observed; rows nearer than the spacing to the last are left out."""
+    spacing_m = limits.spacing_m
+    rows = [0]
+    for k in range(1, len(point_m)):
+        if np.linalg.norm(point_m[k, :2] - point_m[rows[-1], :2]) >= spacing_m:
+            rows.append(k)
+    kept = np.array(rows, dtype=np.intp)
+    plan = point_m[kept, :2]
+    reach = max(1, round(turn_m / spacing_m / 2.0))
+    before = plan - plan[np.maximum(np.arange(len(kept)) - reach, 0)]
+    after = plan[np.minimum(np.arange(len(kept)) + reach, len(kept) - 1)] - plan
+    size = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    turned = (before * after).sum(axis=1) < -0.5 * size
+    # the sharpest point of each turn
+    sharp = np.where(turned, (before * after).sum(axis=1) / np.where(size > 0.0, size, 1.0), 1.0)
+    cuts = [
+        int(group[np.argmin(sharp[group])])
+        for group in np.split(np.flatnonzero(turned), np.flatnonzero(np.diff(np.flatnonzero(turned)) > reach) + 1)
+        if len(group)
+    ]
+    legs = []
+    gap = np.flatnonzero((np.diff(time_s) > _GAP_S) & (np.linalg.norm(np.diff(point_m, axis=0), axis=1) > turn_m))
+    gaps = np.searchsorted(kept, gap, side="right")
+    edges = sorted([(0, 0), *((c, 0) for c in cuts), *((int(g), 1) for g in gaps), (len(kept) - 1, 0)])
+    for (first, _), (last, broken) in pairwise(edges):
+        part = kept[first : last + 1 - broken]
+        if len(part) >= 2:
+            step = np.linalg.norm(np.diff(point_m[part], axis=0), axis=1)
+            arc = np.concatenate([[0.0], np.cumsum(step)])
+            legs.append(Leg(run=run, row=part, arc_m=arc, point_m=point_m[part]))
+    return legs
+
+
+def _sampled(leg: Leg, spacing_m: float) -> tuple[Floats, Floats]:
+    """Return arc lengths and points of a leg at even spacing."""
+    arc = np.arange(0.0, leg.arc_m[-1], spacing_m)
+    return arc, leg.at(arc)
+
+
+def find_course(legs: Sequence[Leg], limits: SurveyLimits) -> Course:
+    """Find the course of the line: the longest leg until it repeats itself, extended by the other legs at its ends."""
+    spacing_m, width_m = limits.spacing_m, limits.same_line_m
+    order = sorted(range(len(legs)), key=lambda i: -float(legs[i].arc_m[-1]))
+    first = _sampled(legs[order[0]], spacing_m)[1]
+    course = _until_repeated(first, spacing_m, width_m)
+    grown = True
+    while grown and not course.closed:
+        grown = False
+        for i in order:
+            longer = _extended(course, _sampled(legs[i], spacing_m)[1], spacing_m, width_m)
+            if longer is not None:
+                course, grown = longer, True
+                break
+    return course
+
+
+def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
+    """Return the beginning of a polyline up to where it lies beside itself for some widths."""
+    apart, least = int(_APART_WIDTHS * width_m / spacing_m), int(_APART_WIDTHS * width_m / spacing_m)
+    way = directions(points)
+    tree = cKDTree(points[:, :2])
+    repeated = np.zeros(len(points), dtype=np.bool_)
+    earlier = np.full(len(points), -1)
+    for i, near in enumerate(tree.query_ball_point(points[:, :2], width_m)):
+        others = np.array([j for j in near if j < i - apart], dtype=np.intp)
+        others = others[np.abs(way[others] @ way[i]) > _SAME_WAY]
+        if len(others):
+            repeated[i] = True
+            earlier[i] = others[np.argmin(np.linalg.norm(points[others, :2] - points[i, :2], axis=1))]
+    for i in np.flatnonzero(repeated):
+        stretch = repeated[i : i + least]
+        if len(stretch) == least and stretch.mean() >= _MOSTLY:
+            j = int(earlier[i])
+            if j * spacing_m < 2.0 * width_m and float(way[j] @ way[i]) > 0.0:
+                return _closed_course(points, int(i), j, spacing_m)
+            return Course(point_m=points[:i])
+    return Course(point_m=points)
+
+
+def _closed_course(points: Floats, end: int, start: int, spacing_m: float) -> Course:
+    """Return one turn of a closed line: from point `start` to `end`, which is the same place; the gap is evened out."""
+    turn = points[start : end + 1].copy()
+    gap = turn[0] - turn[-1]
+    along = directions(points)[start]
+    gap[:2] -= along * float(along @ gap[:2])
+    count = min(len(turn), int(_SEAM_M / spacing_m))
+    turn[-count:] += gap * np.linspace(0.0, 1.0, count)[:, None]
+    # the last point is a spacing before the first
+    ahead = (turn[:, :2] - turn[0, :2]) @ along
+    near = np.linalg.norm(turn[:, :2] - turn[0, :2], axis=1) < 4.0 * spacing_m
+    past = np.flatnonzero(near & (ahead > -0.5 * spacing_m) & (np.arange(len(turn)) > len(turn) // 2))
+    return Course(point_m=turn[: past[0]] if len(past) else turn, closed=True)
+
+
+def _extended(course: Course, points: Floats, spacing_m: float, width_m: float) -> Course | None:
+    """Return the course with the part of a leg that leads beyond one of its ends, None where none does."""
+    place, sign, _ = match_points(course, points, width_m)
+    least = int(_APART_WIDTHS * width_m / spacing_m)
+    near_end = 2.0 * width_m / spacing_m
+    on = np.isfinite(place)
+    edges = np.flatnonzero(np.diff(on.astype(np.int8)))
+    for edge in edges:
+        leaving = bool(on[edge])
+        at = edge if leaving else edge + 1
+        outward = sign[at] if leaving else -sign[at]
+        last = len(course) - 1
+        if not ((outward > 0 and place[at] > last - near_end) or (outward < 0 and place[at] < near_end)):
+            continue
+        if leaving:
+            ends = np.flatnonzero(on[edge + 1 :])
+            piece = points[edge + 1 : edge + 1 + ends[0]] if len(ends) else points[edge + 1 :]
+        else:
+            begins = np.flatnonzero(on[: edge + 1])
+            piece = points[(begins[-1] + 1 if len(begins) else 0) : edge + 1][::-1]
+        if len(piece) < least:
+            continue
+        nearest = course.point_m[round(float(place[at]))]
+        gap = nearest - points[at]
+        gap -= _along(points, at) * float(_along(points, at) @ gap)
+        fade = np.clip(1.0 - np.arange(len(piece)) * spacing_m / _SEAM_M, 0.0, 1.0)
+        piece = piece + gap * fade[:, None]
+        kept = (
+            course.point_m[: round(float(place[at])) + 1] if outward > 0 else course.point_m[round(float(place[at])) :]
+        )
+        joined = np.concatenate([kept, piece]) if outward > 0 else np.concatenate([piece[::-1], kept])
+        longer = _until_repeated(joined, spacing_m, width_m)
+        if len(longer) > len(course) or longer.closed:
+            return longer
+    return None
+
+
+def _along(points: Floats, at: int) -> Floats:
+    way = directions(points)[at]
+    return np.array([way[0], way[1], 0.0])
+
+
+def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats, Integers, Floats]:
+    """Match points of a leg, in its order, to the course.
+
+    Returns
+    -------
+    place : ndarray, shape (q,)
+        Number of the point of the course with its fraction; NaN further from it than the width, or across it.
+    sign : ndarray of int, shape (q,)
+        1 along the course, -1 against it, 0 beside it.
+    across_m : ndarray, shape (q,) [m]
+        Distance to the right of it.
+    """
+    way, line_way = directions(points), course.direction
+    vertices = course.point_m[:, :2]
+    count = min(_NEIGHBOURS, len(course))
+    distance, vertex = cKDTree(vertices).query(points[:, :2], k=np.arange(1, count + 1), distance_upper_bound=width_m)
+    known = np.isfinite(distance)
+    vertex = np.where(known, vertex, 0)
+    cosine = np.einsum("qi,qki->qk", way, line_way[vertex])
+    fits = known & (np.abs(cosine) > _SAME_WAY)
+    best = np.argmin(np.where(fits, distance, np.inf), axis=1)
+    index = np.arange(len(points))
+    found = fits[index, best]
+    at = vertex[index, best]
+    offset = points[:, :2] - vertices[at]
+    along = (offset * line_way[at]).sum(axis=1)
+    step = _mean_spacing(course)
+    last = len(course) - (0 if course.closed else 1)
+    place = at + np.clip(along / step, -0.5, 0.5)
+    place = np.where(found & (place >= -1e-9) & (place <= last), place, np.nan)
+    if course.closed:
+        place = np.where(found & np.isnan(place), at + 0.0, place)
+    sign = np.where(found, np.sign(cosine[index, best]), 0.0).astype(np.int64)
+    across = offset[:, 0] * line_way[at][:, 1] - offset[:, 1] * line_way[at][:, 0]
+    return place, sign, np.where(found, across, np.nan)
+
+
+def _mean_spacing(course: Course) -> float:
+    return float(np.mean(np.linalg.norm(np.diff(course.point_m[:, :2], axis=0), axis=1)))
+
+
+def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tuple[list[Pass], float]:
+    """Find the pieces of all legs that lie on the course, and the way that does not [m]."""
+    spacing_m, width_m = limits.spacing_m, limits.same_line_m
+    passes: list[Pass] = []
+    beside = 0.0
+    turn = float(len(course))
+    jump = _APART_WIDTHS * width_m / spacing_m
+    for number, leg in enumerate(legs):
+        arc, points = _sampled(leg, spacing_m)
+        if len(points) < 3:
+            continue
+        place, sign, _ = match_points(course, points, width_m)
+        beside += spacing_m * int(np.isnan(place).sum())
+        start = 0
+        while start < len(arc):
+            if np.isnan(place[start]):
+                start += 1
+                continue
+            chain, value = [start], [float(place[start])]
+            way = int(sign[start])
+            for k in range(start + 1, len(arc)):
+                if np.isnan(place[k]):
+                    if k - chain[-1] > jump:
+                        break
+                    continue
+                here = float(place[k])
+                if course.closed:
+                    here += turn * round((value[-1] - here) / turn)
+                expected = value[-1] + way * (k - chain[-1])
+                if sign[k] != way or abs(here - expected) > jump:
+                    break
+                chain.append(k)
+                value.append(here)
+            if len(chain) >= 3:
+                ordered = way * np.maximum.accumulate(way * np.array(value))
+                passes.append(Pass(leg=number, sign=way, arc_m=arc[chain], place=ordered))
+            start = chain[-1] + 1
+    return passes, beside
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ties:
+    """Where runs pass the points of the line, m ties.
+
+    Attributes
+    ----------
+    run : ndarray of int, shape (m,)
+    row : ndarray of int, shape (m, 4)
+        Rows of the run about the point.
+    weight : ndarray, shape (m, 4)
+        Of these rows, with the sum 1.
+    point : ndarray of int, shape (m,)
+    number : ndarray of int, shape (m,)
+        Number of the pass.
+    """
+
+    run: Indices
+    row: Indices
+    weight: Floats
+    point: Indices
+    number: Indices
+
+
+def find_ties(course: Course, legs: Sequence[Leg], passes: Sequence[Pass]) -> Ties:
+    """Find where each pass crosses the points of the line."""
+    parts: list[tuple[Indices, Indices, Floats, Indices, Indices]] = []
+    for number, each in enumerate(passes):
+        place, arc = each.sign * each.place, each.arc_m
+        rising = np.concatenate([[True], np.diff(place) > 1e-9])
+        place, arc = place[rising], arc[rising]
+        low, high = int(np.ceil(place[0])), int(np.floor(place[-1]))
+        points = np.arange(low, high + 1)
+        if not len(points):
+            continue
+        rows, weight = legs[each.leg].nodes_at(np.interp(points, place, arc))
+        run = np.full(len(points), legs[each.leg].run)
+        index = np.mod(each.sign * points, len(course)) if course.closed else each.sign * points
+        parts.append((run, rows, weight, index, np.full(len(points), number)))
+    empty = np.zeros(0, dtype=np.intp)
+    if not parts:
+        return Ties(run=empty, row=np.zeros((0, 4), np.intp), weight=np.zeros((0, 4)), point=empty, number=empty)
+    run, row, weight, point, number_of = (np.concatenate(items) for items in zip(*parts, strict=True))
+    return Ties(run=run, row=row, weight=weight, point=point, number=number_of)

@@ -1,0 +1,185 @@
+"""Runs of a survey: positions of one receiver, and its steps between them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+from pydantic import Field
+
+from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Indices, freeze_arrays
+from railfix.core.settings import Settings, option
+from railfix.core.timescale import seconds
+from railfix.io.position_log import PositionLog
+from railfix.track.from_positions import SIGMA_OF_QUALITY
+
+#: Standard deviation of the error that all positions of a run share, by their quality (RTKLIB), plan and height [m]:
+#: orbits, ionosphere and reference frame, which no averaging over the run takes away.
+COMMON_SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
+    {1: (0.02, 0.04), 2: (0.2, 0.4), 3: (0.5, 1.0), 4: (0.3, 0.6), 5: (1.0, 2.0)}
+)
+_UNKNOWN_QUALITY: Final = 5
+
+
+class SurveyLimits(Settings):
+    """Assumptions of a survey.
+
+    Attributes
+    ----------
+    interval_s : float [s]
+        Least time between the positions used; faster logs are thinned.
+    correlation_s, correlation_m : float
+        Errors of positions repeat over so long at standstill and over so much way: together they count as one.
+    acceleration_mps2, climb_mps2 : float
+        Standard deviation of the change of the horizontal and of the vertical velocity in a second.
+    freedom : float
+        Degrees of freedom of Student's t errors: outliers lose their weight.
+    same_line_m : float [m]
+        Passes so near to each other, in the same or the opposite direction, are on one line.
+    apart_m : float [m]
+        Standard deviation of the distance of a pass from the line: lanes, other antennas.
+    spacing_m : float [m]
+        Distance between points of the map.
+    """
+
+    interval_s: float = Field(default=1.0, gt=0)
+    correlation_s: float = Field(default=30.0, ge=0)
+    correlation_m: float = Field(default=50.0, ge=0)
+    acceleration_mps2: float = Field(default=1.0, gt=0)
+    climb_mps2: float = Field(default=0.1, gt=0)
+    freedom: float = Field(default=3.0, gt=0)
+    same_line_m: float = option(
+        "Passes nearer to each other than this, in the same or the opposite direction, are on one line.",
+        20.0,
+        name="--same-line",
+        metavar="M",
+        gt=0,
+    )
+    apart_m: float = option(
+        "Standard deviation of the distance of a pass from the line: lanes, antennas on other places of the vehicle.",
+        0.5,
+        name="--apart",
+        metavar="M",
+        gt=0,
+    )
+    spacing_m: float = option(
+        "Distance between the points of the map.", 5.0, name="--spacing", metavar="M", gt=0, le=100.0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSignals(FrozenArrays):
+    """Ranges of a run and their changes, M ranges and C changes.
+
+    Attributes
+    ----------
+    row : ndarray of int, shape (M,)
+        Row of the run.
+    sat_ecef_m : ndarray, shape (M, 3) [m]
+        Satellites at transmission.
+    code_m, sigma_m : ndarray, shape (M,) [m]
+        Corrected pseudoranges, and their standard deviations.
+    clock : ndarray of int, shape (M,)
+        Number of the receiver clock.
+    step : ndarray of int, shape (C,)
+        Row before the change; it ends at the next row.
+    before_ecef_m, after_ecef_m : ndarray, shape (C, 3) [m]
+        The satellite at transmission, at both rows.
+    change_m, change_sigma_m : ndarray, shape (C,) [m]
+        Change of the range by the carrier phase or Dopplers.
+    """
+
+    row: Indices
+    sat_ecef_m: Floats
+    code_m: Floats
+    sigma_m: Floats
+    clock: Indices
+    step: Indices
+    before_ecef_m: Floats
+    after_ecef_m: Floats
+    change_m: Floats
+    change_sigma_m: Floats
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurveyRun(FrozenArrays):
+    """Positions of one antenna in one run, n rows in order of time.
+
+    Attributes
+    ----------
+    name : str
+    time : ndarray of datetime64[ns], shape (n,)
+    ecef_m : ndarray, shape (n, 3) [m]
+        NaN where there is no position.
+    sigma_m : ndarray, shape (n, 3) [m]
+        Standard deviations east, north, up.
+    signals : RunSignals or None
+        What the positions come from: used in place of them, with several epochs to judge by.
+    common_sigma_m : tuple of float [m]
+        Standard deviation, plan and height, of the error that all positions share.
+    """
+
+    name: str
+    time: Datetimes
+    ecef_m: Floats
+    sigma_m: Floats
+    signals: RunSignals | None = None
+    common_sigma_m: tuple[float, float] = COMMON_SIGMA_OF_QUALITY[_UNKNOWN_QUALITY]
+
+    def __post_init__(self) -> None:
+        shape = (len(self.time), 3)
+        for name in ("ecef_m", "sigma_m"):
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}, expected {shape}")
+        freeze_arrays(self)
+        if not (np.diff(self.time) > np.timedelta64(0, "ns")).all():
+            raise ValueError("time must rise strictly")
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def seconds(self) -> Floats:
+        """Time since the first row, shape (n,) [s]."""
+        return seconds(self.time - self.time[0])
+
+
+def run_of_log(log: PositionLog, limits: SurveyLimits) -> SurveyRun:
+    """Return the positions of a log as a run, thinned to the interval, each with a standard deviation.
+
+    Those that the log states, at least a third of those of its quality (`SIGMA_OF_QUALITY`): a filter's own are often
+    the noise alone. ValueError: fewer than three positions with a time.
+    """
+    rows = np.flatnonzero(np.isfinite(log.ecef_m).all(axis=1) & ~np.isnat(log.time))
+    rows = rows[np.argsort(log.time[rows], kind="stable")]
+    rows = rows[thinned_rows(log.time[rows], limits.interval_s)]
+    if len(rows) < 3:
+        raise ValueError(f"{len(rows)} positions with a time; a run of a survey needs three")
+    quality = np.where(log.quality[rows] >= 1, log.quality[rows], _UNKNOWN_QUALITY)
+    usual = np.array([SIGMA_OF_QUALITY.get(int(q), SIGMA_OF_QUALITY[_UNKNOWN_QUALITY]) for q in quality])[:, [0, 0, 1]]
+    stated = log.sigma_m[rows][:, [1, 0, 2]]
+    common = [COMMON_SIGMA_OF_QUALITY.get(int(q), COMMON_SIGMA_OF_QUALITY[_UNKNOWN_QUALITY]) for q in quality]
+    plan, height = np.median(np.array(common), axis=0)
+    return SurveyRun(
+        name=log.path,
+        time=log.time[rows],
+        ecef_m=log.ecef_m[rows],
+        sigma_m=np.where(np.isfinite(stated), np.maximum(stated, usual / 3.0), usual),
+        common_sigma_m=(float(plan), float(height)),
+    )
+
+
+def thinned_rows(time: Datetimes, interval_s: float) -> Indices:
+    """Select rows at least an interval apart, to a twentieth of it."""
+    since = seconds(time - time[0]) if len(time) else np.zeros(0)
+    kept: list[int] = []
+    for k, at in enumerate(since.tolist()):
+        if not kept or at - since[kept[-1]] >= 0.95 * interval_s:
+            kept.append(k)
+    return np.array(kept, dtype=np.intp)
