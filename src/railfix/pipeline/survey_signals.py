@@ -16,7 +16,7 @@ from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.locate import AntennaRanges, antenna_ranges, locate_ranges
 from railfix.pipeline.received import Received
-from railfix.positioning.carrier import SlipState, corrected_phase_m, find_slips
+from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, thinned_rows
 
 #: Steps longer than so many intervals have no changes: Dopplers at both ends tell too little.
@@ -79,8 +79,8 @@ def survey_epochs(
     config: Config,
     limits: SurveyLimits,
     book: ChannelBook,
-    slip_state: SlipState | None,
-) -> tuple[SurveyEpochs, SlipState | None]:
+    slip_state: CycleSlipState | None,
+) -> tuple[SurveyEpochs, CycleSlipState | None]:
     """Return the epochs of some observations, thinned to the interval of the survey, and the state of the slips.
 
     A range changes by the carrier phase where it goes on without a slip at every epoch between, else by the mean of
