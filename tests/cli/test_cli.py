@@ -30,6 +30,7 @@ COMMANDS = [
     ["map", "check"],
     ["map", "from-positions"],
     ["map", "survey"],
+    ["map", "service"],
     ["ground"],
     ["ground", "monitor"],
     ["ground", "keys"],

@@ -13,6 +13,7 @@ from rich.table import Table
 from railfix.cli.command import Command, Commands
 from railfix.cli.console import console_of_tables, show_notes
 from railfix.cli.map_network import MapReading, columns_of, match_command, network, route
+from railfix.cli.map_service import service
 from railfix.cli.map_survey import survey
 from railfix.cli.options import OverwriteOption, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
@@ -249,6 +250,7 @@ def from_positions_command(
 
 
 app.command("survey", cls=Command)(survey)
+app.command("service", cls=Command)(service)
 app.command("network", cls=Command)(network)
 app.command("route", cls=Command)(route)
 app.command("match", cls=Command)(match_command)

@@ -94,7 +94,7 @@ def survey_epochs(
     nothing = np.zeros(usable.shape)
     phase = corrected_phase_m(slips.phase_m[:, columns], seen.states.clock_m, nothing, nothing)
     rate = -SPEED_OF_LIGHT / seen.channels.frequency_hz * obs.doppler_hz[:, columns]
-    broken = np.cumsum(slips.slip[:, columns] | obs.break_before[:, None], axis=0)
+    broken = np.cumsum(slips.slip[:, columns] | obs.break_before[:, None], axis=0, dtype=np.intp)
     rows = thinned_rows(obs.time, limits.interval_s)
     signals = _signals(
         seen, obs.time[rows], rows, usable, phase, rate, broken, obs.cn0_dbhz[:, columns], limits, config

@@ -127,7 +127,7 @@ def independent_share(run: SurveyRun, near_m: Floats, limits: SurveyLimits) -> F
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(near_m, axis=0), axis=1)])
     by_time = since / np.maximum(2.0 * limits.correlation_s, 1e-9)
     by_way = way / np.maximum(2.0 * limits.correlation_m, 1e-9)
-    return np.minimum(1.0, by_time + by_way)
+    return np.asarray(np.minimum(1.0, by_time + by_way))
 
 
 def _solve(

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices
+from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.track.from_positions import ANTENNA_PATH
 from railfix.track.survey.adjustment import Adjusted, adjust
@@ -51,7 +51,7 @@ class Survey:
     track: Track
     sigma_plan_m: Floats
     sigma_height_m: Floats
-    passes: Floats
+    passes: Integers
     runs_ecef_m: tuple[Floats, ...]
     scale: tuple[float, ...]
     beside_m: float
@@ -184,7 +184,7 @@ def _survey(
     if len(order) < 3:
         raise ValueError("the runs have no line in common; give runs over one line")
     sigma = adjusted.line_sigma_m[order]
-    plan, height = (float(np.percentile(sigma[:, axis], _OF_THE_MAP)) for axis in range(2))
+    sigma_plan, sigma_height = (float(np.percentile(sigma[:, axis], _OF_THE_MAP)) for axis in range(2))
     against = sum(len(each.place) for each in passes if each.sign < 0) / max(sum(len(e.place) for e in passes), 1)
     driven = sum(float(leg.arc_m[-1]) for leg in legs)
     length = float(np.linalg.norm(np.diff(ecef[order], axis=0), axis=1).sum())
@@ -193,7 +193,7 @@ def _survey(
         f"surveyed from {len(runs)} run(s) of {driven:,.0f} m together, {driven / length:.1f} times the line, "
         f"{against:.0%} of it against its direction; each point is passed {count[order].min()} to {count[order].max()} "
         "times",
-        f"accuracy of the map {plan:.2f} m in plan and {height:.2f} m in height, 95th percentile of those along it",
+        f"accuracy of the map {sigma_plan:.2f} m in plan and {sigma_height:.2f} m in height: 95th percentiles along it",
     ]
     if beside > 0.02 * driven:
         notes.append(
@@ -202,8 +202,8 @@ def _survey(
     track = Track.from_ecef(
         ecef[order],
         name=name,
-        sigma_plan_m=plan,
-        sigma_height_m=height,
+        sigma_plan_m=sigma_plan,
+        sigma_height_m=sigma_height,
         provenance=Provenance(files=tuple(run.name for run in runs), notes=tuple(notes)),
     )
     return Survey(

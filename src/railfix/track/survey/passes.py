@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -179,18 +179,19 @@ def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
     tree = cKDTree(points[:, :2])
     repeated = np.zeros(len(points), dtype=np.bool_)
     earlier = np.full(len(points), -1)
-    for i, near in enumerate(tree.query_ball_point(points[:, :2], width_m)):
+    found: Any = tree.query_ball_point(points[:, :2], width_m)
+    for i, near in enumerate(found):
         others = np.array([j for j in near if j < i - apart], dtype=np.intp)
         others = others[np.abs(way[others] @ way[i]) > _SAME_WAY]
         if len(others):
             repeated[i] = True
             earlier[i] = others[np.argmin(np.linalg.norm(points[others, :2] - points[i, :2], axis=1))]
-    for i in np.flatnonzero(repeated):
+    for i in np.flatnonzero(repeated).tolist():
         stretch = repeated[i : i + least]
         if len(stretch) == least and stretch.mean() >= _MOSTLY:
             j = int(earlier[i])
             if j * spacing_m < 2.0 * width_m and float(way[j] @ way[i]) > 0.0:
-                return _closed_course(points, int(i), j, spacing_m)
+                return _closed_course(points, i, j, spacing_m)
             return Course(point_m=points[:i])
     return Course(point_m=points)
 
@@ -216,8 +217,7 @@ def _extended(course: Course, points: Floats, spacing_m: float, width_m: float) 
     least = int(_APART_WIDTHS * width_m / spacing_m)
     near_end = 2.0 * width_m / spacing_m
     on = np.isfinite(place)
-    edges = np.flatnonzero(np.diff(on.astype(np.int8)))
-    for edge in edges:
+    for edge in np.flatnonzero(np.diff(on.astype(np.int8))).tolist():
         leaving = bool(on[edge])
         at = edge if leaving else edge + 1
         outward = sign[at] if leaving else -sign[at]
