@@ -231,7 +231,7 @@ def mixed() -> tuple[Navigation, np.ndarray, np.ndarray]:
     return navigation(*rows), np.array([c[0] for c in channels]), np.array([c[1] for c in channels])
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.lists(st.sampled_from([1, 2, 7, 95, 96, 150]), min_size=1, max_size=6), st.integers(0, 2**32 - 1))
 def test_any_cutting_into_chunks_gives_the_same_bits(lengths: list[int], seed: int) -> None:
     nav, satellite, signal = mixed()

@@ -164,7 +164,7 @@ def test_satellite_without_record_is_told_apart_from_one_too_old() -> None:
     assert look(nav, 0.0, "S29").no_record.all(), "a constellation that is not computed has no record"
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.lists(st.tuples(st.sampled_from("ABC"), st.integers(-9, 9), st.integers(-3, 3)), min_size=1, max_size=12),
     st.lists(st.integers(-40, 40), min_size=1, max_size=8),

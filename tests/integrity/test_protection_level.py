@@ -123,7 +123,7 @@ def test_case_worked_by_hand_against_rows_and_columns():
 @example(
     seed=675235, system=("GGGGGEEECCC", None), scale=1.0, biased=False, shared=False, risk=1e-4, fault=0.0
 )  # steps between two points
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_level_equals_solving_every_subset_again(seed, system, scale, biased, shared, risk, fault):
     systems, ties = system
     ranges = oracle.made(ARC, systems, seed=seed, tie_sigma_m=ties, faults_m={1: fault})

@@ -50,7 +50,7 @@ def without_the_map(case: oracle.Problem, seen_m: tuple[float, float] | None, sc
     biased=st.booleans(),
     seen=st.sampled_from([(0.0, 0.0), (4.5, -10.0), None]),
 )
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_tails_of_all_hypotheses_use_up_the_risk(seed, side_prior, of_constellation, common, scale, biased, seen):
     """Satellites, sides, constellations, a wrong map, and as many of them together as their priors ask for."""
     ranges = oracle.made(ARC, SYSTEMS, seed=seed, faults_m={1: 9.0})

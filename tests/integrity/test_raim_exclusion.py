@@ -65,7 +65,7 @@ def check_against_trying(case: oracle.Problem, model: LinearModel, limits: RaimL
         ]
     ),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_line_equals_trying_every_subset(seed, system, faults, scale, limits):
     systems, ties = system
     arc = np.array([731.0])
@@ -81,7 +81,7 @@ def test_line_equals_trying_every_subset(seed, system, faults, scale, limits):
     faults=st.dictionaries(st.integers(0, 3), BIG, max_size=2),
     limits=st.sampled_from([RaimLimits(), RaimLimits(separation_risk=1.0), RaimLimits(mode="fixed")]),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_space_equals_trying_every_subset(seed, system, faults, limits):
     systems, ties = system
     ranges = oracle.made(np.array([731.0]), systems, seed=seed, tie_sigma_m=ties, faults_m=faults)

@@ -239,7 +239,7 @@ TAILS = st.text(st.sampled_from(" 019x"), min_size=2, max_size=2)
 TEXTS = st.tuples(STANDARD | st.text(CHARACTERS, min_size=14, max_size=14), TAILS)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(TEXTS, min_size=1, max_size=12), st.integers(0, 16))
 @example([("             -", "  "), ("         -.500", "  "), ("        - .500", "  "), ("  ,     1.500 ", "  ")], 16)
 @example([("       5  .500", "  "), ("      ,5.500  ", "  "), ("     ,   1.500", "  "), ("     =   1.500", "  ")], 16)

@@ -82,7 +82,7 @@ def test_chunks_of_a_recording_give_the_whole(m8t, size: int, epochs: int):
 
 @pytest.mark.requirement("A8")
 @given(edges=st.sets(st.integers(1, 199), min_size=1, max_size=8), first=st.sampled_from([0, 700, 1500]))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_cut_anywhere(edges: set[int], first: int):
     """A live epoch, given the state before it, is that epoch of the batch."""
     one = processor()

@@ -150,7 +150,7 @@ def test_the_last_epoch_of_a_run_is_that_of_the_past_alone(limits):
 
 @pytest.mark.requirement("A5")
 @given(seed=st.integers(0, 2**32 - 1), clocks=st.sampled_from(["own", "shared"]))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_exact_ranges_and_any_whole_cycles_give_the_place(seed, clocks):
     arc, time = moving(12), carrier_cases.times(12)
     cycles = np.random.default_rng(seed).integers(-50_000_000, 50_000_000, 64).astype(float)

@@ -115,7 +115,7 @@ def test_search_equals_exhaustive_search(used, sigma_m):
 
 @pytest.mark.requirement("A3")
 @given(seed=st.integers(0, 2**32 - 1), outlier=st.floats(-2000, 2000))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_search_equals_exhaustive_search_under_multipath(seed, outlier):
     ranges = synthetic.ranges(LINE, arcs(8, seed), seed=seed)
     code = ranges.code_m.copy()
@@ -256,7 +256,7 @@ def test_beyond_the_end_is_clamped_and_told():
 
 @pytest.mark.requirement("A4")
 @given(seed=st.integers(0, 2**32 - 1), shift=st.floats(-9e5, 9e5))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_clock_shift_and_order_of_satellites_change_nothing(seed, shift):
     where = arcs(5, seed)
     ranges = synthetic.ranges(LINE, where, systems="GGGGGGG", seed=seed)

@@ -82,7 +82,7 @@ def by_hand(seconds_of_day: float, latitude: float, longitude: float, elevation:
     return delay * SPEED_OF_LIGHT
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.floats(0, 86_399), st.floats(-85, 85), st.floats(-180, 180), st.floats(1, 90), st.floats(0, 360)
 )  # fmt: skip

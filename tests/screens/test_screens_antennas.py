@@ -255,7 +255,7 @@ def test_instants_of_separate_clocks() -> None:
 
 
 @pytest.mark.requirement("B3")
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 1000))
 def test_order_and_cutting_do_not_matter(seed: int) -> None:
     rng = np.random.default_rng(seed)

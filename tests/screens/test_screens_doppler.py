@@ -238,7 +238,7 @@ def _pieces(limits: DopplerLimits, size: int, *arrays: np.ndarray) -> tuple[np.n
     return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 10_000),
     size=st.sampled_from([1, 2, 7, 13]),
@@ -259,7 +259,7 @@ def test_any_cutting_gives_the_same_bits(seed: int, size: int, mode: str, hold: 
         np.testing.assert_array_equal(a, b)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10_000))
 def test_order_of_satellites_and_a_common_clock_do_not_matter(seed: int) -> None:
     rng = np.random.default_rng(seed)
