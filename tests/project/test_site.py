@@ -120,5 +120,5 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     page = (tmp_path / "site" / "notebooks" / "first-positions.html").read_text(encoding="utf-8")
-    assert "largest_conventional_m" in page
+    assert "single epochs" in page
     assert page.count("<img") == 2  # plan and errors
