@@ -63,7 +63,8 @@ def recordings() -> dict[str, Recording]:
         folder / name
         for name in ("urbannav_tst", "gsdc_pixel5_a", "japan_mosaic_2021265_with_GEONET3034", "smartloc_berlin_rinex")
     )
-    rows = np.array([line.split()[1:5] for line in (berlin / "Berlin_Potsdamer_Platz_RTK_GT.txt").open()], dtype=float)
+    lines = (berlin / "Berlin_Potsdamer_Platz_RTK_GT.txt").read_text(encoding="ascii").splitlines()
+    rows = np.array([line.split()[1:5] for line in lines], dtype=np.float64)
     start = np.datetime64("2016-06-06T11:10:41.7", "ns")
     between = recordings_truth.urbannav_truth(paths.DATA)
     nav = (towers / "hksc137c.nav",)

@@ -128,10 +128,10 @@ def test_check_finds_a_gap_a_kink_and_a_track_twice() -> None:
 
 
 def test_runs_are_on_the_right_track_and_probabilities_are_calibrated() -> None:
-    """Of tracks 3.6 m apart: the share on the right one at the probability that is given, over 40 runs."""
+    """Of tracks 3.6 m apart: the share on the right one at the probability that is given, over 25 runs."""
     net = made_network(10.0)
     given, right = [], []
-    for seed in range(40):
+    for seed in range(25):
         rng = np.random.default_rng(seed)
         leg = int(rng.integers(1, 3))
         log, on = made_run(net, [0, leg, 3, 4, 4 + int(rng.integers(1, 3)), 7], rng=rng, sigma_m=1.5)
@@ -143,8 +143,8 @@ def test_runs_are_on_the_right_track_and_probabilities_are_calibrated() -> None:
     assert r.mean() > 0.85
     for low, high in ((0.5, 0.8), (0.8, 0.95), (0.95, 1.01)):
         rows = (p >= low) & (p < high)
-        # runs, not positions, are independent: a bound of 40 runs at three sigma
-        assert r[rows].mean() > p[rows].mean() - 3.0 * np.sqrt(0.25 / 40.0)
+        # runs, not positions, are independent: a bound of 25 runs at three sigma
+        assert r[rows].mean() > p[rows].mean() - 3.0 * np.sqrt(0.25 / 25.0)
 
 
 def test_a_run_beside_the_map_has_no_track() -> None:

@@ -9,6 +9,9 @@ import pytest
 from scipy.linalg import expm
 from scipy.special import binom
 
+from network_around import SHAPES
+from network_around_recordings import recorded_errors, stated
+from network_around_recordings import recordings as recorded
 from network_made import made_network, made_run, segment, to_degrees
 from railfix.track import network_decode
 from railfix.track.network import Candidates, Network
@@ -183,3 +186,16 @@ def test_a_few_positions_far_off_move_no_train_to_the_track_beside() -> None:
     assert matched.probability[rows] == pytest.approx(right.probability[rows], abs=0.1)
     assert np.isnan(matched.probability[102])
     assert np.isfinite(matched.probability[100:102]).all()
+
+
+@pytest.mark.usefixtures("recordings")
+@pytest.mark.parametrize("name", ["Japan", pytest.param("towers M8T", marks=pytest.mark.slow)])
+def test_of_recorded_errors_on_networks_what_is_stated_at_99_percent_is_right(name: str) -> None:
+    """With a constant error of 1.4 m in Japan, and errors of up to 100 m between towers."""
+    errors = recorded_errors(recorded()[name])
+    certain = 0
+    for shape in SHAPES:
+        share, right = stated(errors, shape, 0)
+        assert right[share >= 0.99].all()
+        certain += int((share >= 0.99).sum())
+    assert certain > len(errors.time)

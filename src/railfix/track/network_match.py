@@ -42,8 +42,11 @@ _WITHIN_M: Final = 30.0
 _WITHIN_SIGMAS: Final = 5.0
 _FARTHEST_M: Final = 100.0
 #: Positions farther from all tracks than this many times that distance, for less than a time [s], are wrong.
-_FAR: Final = 4.0
+_FAR: Final = 6.0
 _WRONG_S: Final = 60.0
+#: Tracks that are looked at from such positions, and what stands where there is none.
+_MOST_FAR: Final = 8
+_NO_TRACK: Final = {"track": -1, "chainage_m": np.nan, "offset_m": np.inf}
 #: Median of the absolute value of a normal variable.
 _NORMAL_MEDIAN: Final = 0.6745
 #: Tracks near a position that are looked at.
@@ -134,7 +137,7 @@ class Matched:
         On that track, and distance in plan, positive to its right; NaN without a track.
     probability : ndarray, shape (n,)
         Of that track given the whole log; NaN where there is no position, or a wrong one: for less than a minute
-        farther from all tracks than four times `within_m`, and near some before and after.
+        farther from all tracks than six times `within_m`, and near some before and after.
     candidates : Candidates
     probabilities : ndarray, shape (n, m)
         Of each candidate; the rest to 1 is that of no mapped track. NaN where there is no position.
@@ -256,11 +259,11 @@ def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, w
     Without columns that no row needs.
     """
     near = network.near(latitude_deg, longitude_deg, within_m=within_m, most=_MOST_TRACKS)
-    far = np.abs(near.offset_m[:, 0]) > 0.5 * within_m
+    far = np.abs(near.offset_m[:, 0]) > min(0.5 * within_m, _WITHIN_M)
     if far.any():
-        more = network.near(latitude_deg[far], longitude_deg[far], within_m=_FAR * within_m, most=_MOST_TRACKS)
+        more = network.near(latitude_deg[far], longitude_deg[far], within_m=_FAR * within_m, most=_MOST_FAR)
         for name, values in vars(near).items():
-            values[far] = getattr(more, name)
+            values[far, :_MOST_FAR], values[far, _MOST_FAR:] = getattr(more, name), _NO_TRACK[name]
     most = max(int((near.track >= 0).sum(axis=1).max()), 1)
     return Candidates(**{name: values[:, :most] for name, values in vars(near).items()})
 
@@ -362,8 +365,6 @@ def _spread(matched: Matched, rows: Indices, count: int) -> Matched:
         chainage_m=over(matched.chainage_m, np.nan),
         offset_m=over(matched.offset_m, np.nan),
         probability=over(matched.probability, np.nan),
-        candidates=Candidates(
-            track=over(near.track, -1), chainage_m=over(near.chainage_m, np.nan), offset_m=over(near.offset_m, np.inf)
-        ),
+        candidates=Candidates(**{name: over(values, _NO_TRACK[name]) for name, values in vars(near).items()}),
         probabilities=over(matched.probabilities, np.nan),
     )
