@@ -191,7 +191,7 @@ def _centre(path: str, pipe: Connection) -> None:
             pipe.send(sequence)
 
 
-@pytest.mark.parametrize("kills", [15, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [8, pytest.param(100, marks=pytest.mark.slow)])
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 def test_a_killed_centre_loses_no_acknowledged_report(tmp_path: Path, kills: int) -> None:
     rng, context = random.Random(5), get_context("fork")
