@@ -521,5 +521,8 @@ def test_the_demonstration_ends_with_numbers_and_the_page(tmp_path: Path) -> Non
     written = sorted(path.name for path in (tmp_path / "demo").iterdir())
     tables = ["observations.parquet", "positions.csv", "positions.parquet"]
     assert written == [*tables, "report.html", "run.json", "train.csv", "train.parquet", "unscreened"]
-    names = [figure["data-name"] for figure in Page((tmp_path / "demo" / "report.html").read_text()).figures]
+    page = (tmp_path / "demo" / "report.html").read_text()
+    # the level of the filter along the track, not that on the ground, which has a row too
+    assert re.search(r"level, median</dt><dd>8\.\d m</dd><dd class=\"single\">single epochs 9\.\d m</dd>", page)
+    names = [figure["data-name"] for figure in Page(page).figures]
     assert names.count("error-time") == 2

@@ -166,7 +166,8 @@ def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, ow
     median = levels["level_p50_m"].item() if len(levels) == 1 else None
     above, filtered = f"{len(beyond):,}", ""
     if "train" in evaluation.integrity and (name := run.name_in(evaluation, "train")):
-        of_filter = evaluation.levels.filter(run=name, antenna=antenna, position="constrained_ok")
+        along = "train_protection_level_m"
+        of_filter = evaluation.levels.filter(run=name, antenna=antenna, position="constrained_ok", level=along)
         filtered = number(of_filter["level_p50_m"].item(), 1, " m") if len(of_filter) == 1 else ""
         over = evaluation.integrity["train"].beyond.filter(pl.col("usable"), run=name, antenna=antenna)
         above += f", filtered {len(over):,}"
