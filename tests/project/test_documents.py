@@ -102,6 +102,14 @@ def test_the_code_of_the_first_page_runs() -> None:
     names: dict[str, Any] = {}
     exec(code, names)
     assert len(names["railfix"].train_table(names["result"])) == 2000
+    # what a notebook shows of them: the filter first, then single epochs
+    shown_table = names["result"]._repr_html_()
+    assert shown_table.index("filter along the track") < shown_table.index("single epochs")
+    assert "2,000 epochs tracking or coasting" in shown_table
+    assert repr(names["state"]) == "<State: front; with the filter>"
+    assert re.match(
+        r"<FilterState: 1 place, the most probable at [\d.]+ ± [\d.]+ m>", repr(names["state"].fusion["front"])
+    )
 
 
 def test_the_example_runs_and_prints_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

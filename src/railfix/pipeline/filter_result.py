@@ -110,7 +110,7 @@ class FilterState(NotebookTable):
             return ""
         best = int(np.argmax(track.log_probability))
         place, variance = track.mean[best, StateIndex.ARC], track.covariance[best, StateIndex.ARC, StateIndex.ARC]
-        return f"{place:,.1f} +- {np.sqrt(variance):.1f}"
+        return f"{place:,.1f} ± {np.sqrt(variance):.1f}"
 
 
 @dataclass(frozen=True, kw_only=True)
