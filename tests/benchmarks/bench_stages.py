@@ -34,11 +34,11 @@ STAGES: Final = (
     ("anchor", "railfix.pipeline.corrected_ranges", "_anchor"),
     ("angles", "railfix.pipeline.corrected_ranges", "SeenFrom.of"),
     ("atmosphere", "railfix.pipeline.corrected_ranges", "modelled_delays"),
-    ("screens of one antenna", "railfix.pipeline.antenna_chunk", "AntennaChunk._screened"),
-    ("screens of the antenna pair", "railfix.pipeline.processor", "pair_verdicts"),
+    ("screens of one antenna", "railfix.pipeline.processor", "EpochProcessor._screened"),
+    ("screens of the antenna pair", "railfix.pipeline.processor", "judge_pairs"),
     ("screens of the antenna pair", "railfix.pipeline.processor", "position_verdicts"),
     ("screens of the antenna pair", "railfix.pipeline.processor", "EpochProcessor._pair"),
-    ("rest of positioning", "railfix.pipeline.antenna_chunk", "solve"),
+    ("rest of positioning", "railfix.pipeline.processor", "solve"),
     ("conventional position", "railfix.pipeline.solution", "single_point"),
     ("robust fits", "railfix.pipeline.solution", "_agreeing"),
     ("robust fits", "railfix.pipeline.solution", "_robust_scale"),
@@ -50,16 +50,16 @@ STAGES: Final = (
     ("linear model", "railfix.pipeline.solution", "line_model"),
     ("protection level", "railfix.pipeline.solution", "protection_levels"),
     ("open places", "railfix.pipeline.level_stage", "places_beyond_the_level"),
-    ("results", "railfix.pipeline.antenna_chunk", "antenna_results"),
+    ("results", "railfix.pipeline.processor", "antenna_results"),
     ("results", "railfix.run.tally", "AntennaTally.add"),
     ("filter: measurements", "railfix.pipeline.along_track", "gnss_epochs"),
     ("filter: preparation", "railfix.tracking.filter", "prepare_chunk"),
     ("filter: preparation", "railfix.tracking.filter", "Recursion.__init__"),
     ("filter: recursion", "railfix.tracking.filter", "Recursion.advance"),
     ("filter: starts and searches", "railfix.pipeline.along_track", "track"),
-    ("filter: positions", "railfix.pipeline.antenna_chunk", "along_track"),
-    ("filter: rows of train.csv", "railfix.run.antennas", "train_table"),
-    ("tables", "railfix.run.antennas", "positions_table"),
+    ("filter: positions", "railfix.pipeline.processor", "along_track"),
+    ("filter: rows of train.csv", "railfix.run.result_rows", "train_table"),
+    ("tables", "railfix.run.result_rows", "positions_table"),
     ("tables", "railfix.run.output", "OutputFolder.append_csv"),
     ("tables", "railfix.run.output", "OutputFolder.append_parquet"),
     ("tables", "railfix.run.output", "OutputFolder.commit"),
@@ -150,7 +150,7 @@ def main() -> None:
             stages.spent.clear()
             begin = time.process_time()
             config = parse_config({"filter": options.filter, "tracking": {"level": options.level}})
-            summary = run_files(inputs, config, out=Path(scratch) / f"out{number}", options=RunOptions(workers=1))
+            summary = run_files(inputs, config, out=Path(scratch) / f"out{number}", options=RunOptions())
             whole = time.process_time() - begin
             epochs = summary.tally.epochs
             spent = {**stages.spent, "all": whole, "everything else": whole - sum(stages.spent.values())}

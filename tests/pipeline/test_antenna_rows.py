@@ -1,4 +1,4 @@
-"""Few epochs of two antennas are rows of the same arrays: the same results as of each antenna alone."""
+"""Epochs of two antennas are rows of the same arrays: the same results as of each antenna alone."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ import integrity_tables
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.rinex import read_navigation, read_observations
-from railfix.pipeline import antenna_chunk
+from railfix.pipeline import processor as processing
 from railfix.pipeline.config import Config, parse_config
+from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult, State
-from railfix.positioning.antenna_rows import EVERY, AntennaRows, joined, rows_of
+from railfix.positioning.antenna_rows import EVERY, AntennaRows, joined, rows_of, stack_observations
 from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.error_model import ErrorModel
 from railfix.run.processor import processor_of
@@ -137,10 +138,12 @@ def _assert_same(parts: list[AntennaResult], expected: AntennaResult) -> None:
 @pytest.mark.parametrize("channels", ["same channels", "signals of its own", "channels of its own"])
 def test_rows_of_two_antennas_give_the_results_of_each_alone(settings: str, channels: str) -> None:
     config, logs = parse_config(SETTINGS[settings]), _logs(channels)
+    alone = tuple(name for name in config.screens if name not in ("antenna_pair", "antenna_spacing"))
+    config = config.model_copy(update={"screens": alone})
     time = logs["front"].time
     logs["rear"] = _missing(logs["rear"], every=11)
     after, model = np.timedelta64(50, "ms"), error_model(0.3) if settings == "error model" else None
-    whole = _run(config, logs, time[-1:] + after, model)
+    whole = {name: _run(config, {name: log}, time[-1:] + after, model)[name] for name, log in logs.items()}
     # One epoch, three, one, two; now and then the rear antenna has one less, or none.
     cut = _run(config, logs, time[np.cumsum([1, 3, 1, 2] * (len(time) // 7)) - 1] + after, model)
     for name, (expected,) in whole.items():
@@ -168,29 +171,30 @@ def test_recordings_as_two_receivers_give_the_results_of_each_alone() -> None:
             _assert_same(parts[antenna], processor.process({antenna: log})[0].antennas[antenna])
 
 
-@pytest.mark.requirement("A8")
-def test_only_few_epochs_without_carrier_and_with_one_map_sigma_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.requirement("A5")
+@pytest.mark.parametrize("carrier", ["smoothed", "float"])
+def test_carrier_phases_of_two_antennas_give_the_results_of_each_alone(carrier: str) -> None:
     logs, navigation, paths = _inputs()
-    joined_to: list[int] = []
-    solve = antenna_chunk.solve
+    logs = {"front": _without(logs["front"], ("G05",)), "rear": _missing(logs["rear"], every=11)}
+    config = parse_config({"carrier": carrier, "filter": "off", "screens": ["elevation", "doppler", "raim"]})
+    both, state = EpochProcessor(config, paths, navigation=navigation), State()
+    parts: dict[str, list[AntennaResult]] = {name: [] for name in logs}
+    for cut in (slice(0, 40), slice(40, 119)):
+        result, state = both.process({name: log[cut] for name, log in logs.items()}, state)
+        for name, own in result.antennas.items():
+            parts[name].append(own)
+    for name, log in logs.items():
+        expected = both.process({name: log})[0].antennas[name]
+        for column in ("arc_m", "along_sigma_m", "status"):
+            got = np.concatenate([getattr(part, column) for part in parts[name]])
+            np.testing.assert_allclose(got, getattr(expected, column), rtol=1e-9, atol=_SAME, err_msg=column)
 
-    def counted(corrected: Any, antennas: AntennaRows, *rest: Any) -> Any:
-        joined_to.append(len(antennas.parts))
-        return solve(corrected, antennas, *rest)
 
-    monkeypatch.setattr(antenna_chunk, "solve", counted)
-
-    def parts(settings: dict[str, Any], epochs: int, own: dict[str, Trajectory] = paths) -> list[int]:
-        joined_to.clear()
-        processor_of(parse_config(settings), navigation, own).process({n: log[:epochs] for n, log in logs.items()})
-        return list(joined_to)
-
-    assert parts({}, 1) == [2]
-    assert parts({}, 8) == [2]
-    assert parts({}, 9) == [1, 1]
-    assert parts({"carrier": "smoothed"}, 1) == [1, 1]
+def test_antennas_on_maps_of_other_sigmas_are_refused() -> None:
+    _, navigation, paths = _inputs()
     other = paths | {"rear": replace(paths["rear"], sigma_plan_m=2.0 * paths["rear"].sigma_plan_m)}
-    assert parts({}, 1, other) == [1, 1]
+    with pytest.raises(ValueError, match="different sigmas of the map"):
+        processor_of(parse_config({}), navigation, other)
 
 
 def test_joined_rows_are_taken_apart_again() -> None:
@@ -221,24 +225,22 @@ def test_rows_are_split_by_antenna() -> None:
     np.testing.assert_array_equal(both.at_arc(arc)[2:], paths["rear"].at_arc(arc[2:]))
 
 
-@pytest.mark.parametrize("epochs", [1, 40])
-def test_chunks_are_freed_as_soon_as_they_are_done(monkeypatch: pytest.MonkeyPatch, epochs: int) -> None:
+def test_chunks_are_freed_as_soon_as_they_are_done(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a search for garbage: the arrays of a chunk would wait for it, and memory grow."""
-    made: list[weakref.ref[antenna_chunk.AntennaChunk]] = []
-    begin = antenna_chunk.AntennaChunk.__init__
+    made: list[weakref.ref[Any]] = []
 
-    def noted(chunk: antenna_chunk.AntennaChunk, *arguments: Any) -> None:
-        made.append(weakref.ref(chunk))
-        begin(chunk, *arguments)
+    def noted(*arguments: Any, **options: Any) -> Any:
+        ranges = correct_ranges(*arguments, **options)
+        made.append(weakref.ref(ranges))
+        return ranges
 
-    monkeypatch.setattr(antenna_chunk.AntennaChunk, "__init__", noted)
+    monkeypatch.setattr(processing, "correct_ranges", noted)
     logs, navigation, paths = _inputs()
     processor = processor_of(parse_config({"filter": "track"}), navigation, paths)
     gc.disable()
     try:
-        processor.process({name: log[:epochs] for name, log in logs.items()})
-        assert len(made) == 2
-        assert [chunk() for chunk in made] == [None, None]
+        processor.process({name: log[:40] for name, log in logs.items()})
+        assert [ranges() for ranges in made] == [None]
     finally:
         gc.enable()
 
@@ -250,6 +252,6 @@ def test_frequencies_of_glonass_that_one_log_alone_states_count_for_both() -> No
     stated = replace(front, header=replace(front.header, glonass_channel={"R05": 1, "R06": -4}))
     silent = replace(front, header=replace(front.header, glonass_channel={}))
     for logs in ((silent, stated), (stated, silent)):
-        rows, parts = antenna_chunk.one_after_the_other(logs)
+        rows, parts = stack_observations(logs)
         assert [part.stop for part in parts] == [2, 4]
         assert rows.header.glonass_channel == {"R05": 1, "R06": -4}

@@ -153,8 +153,7 @@ def lock(value: Any) -> None:
 @pytest.mark.parametrize("carrier", ["off", "smoothed", "float"])
 def test_stages_take_read_only_values(monkeypatch: pytest.MonkeyPatch, carrier: str) -> None:
     """Ranges, solutions and states are locked between the stages; the results are those without the locks."""
-    from railfix.pipeline import antenna_chunk
-    from railfix.pipeline import processor as of_chunks
+    from railfix.pipeline import processor as processing
 
     parts = {name: log[250:310] for name, log in demo_observations().items()}
     make = processor({"carrier": carrier, "raim": {"false_alarm": 0.2}, "raim_protection": "on"})
@@ -171,10 +170,9 @@ def test_stages_take_read_only_values(monkeypatch: pytest.MonkeyPatch, carrier: 
 
         return locked
 
-    of_antenna = ("with_slips", "smoothed", "solve", "antenna_results", "along_track")
-    for module, names in ((of_chunks, ("correct_ranges", "pair_antennas")), (antenna_chunk, of_antenna)):
-        for name in names:
-            monkeypatch.setattr(module, name, locking(getattr(module, name)))
+    stages = ("correct_ranges", "pair_antennas", "with_slips", "smoothed", "solve", "antenna_results", "along_track")
+    for name in stages:
+        monkeypatch.setattr(processing, name, locking(getattr(processing, name)))
     found, state = make.process({n: p[:30] for n, p in parts.items()})
     lock(state)
     more, _ = make.process({n: p[30:] for n, p in parts.items()}, state)

@@ -22,7 +22,9 @@ from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import satellite_states
 from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config, parse_config
+from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.fault_exclusion import fault_free
 from railfix.pipeline.level_stage import level_facts, low_sides, prior_basis_text, protection_levels
 from railfix.pipeline.processor import AntennaResult
@@ -162,12 +164,13 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     assert level_facts(parse_config({"filter": "off"}))["kind"] == "separation"
     processor = processor_of(config, recording.navigation, {"front": recording.line})
     obs = recording.observations[180:200]
-    one = processor.chunks({"front": obs}, State())["front"].screened()
+    index = processor.indices["front"]
+    antennas, received = AntennaRows.of(index), processor.received
+    corrected = correct_ranges(obs, ChannelBook(config).of(obs, received.navigation), config, received, antennas)
+    one = processor._screened(("front",), antennas, corrected, State())[0]["front"]
     ranges = one.ranges()
     point = single_point(ranges, one.anchor_ecef_m)
-    index = processor.indices["front"]
     place = place_on_line(ranges, index, point, config)
-    antennas = AntennaRows.of(index)
     scale = np.ones(len(ranges))
     ranges, place, raim = fault_free(
         ranges, antennas, place, scale, ranges.weight > 0, config.model_copy(update={"screens": ()})

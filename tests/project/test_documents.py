@@ -69,9 +69,9 @@ def test_command_lines_and_options_exist(path: Path) -> None:
         ("run ... --fron a", False, "unknown --fron"),
         ("run ... --set elevation.mask=15", False, "elevation.mask"),
         ("run ... --without dopler", False, "dopler"),
-        ("run --front a --track b --out c --workers x", True, "integer"),
+        ("run --front a --track b --out c --chunk x", True, "integer"),
         ("run --front a --nav b --out c", True, "--track"),
-        ("run --front a --nav b --track c --out d --workers 2", True, None),
+        ("run --front a --nav b --track c --out d --chunk 2", True, None),
     ],
 )
 def test_what_is_wrong_with_a_command_line_is_found(words: str, whole: bool, said: str | None) -> None:

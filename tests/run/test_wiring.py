@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from datetime import datetime
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -14,6 +15,7 @@ import polars as pl
 import pytest
 
 from railfix.core.reasons import Reason, Status
+from railfix.io.rinex import read_observations, write_observations
 from railfix.pipeline.config import Config
 from railfix.pipeline.results import Result
 from railfix.pipeline.tables import observations_table, positions_table
@@ -226,3 +228,20 @@ def test_a_row_of_merits_has_each_figure_once() -> None:
     row = {**figures, **limits, "rate": 0.5, "position": "constrained", "antenna": "front"}
     expected = ["front", "on the map", "1", "50.00 %", *(f"{k:.2f}" for k in range(3, 9)), "9", "10.00", "11.00"]
     assert merit_row(row, "antenna") == expected
+
+
+@pytest.mark.requirement("B6")
+def test_a_satellite_that_the_filter_left_out_is_named_by_the_run(tmp_path: Path) -> None:
+    """Codes of one satellite 60 m too long for all of a log at 1 Hz; single epochs exclude them, the filter learns."""
+    inputs = demo_inputs()
+    log = read_observations(inputs.front)
+    log = log[::10]
+    strong = str(log.satellite[np.nan_to_num(log.cn0_dbhz).mean(axis=0).argmax()])
+    write_observations(
+        replace(log, code_m=log.code_m + np.where(log.satellite == strong, 60.0, 0.0)), tmp_path / "front.rnx"
+    )
+    faulty = inputs.replaced(front=(tmp_path / "front.rnx",), rear=())
+    run = run_files(faulty, Config(), out=tmp_path / "run")
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert any(f"front: the filter left out the codes of {strong} at " in note for note in run.notes), run.notes
+    assert strong in record["antennas"]["front"]["satellites_left_out_by_the_filter"]

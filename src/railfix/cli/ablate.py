@@ -18,7 +18,7 @@ from railfix.run import RunInputs, RunOptions
 def ablate(
     inputs: RunInputs,
     choices: Choices,
-    options: Annotated[RunOptions, Without("observations", "workers", "chunk_epochs", "reference")],
+    options: Annotated[RunOptions, Without("observations", "chunk_epochs", "reference")],
     *,
     out: OutOption,
 ) -> None:

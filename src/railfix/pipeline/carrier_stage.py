@@ -16,7 +16,6 @@ from railfix.positioning.carrier import (
     PhasePositions,
     Phases,
     PhaseState,
-    Slips,
     SmoothingState,
     corrected_phase_m,
     find_slips,
@@ -75,7 +74,6 @@ def smoothed(ranges: CorrectedRanges, config: Config, state: CarrierState) -> tu
 
 def code_and_phase(
     corrected: CorrectedRanges,
-    slips: Slips,
     ranges: Ranges,
     trajectory: Trajectory,
     arc_m: Floats,
@@ -87,7 +85,7 @@ def code_and_phase(
     Parameters
     ----------
     corrected : CorrectedRanges
-    slips : Slips
+        With their slips (`with_slips`).
     ranges : Ranges
         Codes that the position was solved with; a phase is used where its code is.
     trajectory : Trajectory
@@ -101,6 +99,8 @@ def code_and_phase(
     PhasePositions
     CarrierState
     """
+    slips = corrected.slips
+    assert slips is not None, "with_slips() comes first"
     time, columns, satellites = corrected.time, corrected.columns, corrected.satellites
     satellite, signal = corrected.satellite, corrected.signal
     used = ranges.weight > 0
@@ -124,4 +124,4 @@ def code_and_phase(
         arc_id=arcs,
     )
     positions, after = phase_positions(time, ranges, phases, trajectory, arc_m, state.phase, limits=config.phase)
-    return positions, replace(state, continuity=continuity, arcs=numbers, phase=after)
+    return replace(positions, arcs=None), replace(state, continuity=continuity, arcs=numbers, phase=after)

@@ -1,12 +1,14 @@
-"""Steps of a chunk of one antenna, and what two antennas show each other between them."""
+"""What two antennas of one vehicle show each other: screens of common observations, of positions, of the filter."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
-from railfix.core.arrays import Floats
-from railfix.screens import AntennaRanges, FilteredMotion, PairedEpochs, PairScreen, PositionScreen, Screened, Verdict
+from railfix.core.arrays import Floats, changed
+from railfix.pipeline.corrected_ranges import CorrectedRanges
+from railfix.positioning.antenna_rows import joined
+from railfix.screens import FilteredMotion, PairedEpochs, PairScreen, PositionScreen, Screened
 from railfix.screens.pairs import on_pairs
 
 
@@ -18,38 +20,22 @@ class PositionVerdict(NamedTuple):
     status: int
 
 
-class ChunkSteps(Protocol):
-    """A chunk of one antenna, in this process or another one; the steps are called in this order."""
-
-    def screened(self) -> AntennaRanges:
-        """Return the corrected ranges after the screens of this antenna alone."""
-
-    def judge(self, verdicts: Iterable[Verdict]) -> None:
-        """Take the verdicts of the screens of common observations."""
-
-    def solved(self) -> Floats:
-        """Solve and return the chainages that are published, NaN where there is none, shape (T,) [m]."""
-
-    def check(self, verdicts: Iterable[PositionVerdict]) -> None:
-        """Take the verdicts of the screens of the published positions."""
-
-    def filtered(self) -> FilteredMotion:
-        """Filter along the track and return its places; NaN where the filter is off."""
-
-    def check_filter(self, spacing: Screened | None) -> None:
-        """Take the verdict on the distance and speeds of those places; None where they were not looked at."""
-
-
-def pair_verdicts(
-    screens: Sequence[tuple[Any, Any]], pair: PairedEpochs | None, ranges: Mapping[str, AntennaRanges]
-) -> dict[str, tuple[Verdict, ...]]:
-    """Return the verdicts of the screens of common observations, by antenna; `screens` are with their limits."""
-    verdicts: dict[str, tuple[Verdict, ...]] = {}
+def judge_pairs(
+    screens: Sequence[tuple[Any, Any]], pair: PairedEpochs | None, ranges: Mapping[str, CorrectedRanges]
+) -> dict[str, CorrectedRanges]:
+    """Return the ranges after the screens of common observations, by antenna; `screens` are with their limits."""
+    judged = dict(ranges)
     for screen, limits in screens:
         if pair is not None and isinstance(screen, PairScreen):
-            for name, more in screen.judge(ranges["front"], ranges["rear"], pair, limits).items():
-                verdicts[name] = (*verdicts.get(name, ()), *more)
-    return verdicts
+            for name, verdicts in screen.judge(ranges["front"], ranges["rear"], pair, limits).items():
+                judged[name] = judged[name].judged(verdicts)
+    return judged
+
+
+def with_screens(corrected: CorrectedRanges, ranges: Mapping[str, CorrectedRanges]) -> CorrectedRanges:
+    """Return the ranges of all antennas with what the screens and the carrier phases of each have changed."""
+    names = ("reason", "sigma_m", "corrected_code_m", "slips")
+    return changed(corrected, **{name: joined([getattr(own, name) for own in ranges.values()]) for name in names})
 
 
 def position_verdicts(

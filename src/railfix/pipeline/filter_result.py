@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,10 +15,15 @@ from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import SensorState
 from railfix.pipeline.smoothing import Replay
 from railfix.positioning.carrier import CycleSlipState
+from railfix.positioning.map_offset import MapOffsetLimits, beyond_threshold
+from railfix.screens import FilteredMotion
 from railfix.tracking import Line, Tracked, TrackState
 from railfix.tracking.levels import LevelState
 from railfix.tracking.result import is_bounded
 from railfix.tracking.state import StateIndex
+
+if TYPE_CHECKING:
+    from railfix.pipeline.results import AntennaResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +71,18 @@ class SingleEpochs:
     near_ecef_m: Floats
     off_map: Masks
     map_offset: Masks
+
+
+def single_epochs(result: AntennaResult, off_map: Masks, limits: MapOffsetLimits) -> SingleEpochs:
+    """Return what the filter uses of the results of single epochs; `off_map` as in `SingleEpochs`."""
+    return SingleEpochs(
+        noise_scale=result.noise_scale,
+        arc_m=result.arc_m,
+        sigma_m=result.own_sigma_m,
+        near_ecef_m=result.conventional_ecef_m,
+        off_map=off_map,
+        map_offset=beyond_threshold(result.map_offset, limits),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,6 +170,12 @@ class AlongTrack(NotebookTable):
     def time(self) -> Datetimes:
         """Time tags, shape (T,)."""
         return self.tracked.time
+
+    @property
+    def motion(self) -> FilteredMotion:
+        """Places and speeds, for the comparison with those of another antenna."""
+        found = self.tracked
+        return FilteredMotion(self.chainage_m, found.sigma_m, found.speed_mps, found.speed_sigma_mps)
 
     def __len__(self) -> int:
         return len(self.tracked)

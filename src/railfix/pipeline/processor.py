@@ -8,32 +8,32 @@ any cutting gives the same results.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from railfix.core.arrays import changed
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, SensorSamples
-from railfix.pipeline.antenna_chunk import AntennaChunk, SolvedTogether, is_short, one_after_the_other
+from railfix.pipeline.along_track import along_track, checked
 from railfix.pipeline.antenna_order import AntennaOrder
+from railfix.pipeline.assemble import antenna_results, with_coordinates
+from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
-from railfix.pipeline.compared import (
-    ChunkSteps,
-    filter_verdicts,
-    pair_verdicts,
-    position_verdicts,
-)
+from railfix.pipeline.compared import filter_verdicts, judge_pairs, position_verdicts, with_screens
 from railfix.pipeline.config import SCREEN_NAMES, Config
-from railfix.pipeline.corrected_ranges import correct_ranges
+from railfix.pipeline.corrected_ranges import CorrectedRanges, correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
-from railfix.pipeline.filter_result import FilterState
-from railfix.pipeline.received import Received, known_from_start, receive
+from railfix.pipeline.filter_result import AlongTrack, FilterState, single_epochs
+from railfix.pipeline.received import known_from_start, receive
 from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
 from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples
-from railfix.positioning.antenna_rows import AntennaRows
+from railfix.pipeline.solution import Solution, solve
+from railfix.positioning.antenna_rows import AntennaRows, rows_of, stack_observations
 from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.ranges.error_model import Conditions, ErrorModel, condition_differences
@@ -41,6 +41,7 @@ from railfix.ranges.sbas import SbasMessages
 from railfix.screens import (
     SCREENS,
     AntennaRanges,
+    ObservationScreen,
     PairedEpochs,
     Screen,
     ScreenSetup,
@@ -112,6 +113,8 @@ class EpochProcessor:
     ) -> None:
         if not trajectories:
             raise ValueError("at least one antenna's trajectory is needed")
+        if len({(t.sigma_plan_m, t.sigma_height_m) for t in trajectories.values()}) > 1:
+            raise ValueError("the trajectories of the antennas have different sigmas of the map; they are of one map")
         self.config = config
         plan, height = config.map_plan_sigma_m, config.map_height_sigma_m
         self.trajectories = {
@@ -137,6 +140,7 @@ class EpochProcessor:
         )
         self._track, self.units = track, units
         self._features: dict[str, LineFeatures] = {}
+        self._threads = ThreadPoolExecutor(len(trajectories)) if len(trajectories) > 1 else None
         self._before_filter = FilterState()
         self._lacking = self._inactive_notes()
 
@@ -222,107 +226,117 @@ class EpochProcessor:
                 if name not in observations
             }
             state = replace(state, fusion={**state.fusion, **waiting})
-        chunks = self.chunks(observations, state, sensors=sensors)
-        self.compare(chunks)
-        return self.gathered(chunks, state)
-
-    def chunks(
-        self, observations: Mapping[str, Observations], state: State, *, sensors: SensorSamples | None = None
-    ) -> dict[str, AntennaChunk]:
-        """Return a chunk of each antenna, to be taken through their steps by `compare` and `gathered`.
-
-        Few epochs of several antennas are rows of the same arrays.
-
-        Parameters
-        ----------
-        observations : mapping of str to Observations
-            By antenna.
-        state : State
-            After the chunk before this one.
-        sensors : SensorSamples, optional
-        """
-        received = state.received or self.received
-        if self._joinable(observations):
-            together = dict.fromkeys(observations, self._correct(observations, received))
-        else:
-            together = {name: self._correct({name: own}, received) for name, own in observations.items()}
-        return {
-            name: AntennaChunk(
-                self,
-                name,
-                own,
-                together[name],
-                state.antennas.get(name) or AntennaState(),
-                state.fusion.get(name) or self._before_filter,
-                sensors,
-            )
-            for name, own in observations.items()
-        }
-
-    def _joinable(self, observations: Mapping[str, Observations]) -> bool:
-        """Whether the epochs of all antennas are rows of the same arrays."""
-        sigmas = {(t.sigma_plan_m, t.sigma_height_m) for t in (self.trajectories[name] for name in observations)}
-        return self.config.carrier == "off" and len(sigmas) == 1 and is_short(list(observations.values()))
-
-    def _correct(self, observations: Mapping[str, Observations], received: Received) -> SolvedTogether:
-        """Return the corrected ranges of one antenna, or of the rows of several."""
-        indices = tuple(self.indices[name] for name in observations)
-        obs, parts = one_after_the_other(list(observations.values()))
-        antennas, channels = AntennaRows(indices, parts), self._channels.of(obs, received.navigation)
-        model = self._error_model
-        return SolvedTogether(
-            correct_ranges(obs, channels, self.config, received, antennas, error_model=model), antennas, self.config
-        )
-
-    def gathered(self, chunks: Mapping[str, AntennaChunk], state: State) -> tuple[Result, State]:
-        """Return the results of compared chunks, and the state after them.
-
-        Parameters
-        ----------
-        chunks : mapping of str to AntennaChunk
-            By antenna.
-        state : State
-            Before them.
-        """
-        results = {name: chunk.finished() for name, chunk in chunks.items()}
-        tracks = {name: chunk.tracked for name, chunk in chunks.items() if chunk.tracked is not None}
-        of_chunks = [note for chunk in chunks.values() for note in chunk.notes]
-        notes = (*(state.received or self.received).notes, *self._lacking, *of_chunks)
+        names, (obs, parts) = tuple(observations), stack_observations(list(observations.values()))
+        antennas = AntennaRows(tuple(self.indices[name] for name in names), parts)
+        channels = self._channels.of(obs, received.navigation)
+        corrected = correct_ranges(obs, channels, self.config, received, antennas, error_model=self._error_model)
+        ranges, own_states = self._screened(names, antennas, corrected, state)
+        pair = self._pair(ranges)
+        ranges = judge_pairs(self.screens, pair, ranges)
+        corrected, solution, own_states = solve(with_screens(corrected, ranges), antennas, self.config, own_states)
+        single = self._single_epochs(antennas, corrected, solution, pair, ranges)
+        fusion, filter_states = self._filtered(antennas, corrected, solution, single, state, sensors, pair)
         after = replace(
             state,
-            antennas={**state.antennas, **{name: chunk.state for name, chunk in chunks.items()}},
-            fusion={**state.fusion, **{name: chunks[name].filter_state for name in tracks}},
+            antennas={**state.antennas, **dict(zip(names, own_states, strict=True))},
+            fusion={**state.fusion, **filter_states},
         )
-        return Result(antennas=results, notes=notes, fusion=tracks), after
+        notes = (*received.notes, *self._lacking, *self._curve_notes(observations))
+        return Result(antennas=single, notes=notes, fusion=fusion), after
 
-    def line_references(self, name: str, sensors: SensorSamples | None) -> LineReferences:
+    def _screened(
+        self, names: Sequence[str], antennas: AntennaRows, corrected: CorrectedRanges, state: State
+    ) -> tuple[dict[str, CorrectedRanges], list[AntennaState]]:
+        """Return the ranges of each antenna after the screens that judge one antenna alone, and its new state."""
+        ranges, after = {}, []
+        for name, rows in zip(names, antennas.parts, strict=True):
+            before = state.antennas.get(name) or AntennaState()
+            own, states = rows_of(corrected, rows), dict(before.screens)
+            for screen, limits in self.screens:
+                if isinstance(screen, ObservationScreen):
+                    verdicts, screen_state = screen.judge(own, limits, self.setup, states.get(screen.name))
+                    own = own.judged(verdicts)
+                    if screen_state is not None:
+                        states[screen.name] = screen_state
+            carrier = before.carrier
+            if self.config.carrier != "off":
+                own, carrier = with_slips(own, self.config, carrier or CarrierState())
+                if self.config.carrier == "smoothed":
+                    own, carrier = smoothed(own, self.config, carrier)
+            ranges[name] = own
+            after.append(replace(before, screens=states, carrier=carrier))
+        return ranges, after
+
+    def _single_epochs(
+        self,
+        antennas: AntennaRows,
+        corrected: CorrectedRanges,
+        solution: Solution,
+        pair: PairedEpochs | None,
+        ranges: Mapping[str, CorrectedRanges],
+    ) -> dict[str, AntennaResult]:
+        """Return the results of single epochs by antenna, after the screens of the published positions."""
+        chainage = antennas.apart(lambda index, rows: index.trajectory.chainage_at(solution.arc_m[rows]))
+        published = dict(zip(ranges, chainage, strict=True))
+        screens = {name: dict(own.screens) for name, own in ranges.items()}
+        rows_by_name, status = dict(zip(ranges, antennas.parts, strict=True)), solution.status.copy()
+        for name, verdicts in position_verdicts(self.screens, pair, published).items():
+            rows = rows_by_name[name]
+            for verdict in verdicts:
+                doubtful = verdict.screened.reject & with_coordinates(self.config.failed_checks)[status[rows]]
+                status[rows] = np.where(doubtful, verdict.status, status[rows])
+                screens[name][verdict.name] = verdict.screened
+        results = antenna_results(corrected, antennas, changed(solution, status=status), self.config)
+        return {name: changed(rows_of(results, rows), screens=screens[name]) for name, rows in rows_by_name.items()}
+
+    def _filtered(
+        self,
+        antennas: AntennaRows,
+        corrected: CorrectedRanges,
+        solution: Solution,
+        single: Mapping[str, AntennaResult],
+        state: State,
+        sensors: SensorSamples | None,
+        pair: PairedEpochs | None,
+    ) -> tuple[dict[str, AlongTrack], dict[str, FilterState]]:
+        """Return the places of the filter along the track by antenna, and its states; two antennas in two threads."""
+        if self.config.filter == "off":
+            return {}, {}
+
+        def one_antenna(name: str, rows: slice) -> tuple[AlongTrack, FilterState]:
+            return along_track(
+                rows_of(corrected, rows),
+                single_epochs(single[name], solution.off_map[rows], self.config.map_offset),
+                self.trajectories[name],
+                self.config,
+                state.fusion.get(name) or self._before_filter,
+                samples=sensors,
+                surroundings=self._line_references(name, sensors),
+            )
+
+        over_antennas = map if self._threads is None else self._threads.map
+        found = dict(zip(single, over_antennas(one_antenna, single, antennas.parts), strict=True))
+        motions = {name: tracked.motion for name, (tracked, _) in found.items()}
+        spacing, held_s = filter_verdicts(self.screens, pair, motions), self.config.antenna_spacing.filter_held_s
+        fusion, after = {}, {}
+        for name, (tracked, filter_state) in found.items():
+            fusion[name], after[name] = checked(tracked, spacing.get(name), filter_state, held_s)
+        return fusion, after
+
+    def _curve_notes(self, observations: Mapping[str, Observations]) -> Iterator[str]:
+        """Yield notes on a C/N0 curve of another antenna or receiver."""
+        curve = self.setup.cn0_curve
+        if curve is not None and "cn0" in self.config.screens:
+            for name, own in observations.items():
+                yield from (f"{name}: {note}" for note in curve.notes_for(own.header))
+
+    def _line_references(self, name: str, sensors: SensorSamples | None) -> LineReferences:
         """Ground units, and the features of the line: made when there is an inertial unit."""
         wanted = "feature" in self.config.filter_sources and sensors is not None and len(sensors.inertial) > 0
         if wanted and self._track is not None and name not in self._features:
             limits = self.config.sensors.feature
             self._features[name] = LineFeatures.of(self._track, self.trajectories[name], limits)
         return LineReferences(features=self._features.get(name), units=self.units)
-
-    def compare(self, chunks: Mapping[str, ChunkSteps]) -> None:
-        """Take the same chunk of all antennas through the screens that compare them, up to their last step.
-
-        Parameters
-        ----------
-        chunks : mapping of str to ChunkSteps
-            By antenna. Those of other processes come last: they work while this one does.
-        """
-        ranges = {name: chunk.screened() for name, chunk in chunks.items()}
-        pair = self._pair(ranges)
-        verdicts = pair_verdicts(self.screens, pair, ranges)
-        for name, chunk in chunks.items():
-            chunk.judge(verdicts.get(name, ()))
-        published = {name: chunk.solved() for name, chunk in chunks.items()}
-        checks = position_verdicts(self.screens, pair, published)
-        for name, chunk in chunks.items():
-            chunk.check(checks.get(name, ()))
-        spacing = filter_verdicts(self.screens, pair, {name: chunk.filtered() for name, chunk in chunks.items()})
-        for name, chunk in chunks.items():
-            chunk.check_filter(spacing.get(name))
 
     def _pair(self, ranges: Mapping[str, AntennaRanges]) -> PairedEpochs | None:
         """Return the common epochs of two antennas of one vehicle; None where there are no such antennas."""

@@ -96,7 +96,6 @@ def solve(
     corrected : CorrectedRanges
         After the screens of the observations.
     antennas : AntennaRows
-        More than one only where no carrier phase is used.
     config : Config
     states : sequence of AntennaState
         By antenna.
@@ -168,11 +167,15 @@ def solve(
     variance = epoch_variance(scale, constrained.wsse, redundancy, limits=config.noise_scale)
     nominal = _nominal_variance_m2(model, corrected, config)
     phase, carriers = None, [state.carrier for state in states]
-    if config.carrier == "float" and corrected.slips is not None:
-        (index,), (carrier,) = antennas.indices, carriers
-        phase, carriers[0] = code_and_phase(
-            corrected, corrected.slips, ranges, index.trajectory, arc, config, carrier or CarrierState()
-        )
+    if config.carrier == "float":
+
+        def own_phase(
+            index: SearchIndex, rows: slice, state: CarrierState | None
+        ) -> tuple[PhasePositions, CarrierState]:
+            own = rows_of(corrected, rows), rows_of(ranges, rows)
+            return code_and_phase(*own, index.trajectory, constrained.arc_m[rows], config, state or CarrierState())
+
+        phase, carriers = antennas.each_with_state(own_phase, carriers)
         arc, exact, total, variance = phase.arc_m, phase.noise_sigma_m, phase.sigma_m, scale**2
     along_sigma = np.sqrt(variance * exact**2 + (total**2 - exact**2) + nominal)
     judged = own_sigma if phase is None else along_sigma

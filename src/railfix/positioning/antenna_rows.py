@@ -1,6 +1,6 @@
 """Epochs of several antennas as the rows of one set of arrays.
 
-A live epoch of two antennas is two rows. Stages that know neither the line nor earlier epochs (orbits, 3-D positions,
+An epoch of two antennas is two rows. Stages that know neither the line nor earlier epochs (orbits, 3-D positions,
 robust fits, levels) take all rows in one call; those that do are called for the rows of each antenna, and what they
 return is joined.
 """
@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
+from itertools import accumulate, pairwise
 from typing import Any, Final, TypeVar, cast
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices
+from railfix.gnss.observations import Observations, concatenate
 from railfix.positioning.section_search import SearchIndex
 
 Value = TypeVar("Value")
@@ -92,6 +94,26 @@ class AntennaRows:
     def at_arc(self, arc_m: Floats) -> Floats:
         """Points of the lines at arc lengths, shape (T, 3) [m]; NaN for NaN."""
         return self.each(lambda index, rows: index.trajectory.at_arc(arc_m[rows]))
+
+
+def stack_observations(observations: Sequence[Observations]) -> tuple[Observations, tuple[slice, ...]]:
+    """Return the observations of several antennas, with all their channels, as rows; and the rows of each."""
+    first, *others = observations
+    if not others:
+        return first, (EVERY,)
+    ends = [0, *accumulate(map(len, observations))]
+    same = all(_has_same_channels(first, other) for other in others)
+    stacked = joined(observations) if same else concatenate(observations)
+    return stacked, tuple(slice(a, b) for a, b in pairwise(ends))
+
+
+def _has_same_channels(first: Observations, other: Observations) -> bool:
+    """Whether two receivers have the same channels in the same order, and GLONASS satellites the same frequencies."""
+    return (
+        first.satellite.tobytes() == other.satellite.tobytes()
+        and first.signal.tobytes() == other.signal.tobytes()
+        and first.header.glonass_channel == other.header.glonass_channel
+    )
 
 
 @cache

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 from pydantic import Field
@@ -28,7 +29,7 @@ from scipy.special import chdtri
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.settings import Settings
-from railfix.kernels.layout import FAN_OUT, ROTATION_GRADIENT
+from railfix.kernels.layout import CLEAR_M, FAN_OUT, ROTATION_GRADIENT
 from railfix.positioning.normal_equations import Ranges, fit, normal_equations
 from railfix.positioning.single_point import SinglePoint
 from railfix.track.trajectory import Trajectory
@@ -114,15 +115,12 @@ class SearchIndex:
         Mean of its points.
     tree : cKDTree
         Of its points.
-    off_tangent_m : ndarray, shape (V - 1,) [m]
-        Distance of each section from the parts of the line off its tangent, filled in where a train comes along
-        (`integrity.protection.open_places`); NaN elsewhere.
     """
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
         self.middle_ecef_m = trajectory.ecef_m.mean(axis=0)
-        self.off_tangent_m = np.full(len(trajectory.length_m), np.nan)
+        self._clear_m = np.full(len(trajectory.length_m), np.nan)
         points = trajectory.ecef_m
         self.tree = cKDTree(points)
         self.levels: list[_Stretches] = []
@@ -142,6 +140,26 @@ class SearchIndex:
         first = np.cumsum([0, *(len(level.middle) for level in self.levels)])
         middle = np.concatenate([level.middle for level in self.levels])
         return middle, np.concatenate([level.radius_m for level in self.levels]), first
+
+    def clear_of_tangent_m(self, arc_m: Floats) -> Floats:
+        """Return a distance within which no part of the line lies off the tangent, at positions on it, shape (T,) [m].
+
+        Along and across, without the height. The same for all positions on a section, and computed once for each; at
+        most `CLEAR_M`.
+        """
+        line = self.trajectory
+        section = line.segment_at(arc_m)[0]
+        new = np.unique(section[np.isnan(self._clear_m[section])])
+        if len(new):
+            middle = line.ecef_m[new] + 0.5 * line.length_m[new, None] * line.tangent[new]
+            reach = CLEAR_M + 0.5 * line.length_m[new] + line.length_m.max()
+            lists = self.tree.query_ball_point(middle, reach)
+            count = np.fromiter(map(len, lists), dtype=np.intp, count=len(lists))
+            vertex = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=int(count.sum()))
+            self._clear_m[new] = kernels.off_tangent.clear_of_sections(
+                line.ecef_m, line.tangent, line.across, line.length_m, new.astype(np.intp), count, vertex
+            )
+        return np.asarray(self._clear_m[section])
 
 
 @dataclass

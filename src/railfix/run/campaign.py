@@ -209,7 +209,7 @@ def position_run(run: CampaignRun) -> dict[str, Any]:
     try:
         check_folder(run.out, overwrite="replace")
         if not run.done:
-            options = run.options.replaced(overwrite="replace", workers=run.options.workers or 1)
+            options = run.options.replaced(overwrite="replace")
             run_files(run.inputs, run.config, out=run.out, options=options)
         record = read_record(run.out).record
     except RailfixError as error:

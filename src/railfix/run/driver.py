@@ -6,9 +6,7 @@ import sys
 import time as clock
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
@@ -22,18 +20,18 @@ from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import basis_of, level_facts, prior_basis_text, risk_of
-from railfix.pipeline.processor import EpochProcessor
-from railfix.run.antennas import AntennaRun, OtherProcess, processes, write_rows
+from railfix.pipeline.processor import EpochProcessor, State
+from railfix.run.beside import without_beside
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
-from railfix.run.chunks import cuts
+from railfix.run.chunks import aligned, read_ahead
 from railfix.run.inputs import Antenna, RunInputs
 from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filtered, levels, package_versions, run_record
+from railfix.run.result_rows import Replays, ResultRows, add_smoothed
 from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sensors import check_filter, read_sensors, units_of_ranges
-from railfix.run.smoothed_columns import add_smoothed
 from railfix.run.sources import TRACK_FILE, Log, OpenedLine, open_line
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS
@@ -119,35 +117,30 @@ def run_files(
     inputs, config = inputs.checked(config or Config())
     needing = [name for name in SENSORS if getattr(inputs, name) is not None]
     check_filter(config, [*needing, *(["smooth"] if options.smooth == "on" else [])])
-    with ExitStack() as stack:
-        # Forked before any thread is started, and before polars starts its own.
-        others = [
-            stack.enter_context(OtherProcess(name, partial(_antenna_run, name, inputs, config, options)))
-            for name in tuple(inputs.logs)[1 : processes(options.workers)]
-        ]
-        folder = stack.enter_context(OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths))
-        hashing, beside = (stack.enter_context(ThreadPoolExecutor(max_workers=1)) for _ in range(2))
+    with (
+        OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths) as folder,
+        ThreadPoolExecutor(max_workers=1) as hashing,
+        ThreadPoolExecutor(max_workers=1) as beside,
+    ):
         entries, packages = inputs.entries(hashing, out), beside.submit(package_versions)
         navigation, line, logs = open_inputs(inputs, options, config)
         sensors, units = sensors_of(inputs)
         processor = processor_of(config, navigation, line.trajectories, track=line.track, units=units)
-        write, smooth = options.observations == "write", options.smooth == "on"
-        runs: dict[str, AntennaRun | OtherProcess] = {
-            name: AntennaRun(name, processor, log, sensors, observations=write, smooth=smooth, route=line.route)
-            for name, log in logs.items()
-            if name not in {other.name for other in others}
-        }
-        runs |= {other.name: other.reads(logs[other.name]) for other in others}
-        checks = SensorChecks()
-        tally = _position(runs, line, processor, folder, beside, progress, checks if sensors else None)
-        if smooth:
-            add_smoothed(runs, folder)
+        rows = ResultRows(
+            folder=folder,
+            line=line,
+            observations=options.observations == "write",
+            checks=SensorChecks() if sensors else None,
+            replays={name: Replays() for name in logs} if options.smooth == "on" else {},
+        )
+        tally = _position(logs, sensors, processor, rows, beside, progress)
+        if rows.replays:
+            add_smoothed(rows.replays, processor, folder)
         check_whole_run(navigation, tally, sbas=processor.received.sbas, sensors=sensors)
         notes = (
             *notes_of(line, navigation, tally, logs, note_statistic=config.map_offset.note_threshold),
             *_notes_of_levels(config, tally),
-            *checks.notes(sensors, units, next(iter(line.trajectories.values())), config.sensors),
-            *checks.radar_alarms(sensors.radar),
+            *_notes_of_sensors(rows.checks, sensors, units, line, config),
         )
         sources = [entry.result() for entry in entries]
         folder.end_parquet(_footer(sources, notes))
@@ -239,22 +232,6 @@ def time_of(navigation: Navigation) -> np.datetime64 | None:
     return None if not len(clocks) else np.sort(clocks)[len(clocks) // 2]
 
 
-def _antenna_run(name: Antenna, inputs: RunInputs, config: Config, options: RunOptions) -> AntennaRun:
-    """Return the run of one antenna, for a process of its own."""
-    navigation, line, logs = open_inputs(inputs, options, config)
-    sensors, units = sensors_of(inputs)
-    processor = processor_of(config, navigation, line.trajectories, track=line.track, units=units)
-    return AntennaRun(
-        name,
-        processor,
-        logs[name],
-        sensors,
-        observations=options.observations == "write",
-        smooth=options.smooth == "on",
-        route=line.route,
-    )
-
-
 def sensors_of(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
     """Read the samples of the sensors on board, and the ground units that they measured ranges to.
 
@@ -270,49 +247,53 @@ def sensors_of(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
 
 
 def _position(
-    runs: Mapping[str, AntennaRun | OtherProcess],
-    line: OpenedLine,
+    logs: Mapping[Antenna, Log],
+    sensors: SensorSamples,
     processor: EpochProcessor,
-    folder: OutputFolder,
+    rows: ResultRows,
     beside: Executor,
     progress: Progress | None,
-    checks: SensorChecks | None,
 ) -> Tally:
-    """Position chunk by chunk: counts and rows. Other processes come last in `runs`, and are asked first.
+    """Position chunk by chunk: counts and rows.
 
-    The rows of a chunk are written by `beside` while the next one is positioned. `checks` takes those of the first
-    antenna, where there are sensors.
+    The next chunk is read, and the rows of the one before are written by `beside`, while one is positioned.
     """
     tally = Tally(min_satellites=processor.config.min_satellites, order=processor.antenna_order())
-    after = np.datetime64("NaT", "ns")
+    after, state = np.datetime64("NaT", "ns"), State()
     written: Future[None] | None = None
-    for cut in cuts({name: run.more for name, run in runs.items()}):
+    for chunk in read_ahead(aligned({name: log.parts() for name, log in logs.items()})):
         began = clock.perf_counter()
-        end = max(times[-1] for times in cut.values() if len(times))
-        chunks = {name: run for name, run in runs.items() if name in cut}
-        for name, run in reversed(chunks.items()):
-            run.begin(len(cut[name]), after, end)
+        end = max(own.time[-1] for own in chunk.values() if len(own))
+        result, state = processor.process(chunk, state, sensors=sensors.between(after, end))
         after = end
-        processor.compare(chunks)
-        rows = {name: run.finished() for name, run in chunks.items()}
-        tally.took(cut.values(), clock.perf_counter() - began)
-        tally.compare({name: of_antenna.positions for name, of_antenna in rows.items()})
-        for name, of_antenna in rows.items():
-            tally.antennas[name] = of_antenna.tally
-            tally.notes.update(dict.fromkeys(of_antenna.notes))
-        first = next(iter(rows.values()))
-        if checks is not None and first.train is not None:
-            checks.take(first.positions, first.train)
+        if rows.line.route is not None:
+            result = without_beside(result, rows.line.route, processor.config)
+        tally.took([own.time for own in chunk.values()], clock.perf_counter() - began)
+        tally.add(result)
         check_same_day(processor.received.navigation, tally)
         check_same_place(tally, antennas="all")
         if written is not None:
             written.result()
-        written = beside.submit(write_rows, list(rows.values()), line, folder)
+        written = beside.submit(rows.write, result)
         if progress is not None:
-            progress(epochs=tally.epochs, fraction=min(run.log.share for run in runs.values()))
+            progress(epochs=tally.epochs, fraction=min(log.share for log in logs.values()))
     if written is not None:
         written.result()
     return tally
+
+
+def _notes_of_sensors(
+    checks: SensorChecks | None,
+    sensors: SensorSamples,
+    units: GroundUnits | None,
+    line: OpenedLine,
+    config: Config,
+) -> tuple[str, ...]:
+    """Return notes on sensors whose settings or tables contradict the satellites; none without sensors."""
+    if checks is None:
+        return ()
+    trajectory = next(iter(line.trajectories.values()))
+    return (*checks.notes(sensors, units, trajectory, config.sensors), *checks.radar_alarms(sensors.radar))
 
 
 #: Satellites left out by the filter that notes name.

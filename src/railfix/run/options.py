@@ -96,14 +96,6 @@ class RunOptions(Settings):
         "off",
         name="--smooth",
     )
-    workers: int = option(
-        "Processes side by side: 2 gives each of two antennas its own (Linux); the results do not depend on it. 0: 2 "
-        "where that can be, otherwise 1.",
-        0,
-        metavar="N",
-        ge=0,
-        le=2,
-    )
     track: TrackReading = Field(default_factory=TrackReading)
     logs: LogReading = Field(default_factory=LogReading)
 

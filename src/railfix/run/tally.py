@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings
 from railfix.core.reasons import Reason, Status, first_reason, reason_names
@@ -277,17 +276,9 @@ class Tally:
             tally.add(antenna)
             if name in result.fusion:
                 tally.add_filter(result.fusion[name], antenna.satellite[antenna.columns])
+        if self.order is not None and len(result.antennas) > 1:
+            self.order.add(*(_placed(result.antennas[name]) for name in ("front", "rear")))
         self.notes.update(dict.fromkeys(result.notes))
-
-    def compare(self, positions: Mapping[str, pl.DataFrame]) -> None:
-        """Compare the positions of one more chunk of two antennas (`tables.positions_table`)."""
-        if self.order is not None and len(positions) > 1:
-            self.order.add(
-                *(
-                    (rows["time_gpst"].to_numpy(), rows["chainage_m"].to_numpy(), rows["along_sigma_m"].to_numpy())
-                    for rows in (positions["front"], positions["rear"])
-                )
-            )
 
     @property
     def all_notes(self) -> tuple[str, ...]:
@@ -310,6 +301,11 @@ class Tally:
     def positioned(self) -> int:
         """Epochs with a position, of all antennas."""
         return sum(a.positioned for a in self.antennas.values())
+
+
+def _placed(result: AntennaResult) -> tuple[Datetimes, Floats, Floats]:
+    """Return time tags, chainages and their sigmas."""
+    return result.time, result.chainage_m, result.along_sigma_m
 
 
 def _count_left_out(

@@ -22,7 +22,7 @@ from railfix.integrity.protection.off_tangent import Forms, whitened, without_si
 from railfix.integrity.protection.risk import RiskBudget
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.model import Compact
-from railfix.kernels.layout import ALONG, CLEAR_M, LEAST_REDUNDANCY
+from railfix.kernels.layout import ALONG, LEAST_REDUNDANCY
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.section_search import SearchIndex
 
@@ -103,7 +103,7 @@ def places_beyond_the_level(
     likely, sigmas = risk.prior(systems), (antennas.sigma_plan_m, antennas.sigma_height_m)
     clear = np.full(len(arc_m), np.nan)
     for index, own in antennas.split(rows):
-        clear[own] = _off_tangent_m(index, arc_m[own])
+        clear[own] = index.clear_of_tangent_m(arc_m[own])
     for first in range(0, len(rows), size):
         block = rows[first : first + size]
         part, noise = model.take(block), np.maximum(scale[block], 1.0)
@@ -126,26 +126,6 @@ def places_beyond_the_level(
                 spent = _risk_of_block(index, arc_m[some], level_m[some], parts, design, none, prior, of_sides, risk)
                 result[some] = spent > risk.risk_per_sample
     return result
-
-
-def _off_tangent_m(index: SearchIndex, arc_m: Floats) -> Floats:
-    """Return a distance within which no part of the line lies off the tangent, at positions on it, shape (T,) [m].
-
-    Along and across, without the height. The same for all positions on a section; at most `CLEAR_M`.
-    """
-    line = index.trajectory
-    section = line.segment_at(arc_m)[0]
-    new = np.unique(section[np.isnan(index.off_tangent_m[section])])
-    if len(new):
-        middle = line.ecef_m[new] + 0.5 * line.length_m[new, None] * line.tangent[new]
-        reach = CLEAR_M + 0.5 * line.length_m[new] + line.length_m.max()
-        lists = index.tree.query_ball_point(middle, reach)
-        count = np.fromiter(map(len, lists), dtype=np.intp, count=len(lists))
-        vertex = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=int(count.sum()))
-        index.off_tangent_m[new] = kernels.off_tangent.clear_of_sections(
-            line.ecef_m, line.tangent, line.across, line.length_m, new.astype(np.intp), count, vertex
-        )
-    return np.asarray(index.off_tangent_m[section])
 
 
 def _risk_of_block(

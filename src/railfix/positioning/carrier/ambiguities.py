@@ -121,8 +121,8 @@ class PhasePositions:
         Of the arc of each used phase, as known at the epoch.
     n_codes, n_phases : ndarray of int, shape (T,)
         Used.
-    arcs : ArcAmbiguities
-        All arcs of a run, or those alive after the last epoch (`phase_positions`).
+    arcs : ArcAmbiguities or None
+        All arcs of a run, or those alive after the last epoch (`phase_positions`); None in results, row by row.
     iterations : int
     """
 
@@ -136,7 +136,7 @@ class PhasePositions:
     ambiguity_sigma_m: Floats
     n_codes: Integers
     n_phases: Integers
-    arcs: ArcAmbiguities
+    arcs: ArcAmbiguities | None
     iterations: int
 
 
