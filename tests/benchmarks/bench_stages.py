@@ -115,7 +115,7 @@ def watched() -> Stages:
         setattr(holder, function, stages.timed(name, getattr(holder, function)))
     from railfix.run import driver
 
-    driver.cuts = stages.iterated("reading", driver.cuts)
+    driver.aligned = stages.iterated("reading", driver.aligned)
     return stages
 
 

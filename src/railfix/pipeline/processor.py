@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import changed
+from railfix.core.arrays import Masks, changed
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, SensorSamples
@@ -51,7 +51,33 @@ from railfix.screens.pairs import pair_antennas
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
-__all__ = ["AntennaResult", "AntennaState", "EpochProcessor", "Result", "State"]
+__all__ = ["AntennaResult", "AntennaState", "EpochProcessor", "Result", "SolvedChunk", "State"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolvedChunk:
+    """Single epochs of a chunk, and what the filter along the track takes from them.
+
+    Attributes
+    ----------
+    results : mapping of str to AntennaResult
+    ranges : mapping of str to CorrectedRanges
+        After all screens and exclusions, by antenna.
+    off_map : mapping of str to ndarray of bool, shape (T,)
+        The train is away from the line.
+    pair : PairedEpochs or None
+        Common epochs of two antennas of one vehicle.
+    sensors : SensorSamples or None
+        Of the sensors on board since the chunk before.
+    notes : tuple of str
+    """
+
+    results: Mapping[str, AntennaResult]
+    ranges: Mapping[str, CorrectedRanges]
+    off_map: Mapping[str, Masks]
+    pair: PairedEpochs | None
+    sensors: SensorSamples | None
+    notes: tuple[str, ...]
 
 
 class EpochProcessor:
@@ -205,6 +231,21 @@ class EpochProcessor:
         SettingsError
             As the class.
         """
+        solved, state = self.single_epochs(
+            observations, state, navigation=navigation, messages=messages, sensors=sensors
+        )
+        return self.along_track(solved, state)
+
+    def single_epochs(
+        self,
+        observations: Mapping[str, Observations],
+        state: State | None = None,
+        *,
+        navigation: Navigation | None = None,
+        messages: SbasMessages | None = None,
+        sensors: SensorSamples | None = None,
+    ) -> tuple[SolvedChunk, State]:
+        """Return the single epochs of one chunk: the part of `process` before the filter; parameters are the same."""
         unknown = sorted(set(observations) - set(self.trajectories))
         if unknown:
             raise ValueError(f"no trajectory for antenna {', '.join(unknown)}")
@@ -218,14 +259,6 @@ class EpochProcessor:
             navigation=navigation,
             messages=messages,
         )
-        state = replace(state, received=received)
-        if sensors:
-            waiting = {
-                name: replace(own, sensors=waiting_samples(own.sensors, sensors))
-                for name, own in state.fusion.items()
-                if name not in observations
-            }
-            state = replace(state, fusion={**state.fusion, **waiting})
         names, (obs, parts) = tuple(observations), stack_observations(list(observations.values()))
         antennas = AntennaRows(tuple(self.indices[name] for name in names), parts)
         channels = self._channels.of(obs, received.navigation)
@@ -234,15 +267,40 @@ class EpochProcessor:
         pair = self._pair(ranges)
         ranges = judge_pairs(self.screens, pair, ranges)
         corrected, solution, own_states = solve(with_screens(corrected, ranges), antennas, self.config, own_states)
-        single = self._single_epochs(antennas, corrected, solution, pair, ranges)
-        fusion, filter_states = self._filtered(antennas, corrected, solution, single, state, sensors, pair)
-        after = replace(
-            state,
-            antennas={**state.antennas, **dict(zip(names, own_states, strict=True))},
-            fusion={**state.fusion, **filter_states},
+        solved = SolvedChunk(
+            results=self._results(antennas, corrected, solution, pair, ranges),
+            ranges={name: rows_of(corrected, rows) for name, rows in zip(names, parts, strict=True)},
+            off_map={name: solution.off_map[rows] for name, rows in zip(names, parts, strict=True)},
+            pair=pair,
+            sensors=sensors,
+            notes=(*received.notes, *self._lacking, *self._curve_notes(observations)),
         )
-        notes = (*received.notes, *self._lacking, *self._curve_notes(observations))
-        return Result(antennas=single, notes=notes, fusion=fusion), after
+        after = {**state.antennas, **dict(zip(names, own_states, strict=True))}
+        return solved, replace(state, received=received, antennas=after)
+
+    def along_track(self, solved: SolvedChunk, state: State) -> tuple[Result, State]:
+        """Return the results of one chunk with those of the filter, where it is on: the second part of `process`.
+
+        Parameters
+        ----------
+        solved : SolvedChunk
+        state : State
+            Of it only what the filter left after the chunk before is used, and replaced.
+        """
+        fusion, filter_states, sensors = {}, dict(state.fusion), solved.sensors
+        if sensors:
+            for name, own in state.fusion.items():
+                if name not in solved.results:
+                    filter_states[name] = replace(own, sensors=waiting_samples(own.sensors, sensors))
+        if self.config.filter == "track":
+            found = self._filtered(solved, state)
+            motions = {name: tracked.motion for name, (tracked, _) in found.items()}
+            spacing = filter_verdicts(self.screens, solved.pair, motions)
+            held_s = self.config.antenna_spacing.filter_held_s
+            for name, (tracked, own) in found.items():
+                fusion[name], filter_states[name] = checked(tracked, spacing.get(name), own, held_s)
+        result = Result(antennas=solved.results, notes=solved.notes, fusion=fusion)
+        return result, replace(state, fusion=filter_states)
 
     def _screened(
         self, names: Sequence[str], antennas: AntennaRows, corrected: CorrectedRanges, state: State
@@ -267,7 +325,7 @@ class EpochProcessor:
             after.append(replace(before, screens=states, carrier=carrier))
         return ranges, after
 
-    def _single_epochs(
+    def _results(
         self,
         antennas: AntennaRows,
         corrected: CorrectedRanges,
@@ -289,39 +347,22 @@ class EpochProcessor:
         results = antenna_results(corrected, antennas, changed(solution, status=status), self.config)
         return {name: changed(rows_of(results, rows), screens=screens[name]) for name, rows in rows_by_name.items()}
 
-    def _filtered(
-        self,
-        antennas: AntennaRows,
-        corrected: CorrectedRanges,
-        solution: Solution,
-        single: Mapping[str, AntennaResult],
-        state: State,
-        sensors: SensorSamples | None,
-        pair: PairedEpochs | None,
-    ) -> tuple[dict[str, AlongTrack], dict[str, FilterState]]:
+    def _filtered(self, solved: SolvedChunk, state: State) -> dict[str, tuple[AlongTrack, FilterState]]:
         """Return the places of the filter along the track by antenna, and its states; two antennas in two threads."""
-        if self.config.filter == "off":
-            return {}, {}
 
-        def one_antenna(name: str, rows: slice) -> tuple[AlongTrack, FilterState]:
+        def one_antenna(name: str) -> tuple[AlongTrack, FilterState]:
             return along_track(
-                rows_of(corrected, rows),
-                single_epochs(single[name], solution.off_map[rows], self.config.map_offset),
+                solved.ranges[name],
+                single_epochs(solved.results[name], solved.off_map[name], self.config.map_offset),
                 self.trajectories[name],
                 self.config,
                 state.fusion.get(name) or self._before_filter,
-                samples=sensors,
-                surroundings=self._line_references(name, sensors),
+                samples=solved.sensors,
+                surroundings=self._line_references(name, solved.sensors),
             )
 
         over_antennas = map if self._threads is None else self._threads.map
-        found = dict(zip(single, over_antennas(one_antenna, single, antennas.parts), strict=True))
-        motions = {name: tracked.motion for name, (tracked, _) in found.items()}
-        spacing, held_s = filter_verdicts(self.screens, pair, motions), self.config.antenna_spacing.filter_held_s
-        fusion, after = {}, {}
-        for name, (tracked, filter_state) in found.items():
-            fusion[name], after[name] = checked(tracked, spacing.get(name), filter_state, held_s)
-        return fusion, after
+        return dict(zip(solved.results, over_antennas(one_antenna, solved.results), strict=True))
 
     def _curve_notes(self, observations: Mapping[str, Observations]) -> Iterator[str]:
         """Yield notes on a C/N0 curve of another antenna or receiver."""

@@ -16,11 +16,12 @@ from railfix import __version__
 from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError
 from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import basis_of, level_facts, prior_basis_text, risk_of
-from railfix.pipeline.processor import EpochProcessor, State
+from railfix.pipeline.processor import EpochProcessor, SolvedChunk, State
 from railfix.run.beside import without_beside
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.chunks import aligned, read_ahead
@@ -256,19 +257,20 @@ def _position(
 ) -> Tally:
     """Position chunk by chunk: counts and rows.
 
-    The next chunk is read, and the rows of the one before are written by `beside`, while one is positioned.
+    Four chunks are on their way at a time: one is read, one has its single epochs positioned, one is filtered, and the
+    rows of one are written by `beside`.
     """
     tally = Tally(min_satellites=processor.config.min_satellites, order=processor.antenna_order())
-    after, state = np.datetime64("NaT", "ns"), State()
+    state = State()
     written: Future[None] | None = None
-    for chunk in read_ahead(aligned({name: log.parts() for name, log in logs.items()})):
-        began = clock.perf_counter()
-        end = max(own.time[-1] for own in chunk.values() if len(own))
-        result, state = processor.process(chunk, state, sensors=sensors.between(after, end))
-        after = end
+    chunks = read_ahead(aligned({name: log.parts() for name, log in logs.items()}))
+    began = clock.perf_counter()
+    for solved in read_ahead(_single_epochs(chunks, sensors, processor)):
+        result, state = processor.along_track(solved, state)
         if rows.line.route is not None:
             result = without_beside(result, rows.line.route, processor.config)
-        tally.took([own.time for own in chunk.values()], clock.perf_counter() - began)
+        tally.took([own.time for own in result.antennas.values()], clock.perf_counter() - began)
+        began = clock.perf_counter()
         tally.add(result)
         check_same_day(processor.received.navigation, tally)
         check_same_place(tally, antennas="all")
@@ -280,6 +282,18 @@ def _position(
     if written is not None:
         written.result()
     return tally
+
+
+def _single_epochs(
+    chunks: Iterator[dict[str, Observations]], sensors: SensorSamples, processor: EpochProcessor
+) -> Iterator[SolvedChunk]:
+    """Yield the single epochs of chunks, each with the samples of the sensors up to its end."""
+    after, state = np.datetime64("NaT", "ns"), State()
+    for chunk in chunks:
+        end = max(own.time[-1] for own in chunk.values() if len(own))
+        solved, state = processor.single_epochs(chunk, state, sensors=sensors.between(after, end))
+        after = end
+        yield solved
 
 
 def _notes_of_sensors(

@@ -258,7 +258,7 @@ class Tally:
     notes : dict of str
         As keys, in the order in which they came.
     chunks : list of (datetime64[ns], int, float)
-        First epoch of each chunk, its epochs of all antennas, and the time that positioning it took [s].
+        First epoch of each chunk, its epochs of all antennas, and the time since the chunk before [s].
     order : AntennaOrder, optional
         Test of the order of two antennas.
     """
