@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time as clock
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -30,7 +29,7 @@ from railfix.run.inputs import RunInputs
 from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
-from railfix.run.record import package_versions, run_record
+from railfix.run.record import Provenance, package_versions, run_record
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS, ScreenSetup
 from railfix.track.trajectory import Trajectory
@@ -221,19 +220,16 @@ def ablate_files(
         threshold = config.map_offset.note_threshold
         notes = (*left_out, *notes_of(line, navigation, tallies[ALL], logs, note_statistic=threshold))
         wall = clock.perf_counter() - began
-        record = run_record(
+        made_from = Provenance(
             files=[entry.result() for entry in entries],
             packages=package_versions(),
-            command=sys.argv,
             asked=asked or {},
-            used=config.model_copy(update={"screens": screens}).as_dict(),
-            options=options.model_dump(mode="json"),
+            config=config.model_copy(update={"screens": screens, "protection": "off"}),
+            options=options,
             line=line.facts,
             navigation=navigation,
-            tally=tallies[ALL],
-            notes=notes,
-            wall_s=wall,
         )
+        record = run_record(made_from, tallies[ALL], notes, wall_s=wall)
         rows = [effect.as_row() for effect in effects]
         folder.append_csv("ablation.csv", pl.DataFrame(rows, infer_schema_length=None))
         folder.write_json("ablation.json", record | {"choices": rows})

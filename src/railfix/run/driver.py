@@ -29,7 +29,7 @@ from railfix.run.inputs import Antenna, RunInputs
 from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
-from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filtered, levels, package_versions, run_record
+from railfix.run.record import AlongSigma, Figures, Filtered, Levels, Provenance, package_versions, run_record
 from railfix.run.result_rows import Replays, ResultRows, add_smoothed
 from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sensors import check_filter, read_sensors, units_of_ranges
@@ -145,35 +145,27 @@ def run_files(
         )
         sources = [entry.result() for entry in entries]
         folder.end_parquet(_footer(sources, notes))
-        sigma, found_levels = along_sigma(folder, tally), levels(folder, tally)
-        tracks = filtered(folder, tally) if config.filter == "track" else {}
-        level_basis = "protection" if basis_of(config) == "measured" else "indicative protection"
+        figures = Figures.of(folder, tally, config)
         wall = clock.perf_counter() - began
-        record = run_record(
-            files=sources,
-            packages=packages.result(),
-            command=sys.argv,
-            asked=asked or {},
-            used=config.as_dict(),
-            options=options.model_dump(mode="json"),
-            line=line.facts,
-            navigation=navigation,
-            tally=tally,
-            sigma=sigma,
-            protection=level_facts(config),
-            found_levels=found_levels,
-            found_tracks=tracks,
-            notes=notes,
-            wall_s=wall,
-        )
+        made_from = Provenance(
+            files=sources, packages=packages.result(), asked=asked or {}, config=config, options=options,
+            line=line.facts, navigation=navigation,
+        )  # fmt: skip
+        record = run_record(made_from, tally, notes, wall_s=wall, figures=figures)
         folder.write_json("run.json", record)
         if not line.from_file:
             write_track_csv(line.track, folder.staged(TRACK_FILE))
         files = folder.commit()
     return RunSummary(
-        tally=tally, sigma=sigma, levels=found_levels, tracks=tracks, level_basis=level_basis, notes=notes, files=files,
+        tally=tally,
+        sigma=figures.sigma,
+        levels=figures.levels,
+        tracks=figures.tracks,
+        level_basis="protection" if basis_of(config) == "measured" else "indicative protection",
+        notes=notes,
+        files=files,
         wall_s=wall,
-    )  # fmt: skip
+    )
 
 
 def open_inputs(

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import platform
+import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
-from types import MappingProxyType
 from typing import Any, Final
 
 import polars as pl
@@ -15,6 +15,9 @@ from railfix import __version__
 from railfix.core.reasons import Status
 from railfix.gnss.navigation import Navigation
 from railfix.kernels import numba_version
+from railfix.pipeline.config import Config
+from railfix.pipeline.level_stage import level_facts
+from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.tally import Tally
 from railfix.tracking import TrackStatus
@@ -117,69 +120,92 @@ def _one_by_one(rows: pl.LazyFrame, figures: Mapping[str, pl.Expr]) -> dict[str,
     return {name: rows.select(figure).collect().item() for name, figure in figures.items()}
 
 
-def run_record(
-    *,
-    files: Sequence[Mapping[str, Any]],
-    packages: Mapping[str, str],
-    command: Sequence[str],
-    asked: Mapping[str, Any],
-    used: Mapping[str, Any],
-    options: Mapping[str, Any],
-    line: Mapping[str, Any],
-    navigation: Navigation,
-    tally: Tally,
-    notes: Sequence[str],
-    wall_s: float,
-    protection: Mapping[str, Any] = MappingProxyType({}),
-    sigma: Mapping[str, AlongSigma] = MappingProxyType({}),
-    found_levels: Mapping[str, Levels] = MappingProxyType({}),
-    found_tracks: Mapping[str, Filtered] = MappingProxyType({}),
-) -> dict[str, Any]:
-    """Return the content of ``run.json`` as plain values.
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """What a run was made from.
 
-    Parameters
+    Attributes
     ----------
     files : sequence of mapping
         Inputs with size and hash.
     packages : mapping of str to str
         `package_versions`.
-    asked, used, options : mapping
-        Settings as given, all settings that were in force, and choices that are no settings of the positions.
+    asked : mapping
+        Settings as given.
+    config : Config
+        Settings that were in force.
+    options : RunOptions
+        Choices that are no settings of the positions.
     line : mapping
         Facts of the track map, the vehicle and the trajectories.
-    protection : mapping
-        Assumptions of the protection levels (`railfix.pipeline.level_stage.level_facts`).
-    sigma, found_levels, found_tracks : mapping of str to AlongSigma, Levels, Filtered
-        By antenna; empty where there are none.
+    navigation : Navigation
     """
+
+    files: Sequence[Mapping[str, Any]]
+    packages: Mapping[str, str]
+    asked: Mapping[str, Any]
+    config: Config
+    options: RunOptions
+    line: Mapping[str, Any]
+    navigation: Navigation
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figures:
+    """Percentiles of a run by antenna; empty where there are none.
+
+    Attributes
+    ----------
+    sigma : mapping of str to AlongSigma
+    levels : mapping of str to Levels
+    tracks : mapping of str to Filtered
+    """
+
+    sigma: Mapping[str, AlongSigma] = field(default_factory=dict)
+    levels: Mapping[str, Levels] = field(default_factory=dict)
+    tracks: Mapping[str, Filtered] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, folder: OutputFolder, tally: Tally, config: Config) -> Figures:
+        """Figures of the rows written."""
+        tracks = filtered(folder, tally) if config.filter == "track" else {}
+        return cls(sigma=along_sigma(folder, tally), levels=levels(folder, tally), tracks=tracks)
+
+
+def run_record(
+    made_from: Provenance, tally: Tally, notes: Sequence[str], *, wall_s: float, figures: Figures | None = None
+) -> dict[str, Any]:
+    """Return the content of ``run.json`` as plain values."""
+    figures = figures or Figures()
+    navigation, config = made_from.navigation, made_from.config
     observed = sum(antenna.observed for antenna in tally.antennas.values())
     ok = sum(antenna.status[Status.OK.text] for antenna in tally.antennas.values())
     return {
-        "versions": {"railfix": __version__, "python": platform.python_version(), **packages},
+        "versions": {"railfix": __version__, "python": platform.python_version(), **made_from.packages},
         "platform": platform.platform(),
         "kernels": numba_version(),
-        "command": list(command),
-        "inputs": list(files),
-        "settings_asked": dict(asked),
-        "settings_used": dict(used),
-        "options": dict(options),
-        "line": dict(line),
+        "command": sys.argv,
+        "inputs": list(made_from.files),
+        "settings_asked": dict(made_from.asked),
+        "settings_used": config.as_dict(),
+        "options": made_from.options.model_dump(mode="json"),
+        "line": dict(made_from.line),
         "navigation": {
             "records": len(navigation.kepler) + len(navigation.glonass),
             "skipped": dict(navigation.skipped),
             "klobuchar_from": sorted(navigation.klobuchar),
             "precise": "" if navigation.precise is None else navigation.precise.source,
         },
-        "protection": dict(protection),
+        "protection": level_facts(config),
         "notes": list(notes),
         "positioning_rate": tally.positioned / observed if observed else None,
         "ok_rate": ok / observed if observed else None,
         "antennas": {
             name: {
                 **antenna.as_dict(),
-                "along_sigma_m": asdict(sigma[name]) if name in sigma else None,
-                "protection_level": asdict(found_levels[name]) if name in found_levels else None,
-                "filter": asdict(found_tracks[name]) if name in found_tracks else None,
+                "along_sigma_m": asdict(figures.sigma[name]) if name in figures.sigma else None,
+                "protection_level": asdict(figures.levels[name]) if name in figures.levels else None,
+                "filter": asdict(figures.tracks[name]) if name in figures.tracks else None,
             }
             for name, antenna in tally.antennas.items()
         },
