@@ -339,15 +339,16 @@ def test_ephemerides_count_from_when_they_are_complete(recordings: Path, tmp_pat
 
 
 def test_two_channels_agree_and_a_difference_stops(logs: dict[str, tuple[Observations, ...]]) -> None:
-    channels = TwoChannels(processor("front"), LiveSettings())
+    """Both antennas, so that the second process has what the first one has."""
+    channels = TwoChannels(processor(), LiveSettings())
     try:
-        alone = LiveEngine(processor("front"), LiveSettings())
-        arrivals = [(tag_ns(epoch), "front", epoch) for epoch in logs["front"][:40]]
+        alone = LiveEngine(processor(), LiveSettings())
+        arrivals = [(tag_ns(epoch), name, epoch) for name in logs for epoch in logs[name][:20]]
         assert digests(played(channels, arrivals)) == digests(played(alone, arrivals))
         # A fault in one channel alone: its engine gets an epoch that the other does not.
-        LiveEngine.push(channels, "front", logs["front"][40], now_ns=tag_ns(logs["front"][40]))
-        with pytest.raises(ChannelsDisagreeError, match="messages in one"):
-            channels.poll(now_ns=tag_ns(logs["front"][40]))
+        LiveEngine.push(channels, "front", logs["front"][20], now_ns=tag_ns(logs["front"][20]))
+        with pytest.raises(ChannelsDisagreeError, match="first in the stage: corrected ranges"):
+            channels.poll(now_ns=tag_ns(logs["front"][20]) + 50 * MS)
     finally:
         channels.close()
     ours = digests(played(LiveEngine(processor("front"), LiveSettings()), arrivals[:5]))

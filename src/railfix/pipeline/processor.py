@@ -166,9 +166,17 @@ class EpochProcessor:
         )
         self._track, self.units = track, units
         self._features: dict[str, LineFeatures] = {}
-        self._threads = ThreadPoolExecutor(len(trajectories)) if len(trajectories) > 1 else None
         self._before_filter = FilterState()
         self._lacking = self._inactive_notes()
+        self._threads = _threads(len(trajectories))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return everything but the threads, which another process has of its own."""
+        return {name: value for name, value in self.__dict__.items() if name != "_threads"}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._threads = _threads(len(self.trajectories))
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -405,6 +413,10 @@ def conditions_of(config: Config) -> Conditions:
         ionosphere="sbas" if config.sbas else config.ionosphere,
         troposphere="sbas" if config.sbas else config.troposphere,
     )
+
+
+def _threads(antennas: int) -> ThreadPoolExecutor | None:
+    return ThreadPoolExecutor(antennas) if antennas > 1 else None
 
 
 def _check_rising(name: str, observations: Observations) -> None:
