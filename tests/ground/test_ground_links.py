@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import random
 import time
 from collections import Counter
@@ -19,7 +20,7 @@ from railfix.ground.keys import write_keys
 from railfix.ground.link_figure import coverage
 from railfix.ground.link_quality import LinkChoice, LinkLimits, LinkMeter
 from railfix.ground.links import BEARERS, CentreLinks, TrainLinks
-from railfix.ground.quic import LinkProtocol
+from railfix.ground.quic import LinkProtocol, configuration, connected
 from railfix.ground.relay import LinkDisturbance, Relay, RelaySettings
 
 pytestmark = pytest.mark.requirement("F3")
@@ -335,6 +336,26 @@ def test_each_threat_on_the_wire(tmp_path: Path) -> None:
             relay.close()
 
     run(work())
+
+
+def test_a_centre_that_does_not_answer_is_one_time_out(keys: Path) -> None:
+    """And no error that nobody takes, which asyncio would print with every try."""
+    untaken: list[Any] = []
+
+    async def work() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: untaken.append(context))
+        settings = configuration(keys, "train-7", is_client=True)
+        settings.initial_rtt = 0.01  # closing takes some of them
+        with pytest.raises(TimeoutError):
+            async with connected(
+                ("127.0.0.1", 9), settings, local="127.0.0.1", received=lambda *_: None, timeout_s=0.1
+            ):
+                pass
+        await asyncio.sleep(0.3)
+        gc.collect()
+
+    asyncio.run(work())
+    assert untaken == []
 
 
 @pytest.mark.parametrize("kind", ["other authority", "no certificate", "other train"])

@@ -202,6 +202,7 @@ async def connected(
         await asyncio.wait_for(protocol.wait_connected(), timeout_s)
         yield protocol
     finally:
+        protocol._connected_waiter = None  # after a time-out nobody takes the error that closing gives it
         protocol.close()
         await asyncio.sleep(0)
         transport.close()
