@@ -26,6 +26,7 @@ from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_j
 from railfix.live.channels import TwoChannels, compare, digests
 from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.forms import nmea_bytes, tpv_bytes
+from railfix.live.lag import Lag
 from railfix.live.metrics import Metrics
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
@@ -201,8 +202,22 @@ def test_a_session_that_falls_behind_says_so_and_skips_to_the_present(
     stepped = LiveEngine(processor("front"), settings)
     times = [tag_ns(epoch) + (3000 * MS if k >= 10 else 0) for k, epoch in enumerate(epochs)]
     played(stepped, [(at, "front", epoch) for at, epoch in zip(times, epochs, strict=True)])
-    assert stepped.counts["skipped, behind the receivers"] == 11
+    assert stepped.counts["skipped, behind the receivers"] == 21
     assert any("the receivers' time is 3.0 s later than before" in text for text in stepped.told)
+
+
+def test_a_computer_too_busy_to_skip_is_no_step_of_the_tags() -> None:
+    """From 1 s on an epoch of 0.1 s is taken every 0.3 s, 30 of them; then the computer is free again."""
+    lag, now_ns, skipped = Lag(behind_s=1.0), 0, []
+    for k in range(120):
+        free = max(now_ns + 5 * MS, k * 100 * MS)
+        now_ns = k * 100 * MS if k < 10 else now_ns + 300 * MS if k < 40 else free
+        skipped.append(lag.skips(k * 100 * MS, now_ns))
+    assert lag.told[0] == "1.2 s behind the receivers: epochs are skipped up to the present"
+    assert lag.told[1].startswith("at the present again")
+    assert len(lag.told) == 2
+    assert skipped[15:100] == [True] * 85
+    assert not any(skipped[105:])
 
 
 def test_duplicates_order_and_restart(logs: dict[str, tuple[Observations, ...]]) -> None:

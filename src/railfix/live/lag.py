@@ -7,8 +7,11 @@ from typing import Final
 
 #: Largest drift of the computer's clock against the receivers' time; the shortest delay is forgotten at this rate.
 DRIFT: Final = 1e-4
-#: A delay that has not become shorter after skipping for this time is one of the tags, not of the session [s].
-ADMITTED_S: Final = 1.0
+#: A delay that stays the same, to within `STEADY_S`, for this time and number of skipped epochs is one of the tags, not
+#: of the session: that of a session becomes shorter, and longer where the computer is too busy even to skip [s].
+ADMITTED_S: Final = 2.0
+STEADY_S: Final = 0.2
+STEADY_EPOCHS: Final = 5
 
 
 @dataclass(kw_only=True)
@@ -31,7 +34,8 @@ class Lag:
     _shortest_ns: float | None = None
     _at_ns: int = 0
     _since_ns: int = 0
-    _first_s: float = 0.0
+    _steady_s: float = 0.0
+    _steady: int = 0
 
     def reset(self) -> None:
         """Forget the shortest delay: the tags have another origin."""
@@ -48,16 +52,19 @@ class Lag:
             if lag_s <= self.behind_s:
                 return False
             self.told.append(f"{lag_s:.1f} s behind the receivers: epochs are skipped up to the present")
-            self._since_ns, self._first_s = now_ns, lag_s
+            self._steady = 0
         elif lag_s <= 0.25 * self.behind_s:
             self.told.append(f"at the present again, {self.skipped} epochs were skipped")
             self.skipped = 0
             return False
-        elif (now_ns - self._since_ns) * 1e-9 > ADMITTED_S and lag_s > 0.9 * self._first_s:
+        if self._steady == 0 or abs(lag_s - self._steady_s) > STEADY_S:
+            self._since_ns, self._steady_s, self._steady = now_ns, lag_s, 0
+        elif self._steady >= STEADY_EPOCHS and (now_ns - self._since_ns) * 1e-9 > ADMITTED_S:
             self.told.append(
                 f"the receivers' time is {lag_s:.1f} s later than before; {self.skipped} epochs were skipped"
             )
             self.reset()
             return False
+        self._steady += 1
         self.skipped += 1
         return True
