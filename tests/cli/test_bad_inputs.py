@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from bad_inputs import CASES, COMMANDS, FAULTS, MISTAKES, Desk, desk_in
+from more_mistakes import MORE, Edit, feet
 from railfix.cli import app
 
 #: Faults that leave nothing to be read.
@@ -71,15 +73,44 @@ def test_one_sentence_and_nothing_destroyed(desk: Desk, kind: str, fault: str) -
 
 
 @pytest.mark.requirement("G4")
-@pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_of_the_user_is_one_sentence_with_its_remedy(desk: Desk, name: str) -> None:
-    files, command, code, words = MISTAKES[name]
+@pytest.mark.parametrize("name", [*MISTAKES, *MORE])
+def test_a_mistake_of_the_user_is_one_sentence_with_its_remedy(good: Desk, name: str) -> None:
+    files, command, code, words = {**MISTAKES, **MORE}[name]
     for file, text in files.items():
-        (desk.folder / file).write_text(text)
-    before = contents(desk.folder)
-    result = RUNNER.invoke(app, desk.words(command))
+        (good.folder / file).write_text(text if isinstance(text, str) else text.text(good.folder))
+    before = contents(good.folder)
+    try:
+        result = RUNNER.invoke(app, good.words(command))
+        after = contents(good.folder)
+    finally:
+        for file in files:
+            (good.folder / file).unlink()
+    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
     assert result.exit_code == code, result.output
-    assert result.stderr.startswith("railfix: error: ")
-    assert result.stderr.count("\n") == 1
-    assert words in result.stderr
-    assert contents(desk.folder) == before
+    if code == 2:  # the usage and a box
+        assert words in " ".join(re.sub("[│╭╮╰╯─]", " ", result.stderr).split())
+    else:
+        sentences = [line for line in result.stderr.splitlines() if not line.startswith("railfix live: ")]
+        assert len(sentences) == 1
+        assert sentences[0].startswith("railfix: error: ")
+        assert words in sentences[0]
+    assert after == before
+
+
+@pytest.mark.requirement("G4")
+@pytest.mark.parametrize(
+    ("source", "edit", "words"),
+    [
+        ("line.csv", Edit("line.csv", r"^([\d.]+,[\d.]+,)([\d.]+)(.*)$", feet), "are the heights of the map in feet?"),
+        ("front.obs", Edit("front.obs", "GPS(?= +TIME OF FIRST)", "GLO"), "with time tags 18 s earlier"),
+    ],
+    ids=["heights_in_feet", "time_tags_of_glonass"],
+)
+def test_a_run_off_the_line_names_the_likely_cause(desk: Desk, source: str, edit: Edit, words: str) -> None:
+    text = edit.text(desk.folder)
+    (desk.folder / source).unlink()
+    (desk.folder / source).write_text(text)
+    command = "run --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --out {out}"
+    result = RUNNER.invoke(app, desk.words(command))
+    assert result.exit_code == 0, result.output
+    assert re.search(f"likely cause: .*{re.escape(words)}", result.output.split("Filter along")[0])

@@ -280,3 +280,14 @@ def test_epochs_out_of_order_are_refused(step: int) -> None:
     time[2] = time[1] + step * np.timedelta64(1, "ms")
     with pytest.raises(ValueError, match=r"front: epoch 2 \(.*\) is not after .*; give epochs in order of time"):
         processor().process({"front": replace(front, time=time)})
+
+
+@pytest.mark.requirement("G4")
+def test_a_chunk_before_the_last_one_and_a_processor_without_navigation_are_named():
+    one, parts = processor(), {name: whole[:20] for name, whole in demo_observations().items()}
+    _, state = one.process({name: part[10:] for name, part in parts.items()})
+    with pytest.raises(ValueError, match=r"front: the chunk begins at .*, not after .* as the state before it ended"):
+        one.process({name: part[:10] for name, part in parts.items()}, state)
+    result, _ = EpochProcessor(one.config, one.trajectories).process(parts)
+    assert result.notes[0].startswith("no navigation record is known; give navigation to EpochProcessor")
+    assert not any("no navigation" in note for note in one.process(parts)[0].notes)

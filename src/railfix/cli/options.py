@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import date, datetime
 from functools import wraps
@@ -136,7 +137,7 @@ def _option(name: str, field: Any, path: tuple[str, ...]) -> _Option:
     if switch:
         kind, default = bool, False
     elif kind in (date, datetime):
-        settings["formats"] = [_DAY] if kind is date else _TIMES
+        settings |= {"formats": [_DAY]} if kind is date else {"parser": _gps_time}
         kind = datetime
     elif not several and field.default is not None and not field.is_required():
         default = field.default
@@ -150,6 +151,15 @@ def _option(name: str, field: Any, path: tuple[str, ...]) -> _Option:
         "_".join(path), inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[annotation, info]
     )
     return _Option(path=path, parameter=parameter, default=field.default, switch=switch, numbers=numbers)
+
+
+def _gps_time(text: str) -> datetime:
+    """Read a time of the command line."""
+    for form in _TIMES:
+        with suppress(ValueError):
+            return datetime.strptime(text, form)
+    zone = "; GPS time has no time zone, and UTC is behind it by the leap seconds" if text[-1:] in "Zz" else ""
+    raise typer.BadParameter(f"{text!r} is no GPS time such as 2026-05-12 or 2026-05-12T03:00:00.5{zone}")
 
 
 def _plain_type(annotation: Any) -> tuple[Any, bool]:

@@ -49,6 +49,7 @@ def verdict_of_run(summary: RunSummary) -> list[str]:
             text += f"; {summary.level_basis} level {level.p50_m:.0f} m at the median"
         lines.append(text)
     lines.append(_doubts(summary))
+    lines += [f"likely cause: {cause}" for cause in summary.causes.values() if cause][:1]
     lines.append(f"next: railfix report {shlex.quote(str(file.parent))} --out report.html")
     return lines
 

@@ -20,6 +20,7 @@ from railfix.evaluate.run_folder import RunFolder
 from railfix.run.inputs import INPUTS
 from railfix.run.options import TrackReading
 from railfix.track import Track, read_track
+from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
@@ -114,6 +115,7 @@ def errors_of(
     InputFileError
         The track or the vehicle cannot be read.
     """
+    _check_same_place(run, antenna, answers)
     against, trusted = _against_chainage(run, antenna, answers)
     turn = run.turn_m(antenna)
     if method != "trajectory":
@@ -148,6 +150,17 @@ def errors_of(
         files=used,
         notes=(*notes, *_note_of_passes(antenna, arc, error, answers, trajectory), *more),
     )
+
+
+def _check_same_place(run: RunFolder, antenna: str, answers: Answers) -> None:
+    """Raise MismatchError where the reference lies further than `ANOTHER_PLACE_M` from the positions."""
+    apart = np.linalg.norm(answers.ecef_m - answers.reference_ecef_m, axis=1)
+    apart = apart[np.isfinite(apart)]
+    if len(apart) and (median := float(np.median(apart))) > ANOTHER_PLACE_M:
+        raise MismatchError(
+            f"{run.path}: the reference of the {antenna} antenna lies {median / 1000:,.0f} km from its positions; give "
+            "that of this run, and check the order of its coordinates"
+        )
 
 
 def _note_of_passes(

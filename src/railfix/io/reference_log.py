@@ -179,7 +179,9 @@ def _of_antenna(
     rows = np.flatnonzero(usable & (owner == name))
     _, first = np.unique(columns["time"][rows], return_index=True)
     if len(first) < 2:
-        raise InputFileError(path, f"fewer than two positions for the antenna {name} with a time{what}")
+        others = sorted({*owner.tolist()} - {name})
+        there = f"; the file has those of {', '.join(others)}" if others else ""
+        raise InputFileError(path, f"fewer than two positions for the antenna {name} with a time{what}{there}")
     return AntennaReference(**{key: values[rows[first]] for key, values in columns.items()})  # type: ignore[arg-type]
 
 

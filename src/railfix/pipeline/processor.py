@@ -29,7 +29,7 @@ from railfix.pipeline.config import SCREEN_NAMES, Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
 from railfix.pipeline.filter_result import AlongTrack, FilterState, single_epochs
-from railfix.pipeline.received import known_from_start, receive
+from railfix.pipeline.received import Received, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
 from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples
 from railfix.pipeline.solution import Solution, solve
@@ -235,7 +235,7 @@ class EpochProcessor:
         Raises
         ------
         ValueError
-            An antenna has no trajectory, or its epochs do not rise in time.
+            An antenna has no trajectory, or its epochs do not rise in time, from those of `state` on.
         SettingsError
             As the class.
         """
@@ -257,9 +257,9 @@ class EpochProcessor:
         unknown = sorted(set(observations) - set(self.trajectories))
         if unknown:
             raise ValueError(f"no trajectory for antenna {', '.join(unknown)}")
-        for name, part in observations.items():
-            _check_rising(name, part)
         state = state or State()
+        for name, part in observations.items():
+            _check_rising(name, part, state.antennas.get(name))
         received = receive(
             state.received or self.received,
             self.config,
@@ -281,9 +281,11 @@ class EpochProcessor:
             off_map={name: solution.off_map[rows] for name, rows in zip(names, parts, strict=True)},
             pair=pair,
             sensors=sensors,
-            notes=(*received.notes, *self._lacking, *self._curve_notes(observations)),
+            notes=(*_missing_notes(received), *received.notes, *self._lacking, *self._curve_notes(observations)),
         )
-        after = {**state.antennas, **dict(zip(names, own_states, strict=True))}
+        after = dict(state.antennas)
+        for name, part, own in zip(names, observations.values(), own_states, strict=True):
+            after[name] = replace(own, ended=part.time[-1] if len(part) else own.ended)
         return solved, replace(state, received=received, antennas=after)
 
     def along_track(self, solved: SolvedChunk, state: State) -> tuple[Result, State]:
@@ -419,9 +421,21 @@ def _threads(antennas: int) -> ThreadPoolExecutor | None:
     return ThreadPoolExecutor(antennas) if antennas > 1 else None
 
 
-def _check_rising(name: str, observations: Observations) -> None:
-    """Raise ValueError where an epoch is not after the one before it."""
+def _missing_notes(received: Received) -> tuple[str, ...]:
+    """Return a note where no navigation record is known."""
+    known = received.navigation
+    if known.precise is not None or len(known.kepler) or len(known.glonass):
+        return ()
+    return ("no navigation record is known; give navigation to EpochProcessor or to process",)
+
+
+def _check_rising(name: str, observations: Observations, before: AntennaState | None) -> None:
+    """Raise ValueError where an epoch is not after the one before it, of the chunk `before` or its own."""
     time = observations.time
     if (back := np.flatnonzero(time[1:] <= time[:-1])).size:
         earlier, later = time[back[0] : back[0] + 2]
         raise ValueError(f"{name}: epoch {back[0] + 1} ({later}) is not after {earlier}; give epochs in order of time")
+    if before is not None and len(time) and time[0] <= before.ended:
+        raise ValueError(
+            f"{name}: the chunk begins at {time[0]}, not after {before.ended} as the state before it ended"
+        )

@@ -107,6 +107,8 @@ class AntennaState(NotebookTable):
         State of each screen that has one, by its name.
     carrier : CarrierState or None
         State of the carrier-phase stages, where they are used.
+    ended : datetime64[ns]
+        Last epoch; NaT before the first.
     """
 
     noise: NoiseState = field(default_factory=NoiseState)
@@ -116,6 +118,7 @@ class AntennaState(NotebookTable):
     offsets: OffsetState = field(default_factory=OffsetState)
     screens: Mapping[str, Any] = field(default_factory=dict)
     carrier: CarrierState | None = None
+    ended: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
 
     def __repr__(self) -> str:
         screens = ", ".join(sorted(self.screens)) or "none"

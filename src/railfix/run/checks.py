@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final, Literal
 
 import numpy as np
@@ -108,25 +109,34 @@ def check_sensor_time(sensors: SensorSamples, tally: Tally) -> None:
 
 
 def check_whole_run(
-    navigation: Navigation, tally: Tally, *, sbas: SbasCorrections | None = None, sensors: SensorSamples | None = None
+    navigation: Navigation,
+    tally: Tally,
+    *,
+    sbas: SbasCorrections | None = None,
+    sensors: SensorSamples | None = None,
+    causes: Mapping[str, str] | None = None,
 ) -> None:
-    """Raise MismatchError where the inputs of a whole run do not match, NoPositionError where it has no position."""
+    """Raise MismatchError where the inputs of a whole run do not match, NoPositionError where it has no position.
+
+    `causes`: likely causes by antenna, which the error names.
+    """
     check_same_time(tally)
     check_same_day(navigation, tally, reach=RECORD_REACH)
     check_same_place(tally)
     check_sbas_time(sbas, tally)
     if sensors is not None:
         check_sensor_time(sensors, tally)
-    check_positions(tally)
+    check_positions(tally, causes or {})
 
 
-def check_positions(tally: Tally) -> None:
+def check_positions(tally: Tally, likely: Mapping[str, str]) -> None:
     """Raise NoPositionError, with the commonest status and reason, where a run has not one position."""
     if tally.positioned:
         return
     if not tally.epochs:
         raise NoPositionError("no epoch between --start and --end; the logs have none there")
     causes = "; ".join(_why_nothing(name, antenna) for name, antenna in tally.antennas.items() if antenna.epochs)
+    causes += "".join(f"; {name}: {cause}" for name, cause in likely.items() if cause)
     raise NoPositionError(f"not one position: {causes}")
 
 

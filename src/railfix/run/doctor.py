@@ -56,8 +56,12 @@ def examine_files(paths: Sequence[Path]) -> Diagnosis:
         A file is missing or cannot be opened.
     """
     for path in paths:
+        if path.is_dir():
+            raise InputFileError(path, "is a folder; name the files in it")
         if not path.is_file():
-            raise InputFileError(path, "there is no such file; name files, each of them once")
+            raise InputFileError(path, "there is no such file; check the name")
+        if sum(path.samefile(other) for other in paths if other.exists()) > 1:
+            raise InputFileError(path, "is given twice; name each file once")
     findings = tuple(_examine(path) for path in paths)
     problems = tuple(_problems(findings))
     return Diagnosis(findings=findings, problems=problems, command=_command(findings))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import sys
 import time as clock
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
@@ -69,6 +70,8 @@ class RunSummary:
     files : mapping of str to Path
         The results.
     wall_s : float
+    causes : mapping of str to str
+        Likely cause by antenna, of those without a position on the line.
     """
 
     tally: Tally
@@ -79,6 +82,7 @@ class RunSummary:
     notes: tuple[str, ...]
     files: Mapping[str, Path]
     wall_s: float
+    causes: Mapping[str, str] = field(default_factory=dict)
 
 
 def run_files(
@@ -137,9 +141,10 @@ def run_files(
         tally = _position(logs, sensors, processor, rows, beside, progress)
         if rows.replays:
             add_smoothed(rows.replays, processor, folder)
-        check_whole_run(navigation, tally, sbas=processor.received.sbas, sensors=sensors)
+        causes = _causes(tally, logs, processor, config, line)
+        check_whole_run(navigation, tally, sbas=processor.received.sbas, sensors=sensors, causes=causes)
         notes = (
-            *notes_of(line, navigation, tally, logs, note_statistic=config.map_offset.note_threshold),
+            *notes_of(line, navigation, tally, logs, causes, note_statistic=config.map_offset.note_threshold),
             *_notes_of_levels(config, tally),
             *_notes_of_sensors(rows.checks, sensors, units, line, config),
         )
@@ -165,6 +170,7 @@ def run_files(
         notes=notes,
         files=files,
         wall_s=wall,
+        causes=causes,
     )
 
 
@@ -288,6 +294,22 @@ def _single_epochs(
         yield solved
 
 
+def _causes(
+    tally: Tally, logs: Mapping[Antenna, Log], processor: EpochProcessor, config: Config, line: OpenedLine
+) -> dict[str, str]:
+    """Return likely causes by antenna, of those without a position on the line; blank where none was found."""
+    causes: dict[str, str] = {}
+    for name in logs:
+        antenna = tally.antennas[name]
+        if antenna.observed and antenna.status["off_map"] == antenna.positioned:
+            from railfix.run.mismatch import likely_cause
+
+            again = replace(logs[name], problems=[], skipped=Counter())
+            part = next(again.parts())
+            causes[name] = likely_cause(part, processor.received, config, line.trajectories[name])
+    return causes
+
+
 def _notes_of_sensors(
     checks: SensorChecks | None,
     sensors: SensorSamples,
@@ -302,14 +324,25 @@ def _notes_of_sensors(
     return (*checks.notes(sensors, units, trajectory, config.sensors), *checks.radar_alarms(sensors.radar))
 
 
+#: What a note asks where positions are off the map and no cause was found.
+_TRACK: Final = "is this the right track?"
 #: Satellites left out by the filter that notes name.
 _NAMED: Final = 3
 
 
 def notes_of(
-    line: OpenedLine, navigation: Navigation, tally: Tally, logs: Mapping[Antenna, Log], *, note_statistic: float
+    line: OpenedLine,
+    navigation: Navigation,
+    tally: Tally,
+    logs: Mapping[Antenna, Log],
+    causes: Mapping[str, str] | None = None,
+    *,
+    note_statistic: float,
 ) -> tuple[str, ...]:
-    """Return the notes of a run, each once; of the map from `MapOffsetLimits.note_threshold` of its test on."""
+    """Return the notes of a run, each once; of the map from `MapOffsetLimits.note_threshold` of its test on.
+
+    `causes`: why no position of an antenna is on the line, where that is so.
+    """
     notes = [*line.notes, *_map_notes(line), *navigation.notes, *_broken_notes(logs), *tally.all_notes]
     for name, antenna in tally.antennas.items():
         notes += [
@@ -335,7 +368,7 @@ def notes_of(
         off = antenna.status["off_map"]
         if off > 0.1 * antenna.positioned:
             which = "every position is" if off == antenna.positioned else f"{off} of {antenna.positioned} positions are"
-            notes.append(f"{name}: {which} off the map; is this the right track?")
+            notes.append(f"{name}: {which} off the map; {(causes or {}).get(name) or _TRACK}")
     return tuple(dict.fromkeys(notes))
 
 

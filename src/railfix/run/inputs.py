@@ -183,6 +183,7 @@ class RunInputs(InputFiles):
         """
         self.check_files()
         check_given_once((f"--{name}", path) for name, paths in self.logs.items() for path in paths)
+        check_given_once(("--track", path) for path in self.track)
 
 
 def logs_by_antenna(front: tuple[Path, ...], rear: tuple[Path, ...]) -> dict[Antenna, tuple[Path, ...]]:
@@ -198,7 +199,7 @@ def check_given_once(files: Iterable[tuple[str, Path]]) -> None:
         resolved = path.resolve()
         if resolved in seen:
             option_name, first = seen[resolved]
-            raise InputFileError(path, f"is given twice ({option_name} {first} and {name} {path}); give each log once")
+            raise InputFileError(path, f"is given twice ({option_name} {first} and {name} {path}); give each file once")
         seen[resolved] = (name, path)
 
 

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 #: Ellipsoidal heights of railways, tunnels below the sea included [m].
 _HEIGHTS_M: Final = (-1000.0, 9000.0)
+#: Shortest track of a run [m].
+_SHORTEST_M: Final = 1.0
 #: Track of a run that is not that of its files as they are, in the folder of results.
 TRACK_FILE: Final = "track.csv"
 
@@ -136,7 +138,7 @@ def open_line(
         centreline, route = _read_line(track, reading, heights=heights, find=find)
         if route is None:
             prepared.keep_track(key, centreline)
-    _check_heights(track, centreline)
+    _check_extent(track, centreline)
     shift, moved = None, centreline
     if at is not None:
         moved, shift = track_at(centreline, at, **reading.motion)
@@ -152,8 +154,10 @@ def open_line(
     )
 
 
-def _check_heights(files: tuple[Path, ...], track: Track) -> None:
-    """Raise MismatchError where no place on Earth has the heights of a track."""
+def _check_extent(files: tuple[Path, ...], track: Track) -> None:
+    """Raise MismatchError where no place on Earth has the heights of a track, or it is no line."""
+    if (length := float(track.chainage_m[-1] - track.chainage_m[0])) < _SHORTEST_M:
+        raise MismatchError(f"{', '.join(map(str, files))}: is {length:g} m long; give the track of a line")
     low, high = float(np.nanmin(track.height_m)), float(np.nanmax(track.height_m))
     if low < _HEIGHTS_M[0] or high > _HEIGHTS_M[1]:
         raise MismatchError(

@@ -174,6 +174,8 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
         raise SettingsError("a base station needs both --base and --base-place")
     if any(base.samefile(log) for base in inputs.base for log in (*inputs.front, *inputs.rear)):
         raise SettingsError(f"--base {inputs.base[0]}: is the log of the train; give that of the base station")
+    if options.spacing > 0.0 and not inputs.rear:
+        raise SettingsError("--spacing is given without --rear; give the log of the rear antenna, too")
     if inputs.rear and not options.spacing > 0.0:
         raise SettingsError("two antennas need --spacing, the distance from the rear to the front one")
     if (inputs.last is None) != (options.moved is None):

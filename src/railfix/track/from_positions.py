@@ -306,7 +306,8 @@ def track_of(
     """Create the track of the positions selected by `thin`."""
     if len(thinned.kept) < 2:
         dropped = ", ".join(f"{count} {reason}" for reason, count in thinned.dropped.items() if count)
-        raise ValueError(f"{len(thinned.kept)} of {len(ecef_m)} positions left, a track needs two ({dropped})")
+        dropped = f" ({dropped})" if dropped else ""
+        raise ValueError(f"{len(thinned.kept)} of {len(ecef_m)} positions left, a track needs two{dropped}")
     notes = [ANTENNA_PATH, *([accuracy] if accuracy else [])]
     if thinned.jump_m.max(initial=0.0) > gap_m:
         raise ValueError(
@@ -400,10 +401,15 @@ def from_position_log(
     Raises
     ------
     InputFileError
-        Fewer than two points are left, or the log has no column for a filter.
+        Fewer than two points are left, the times run backwards, or the log has no column for a filter.
     """
     limits = limits or ThinningLimits(spacing_m=spacing_m)
     usable = usable_rows(log, quality=quality, max_sigma_m=max_sigma_m)
+    timed = np.flatnonzero(~np.isnat(log.time))
+    back = np.flatnonzero(np.diff(log.time[timed]) < np.timedelta64(0, "ns"))
+    if len(back):
+        line = int(log.line[timed[back[0] + 1]])
+        raise InputFileError(log.path, "the time is before that of the position above; sort them by time", line=line)
     thinned = thin(log.time, log.ecef_m, usable=usable, limits=limits)
     plan, height, accuracy = _accuracy(log, thinned.kept)
     try:

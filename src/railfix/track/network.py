@@ -7,6 +7,7 @@ track to another only over a connection that is navigable: of a switch the stem 
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -34,6 +35,8 @@ _NEAR_WAY_M: Final = 5_000.0
 _SAMPLE_M: Final = 50.0
 #: Nearest samples examined for each position at first; more where these do not reach as far as asked.
 _SAMPLES: Final = 32
+#: Tracks that a message names one by one.
+_NAMED: Final = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,9 +253,11 @@ class Network:
     def index_of(self, name: str) -> int:
         """Number of the track of a name; SettingsError when there is none."""
         if name not in self.names:
-            close = [n for n in self.names if name.lower() in n.lower()][:3]
-            hint = f"; similar names: {', '.join(close)}" if close else f"; there are {len(self.names)} tracks"
-            raise SettingsError(f"there is no track {name!r} in the network{hint}")
+            close = [n for n in self.names if name.lower() in n.lower()] or difflib.get_close_matches(name, self.names)
+            few = len(self.names) <= _NAMED
+            shown = ", ".join(map(repr, self.names if few else close[:3]))
+            hint = f"its tracks are {shown}" if few else f"similar: {shown}" if close else f"it has {len(self.names)}"
+            raise SettingsError(f"there is no track {name!r} in the network; {hint}")
         return self.names.index(name)
 
     def _ways_from(self, node: int, stop: int) -> tuple[dict[int, float], dict[int, list[int]]]:
