@@ -116,7 +116,7 @@ def test_exit_codes(tmp_path: Path) -> None:
     cases = [
         (8, ("demo", "--out", tmp_path / "file", "--seconds", 1), "file"),
         (8, ("demo", "--out", tmp_path / "full"), "not empty"),
-        (4, ("demo", "--out", out, "--seconds", -1), "--seconds must be positive"),
+        (4, ("demo", "--out", out, "--seconds", -1), "--seconds: Input should be greater than 0"),
         (4, ("demo", "--out", out, "--set", "sky.systems=Q"), "sky.systems"),
         (4, ("demo", "--out", out, "--set", "sky.sistems=G"), "known are cutoff_deg"),
         (4, (tmp_path / "wrong.toml", "--out", out), "known are duration_s"),

@@ -4,62 +4,68 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from railfix.cli.console import progress_bar
-from railfix.cli.options import OverwriteOption, overwriting
+from railfix.cli.options import from_models
 from railfix.cli.settings import check_set_once, set_value
 from railfix.core.errors import SettingsError
+from railfix.core.settings import Settings, option
 from railfix.run.output import Overwrite, check_folder
 from railfix.simulate.run import write_run
 from railfix.simulate.scenario import Scenario
 from railfix.simulate.scenario_file import Recipe, load_recipe, shipped_scenarios
 
-_PANEL = "Choices"
+
+class SimulateOptions(Settings):
+    """Where the runs go, and what overrides the scenario."""
+
+    out: Path | None = option(
+        "Folder for the files; each run of a recipe in its own below it.", None, metavar="DIR", panel="Options"
+    )
+    seconds: float | None = option("Duration, overriding the scenario's.", None, metavar="S", gt=0.0)
+    seed: int | None = option("Seed, overriding the scenario's.", None)
+    setting: tuple[str, ...] = option(
+        "One setting, overriding the scenario's: --set receiver.code_sigma_m=0; may be repeated.",
+        (),
+        name="--set",
+        metavar="KEY=VALUE",
+    )
+    only: tuple[str, ...] = option(
+        "Only this run of a recipe, by its number from 1 or its name; may be repeated.", (), metavar="RUN"
+    )
+    packing: Literal["packed", "plain"] = option("Write unpacked files: .rnx, .csv.", "packed", name="--plain")
+    overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """Settings that override the scenario's."""
+        check_set_once(self.setting)
+        changes: dict[str, Any] = {}
+        for text in self.setting:
+            set_value(changes, text)
+        given = {"duration_s": self.seconds, "seed": self.seed}
+        return changes | {name: value for name, value in given.items() if value is not None}
+
+    @property
+    def words(self) -> list[str]:
+        """Options that make the same run again."""
+        sets = [("--set", text) for text in self.setting]
+        given = [("--out", self.out), ("--seconds", self.seconds), ("--seed", self.seed), *sets]
+        words = [word for name, value in given if value is not None for word in (name, str(value))]
+        return [*words, "--plain"] if self.packing == "plain" else words
 
 
+@from_models
 def simulate(
+    options: SimulateOptions,
     *,
     scenario: Annotated[
         str | None,
         typer.Argument(metavar="SCENARIO", help="Scenario file (TOML), or the name of a shipped one, see --list."),
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="Folder for the files; each run of a recipe in its own below it."),
-    ] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option("--seconds", metavar="S", rich_help_panel=_PANEL, help="Duration, overriding the scenario's."),
-    ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option("--seed", rich_help_panel=_PANEL, help="Seed, overriding the scenario's."),
-    ] = None,
-    setting: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            rich_help_panel=_PANEL,
-            help="One setting, overriding the scenario's: --set receiver.code_sigma_m=0; may be repeated.",
-        ),
-    ] = None,
-    only: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--only",
-            metavar="RUN",
-            rich_help_panel=_PANEL,
-            help="Only this run of a recipe, by its number from 1 or its name; may be repeated.",
-        ),
-    ] = None,
-    plain: Annotated[
-        bool, typer.Option("--plain", rich_help_panel=_PANEL, help="Write unpacked files: .rnx, .csv.")
-    ] = False,
-    overwrite: OverwriteOption = False,
     list_shipped: Annotated[bool, typer.Option("--list", help="Name the shipped scenarios and end.")] = False,
 ) -> None:
     """Simulate runs of a train: logs of two antennas, navigation, track map, vehicle, sensors, and ground truth.
@@ -83,29 +89,15 @@ def simulate(
             runs = f" ({len(recipe.names)} runs)" if recipe.names[0] else ""
             typer.echo(f"{name:18} {recipe.description}{runs}")
         return
-    if scenario is None or out is None:
+    if scenario is None or options.out is None:
         raise typer.BadParameter("give a SCENARIO and --out DIR, or --list")
     recipe = load_recipe(scenario)
-    numbers = _choose_runs(recipe, only or [])
-    replacing = overwriting(overwrite)
-    folders = {number: out / recipe.names[number] for number in numbers}
+    numbers = _choose_runs(recipe, options.only)
+    folders = {number: options.out / recipe.names[number] for number in numbers}
     for folder in folders.values():
-        check_folder(folder, overwrite=replacing)
-    changes = _changes(setting or [], seconds, seed)
-    scenarios = {number: recipe.scenario(number, changes=changes) for number in numbers}
-    options = [
-        *_words("--seconds", seconds),
-        *_words("--seed", seed),
-        *(w for s in setting or [] for w in ("--set", s)),
-    ]
-    _simulate(
-        recipe,
-        ["railfix", "simulate", scenario, "--out", str(out), *options],
-        scenarios,
-        folders,
-        plain=plain,
-        overwrite=replacing,
-    )
+        check_folder(folder, overwrite=options.overwrite)
+    scenarios = {number: recipe.scenario(number, changes=options.changes) for number in numbers}
+    _simulate(recipe, ["railfix", "simulate", scenario, *options.words], scenarios, folders, options)
 
 
 def _simulate(
@@ -113,16 +105,13 @@ def _simulate(
     command: list[str],
     scenarios: dict[int, Scenario],
     folders: dict[int, Path],
-    *,
-    plain: bool,
-    overwrite: Overwrite,
+    options: SimulateOptions,
 ) -> None:
     done = 0
     files: dict[str, Path] = {}
     with progress_bar("simulation") as show:
         for at, (number, scenario) in enumerate(scenarios.items()):
             run = ["--only", recipe.names[number]] if recipe.names[number] else []
-            packed = ["--plain"] if plain else []
             total, before = 2 * scenario.epochs, done
 
             def progress(_antenna: str, epochs: int, at: int = at, total: int = total, before: int = before) -> None:
@@ -133,9 +122,9 @@ def _simulate(
             files = write_run(
                 scenario,
                 folders[number],
-                packing="plain" if plain else "packed",
-                command=shlex.join([*command, *run, *packed]),
-                overwrite=overwrite,
+                packing=options.packing,
+                command=shlex.join([*command, *run]),
+                overwrite=options.overwrite,
                 progress=progress,
             )
     if len(scenarios) == 1:
@@ -147,7 +136,7 @@ def _simulate(
     typer.echo(f"{done:,} antenna-epochs")
 
 
-def _choose_runs(recipe: Recipe, only: list[str]) -> list[int]:
+def _choose_runs(recipe: Recipe, only: tuple[str, ...]) -> list[int]:
     """Numbers of the runs to make, from 0."""
     if not only:
         return list(range(len(recipe.names)))
@@ -165,21 +154,3 @@ def _choose_runs(recipe: Recipe, only: list[str]) -> list[int]:
                 f"{recipe.names[0]} to {recipe.names[-1]}"
             )
     return sorted(set(numbers))
-
-
-def _changes(setting: list[str], seconds: float | None, seed: int | None) -> dict[str, Any]:
-    check_set_once(tuple(setting))
-    changes: dict[str, Any] = {}
-    for text in setting:
-        set_value(changes, text)
-    if seconds is not None and not seconds > 0.0:
-        raise SettingsError(f"--seconds must be positive, got {seconds:g}")
-    if seconds is not None:
-        changes["duration_s"] = seconds
-    if seed is not None:
-        changes["seed"] = seed
-    return changes
-
-
-def _words(option: str, value: float | None) -> list[str]:
-    return [] if value is None else [option, str(value)]
