@@ -12,12 +12,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from railfix.core.errors import OutputError
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
 from railfix.ground.keys import write_keys
-from railfix.ground.link_figure import coverage
+from railfix.ground.link_figure import coverage, round_trips
 from railfix.ground.link_quality import LinkChoice, LinkLimits, LinkMeter
 from railfix.ground.links import BEARERS, CentreLinks, TrainLinks
 from railfix.ground.quic import LinkProtocol, configuration, connected
@@ -150,6 +151,26 @@ def test_a_frame_without_a_place_counts_in_the_rate_and_not_in_the_coverage() ->
 def test_coverage_adds_the_meters_of_a_bearer_up() -> None:
     first, second = (LinkMeter(coverage={(3, 1): (8, 10), (4, place): (1, 2)}) for place in (1, -1))
     assert coverage([first, second]) == {1: {3: (16, 20), 4: (1, 2)}, -1: {4: (1, 2)}}
+
+
+def test_round_trips_over_time_and_place_are_those_of_every_frame() -> None:
+    """Two trains: answers that grow by 1 ms a frame, every third frame of the second lost (P5, figures 9 and 10)."""
+    meters = [LinkMeter(limits=LinkLimits(window=5)) for _ in range(2)]
+    for k in range(30):
+        for n, meter in enumerate(meters):
+            meter.sent(k, 50.0 + k + 0.5 * n, chainage_m=20.0 * k, direction=1)
+            if n == 0 or k % 3:
+                meter.answered(k, 50.2 + k + 0.5 * n, 0.1 + 0.001 * k)
+    for meter in meters:
+        meter.settle(1e3)
+    time_s, chainage_m, trip_s = round_trips(meters)
+    np.testing.assert_allclose(time_s, 0.5 * np.arange(60))
+    np.testing.assert_allclose(chainage_m, 20.0 * np.repeat(np.arange(30), 2))
+    lost = np.arange(60) % 6 == 1
+    np.testing.assert_array_equal(np.isnan(trip_s), lost)
+    np.testing.assert_allclose(trip_s[~lost], (0.1 + 0.001 * np.repeat(np.arange(30), 2))[~lost])
+    assert meters[0].round_trip_s == pytest.approx(0.127)  # median of the last five
+    assert [len(part) for part in round_trips([LinkMeter()])] == [0, 0, 0]
 
 
 def test_switching_takes_at_most_three_misses_and_the_answer_time_and_returns() -> None:
@@ -443,7 +464,45 @@ def test_a_certificate_ends_while_connected(tmp_path: Path, how: str) -> None:
     run(work())
 
 
-def test_spare_mode_switches_and_sends_the_newest_when_both_were_gone(keys: Path) -> None:
+@pytest.mark.parametrize("out_s", [0.3, pytest.param(3.0, marks=pytest.mark.slow)])
+def test_the_next_report_arrives_at_once_when_both_links_were_gone(keys: Path, out_s: float) -> None:
+    """In a tunnel: nothing of the outage is queued, and the first report after it is used."""
+
+    async def work() -> tuple[float, list[int]]:
+        got: list[int] = []
+        centre = CentreLinks(keys, HOSTS, received=lambda _, payload: got.append(int(payload)), wait_s=0.0)
+        await centre.start()
+        relays = {name: Relay(centre.addresses[name], RelaySettings(delay_s=0.005)) for name in BEARERS}
+        for name in BEARERS:
+            await relays[name].open(HOSTS[name])
+        limits = LinkLimits(answer_s=0.1)
+        train = TrainLinks(7, keys, {n: r.address for n, r in relays.items()}, LOCAL, limits=limits)
+        await train.start()
+        await _until(lambda: len(train.protocols) == 2, 5.0)
+        train.send(b"0")
+        await _until(lambda: bool(got), 2.0)
+        for relay in relays.values():
+            relay.disturbance.up = False
+        for k in range(1, 11):
+            train.send(b"%d" % k)
+            await asyncio.sleep(out_s / 10)
+        for relay in relays.values():
+            relay.disturbance.up = True
+        train.send(b"11")
+        after_s = await _until(lambda: len(got) > 1, 5.0)
+        await train.stop()
+        await centre.stop()
+        for relay in relays.values():
+            relay.close()
+        return after_s, got
+
+    after_s, got = asyncio.run(work())
+    print(f"both links out for {out_s} s: the next report {after_s:.3f} s after")
+    assert got == [0, 11]
+    assert after_s < 0.5
+
+
+def test_spare_mode_switches_and_returns(keys: Path) -> None:
     async def work() -> None:
         got: list[bytes] = []
         centre = CentreLinks(keys, HOSTS, received=lambda _, payload: got.append(payload), wait_s=0.0)

@@ -250,7 +250,10 @@ def demo(
         float, typer.Option(metavar="S", min=0.0, max=3600.0, help="Keep the page after the end for this time.")
     ] = 0.0,
     coverage: Annotated[
-        Path | None, typer.Option(metavar="PNG", help="Picture of the response rates along the line.")
+        Path | None,
+        typer.Option(
+            metavar="PNG", help="Picture of the links: response rates along the line, round trips over time and place."
+        ),
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:

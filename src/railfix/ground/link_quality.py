@@ -4,12 +4,24 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from itertools import islice
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from railfix.core.settings import Settings
+
+#: Results that are kept: an hour of ten frames a second.
+KEPT: Final = 36_000
+
+
+class LinkResult(NamedTuple):
+    """Result of a frame: when and where it was sent, and its round trip [s], NaN where it was not answered in time."""
+
+    sent_s: float
+    chainage_m: float
+    round_trip_s: float
 
 
 class LinkLimits(Settings):
@@ -54,19 +66,20 @@ class LinkMeter:
         Misses, and answers, in a row.
     coverage : dict of (int, int) to (int, int)
         Answered and sent frames by place and running direction.
+    results : deque of LinkResult
+        The last `KEPT` frames, by the time of their result.
     """
 
     limits: LinkLimits = field(default_factory=LinkLimits)
     misses: int = 0
     good: int = 0
     coverage: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
-    _open: dict[int, tuple[float, tuple[int, int] | None]] = field(default_factory=dict)
-    _results: deque[tuple[float, float]] = field(default_factory=deque)
+    results: deque[LinkResult] = field(default_factory=lambda: deque(maxlen=KEPT))
+    _open: dict[int, tuple[float, float | None, int]] = field(default_factory=dict)
 
     def sent(self, sequence: int, now_s: float, *, chainage_m: float | None = None, direction: int = 0) -> None:
         """Note a frame that was sent; from a place that is not known it is not in the coverage."""
-        place = None if chainage_m is None else (int(chainage_m // self.limits.place_m), direction)
-        self._open[sequence] = (now_s, place)
+        self._open[sequence] = (now_s, chainage_m, direction)
 
     def answered(self, sequence: int, now_s: float, round_trip_s: float) -> None:
         """Note the echo of a frame; one that is too late, or comes twice, is none."""
@@ -85,26 +98,30 @@ class LinkMeter:
             self.misses, self.good = self.misses + 1, 0
             self._note(waiting, float("nan"))
 
-    def _note(self, waiting: tuple[float, tuple[int, int] | None], round_trip_s: float) -> None:
-        sent_s, place = waiting
-        if place is not None:
+    def _note(self, waiting: tuple[float, float | None, int], round_trip_s: float) -> None:
+        sent_s, chainage_m, direction = waiting
+        if chainage_m is not None:
+            place = int(chainage_m // self.limits.place_m), direction
             answered, sent = self.coverage.get(place, (0, 0))
             self.coverage[place] = (answered + (round_trip_s == round_trip_s), sent + 1)
-        self._results.append((sent_s, round_trip_s))
-        if len(self._results) > self.limits.window:
-            self._results.popleft()
+        known = float("nan") if chainage_m is None else chainage_m
+        self.results.append(LinkResult(sent_s, known, round_trip_s))
+
+    @property
+    def _window_s(self) -> list[float]:
+        return [result.round_trip_s for result in islice(reversed(self.results), self.limits.window)]
 
     @property
     def response_rate(self) -> float:
         """Share of the frames of the window that were answered in time; NaN without frames."""
-        results = [value for _, value in self._results]
-        return float(np.isfinite(results).mean()) if results else float("nan")
+        window = self._window_s
+        return float(np.isfinite(window).mean()) if window else float("nan")
 
     @property
     def round_trip_s(self) -> float:
         """Median round-trip time of the window [s]; NaN without answers."""
-        results = [value for _, value in self._results if value == value]
-        return float(np.median(results)) if results else float("nan")
+        answered = [value for value in self._window_s if value == value]
+        return float(np.median(answered)) if answered else float("nan")
 
 
 LinkName = Literal["A", "B"]
