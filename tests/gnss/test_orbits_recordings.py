@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 
 from orbit_cases import one_record
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.gnss.navigation import Navigation
+from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits import satellite_states
 from railfix.gnss.orbits.kepler import Orbits, kepler_state
 from railfix.gnss.orbits.record_selection import validity_s
@@ -36,7 +37,12 @@ MOST = 250
 
 @cache
 def ours(path: Path) -> Navigation:
-    return read_navigation(path)
+    """Records of the messages that the other programs read, too: not those of CNAV."""
+    navigation = read_navigation(path)
+    kepler = navigation.kepler
+    classic = np.isin(kepler.message, ("LNAV", "INAV", "FNAV", "D1", "D2"))
+    table = {item.name: getattr(kepler, item.name)[classic] for item in fields(KeplerRecords)}
+    return replace(navigation, kepler=KeplerRecords(**table))
 
 
 def some(count: int) -> range:

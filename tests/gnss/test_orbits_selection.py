@@ -285,7 +285,7 @@ def test_group_delay_of_each_constellation_and_signal() -> None:
     tgd = -1.1e-8 * SPEED_OF_LIGHT
     assert delay_m("1C", "G05") == pytest.approx(tgd)
     assert delay_m("2W", "G05") == pytest.approx(tgd * (77 / 60) ** 2)
-    assert delay_m("5Q", "J02") == pytest.approx(tgd * (154 / 115) ** 2)
+    assert delay_m("5Q", "J02") == pytest.approx(tgd), "LNAV has no ISC"
     bgd_a, bgd_b = -3.3e-9 * SPEED_OF_LIGHT, -4.1e-9 * SPEED_OF_LIGHT
     assert delay_m("1C", "E11") == pytest.approx(bgd_b)
     assert delay_m("7Q", "E11") == pytest.approx(bgd_b * (154 / 118) ** 2)

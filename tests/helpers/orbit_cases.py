@@ -17,6 +17,7 @@ _COMMON: dict[str, Any] = {
     "cuc": -3.1e-6, "cus": 8.9e-6, "crc": 210.5, "crs": -41.25, "cic": 1.3e-7, "cis": -9.1e-8, "m0": -1.234567,
     "omega0": 2.04, "omega": 0.71, "health": 0, "accuracy_m": 2.0, "iode": 7, "iodc": 7, "data_source": 0,
     "group_delay_1_s": -1.1e-8, "group_delay_2_s": np.nan, "fit_interval_h": np.nan,
+    "a_dot": 0.0, "delta_n_dot": 0.0, "inter_signal_s": (np.nan,) * 6,
 }  # fmt: skip
 #: One satellite of each kind: what differs from the common numbers.
 KINDS: dict[str, dict[str, Any]] = {
@@ -63,12 +64,11 @@ def kepler(*rows: dict[str, Any]) -> KeplerRecords:
         full.append(values)
     kinds = {"satellite": "<U3", "message": "<U4", "toc": "M8[ns]", "toe": "M8[ns]", "transmitted": "M8[ns]"}
     kinds |= dict.fromkeys(("health", "iode", "iodc", "data_source"), "int64")
-    return KeplerRecords(
-        **{
-            item.name: np.array([row[item.name] for row in full], dtype=kinds.get(item.name, "float64"))
-            for item in fields(KeplerRecords)
-        }
-    )
+    table = {
+        item.name: np.array([row[item.name] for row in full], dtype=kinds.get(item.name, "float64"))
+        for item in fields(KeplerRecords)
+    }
+    return KeplerRecords(**{**table, "inter_signal_s": table["inter_signal_s"].reshape(-1, 6)})
 
 
 def glonass(*rows: dict[str, Any]) -> GlonassRecords:

@@ -9,7 +9,7 @@ import ncompress
 import numpy as np
 import pytest
 
-from navigation_text import KEPLER, header, label, record, record_2, write
+from navigation_text import KEPLER, header, label, number, record, record_2, write
 from railfix.gnss.navigation import Navigation, glonass_channels
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.io.rinex import read_navigation
@@ -168,13 +168,13 @@ def test_version_2_glonass_counts_the_seconds_of_the_day(tmp_path: Path) -> None
     assert glonass.transmitted[1] == np.datetime64("2020-06-25T23:59:48", "ns")
 
 
-def test_version_4_reads_the_classic_messages_and_counts_the_rest(tmp_path: Path) -> None:
+def test_version_4_reads_the_messages_and_counts_the_rest(tmp_path: Path) -> None:
     def eph(name: str, message: str, lines: int | None = None) -> str:
         text = f"> EPH {name} {message}\n" + record(name)
         return text if lines is None else text + "    0.000000000000D+00\n" * lines
 
-    text = header(4.02) + eph("G01", "LNAV") + eph("G01", "CNAV", 1) + eph("E03", "INAV") + eph("E03", "FNAV")
-    text += eph("C20", "D1") + eph("C03", "D2") + eph("C20", "CNV1", 2) + eph("J02", "LNAV") + eph("R05", "FDMA", 1)
+    text = header(4.02) + eph("G01", "LNAV") + eph("E03", "INAV") + eph("E03", "FNAV")
+    text += eph("C20", "D1") + eph("C03", "D2") + eph("J02", "LNAV") + eph("R05", "FDMA", 1)
     text += "> STO G01 LNAV\n    2020 06 26 00 00 00 GPUT\n" + "> EOP J02 CNVX\n    2020 06 26 00 00 00\n"
     text += "> STO E   IFNV\n    2020 06 26 00 00 00 GAGP\n" + "> STO R   FDMA\n    2020 06 26 00 00 00 GLGP\n"
     text += eph("S22", "SBAS") + eph("I02", "LNAV")
@@ -183,9 +183,62 @@ def test_version_4_reads_the_classic_messages_and_counts_the_rest(tmp_path: Path
         ("G01", "LNAV"), ("E03", "INAV"), ("E03", "FNAV"), ("C20", "D1"), ("C03", "D2"), ("J02", "LNAV"),
     ]  # fmt: skip
     assert navigation.glonass.satellite.tolist() == ["R05"]
-    assert navigation.skipped == {
-        "G CNAV": 1, "C CNV1": 1, "STO": 3, "EOP": 1, "S SBAS": 1, "I LNAV": 1,
-    }  # fmt: skip
+    assert navigation.skipped == {"STO": 3, "EOP": 1, "S SBAS": 1, "I LNAV": 1}
+
+
+#: Numbers of the newer messages after their orbits: ISC, then accuracy to ISC of CNAV; those of CNV1 after their ISC.
+_ISC = [-1e-9, -2e-9, -3e-9, -4e-9]
+_CNAV = [2.0, 0.0, -1e-8, 1.0, *_ISC]
+_CNV = [5e-9, 6e-9, 1.0, 0.0, 0.0, 20.0, 457200.0, None, None, 21.0]
+
+
+@pytest.mark.requirement("A11")
+@pytest.mark.parametrize(
+    ("name", "message", "last", "expected"),
+    [
+        ("G01", "CNAV", [*_CNAV, 457200.0, 2111.0], {"group_delay_1_s": -1e-8, "inter_signal_s": [*_ISC, None, None]}),
+        (
+            "J02", "CNV2", [*_CNAV, -5e-9, -6e-9, None, None, 457200.0, 2111.0],
+            {"group_delay_1_s": -1e-8, "inter_signal_s": [*_ISC, -5e-9, -6e-9]},
+        ),
+        (
+            "C20", "CNV1", [0.0, 0.0, 0.0, 0.0, 3e-9, None, *_CNV],
+            {"group_delay_1_s": 5e-9, "inter_signal_s": [3e-9, *[None] * 5], "iodc": 20, "iode": 21},
+        ),
+        (
+            "C20", "CNV2", [0.0, 0.0, 0.0, 0.0, None, 4e-9, *_CNV],
+            {"group_delay_2_s": 6e-9, "inter_signal_s": [None, 4e-9, *[None] * 4], "iodc": 20, "iode": 21},
+        ),
+        (
+            "C20", "CNV3", [0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 5e-9, 457200.0],
+            {"group_delay_1_s": 5e-9, "group_delay_2_s": None, "inter_signal_s": [None] * 6, "iodc": 0},
+        ),
+    ],
+)  # fmt: skip
+def test_every_field_of_the_messages_of_version_4(
+    tmp_path: Path, name: str, message: str, last: list[float | None], expected: dict[str, object]
+) -> None:
+    """Layouts of RINEX 4.02, tables A10, A11 and A18 to A20; `last` begins after the rate of delta_n."""
+    names = list(KEPLER)[:20]  # up to i_dot, with a_dot where the issue of data stands
+    cnav = name[0] in "GJ"
+    first = {n: (2e-2 if n == "iode" else 400000.0 if cnav and n == "toe_sow_s" else KEPLER[n]) for n in names}
+    between = [3e-14, -2.0, 1.0] if cnav else [3e-14, 3.0, 457200.0]
+    fields = [*first.values(), *between, *last]
+    lines = [f"{name} 2020 06 26 08 00 00" + "".join(number(v) for v in fields[:3])]
+    lines += ["    " + "".join(number(v) for v in fields[i : i + 4]) for i in range(3, len(fields), 4)]
+    records = read(tmp_path, header(4.02) + f"> EPH {name} {message}\n" + "\n".join(lines) + "\n").kepler
+    assert records.message.tolist() == [message]
+    assert (records.a_dot[0], records.delta_n_dot[0]) == (2e-2, 3e-14)
+    for n in ("crs", "delta_n", "m0", "cuc", "sqrt_a", "cic", "cis", "i0", "omega_dot", "i_dot"):
+        assert getattr(records, n)[0] == KEPLER[n], n
+    leap = np.timedelta64(0 if cnav else 14, "s")
+    assert records.toe[0] == records.toc[0] == TOC + leap
+    assert records.transmitted[0] == TOC - np.timedelta64(3600, "s") + leap
+    assert records.health[0] == 0
+    assert records.accuracy_m[0] == pytest.approx(4.0 if cnav else np.nan, nan_ok=True)  # URA_ED 2: 2^(1 + 2/2)
+    for n, value in expected.items():
+        wanted = np.array(value, dtype=float)
+        np.testing.assert_array_equal(np.asarray(getattr(records, n)[0], dtype=float), wanted, err_msg=n)
 
 
 def test_version_4_ionosphere(tmp_path: Path) -> None:

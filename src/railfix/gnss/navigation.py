@@ -57,7 +57,8 @@ class KeplerRecords(_Records):
     ----------
     satellite : ndarray of str, shape (n,)
     message : ndarray of str, shape (n,)
-        "LNAV" (GPS, QZSS), "INAV", "FNAV" (Galileo), "D1", "D2" (BeiDou; D2 is sent by GEO satellites).
+        "LNAV", "CNAV", "CNV2" (GPS, QZSS), "INAV", "FNAV" (Galileo), "D1", "D2", "CNV1" to "CNV3" (BeiDou; D2 is sent
+        by GEO satellites).
     toc, toe : ndarray of datetime64[ns], shape (n,)
         Clock and ephemeris reference times, GPS time. The week is resolved from toc.
     transmitted : ndarray of datetime64[ns], shape (n,)
@@ -66,20 +67,25 @@ class KeplerRecords(_Records):
         Clock polynomial [s, s/s, s/s^2].
     sqrt_a, eccentricity, m0, delta_n, omega0, i0, omega, omega_dot, i_dot : ndarray, shape (n,)
         [m^0.5, -, rad, rad/s, rad, rad, rad, rad/s, rad/s].
+    a_dot, delta_n_dot : ndarray, shape (n,) [m/s, rad/s^2]
+        Rates of the semi-major axis and of delta_n; 0 in the messages that have none.
     cuc, cus, crc, crs, cic, cis : ndarray, shape (n,)
         Harmonic corrections [rad, rad, m, m, rad, rad].
     toe_sow_s : ndarray, shape (n,) [s]
         Toe as seconds of the constellation's own week (BDT for BeiDou): enters the node's longitude.
     health : ndarray of int, shape (n,)
-        As broadcast: GPS/QZSS 6-bit SV health, Galileo 9-bit word, BeiDou SatH1.
+        As broadcast: GPS/QZSS 6-bit SV health (CNAV: 3 bits, L1, L2, L5), Galileo 9-bit word, BeiDou SatH1 (CNV: HS).
     accuracy_m : ndarray, shape (n,) [m]
-        URA or SISA as written.
+        URA or SISA as written; nominal value of the URA_ED index of CNAV, NaN for CNV1 to CNV3.
     iode, iodc : ndarray of int, shape (n,)
         Issue of data (IODnav of Galileo in both; AODE and AODC of BeiDou).
     data_source : ndarray of int, shape (n,)
         Data sources of Galileo, codes on L2 of GPS and QZSS; 0 for BeiDou.
     group_delay_1_s, group_delay_2_s : ndarray, shape (n,) [s]
-        GPS/QZSS TGD and NaN; Galileo BGD E5a/E1 and BGD E5b/E1; BeiDou TGD1 and TGD2.
+        GPS/QZSS TGD and NaN; Galileo BGD E5a/E1 and BGD E5b/E1; BeiDou TGD1 and TGD2, of CNV1 and CNV2 TGD_B1Cp and
+        TGD_B2ap, of CNV3 TGD_B2bI and NaN.
+    inter_signal_s : ndarray, shape (n, 6) [s]
+        Inter-signal corrections: GPS/QZSS L1 C/A, L2C, L5I5, L5Q5, L1C_D, L1C_P; BeiDou B1C_D and B2a_D; NaN elsewhere.
     fit_interval_h : ndarray, shape (n,) [h]
         GPS/QZSS fit interval in hours (QZSS flag 0 -> 2, 1 -> 4; GPS flag 0 -> 4); NaN elsewhere.
     """
@@ -101,6 +107,8 @@ class KeplerRecords(_Records):
     omega: Floats
     omega_dot: Floats
     i_dot: Floats
+    a_dot: Floats
+    delta_n_dot: Floats
     cuc: Floats
     cus: Floats
     crc: Floats
@@ -115,6 +123,7 @@ class KeplerRecords(_Records):
     data_source: Integers
     group_delay_1_s: Floats
     group_delay_2_s: Floats
+    inter_signal_s: Floats
     fit_interval_h: Floats
 
 

@@ -25,16 +25,20 @@ _ELEMENTS: Final[dict[str, Any]] = {
     "Floats": np.float64,
     "Integers": np.int64,
 }
+#: Shapes of fields with columns, without rows.
+_EMPTY: Final[dict[str, tuple[int, ...]]] = {
+    **dict.fromkeys(("position_ecef_m", "velocity_ecef_mps", "acceleration_ecef_mps2"), (0, 3)),
+    "inter_signal_s": (0, 6),
+}
 #: Fields that distinguish two Keplerian records of one satellite.
 _KEPLER_KEY: Final = ("satellite", "message", "toe", "toc", "iode", "iodc", "health")
 _GLONASS_KEY: Final = ("satellite", "toe", "health")
 
 
 def _no_records(kind: type[Records]) -> Records:
-    """Return a record table without rows; vectors of GLONASS have shape (0, 3)."""
+    """Return a record table without rows; vectors of GLONASS have shape (0, 3), inter-signal corrections (0, 6)."""
     arrays = {
-        item.name: np.empty((0, 3) if "_ecef_" in item.name else 0, dtype=_ELEMENTS[str(item.type)])
-        for item in fields(kind)
+        item.name: np.empty(_EMPTY.get(item.name, (0,)), dtype=_ELEMENTS[str(item.type)]) for item in fields(kind)
     }
     return kind(**arrays)
 

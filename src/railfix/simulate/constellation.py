@@ -175,7 +175,8 @@ def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Gener
             "af0_s": bias + rate * dt, "af1": rate, "af2": 0.0, "sqrt_a": sqrt_a, "eccentricity": orbit.eccentricity,
             "m0": _wrap(orbit.mean_anomaly + speed * dt), "delta_n": motion, "omega0": _wrap(node),
             "i0": orbit.tilt + tilting * dt, "omega": _wrap(orbit.perigee), "omega_dot": drift, "i_dot": tilting,
-            **wobble, "toe_sow_s": float(toe_sow), "accuracy_m": 3.12 if system == "E" else 2.0,
+            **wobble, "a_dot": 0.0, "delta_n_dot": 0.0, "toe_sow_s": float(toe_sow),
+            "accuracy_m": 3.12 if system == "E" else 2.0,
             "group_delay_1_s": delay[0], "group_delay_2_s": delay[1] if system in "EC" else np.nan,
             "fit_interval_h": {"G": 4.0, "J": 2.0}.get(system, np.nan),
         }  # fmt: skip
@@ -184,6 +185,7 @@ def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Gener
             row
             | {
                 "satellite": orbit.name, "message": _MESSAGE[system], "toc": toe, "toe": toe,
+                "inter_signal_s": np.full(6, np.nan),
                 "transmitted": scenario.start + timedelta(sent_sow - start_sow),
                 "health": _ill_health(system) if ill else 0,
                 "iode": issue + k, "iodc": issue + k, "data_source": _INAV_SOURCE if system == "E" else 0,

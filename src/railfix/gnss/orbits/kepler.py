@@ -52,7 +52,7 @@ class Orbits:
         BeiDou GEO: rotation rate of the Earth-fixed frame against the tilted frame of toe; 0 elsewhere.
     relativity : ndarray, shape (n,) [s]
         F e sqrt(A), the factor of sin E.
-    eccentricity, m0, i_dot, cuc, cus, crc, crs, cic, cis : ndarray, shape (n,)
+    eccentricity, m0, i_dot, a_dot, delta_n_dot, cuc, cus, crc, crs, cic, cis : ndarray, shape (n,)
         As `navigation.KeplerRecords`.
     """
 
@@ -76,6 +76,8 @@ class Orbits:
     cic: Floats
     cis: Floats
     relativity: Floats
+    a_dot: Floats
+    delta_n_dot: Floats
 
     @classmethod
     def from_records(cls, records: KeplerRecords) -> Orbits:
@@ -103,7 +105,7 @@ class Orbits:
 
     @cached_property
     def table(self) -> Floats:
-        """All values of each orbit, shape (n, 20), in the order of the attributes."""
+        """All values of each orbit, shape (n, 22), in the order of the attributes."""
         return np.stack([getattr(self, item.name) for item in fields(Orbits)], axis=1)
 
     @classmethod
@@ -112,7 +114,7 @@ class Orbits:
         return cls(**{item.name: table[:, i] for i, item in enumerate(fields(Orbits))})
 
 
-_AS_BROADCAST: Final = ("eccentricity", "m0", "i_dot", "cuc", "cus", "crc", "crs", "cic", "cis")
+_AS_BROADCAST: Final = ("eccentricity", "m0", "i_dot", "a_dot", "delta_n_dot", "cuc", "cus", "crc", "crs", "cic", "cis")
 
 
 def is_beidou_geo(satellite: str) -> bool:
@@ -155,7 +157,7 @@ def _rotate(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats
 
 
 def kepler_state(orbits: Orbits, since_toe_s: Floats) -> tuple[Components, Components, Floats]:
-    """Compute satellite states at times since toe (IS-GPS-200, table 20-IV).
+    """Compute satellite states at times since toe (IS-GPS-200, tables 20-IV and 30-II).
 
     Parameters
     ----------
@@ -172,7 +174,8 @@ def kepler_state(orbits: Orbits, since_toe_s: Floats) -> tuple[Components, Compo
         F e sqrt(A) sin E, the same as -2 r.v / c^2.
     """
     el, t = orbits, since_toe_s
-    _, sin_e, cos_e = eccentric_anomaly(el.m0 + el.motion * t, el.eccentricity)
+    motion = el.motion + el.delta_n_dot * t
+    _, sin_e, cos_e = eccentric_anomaly(el.m0 + 0.5 * (el.motion + motion) * t, el.eccentricity)
     shrink = 1.0 - el.eccentricity * cos_e
     sin_v, cos_v = el.root * sin_e / shrink, (cos_e - el.eccentricity) / shrink
     sin_p = sin_v * el.cos_omega + cos_v * el.sin_omega
@@ -180,12 +183,15 @@ def kepler_state(orbits: Orbits, since_toe_s: Floats) -> tuple[Components, Compo
     sin_2p, cos_2p = 2.0 * sin_p * cos_p, cos_p * cos_p - sin_p * sin_p
     sin_u, cos_u = _rotate(sin_p, cos_p, el.cus * sin_2p + el.cuc * cos_2p)
     sin_i, cos_i = _rotate(el.sin_i0, el.cos_i0, el.i_dot * t + el.cis * sin_2p + el.cic * cos_2p)
-    r = el.a * shrink + el.crs * sin_2p + el.crc * cos_2p
+    a = el.a + el.a_dot * t
+    r = a * shrink + el.crs * sin_2p + el.crc * cos_2p
 
-    e_rate = el.motion / shrink
+    e_rate = motion / shrink
     p_rate = e_rate * el.root / shrink
     u_rate = p_rate * (1.0 + 2.0 * (el.cus * cos_2p - el.cuc * sin_2p))
-    r_rate = el.a * el.eccentricity * sin_e * e_rate + 2.0 * p_rate * (el.crs * cos_2p - el.crc * sin_2p)
+    r_rate = (
+        a * el.eccentricity * sin_e * e_rate + el.a_dot * shrink + 2.0 * p_rate * (el.crs * cos_2p - el.crc * sin_2p)
+    )
     i_rate = el.i_dot + 2.0 * p_rate * (el.cis * cos_2p - el.cic * sin_2p)
 
     node = el.node + el.node_rate * t

@@ -31,8 +31,8 @@ class ChannelRecords:
     kepler, glonass : ndarray of int, shape (K,), (R,)
         Channels of the constellations with Keplerian records, and of GLONASS.
     preferred, other : ndarray of int, shape (K,)
-        Numbers in the lookup: for Galileo the message with the clock of the channel's signal, and
-        the other message; for other constellations the satellite, and -1.
+        Numbers in the lookup: the message with the clock and the group delay of the channel's signal, and another
+        one; -1 for none.
     any_other : bool
     signal : ndarray of int, shape (K,)
         Row of `group_delay_s` and `unhealthy`.
@@ -60,8 +60,8 @@ class PreparedRecords:
         self.navigation = navigation
         validity = validity_s(kepler)
         self.validity = timedelta(validity)
-        galileo = kepler.satellite.astype("<U1") == "E"
-        label = np.where(galileo, np.char.add(np.char.add(kepler.satellite, " "), kepler.message), kepler.satellite)
+        named = ~np.isin(kepler.message, ("LNAV", "D1", "D2"))
+        label = np.where(named, np.char.add(np.char.add(kepler.satellite, " "), kepler.message), kepler.satellite)
         self.lookup = make_lookup(label, kepler.toe, kepler.transmitted, validity)
         self.orbits = Orbits.from_records(kepler)
         self.clock = np.stack([kepler.af0_s, kepler.af1, kepler.af2])
@@ -120,12 +120,29 @@ def _rows(of_signal: Callable[[str], NDArray[np.generic]], codes: list[str], rec
     return np.array([of_signal(code) for code in codes], dtype=np.float64).reshape(len(codes), records)
 
 
+#: Message with the group delay of a signal other than LNAV, D1 and D2, by constellation and signal.
+_MESSAGE_OF: Final = {
+    **dict.fromkeys(("G2S", "G2L", "G2X", "G5I", "G5Q", "G5X", "J2S", "J2L", "J2X", "J5I", "J5Q", "J5X"), "CNAV"),
+    **dict.fromkeys(("G1S", "G1L", "G1X", "J1S", "J1L", "J1X"), "CNV2"),
+    **dict.fromkeys(("C1D", "C1P", "C1X", "C5X"), "CNV1"),
+    **dict.fromkeys(("C5D", "C5P"), "CNV2"),
+    **dict.fromkeys(("C7D", "C7Z"), "CNV3"),
+}
+
+
 def _labels(satellite: str, signal: str) -> tuple[str, str]:
-    """Return the names in the lookup, preferred first: F/NAV has the clock of E1 and E5a, I/NAV of E1 and E5b."""
-    if satellite[0] != "E":
-        return satellite, ""
-    messages = ("FNAV", "INAV") if signal[:1] == "5" else ("INAV", "FNAV")
-    return f"{satellite} {messages[0]}", f"{satellite} {messages[1]}"
+    """Return the names in the lookup, preferred first: F/NAV has the clock of E1 and E5a, I/NAV of E1 and E5b.
+
+    LNAV, D1 and D2 have the name of the satellite alone. They come first unless another message has the group delay of
+    the signal; CNAV serves where there is no LNAV.
+    """
+    if satellite[0] == "E":
+        messages = ("FNAV", "INAV") if signal[:1] == "5" else ("INAV", "FNAV")
+        return f"{satellite} {messages[0]}", f"{satellite} {messages[1]}"
+    message = _MESSAGE_OF.get(satellite[0] + signal)
+    if message is not None:
+        return f"{satellite} {message}", satellite
+    return satellite, f"{satellite} CNAV"
 
 
 @lru_cache(maxsize=8)

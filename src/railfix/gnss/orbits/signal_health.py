@@ -22,6 +22,19 @@ QZSS_HEALTH: Final[Mapping[str, int]] = {
 #: A record that states an accuracy beyond this (GPS and QZSS: URA index 8 and more, 15 is no prediction at all;
 #: IS-GPS-200, 20.3.3.3.1.3) is of no use [m]; the performance standard of GPS calls such a signal marginal.
 LARGEST_ACCURACY_M: Final = 48.0
+#: Columns of `KeplerRecords.inter_signal_s` by signal of GPS and QZSS; their mean where data and pilot are one code.
+_ISC: Final[Mapping[str, list[int]]] = {
+    "1C": [0], "1E": [0], "2S": [1], "2L": [1], "2X": [1], "5I": [2], "5Q": [3], "5X": [2, 3],
+    "1S": [4], "1L": [5], "1X": [4, 5],
+}  # fmt: skip
+#: Standard deviation of the delay on L2 and L5 without ISC [m]: over the satellites of GPS whose CNAV has it, on
+#: 2025-02-15, TGD - ISC less what stands for it has 0.24 m on L2C and 0.55 m on L5Q
+#: (`tests/gnss/test_group_delays.py`).
+_WITHOUT_ISC_M: Final[Mapping[str, float]] = {"2": 0.3, "5": 0.6}
+#: Signals of the P code, to which TGD refers.
+_P_CODES: Final = ("2P", "2W", "2Y", "2D", "2N", "2M")
+#: Bits of the health word of CNAV by band.
+_CNAV_HEALTH: Final[Mapping[str, int]] = {"1": 0b100, "2": 0b010, "5": 0b001}
 #: All bits.
 _ANY: Final = -1
 
@@ -31,11 +44,13 @@ def unhealthy(records: KeplerRecords, signal: str) -> Masks:
 
     GPS: any of the six bits. QZSS and Galileo: the bits of the signal; Galileo also where no
     accuracy is predicted (SISA "NAPA", written as -1; OS SDD 1.3, 2.3.1.4 calls that marginal).
-    BeiDou: SatH1. All: an accuracy beyond `LARGEST_ACCURACY_M`.
+    CNAV and CNAV-2: the bit of the band. BeiDou: SatH1 or HS. All: an accuracy beyond `LARGEST_ACCURACY_M`.
     """
     system = records.satellite.astype("<U1")
     bits = np.full(len(records), _ANY, dtype=np.int64)
     bits[system == "J"] = QZSS_HEALTH.get(signal, _ANY)
+    cnav = np.isin(system, ["G", "J"]) & (records.message == "CNAV")
+    bits[cnav] = _CNAV_HEALTH.get(signal[:1], _ANY)
     bits[system == "E"] = GALILEO_HEALTH.get(signal[:1], _ANY)
     no_accuracy = ((system == "E") & (records.accuracy_m < 0.0)) | (records.accuracy_m > LARGEST_ACCURACY_M)
     return np.asarray(((records.health & bits) != 0) | no_accuracy)
@@ -47,13 +62,15 @@ def group_delay_s(
     """Compute the group delay of a signal relative to the satellite clock, shape (n,) [s].
 
     ======== =====================================================================================
-    GPS,     TGD on L1, scaled by (f1/f)^2 elsewhere (IS-GPS-200, 20.3.3.3.3.2). L5 and the civil
-    QZSS     L2 signals would need inter-signal corrections that LNAV does not contain: some decimetres.
+    GPS,     TGD on L1, (f1/f2)^2 TGD on L2 (IS-GPS-200, 20.3.3.3.3.2). CNAV and CNAV-2: TGD - ISC on
+    QZSS     L1 C/A, L2C, L5 and L1C (IS-GPS-200, 30.3.3.3.1.1; IS-GPS-705, 20.3.3.3.1.2; IS-GPS-800,
+             3.5.3.9). LNAV has no ISC: TGD on L5 (`group_delay_sigma_m`).
     Galileo  OS SIS ICD 5.1.5. Clocks of I/NAV refer to E1 and E5b, of F/NAV to E1 and E5a. E1 uses
              the BGD of its clock; E5a and E5b follow from both BGDs. F/NAV has no BGD E5b/E1:
              BGD E5a/E1 is used in its place. NaN on E6, whose delay is not broadcast.
-    BeiDou   The clock is that of B3I (B1I ICD 3.0, 5.2.4.10): TGD1 on B1I, TGD2 on B2I, 0 on B3I;
-             NaN on signals whose delay D1 and D2 do not contain (B1C, B2a, B2b).
+    BeiDou   The clock is that of B3I (B1I ICD 3.0, 5.2.4.10), 0 on B3I. D1 and D2: TGD1 on B1I, TGD2 on B2I.
+             CNV1, CNV2 (B1C ICD 1.0, 7.6; B2a ICD 1.0, 7.6): TGD_B1Cp and TGD_B2ap on the pilots, with ISC on
+             the data signals. CNV3: TGD_B2bI on B2b. NaN on signals whose delay the message does not contain.
     ======== =====================================================================================
 
     Parameters
@@ -68,15 +85,34 @@ def group_delay_s(
     delay = np.full(len(records), np.nan)
     system = records.satellite.astype("<U1")
     band = signal[:1]
-    for letter in ("G", "J"):
-        frequency = CARRIER_FREQUENCY[letter].get(band, np.nan)
-        here = system == letter
-        delay[here] = records.group_delay_1_s[here] * (FREQUENCY_L1 / frequency) ** 2
+    here = np.isin(system, ["G", "J"])
+    delay[here] = _navstar(records, signal)[here]
     here = system == "E"
     delay[here] = _galileo(records, band, always_fnav=clock == "ionosphere_free")[here]
     here = system == "C"
     delay[here] = _beidou(records, signal, ionosphere_free=clock == "ionosphere_free")[here]
     return delay
+
+
+def group_delay_sigma_m(records: KeplerRecords, signal: str) -> Floats:
+    """Return the standard deviation of a group delay that the record lacks a part of, shape (n,) [m]; 0 for the others.
+
+    L2C and L5 by LNAV, without their ISC.
+    """
+    lacking = np.isin(records.satellite.astype("<U1"), ["G", "J"]) & (records.message == "LNAV")
+    return np.where(lacking, _WITHOUT_ISC_M.get(signal[:1], 0.0) * (signal not in _P_CODES), 0.0)
+
+
+def _navstar(records: KeplerRecords, signal: str) -> Floats:
+    tgd = records.group_delay_1_s
+    frequency = CARRIER_FREQUENCY["G"].get(signal[:1], np.nan)
+    scale = (FREQUENCY_L1 / frequency) ** 2
+    legacy = tgd * (1.0 if signal[:1] == "5" else scale)
+    columns = _ISC.get(signal)
+    if columns is None:
+        return legacy
+    corrected = tgd - records.inter_signal_s[:, columns].mean(axis=1)
+    return np.where(records.message == "LNAV", legacy, corrected)
 
 
 def _galileo(records: KeplerRecords, band: str, *, always_fnav: bool) -> Floats:
@@ -93,11 +129,31 @@ def _galileo(records: KeplerRecords, band: str, *, always_fnav: bool) -> Floats:
 
 
 def _beidou(records: KeplerRecords, signal: str, *, ionosphere_free: bool) -> Floats:
-    tgd1 = records.group_delay_1_s
-    by_signal = {"2": tgd1, "6": np.zeros(len(records))}
-    # 7I and 7Q are B2I; 7D, 7P and 7Z are B2b.
-    if signal in ("7I", "7Q", "7X"):
-        by_signal["7"] = records.group_delay_2_s
-    delay = by_signal.get(signal[:1], np.full(len(records), np.nan))
+    unknown = np.full(len(records), np.nan)
+    first, second = records.group_delay_1_s, records.group_delay_2_s
+    if signal[:1] == "6":
+        delay = np.zeros(len(records))
+    elif signal[:1] == "2":
+        delay = np.where(_is_of(records, "D1", "D2"), first, unknown)
+    elif signal in ("7I", "7Q", "7X"):  # B2I; 7D, 7P and 7Z are B2b
+        delay = np.where(_is_of(records, "D1", "D2"), second, unknown)
+    elif signal in ("7D", "7Z"):
+        delay = np.where(_is_of(records, "CNV3"), first, unknown)
+    elif signal in ("1P", "1X"):
+        delay = np.where(_is_of(records, "CNV1", "CNV2"), first, unknown)
+    elif signal in ("5P", "5X"):
+        delay = np.where(_is_of(records, "CNV1", "CNV2"), second, unknown)
+    elif signal == "1D":
+        delay = np.where(_is_of(records, "CNV1"), first + records.inter_signal_s[:, 0], unknown)
+    elif signal == "5D":
+        delay = np.where(_is_of(records, "CNV2"), second + records.inter_signal_s[:, 1], unknown)
+    else:
+        delay = unknown
+    if not ionosphere_free:
+        return delay
     f1, f3 = CARRIER_FREQUENCY["C"]["2"] ** 2, CARRIER_FREQUENCY["C"]["6"] ** 2
-    return delay - f1 / (f1 - f3) * tgd1 if ionosphere_free else delay
+    return np.where(_is_of(records, "D1", "D2"), delay - f1 / (f1 - f3) * first, unknown)
+
+
+def _is_of(records: KeplerRecords, *messages: str) -> Masks:
+    return np.isin(records.message, messages)

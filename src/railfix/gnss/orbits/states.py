@@ -226,7 +226,7 @@ class SelectedKepler(NamedTuple):
     """Keplerian records, R of them, as arrays."""
 
     toe_ns: Integers  # (R,) since 1970
-    orbits: Floats  # (R, 20) `Orbits.table`
+    orbits: Floats  # (R, 22) `Orbits.table`
     clock: Floats  # (3, R) clock polynomial
     toe_after_toc_s: Floats  # (R,)
     accuracy_m: Floats  # (R,)

@@ -10,7 +10,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes
 from railfix.core.timescale import from_week, gpst_minus_utc, nearest_week, seconds, timedelta, to_week
 from railfix.io.receiver import nav_messages
-from railfix.io.rinex.navigation_records import FIELDS, RawRecord
+from railfix.io.rinex.navigation_records import RawRecord, fields_of
 
 Values = Mapping[str, float]
 #: A record, and what tells it from the satellite's next one.
@@ -125,7 +125,7 @@ def _issue(values: Values, *names: str) -> tuple[float, ...]:
 
 def _raw(satellite: str, message: str, epoch: Datetimes | np.datetime64, numbers: Mapping[str, float]) -> RawRecord:
     """A record in the order of numbers that RINEX has; what the message lacks is NaN."""
-    values = [float(numbers.get(name, np.nan)) for name in FIELDS[satellite[0]]]
+    values = [float(numbers.get(name, np.nan)) for name in fields_of(satellite[0], message)]
     return RawRecord(
         satellite[0], satellite, message, np.asarray(epoch, dtype="datetime64[ns]").reshape(1)[0], values, 3.0
     )

@@ -1,7 +1,7 @@
 """RINEX navigation files of versions 2, 3 and 4: broadcast orbits, clocks and ionosphere.
 
-GPS, QZSS, Galileo, BeiDou and GLONASS records in the messages that carry the classic parameters
-(LNAV, I/NAV, F/NAV, D1, D2, FDMA) are read; everything else is passed over and counted.
+GPS, QZSS, Galileo, BeiDou and GLONASS records are read (LNAV, CNAV, CNAV-2, I/NAV, F/NAV, D1, D2, CNAV-1 to
+CNAV-3, FDMA); everything else is passed over and counted.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from railfix.core.files import BrokenLines, FilePath, Paths, listed, read_text_l
 from railfix.gnss.navigation import Navigation
 from railfix.io.rinex.navigation_header import NavigationContent, read_header
 from railfix.io.rinex.navigation_records import (
-    FIELDS,
     RawRecord,
+    fields_of,
     first_fault,
     glonass_records,
     kepler_records,
@@ -30,8 +30,13 @@ from railfix.io.rinex.navigation_records import (
 #: Fewest and most lines of a record, the epoch line included, by constellation (RINEX 2.11, tables A4 and
 #: A11; 3.05, tables A6 to A16: GLONASS has a fifth line since 3.05, whose flags are not needed).
 _LINES: Final = {"G": (8, 8), "J": (8, 8), "E": (8, 8), "C": (8, 8), "R": (4, 5)}
-#: Classic messages by constellation as RINEX 4 names them.
-_MESSAGES: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV", "FNAV"), "C": ("D1", "D2"), "R": ("FDMA",)}
+#: The same of the messages that came with RINEX 4 (4.02, tables A10, A11, A18 to A20).
+_LINES_4: Final = {"CNAV": (9, 9), "CNV1": (10, 10), "CNV2": (10, 10), "CNV3": (9, 9)}
+#: Messages by constellation as RINEX 4 names them.
+_MESSAGES: Final = {
+    "G": ("LNAV", "CNAV", "CNV2"), "J": ("LNAV", "CNAV", "CNV2"), "E": ("INAV", "FNAV"),
+    "C": ("D1", "D2", "CNV1", "CNV2", "CNV3"), "R": ("FDMA",),
+}  # fmt: skip
 #: Constellations whose records are skipped: SBAS, NavIC.
 _SKIPPED: Final = ("S", "I")
 #: Width of a number.
@@ -170,7 +175,7 @@ def _record(path: FilePath, block: _Block, version: float, content: NavigationCo
     if system in _SKIPPED or (block.message and block.message not in _MESSAGES[system]):
         content.skipped[f"{system} {block.message}".strip()] += 1
         return None
-    fewest, most = _LINES[system]
+    fewest, most = _LINES_4.get(block.message, _LINES[system])
     # Trailing blank lines belong to the record; a further line with fields does not.
     count = next((k for k in range(len(block.text), fewest, -1) if block.text[k - 1].strip()), fewest)
     count = min(count, len(block.text))
@@ -197,7 +202,7 @@ def _record(path: FilePath, block: _Block, version: float, content: NavigationCo
 
 def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> list[float]:
     """Parse the numbers of a record in the order of the file; blank is NaN."""
-    names = FIELDS[satellite[0]]
+    names = fields_of(satellite[0], block.message)
     numbers: list[float] = []
     for k, name in enumerate(names):
         # Three numbers stand on the first line, after satellite and time; four on each of the others.

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from railfix.core.arrays import Floats, Integers, Strings
-from railfix.core.timescale import bdt_to_gpst, nearest_week, seconds, timedelta, utc_to_gpst
+from railfix.core.timescale import bdt_to_gpst, nearest_week, seconds, timedelta, to_week, utc_to_gpst
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords
 
 #: Numbers of a Keplerian record in the order of the file, the three of the clock first.
@@ -23,8 +23,31 @@ _GLONASS: Final = (
     "clock_bias relative_frequency message_time x x_velocity x_acceleration health "
     "y y_velocity y_acceleration frequency_channel z z_velocity z_acceleration age"
 ).split()
-#: Names of the numbers of a record by constellation.
-FIELDS: Final[Mapping[str, Sequence[str]]] = {**dict.fromkeys("GJEC", _KEPLER), "R": _GLONASS}
+#: First numbers of CNAV and of CNV1 to CNV3; toe of CNAV is its clock time (IS-GPS-200, 30.3.3.1.1).
+_ORBIT_4: Final = (
+    "af0_s af1 af2 a_dot crs delta_n m0 cuc eccentricity cus sqrt_a {} cic omega0 cis i0 crc omega omega_dot "
+    "i_dot delta_n_dot "
+)
+_CNAV: Final = _ORBIT_4.format("top") + (
+    "ned_0 ned_1 accuracy_index health group_delay_1_s ned_2 "
+    "inter_signal_0 inter_signal_1 inter_signal_2 inter_signal_3 "
+)
+_CNV: Final = _ORBIT_4.format("toe_sow_s") + "kind top sisai_oe sisai_ocb sisai_oc1 sisai_oc2 "
+_CNV_END: Final = " group_delay_1_s group_delay_2_s sismai health flags iodc transmitted spare spare iode"
+#: Numbers of the messages that came with RINEX 4 (4.02, tables A10, A11, A18 to A20).
+_MESSAGES_4: Final[Mapping[str, str]] = {
+    **dict.fromkeys(("G CNAV", "J CNAV"), _CNAV + "transmitted week"),
+    **dict.fromkeys(("G CNV2", "J CNV2"), _CNAV + "inter_signal_4 inter_signal_5 spare spare transmitted week"),
+    "C CNV1": _CNV + "inter_signal_0 spare" + _CNV_END,
+    "C CNV2": _CNV + "spare inter_signal_1" + _CNV_END,
+    "C CNV3": _CNV + "sismai health flags group_delay_1_s transmitted",
+}
+#: Names of the numbers of a record by constellation, and by constellation and message where they differ.
+FIELDS: Final[Mapping[str, Sequence[str]]] = {
+    **dict.fromkeys("GJEC", _KEPLER),
+    "R": _GLONASS,
+    **{message: names.split() for message, names in _MESSAGES_4.items()},
+}
 #: Numbers without which there is no orbit or no clock.
 _NEEDED: Final = frozenset(
     "af0_s sqrt_a eccentricity m0 toe_sow_s omega0 i0 omega omega_dot "
@@ -41,6 +64,8 @@ _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
         for names, limit in (
             ("af0_s clock_bias", 1.0),
             ("m0 omega0 i0 omega", 7.0),
+            ("delta_n_dot", 1e-10),
+            ("a_dot", 10.0),
             ("delta_n omega_dot i_dot af1 af2 relative_frequency", 1e-6),
             ("cuc cus cic cis", 1e-3),
             ("crc crs", 1e5),
@@ -72,6 +97,16 @@ class RawRecord:
     numbers: list[float]
     version: float
 
+    @property
+    def fields(self) -> Sequence[str]:
+        """Names of the numbers."""
+        return fields_of(self.system, self.message)
+
+
+def fields_of(system: str, message: str) -> Sequence[str]:
+    """Return the names of the numbers of a message in the order of the file."""
+    return FIELDS.get(f"{system} {message}", FIELDS[system])
+
 
 def number(text: str) -> float:
     """Parse one FORTRAN number; blank and 0.9999E9 are the same NaN object, so that equal records compare equal.
@@ -89,7 +124,7 @@ def number(text: str) -> float:
 
 def first_fault(record: RawRecord) -> tuple[int, str] | None:
     """Return index and description of the first impossible number; None for a valid record."""
-    for k, (name, value) in enumerate(zip(FIELDS[record.system], record.numbers, strict=True)):
+    for k, (name, value) in enumerate(zip(record.fields, record.numbers, strict=True)):
         if name in _NEEDED and math.isnan(value):
             return k, f"{name} is blank"
         low, high = _BETWEEN.get(name, _OTHERS_BETWEEN)
@@ -108,12 +143,13 @@ def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
 
     Blank rates, corrections, health and issues are 0, as RINEX defines; group delays and accuracies are NaN.
     """
-    table = np.array([r.numbers for r in raw], dtype=np.float64).reshape(len(raw), len(_KEPLER))
-    column = dict(zip(_KEPLER, table.T, strict=True))
+    column = _columns(raw)
     satellite = np.array([r.satellite for r in raw], dtype="<U3")
     system = satellite.astype("<U1")
     own = np.array([r.epoch for r in raw], dtype="datetime64[ns]")
-    toe = nearest_week(column["toe_sow_s"], own)
+    of_clock = np.isnan(column["toe_sow_s"])
+    column["toe_sow_s"] = np.where(of_clock, to_week(own)[1], column["toe_sow_s"])
+    toe = np.where(of_clock, own, nearest_week(column["toe_sow_s"], own))
     # The week follows from the clock reference time, not from the week number: converted files are 1024 weeks off.
     sent_sow = column["transmitted"]
     usable = np.abs(np.where(np.isnan(sent_sow), np.inf, sent_sow)) < 2 * 604_800
@@ -123,7 +159,10 @@ def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
     gps_like = np.isin(system, ["G", "J"])
     integers = {name: _integers(column[name]) for name in ("iode", "health", "data_source")}
     # The field of IODC is the second group delay of Galileo and BeiDou; AODC of BeiDou is in that of the fit interval.
-    iodc = np.select([gps_like, beidou], [column["group_delay_2_s"], column["fit"]], column["iode"])
+    cnv = ~np.isnan(column["iodc"])
+    iodc = np.select(
+        [gps_like, cnv, beidou], [column["group_delay_2_s"], column["iodc"], column["fit"]], column["iode"]
+    )
     return KeplerRecords(
         satellite=satellite,
         message=_messages(raw, system, integers["data_source"], satellite),
@@ -134,18 +173,39 @@ def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
         iodc=_integers(iodc),
         health=integers["health"],
         data_source=np.where(beidou, 0, integers["data_source"]),
-        accuracy_m=column["accuracy_m"],
+        accuracy_m=np.where(np.isnan(column["accuracy_m"]), _ura_m(column["accuracy_index"]), column["accuracy_m"]),
         group_delay_1_s=column["group_delay_1_s"],
         group_delay_2_s=np.where(gps_like, np.nan, column["group_delay_2_s"]),
+        inter_signal_s=np.stack([column[f"inter_signal_{i}"] for i in range(6)], axis=-1),
         fit_interval_h=_fit_interval(system, column["fit"]),
         **{
             name: np.nan_to_num(column[name])
             for name in (
-                "af0_s af1 af2 sqrt_a eccentricity m0 delta_n omega0 i0 omega omega_dot i_dot "
+                "af0_s af1 af2 sqrt_a eccentricity m0 delta_n omega0 i0 omega omega_dot i_dot a_dot delta_n_dot "
                 "cuc cus crc crs cic cis toe_sow_s"
             ).split()
         },
     )
+
+
+def _columns(raw: Sequence[RawRecord]) -> dict[str, Floats]:
+    """Return the numbers of all records by name, shape (n,) each; NaN where a message does not have one."""
+    names = {name for key, own in FIELDS.items() if key != "R" for name in own}
+    column = {name: np.full(len(raw), _BLANK) for name in names}
+    layouts: dict[tuple[str, ...], list[int]] = {}
+    for i, record in enumerate(raw):
+        layouts.setdefault(tuple(record.fields), []).append(i)
+    for layout, rows in layouts.items():
+        table = np.array([raw[i].numbers for i in rows], dtype=np.float64)
+        for name, values in zip(layout, table.T, strict=True):
+            column[name][rows] = values
+    return column
+
+
+def _ura_m(index: Floats) -> Floats:
+    """Return the nominal value [m] of a URA_ED index, 8192 m for no prediction (IS-GPS-200, 30.3.3.1.1.4)."""
+    metres = 2.0 ** np.where(index <= 6, 1.0 + index / 2.0, index - 2.0)
+    return np.where((index == 15) | (index == -16), 8192.0, metres)
 
 
 def _integers(values: Floats) -> Integers:

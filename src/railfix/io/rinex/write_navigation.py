@@ -20,6 +20,8 @@ from railfix.io.rinex.packing import Packing, open_target
 UNKNOWN_TRANSMISSION_S: Final = 0.9999e9
 #: Name of a constellation's Klobuchar coefficients.
 _IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}
+#: Messages of Keplerian records that version 3 has.
+_WRITTEN: Final = ("LNAV", "INAV", "FNAV", "D1", "D2")
 _BLANK: Final = " " * 19
 #: Versions that can be written.
 RinexVersion = Literal["3.04", "4.02"]
@@ -164,6 +166,8 @@ def _kepler_fields(records: KeplerRecords) -> tuple[Datetimes, list[Floats]]:
     unknown = np.unique(letter[~np.isin(letter, ["G", "J", "E", "C"])])
     if unknown.size:
         raise ValueError(f"Keplerian records of constellation {unknown[0]!r} have no RINEX form")
+    if (other := ~np.isin(records.message, _WRITTEN)).any():
+        raise ValueError(f"records of {records.message[other][0]} cannot be written; leave them out")
     beidou, galileo = letter == "C", letter == "E"
     navstar = ~(beidou | galileo)
     shift = timedelta(np.where(beidou, BDT_MINUS_GPST_S, 0.0))
