@@ -263,7 +263,7 @@ def test_a_newer_record_that_calls_a_satellite_unhealthy_wins_over_the_issue_of_
     kepler = recording.navigation.kepler
     row = int(np.flatnonzero(kepler.satellite == one)[0])
     names = list(kepler.__dataclass_fields__)
-    extra = {name: np.append(getattr(kepler, name), getattr(kepler, name)[row]) for name in names}
+    extra = {name: np.concatenate([getattr(kepler, name), getattr(kepler, name)[row : row + 1]]) for name in names}
     extra["health"][-1], extra["iode"][-1] = 63, (int(kepler.iode[row]) + 7) % 256
     extra["transmitted"][-1] = recording.observations.time[0]
     extra["toe"][-1] = extra["toe"][-1] + np.timedelta64(16, "s")
