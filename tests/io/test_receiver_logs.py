@@ -493,15 +493,21 @@ def test_one_kind_of_observations_is_taken_however_the_stream_is_cut(first: str)
         assert channels(undated) == channels(alone)
 
 
-def test_a_flipped_bit_of_a_subframe_is_found_by_its_parity(recordings: Path) -> None:
-    """One bit of every GPS subframe, data or parity, the checksum of the message put right again."""
+@pytest.mark.parametrize("system", ["G", "J"])
+def test_a_flipped_bit_of_a_subframe_is_found_by_its_parity(recordings: Path, system: str) -> None:
+    """One bit of every GPS subframe, data or parity, the checksum of the message put right again; the same of QZSS."""
     data = bytearray(gzip.decompress((recordings / "live" / COLD_START).read_bytes())[:1_500_000])
-    frames = find_frames(np.frombuffer(data, np.uint8))
+    frames = find_frames(np.frombuffer(bytes(data), np.uint8))
+    if system == "J":
+        for row in frames.of("ubx", 0x0213).tolist():
+            start, end = int(frames.start[row]), int(frames.end[row])
+            data[start : start + 2] = bytes([5 if data[start] == 0 else 9, data[start + 1] % 7 + 1])
+            data[int(frames.frame_start[row]) : end + 2] = ubx_made.frame(0x0213, bytes(data[start:end]))
     _, true = in_fragments(bytes(data), [])
     rng, flipped = np.random.default_rng(4), 0
     for row in frames.of("ubx", 0x0213).tolist():
         start, end = int(frames.start[row]), int(frames.end[row])
-        if data[start] or data[start + 2]:  # GPS, L1 C/A
+        if data[start] != (0 if system == "G" else 5) or data[start + 2]:  # L1 C/A
             continue
         bit = int(rng.integers(0, 30))
         data[start + 8 + 4 * int(rng.integers(0, 10)) + bit // 8] ^= 1 << bit % 8
@@ -510,9 +516,9 @@ def test_a_flipped_bit_of_a_subframe_is_found_by_its_parity(recordings: Path) ->
         flipped += 1
     piece, _ = decode(bytes(data), StreamState(), at_end=True)
     assert flipped > 200
-    assert piece.ephemerides.skipped["G subframes with wrong parity"] == flipped
-    assert not [record for record in piece.ephemerides.records if record.satellite.startswith("G")]
-    assert [record for record in true if "'G" in str(record)], "there were some to lose"
+    assert piece.ephemerides.skipped[f"{system} subframes with wrong parity"] == flipped
+    assert not [record for record in piece.ephemerides.records if record.satellite.startswith(system)]
+    assert [record for record in true if f"'{system}" in str(record)], "there were some to lose"
 
 
 def test_impossible_weeks_and_numbers_are_counted(tmp_path: Path) -> None:

@@ -231,15 +231,8 @@ def array(rtk: Any, values: list[float]) -> Any:
     return values_of
 
 
-@pytest.mark.parametrize("clock", ["RXM-RAWX", "NAV-PVT"])
-@pytest.mark.parametrize(("began_s", "records"), [(0, 1), (-30, 0), (30, 0)])
-def test_glonass_strings_are_of_one_frame(began_s: int, records: int, clock: str) -> None:
-    """String 1 comes before the receiver's first epoch: its t_k tells whether the others are of its frame.
-
-    A log without observations has its time from NAV-PVT.
-    """
-    week, tow, moscow = 2081, 250_698.0, 3 * 3600
-    frame = int(tow - 18 + moscow) % 86_400 + began_s
+def glonass_frame(began_s: int) -> list[bytes]:
+    """RXM-SFRBX of strings 1 to 4 of R12, of a frame that begins at a second of the day of Moscow."""
     bits = random_bits(1, 4 * 88).reshape(4, 88)
     bits[:, 85:] = 0
     for k in range(4):
@@ -248,9 +241,9 @@ def test_glonass_strings_are_of_one_frame(began_s: int, records: int, clock: str
         put(bits[k], 50, 27, 14_700 * 2**11)
         put(bits[k], 21, 24, 2**20)
         put(bits[k], 45, 5, 1)
-    for first, length, value in ((9, 5, frame // 3600), (14, 6, frame // 60 % 60), (20, 1, frame // 30 % 2)):
+    for first, length, value in ((9, 5, began_s // 3600), (14, 6, began_s // 60 % 60), (20, 1, began_s // 30 % 2)):
         put(bits[0], first, length, value)
-    put(bits[1], 9, 7, (frame + 900) // 900)
+    put(bits[1], 9, 7, (began_s + 900) // 900)
     put(bits[3], 5, 22, 1000)
     put(bits[3], 70, 5, 12)
     parts = []
@@ -261,14 +254,59 @@ def test_glonass_strings_are_of_one_frame(began_s: int, records: int, clock: str
         whole = np.concatenate([codes[nav_messages.glonass_hamming(codes[:, :85])][0], np.zeros(40, np.uint8)])
         words = np.frombuffer(np.packbits(whole).tobytes()[:16], ">u4").astype("<u4").tobytes()
         parts.append(ubx_frame(0x0213, bytes([6, 12, 0, 7, 4, 0, 2, 0]) + words))
-        now = tow + 2.0 * k + 2.0
-        if clock == "RXM-RAWX":
-            parts.append(ubx_frame(0x0215, struct.pack("<dHbBBB2x", now, week, 18, 0, 1, 1)))
-        else:
-            parts.append(ubx_frame(0x0107, struct.pack("<IHBB3xB80x", round(now * 1000), 2019, 11, 26, 3)))
+    return parts
+
+
+def empty_epoch(tow: float) -> bytes:
+    return ubx_frame(0x0215, struct.pack("<dHbBBB2x", tow, 2081, 18, 0, 1, 1))
+
+
+def epochs_of_records(parts: list[bytes]) -> list[str]:
+    """Records of a stream, the same whole and cut at every message."""
+    found = []
     for pieces in ([b"".join(parts)], parts):
         state, epochs = StreamState(), []
         for data in pieces:
             piece, state = decode(data, state)
             epochs += [str(record.epoch) for record in piece.ephemerides.records]
-        assert epochs == ["2019-11-26T21:45:00.000000000"] * records
+        found.append(epochs)
+    assert found[0] == found[1]
+    return found[0]
+
+
+@pytest.mark.parametrize("clock", ["RXM-RAWX", "NAV-PVT"])
+@pytest.mark.parametrize(("began_s", "records"), [(0, 1), (-30, 0), (30, 0)])
+def test_glonass_strings_are_of_one_frame(began_s: int, records: int, clock: str) -> None:
+    """String 1 comes before the receiver's first epoch: its t_k tells whether the others are of its frame.
+
+    A log without observations has its time from NAV-PVT.
+    """
+    tow = 250_698.0
+    parts = []
+    for k, string in enumerate(glonass_frame(int(tow - 18 + 3 * 3600) % 86_400 + began_s)):
+        now = tow + 2.0 * k + 2.0
+        date = ubx_frame(0x0107, struct.pack("<IHBB3xB80x", round(now * 1000), 2019, 11, 26, 3))
+        parts += [string, empty_epoch(now) if clock == "RXM-RAWX" else date]
+    assert epochs_of_records(parts) == ["2019-11-26T21:45:00.000000000"] * records
+
+
+@pytest.mark.parametrize(
+    ("before_s", "after_s", "other", "records"),
+    [
+        (-12, 18, (), 1),  # an epoch every 30 s
+        (-120, 29, (), 1),  # a damaged log has lost two minutes of epochs
+        (-12, 39, (), 0),  # the strings may be of the next frame
+        (-120, 29, (1,), 0),  # string 2 is of the frame before: it came before string 1
+        (-1, 18, (2,), 0),  # string 3 is lost
+    ],
+)
+def test_glonass_records_without_an_epoch_at_their_strings(
+    before_s: int, after_s: int, other: tuple[int, ...], records: int
+) -> None:
+    """The first epoch after all strings, less than a frame after its beginning, shows that they are of one."""
+    tow = 250_698.0
+    strings = glonass_frame(int(tow - 18 + 3 * 3600) % 86_400)
+    kept = [string for k, string in enumerate(strings) if k not in other]
+    early = [strings[1]] if other == (1,) else []
+    parts = [empty_epoch(tow + before_s), *early, *kept, empty_epoch(tow + after_s), empty_epoch(tow + after_s + 1)]
+    assert epochs_of_records(parts) == ["2019-11-26T21:45:00.000000000"] * records

@@ -42,6 +42,9 @@ _UBX_E5B: Final = (5, 6)
 _STRINGS_S: Final = 15.0
 #: Longest time from the last epoch to the string that counts as received then.
 _EPOCH_BEFORE_S: Final = 5.0
+#: Time from one GLONASS frame to the next.
+_FRAME_S: Final = 30.0
+_NEVER: Final = np.datetime64("NaT", "ns")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,11 +52,13 @@ class Unfinished:
     """What the subframes so far left.
 
     `latest` has the fields of the latest subframe by satellite and number, with the time it was received; `issued`,
-    by satellite and message, what tells its last record from the next.
+    by satellite and message, what tells its last record from the next; `waiting`, GLONASS satellites with all strings,
+    and the first epoch after these, which tells whether they are of one frame (NaT until it comes).
     """
 
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    waiting: Mapping[str, np.datetime64] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,15 +77,27 @@ class Assembled:
     undated: frozenset[str] = frozenset()
 
 
-def assembled(subframes: Subframes, time: Datetimes, state: Unfinished | None = None) -> tuple[Assembled, Unfinished]:
+def assembled(
+    subframes: Subframes,
+    time: Datetimes,
+    state: Unfinished | None = None,
+    *,
+    after: Datetimes | None = None,
+    first: np.datetime64 = _NEVER,
+) -> tuple[Assembled, Unfinished]:
     """Ephemerides that a piece of a stream completes, and what it leaves unfinished.
 
-    `time`, when each subframe was received, to within some seconds, shape (N,), resolves weeks and days.
+    `time`, the last epoch before each subframe, shape (N,), resolves weeks and days; `after` is the first one after
+    each, NaT where the piece has none, `first` that of the piece.
     """
     builder = _Builder(state or Unfinished())
+    builder.waiting = {name: first if np.isnat(at) else at for name, at in builder.waiting.items()}
+    after = np.full(len(time), _NEVER) if after is None else after
     pages, counts = _pages(subframes)
     for row, satellite, number, values in pages:
-        builder.add(satellite, number, values, time[row])
+        builder.settle(time[row])
+        builder.add(satellite, number, values, time[row], after[row])
+    builder.settle(None)
     return builder.result(counts)
 
 
@@ -207,7 +224,7 @@ class _Builder:
     """Latest subframes of all satellites, and the records they complete."""
 
     def __init__(self, state: Unfinished) -> None:
-        self.latest, self.issued = dict(state.latest), dict(state.issued)
+        self.latest, self.issued, self.waiting = dict(state.latest), dict(state.issued), dict(state.waiting)
         self.records: list[RawRecord] = []
         self.times: list[np.datetime64] = []
         self.rejected: list[tuple[RawRecord, str]] = []
@@ -233,18 +250,32 @@ class _Builder:
             skipped=_nonzero(counts),
             undated=frozenset(self.undated),
         )
-        return records, Unfinished(latest=self.latest, issued=self.issued)
+        return records, Unfinished(latest=self.latest, issued=self.issued, waiting=self.waiting)
 
-    def add(self, satellite: str, number: int, values: Values, time: np.datetime64) -> None:
-        """Take one subframe; a record it completes is appended."""
+    def add(self, satellite: str, number: int, values: Values, time: np.datetime64, after: np.datetime64) -> None:
+        """Take one subframe between two epochs; a record it completes is appended."""
         letter = satellite[0]
+        if letter == "R":
+            self.waiting.pop(satellite, None)
+            if number == 1:  # strings before it are of another frame
+                for k in (2, 3, 4):
+                    self.latest.pop((satellite, k), None)
         self.latest[satellite, number] = {**values, "received": float(time.astype(np.int64))}
         if letter in "GJ" and number == 4:
             self._ionosphere_gps(letter, values)
             return
         make = {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}.get(letter)
         record = (make or (self._d2 if number > 100 else self._d1))(satellite, time)
+        if letter == "R" and record is None and self._parts(satellite, (1, 2, 3, 4)) is not None:
+            self.waiting[satellite] = after
         self.issue(record, time)
+
+    def settle(self, until: np.datetime64 | None) -> None:
+        """Append records of GLONASS strings whose next epoch came within their frame, up to a time or all known."""
+        for satellite, after in list(self.waiting.items()):
+            if not np.isnat(after) and (until is None or after <= until):
+                del self.waiting[satellite]
+                self.issue(self._glonass(satellite, after, within=_FRAME_S), after)
 
     def issue(self, record: Record | None, time: np.datetime64) -> None:
         """Append a record, unless it is the satellite's last one of that message again or cannot be."""
@@ -307,18 +338,23 @@ class _Builder:
         values = {name: float(value[0]) for name, value in fields(bits, nav_messages.D2).items()}
         return beidou_record(satellite, "D2", {**values, "tow_s": parts[0]["tow_s"]}, time)
 
-    def _glonass(self, satellite: str, time: np.datetime64) -> Record | None:
+    def _glonass(self, satellite: str, time: np.datetime64, *, within: float | None = None) -> Record | None:
         parts = self._parts(satellite, (1, 2, 3, 4))
         if parts is None or f"R{int(parts[3]['slot']):02d}" != satellite:
             return None
         if self.needs_date(satellite, time):
             return None
         # All of one frame, which begins at t_k of string 1; strings follow each other every 2 s. String 1 may have come
-        # before the receiver's first epoch, so that its time of reception is not known.
+        # before the receiver's first epoch, so that its time of reception is not known; where epochs are lost or rare,
+        # the first one after all strings tells that no later frame can have begun.
         began = frame_time(parts[0], time)
-        received = np.array([part["received"] for part in parts[1:]]).astype(np.int64).astype("datetime64[ns]")
-        after_s = seconds(received - began)
-        if not ((after_s > -_EPOCH_BEFORE_S) & (after_s < _STRINGS_S)).all():
+        if within is None:
+            received = np.array([part["received"] for part in parts[1:]]).astype(np.int64).astype("datetime64[ns]")
+            after_s = seconds(received - began)
+            of_one_frame = bool(((after_s > -_EPOCH_BEFORE_S) & (after_s < _STRINGS_S)).all())
+        else:
+            of_one_frame = 0.0 < float(seconds(time - began)) < within
+        if not of_one_frame:
             return None
         values = {**parts[0], **parts[1], **parts[2], **parts[3]}
         return glonass_record(satellite, {**values, "health": float(int(values["health"]) >> 2)}, time)

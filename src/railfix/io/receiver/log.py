@@ -155,6 +155,11 @@ class _Dated(NamedTuple):
         index = np.searchsorted(self.places, places) - 1
         return np.where(index < 0, before, self.times[np.maximum(index, 0)])
 
+    def first_after(self, places: Integers) -> Datetimes:
+        """Time of the first one after each place of the stream; NaT where there is none."""
+        times = np.append(self.times, np.datetime64("NaT", "ns"))
+        return np.asarray(times[np.searchsorted(self.places, places)])
+
 
 def _date(frames: Frames, raw: Measurements, epochs_at: Integers, *, observed: bool) -> _Dated:
     """The receiver's epochs, of messages at places; before the first one, its other messages with a date."""
@@ -175,7 +180,9 @@ def _navigation(
     """Ephemerides and SBAS messages of a block; `msm` are the epochs of RTCM 3."""
     subframes = joined_subframes(ubx.sfrbx_subframes(frames), sbf.navigation_subframes(frames))
     received = dated.last_before(subframes.order, state.time if np.isnat(state.clock) else state.clock)
-    first, unfinished = assembled(subframes, received, state.subframes)
+    after = dated.first_after(subframes.order)
+    start = dated.first_after(np.zeros(1, dtype=np.int64))[0]
+    first, unfinished = assembled(subframes, received, state.subframes, after=after, first=start)
     messages = sorted(rtcm.ephemeris_fields(frames))
     places = np.array([place for place, _, _ in messages], dtype=np.int64)
     before = state.clock if np.isnat(state.time) else state.time

@@ -187,7 +187,8 @@ def gathered(data: Bytes, start: np.ndarray, layout: np.dtype) -> np.ndarray:
 def sfrbx_subframes(frames: Frames) -> Subframes:
     """Navigation subframes of all RXM-SFRBX messages, words as received (32 bits, right-aligned as u-blox has them).
 
-    Those of GPS L1 C/A with a wrong parity are left out and counted: the checksum of the message is of its bytes alone.
+    Those of GPS and QZSS L1 C/A with a wrong parity are left out and counted: the checksum of the message is of its
+    bytes alone.
     """
     chosen = frames.of("ubx", RXM_SFRBX)
     length = frames.end[chosen] - frames.start[chosen]
@@ -203,20 +204,21 @@ def sfrbx_subframes(frames: Frames) -> Subframes:
         block = frames.data[place[:, None] + np.arange(4)] if len(place) else np.zeros((0, 4), np.uint8)
         words[has, k] = np.ascontiguousarray(block).view("<u4")[:, 0]
     system, signal = frames.data[first].astype(np.int64), frames.data[first + 2].astype(np.int64)
-    wrong = (system == 0) & (signal == 0) & ~has_lnav_parity(words)
+    wrong = np.isin(system, (0, 5)) & (signal == 0) & ~has_lnav_parity(words)
+    counts = {f"{SYSTEMS[k]} subframes with wrong parity": int(np.sum(wrong & (system == k))) for k in (0, 5)}
     subframes = Subframes(
         satellite=_NAMES[system, frames.data[first + 1]],
         signal=signal,
         glonass_channel=frames.data[first + 3].astype(np.int64) - 7,
         words=words,
         order=frames.frame_start[chosen],
-        skipped={"G subframes with wrong parity": int(wrong.sum())} if wrong.any() else {},
+        skipped={what: number for what, number in counts.items() if number},
     )
     return subframes.take(np.flatnonzero(~wrong))
 
 
 def has_lnav_parity(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> Masks:
-    """Whether the parity of all ten words of LNAV subframes is right, shape (N,) (IS-GPS-200, table 20-XIV).
+    """Whether the parity of all ten words of LNAV subframes is right, shape (N,) (IS-GPS-200, table 20-XIV; also QZSS).
 
     u-blox inverts a word whose predecessor ends in 1, data and parity, as if it ended in 0; the bit before that one is
     then the exclusive or of the predecessor's last two.
