@@ -292,11 +292,11 @@ MISTAKES: Final[dict[str, tuple[dict[str, str], str, int, str]]] = {
     ),
     "bins_of_letters": (
         {}, "error-model {desk}/results --reference {desk}/truth.csv --elevations 10,five --out {out}", 4,
-        "--elevations '10,five': expected numbers with commas",
+        "--elevations: Input should be a valid number",
     ),
     "sectors_none": (
         {}, "error-model {desk}/results --reference {desk}/truth.csv --sectors 0 --out {out}", 4,
-        "bins of the model: setting sectors: Input should be greater",
+        "--sectors: Input should be greater",
     ),
     "bin_of_no_width": (
         {}, "cn0-curve {desk}/front.obs --nav {desk}/brdc.nav --bin 0 --out {out}", 4,

@@ -51,6 +51,8 @@ _MAP: Final = "map from-positions {desk}/s.csv --out {out}.csv"
 _WHICH: Final = "which-track --front {desk}/front.obs --nav {desk}/brdc.nav --map {desk}/line.geojson"
 _REFERENCE: Final = "reference --rtk {desk}/rtk.csv --track {desk}/line.csv --vehicle {desk}/train.toml --out {out}"
 _MODEL: Final = "error-model {desk}/results --reference {desk}/truth.csv --out {out}.toml"
+_ABLATE: Final = f"ablate {_LOG} --track {{desk}}/line.csv --out {{out}} --truth {{desk}}/truth.csv"
+_COLUMN: Final = " --column time_utc=Moment"
 _LIVE: Final = f"live {_LOG} --track {{desk}}/line.csv"
 _NETWORK: Final = "map network {desk}/s.geojson"
 _CAMPAIGN: Final = "campaign {desk}/s.toml --out {out}"
@@ -228,6 +230,16 @@ MORE: Final[dict[str, Mistake]] = {
     ),
     "survey_at_rest": ({}, "map survey {desk}/rtk.csv --out {out}.csv", 5, "positions of a line were expected"),
     "service_limit_negative": ({}, "map service {desk}/results --limit -3", 4, "must be positive"),
+    # -- columns under other names, in every reader of references
+    "evaluated_column": ({}, _EVALUATE + _COLUMN, 3, "there is no column 'Moment' (given for time_utc)"),
+    "reported_column": ({}, _REPORT + " --reference {desk}/truth.csv" + _COLUMN, 3, "there is no column 'Moment'"),
+    "modelled_column": ({}, _MODEL + _COLUMN, 3, "there is no column 'Moment'"),
+    "ablated_column": ({}, _ABLATE + _COLUMN, 3, "there is no column 'Moment'"),
+    "bridged_column": ({}, _REFERENCE + _COLUMN, 3, "there is no column 'Moment'"),
+    "surveyed_column": ({}, "map survey {desk}/rtk.csv --out {out}.csv" + _COLUMN, 3, "there is no column 'Moment'"),
+    "milliseconds_of_unix": (
+        {"s.csv": "unix_s,x_m,y_m,z_m\n1709608182000,1,2,3\n"}, _MAP, 3, "is it in milliseconds?",
+    ),
     # -- doctor, convert, locate
     "doctor_of_nothing": ({}, "doctor {desk}/none", 3, "there is no such file; check the name"),
     "doctor_of_a_folder": ({}, "doctor {desk}", 3, "is a folder; name the files in it"),

@@ -69,6 +69,31 @@ def test_the_truth_of_the_simulator_is_a_reference(packed: str, tmp_path: Path) 
     assert np.isnan(found.sigma_m).all()
 
 
+@pytest.mark.parametrize(
+    ("name", "form"),
+    [
+        ("time_utc", "2024-03-05T00:59:{0:02.0f}.500Z"),
+        ("time_utc", "2024/03/05 00:59:{0:02.0f}.5"),
+        ("unix_s", "{1:.1f}"),
+        ("time_gpst", "2024/03/05 01:00:{2:04.1f}"),
+    ],
+)
+def test_columns_and_times_of_other_systems(name: str, form: str, tmp_path: Path) -> None:
+    """UTC is 18 s behind GPS time in 2024; 2024-03-05 00:59:42 UTC is 1,709,600,382 s after 1970."""
+    rows = ["Moment,Antenna,X,Y,Z,s"]
+    for k in range(3):
+        moment = form.format(42 + k, 1_709_600_382.5 + k, k + 0.5)
+        rows += [f"{moment},{antenna},{PLACE[0] + k},{PLACE[1]},{PLACE[2]},{k}.25" for antenna in ("front", "rear")]
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    columns = {name: "Moment", "antenna": "Antenna", "x_m": "X", "y_m": "Y", "z_m": "Z", "chainage_m": "s"}
+    read = read_reference(tmp_path / "log.csv", ("front", "rear"), columns=columns)
+    expected = START + np.array([500, 1500, 2500], dtype="timedelta64[ms]")
+    for part in read.values():
+        np.testing.assert_array_equal(part.time, expected)
+        np.testing.assert_allclose(part.ecef_m[:, 0], PLACE[0] + np.arange(3))
+        np.testing.assert_allclose(part.chainage_m, [0.25, 1.25, 2.25])
+
+
 def test_of_a_plain_log_the_fixes_count(tmp_path: Path) -> None:
     path = tmp_path / "rtk.pos"
     path.write_text(

@@ -10,8 +10,8 @@ import pytest
 from scipy.stats import norm
 
 from railfix.cli.error_model import priors_text
+from railfix.cli.settings import Choices, settings_of
 from railfix.core.errors import InputFileError
-from railfix.pipeline.config import parse_config
 from railfix.ranges.error_model import (
     POOLED,
     BinStatistics,
@@ -342,12 +342,18 @@ def test_low_satellites_of_one_side_are_counted_together() -> None:
     assert (unused.side_blocks, unused.side_faulty_blocks) == (blocks, 5)
 
 
-def test_measured_priors_are_printed_as_settings_that_a_run_takes() -> None:
+def test_measured_priors_are_those_of_a_run_with_the_model(tmp_path: Path) -> None:
     samples = samples_of(np.zeros(4000), 30.0, 0.0, 45.0)
     rate = fault_rate(replace(samples, block=np.arange(4000) // 4 * 1_000_000 + np.arange(4000) % 4))
-    words = priors_text(rate).split("--set ")[1:]
-    given = dict(word.strip().removeprefix("risk.").split("=") for word in words)
-    assert parse_config({"risk": given}).risk.side_prior == pytest.approx(rate.side_upper, rel=0.05)
+    rate = rate.replaced(no_level_m=((100.0, 200.0),))
+    model, fitted = tmp_path / "line.toml", fit_bins(samples, np.ones(4000, dtype=bool), ErrorModelFit())
+    write_error_model(ErrorModel(bins=ErrorBins(), before=fitted, after=fitted, covers="local", faults=rate), model)
+    assert f"risk.side_prior = {rate.side_upper:.2g} as measured" in priors_text(rate)
+    config, _ = settings_of(Choices(error_model=model))
+    assert (config.risk.priors, config.risk.local_prior) == ("measured", rate.upper)
+    assert (config.risk.side_prior, config.no_level_m) == (rate.side_upper, rate.no_level_m)
+    own, _ = settings_of(Choices(error_model=model, setting=("risk.local_prior=2e-5",)))
+    assert (own.risk.priors, own.risk.local_prior, own.no_level_m) == ("assumed", 2e-5, ())
     short = fault_rate(samples_of(np.zeros(4000), 60.0, 0.0, 45.0))
     assert short.side_upper == 1.0
     assert "stay indicative" in priors_text(short)

@@ -12,6 +12,7 @@ from railfix.cli.settings import Choices, settings_of
 from railfix.evaluate import Score
 from railfix.evaluate.ablation import Ablation, Effect, ablate_files
 from railfix.run import RunInputs, RunOptions
+from railfix.run.options import ColumnNames
 
 
 @from_models
@@ -19,6 +20,7 @@ def ablate(
     inputs: RunInputs,
     choices: Choices,
     options: Annotated[RunOptions, Without("observations", "chunk_epochs", "reference")],
+    columns: ColumnNames,
     *,
     out: OutOption,
 ) -> None:
@@ -50,7 +52,9 @@ def ablate(
     settings, asked = settings_of(choices)
     inputs = inputs.replaced(config=choices.config)
     with progress_bar() as progress:
-        ablation = ablate_files(inputs, settings, out=out, options=options, asked=asked, progress=progress)
+        ablation = ablate_files(
+            inputs, settings, out=out, options=options, asked=asked, names=columns.names, progress=progress
+        )
     show_ablation(ablation)
 
 

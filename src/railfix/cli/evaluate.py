@@ -12,8 +12,8 @@ from railfix.cli.evaluate_tables import show_evaluation
 from railfix.cli.options import OverwriteOption, Without, from_models, overwriting
 from railfix.core.errors import SettingsError
 from railfix.evaluate import EvaluationOptions, RunAndReference, TrackFiles, evaluate_runs, write_evaluation
+from railfix.evaluate.options import EvaluationInputs
 from railfix.evaluate.run_folder import POSITIONS_TABLE, TABLES, tables_of
-from railfix.run.inputs import INPUTS
 from railfix.run.output import OutputFolder
 
 
@@ -21,57 +21,11 @@ from railfix.run.output import OutputFolder
 def evaluate(
     *,
     runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Folder that `railfix run` wrote.")],
-    reference: Annotated[
-        list[str],
-        typer.Option(
-            "--reference",
-            metavar="FILE",
-            rich_help_panel=INPUTS,
-            help="Reference positions (reference.csv, truth.csv, .gz, RTKLIB), one for all runs or one for each in "
-            "order; `auto`: truth.csv or reference.csv beside the log of each run.",
-        ),
-    ],
+    inputs: EvaluationInputs,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Folder for the files; without it the tables alone.")
     ] = None,
-    table: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--table",
-            metavar="NAME",
-            rich_help_panel=INPUTS,
-            help="Table of positions: `positions` (single epochs) or `train` (filter along the track); may be "
-            "repeated. By default every table of the run.",
-        ),
-    ] = None,
-    conventional: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="RUN",
-            rich_help_panel=INPUTS,
-            help="Another run on the same log, whose conventional positions are compared with: one with "
-            "`--screens elevation` gives unscreened ones, as in P1.",
-        ),
-    ] = None,
-    sections: Annotated[
-        Path | None,
-        typer.Option(
-            "--sections",
-            metavar="CSV",
-            rich_help_panel=INPUTS,
-            help="Environment by chainage (from_m,to_m,environment), where the reference has none.",
-        ),
-    ] = None,
     files: Annotated[TrackFiles, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")],
-    label: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--label",
-            metavar="TEXT",
-            rich_help_panel="Choices",
-            help="Name of the configuration of each run, once for each in order; from the settings by default.",
-        ),
-    ] = None,
     options: EvaluationOptions,
     beside_p1: Annotated[
         bool, typer.Option("--beside-p1", rich_help_panel="Choices", help="Also show the results of the source paper.")
@@ -103,36 +57,35 @@ def evaluate(
     4 a setting is wrong; 5 run, reference and line do not match each other; 8 DIR cannot be written;
     1 a defect of railfix.
     """
-    if unknown := [name for name in table or () if name not in TABLES]:
+    if unknown := [name for name in inputs.table if name not in TABLES]:
         raise SettingsError(f"--table {unknown[0]}: no such table; known are {', '.join(TABLES)}")
     pairs = [
-        replace(pair, table=name, conventional=conventional)
-        for pair in _pair(runs, reference, label)
-        for name in table or tables_of(pair.run) or [POSITIONS_TABLE]
+        replace(pair, table=name, conventional=inputs.conventional)
+        for pair in _pair(runs, inputs.reference, inputs.label)
+        for name in inputs.table or tables_of(pair.run) or [POSITIONS_TABLE]
     ]
     written: dict[str, Path] = {}
     if out is None:
-        evaluation = evaluate_runs(pairs, sections=sections, files=files, options=options)
+        evaluation = evaluate_runs(pairs, sections=inputs.sections, files=files, options=options)
     else:
         given = [pair.reference for pair in pairs if isinstance(pair.reference, Path)]
-        inputs = [*given, *files.track, *(path for path in (sections, files.vehicle) if path is not None)]
-        with OutputFolder(out, overwrite=overwriting(overwrite), inputs=inputs) as folder:
-            evaluation = evaluate_runs(pairs, sections=sections, files=files, options=options)
+        read = [*given, *files.track, *(path for path in (inputs.sections, files.vehicle) if path is not None)]
+        with OutputFolder(out, overwrite=overwriting(overwrite), inputs=read) as folder:
+            evaluation = evaluate_runs(pairs, sections=inputs.sections, files=files, options=options)
             written = write_evaluation(evaluation, folder)
     show_evaluation(evaluation, written, beside="p1" if beside_p1 else "nothing")
 
 
-def _pair(runs: list[Path], reference: list[str], label: list[str] | None) -> list[RunAndReference]:
+def _pair(runs: list[Path], reference: tuple[str, ...], label: tuple[str, ...]) -> list[RunAndReference]:
     """Each run with its reference and label."""
-    references: list[str] = reference * len(runs) if len(reference) == 1 else reference
+    references = reference * len(runs) if len(reference) == 1 else reference
     if len(references) != len(runs):
         raise SettingsError(
             f"{len(references)} references for {len(runs)} runs; give one for all runs, or one for each in order"
         )
-    if label is not None and len(label) != len(runs):
+    if label and len(label) != len(runs):
         raise SettingsError(f"{len(label)} labels for {len(runs)} runs; give one for each in order")
-    labels: list[str | None] = [*label] if label is not None else [None] * len(runs)
     return [
         RunAndReference(run=run, reference=None if file == "auto" else Path(file), configuration=name)
-        for run, file, name in zip(runs, references, labels, strict=True)
+        for run, file, name in zip(runs, references, label or [None] * len(runs), strict=True)
     ]

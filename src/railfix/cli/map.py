@@ -12,13 +12,13 @@ from rich.table import Table
 
 from railfix.cli.command import Command, Commands
 from railfix.cli.console import console_of_tables, show_notes
-from railfix.cli.map_network import MapReading, columns_of, match_command, network, route
+from railfix.cli.map_network import Columns, MapReading, match_command, network, route
 from railfix.cli.map_service import service
 from railfix.cli.map_survey import survey
 from railfix.cli.options import OverwriteOption, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
 from railfix.io.nmea import read_any_positions
-from railfix.io.position_log import read_positions
+from railfix.io.position_log import column_names, read_positions
 from railfix.track import (
     MapLimits,
     Thinned,
@@ -209,15 +209,7 @@ def from_positions_command(
     max_sigma: Annotated[
         float | None, typer.Option(metavar="M", help="Largest standard deviation of a position, any axis.")
     ] = None,
-    column: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=COLUMN",
-            help="Column of a CSV under another name, e.g. `latitude_deg=Lat`; may be repeated. Names: time_gpst, or "
-            "week and tow_s; latitude_deg, longitude_deg, height_m, or x_m, y_m, z_m; quality, ratio, sigma_north_m, "
-            "sigma_east_m, sigma_up_m.",
-        ),
-    ] = None,
+    column: Columns = None,
     name: Annotated[str | None, typer.Option(metavar="NAME", help="Name of the track; else that of the file.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -237,7 +229,7 @@ def from_positions_command(
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")
     check_outputs((out, "csv"), overwrite=overwrite, inputs=[positions])
-    log = read_positions(positions, columns=columns_of(column)) if column else read_any_positions(positions)
+    log = read_positions(positions, columns=column_names(column)) if column else read_any_positions(positions)
     track, thinned = from_position_log(
         log,
         spacing_m=spacing,

@@ -13,7 +13,8 @@ from railfix.cli.console import console_of_tables, show_notes
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
 from railfix.core.files import write_whole
-from railfix.run.options import TrackReading
+from railfix.io.position_log import column_names
+from railfix.run.options import ColumnNames, TrackReading
 from railfix.track import write_track_csv
 from railfix.track.network import Network
 from railfix.track.network_check import check_network
@@ -31,7 +32,7 @@ Tolerance = Annotated[
 ]
 Columns = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME=COLUMN", help="Column of a CSV log under another name; may be repeated."),
+    typer.Option(metavar="NAME=COLUMN", help=str(ColumnNames.model_fields["column"].description)),
 ]
 
 #: Reading of a map by itself: without what a run alone needs.
@@ -48,17 +49,6 @@ SameFrame = Annotated[
         help="The positions are in the frame of the map (RTK from its base stations), not in that of the satellites.",
     ),
 ]
-
-
-def columns_of(pairs: list[str] | None) -> dict[str, str]:
-    """Names of columns in railfix and in the file, of ``NAME=COLUMN`` texts."""
-    columns: dict[str, str] = {}
-    for pair in pairs or []:
-        ours, equals, theirs = pair.partition("=")
-        if not equals or not ours.strip() or not theirs.strip():
-            raise SettingsError(f"--column {pair!r}: expected NAME=COLUMN, for example latitude_deg=Lat")
-        columns[ours.strip()] = theirs.strip()
-    return columns
 
 
 def _network(maps: list[Path], reading: TrackReading, tolerance: float) -> Network:
@@ -194,7 +184,7 @@ def _positions(
     path: Path, net: Network, column: list[str] | None, reading: TrackReading, *, same_frame: bool
 ) -> tuple[PlanLog, list[str]]:
     """Positions of a log in the frame of the network, and a note on their shift."""
-    log = read_plan_positions(path, columns=columns_of(column))
+    log = read_plan_positions(path, columns=column_names(column or ()))
     if same_frame:
         return log, []
     moved, shift = log.in_frame_of(net, **reading.motion)

@@ -12,7 +12,7 @@ from rich.table import Table
 from railfix.cli.console import console_of_tables, show_notes, show_verdict
 from railfix.cli.options import LenientOption, OverwriteOption, Without, check_outputs, from_models
 from railfix.cli.settings import Choices, settings_of
-from railfix.run.options import LogReading
+from railfix.run.options import ColumnNames, LogReading
 from railfix.track.survey.runs import SurveyLimits
 
 
@@ -41,6 +41,7 @@ def survey(
     limits: SurveyLimits,
     choices: Annotated[Choices, Without("screens", "without", "filter", "cn0_curve", "error_model", "sbas")],
     reading: LogReading,
+    columns: ColumnNames,
     lenient: LenientOption = False,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -61,7 +62,8 @@ def survey(
     settings, _ = settings_of(choices)
     surveyed = survey_files(
         runs, nav or (), settings,
-        limits=limits, name=name or out.stem, reading=reading, broken_lines="count" if lenient else "stop",
+        limits=limits, name=name or out.stem, reading=reading, columns=columns.names,
+        broken_lines="count" if lenient else "stop",
     )  # fmt: skip
     result = surveyed.survey
     track = result.track

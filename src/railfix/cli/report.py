@@ -9,14 +9,17 @@ from typing import Annotated, Final
 
 import typer
 
-from railfix.cli.options import OverwriteOption, check_outputs
+from railfix.cli.options import OverwriteOption, check_outputs, from_models
+from railfix.evaluate import EvaluationOptions
 from railfix.report import write_report
 from railfix.run.folder import reading_table
+from railfix.run.options import ColumnNames
 
 #: ``M_MMAP_THRESHOLD`` of ``malloc.h``, and the size from which on an array has pages of its own [bytes].
 _THRESHOLD: Final = (-3, 1 << 17)
 
 
+@from_models
 def report(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders that `railfix run` wrote.")],
     *,
@@ -41,6 +44,7 @@ def report(
         Path | None,
         typer.Option(metavar="GEOJSON", help="Streets, buildings or the like to draw below the plan (WGS 84)."),
     ] = None,
+    columns: ColumnNames,
     title: Annotated[str, typer.Option(metavar="TEXT", help="Heading of the page.")] = "",
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -80,6 +84,7 @@ def report(
             conventional=tuple(conventional or ()),
             background=background,
             title=title,
+            options=EvaluationOptions(columns=columns),
         )
     typer.echo(f"wrote {page} ({page.stat().st_size / 1e6:.1f} MB)")
 

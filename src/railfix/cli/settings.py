@@ -10,6 +10,7 @@ from railfix.core.errors import SettingsError
 from railfix.core.settings import Settings, option, read_toml
 from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, parse_config
 from railfix.run.inputs import INPUTS
+from railfix.run.processor import with_measured_priors
 
 
 class Choices(Settings):
@@ -92,7 +93,7 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
     if choices.without:
         dropped = [name for text in choices.without for name in _screens("--without", text)]
         values["screens"] = [name for name in parse_config(values, source=source).screens if name not in dropped]
-    return parse_config(values, source=source), values
+    return with_measured_priors(parse_config(values, source=source)), values
 
 
 def _preset(name: str) -> str:

@@ -154,13 +154,15 @@ def ablate_files(
     out: Path,
     options: RunOptions | None = None,
     asked: Mapping[str, Any] | None = None,
+    names: Mapping[str, str] | None = None,
     progress: Progress | None = None,
 ) -> Ablation:
     """Process the logs with every choice of screens, and write the rates and errors of each.
 
     With ``config.filter = "track"`` the filter along the track has rows too: with everything that is there, and
     without each of its sources, all screens on. The logs are read once. ``ablation.csv`` has a row per choice and
-    antenna, ``ablation.json`` also the content of ``run.json``. With a `truth`, errors along the line are added.
+    antenna, ``ablation.json`` also the content of ``run.json``. With a `truth`, errors along the line are
+    added; `names` are those of its columns (`railfix.io.read_reference`).
 
     Raises
     ------
@@ -175,7 +177,8 @@ def ablate_files(
         ThreadPoolExecutor(max_workers=1) as pool,
     ):
         entries = inputs.entries(pool, out)
-        truth = None if inputs.truth is None else read_reference(inputs.truth, tuple(inputs.logs))
+        antennas = tuple(inputs.logs)
+        truth = None if inputs.truth is None else read_reference(inputs.truth, antennas, columns=names)
         navigation, line, logs = open_inputs(inputs, options, config)
         screens, left_out = judging_screens(config, line.trajectories)
         # protection levels are not part of the result

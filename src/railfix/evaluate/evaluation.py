@@ -299,7 +299,9 @@ def _part(
             raise MismatchError(f"{path}: is a table of the run itself; give a reference that was measured otherwise")
         key = path, tuple(folder.antennas)
         if key not in read:
-            read[key] = read_reference(path, folder.antennas, quality=options.reference_quality)
+            read[key] = read_reference(
+                path, folder.antennas, quality=options.reference_quality, columns=options.columns.names
+            )
         references, source = read[key], str(path)
         inputs.append(fingerprint("reference", path))
     stretches = None

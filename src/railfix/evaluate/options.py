@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Final, Literal, TypeVar
 
 from pydantic import AfterValidator, Field
 
 from railfix.core.settings import Settings, option
 from railfix.evaluate.bracket import LARGEST_GAP_S
+from railfix.run.inputs import INPUTS
+from railfix.run.options import ColumnNames
 
 Method = Literal["chainage", "trajectory"]
 
@@ -29,6 +32,42 @@ def _rising(edges: tuple[Number, ...]) -> tuple[Number, ...]:
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 RisingEdges = Annotated[tuple[Positive, ...], Field(min_length=1), AfterValidator(_rising)]
 RisingCounts = Annotated[tuple[Annotated[int, Field(gt=0)], ...], Field(min_length=1), AfterValidator(_rising)]
+
+
+class EvaluationInputs(Settings):
+    """Files of an evaluation beside the runs, and the names of the runs."""
+
+    reference: tuple[str, ...] = option(
+        "Reference positions (reference.csv, truth.csv, .gz, RTKLIB), one for all runs or one for each in order; "
+        "`auto`: truth.csv or reference.csv beside the log of each run.",
+        metavar="FILE",
+        panel=INPUTS,
+    )
+    table: tuple[str, ...] = option(
+        "Table of positions: `positions` (single epochs) or `train` (filter along the track); may be repeated. By "
+        "default every table of the run.",
+        (),
+        metavar="NAME",
+        panel=INPUTS,
+    )
+    conventional: Path | None = option(
+        "Another run on the same log, whose conventional positions are compared with: one with `--screens elevation` "
+        "gives unscreened ones, as in P1.",
+        None,
+        metavar="RUN",
+        panel=INPUTS,
+    )
+    sections: Path | None = option(
+        "Environment by chainage (from_m,to_m,environment), where the reference has none.",
+        None,
+        metavar="CSV",
+        panel=INPUTS,
+    )
+    label: tuple[str, ...] = option(
+        "Name of the configuration of each run, once for each in order; from the settings by default.",
+        (),
+        metavar="TEXT",
+    )
 
 
 class EvaluationOptions(Settings):
@@ -61,6 +100,7 @@ class EvaluationOptions(Settings):
         name="--reference-quality",
         metavar="Q,...",
     )
+    columns: ColumnNames = Field(default_factory=ColumnNames)
     reference_gap_s: Positive = option(
         "Longest gap of the reference that is interpolated over.", LARGEST_GAP_S, name="--reference-gap", metavar="S"
     )

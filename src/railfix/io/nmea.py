@@ -6,7 +6,7 @@ write minutes with five decimals resolve positions to 2 cm only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from typing import Final
@@ -203,6 +203,7 @@ def read_any_positions(
     *,
     broken_lines: BrokenLines = "stop",
     date: np.datetime64 | None = None,
+    columns: Mapping[str, str] | None = None,
 ) -> PositionLog:
     """Read a log of positions of any kind, by its ending.
 
@@ -215,7 +216,11 @@ def read_any_positions(
     broken_lines : {"stop", "count"}
     date : datetime64, optional
         For NMEA (see `read_nmea`), and UBX logs whose positions have no date.
+    columns : mapping of str, optional
+        See `read_positions`.
     """
+    if columns:
+        return read_positions(path, columns=columns)
     if ending(path) in (".nmea", ".nma", ".gga"):
         return read_nmea(path, broken_lines=broken_lines, date=date)
     if ending(path) == ".gpx":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from typing import Final
@@ -20,12 +20,15 @@ from railfix.io.named_columns import NamedColumns, read_named_columns
 
 #: Standard deviations of a CSV log.
 _SIGMAS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")
-#: Columns of a CSV log; the time is a date, or week and seconds of it, coordinates are geodetic or ECEF.
+#: Columns of a CSV log; the time is GPS time, UTC, Unix time, or GPS week and seconds of it, coordinates are geodetic
+#: or ECEF.
 CSV_COLUMNS: Final = (
-    "time_gpst", "week", "tow_s", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m", "z_m", "quality", "ratio",
-    *_SIGMAS,
+    "time_gpst", "time_utc", "unix_s", "week", "tow_s", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m",
+    "z_m", "quality", "ratio", *_SIGMAS,
 )  # fmt: skip
 _WEEK_S: Final = 604_800
+#: Largest Unix time that is taken for seconds, in 2100.
+_LAST_UNIX_S: Final = 4.1e9
 _GEODETIC: Final = ("latitude_deg", "longitude_deg", "height_m")
 _CARTESIAN: Final = ("x_m", "y_m", "z_m")
 
@@ -88,7 +91,7 @@ def read_positions(path: str | PathLike[str], *, columns: Mapping[str, str] | No
         `columns` names a column that railfix does not know.
     """
     if ending(path) == ".csv":
-        return _read_csv(path, dict(columns or {}))
+        return _read_csv(path, columns or {})
     if columns:
         raise SettingsError(f"{path}: columns can be renamed in a .csv file only")
     return read_rtklib_positions(path)
@@ -97,11 +100,8 @@ def read_positions(path: str | PathLike[str], *, columns: Mapping[str, str] | No
 # --- CSV ---------------------------------------------------------------------
 
 
-def _read_csv(path: str | PathLike[str], columns: dict[str, str]) -> PositionLog:
-    unknown = sorted(set(columns) - set(CSV_COLUMNS))
-    if unknown:
-        raise SettingsError(f"{path}: column {unknown[0]!r} is unknown; expected one of {', '.join(CSV_COLUMNS)}")
-    table = renamed(read_named_columns(path), columns)
+def _read_csv(path: str | PathLike[str], columns: Mapping[str, str]) -> PositionLog:
+    table = renamed(read_named_columns(path), columns, known=CSV_COLUMNS)
     antennas = table.cells["antenna"].unique().sort().to_list() if "antenna" in table else []
     if len(antennas) > 1:
         raise InputFileError(path, f"has positions of {' and '.join(antennas)}; give those of one antenna")
@@ -152,8 +152,21 @@ def qualities_in_words(log: PositionLog) -> str:
     return ", ".join(f"{count} of quality {number}" for number, count in zip(numbers, counts, strict=True))
 
 
-def renamed(table: NamedColumns, columns: dict[str, str]) -> NamedColumns:
+def column_names(pairs: Iterable[str]) -> dict[str, str]:
+    """Return the names of columns in railfix and in the file, of ``NAME=COLUMN`` texts; else SettingsError."""
+    columns: dict[str, str] = {}
+    for pair in pairs:
+        ours, equals, theirs = pair.partition("=")
+        if not equals or not ours.strip() or not theirs.strip():
+            raise SettingsError(f"--column {pair!r}: expected NAME=COLUMN, for example latitude_deg=Lat")
+        columns[ours.strip()] = theirs.strip()
+    return columns
+
+
+def renamed(table: NamedColumns, columns: Mapping[str, str], *, known: Collection[str]) -> NamedColumns:
     """Give columns of a table the names that railfix has for them; see `read_positions`."""
+    if unknown := sorted(set(columns) - set(known)):
+        raise SettingsError(f"{table.path}: column {unknown[0]!r} is unknown; expected one of {', '.join(known)}")
     cells = dict(table.cells)
     for ours, theirs in columns.items():
         if theirs not in table.cells:
@@ -173,7 +186,21 @@ def _check_latitude(table: NamedColumns, geodetic: Floats) -> None:
 
 
 def positions_times(table: NamedColumns) -> Datetimes:
-    """Parse the column ``time_gpst``, else ``week`` and ``tow_s`` of GPS time; NaT where they are blank or absent."""
+    """Parse the time of each row as GPS time; NaT where it is blank or absent.
+
+    The first of the columns ``time_gpst``, ``time_utc`` (with or without ``Z``), ``unix_s``, ``week`` and ``tow_s``.
+    """
+    if "time_gpst" not in table and "time_utc" in table:
+        return _from_utc(_column_of_times(table, "time_utc"))
+    if "time_gpst" not in table and "unix_s" in table:
+        unix = table.numbers("unix_s", blank=np.nan)
+        wrong = np.isfinite(unix) & ((unix < 0.0) | (unix > _LAST_UNIX_S))
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise table.error(row, f"unix_s {unix[row]:g} is no count of seconds since 1970; is it in milliseconds?")
+        whole = np.floor(np.nan_to_num(unix))
+        since = whole.astype("timedelta64[s]") + timedelta(np.nan_to_num(unix) - whole)
+        return _from_utc(np.where(np.isnan(unix), np.datetime64("NaT"), np.datetime64("1970-01-01", "ns") + since))
     if "time_gpst" not in table and "week" in table and "tow_s" in table:
         week, seconds = table.numbers("week", blank=np.nan), table.numbers("tow_s", blank=np.nan)
         known = np.isfinite(week) & np.isfinite(seconds)
@@ -189,15 +216,32 @@ def positions_times(table: NamedColumns) -> Datetimes:
         return time
     if "time_gpst" not in table:
         return np.full(len(table), np.datetime64("NaT", "ns"))
-    cells = table.cells["time_gpst"].to_list()
+    return _column_of_times(table, "time_gpst")
+
+
+def _column_of_times(table: NamedColumns, name: str) -> Datetimes:
+    """Parse a column of dates with times: ISO 8601, or the same with slashes; UTC may end in Z."""
+    cells = [cell.replace("/", "-") for cell in table.cells[name].to_list()]
+    if name == "time_utc":
+        cells = [cell.removesuffix("Z").removesuffix("+00:00").strip() for cell in cells]
     for row, cell in enumerate(cells):
         if cell.endswith("Z") or "+" in cell:
-            raise table.error(row, f"time_gpst '{cell}' carries a time zone; GPS time without one was expected")
+            expected = "UTC" if name == "time_utc" else "GPS time without one"
+            hint = "" if name == "time_utc" else f"; for UTC name the column time_utc, or give --column time_utc={name}"
+            raise table.error(row, f"{name} '{cell}' carries a time zone; {expected} was expected{hint}")
     try:
         return _times([cell or "NaT" for cell in cells])
     except ValueError:
         row = next(i for i, cell in enumerate(cells) if not _is_time(cell))
-        raise table.error(row, f"time_gpst '{cells[row]}' is no ISO 8601 time such as 2021-09-22T06:30:00.2") from None
+        raise table.error(row, f"{name} '{cells[row]}' is no ISO 8601 time such as 2021-09-22T06:30:00.2") from None
+
+
+def _from_utc(time: Datetimes) -> Datetimes:
+    """Convert UTC to GPS time, NaT kept."""
+    known = ~np.isnat(time)
+    converted = time.astype("datetime64[ns]")
+    converted[known] = utc_to_gpst(converted[known])
+    return converted
 
 
 def _is_time(cell: str) -> bool:

@@ -34,7 +34,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import ending
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.io.nmea import read_any_positions
-from railfix.io.position_log import PositionLog, positions_of_table, qualities_in_words
+from railfix.io.position_log import CSV_COLUMNS, PositionLog, positions_of_table, qualities_in_words, renamed
 
 #: Columns of the file, in this order.
 COLUMNS: Final = (
@@ -97,7 +97,11 @@ class AntennaReference:
 
 
 def read_reference(
-    path: str | PathLike[str], antennas: Sequence[str], *, quality: Collection[int] = (_FIX,)
+    path: str | PathLike[str],
+    antennas: Sequence[str],
+    *,
+    quality: Collection[int] = (_FIX,),
+    columns: Mapping[str, str] | None = None,
 ) -> dict[str, AntennaReference]:
     """Read the reference of one antenna, or of several by the column ``antenna``.
 
@@ -110,6 +114,8 @@ def read_reference(
         Antennas to read. A file without the column ``antenna`` holds one antenna.
     quality : collection of int
         Accepted qualities, where the log has them.
+    columns : mapping of str, optional
+        For CSV with other column names, as in `read_positions`.
 
     Returns
     -------
@@ -122,8 +128,8 @@ def read_reference(
     InputFileError
         No positions, no times, an unknown source, or no column ``antenna`` where two are to be read.
     """
-    table = _table(Path(path))
-    log = read_any_positions(path) if table is None else positions_of_table(table)
+    table = _table(Path(path), columns or {})
+    log = read_any_positions(path, columns=columns) if table is None else positions_of_table(table)
     usable = np.isfinite(log.ecef_m).all(axis=1) & ~np.isnat(log.time)
     if log.has_quality:
         usable &= np.isin(log.quality, [*quality])
@@ -136,17 +142,19 @@ def read_reference(
             f"a column antenna ({', '.join(antennas)}) is needed for the reference of two antennas; give a CSV file "
             "with one (railfix reference makes it of a log of one antenna)",
         )
-    columns = _columns(log, table)
+    values = _columns(log, table)
     what = ""
     if log.has_quality:
         wanted, there = ", ".join(map(str, quality)), qualities_in_words(log)
         what = f" and quality {wanted} (the log has {there}; railfix evaluate --reference-quality takes others)"
-    return {name: _of_antenna(path, name, owner, usable, columns, what) for name in antennas}
+    return {name: _of_antenna(path, name, owner, usable, values, what) for name in antennas}
 
 
-def _table(path: Path) -> NamedColumns | None:
+def _table(path: Path, columns: Mapping[str, str]) -> NamedColumns | None:
     """Read the file as a table; None for a file other than CSV."""
-    return read_named_columns(path) if ending(path) == ".csv" else None
+    if ending(path) != ".csv":
+        return None
+    return renamed(read_named_columns(path), columns, known=dict.fromkeys((*CSV_COLUMNS, *COLUMNS)))
 
 
 def _columns(log: PositionLog, table: NamedColumns | None) -> dict[str, NDArray[np.generic]]:

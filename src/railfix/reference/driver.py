@@ -115,7 +115,7 @@ def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) 
     """Read all files except those of the line."""
     day = None if options.date is None else np.datetime64(options.date, "D")
     logs: dict[str, PositionLog] = {
-        name: read_any_positions(path, broken_lines=options.broken_lines, date=day)
+        name: read_any_positions(path, broken_lines=options.broken_lines, date=day, columns=options.columns.names)
         for name, path in inputs.positions.items()
     }
     notes = [note for log in logs.values() for note in log.notes]

@@ -19,7 +19,7 @@ from railfix.run.inputs import (
     track_option,
     vehicle_option,
 )
-from railfix.run.options import TrackReading
+from railfix.run.options import ColumnNames, TrackReading
 from railfix.run.output import Overwrite
 
 
@@ -97,6 +97,8 @@ class ReferenceOptions(Settings):
         What to do with lines that cannot be read.
     overwrite : {"refuse", "replace"}
     track : TrackReading
+    columns : ColumnNames
+        Of positions in CSV.
     date : date or None
         Of NMEA logs that have none (UTC), and of RTCM 3 logs (to within half a week).
     """
@@ -109,3 +111,4 @@ class ReferenceOptions(Settings):
     )
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
     track: TrackReading = Field(default_factory=TrackReading)
+    columns: ColumnNames = Field(default_factory=ColumnNames)

@@ -16,7 +16,7 @@ from markupsafe import Markup
 from railfix import __version__
 from railfix.core.arrays import Floats
 from railfix.core.files import write_whole
-from railfix.evaluate import Evaluation
+from railfix.evaluate import Evaluation, EvaluationOptions
 from railfix.report import tables
 from railfix.report.background import read_background
 from railfix.report.content import Absent, Block, Folded
@@ -92,6 +92,7 @@ def write_report(
     conventional: Sequence[Path] = (),
     background: Path | None = None,
     title: str = "",
+    options: EvaluationOptions | None = None,
 ) -> Path:
     """Write the report on runs.
 
@@ -106,6 +107,7 @@ def write_report(
     background : Path, optional
         GeoJSON file with lines to draw below the plan (`railfix.report.background`).
     title : str
+    options : EvaluationOptions, optional
 
     Returns
     -------
@@ -119,7 +121,7 @@ def write_report(
     OutputError
         The page cannot be written.
     """
-    reported, evaluation = read_runs(runs, references, conventional=conventional)
+    reported, evaluation = read_runs(runs, references, conventional=conventional, options=options)
     lines = () if background is None else read_background(background)
     return write_page(reported, evaluation, out, background=lines, title=title)
 

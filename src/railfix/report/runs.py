@@ -11,7 +11,7 @@ import polars as pl
 import polars.selectors as cs
 
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
-from railfix.evaluate import Evaluation, RunAndReference, evaluate_runs
+from railfix.evaluate import Evaluation, EvaluationOptions, RunAndReference, evaluate_runs
 from railfix.evaluate.evaluation import EvaluatedRun, short_names
 from railfix.evaluate.place import track_of
 from railfix.evaluate.run_folder import NO_MORE, POSITIONS_TABLE, RunFolder, read_run, read_table, tables_of
@@ -106,7 +106,11 @@ class ReportedRun:
 
 
 def read_runs(
-    paths: Sequence[Path], references: Sequence[Path] = (), *, conventional: Sequence[Path] = ()
+    paths: Sequence[Path],
+    references: Sequence[Path] = (),
+    *,
+    conventional: Sequence[Path] = (),
+    options: EvaluationOptions | None = None,
 ) -> tuple[tuple[ReportedRun, ...], Evaluation | None]:
     """Read runs, and evaluate them where there is a reference.
 
@@ -119,6 +123,7 @@ def read_runs(
     conventional : sequence of Path
         None, or for each run in order another run on the same log, whose conventional positions are shown: one with
         the screens of elevation and C/N0 alone gives the unscreened ones of P1.
+    options : EvaluationOptions, optional
 
     Returns
     -------
@@ -154,7 +159,8 @@ def read_runs(
                 RunAndReference(run=path, reference=reference, table=table, conventional=other)
                 for path, reference, other in zip(paths, each, beside, strict=True)
                 for table in tables_of(path) or [POSITIONS_TABLE]
-            ]
+            ],
+            options=options,
         )
     evaluated: dict[tuple[Path, str], tuple[EvaluatedRun, pl.DataFrame]] = {}
     if evaluation is not None:

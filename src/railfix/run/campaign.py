@@ -25,6 +25,7 @@ from railfix.run.folder import read_record
 from railfix.run.inputs import RunInputs
 from railfix.run.options import RunOptions
 from railfix.run.output import check_folder
+from railfix.run.processor import with_measured_priors
 
 #: A field in a pattern: ``{day}``.
 _FIELD: Final = re.compile(r"\{(\w+)\}")
@@ -124,7 +125,7 @@ def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
     keys = list(dict.fromkeys(tuple(values[name] for name in fields) for _, values in found["front"]))
     if not keys:
         raise InputFileError(path, f"no file matches front = {campaign.front!r}; check the pattern")
-    config = Config() if campaign.config is None else load_config(folder / campaign.config)
+    config = Config() if campaign.config is None else with_measured_priors(load_config(folder / campaign.config))
     runs = []
     for key in keys:
         values = dict(zip(fields, key, strict=True))

@@ -11,6 +11,7 @@ from pydantic import Field, field_validator, model_validator
 
 from railfix.core.files import BrokenLines
 from railfix.core.settings import Settings, option
+from railfix.io.position_log import column_names
 from railfix.run.output import Overwrite
 from railfix.track.frames import MapMotion
 from railfix.track.vehicle import Reference
@@ -59,6 +60,23 @@ class TrackReading(Settings):
     cache: Literal["use", "skip"] = option(
         "Prepare the line anew: neither read nor write the cache folder.", "use", name="--no-cache"
     )
+
+
+class ColumnNames(Settings):
+    """Names of columns in CSV files of positions."""
+
+    column: tuple[str, ...] = option(
+        "Column of CSV positions under another name, such as time_utc=Timestamp; may be repeated. Names: time_gpst, "
+        "time_utc, unix_s, or week and tow_s; latitude_deg, longitude_deg, height_m, or x_m, y_m, z_m; antenna, "
+        "chainage_m, quality, ...",
+        (),
+        metavar="NAME=COLUMN",
+    )
+
+    @property
+    def names(self) -> dict[str, str]:
+        """Name in the file by that in railfix; SettingsError where a text is not NAME=COLUMN."""
+        return column_names(self.column)
 
 
 class LogReading(Settings):

@@ -15,6 +15,21 @@ from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
 
+def with_measured_priors(config: Config) -> Config:
+    """Return settings with the priors of faults, and the stretches without a level, of the error model that they name.
+
+    Those that the settings give themselves stay, and all do where the model does not bound its priors.
+    """
+    given = config.risk.model_fields_set & {"local_prior", "side_prior", "priors"}
+    if config.error_model is None or given:
+        return config
+    rate = read_error_model(config.error_model).faults
+    if rate is None or not rate.bounds_priors:
+        return config
+    risk = config.risk.replaced(local_prior=rate.upper, side_prior=rate.side_upper, priors="measured")
+    return config.replaced(risk=risk, no_level_m=config.no_level_m or rate.no_level_m)
+
+
 def processor_of(
     config: Config,
     navigation: Navigation,

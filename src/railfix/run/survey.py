@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -47,6 +47,7 @@ def survey_files(
     limits: SurveyLimits,
     name: str,
     reading: LogReading | None = None,
+    columns: Mapping[str, str] | None = None,
     broken_lines: BrokenLines = "stop",
 ) -> Surveyed:
     """Survey a line from files of positions and logs of observations.
@@ -71,7 +72,8 @@ def survey_files(
     for path in paths:
         try:
             if ending(path) in POSITION_ENDINGS:
-                log = read_any_positions(path, broken_lines=broken_lines, date=date)
+                of_file = columns if ending(path) == ".csv" else None
+                log = read_any_positions(path, broken_lines=broken_lines, date=date, columns=of_file)
                 notes += log.notes
                 runs.append(run_of_log(log, limits))
                 continue

@@ -20,7 +20,7 @@ from railfix.core.files import ending
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.io.named_columns import read_named_columns
 from railfix.io.nmea import read_any_positions
-from railfix.io.position_log import positions_times, renamed
+from railfix.io.position_log import CSV_COLUMNS, positions_times, renamed
 from railfix.track.crs import kind_of_frame
 from railfix.track.frames import FrameShift, MapMotion, in_map_frame
 from railfix.track.network import Candidates, Network
@@ -164,7 +164,7 @@ def read_plan_positions(path: str | PathLike[str], *, columns: Mapping[str, str]
     InputFileError: when the file is not a log of positions.
     """
     if ending(path) == ".csv":
-        table = renamed(read_named_columns(path), dict(columns or {}))
+        table = renamed(read_named_columns(path), columns or {}, known=CSV_COLUMNS)
         if "latitude_deg" in table and "longitude_deg" in table:
             return PlanLog(
                 path=str(path),

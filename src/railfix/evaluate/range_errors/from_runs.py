@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from pydantic import Field
 
 from railfix import __version__
 from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError
 from railfix.core.files import file_sha256
+from railfix.core.settings import Settings, option
 from railfix.evaluate.range_errors.base_station import BaseStation, base_station_from_files
 from railfix.evaluate.range_errors.gather import GatherLimits, joined, range_errors
 from railfix.io.reference_log import read_reference
@@ -24,15 +26,33 @@ from railfix.ranges.error_model import (
     ErrorSamples,
     condition_differences,
     fault_rate,
+    faulty_stretches,
     fit_bins,
 )
 from railfix.run.chunks import aligned
 from railfix.run.driver import open_inputs
 from railfix.run.folder import read_record
+from railfix.run.inputs import input_option
+from railfix.run.options import ColumnNames
 from railfix.run.processor import processor_of
 
 #: Called after each chunk with the name of the run and the epochs processed so far.
 OnChunk = Callable[[str, int], None]
+
+
+class ReferenceStation(Settings):
+    """Reference positions of runs, and a station beside the line, as the command line names them."""
+
+    reference: tuple[Path, ...] = input_option("Reference positions, one file for each RUN in order.", metavar="FILE")
+    base: tuple[Path, ...] = input_option(
+        "RINEX observations of a nearby reference station during all RUNs; repeat it for several files.",
+        (),
+        metavar="OBS",
+    )
+    base_position: str | None = option(
+        "Position of the station; from its header without it.", None, metavar="LAT,LON,HEIGHT"
+    )
+    columns: ColumnNames = Field(default_factory=ColumnNames)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,12 +69,15 @@ class ModelInputs:
         RINEX files of a nearby reference station; may be empty.
     base_position_ecef_m : ndarray, shape (3,), or None [m]
         Of the station, where its header is not good enough.
+    columns : mapping of str
+        Names of columns in a reference that is CSV.
     """
 
     run: Path
     reference: Path
     base: tuple[Path, ...] = ()
     base_position_ecef_m: Floats | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +144,7 @@ def error_model_from_runs(
             railfix_version=__version__,
             files=tuple(files.items()),
         ),
-        faults=fault_rate(samples),
+        faults=fault_rate(samples).replaced(no_level_m=faulty_stretches(samples)),
     )
     return model, samples
 
@@ -133,7 +156,7 @@ def _run_errors(
     past = read_record(source.run)
     past.check_inputs()
     navigation, line, logs = open_inputs(past.inputs, past.options, past.config)
-    references = read_reference(source.reference, tuple(past.inputs.logs))
+    references = read_reference(source.reference, tuple(past.inputs.logs), columns=source.columns)
     processor = processor_of(past.config.replaced(filter="off"), navigation, line.trajectories)
     state = State()
     base: BaseStation | None = None

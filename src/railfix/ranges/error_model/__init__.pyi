@@ -5,10 +5,11 @@ from .fault_rate import fault_rate, faulty_stretches
 from .file import read_error_model, write_error_model
 from .fit import ErrorModelFit, ErrorSamples, fit_bins
 from .marginal import SummaryRow, summary
-from .model import POOLED, BinStatistics, ErrorBins, ErrorModel, ErrorModelSource, FaultRate
+from .model import LARGEST_PRIOR, POOLED, BinStatistics, ErrorBins, ErrorModel, ErrorModelSource, FaultRate
 from .overbound import Overbound, gaussian_overbound
 
 __all__ = [
+    "LARGEST_PRIOR",
     "POOLED",
     "BinStatistics",
     "Conditions",

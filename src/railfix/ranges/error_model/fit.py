@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Floats, Integers, Masks
-from railfix.core.settings import Settings
+from railfix.core.settings import Settings, option
 from railfix.ranges.error_model.model import POOLED, BinStatistics, ErrorBins
 from railfix.ranges.error_model.overbound import gaussian_overbound
 
@@ -28,7 +28,9 @@ class ErrorModelFit(Settings):
     """
 
     bins: ErrorBins = Field(default_factory=ErrorBins)
-    least_blocks: int = Field(default=30, ge=1)
+    least_blocks: int = option(
+        "Passes of a satellite (30 s blocks) below which a bin takes the values of a wider one.", 30, metavar="N", ge=1
+    )
     block_s: float = Field(default=30.0, gt=0.0)
 
 

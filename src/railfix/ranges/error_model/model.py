@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, field_validator
 
 from railfix.core.arrays import Floats, Integers
-from railfix.core.settings import Settings
+from railfix.core.settings import Settings, option
 from railfix.ranges.error_model.conditions import Conditions
 
 #: Sets of samples that the figures of a bin may come from.
@@ -35,9 +35,16 @@ class ErrorBins(Settings):
         without C/N0 go into the lowest.
     """
 
-    elevation_deg: tuple[Annotated[float, Field(ge=0.0, le=90.0)], ...] = (0.0, 15.0, 30.0, 45.0, 60.0, 90.0)
-    sectors: int = Field(default=4, ge=1)
-    cn0_dbhz: tuple[float, ...] = (0.0, 30.0, 35.0, 40.0, 45.0, 60.0)
+    elevation_deg: tuple[Annotated[float, Field(ge=0.0, le=90.0)], ...] = option(
+        "Edges of the bins of elevation.", (0.0, 15.0, 30.0, 45.0, 60.0, 90.0), name="--elevations", metavar="DEG,..."
+    )
+    sectors: int = option("Sectors of azimuth, the first centred ahead of the car.", 4, metavar="N", ge=1)
+    cn0_dbhz: tuple[float, ...] = option(
+        "Edges of the bins of C/N0; 0,60 puts all into one.",
+        (0.0, 30.0, 35.0, 40.0, 45.0, 60.0),
+        name="--cn0",
+        metavar="DBHZ,...",
+    )
 
     @field_validator("elevation_deg", "cn0_dbhz")
     @classmethod
@@ -124,6 +131,10 @@ class ErrorModelSource(Settings):
     files: tuple[tuple[str, str], ...] = ()
 
 
+#: Measured priors above this come of too few blocks of time to leave a level.
+LARGEST_PRIOR: Final = 0.05
+
+
 class FaultRate(Settings):
     """Probability that a used range is faulty at a time, measured.
 
@@ -148,6 +159,8 @@ class FaultRate(Settings):
     side_upper : float
         Upper end of the 95 % interval of the probability that low satellites of one side are faulty together, by
         those blocks: the `side_prior` to use, where it is small enough to leave a level. 1 without such blocks.
+    no_level_m : tuple of (float, float) [m]
+        Stretches where local faults are more frequent than on the line (`faulty_stretches`), chainages from and to.
     """
 
     beyond_sigma: float = Field(gt=0)
@@ -161,6 +174,12 @@ class FaultRate(Settings):
     side_blocks: int = Field(default=0, ge=0)
     side_faulty_blocks: int = Field(default=0, ge=0)
     side_upper: float = Field(default=1.0, ge=0, le=1)
+    no_level_m: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def bounds_priors(self) -> bool:
+        """Whether both priors are bounded well enough to be used."""
+        return max(self.upper, self.side_upper) <= LARGEST_PRIOR
 
 
 @dataclass(frozen=True, kw_only=True)
