@@ -18,6 +18,7 @@ from railfix.run.options import ColumnNames, TrackReading
 from railfix.track import write_track_csv
 from railfix.track.network import Network
 from railfix.track.network_check import check_network
+from railfix.track.network_fill import fill_gaps
 from railfix.track.network_match import Matched, PlanLog, match, read_plan_positions
 from railfix.track.network_read import TOLERANCE_M, read_network
 from railfix.track.network_route import route_of
@@ -233,6 +234,7 @@ def match_command(
 ) -> None:
     """Put positions on the tracks of a network: track, chainage on it, probability, and the next best track.
 
+    Rows without position between known places are filled along the shortest route; `filled_bound_m` bounds their error.
     The map is moved to the frame of the positions at their time. Positions far from all tracks have none.
 
     Example: `railfix map match net.gpkg --log run.pos --out matched.csv`
@@ -272,14 +274,15 @@ def match_command(
 
 def _matched_csv(net: Network, log: PlanLog, matched: Matched) -> str:
     names = (*net.names, "")
-    kilometrage = net.kilometrage_on(matched.track, matched.chainage_m)
+    filled = fill_gaps(net, matched, log.time)
+    kilometrage = net.kilometrage_on(filled.track, filled.chainage_m)
     other = np.where(matched.candidates.track == matched.track[:, None], -1.0, matched.probabilities)
     second = np.argmax(other, axis=1)
     rows_of = np.arange(len(second))
     next_track = np.where(other[rows_of, second] > 0.0, matched.candidates.track[rows_of, second], -1)
     lines = [
         "time_gpst,latitude_deg,longitude_deg,track,chainage_m,kilometrage_m,offset_m,probability,next_track,"
-        "next_probability,unmapped_probability"
+        "next_probability,unmapped_probability,filled_bound_m"
     ]
     unmapped = np.clip(1.0 - matched.probabilities.sum(axis=1), 0.0, 1.0)
 
@@ -287,11 +290,12 @@ def _matched_csv(net: Network, log: PlanLog, matched: Matched) -> str:
         return "" if np.isnan(value) else f"{value:.{digits}f}"
 
     for k in range(len(second)):
-        quoted = [f'"{names[t]}"' if "," in names[t] else names[t] for t in (int(matched.track[k]), int(next_track[k]))]
+        quoted = [f'"{names[t]}"' if "," in names[t] else names[t] for t in (int(filled.track[k]), int(next_track[k]))]
         lines.append(
             f"{'' if np.isnat(log.time[k]) else log.time[k]},{number(log.latitude_deg[k], 9)},"
-            f"{number(log.longitude_deg[k], 9)},{quoted[0]},{number(matched.chainage_m[k], 3)},"
+            f"{number(log.longitude_deg[k], 9)},{quoted[0]},{number(filled.chainage_m[k], 3)},"
             f"{number(kilometrage[k], 3)},{number(matched.offset_m[k], 3)},{matched.probability[k]:.6f},{quoted[1]},"
-            f"{max(other[k, second[k]], 0.0):.6f},{unmapped[k]:.6f}"
+            f"{max(other[k, second[k]], 0.0):.6f},{unmapped[k]:.6f},"
+            f"{number(filled.bound_m[k], 1)}"
         )
     return "\n".join(lines) + "\n"

@@ -260,7 +260,7 @@ class Network:
             raise SettingsError(f"there is no track {name!r} in the network; {hint}")
         return self.names.index(name)
 
-    def _ways_from(self, node: int, stop: int) -> tuple[dict[int, float], dict[int, list[int]]]:
+    def ways_from(self, node: int, stop: int) -> tuple[dict[int, float], dict[int, list[int]]]:
         """Lengths and paths from a node, first near it and, where the track is not among them, in the whole network."""
         import networkx as nx
 
@@ -295,7 +295,7 @@ class Network:
             for node, (cost, route) in best.items():
                 if node not in self.graph:
                     continue
-                length, path = self._ways_from(node, stop)
+                length, path = self.ways_from(node, stop)
                 for end in (0, 2):
                     entry, leave = 4 * stop + end, 4 * stop + 3 - end
                     if entry in length and cost + length[entry] < reached.get(leave, (np.inf, []))[0]:

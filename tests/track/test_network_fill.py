@@ -1,0 +1,75 @@
+"""Gaps of a log on a network, against routes that networkx finds over tracks cut at the known places."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import networkx as nx
+import numpy as np
+import pytest
+
+from network_made import made_network
+from railfix.track.network import Candidates, Network
+from railfix.track.network_fill import fill_gaps
+from railfix.track.network_match import Matched
+
+pytestmark = pytest.mark.requirement("A10")
+
+
+def _matched(track: list[int], chainage: list[float]) -> Matched:
+    numbers, place = np.array(track), np.array(chainage)
+    probability = np.where(numbers >= 0, 1.0, np.nan)
+    near = Candidates(track=numbers[:, None], chainage_m=place[:, None], offset_m=0.0 * place[:, None])
+    return Matched(
+        track=numbers,
+        chainage_m=place,
+        offset_m=0.0 * place,
+        probability=probability,
+        candidates=near,
+        probabilities=probability[:, None],
+    )
+
+
+def _shortest_m(net: Network, first: int, from_m: float, last: int, to_m: float) -> float:
+    """Length of the shortest route, by nodes of places that are written out here, with no code of railfix."""
+    graph: nx.DiGraph[object] = nx.DiGraph()
+    for t, length in enumerate(net.length_m.tolist()):
+        graph.add_edge(("in", t, 0), ("out", t, 1), weight=length)
+        graph.add_edge(("in", t, 1), ("out", t, 0), weight=length)
+    for link in (link for link in net.links if link.navigable):
+        a, b = (link.first, link.first_end), (link.second, link.second_end)
+        graph.add_edge(("out", *a), ("in", *b), weight=0.0)
+        graph.add_edge(("out", *b), ("in", *a), weight=0.0)
+    graph.add_edge("start", ("out", first, 0), weight=from_m)
+    graph.add_edge("start", ("out", first, 1), weight=net.length_m[first] - from_m)
+    graph.add_edge(("in", last, 0), "stop", weight=to_m)
+    graph.add_edge(("in", last, 1), "stop", weight=net.length_m[last] - to_m)
+    return float(nx.dijkstra_path_length(graph, "start", "stop"))
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 3), (3, 0), (0, 2), (2, 0), (1, 3)])
+def test_a_gap_is_filled_by_the_shortest_route(first: int, last: int) -> None:
+    net = made_network(10.0)
+    from_m, to_m = 0.4 * net.length_m[first], 0.7 * net.length_m[last]
+    count = 2001
+    matched = _matched([first, *[-1] * (count - 2), last], [from_m, *[np.nan] * (count - 2), to_m])
+    time = np.datetime64("2024-01-01T00:00:00", "ns") + np.arange(count) * np.timedelta64(1, "s")
+    filled = fill_gaps(net, matched, time)
+    length = _shortest_m(net, first, from_m, last, to_m)
+    assert filled.filled.sum() == count - 2
+    steps = np.linalg.norm(np.diff(net.course_on(filled.track, filled.chainage_m)[0], axis=0), axis=1)
+    assert steps.sum() == pytest.approx(length, abs=1.0)
+    assert steps.max() < 1.5 * length / (count - 1) + 0.5
+    assert filled.bound_m[count // 2] == pytest.approx(length / 2.0, abs=1e-3)
+    assert filled.bound_m[1] == pytest.approx(length * (1.0 - 1.0 / (count - 1)), abs=1e-3)
+
+
+def test_no_route_or_positions_off_the_map_leave_the_gap() -> None:
+    net = made_network(10.0)
+    time = np.full(3, np.datetime64("NaT"), dtype="datetime64[ns]")
+    assert not fill_gaps(net, _matched([1, -1, 2], [1.0, np.nan, 1.0]), time).filled.any()
+    matched = _matched([0, -1, 0], [100.0, np.nan, 200.0])
+    filled = fill_gaps(net, matched, time)
+    assert (filled.track[1], filled.chainage_m[1], filled.bound_m[1]) == (0, 150.0, 50.0)
+    off_map = replace(matched, probability=np.array([1.0, 0.0, 1.0]))
+    assert not fill_gaps(net, off_map, time).filled.any()
