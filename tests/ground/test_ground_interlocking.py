@@ -515,6 +515,7 @@ def test_a_route_is_taken_back_where_the_train_agrees() -> None:
     assert centre.advance(4.0)[0].end_cm == 233_000
 
 
+@pytest.mark.slow
 def test_routes_are_taken_back_in_disturbed_traffic() -> None:
     """Asked at random under loss, delays and restarts: no invariant breaks, some trains agree and some do not."""
     answers: Counter[bool] = Counter()

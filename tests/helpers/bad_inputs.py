@@ -315,7 +315,7 @@ MISTAKES: Final[dict[str, tuple[dict[str, str], str, int, str]]] = {
         "map route {desk}/line.geojson --heights {desk}/s.csv --out {desk}/s.csv --overwrite", 8,
         "is an input, which is never overwritten",
     ),
-    "duration_negative": ({}, "simulate demo --seconds -5 --out {out}", 4, "--seconds must be positive, got -5"),
+    "duration_negative": ({}, "simulate demo --seconds -5 --out {out}", 4, "--seconds: Input should be"),
     "scenario_setting_misspelt": (
         {}, "simulate demo --set receiver.code_sigma=1 --out {out}", 4,
         "with the settings of the command line: unknown setting receiver.code_sigma",

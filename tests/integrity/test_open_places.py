@@ -37,6 +37,7 @@ def pixel(recordings: Path) -> integrity_tables.Case:
 
 
 @pytest.mark.requirement("C2")
+@pytest.mark.slow
 def test_no_ok_position_is_over_its_level_with_a_large_fault(pixel: integrity_tables.Case) -> None:
     """Every second satellite in turn 100 m too long from the middle on, some at a time when another one is off, too."""
     clean = pixel.solved()

@@ -66,6 +66,7 @@ def test_ubx_measurements(recordings: Path, name: str) -> None:
     assert compared > 6_000
 
 
+@pytest.mark.slow
 def test_rtcm_ephemerides(recordings: Path) -> None:
     """Every field of the messages 1019 and 1046 of a caster; angles are semicircles there and radians here."""
     pyrtcm = pytest.importorskip("pyrtcm")

@@ -50,6 +50,7 @@ def results(log: dict[str, Path], out: Path, command: str, *words: str) -> pl.Da
     return pl.read_parquet(out / "positions.parquet").sort("time_gpst")
 
 
+@pytest.mark.slow
 def test_live_with_sbas_is_the_run_with_the_log(log: dict[str, Path], tmp_path: Path) -> None:
     """Positions, statuses and levels of three ways to the same messages, within 1e-9 m."""
     prn = ["--set", "sbas_prn=137"]

@@ -138,6 +138,7 @@ def places(outputs: list[LiveOutput]) -> AlongTrack:
     return found
 
 
+@pytest.mark.slow
 def test_a_live_session_with_sensors_gives_what_the_log_gives(case: Ride, tmp_path: Path) -> None:
     engine = engine_of(case, tmp_path, sensor_wait_s=0.2)
     outputs = live(case, engine, latency_s=0.05)
@@ -286,6 +287,7 @@ def test_a_range_to_a_unit_that_is_not_surveyed_is_counted(case: Ride, tmp_path:
     assert sensed.unsurveyed(None) == 2
 
 
+@pytest.mark.slow
 def test_a_radar_whose_mounting_moves_is_told_in_a_running_session(case: Ride, tmp_path: Path) -> None:
     """The ride's outputs over and over, each time later; from the eleventh on the radar reads 4 % more."""
     engine, said = engine_of(case, tmp_path, sensor_wait_s=0.2), list[str]()

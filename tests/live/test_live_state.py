@@ -87,6 +87,7 @@ def test_a_restart_continues_as_without_one(parts: dict[str, Path], tmp_path: Pa
     assert not np.array_equal(without["along_sigma_m"].to_numpy(), rest["along_sigma_m"].to_numpy(), equal_nan=True)
 
 
+@pytest.mark.slow
 def test_a_state_that_does_not_belong_is_not_used(parts: dict[str, Path], tmp_path: Path) -> None:
     """Too old, another map, other settings, damaged: told, and the positions are those of a fresh start."""
     path = tmp_path / "state"

@@ -11,6 +11,7 @@ from pipeline_cases import clean_observations, processor
 
 
 @pytest.mark.requirement("A8")
+@pytest.mark.slow
 def test_an_epoch_after_a_gap_takes_no_four_times_as_long() -> None:
     """Both antennas and the filter, epoch by epoch; the slowest of the 20 after a gap, the best of three tries."""
     observations = clean_observations()

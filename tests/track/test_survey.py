@@ -71,6 +71,7 @@ def across_m(survey: Survey, line: Floats) -> Floats:
     return np.asarray(cKDTree(line[:, :2]).query(local[:, :2])[0])
 
 
+@pytest.mark.slow
 def test_runs_there_and_back_and_over_a_part_make_one_line() -> None:
     line = open_line()
     runs = [

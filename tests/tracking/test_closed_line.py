@@ -171,6 +171,7 @@ def test_a_vehicle_on_a_ring_has_closed_paths() -> None:
 
 
 @pytest.mark.requirement("A3")
+@pytest.mark.slow
 def test_single_epochs_at_the_join_are_placed_and_have_one_place() -> None:
     """Points of the map 20 m apart, and a start on the other side of the join."""
     angle = np.linspace(0.0, 2.0 * np.pi, POINTS + 1)

@@ -299,9 +299,8 @@ def _part(
             raise MismatchError(f"{path}: is a table of the run itself; give a reference that was measured otherwise")
         key = path, tuple(folder.antennas)
         if key not in read:
-            read[key] = read_reference(
-                path, folder.antennas, quality=options.reference_quality, columns=options.columns.names
-            )
+            names = options.columns.names
+            read[key] = read_reference(path, folder.antennas, quality=options.reference_quality, columns=names)
         references, source = read[key], str(path)
         inputs.append(fingerprint("reference", path))
     stretches = None
@@ -434,10 +433,7 @@ def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
 
 
 def _parts(epochs: pl.DataFrame, by: str, as_one: Sequence[str]) -> Iterator[pl.DataFrame]:
-    """Rows of each value of a column, then the same with both antennas as one, where there are two.
-
-    The columns `as_one` have `ALL` in place of their values.
-    """
+    """Rows of each value of a column, then the same with both antennas as one; columns `as_one` have `ALL`."""
     for keys in (as_one, (*as_one, "antenna"))[: epochs["antenna"].n_unique()]:
         for value in epochs[by].unique(maintain_order=True):
             yield epochs.filter(pl.col(by) == value).with_columns(pl.lit(ALL).alias(key) for key in keys)
