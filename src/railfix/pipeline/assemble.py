@@ -78,6 +78,8 @@ def antenna_results(
         residual_m=on_all_channels(np.where(corrected.reason == 0, constrained.residual_m, np.nan)),
         satellites=corrected.satellites,
         columns=corrected.columns,
+        second=corrected.second,
+        combined=corrected.combined,
         screens=corrected.screens,
         single_point=point,
         section=solution.place.section,

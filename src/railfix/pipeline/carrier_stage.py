@@ -68,7 +68,13 @@ def smoothed(ranges: CorrectedRanges, config: Config, state: CarrierState) -> tu
         state.smoothing,
         limits=config.smoothing,
     )
-    corrected = ranges.corrected_code_m + (result.code_m - obs.code_m)[:, ranges.columns]
+    change = result.code_m - obs.code_m
+    corrected = change[:, ranges.columns]
+    if ranges.second is not None and ranges.combined is not None:
+        other = np.take_along_axis(change, np.maximum(ranges.second.column, 0), axis=1)
+        share = ranges.combined.share
+        corrected = np.where(np.isfinite(share), (1.0 - share) * corrected + share * other, corrected)
+    corrected = ranges.corrected_code_m + corrected
     return replace(ranges, corrected_code_m=corrected), replace(state, smoothing=after)
 
 

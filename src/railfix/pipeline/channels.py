@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -18,8 +18,9 @@ from railfix.gnss.navigation import Navigation, glonass_channels
 from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.pipeline.config import Config
+from railfix.pipeline.second_codes import noise_of
 from railfix.positioning.normal_equations import clock_groups
-from railfix.ranges.weights import channel_order
+from railfix.ranges.weights import SECOND_SIGNALS, channel_order
 
 #: Sets of channels remembered.
 _REMEMBERED: Final = 64
@@ -46,6 +47,16 @@ class Channels:
         Reason of the channels that settings leave out, 0 for the others.
     member : ndarray of int64, shape (M, S)
         1 where a channel is of a satellite, S satellites.
+    second : ndarray of int, shape (K, P)
+        Columns of the second signals of each channel's satellite, in order of preference; -1 for none. P is 0 with
+        one frequency.
+    second_signal, second_ratio, second_noise : ndarray, shape (K, P)
+        Signal with the letter of the constellation, square of the first frequency over it, and its noise over that of
+        L1 C/A.
+    pair_names : tuple of str, length K P
+        Satellite and both signals.
+    pair_groups : ndarray of int, shape (K P,)
+        Number of the pairs with one delay in the receiver.
     """
 
     columns: Indices
@@ -58,6 +69,12 @@ class Channels:
     every_frequency_hz: Floats
     left_out: Integers
     member: Integers
+    second: Indices
+    second_signal: Strings
+    second_ratio: Floats
+    second_noise: Floats
+    pair_names: tuple[str, ...]
+    pair_groups: Integers
 
 
 class ChannelBook:
@@ -113,4 +130,41 @@ class ChannelBook:
             every_frequency_hz=read_only(frequency),
             left_out=read_only(left_out.astype(np.int64)),
             member=read_only((which[:, None] == np.arange(len(names))).astype(np.int64)),
+            **self._second(obs, columns, frequency),
         )
+
+    def _second(self, obs: Observations, columns: Indices, frequency_hz: Floats) -> dict[str, Any]:
+        """Return the second signals of the channels (`Channels`)."""
+        wanted = SECOND_SIGNALS if self._config.frequencies == "two" else {}
+        of_satellite: dict[str, dict[str, int]] = {}
+        for i, (name, signal) in enumerate(zip(obs.satellite.tolist(), obs.signal.tolist(), strict=True)):
+            of_satellite.setdefault(name, {})[signal] = i
+        rows = []
+        for column in columns.tolist():
+            own = of_satellite[name := str(obs.satellite[column])]
+            order = [own[signal] for signal in wanted.get(name[0], ()) if signal in own]
+            rows.append([i for i in order if frequency_hz[i] < frequency_hz[column]])
+        width = max(map(len, rows), default=0)
+        second = np.array([row + [-1] * (width - len(row)) for row in rows], dtype=np.intp).reshape(len(rows), width)
+        letter = np.char.add(obs.satellite.astype("<U1"), obs.signal)
+        signal = np.where(second >= 0, letter[second], "") if width else np.empty(second.shape, dtype="<U3")
+        # BeiDou-2 (C01 to C16) and BeiDou-3 differ by metres in a receiver
+        kind = ["C3" if name[0] == "C" and name > "C16" else name[0] for name in obs.satellite[columns].tolist()]
+        pairs = [
+            (f"{satellite} {first} {other[1:]}", f"{group} {first} {other[1:]}")
+            for satellite, first, group, others in zip(
+                obs.satellite[columns].tolist(), obs.signal[columns].tolist(), kind, signal.tolist(), strict=True
+            )
+            for other in others
+        ]
+        _, groups = np.unique(np.array([group for _, group in pairs], dtype="<U12"), return_inverse=True)
+        ratio = (frequency_hz[columns][:, None] / frequency_hz[second]) ** 2 if width else np.empty(second.shape)
+        noise = np.array([[noise_of(other) for other in others] for others in signal.tolist()], dtype=np.float64)
+        return {
+            "second": read_only(second),
+            "second_signal": read_only(signal),
+            "second_ratio": read_only(np.where(second >= 0, ratio, 2.0)),
+            "second_noise": read_only(noise.reshape(second.shape)),
+            "pair_names": tuple(name for name, _ in pairs),
+            "pair_groups": read_only(groups.astype(np.intp)),
+        }

@@ -34,7 +34,7 @@ def judge_pairs(
 
 def with_screens(corrected: CorrectedRanges, ranges: Mapping[str, CorrectedRanges]) -> CorrectedRanges:
     """Return the ranges of all antennas with what the screens and the carrier phases of each have changed."""
-    names = ("reason", "sigma_m", "corrected_code_m", "slips")
+    names = ("reason", "sigma_m", "corrected_code_m", "bound_sigma_m", "bias_m", "combined", "slips")
     return changed(corrected, **{name: joined([getattr(own, name) for own in ranges.values()]) for name in names})
 
 

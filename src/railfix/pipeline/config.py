@@ -38,6 +38,7 @@ from railfix.positioning.residual_means import LastingErrorLimits
 from railfix.positioning.robust_fit import RobustFitLimits
 from railfix.positioning.section_search import SectionLimits
 from railfix.positioning.single_point import SinglePointLimits
+from railfix.positioning.two_frequencies import TwoFrequencyLimits
 from railfix.ranges.sbas import SbasLimits
 from railfix.ranges.weights import DEFAULT_SIGNALS, CodeNoise, NominalErrors
 from railfix.screens import SCREENS
@@ -112,6 +113,11 @@ class Config(ScreenSettings):
         Satellites ("G07") and constellations ("C") that are left out altogether.
     signals : mapping of str to tuple of str
         Signals of each constellation in order of preference; the first one observed is used.
+    frequencies : {"one", "two"}
+        Whether a second code of each satellite, where there is one, is combined with the first (not with SBAS, whose
+        corrections are those of one frequency).
+    two_frequencies : TwoFrequencyLimits
+        Limits of that.
     screens : tuple of str
         Screens that are on; health and validity of the satellites are always checked.
     cn0_curve : path or None
@@ -205,6 +211,8 @@ class Config(ScreenSettings):
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
     exclude: tuple[Annotated[str, Field(pattern=r"^[GJECR]([0-9]{2})?$")], ...] = ()
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
+    frequencies: Literal["one", "two"] = "one"
+    two_frequencies: TwoFrequencyLimits = TwoFrequencyLimits()
     screens: tuple[str, ...] = SCREEN_NAMES
     cn0_curve: Path | None = None
     failed_checks: Literal["keep", "drop"] = "keep"

@@ -16,11 +16,13 @@ from railfix.gnss.orbits import SatelliteStates, satellite_states
 from railfix.pipeline.channels import Channels
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received
+from railfix.pipeline.second_codes import second_codes
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import Slips
 from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.section_search import SearchIndex, search
 from railfix.positioning.single_point import SinglePointLimits, single_point
+from railfix.positioning.two_frequencies import Combined, SecondCodes
 from railfix.ranges.atmospheric_delays import SeenFrom, modelled_delays
 from railfix.ranges.error_model import ErrorModel
 from railfix.ranges.sbas_delays import SBAS_SIGNAL, corrected_satellites, sbas_delays
@@ -54,6 +56,10 @@ class CorrectedRanges(AntennaRanges):
         Overbounding sigma and largest nominal bias of each range by the error model; 0 without one.
     screens : mapping of str to Screened
         Metric and verdict of each screen so far.
+    second : SecondCodes or None
+        Second codes of the satellites, where two frequencies are used.
+    combined : Combined or None
+        How the two were combined.
     slips : Slips or None
         Of all channels of the observations, where the carrier phase is used.
     """
@@ -67,6 +73,8 @@ class CorrectedRanges(AntennaRanges):
     bound_sigma_m: Floats
     bias_m: Floats
     screens: Mapping[str, Screened] = field(default_factory=dict)
+    second: SecondCodes | None = None
+    combined: Combined | None = None
     slips: Slips | None = None
 
     @property
@@ -182,6 +190,10 @@ def correct_ranges(
         delays = sbas_delays(sbas, fixes, obs.time, seen, frequency)
         beyond = nominal = delays.sigma_m
         reason = np.where(observed, reason | delays.reason, reason)
+    second = None
+    if sbas is None:
+        air = delays.ionosphere_m, delays.troposphere_m
+        second = second_codes(obs, channels, states, received, seen.elevation_deg, *air, config)
     clean = clean - delays.ionosphere_m - delays.troposphere_m
     sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), beyond)
     bound, bias = np.zeros(code.shape), np.zeros(code.shape)
@@ -212,6 +224,7 @@ def correct_ranges(
         bound_sigma_m=bound,
         bias_m=bias,
         reason=np.where(uncorrected, int(Reason.NO_CORRECTION), reason),
+        second=second,
     )
 
 

@@ -31,6 +31,7 @@ from railfix.pipeline.feature_stage import LineFeatures
 from railfix.pipeline.filter_result import AlongTrack, FilterState, single_epochs
 from railfix.pipeline.received import Received, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
+from railfix.pipeline.second_codes import combined
 from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples
 from railfix.pipeline.solution import Solution, solve
 from railfix.positioning.antenna_rows import AntennaRows, rows_of, stack_observations
@@ -271,7 +272,7 @@ class EpochProcessor:
         antennas = AntennaRows(tuple(self.indices[name] for name in names), parts)
         channels = self._channels.of(obs, received.navigation)
         corrected = correct_ranges(obs, channels, self.config, received, antennas, error_model=self._error_model)
-        ranges, own_states = self._screened(names, antennas, corrected, state)
+        ranges, own_states = self._screened(names, antennas, corrected, received, state)
         pair = self._pair(ranges)
         ranges = judge_pairs(self.screens, pair, ranges)
         corrected, solution, own_states = solve(with_screens(corrected, ranges), antennas, self.config, own_states)
@@ -313,7 +314,7 @@ class EpochProcessor:
         return result, replace(state, fusion=filter_states)
 
     def _screened(
-        self, names: Sequence[str], antennas: AntennaRows, corrected: CorrectedRanges, state: State
+        self, names: Sequence[str], antennas: AntennaRows, corrected: CorrectedRanges, received: Received, state: State
     ) -> tuple[dict[str, CorrectedRanges], list[AntennaState]]:
         """Return the ranges of each antenna after the screens that judge one antenna alone, and its new state."""
         ranges, after = {}, []
@@ -326,13 +327,14 @@ class EpochProcessor:
                     own = own.judged(verdicts)
                     if screen_state is not None:
                         states[screen.name] = screen_state
+            own, two = combined(own, self.config, received.ionosphere_sigma_m, before.two_frequencies)
             carrier = before.carrier
             if self.config.carrier != "off":
                 own, carrier = with_slips(own, self.config, carrier or CarrierState())
                 if self.config.carrier == "smoothed":
                     own, carrier = smoothed(own, self.config, carrier)
             ranges[name] = own
-            after.append(replace(before, screens=states, carrier=carrier))
+            after.append(replace(before, screens=states, carrier=carrier, two_frequencies=two))
         return ranges, after
 
     def _results(

@@ -15,6 +15,10 @@ def reason_of_all_channels(corrected: CorrectedRanges) -> Bits:
     not_observed = ~np.isfinite(corrected.observations.code_m) * np.int64(Reason.NOT_OBSERVED)
     reason = np.asarray(not_observed | corrected.channels.left_out)
     reason[:, corrected.columns] = corrected.reason
+    second, found = corrected.second, corrected.combined
+    if second is not None and found is not None:
+        epoch, channel = np.nonzero(np.isfinite(found.share))
+        reason[epoch, second.column[epoch, channel]] = corrected.reason[epoch, channel]
     return reason
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -20,6 +20,7 @@ from railfix.pipeline.conventional import PointStatus
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.level_stage import BASES, KINDS
 from railfix.pipeline.results import AntennaResult
+from railfix.positioning.two_frequencies import Combined, SecondCodes
 from railfix.screens import SCREENS, ScreenColumn
 
 
@@ -220,6 +221,13 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
     )
 )
 
+
+def _second(observed: Observed, values: Callable[[Combined, SecondCodes], Floats]) -> Floats | None:
+    """Return values of the combination of two codes on all channels; None with one frequency."""
+    combined, second = observed.result.combined, observed.result.second
+    return None if combined is None or second is None else observed.on_all_channels(values(combined, second))
+
+
 #: Columns of the table of observations that have a value for each epoch and channel.
 CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
     (
@@ -241,6 +249,27 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
             lambda o: o.result.corrected_code_m,
         ),
         *(_observation_column(c) for screen in SCREENS for c in screen.columns if c.table == "observations"),
+        Column(
+            "second_share",
+            "two frequencies: weight of the second code of the satellite in its range, that of the first is 1 less it; "
+            "negative: toward the ionosphere-free combination, between 0 and 1: mean; empty: the first code alone",
+            lambda o: _second(o, lambda r, _: r.share),
+        ),
+        Column(
+            "ionosphere_measured_m",
+            "two frequencies: delay on the first signal beyond that of the model, by the epochs before",
+            lambda o: _second(o, lambda r, _: r.ionosphere_m),
+        ),
+        Column(
+            "metric_two_frequencies_m",
+            "two frequencies: second code less first beyond what is predicted: multipath and noise",
+            lambda o: _second(o, lambda r, _: r.difference_m),
+        ),
+        Column(
+            "second_cn0_dbhz",
+            "two frequencies: carrier-to-noise density of the second signal",
+            lambda o: _second(o, lambda _, s: s.cn0_dbhz),
+        ),
         Column(
             "raim_own_error_m",
             "screen `raim`: error against all other ranges, of satellites named as faulty; empty where the "

@@ -26,6 +26,7 @@ from railfix.positioning.noise_scale import NoiseState
 from railfix.positioning.residual_means import LastingErrorState
 from railfix.positioning.section_search import Section
 from railfix.positioning.single_point import SinglePoint
+from railfix.positioning.two_frequencies import Combined, SecondCodes, TwoFrequencyState
 from railfix.screens import Screened
 
 if TYPE_CHECKING:
@@ -109,6 +110,8 @@ class AntennaState(NotebookTable):
         State of the carrier-phase stages, where they are used.
     ended : datetime64[ns]
         Last epoch; NaT before the first.
+    two_frequencies : TwoFrequencyState
+        Mean differences of the two codes of satellites.
     """
 
     noise: NoiseState = field(default_factory=NoiseState)
@@ -119,6 +122,7 @@ class AntennaState(NotebookTable):
     screens: Mapping[str, Any] = field(default_factory=dict)
     carrier: CarrierState | None = None
     ended: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    two_frequencies: TwoFrequencyState = field(default_factory=TwoFrequencyState)
 
     def __repr__(self) -> str:
         screens = ", ".join(sorted(self.screens)) or "none"
@@ -193,6 +197,10 @@ class AntennaResult(NotebookTable):
         Of the channels in `columns`.
     columns : ndarray of int, shape (K,)
         Channels that settings allow, in the order of the intermediate results below.
+    second : SecondCodes or None
+        Second codes of satellites, where two frequencies are used, shape (T, K).
+    combined : Combined or None
+        How they were combined with the first.
     screens : mapping of str to Screened
         Metric and verdict of each screen that was on, by name, shape (T, K); "antenna_spacing", which
         judges positions, has shape (T,).
@@ -245,6 +253,8 @@ class AntennaResult(NotebookTable):
     residual_m: Floats
     satellites: SatelliteStates
     columns: Indices
+    second: SecondCodes | None
+    combined: Combined | None
     screens: Mapping[str, Screened]
     single_point: SinglePoint
     section: Section

@@ -30,6 +30,15 @@ DEFAULT_SIGNALS: Final[Mapping[str, tuple[str, ...]]] = {
     "R": ("1C", "1P"),
 }
 
+#: Second signals in order of preference. L2 comes before L5 for GPS and QZSS: LNAV lacks the delay of L5
+#: (`signal_health.group_delay_sigma_m`).
+SECOND_SIGNALS: Final[Mapping[str, tuple[str, ...]]] = {
+    "G": ("2L", "2X", "2S", "2W", "5Q", "5X", "5I"),
+    "J": ("2L", "2X", "2S", "5Q", "5X", "5I"),
+    "E": ("5Q", "5X", "5I", "7Q", "7X", "7I"),
+    "C": ("7I", "7Q", "7X", "6I", "6Q", "6X", "5P", "5X", "5D"),
+}
+
 
 class CodeNoise(Settings):
     """Standard deviation of a corrected pseudorange from C/N0 and elevation.

@@ -1,0 +1,295 @@
+"""Two frequencies: both codes of a satellite combined to one pseudorange, with the ionosphere measured.
+
+The difference of the two corrected codes of a satellite has no geometry. With ``ratio = (f1/f2)^2`` it is
+
+    ``P2 - P1 = B + (ratio - 1) I + e2 - e1``
+
+where I is the error of the modelled ionosphere on the first frequency, and B the delay between the frequencies in the
+receiver, common to all satellites with the same two signals. I changes over minutes: the mean of the differences of a
+satellite measures it, without a phase and its slips. B and I follow from the means of all satellites by best linear
+prediction, with the sigma of the model as the prior; what is common to all satellites stays in B, and the clock
+takes it up. The two codes, less the ionosphere predicted so far, then measure one range with a common error of known
+sigma: least squares in closed form. Where the ionosphere is well known that is the weighted mean of both codes, where
+it is not and the codes are precise, nearly the ionosphere-free combination.
+
+The difference of the epoch itself, less what is predicted, is noise and multipath.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from pydantic import Field
+
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks
+from railfix.core.settings import Settings
+from railfix.positioning.forgetting import correlated_sums
+
+#: Mean size of a normal deviate, inverted.
+_FROM_MEAN_SIZE: Final = 1.2533
+#: Samples with the noise that the weights assume, which the noise scale begins with.
+_FIRST_SAMPLES: Final = 2.0
+#: Sigmas beyond which the mean difference of a satellite counts as so far off and no further.
+_CLIP: Final = 2.5
+#: Satellites that the error of the model is judged by at least, and the least share of its prior variance then.
+_FEWEST: Final = 5
+_LEAST_PRIOR: Final = 0.04
+
+
+class TwoFrequencyLimits(Settings):
+    """Limits of the combination of two frequencies.
+
+    Attributes
+    ----------
+    window_s : float
+        Time constant of the mean differences of the codes: what Klobuchar's model misses changes over many minutes.
+    correlation_s : float
+        Epochs nearer to each other than this are one sample: multipath of a standing train lasts so long.
+    delay_sigma_m : float
+        Standard deviation of a broadcast group delay, difference of two signals.
+    suspicion : float
+        Sigmas beyond which a difference of the two codes has the range weighted down by it.
+    least_suspicion_m : float [m]
+        Smallest such difference.
+    """
+
+    window_s: float = Field(default=600.0, gt=0)
+    correlation_s: float = Field(default=60.0, gt=0)
+    delay_sigma_m: float = Field(default=0.2, gt=0)
+    suspicion: float = Field(default=4.0, gt=0)
+    least_suspicion_m: float = Field(default=3.0, gt=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SecondCodes:
+    """Second codes of satellites: T epochs by K channels of the first.
+
+    Attributes
+    ----------
+    code_m : ndarray, shape (T, K) [m]
+        Corrected by the models; NaN where there is none.
+    noise_m : ndarray, shape (T, K) [m]
+        Standard deviation of noise and multipath that the weights assume.
+    cn0_dbhz : ndarray, shape (T, K)
+    delay_sigma_m : ndarray, shape (T, K) [m]
+        Of a group delay that is not broadcast in full, beside `TwoFrequencyLimits.delay_sigma_m`.
+    ratio : ndarray, shape (T, K)
+        Square of the first frequency over the second.
+    pair : ndarray of int, shape (T, K)
+        Number of satellite and signals among the names of pairs.
+    column : ndarray of int, shape (T, K)
+        Channel of the observations.
+    """
+
+    code_m: Floats
+    noise_m: Floats
+    cn0_dbhz: Floats
+    delay_sigma_m: Floats
+    ratio: Floats
+    pair: Integers
+    column: Integers
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwoFrequencyState:
+    """Mean differences of the codes so far, Q pairs of signals of a satellite.
+
+    Attributes
+    ----------
+    names : tuple of str, length Q
+    sums : ndarray, shape (2 Q,)
+        Information [1/m^2] of each pair, then moments [1/m].
+    scale : ndarray, shape (2,)
+        Sum of the sizes of the differences over the assumed ones, and their number.
+    last : datetime64[ns]
+        Time of the last epoch, NaT before the first.
+    age : float [windows]
+        Of the last epoch.
+    """
+
+    names: tuple[str, ...] = ()
+    sums: Floats = field(default_factory=lambda: np.empty(0))
+    scale: Floats = field(default_factory=lambda: np.zeros(2))
+    last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    age: float = 0.0
+
+    def with_pairs(self, names: tuple[str, ...]) -> tuple[TwoFrequencyState, Integers]:
+        """Return the state with the pairs of a chunk among its own, and the number of each of them."""
+        if names == self.names:
+            return self, np.arange(len(names))
+        known = {name: i for i, name in enumerate(self.names)}
+        fresh = tuple(name for name in names if name not in known)
+        known |= {name: len(known) + i for i, name in enumerate(fresh)}
+        information, moment = np.split(self.sums, 2)
+        none = np.zeros(len(fresh))
+        sums = np.concatenate([information, none, moment, none])
+        own = TwoFrequencyState(
+            names=self.names + fresh, sums=sums, scale=self.scale, last=self.last, age=self.age
+        )  # fmt: skip
+        return own, np.array([known[name] for name in names], dtype=np.intp)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Combined:
+    """One pseudorange a satellite from two codes: T epochs by K channels; NaN where the first code is alone.
+
+    Attributes
+    ----------
+    code_m : ndarray, shape (T, K) [m]
+    variance_m2 : ndarray, shape (T, K) [m^2]
+        Added to that of the first code.
+    share : ndarray, shape (T, K)
+        Weight of the second code; that of the first is 1 less it.
+    ionosphere_m, ionosphere_sigma_m : ndarray, shape (T, K) [m]
+        Delay on the first frequency beyond that of the model.
+    difference_m : ndarray, shape (T, K) [m]
+        Second code less first, what is predicted taken off.
+    suspected : ndarray of bool, shape (T, K)
+    """
+
+    code_m: Floats
+    variance_m2: Floats
+    share: Floats
+    ionosphere_m: Floats
+    ionosphere_sigma_m: Floats
+    difference_m: Floats
+    suspected: Masks
+
+
+def combine_codes(
+    time: Datetimes,
+    code_m: Floats,
+    noise_m: Floats,
+    second: SecondCodes,
+    prior_sigma_m: Floats,
+    pairs: tuple[tuple[str, ...], Integers],
+    state: TwoFrequencyState,
+    limits: TwoFrequencyLimits,
+) -> tuple[Combined, TwoFrequencyState]:
+    """Combine the two codes of each satellite, with the ionosphere from the epochs before.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    code_m, noise_m : ndarray, shape (T, K) [m]
+        First codes, corrected by the models, NaN where unusable; and the noise that the weights assume.
+    second : SecondCodes
+    prior_sigma_m : ndarray, shape (T, K) [m]
+        Standard deviation of the modelled ionosphere on the first frequency, along the sight.
+    pairs : tuple of (tuple of str, ndarray of int)
+        Names of the pairs, length Q, and the number of the group of each whose receiver delay is common, shape (Q,).
+    state : TwoFrequencyState
+    limits : TwoFrequencyLimits
+
+    Returns
+    -------
+    Combined
+    TwoFrequencyState
+        The same, bit by bit, however a log is cut into chunks.
+    """
+    names, groups = pairs
+    own, number = state.with_pairs(names)
+    size = len(own.names)
+    first, other = noise_m**2, second.noise_m**2
+    variance = first + other
+    difference = second.code_m - code_m
+    both = np.isfinite(difference) & np.isfinite(variance)
+    at = number[second.pair] if size else second.pair
+    row = np.nonzero(both)[0]
+    sample = np.zeros((len(time), 2 * size))
+    sample[row, at[both]] = 1.0 / variance[both]
+    sample[row, size + at[both]] = difference[both] / variance[both]
+    ages = {"window_s": limits.window_s, "correlation_s": limits.correlation_s}
+    before, _, sums, age = correlated_sums(time, sample, own.sums, own.last, own.age, **ages)
+    information, mean = np.zeros(both.shape), np.zeros(both.shape)
+    information[both] = before[row, at[both]]
+    known = both & (information > 0.0)
+    mean[known] = before[np.nonzero(known)[0], size + at[known]] / information[known]
+    scale, of_scale = _noise_scale(time, difference - mean, variance, known, own, ages)
+    of_mean = scale[:, None] / np.where(known, information, 1.0)
+    lever = second.ratio - 1.0
+    delay = second.delay_sigma_m**2 + limits.delay_sigma_m**2
+    prior = np.where(known, prior_sigma_m**2, 1.0)
+    group = np.where(known, groups[second.pair], -1) if size else second.pair
+    bias, _ = _receiver_delays(mean, np.where(known, 1.0 / (of_mean + delay + lever**2 * prior), 0.0), group)
+    prior = prior * _prior_scale((mean - bias) ** 2 - delay, lever**2 * prior, known)[:, None]
+    weight = np.where(known, 1.0 / (of_mean + delay + lever**2 * prior), 0.0)
+    bias, of_bias = _receiver_delays(mean, weight, group)
+    gain = lever * prior * weight
+    reach = _CLIP / np.sqrt(np.where(known, weight, 1.0))
+    ionosphere = gain * np.clip(mean - bias, -reach, reach)
+    left = np.maximum(prior - lever * prior * gain + gain**2 * of_bias, 0.0)
+    p1, p2 = code_m - ionosphere, second.code_m - bias - second.ratio * ionosphere
+    noise = np.minimum(scale, 1.0)[:, None]
+    share, total = share_of_second(
+        scale[:, None] * first, scale[:, None] * other + delay + of_bias, second.ratio, left
+    )  # fmt: skip
+    share = np.where(known, share, np.nan)
+    apart = np.where(known, p2 - p1, np.nan)
+    found = Combined(
+        code_m=p1 + share * apart,
+        variance_m2=noise * ((1.0 - share) ** 2 * first + share**2 * other - first),
+        share=share,
+        ionosphere_m=np.where(known, ionosphere, np.nan),
+        ionosphere_sigma_m=np.where(known, np.sqrt(left), np.nan),
+        difference_m=apart,
+        suspected=np.abs(apart) > np.maximum(limits.suspicion * np.sqrt(total), limits.least_suspicion_m),
+    )
+    last = time[-1] if len(time) else own.last
+    return found, TwoFrequencyState(names=own.names, sums=sums, scale=of_scale, last=last, age=age)
+
+
+def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphere_m2: Floats) -> tuple[Floats, Floats]:
+    """Return the weight of the second code in the range by least squares, and the variance of the codes' difference.
+
+    Parameters
+    ----------
+    first_m2, second_m2 : ndarray, any shape [m^2]
+        Variances of both codes, without the ionosphere.
+    ratio : ndarray
+        Square of the first frequency over the second.
+    ionosphere_m2 : ndarray [m^2]
+        Variance of the delay on the first frequency; a large one gives the ionosphere-free combination.
+    """
+    total = first_m2 + second_m2 + (ratio - 1.0) ** 2 * ionosphere_m2
+    return (first_m2 - (ratio - 1.0) * ionosphere_m2) / total, total
+
+
+def _noise_scale(
+    time: Datetimes, deviation: Floats, variance: Floats, known: Masks, own: TwoFrequencyState, ages: dict[str, float]
+) -> tuple[Floats, Floats]:
+    """Return the variance of the differences over the assumed one, by the epochs before, shape (T,), and the sums."""
+    size = np.where(known, np.abs(deviation) / np.sqrt(np.where(known, variance, 1.0)), 0.0)
+    sample = np.stack([_sum(size), _sum(known.astype(np.float64))], axis=1)
+    before, _, after, _ = correlated_sums(time, sample, own.scale, own.last, own.age, **ages)
+    mean = (_FROM_MEAN_SIZE * before[:, 0] + _FIRST_SAMPLES) / (before[:, 1] + _FIRST_SAMPLES)
+    return mean**2, after
+
+
+def _prior_scale(excess: Floats, expected: Floats, known: Masks) -> Floats:
+    """Return the variance of the model's error that the satellites show over the prior one, at most 1, shape (T,)."""
+    shown = _sum(np.where(known, np.minimum(excess, 4.0 * expected), 0.0))
+    scale = np.clip(shown / np.maximum(_sum(np.where(known, expected, 0.0)), 1e-9), _LEAST_PRIOR, 1.0)
+    return np.where(np.count_nonzero(known, axis=1) >= _FEWEST, scale, 1.0)
+
+
+def _receiver_delays(mean: Floats, weight: Floats, group: Integers) -> tuple[Floats, Floats]:
+    """Return the delay common to the satellites of each group, and its variance, of each channel, shapes (T, K)."""
+    bias, variance = np.zeros(mean.shape), np.zeros(mean.shape)
+    for number in np.unique(group[group >= 0]).tolist():
+        here = group == number
+        has = here.any(axis=1)
+        own = np.where(here, weight, 0.0)
+        centre = _sum(own * mean) / np.where(has, _sum(own), 1.0)
+        own = own / (1.0 + own * (mean - centre[:, None]) ** 2 / _CLIP**2)  # a satellite that is far off counts little
+        total = np.where(has, _sum(own), 1.0)
+        bias = np.where(here, (_sum(own * mean) / total)[:, None], bias)
+        variance = np.where(here, 1.0 / total[:, None], variance)
+    return bias, variance
+
+
+def _sum(values: Floats) -> Floats:
+    """Sum over the channels one after the other: channels without a value between them change no bit."""
+    return np.asarray(np.cumsum(values, axis=1)[:, -1]) if values.shape[1] else np.zeros(len(values))

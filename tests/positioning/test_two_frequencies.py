@@ -1,0 +1,189 @@
+"""Two codes of a satellite combined: against least squares written out, the truth, and pieces of a log."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import recordings_truth
+from railfix.core.arrays import Floats
+from railfix.core.reasons import Reason
+from railfix.core.timescale import timedelta
+from railfix.evaluate import interpolate_reference
+from railfix.gnss.orbits.signal_health import group_delay_s
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.second_codes import NAME, signal_delays
+from railfix.positioning.two_frequencies import (
+    Combined,
+    SecondCodes,
+    TwoFrequencyLimits,
+    TwoFrequencyState,
+    combine_codes,
+    share_of_second,
+)
+from railfix.run.processor import processor_of
+from railfix.track import from_positions
+from railfix.track.trajectory import Trajectory
+
+pytestmark = pytest.mark.requirement("A11")
+
+RATIO = (77 / 60) ** 2
+NAMES = tuple(f"G{i:02d} 1C 2W" for i in range(1, 9))
+START = np.datetime64("2024-03-13T08:00:00", "ns")
+
+
+def made(
+    epochs: int = 900, *, noise_m: float = 0.3, ionosphere_m: Floats | None = None, delay_m: float = 12.0
+) -> tuple[np.ndarray, Floats, SecondCodes, Floats]:
+    """Codes of eight satellites at 1 Hz: ranges 0, an error of the modelled ionosphere, a delay of the receiver."""
+    rng = np.random.default_rng(7)
+    satellites = len(NAMES)
+    error = np.linspace(-2.0, 2.0, satellites) if ionosphere_m is None else ionosphere_m
+    first, second = rng.normal(scale=noise_m, size=(2, epochs, satellites))
+    shape = (epochs, satellites)
+    codes = SecondCodes(
+        code_m=RATIO * error + delay_m + second, noise_m=np.ones(shape), cn0_dbhz=np.full(shape, 45.0),
+        delay_sigma_m=np.zeros(shape), ratio=np.full(shape, RATIO),
+        pair=np.broadcast_to(np.arange(satellites), shape), column=np.broadcast_to(np.arange(satellites), shape),
+    )  # fmt: skip
+    return START + timedelta(np.arange(float(epochs))), error + first, codes, np.broadcast_to(error, shape)
+
+
+def combine(
+    time: np.ndarray, code: Floats, second: SecondCodes, state: TwoFrequencyState | None = None, prior_m: float = 1.5
+) -> tuple[Combined, TwoFrequencyState]:
+    ones = np.ones(code.shape)
+    pairs = (NAMES, np.zeros(len(NAMES), dtype=np.intp))
+    return combine_codes(
+        time, code, ones, second, prior_m * ones, pairs, state or TwoFrequencyState(), TwoFrequencyLimits()
+    )
+
+
+def spread(values: Floats) -> float:
+    """Standard deviation between satellites: what is common to all of them is the clock's."""
+    return float((values - values.mean(axis=1, keepdims=True)).std())
+
+
+def test_the_ionosphere_is_measured_and_codes_lose_its_error() -> None:
+    time, code, second, error = made()
+    found, _ = combine(time, code, second)
+    late = slice(600, None)
+    assert np.isnan(found.share[:1]).all(), "no epoch before the first"
+    measured = found.ionosphere_m[late] - error[late]
+    assert spread(measured) < 0.25 * spread(error[late])
+    assert spread(found.code_m[late]) < 0.4 * spread(code[late])
+    assert (np.abs(measured - measured.mean(axis=1, keepdims=True)) < 4 * found.ionosphere_sigma_m[late]).all()
+
+
+@pytest.mark.parametrize("ionosphere_m2", [0.0, 0.04, 1.0, 1e6])
+def test_share_is_that_of_least_squares_with_the_ionosphere_unknown(ionosphere_m2: float) -> None:
+    """The closed form against normal equations with range and ionosphere as unknowns, the prior as a measurement."""
+    first, second = 0.09, 0.25
+    share, _ = share_of_second(*(np.array(v) for v in (first, second, RATIO, ionosphere_m2)))
+    design = np.array([[1.0, 1.0], [1.0, RATIO], [0.0, 1.0]])
+    weight = np.diag(1.0 / np.array([first, second, max(ionosphere_m2, 1e-12)]))
+    estimator = np.linalg.solve(design.T @ weight @ design, design.T @ weight)
+    assert float(share) == pytest.approx(estimator[0, 1], abs=1e-5)
+
+
+def test_share_at_both_ends() -> None:
+    """By hand: equal codes and no ionosphere are averaged; with an unknown one, -f2^2 / (f1^2 - f2^2)."""
+    assert share_of_second(*(np.array(v) for v in (1.0, 1.0, RATIO, 0.0)))[0] == 0.5
+    assert share_of_second(*(np.array(v) for v in (1.0, 1.0, RATIO, 1e9)))[0] == pytest.approx(-3600 / (5929 - 3600))
+
+
+def test_pieces_of_a_log_give_the_same_bits() -> None:
+    time, code, second, _ = made(300)
+    whole, last = combine(time, code, second)
+    state, parts = None, []
+    for rows in (slice(0, 1), slice(1, 80), slice(80, 300)):
+        part = SecondCodes(**{f.name: getattr(second, f.name)[rows] for f in fields(SecondCodes)})
+        found, state = combine(time[rows], code[rows], part, state)
+        parts.append(found)
+    for item in fields(Combined):
+        pieces = np.concatenate([getattr(part, item.name) for part in parts])
+        np.testing.assert_array_equal(pieces, getattr(whole, item.name), err_msg=item.name)
+    assert state is not None
+    np.testing.assert_array_equal(state.sums, last.sums)
+
+
+def test_satellites_may_come_in_another_order() -> None:
+    _, state = combine(*made(300)[:3])
+    kept, number = state.with_pairs(("G09 1C 2W", *reversed(NAMES)))
+    assert kept.names == (*NAMES, "G09 1C 2W")
+    assert number.tolist() == [8, *range(7, -1, -1)]
+    assert kept.sums[:8].tolist() == state.sums[:8].tolist()
+    assert kept.sums[8] == kept.sums[17] == 0.0
+
+
+def test_reflection_in_one_code_is_suspected() -> None:
+    time, code, second, _ = made(300)
+    code[250:260, 2] += 20.0
+    found, _ = combine(time, code, second)
+    assert found.suspected[250:260, 2].all()
+    assert found.suspected.sum() == 10
+
+
+def test_noisy_codes_leave_the_ionosphere_to_the_model() -> None:
+    """Differences of 6 m for five minutes: what they take for ionosphere stays within the prior sigma."""
+    time, code, second, error = made(300, noise_m=6.0, ionosphere_m=np.zeros(8))
+    found, _ = combine(time, code, second)
+    assert np.abs(found.ionosphere_m[60:] - error[60:]).max() < 1.5
+    assert (found.share[60:] > 0.2).all(), "weighted mean of two codes"
+
+
+@pytest.fixture(scope="module")
+def open_sky(recordings: Path) -> dict[str, tuple[AntennaResult, Floats]]:
+    """Four minutes of open sky in Japan by one and two frequencies, with the reference positions."""
+    folder = recordings / "kinematic" / "japan_mosaic_2021265_with_GEONET3034"
+    time, ecef = recordings_truth.japan_truth(folder)
+    line = Trajectory.from_track(from_positions(time, ecef, spacing_m=5.0))
+    log, navigation = read_observations(folder / "SEPT265G.21O")[:240], read_navigation(folder / "SEPT2650.21P")
+    reference = interpolate_reference(log.time, time, ecef)
+    found = {}
+    for frequencies in ("one", "two"):
+        config = parse_config({"frequencies": frequencies, "filter": "off", "protection": "off"})
+        processor = processor_of(config, navigation, {"front": line})
+        result, state = processor.process({"front": log})
+        found[frequencies] = result.antennas["front"], reference
+        if frequencies == "two":
+            state = None
+            for rows in (slice(0, 1), slice(1, 100), slice(100, 240)):
+                part, state = processor.process({"front": log[rows]}, state)
+            np.testing.assert_array_equal(part.antennas["front"].arc_m, result.antennas["front"].arc_m[100:])
+    return found
+
+
+def test_open_sky_is_better_by_half(open_sky: dict[str, tuple[AntennaResult, Floats]]) -> None:
+    """Under open sky the horizontal error of 3-D positions is nearly all ionosphere: two frequencies halve it."""
+    error = {}
+    for name, (result, reference) in open_sky.items():
+        up = reference / np.linalg.norm(reference, axis=1, keepdims=True)
+        apart = result.conventional_ecef_m - reference
+        across = apart - np.einsum("ti,ti->t", apart, up)[:, None] * up
+        error[name] = np.nanmedian(np.linalg.norm(across, axis=1)[60:])
+    assert error["two"] < 0.5 * error["one"]
+
+
+def test_second_signals_are_used_and_counted_so(open_sky: dict[str, tuple[AntennaResult, Floats]]) -> None:
+    two, one = open_sky["two"][0], open_sky["one"][0]
+    assert NAME in two.screens
+    taken = int(Reason.OTHER_SIGNAL_TAKEN)
+    assert (two.reason == 0).sum() > 1.8 * (one.reason == 0).sum()
+    assert ((two.reason & taken) > 0).sum() < ((one.reason & taken) > 0).sum()
+    assert (two.n_used == one.n_used).mean() > 0.95, "satellites are counted, not signals"
+
+
+def test_delay_that_lnav_lacks_is_that_of_cnav(recordings: Path) -> None:
+    navigation = read_navigation(recordings / "sbas" / "msas_20250215" / "046r_rnx.nav")
+    records = navigation.kepler
+    delay, sigma, _ = signal_delays(navigation, "5Q")
+    for i in np.flatnonzero((records.satellite == "G11") & (records.message == "LNAV")):
+        cnav = np.flatnonzero((records.satellite == "G11") & (records.message == "CNAV"))
+        assert delay[i] == pytest.approx(group_delay_s(records, "5Q")[cnav[0]] * 299_792_458.0, abs=0.01)
+        assert sigma[i] == 0.0

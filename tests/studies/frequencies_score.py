@@ -1,0 +1,110 @@
+"""One against two frequencies on the recordings that have two, printed as a table.
+
+Run ``python tests/studies/frequencies_score.py`` with the recordings beside the checkout. Constants were chosen with
+the town, the phone and the Japanese log in view; the static station shaped the prior; the roof was kept out.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+import paths
+import recordings_truth
+from railfix.core.arrays import Floats
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.evaluate import interpolate_reference, straight_distance
+from railfix.gnss.observations import Observations
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.along_track import on_line_m
+from railfix.pipeline.config import parse_config
+from railfix.run.processor import processor_of
+from railfix.track.trajectory import Trajectory
+from recordings_score import straight_line, trajectory_of
+
+#: First epochs, processed one at a time, for the cost.
+_LIVE_EPOCHS = 120
+
+
+def recordings(data: Path) -> Iterator[tuple[str, Observations, Path, Floats, Trajectory]]:
+    """Name, observations, navigation file, reference positions at the epochs, and line of each recording."""
+    car = data / "kinematic"
+    for name, folder, obs, nav, truth in (
+        ("town, F9P", "urbannav_tst", "20210517.light-urban.tste.ublox.f9p.obs", "hksc137c.nav", "urbannav"),
+        ("phone", "gsdc_pixel5_a", "Pixel5_a.21o", "hour1180.21n", "gsdc"),
+        ("Japan", "japan_mosaic_2021265_with_GEONET3034", "SEPT265G.21O", "SEPT2650.21P", "japan"),
+    ):
+        at, ecef = getattr(recordings_truth, f"{truth}_truth")(car / folder)
+        log = read_observations(car / folder / obs)
+        yield name, log, car / folder / nav, interpolate_reference(log.time, at, ecef), trajectory_of(at, ecef)
+    roof = data / "dual" / "mosaic_x2_99cm"
+    log = read_observations(roof / "rover.obs")
+    latitude, longitude, height = map(float, (roof / "rover_position.txt").read_text().split()[:3])
+    place = ecef_from_geodetic(np.array(latitude), np.array(longitude), np.array(height))
+    for azimuth in (0, 90):
+        reference = np.broadcast_to(place, (len(log), 3))
+        yield f"roof, az {azimuth}", log, roof / "base.nav", reference, straight_line(place, azimuth)
+    station = data / "static" / "ESBC_2020177"
+    log = read_observations(station / "ESBC00DNK_R_20201770000_01D_30S_MO.crx.gz")
+    place = log.header.approximate_ecef_m
+    for azimuth in (0, 90):
+        reference = np.broadcast_to(place, (len(log), 3))
+        navigation = station / "ESBC00DNK_R_20201770000_01D_MN.rnx.gz"
+        yield f"station, az {azimuth}", log, navigation, reference, straight_line(place, azimuth)
+
+
+def row(log: Observations, navigation: Path, reference: Floats, line: Trajectory, frequencies: str) -> str:
+    """Percentiles of the errors, rate, level, and cost of a live epoch."""
+    tracked = len(log) < 2000  # a day at 30 s is no ride
+    config = parse_config(
+        {"frequencies": frequencies, "filter": "track" if tracked else "off", "elevation": {"mask_deg": 15.0}}
+    )
+    processor = processor_of(config, read_navigation([navigation]), {"front": line})
+    result, _ = processor.process({"front": log})
+    antenna = result.antennas["front"]
+    inside = np.isfinite(reference[:, 0])
+    latitude, longitude, _ = geodetic_from_ecef(reference)
+    away = antenna.conventional_ecef_m - reference
+    across = np.linalg.norm(np.einsum("tij,tj->ti", enu_axes(latitude, longitude), away)[:, :2], axis=1)
+    texts = [_percentiles(straight_distance(antenna.arc_m, reference, line)[inside]), _percentiles(across[inside])]
+    filtered = result.fusion.get("front")
+    texts.append(
+        _percentiles(straight_distance(on_line_m(filtered.tracked, line), reference, line)[inside])
+        if filtered
+        else f"{'':17}"
+    )
+    assert antenna.protection is not None
+    level = antenna.protection.level.level_m
+    texts.append(f"{np.isfinite(antenna.arc_m[inside]).mean() * 100:6.1f} {np.median(level[np.isfinite(level)]):6.1f}")
+    live, taken = min(_LIVE_EPOCHS, len(log)), np.inf
+    for _ in range(2):  # the first time fills caches
+        state, begin = None, time.perf_counter()
+        for k in range(live):
+            _, state = processor.process({"front": log[k : k + 1]}, state)
+        taken = min(taken, (time.perf_counter() - begin) / live)
+    return " | ".join([*texts, f"{1e3 * taken:6.2f}"])
+
+
+def _percentiles(error: Floats) -> str:
+    known = error[np.isfinite(error)]
+    return f"{np.percentile(known, 50):5.2f} {np.percentile(known, 95):5.2f} {known.max():5.1f}"
+
+
+def main() -> int:
+    if not paths.DATA.is_dir():
+        print(f"the real recordings are not at {paths.DATA}", file=sys.stderr)
+        return 1
+    columns = f"{'along p50 p95 max':17} | {'3-D, horizontal':17} | {'filter':17}"
+    print(f"{'recording':16} {'':3}   {columns} | rate%  level | ms/epoch")
+    for name, log, navigation, reference, line in recordings(paths.DATA):
+        for frequencies in ("one", "two"):
+            print(f"{name:16} {frequencies:3}   {row(log, navigation, reference, line, frequencies)}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
