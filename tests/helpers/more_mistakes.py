@@ -267,7 +267,7 @@ MORE: Final[dict[str, Mistake]] = {
     "spacing_of_one_antenna": ({}, _WHICH + " --spacing 18", 4, "--spacing is given without --rear"),
     # -- simulate, error model, reference
     "scenario_unknown": ({}, "simulate nothing --out {out}", 3, "is neither a scenario file nor a shipped one"),
-    "duration_of_nan": ({}, "simulate demo --seconds nan --out {out}", 4, "--seconds: Input should be a finite number, got nan"),
+    "duration_of_nan": ({}, "simulate demo --seconds nan --out {out}", 4, "--seconds: Input should be a finite"),
     "noise_negative": (
         {}, "simulate demo --seconds 1 --set receiver.code_sigma_m=-1 --out {out}", 4, "setting receiver.code_sigma_m",
     ),
