@@ -167,7 +167,7 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     index = processor.indices["front"]
     antennas, received = AntennaRows.of(index), processor.received
     corrected = correct_ranges(obs, ChannelBook(config).of(obs, received.navigation), config, received, antennas)
-    one = processor._screened(("front",), antennas, corrected, State())[0]["front"]
+    one = processor._screened(("front",), antennas, corrected, received, State())[0]["front"]
     ranges = one.ranges()
     point = single_point(ranges, one.anchor_ecef_m)
     place = place_on_line(ranges, index, point, config)
