@@ -50,6 +50,7 @@ def test_refusals(recordings: Path, tmp_path: Path) -> None:
     assert out.read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_run_on_a_receiver_log(recordings: Path, tmp_path: Path) -> None:
     """A log in UBX gives the positions of the RINEX file converted from it."""
     log = recordings / "live" / COLD_START

@@ -31,7 +31,8 @@ def running(name: str) -> World:
 @pytest.mark.parametrize(
     ("name", "length", "least"),
     [
-        ("following", 3, 7_000),
+        ("following", 2, 300),
+        pytest.param("following", 3, 7_000, marks=pytest.mark.slow),
         ("meeting", 3, 3_000),
         ("three", 2, 500),
         pytest.param("following", 4, 100_000, marks=pytest.mark.slow),

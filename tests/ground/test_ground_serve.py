@@ -87,7 +87,7 @@ def started(folder: Path, *options: str) -> subprocess.Popen[str]:
     return process
 
 
-@pytest.mark.parametrize("kills", [1, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [pytest.param(100, marks=pytest.mark.slow)])
 def test_a_killed_centre_keeps_what_its_trains_know(folder: Path, tmp_path: Path, kills: int) -> None:
     """Reports that an authority has acknowledged, the authority itself, and its number are in the store."""
     rng = random.Random(kills)

@@ -103,7 +103,7 @@ def test_ubx_observations_are_those_of_rtklib(ubx: Path, tmp_path: Path) -> None
     assert assert_same_values(railfix.read_observations(ubx), rinex.read_observations(observations)) > 40_000
 
 
-@pytest.mark.parametrize("kind", [pytest.param(7, marks=pytest.mark.slow), 4])
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=pytest.mark.slow) for kind in (7, 4)])
 def test_rtcm_observations_are_those_of_rtklib(recordings: Path, tmp_path: Path, kind: int) -> None:
     """MSM4 and MSM7 that `str2str` makes of the UBX log."""
     source = unpacked(recordings / "live" / TWO_BANDS, tmp_path)

@@ -31,7 +31,9 @@ def frames_of(data: bytes) -> Frames:
     return find_frames(np.frombuffer(data, np.uint8))
 
 
-@pytest.mark.parametrize("name", [pytest.param(COLD_START, marks=pytest.mark.slow), TWO_BANDS])
+@pytest.mark.parametrize(
+    "name", [pytest.param(COLD_START, marks=pytest.mark.slow), pytest.param(TWO_BANDS, marks=pytest.mark.slow)]
+)
 def test_ubx_measurements(recordings: Path, name: str) -> None:
     """Every RXM-RAWX: time, satellites, and the values of each measurement as they were sent."""
     pyubx2 = pytest.importorskip("pyubx2")

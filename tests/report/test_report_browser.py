@@ -170,6 +170,7 @@ def test_every_picture_is_drawn_in_a_window_that_holds_them_all(page: Path) -> N
     assert len(read.figures) > 30
 
 
+@pytest.mark.slow
 def test_pictures_can_be_pointed_at_enlarged_and_clicked(page: Path, tmp_path: Path) -> None:
     copy = tmp_path / "exercise.html"
     copy.write_text(page.read_text(encoding="utf-8").replace("</body>", EXERCISE), encoding="utf-8")
