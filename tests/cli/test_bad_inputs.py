@@ -44,6 +44,7 @@ def contents(folder: Path) -> dict[str, str]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", COMMANDS)
 def test_the_good_inputs_are_good(desk: Desk, kind: str) -> None:
     result = RUNNER.invoke(app, desk.words(COMMANDS[kind]))

@@ -106,6 +106,7 @@ def test_screens_reach_their_figures(recordings: Path, name, setting, rate, p50_
         assert outcome.constrained.max_m < 20.0
 
 
+@pytest.mark.slow
 @pytest.mark.requirement("B4")
 @pytest.mark.parametrize("name", sorted(recordings_score.RECORDINGS))
 def test_all_screens_are_no_worse_than_none(recordings: Path, name: str):
@@ -158,6 +159,7 @@ def test_three_random_satellites_of_a_station_are_enough(recordings: Path, monke
     assert found.constrained.wrong_place == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.requirement("A6")
 @pytest.mark.parametrize(
     ("name", "observations", "navigation", "systems", "ratio", "rate_gain"),
@@ -202,6 +204,7 @@ def test_against_the_single_point_with_exclusion_of_rtklib(
     assert rates[0] >= rates[1] + rate_gain
 
 
+@pytest.mark.slow
 @pytest.mark.requirement("B4")
 @pytest.mark.parametrize("size_m", [20.0, 50.0, 200.0])
 def test_short_faults_on_a_curved_course_are_excluded(recordings: Path, size_m: float):

@@ -46,6 +46,7 @@ def test_no_sequence_of_events_leads_into_a_train(name: str, length: int, least:
     assert worlds > least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rule", "name", "sequence"),
     [

@@ -80,6 +80,7 @@ def risk_beyond(
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.requirement("C2")
 @pytest.mark.parametrize(
     ("local_prior", "side_prior"),

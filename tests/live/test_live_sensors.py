@@ -173,6 +173,7 @@ def test_a_sensor_that_is_late_is_left_out_and_no_way_is_made_up(case: Ride, tmp
     np.testing.assert_allclose(found.chainage_m, alone.chainage_m, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_restart_in_a_slip_goes_on_from_the_state_file(case: Ride, tmp_path: Path) -> None:
     """The tables are read again from their beginning: what the state has heard already does not count twice."""
 
@@ -312,6 +313,7 @@ def test_a_radar_whose_mounting_moves_is_told_in_a_running_session(case: Ride, t
     assert re.search(r"from .* its speeds are \+[34].\d % off those by satellites, [+-]0.\d % before", note), note
 
 
+@pytest.mark.slow
 def test_the_watch_of_the_sensors_speaks_once_and_forgets(
     case: Ride, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -431,6 +431,7 @@ def program(*words: str) -> list[str]:
     return [sys.executable, "-m", "railfix", "live", *words]
 
 
+@pytest.mark.slow
 def test_hangup_metrics_and_the_end_by_a_signal(tmp_path: Path) -> None:
     """SIGHUP reloads nothing and says so, in the log and in the metrics; SIGTERM ends with the state written."""
     log = tmp_path / "log.ubx"

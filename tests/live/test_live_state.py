@@ -122,6 +122,7 @@ def test_a_state_that_does_not_belong_is_not_used(parts: dict[str, Path], tmp_pa
     assert "its last epoch is 2.9 s after the first new one, up to 60 s before it (state_age_s) are allowed" in told
 
 
+@pytest.mark.slow
 def test_no_number_is_sent_twice_after_a_crash(parts: dict[str, Path], tmp_path: Path) -> None:
     """Killed at any moment, also before the first epoch of its receiver and before the first file is due."""
     files, state, sent = demo_files(), tmp_path / "state", tmp_path / "messages"

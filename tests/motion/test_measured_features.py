@@ -96,6 +96,7 @@ def test_a_folder_without_a_measured_line_is_refused(tmp_path: Path) -> None:
         read_measured(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_command_lists_what_two_runs_measured_beside_the_map(tmp_path: Path) -> None:
     sets = ["--set", "sensors.tachometer={}", "--set", "sensors.inertial={}"]
     for seed in ("1", "2"):

@@ -80,6 +80,7 @@ def test_chunks_of_a_recording_give_the_whole(m8t, size: int, epochs: int):
     same(whole["front"], pieces["front"], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.requirement("A8")
 @given(edges=st.sets(st.integers(1, 199), min_size=1, max_size=8), first=st.sampled_from([0, 700, 1500]))
 @settings(max_examples=15)

@@ -253,6 +253,7 @@ def test_single_point_as_it_comes(logs: dict[str, Log], tmp_path: Path, name: st
     assert own_p50 < 1.25 * other_p50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["geonet 0759", "geonet 3040", "esbc G", "esbc E", "esbc C", "esbc GEC"])
 def test_up_error_of_a_station(logs: dict[str, Log], name: str):
     """Ionosphere and troposphere off would leave more than 10 m here."""

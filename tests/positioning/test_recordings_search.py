@@ -187,6 +187,7 @@ def test_search_equals_exhaustive_search(recordings: Path, calls: Calls, name: s
     assert ties == 0
 
 
+@pytest.mark.slow
 @pytest.mark.requirement("A4")
 @pytest.mark.parametrize("name", RUNS)
 def test_position_equals_a_general_optimiser(recordings: Path, calls: Calls, name: str):

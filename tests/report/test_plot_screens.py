@@ -87,6 +87,7 @@ def test_pictures_hold_what_the_run_counted(
         assert (outcome == "untestable").sum() >= tally.epochs - tally.observed
 
 
+@pytest.mark.slow
 def test_the_command_writes_pictures(run: RunSummary, folder: Path, tmp_path: Path) -> None:
     small = tmp_path / "small"
     small.mkdir()

@@ -79,6 +79,7 @@ def test_choices_are_all_none_each_alone_and_all_but_each() -> None:
     assert choices(()) == {"all": ()}
 
 
+@pytest.mark.slow
 def test_the_logs_are_read_once(ablation: tuple[Ablation, list[int]]) -> None:
     made, readings = ablation
     assert len(readings) == 2

@@ -62,6 +62,7 @@ def calibrated() -> Sample:
     return city()
 
 
+@pytest.mark.slow
 def test_the_city_is_as_bad_as_the_recordings_that_it_is_calibrated_on(calibrated: Sample, recordings: Path) -> None:
     """Tails and faults beyond 5 sigma of both receivers in Hong Kong or within 25 % beside them, and their C/N0."""
     theirs = recorded_cities(recordings)[:2]

@@ -154,6 +154,7 @@ def test_misuse_ends_with_one_sentence_and_its_code(
     assert not (tmp_path / "m.csv").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("log", "limit_m"),
     [("20210517.light-urban.tste.ublox.m8t.GC.obs", 5.0), ("20210517.light-urban.tste.ublox.f9p.obs", 3.0)],
