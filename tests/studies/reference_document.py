@@ -6,6 +6,7 @@ from __future__ import annotations
 import inspect
 import re
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from enum import IntEnum, IntFlag
 from itertools import groupby
@@ -127,6 +128,17 @@ def _bounds(field: FieldInfo) -> str:
     return opening + (f", {limits['lt']:g})" if "lt" in limits else f", {limits['le']:g}]")
 
 
+def _as_toml(value: object) -> str:
+    """A default as a configuration file has it, without spaces; numbers with four digits where they have more."""
+    if isinstance(value, Mapping):
+        return f"{{{','.join(f'{key}={_as_toml(item)}' for key, item in value.items())}}}"
+    if isinstance(value, tuple):
+        return f"[{','.join(_as_toml(item) for item in value)}]"
+    if isinstance(value, str):
+        return f'"{value}"'
+    return f"{value:.4g}" if isinstance(value, float) and len(str(value)) > 8 else str(value)
+
+
 def _setting_cells(prefix: str, group: Settings) -> Iterator[tuple[str, str, str, str]]:
     """Group, key, default with bounds, and the first sentence of the description of each setting."""
     docs = _attribute_docs(type(group))
@@ -137,7 +149,9 @@ def _setting_cells(prefix: str, group: Settings) -> Iterator[tuple[str, str, str
             continue
         unit, text = re.match(r"(?:\[([^\]]+)\]\s*)?(.*)", docs.get(name, ""), flags=re.DOTALL).groups()  # type: ignore[union-attr]
         sentence = re.split(r"(?<=[a-z)`])[.;:] ", text)[0].rstrip(".").replace("``", "`")
-        default = f"`{value}`" if value not in (None, "", ()) else "none"
+        default = (
+            f"`{value if isinstance(value, str) else _as_toml(value)}`" if value not in (None, "", (), {}) else "none"
+        )
         known = name.rsplit("_", 1)[-1] in UNITS
         yield prefix, name, " ".join(filter(None, (default, "" if known else unit, _bounds(field)))), sentence
 
@@ -152,7 +166,8 @@ def settings_page(title: str, text: str, settings: Iterable[tuple[str, str, str,
         lines += ["", f"## `[{prefix}]`" if prefix else "## Outside of tables", ""]
         for meaning, cells in groupby(group, key=lambda cell: cell[3]):
             _, names, values, _ = zip(*cells, strict=True)
-            lines.append(f"- {_named(names)}: {', '.join(values)}. {meaning}")
+            each = values if len(set(values)) > 1 else values[:1]
+            lines.append(f"- {_named(names)}: {', '.join(each)}. {meaning}")
     return "\n".join(lines) + "\n"
 
 
@@ -195,17 +210,21 @@ def _meaning(columns: Mapping[str, Column[Any]], name: str) -> str | None:
 def evaluation_columns() -> str:
     """Page of the columns of `railfix evaluate`."""
     lines = ["# Columns of the evaluation", "", WRITTEN, "What they mean together: [evaluation](evaluation.md)."]
+    count = Counter(item for columns in EVALUATION.values() for item in columns.items())
+    common = {name: meaning for (name, meaning), number in count.items() if number > 1}
+    lines += _columns("Columns of several files", common)
     for heading, columns in EVALUATION.items():
-        lines += _columns(heading, columns)
+        rest = {name: meaning for name, meaning in columns.items() if common.get(name) != meaning}
+        lines += _columns(heading, rest)
     return "\n".join(lines) + "\n"
 
 
 def pages() -> dict[Path, str]:
     """Text of each page by its path."""
     general = (
-        "Keys of the configuration file (TOML), by its tables, each with its default; `--set` takes `table.key=value`. "
-        "Names end with their [unit](columns.md). Numbers are above 0 unless other bounds follow; `[0, 1)` includes 0. "
-        "The filter has [settings of its own](settings-filter.md)."
+        "Keys of the configuration file (TOML), by its tables, each with its default, or one for all keys of an entry. "
+        "`--set` takes `table.key=value`. Names end with their [unit](columns.md). Numbers are above 0 unless other "
+        "bounds follow; `[0, 1)` includes 0. The filter has [settings of its own](settings-filter.md)."
     )
     every = list(_setting_cells("", Config()))
     of_filter = [cell for cell in every if f"{cell[0]}.{cell[1]}".lstrip(".").startswith(FILTER)]

@@ -79,7 +79,7 @@ BEYOND_COLUMNS: Final[dict[str, str]] = {
     "time_gpst": "time tag of the receiver, GPS time",
     "antenna": "`front` or `rear`",
     "chainage_m": "of the reference",
-    "environment": "of the reference or the sections",
+    "environment": "of the reference or of the sections; `unknown` where neither has one",
     "error_m": "position on the map, + toward the end of the line",
     "KIND_level_m": "protection level",
     "KIND_fault_free_m": "part of the level",

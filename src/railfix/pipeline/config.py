@@ -141,8 +141,8 @@ class Config(ScreenSettings):
         Time of positions off the map after which the filter gives up its place, and of others after which it begins
         anew. On the recordings, with a right map, no two positions in a row are off it.
     track_risk : float
-        On a network: no position is `ok` or `tracking`, and none has a level, where another track than the route's, or
-        none of the map, is more probable; `railfix which-track` allows the same.
+        Probability of another track than the route's, or of none of the map, above which no position on a network is
+        `ok` or `tracking` or has a level. `railfix which-track` allows the same.
     ionosphere : {"klobuchar", "off"}
         Model of the delay.
     troposphere : {"saastamoinen", "off"}

@@ -25,6 +25,7 @@ class SinglePointLimits(Settings):
     tolerance_m : float
         The last step: one of 1 m leaves 0.01 mm (`after_step`).
     max_iterations : int
+        Steps at most.
     false_alarm : float
         Probability that noise alone fails the chi-square test of the residuals.
     dilution_limit : float

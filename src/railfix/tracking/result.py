@@ -18,25 +18,25 @@ class TrackStatus(IntEnum):
 
     #: One place, from measurements of this epoch.
     TRACKING = constants.TRACKING
-    #: Several places are possible; the most probable one is given.
+    #: Another place of the line is more probable than the risk; the most probable one is given.
     SEVERAL_BRANCHES = constants.SEVERAL_BRANCHES
-    #: No measurement of this epoch, or none that is believed: the predicted place.
+    #: Predicted: no measurement of this epoch, or none that is believed.
     COASTING = constants.COASTING
-    #: Measurements contradict the track: places are sought again.
+    #: Measurements contradict the track: places are sought over the whole line.
     LOST = constants.LOST
-    #: No place: predicted too far.
+    #: No place: predicted with more than 200 m of standard deviation.
     EXPIRED = constants.EXPIRED
-    #: No place yet: no epoch so far had redundant codes.
+    #: No place: no epoch so far had two codes more than unknowns.
     NOT_STARTED = constants.NOT_STARTED
-    #: No place: the satellites have put the train away from the line for some time.
+    #: No place: every position for 10 s contradicted the line.
     OFF_MAP = constants.OFF_MAP
-    #: One place, but 3-D positions of the last minutes lie beside or above the line: the map is wrong here, or it is
-    #: another track.
+    #: One place, but 3-D positions of the last minutes lie beside or above the line, or another track of the network
+    #: is more probable than `track_risk`.
     MAP_OFFSET = constants.MAP_OFFSET
-    #: One place, but not as far from that of the other antenna as the antennas are apart, or not as fast, within the
-    #: last 20 s: one of the two is wrong.
+    #: One place, but within the last 20 s its distance from the other antenna's was off by more than 5 m, or its speed
+    #: by more than 1.5 m/s, and four standard deviations.
     ANTENNAS_DISAGREE = constants.ANTENNAS_DISAGREE
-    #: One place, but measurements contradict it or one of the sub-filters that bound it: nothing bounds its error.
+    #: One place, but measurements, the velocity or a sub-filter contradict it: nothing bounds its error.
     DOUBTFUL = constants.DOUBTFUL
 
     @property
