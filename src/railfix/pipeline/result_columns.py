@@ -72,7 +72,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "own_sigma_m",
-            "single-epoch sigma: standard deviation from the codes of the epoch alone; `uncertain` above its limit",
+            "single-epoch sigma, from the codes of the epoch alone; `uncertain` above its limit",
             lambda r: r.own_sigma_m,
         ),
         Column("latitude_deg", "antenna, WGS 84", lambda r: r.latitude_deg),
@@ -104,8 +104,8 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "raim_level_m",
-            "P4's level: error by a fault that RAIM misses, and by noise; infinite where a satellite is "
-            "unchecked, empty where a fault is left or `raim_protection` is off",
+            "P4's level: error by a fault that RAIM misses, and noise; infinite with a satellite unchecked, "
+            "empty with a fault left or `raim_protection` off",
             lambda r: r.raim.protection_level_m,
         ),
         Column(
@@ -121,27 +121,27 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_one_fault_m",
-            "the same for a fault of one satellite; 0 where that is less likely than its share",
+            "the same for faults of one satellite, of two; 0 where less likely than its share",
             lambda r: None if r.protection is None else r.protection.level.one_fault_m,
         ),
         Column(
             "protection_two_faults_m",
-            "the same for faults of two satellites; 0 where that is less likely than its share",
+            "the same for faults of one satellite, of two; 0 where less likely than its share",
             lambda r: None if r.protection is None else r.protection.level.two_fault_m,
         ),
         Column(
             "protection_k_fault_free",
-            "K of the first part",
+            "K of each part, of the second and third beside its threshold",
             lambda r: None if r.protection is None else r.protection.level.k_fault_free,
         ),
         Column(
             "protection_k_one_fault",
-            "K of the second part, beside its threshold",
+            "K of each part, of the second and third beside its threshold",
             lambda r: None if r.protection is None else r.protection.level.k_one_fault,
         ),
         Column(
             "protection_k_two_faults",
-            "K of the third part, beside its threshold",
+            "K of each part, of the second and third beside its threshold",
             lambda r: None if r.protection is None else r.protection.level.k_two_faults,
         ),
         Column(
@@ -181,8 +181,8 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         *(_position_column(c) for screen in SCREENS for c in screen.columns if c.table == "positions"),
         Column(
             "conventional_status",
-            "checks of the 3-D single point: `valid`, `no_position`, `residuals` beyond noise (chi-square test), "
-            "`dilution` over its limit; its columns are kept as they are",
+            "3-D single point: `valid`, `no_position`, `residuals` beyond noise (chi-square test), "
+            "`dilution` over its limit",
             lambda r: r.conventional_status,
             words=tuple(s.name.lower() for s in PointStatus),
         ),
@@ -198,21 +198,24 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "map_offset_across_m",
-            "mean of the 3-D positions of the last minutes, right of the line in the direction of "
-            "rising chainage; empty for the first minute",
+            "mean of the 3-D positions of the last minutes, right of the line with rising chainage; empty "
+            "for the first minute",
             lambda r: r.map_offset.across_m,
         ),
         Column("map_offset_up_m", "the same, above the line", lambda r: r.map_offset.up_m),
         Column(
             "map_detectable_across_m",
-            "smallest offset of the map across the line that the status `map_offset` names (99 %)",
+            "smallest offset, across and up, that the status `map_offset` names (99 %)",
             lambda r: r.map_offset.detectable_m[:, 0],
         ),
-        Column("map_detectable_up_m", "the same, in height", lambda r: r.map_offset.detectable_m[:, 1]),
+        Column(
+            "map_detectable_up_m",
+            "smallest offset, across and up, that the status `map_offset` names (99 %)",
+            lambda r: r.map_offset.detectable_m[:, 1],
+        ),
         Column(
             "map_offset_statistic",
-            "square of that offset in its own sigmas (noise, satellites, atmosphere, stated error of "
-            "the map); status `map_offset` from 13.8 on",
+            "square of that offset in its own sigmas; status `map_offset` from 13.8 on",
             lambda r: r.map_offset.statistic,
         ),
         Column("conventional_x_m", "3-D single point, ECEF", lambda r: r.conventional_ecef_m[:, 0]),
@@ -239,8 +242,8 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
             "corrected pseudorange minus what the position on the line and the clock explain",
             lambda o: o.result.residual_m,
         ),
-        Column("elevation_deg", "elevation of the satellite", lambda o: o.result.elevation_deg),
-        Column("azimuth_deg", "azimuth of the satellite, from north over east", lambda o: o.result.azimuth_deg),
+        Column("elevation_deg", "of the satellite, azimuth from north over east", lambda o: o.result.elevation_deg),
+        Column("azimuth_deg", "of the satellite, azimuth from north over east", lambda o: o.result.azimuth_deg),
         Column("cn0_dbhz", "carrier-to-noise density", lambda o: o.result.cn0_dbhz),
         Column("sigma_m", "standard deviation that the weights assume", lambda o: o.result.sigma_m),
         Column(
@@ -251,8 +254,8 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         *(_observation_column(c) for screen in SCREENS for c in screen.columns if c.table == "observations"),
         Column(
             "second_share",
-            "two frequencies: weight of the second code of the satellite in its range, that of the first is 1 less it; "
-            "negative: toward the ionosphere-free combination, between 0 and 1: mean; empty: the first code alone",
+            "two frequencies: weight of the second code, that of the first is 1 less it; negative: toward "
+            "the ionosphere-free combination; empty: the first code alone",
             lambda o: _second(o, lambda r, _: r.share),
         ),
         Column(
@@ -283,10 +286,14 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         ),
         Column(
             "innovation_phase_m",
-            "the same of the change of the carrier phase since the epoch before",
+            "the same of the carrier phase's change, of the Doppler",
             lambda o: o.innovations["innovation_phase_m"],
         ),
-        Column("innovation_doppler_mps", "the same of the Doppler", lambda o: o.innovations["innovation_doppler_mps"]),
+        Column(
+            "innovation_doppler_mps",
+            "the same of the carrier phase's change, of the Doppler",
+            lambda o: o.innovations["innovation_doppler_mps"],
+        ),
         Column(
             "weight_code",
             "weight of the code in the filter; 1 is that of an error of one standard deviation",

@@ -74,22 +74,21 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("hypotheses", "places that are possible", lambda r: r.tracked.hypotheses, dtype=pl.Int16()),
         Column(
             "protection_level_m",
-            "the error along the line exceeds it with the stated risk, faults, a wrong map and other branches "
-            "included; infinite where another place is likelier than the risk or measurements contradict the place; "
-            "empty with `tracking.level` off",
+            "exceeded by the error along the line with the stated risk, other branches included; infinite "
+            "where another place is likelier or measurements contradict the place; empty with "
+            "`tracking.level` off",
             lambda r: r.tracked.level_m,
         ),
         Column(
             "protection_level_ground_m",
-            "the same of the straight distance on the ground: on another lap or strand of the same street the place is "
-            "right within it though the chainage is not",
+            "the same of the straight distance on the ground: on another lap of the same street the place "
+            "is right within it though the chainage is not",
             lambda r: r.tracked.ground_level_m,
         ),
         Column("protection_noise_m", "its part by noise without a fault", lambda r: r.tracked.level_noise_m),
         Column(
             "protection_separation_m",
-            "largest distance of a sub-filter without one satellite, constellation, sensor, all Dopplers or phases, or "
-            "with a map that may be wrong",
+            "largest distance of a sub-filter of the level",
             lambda r: r.tracked.separation_m,
         ),
         Column(
@@ -102,8 +101,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "motion",
-            "by tachometer and inertial unit together: `init`, `standing`, `low_speed`, `normal`, `inertial_spin`, "
-            "`inertial_slide`, `rolling`, `expired` (see `docs/sensors.md`)",
+            "by tachometer and inertial unit together, see `docs/sensors.md`",
             lambda r: r.sensed.state,
             words=tuple(state.name.lower() for state in MotionState),
         ),
@@ -126,29 +124,24 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             lambda r: r.tracked.code_weight,
         ),
         Column("motion_weight", "mean weight of Dopplers and phases", lambda r: r.tracked.motion_weight),
-        Column(
-            "wheel_scale", "share that the wheel's way is too short by, as estimated", lambda r: r.tracked.wheel_scale
-        ),
-        Column(
-            "radar_scale", "share that the radar's way is too short by, as estimated", lambda r: r.tracked.radar_scale
-        ),
+        Column("wheel_scale", "share that its way is too short by, as estimated", lambda r: r.tracked.wheel_scale),
+        Column("radar_scale", "share that its way is too short by, as estimated", lambda r: r.tracked.radar_scale),
         Column("force_offset_mps2", "offset of the accelerometer, as estimated", lambda r: r.tracked.force_offset_mps2),
         Column(
             "map_scale",
-            "factor on the error of lengths along the map (`tracking.map_scale_m`): above 1 where the "
-            "pseudoranges keep moving against the map",
+            "factor on `tracking.map_scale_m`: above 1 where pseudoranges keep moving against the map",
             lambda r: r.tracked.map_scale,
         ),
         Column(
             "measured_chainage_m",
-            "chainage of the vehicle's middle (without a vehicle file of the antenna) to which the next "
-            "three belong: means since the epoch before",
+            "chainage of the vehicle's middle, or the antenna, to which the next three belong: means since "
+            "the epoch before",
             lambda r: r.sensed.under_m,
         ),
         Column(
             "measured_gradient_permille",
-            "gradient under the body by tachometer and accelerometer, "
-            "+ where the line rises with chainage; empty where the wheel slips or is slower than 1 m/s",
+            "gradient by tachometer and accelerometer, + where the line rises with chainage; empty where "
+            "the wheel slips or is slower than 1 m/s",
             lambda r: 1e3 * r.sensed.gradient,
         ),
         Column(
@@ -169,22 +162,28 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "innovation_wheel_m",
-            "way of the wheel since the epoch before less the predicted one",
+            "measured less predicted: way since the epoch before",
             lambda r: _innovation(r, Kind.WHEEL),
         ),
-        Column("innovation_radar_m", "the same of the radar", lambda r: _innovation(r, Kind.RADAR)),
+        Column(
+            "innovation_radar_m",
+            "measured less predicted: way since the epoch before",
+            lambda r: _innovation(r, Kind.RADAR),
+        ),
         Column(
             "innovation_force_mps2",
-            "mean specific force forward less the predicted one",
+            "measured less predicted: mean specific force forward",
             lambda r: _innovation(r, Kind.FORCE),
         ),
         Column(
             "innovation_place_m",
-            "place by a feature of the line less the predicted one",
+            "measured less predicted: place by a feature of the line",
             lambda r: _innovation(r, Kind.PLACE),
         ),
         Column(
-            "innovation_range_m", "range to a ground unit less the predicted one", lambda r: _innovation(r, Kind.RANGE)
+            "innovation_range_m",
+            "measured less predicted: range to a ground unit",
+            lambda r: _innovation(r, Kind.RANGE),
         ),
     )
 )
