@@ -64,14 +64,12 @@ def proofs() -> dict[str, list[str]]:
 
 
 def _tests(row: str, marked: list[str]) -> list[str]:
-    """Lines with the tests that prove most, and how many more name the row; or that there are none."""
+    """Lines with the tests that prove most, or that there are none."""
     chosen: list[str] = ROWS[row]["tests"]
     wrong = sorted(set(chosen) - set(marked))
     if wrong:
         raise ValueError(f"requirements.toml, {row}: no test with the marker of the row is named {', '.join(wrong)}")
-    more = len(set(marked)) - len(chosen)
-    names = [*(f"`{test}`" for test in chosen), *([f"+{more}"] if more > 0 else [])] or ["**open**"]
-    return [f"  {name}" for name in names]
+    return [f"  `{test}`" for test in chosen] or ["  **open**"]
 
 
 def table() -> str:
@@ -83,16 +81,17 @@ def table() -> str:
     lines = [
         "# Traceability",
         "",
-        "What is asked, where a command prints what is reached, and the three tests that prove most (+ further ones).",
+        "What is asked, its *figure*, what is reached, and the tests that prove most; a row without a test is open.",
         "Written by `python tests/studies/traceability.py` from `tests/references/requirements.toml` and the markers",
-        '`@pytest.mark.requirement("A7")` of the tests; a row without a test is open.',
+        '`@pytest.mark.requirement("A7")` of all tests.',
     ]
     heading = ""
     for row, told in ROWS.items():
         if told["heading"] != heading:
             heading = told["heading"]
             lines += ["", f"## {heading}", ""]
-        parts = [told["asks"], *(f"{key.title()}: {told[key]}" for key in ("figure", "reached") if key in told)]
+        asked = told["asks"] + (f"; *{told['figure']}*" if "figure" in told else "")
+        parts = [asked, *([f"Reached: {told['reached']}"] if "reached" in told else [])]
         lines += [f"- **{row}** {'. '.join(parts)}", *_tests(row, proven.get(row, []))]
     return "\n".join(lines) + "\n"
 
