@@ -75,3 +75,15 @@ def test_beside_a_wall_no_echo_is_taken() -> None:
     direct = np.hypot(unit - 200.0, 3.0)
     assert gated(direct, unit, place_m=200.0, sigma_m=0.24).all()
     assert not gated(direct + 4.0, unit, place_m=200.0, sigma_m=0.24).any()
+
+
+@pytest.mark.requirement("E4")
+@pytest.mark.parametrize(("sigma", "early_m", "late_m"), [(0.24, 0.72, 0.72), (0.1, 0.3, 0.6)])
+def test_the_gate_is_three_sigma_wide_on_both_sides_and_never_narrower_than_echoes_are_late(
+    sigma: float, early_m: float, late_m: float
+) -> None:
+    """P2 3.3: no echo comes early, so that the early side has no such least width."""
+    unit = np.full(4, 260.0)
+    direct = np.hypot(unit - 200.0, 3.0)
+    error = np.array([0.02 - early_m, -0.02 - early_m, late_m - 0.02, late_m + 0.02])
+    assert gated(direct + error, unit, place_m=200.0, sigma_m=sigma).tolist() == [True, False, True, False]

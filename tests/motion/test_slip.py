@@ -165,6 +165,17 @@ def test_the_papers_rule_is_blind_where_its_closed_form_says(duration: float, ex
 
 
 @pytest.mark.requirement("E1")
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_papers_rule_has_a_limit_of_45_permille_of_gravity(sign: float) -> None:
+    """P2 2.1: 35 permille of line, 10 of the pitching body; a wheel that gains or loses speed evenly for a second."""
+    still = even_motion(10.0, 5.0, 1.0, 0.0)
+    for permille, slips in ((43.0, False), (47.0, True)):
+        gain = sign * permille / 1e3 * GRAVITY_MPS2 * np.clip(still.time_s - 5.0, 0.0, 1.0)
+        found = replace(still, wheel=still.wheel + gain).run(rule="p2")
+        assert np.isin(found.state, SLIPPING).any() == slips
+
+
+@pytest.mark.requirement("E1")
 def test_the_papers_rule_finds_a_slip_as_it_begins_and_lets_go_at_its_top() -> None:
     """P2's rule: the wheel's acceleration beyond 45 permille of gravity, 0.44 m/s2."""
     case = motion(100.0, [(75.0, 4.0, 0.5)])

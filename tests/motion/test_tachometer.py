@@ -99,6 +99,23 @@ def test_lost_and_doubled_teeth_are_found() -> None:
 
 
 @pytest.mark.requirement("E2")
+@pytest.mark.parametrize(("share", "found"), [(0.85, True), (1.15, True), (0.75, False), (1.25, False)])
+def test_a_doubled_tooth_is_one_within_a_fifth_of_its_neighbours(share: float, found: bool) -> None:
+    """Two intervals, one after the other, that together are as long as the one before and the one after."""
+    intervals = np.full(30, 0.005)
+    intervals[14:16] = share * 0.005 * np.array([0.3, 0.7])
+    assert tooth_faults(_pulses(np.cumsum(intervals)))[1].any() == found
+
+
+@pytest.mark.requirement("E2")
+@pytest.mark.parametrize(("ratio", "found"), [(1.75, True), (2.25, True), (1.65, False), (2.35, False)])
+def test_a_lost_tooth_is_one_within_a_third_of_an_interval(ratio: float, found: bool) -> None:
+    intervals = np.full(30, 0.005)
+    intervals[14] *= ratio
+    assert tooth_faults(_pulses(np.cumsum(intervals)))[0].any() == found
+
+
+@pytest.mark.requirement("E2")
 @pytest.mark.parametrize(("factor", "unit"), [(1.0, "m/s"), (3.6, "km/h"), (2.2369, "miles per hour")])
 @pytest.mark.parametrize("lag", [0.0, 1.0, -0.8])
 def test_units_lags_and_diameters_of_logs_are_found(factor: float, unit: str, lag: float) -> None:

@@ -219,6 +219,16 @@ def test_one_clock_shows_an_error_common_to_all_satellites_of_one_antenna() -> N
 
 
 @pytest.mark.requirement("B3")
+def test_one_code_far_off_is_rejected_and_does_not_pass_for_separate_clocks() -> None:
+    """The mean of the five differences is 120 m, beyond which clocks are separate; their median is 0."""
+    front, rear, told = two_antennas()
+    rear[:, 1] += 600.0
+    result = paired(front, rear, told, limits=AntennaPairLimits(clocks="common"))
+    np.testing.assert_array_equal(result.reject, np.broadcast_to(SATELLITES == "G02", front.shape))
+    np.testing.assert_array_equal(result.clock_m, 0.0)
+
+
+@pytest.mark.requirement("B3")
 def test_exactly_at_the_limit_is_used() -> None:
     front = np.full((1, 5), 2.0**24)
     rear = front + np.array([5.0, 5.0 + 2.0**-20, -5.0, 0.0, 0.0])
