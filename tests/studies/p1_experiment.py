@@ -8,10 +8,11 @@ commercial 145.2 km of the scenario p1-commercial: every configuration beside P1
 corrected  GPS alone on those lines and on five of other seeds, with and without simulated SBAS corrections
 filtered   the filter along the track on the lines of "commercial", without sensors and with two
 test-line  figures 7 and 8 and table 4
+figure-8   the picture of figure 8
 static     two and three satellites, standing at many points of the test line
 ========== =====================================================================
 
-Nothing is written; the simulated signals go from the simulator to the positioning in memory.
+Nothing but that picture is written; the simulated signals go from the simulator to the positioning in memory.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from p1_ride import (
 )
 from p1_rtklib import ABSENT, PROGRAM
 from p1_static import static_report
-from p1_test_line import SERVICE, line_report
+from p1_test_line import PICTURE, SERVICE, figure_8, line_report
 from railfix.core.arrays import Masks
 from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.simulate import Scenario
@@ -76,13 +77,13 @@ YARDSTICK: Final = Way("conventional", COMMON, "conventional")
 WAYS: Final = (
     YARDSTICK,
     Way("validated", COMMON, "validated"),
-    Way("RTKLIB", {}, "rtklib"),
+    Way("RTKLIB", COMMON, "rtklib"),
     Way("constrained", COMMON),
     Way("p1", {"preset": "p1"}),
     Way("default, drop", DEFAULT, "checked"),
     Way("strict", DEFAULT, "checked", largest_sigma_m=10.0),
 )
-#: The filter along the track beside the conventional position.
+#: The filter along the track beside the conventional positions.
 FILTERED: Final = {"preset": "default", "filter": "track"}
 FILTER_WAYS: Final = (
     YARDSTICK,
@@ -319,7 +320,7 @@ def corrected_report(folder: Path) -> Iterator[str]:
 
 
 def filtered_report(folder: Path) -> Iterator[str]:
-    """The filter along the track beside the conventional position, line by line as each is done."""
+    """The filter along the track beside the conventional positions, line by line as each is done."""
     campaigns = []
     for number in range(4):
         campaigns.append(commercial(folder, (number,), ways=FILTER_WAYS, systems=FILTER_SYSTEMS))
@@ -397,11 +398,13 @@ def report(part: str, folder: Path) -> Iterator[str]:
         yield from corrected_report(folder)
     elif part == "test-line":
         yield from line_report()
+    elif part == "figure-8":
+        figure_8().savefig(PICTURE, dpi=100, metadata={"Software": None})
     else:
         yield from static_report()
 
 
-PARTS: Final = ("short", "commercial", "corrected", "filtered", "test-line", "static")
+PARTS: Final = ("short", "commercial", "corrected", "filtered", "test-line", "figure-8", "static")
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -75,15 +75,16 @@ class Way:
 
 
 @cache
-def cn0_curve(folder: Path) -> Path:
-    """P1 2.3(1): mean C/N0 over elevation, of a day of open sky standing, with the receivers of the commercial run."""
-    base = load_recipe("commercial-run").scenario()
+def cn0_curve(folder: Path, recipe: str = "commercial-run") -> Path:
+    """P1 2.3(1): mean C/N0 over elevation, of a day of open sky standing, with the receivers of a scenario."""
+    base = load_recipe(recipe).scenario()
     day = Scenario().replaced(
         seed=230,
         start=base.start,
         duration_s=86_400.0,
         rate_hz=0.1,
         run=RunSettings(first_stand_s=1e6),
+        sky=base.sky,
         receiver=base.receiver,
         errors=base.errors,
     )
@@ -91,7 +92,7 @@ def cn0_curve(folder: Path) -> Path:
     for piece in Simulation(day).pieces("front"):
         observed = piece.observations
         samples.add(observed.cn0_dbhz, piece.geometry.elevation_deg, observed.satellite, observed.signal)
-    path = folder / "cn0-curve.toml"
+    path = folder / f"cn0-curve-{recipe}.toml"
     write_cn0_curve(fit_cn0_curve(samples), path)
     return path
 
@@ -282,16 +283,19 @@ def of_rtklib(bench: Bench, way: Way, letters: str, truth: Passage, parts: Seque
         messages = Path(folder) / "messages.sbs"
         if way.sbas:
             messages.write_bytes(bench.messages)
-        place = single_points(bench.simulation, parts, letters, messages if way.sbas else None)
+        limits = {
+            "mask_deg": way.settings.get("elevation", {}).get("mask_deg", 20.0),
+            "floor_dbhz": 30.0 if "cn0" in way.settings["screens"] else 0.0,
+        }
+        place = single_points(bench.simulation, parts, letters, messages if way.sbas else None, **limits)
     trajectory = bench.trajectories[truth.antenna]
     error = trajectory.chainage_at(trajectory.nearest(place)[0]) - truth.chainage_m
-    unknown = np.full(len(place), np.nan)
     return Found(
         error_m=error,
         status=np.where(np.isfinite(error), Status.OK, Status.NO_CONVERGENCE).astype(np.int8),
         n_used=np.zeros(len(place), dtype=np.int64),
-        own_sigma_m=unknown,
-        horizontal_m=unknown,
+        own_sigma_m=np.full(len(place), np.nan),
+        horizontal_m=horizontal_m(place - truth.ecef_m, truth.ecef_m),
     )
 
 
@@ -311,16 +315,19 @@ def of_result(way: Way, got: AntennaResult, truth: Passage, track: AlongTrack | 
     if way.positions not in ("conventional", "validated", "filtered"):
         kept &= (got.own_sigma_m <= way.largest_sigma_m) | (got.status == Status.OFF_MAP)
     error = chainage - truth.chainage_m
-    away = place - truth.ecef_m
-    up = truth.ecef_m / np.linalg.norm(truth.ecef_m, axis=1, keepdims=True)
-    flat = away - np.einsum("ti,ti->t", away, up)[:, None] * up
     return Found(
         error_m=np.where(kept, error, np.nan),
         status=got.status,
         n_used=got.n_used,
         own_sigma_m=got.own_sigma_m,
-        horizontal_m=np.linalg.norm(flat, axis=1),
+        horizontal_m=horizontal_m(place - truth.ecef_m, truth.ecef_m),
     )
+
+
+def horizontal_m(away_m: Floats, place_m: Floats) -> Floats:
+    """Horizontal part of differences at places, shape (T,) [m]; the vertical is toward the Earth's centre."""
+    up = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
+    return np.linalg.norm(away_m - np.einsum("ti,ti->t", away_m, up)[:, None] * up, axis=1)
 
 
 def broken(piece: Piece, got: AntennaResult, found: Found, t: int, *, passage: int, before: int) -> Breaking:
