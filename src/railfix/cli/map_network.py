@@ -15,13 +15,14 @@ from railfix.core.errors import MapQualityError, MismatchError, SettingsError
 from railfix.core.files import write_whole
 from railfix.io.position_log import column_names
 from railfix.run.options import ColumnNames, TrackReading
-from railfix.track import write_track_csv
+from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network
 from railfix.track.network_check import check_network
 from railfix.track.network_fill import fill_gaps
 from railfix.track.network_match import Matched, PlanLog, match, read_plan_positions
 from railfix.track.network_read import TOLERANCE_M, read_network
 from railfix.track.network_route import route_of
+from railfix.track.quality import error_note
 from railfix.track.read import track_of_segments
 
 #: Findings printed before the rest is only counted.
@@ -177,7 +178,7 @@ def route(
     console = console_of_tables()
     console.print(f"route: {', '.join(net.names[k] for k in passed)}", markup=False, soft_wrap=True)
     console.print(f"{len(track)} points, {track.chainage_m[-1]:,.1f} m")
-    show_notes(console, [*notes, *track.provenance.notes])
+    show_notes(console, [*notes, *track.provenance.notes, *error_note(check_track(track))])
     console.print(f"track map: {out}", markup=False, soft_wrap=True)
 
 

@@ -38,6 +38,7 @@ from railfix.run.sources import TRACK_FILE, Log, OpenedLine, open_line
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
+from railfix.track.quality import error_note
 
 if TYPE_CHECKING:
     from railfix.run.route import RouteOfLog
@@ -385,12 +386,7 @@ def _describe_detectable(detectable_m: Floats) -> str:
 
 def _map_notes(line: OpenedLine) -> Iterator[str]:
     """Result of the check of the track map."""
-    quality = check_track(line.track)
-    if quality.errors:
-        yield (
-            f"map check: {len(quality.errors)} error(s), {len(quality.warnings)} warning(s); the first error "
-            f"{quality.errors[0].sentence}; see railfix map check"
-        )
+    yield from error_note(check_track(line.track))
 
 
 def _broken_notes(logs: Mapping[Antenna, Log]) -> Iterator[str]:

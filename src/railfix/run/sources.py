@@ -22,6 +22,7 @@ from railfix.track import Track
 from railfix.track.frames import FrameShift, track_at
 from railfix.track.read import read_segments, track_of_segments
 from railfix.track.segment import MapReading, Segment
+from railfix.track.track import HEIGHTS_M
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import Vehicle, antenna_trajectory, read_vehicle
 
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
     from railfix.run.route import RouteOfLog
     from railfix.track.network import Network
 
-#: Ellipsoidal heights of railways, tunnels below the sea included [m].
-_HEIGHTS_M: Final = (-1000.0, 9000.0)
 #: Shortest track of a run [m].
 _SHORTEST_M: Final = 1.0
 #: Track of a run that is not that of its files as they are, in the folder of results.
@@ -159,10 +158,10 @@ def _check_extent(files: tuple[Path, ...], track: Track) -> None:
     if (length := float(track.chainage_m[-1] - track.chainage_m[0])) < _SHORTEST_M:
         raise MismatchError(f"{', '.join(map(str, files))}: is {length:g} m long; give the track of a line")
     low, high = float(np.nanmin(track.height_m)), float(np.nanmax(track.height_m))
-    if low < _HEIGHTS_M[0] or high > _HEIGHTS_M[1]:
+    if low < HEIGHTS_M[0] or high > HEIGHTS_M[1]:
         raise MismatchError(
             f"{', '.join(map(str, files))}: has heights from {low:,.0f} to {high:,.0f} m; expected metres between "
-            f"{_HEIGHTS_M[0]:,.0f} and {_HEIGHTS_M[1]:,.0f}: are they in millimetres?"
+            f"{HEIGHTS_M[0]:,.0f} and {HEIGHTS_M[1]:,.0f}: are they in millimetres?"
         )
 
 

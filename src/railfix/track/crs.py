@@ -80,11 +80,28 @@ def known_crs(crs: str, *, path: str | PathLike[str] = "") -> CRS:
 def used_crs(path: str | PathLike[str], given: str | None, named: str | None) -> str | None:
     """The CRS given for a file, or the one that it names itself; SettingsError when they contradict each other."""
     if given is None or named is None:
-        return given or named
+        used = given or named
+        if used is not None:
+            known_crs(used, path=path)
+        return used
     one, other = (known_crs(name, path=path).to_2d() for name in (given, named))
     if not one.equals(other, ignore_axis_order=True):
         raise SettingsError(f"{path}: --crs {given} contradicts the file's own CRS {named}")
     return given if known_crs(given).is_compound else named  # with its height datum, where it has one
+
+
+def unit_of_grid(crs: str, *, path: str) -> float:
+    """Metres of the unit of a projected CRS; SettingsError when it is none."""
+    system = known_crs(crs, path=path)
+    if not system.is_projected and not (system.is_compound and system.sub_crs_list[0].is_projected):
+        raise SettingsError(f"{path}: {crs} is {system.name}, no grid; a design is in one, such as EPSG:25832 (--crs)")
+    return float(system.axis_info[0].unit_conversion_factor)
+
+
+def unit_of_heights(crs: str | None) -> float:
+    """Metres of the unit of the heights of a CRS; 1 where it has none."""
+    axes = [] if crs is None else known_crs(crs).axis_info
+    return float(axes[2].unit_conversion_factor) if len(axes) > 2 else 1.0
 
 
 def vertical_of(crs: str | None) -> CRS | None:
@@ -156,7 +173,9 @@ def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: 
     """Reject points outside the area of use of a CRS's frame, of which a projection may be used beyond its own."""
     finite = np.isfinite(latitude_deg) & np.isfinite(longitude_deg) & (np.abs(latitude_deg) <= 90.0)
     if not finite.all():
-        raise InputFileError(path, f"some coordinates lie outside the CRS {crs}; is it the right one?")
+        raise InputFileError(
+            path, f"some coordinates lie outside the CRS {crs}; give the right one (--crs), in the unit of the file"
+        )
     geodetic = geodetic_of(crs)
     outside, area = ~is_in_area(geodetic, latitude_deg, longitude_deg, margin_deg=MARGIN_DEG), geodetic.area_of_use
     if area is None or not outside.any():
@@ -259,5 +278,6 @@ def is_in_area(crs: CRS, latitude_deg: Floats, longitude_deg: Floats, *, margin_
         return np.ones(len(latitude_deg), dtype=bool)
     inside = (latitude_deg >= area.south - margin_deg) & (latitude_deg <= area.north + margin_deg)
     width = (area.east - area.west) % 360.0 if area.east - area.west < 360.0 else 360.0
-    from_west = (longitude_deg - area.west + margin_deg) % 360.0
+    with np.errstate(invalid="ignore"):  # outside a grid there is no longitude
+        from_west = (longitude_deg - area.west + margin_deg) % 360.0
     return np.asarray(inside & (from_west <= width + 2.0 * margin_deg))

@@ -113,7 +113,8 @@ def _check_columns(table: NamedColumns) -> tuple[str, ...]:
         what = "both 'height_m' and 'elevation_m'" if "height_m" in table else "neither 'height_m' nor 'elevation_m'"
         message = f"{what}; one is needed: height_m is ellipsoidal, elevation_m is orthometric (levelling)"
         raise InputFileError(table.path, message, line=table.header_line)
-    extra = [name for name in table.cells if name not in KNOWN_COLUMNS]
+    used = [name for name in KNOWN_COLUMNS if name != "geoid_m" or "elevation_m" in table]
+    extra = [name for name in table.cells if name not in used]
     return (f"{table.path}: columns not used: {', '.join(extra)}",) if extra else ()
 
 
@@ -134,7 +135,11 @@ def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floa
     outside = np.abs(latitude_deg) > 90.0
     if outside.any():
         row = int(np.argmax(outside))
-        raise table.error(row, f"latitude_deg {latitude_deg[row]:g} is over 90; are latitude and longitude swapped?")
+        value = latitude_deg[row]
+        hint = "are latitude and longitude swapped?"
+        if abs(value) > 360.0:
+            hint = "degrees were expected, not metres of a grid (read from GeoJSON), minutes or seconds"
+        raise table.error(row, f"latitude_deg {value:g} is over 90; {hint}")
     outside = np.abs(longitude_deg) > 360.0
     if outside.any():
         row = int(np.argmax(outside))
@@ -164,6 +169,9 @@ def _in_frame(crs: str | None, latitude: Floats, longitude: Floats, *, path: str
             f"{path}: {crs} is {system.name}, but the columns are latitude and longitude; "
             "projected coordinates are read from GeoJSON"
         )
+    unit = system.axis_info[0].unit_name
+    if unit != "degree":
+        raise SettingsError(f"{path}: {crs} is {system.name}, in {unit}s, but the columns are in degrees")
     return frame_degrees(crs, longitude, latitude, path=path)
 
 

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from pyproj import CRS, Transformer
 
 from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import InputFileError
-from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, frame_degrees, is_in_area, older_datum_note
+from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, frame_degrees, is_in_area, older_datum_note, unit_of_grid
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, alignment_points
 from railfix.track.heights import stated_heights
 from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
+
+#: Longest part of an alignment to which its profile is extended [m].
+_PROFILE_BEYOND_M: Final = 50.0
 
 
 def segment_of_design(
@@ -40,9 +44,13 @@ def segment_of_design(
         raise InputFileError(path, f"alignment {name!r} is in a grid that the file does not name; give --crs")
     points, joints = alignment_points(plan, profile, cant)
     xy, up, scale = points.xy_m, 0.0, 1.0
+    unit = unit_of_grid(crs, path=path)
     if grid is not None:
+        if unit != 1.0:
+            raise InputFileError(path, f"the grid {crs} is not in metres, which is not read; give one in metres")
         east, north, up, cosine, sine, scale = grid
         xy = np.array([east, north]) + scale * xy @ np.array([[cosine, sine], [-sine, cosine]])
+    xy /= unit
     curvature = points.curvature
     if grid is None and _within(crs, xy[:, ::-1]) and not _within(crs, xy):
         # northing before easting turns the plane over, so a curve to the left in the file is one to the right
@@ -52,6 +60,7 @@ def segment_of_design(
     _check_length(plan, frame, latitude, longitude, path=f"{path} ({name})")
     height, model, datum = np.full(len(latitude), np.nan), "", NO_HEIGHTS
     if profile:
+        joints += _check_profile(plan, profile, path=f"{path} ({name})")
         height, model, datum = stated_heights(points.height_m + up, latitude, longitude, reading, path=path)
     radius = np.full(len(latitude), np.inf)
     bent = np.abs(curvature) > 1e-9
@@ -73,6 +82,17 @@ def segment_of_design(
         metadata={"name": name},
         notes=(*notes, *joints, *older_datum_note(crs)),
     )
+
+
+def _check_profile(plan: Sequence[PlanElement], profile: Sequence[ProfileElement], *, path: str) -> tuple[str, ...]:
+    """Reject a profile that leaves out more of the plan than `_PROFILE_BEYOND_M`; note what it leaves out."""
+    length, low = sum(element.length_m for element in plan), min(element.start_m for element in profile)
+    high = max(element.start_m + element.length_m for element in profile)
+    left_out = max(low, 0.0) + max(length - high, 0.0)
+    where = f"the profile runs from {low:.0f} to {high:.0f} m of an alignment of {length:.0f} m"
+    if left_out > _PROFILE_BEYOND_M:
+        raise InputFileError(path, f"{where}; mend its stations, or remove it and give --heights")
+    return (f"{path}: {where}; its last gradients go on",) if left_out > 1.0 else ()
 
 
 def _check_length(plan: Sequence[PlanElement], frame: str, latitude: Floats, longitude: Floats, *, path: str) -> None:

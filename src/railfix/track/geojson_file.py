@@ -15,7 +15,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import read_text
 from railfix.core.spelling import misspelt
-from railfix.track.crs import frame_degrees, known_crs, older_datum_note, used_crs
+from railfix.track.crs import frame_degrees, known_crs, older_datum_note, unit_of_heights, used_crs
 from railfix.track.csv_file import OPTIONAL_COLUMNS, attributes
 from railfix.track.heights import HEIGHT_DATUMS, ellipsoidal_heights, own_height_datum
 from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
@@ -238,6 +238,12 @@ def _heights(
     if geoid is None and datum == "orthometric" and geoid_m is None:
         geoid = line.text("geoid")
     height, model = ellipsoidal_heights(
-        line.coordinates[:, 2], latitude, longitude, datum=datum, geoid=geoid, geoid_m=geoid_m, path=line.source
+        line.coordinates[:, 2] * unit_of_heights(crs),
+        latitude,
+        longitude,
+        datum=datum,
+        geoid=geoid,
+        geoid_m=geoid_m,
+        path=line.source,
     )
     return height, model, datum

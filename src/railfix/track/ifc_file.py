@@ -30,7 +30,7 @@ _LAWS: Final = {
 }
 _ARCS: Final = {"CONSTANTGRADIENT": "parabola", "PARABOLICARC": "parabola", "CIRCULARARC": "circle"}
 _TOKEN: Final = re.compile(r"'(?:[^']|'')*'|#\d+|\.[A-Z0-9_]+\.|[A-Z][A-Z0-9_]*|[-+]?\d[\d.]*(?:E[-+]?\d+)?|[(),$*]")
-_PREFIX: Final = {"MILLI": 1e-3, "CENTI": 1e-2, "DECI": 0.1, "KILO": 1e3}
+_PREFIX: Final = {"None": 1.0, "MILLI": 1e-3, "CENTI": 1e-2, "DECI": 0.1, "DECA": 10.0, "HECTO": 100.0, "KILO": 1e3}
 
 
 @dataclass(frozen=True)
@@ -128,8 +128,10 @@ def read_ifc_segments(path: str | PathLike[str], reading: MapReading) -> list[Se
             if cant:
                 gauge = step.at(layouts["IFCALIGNMENTCANT"], what="IFCALIGNMENTCANT").values[-1] * scale
                 plan = _leaning(plan, [(height or 0.0) * scale / gauge for height in heights], cant)
-        except (TypeError, IndexError):
-            raise InputFileError(path, f"alignment {name!r}: a segment lacks a number that IFC 4.3 requires") from None
+        except (TypeError, IndexError, ValueError):
+            raise InputFileError(
+                path, f"alignment {name!r}: a segment lacks a number that IFC 4.3 requires, or it is none"
+            ) from None
         uneven = sum(_is_uneven(e) for e in elements.get("IFCALIGNMENTCANT", []))
         notes = (
             (f"{uneven} segments of constant cant have two values and are taken as linear transitions",)
@@ -164,7 +166,7 @@ def _units(step: _Step) -> tuple[float, float]:
         if f"#{number}" not in assigned:
             continue
         if entity.kind == "IFCSIUNIT" and entity.values[1] == ".LENGTHUNIT.":
-            length = _PREFIX.get(str(entity.values[2]).strip("."), 1.0)
+            length = _PREFIX[str(entity.values[2]).strip(".")]
         elif entity.kind == "IFCCONVERSIONBASEDUNIT":
             factor = step.at(entity.values[3], what="a unit").values[0]
             value = next((v for v in (factor if isinstance(factor, list) else [factor]) if isinstance(v, float)), None)
@@ -257,7 +259,9 @@ def _law(step: _Step, entity: _Entity, kinds: dict[str, str]) -> str:
 
 def _plan(step: _Step, entity: _Entity, scale: float, angle: float) -> PlanElement:
     point, direction, first, last, length = entity.values[2:7]
-    x, y = step.at(point, what=entity.kind).values[0][:2]
+    x, y, *rest = step.at(point, what=entity.kind).values[0]
+    if len(rest) > 1:
+        raise InputFileError(step.path, f"point {point} has {2 + len(rest)} coordinates; are there commas in numbers?")
     law = _law(step, entity, {k: v for k, v in _LAWS.items() if "CANT" not in k and k != "LINEARTRANSITION"})
     if entity.values[-1] == ".CIRCULARARC.":
         last = first  # some programs write 0, or the radius of the next element (IFC 4.3.2: both are the same)

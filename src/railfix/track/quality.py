@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from pydantic import Field
@@ -16,9 +16,13 @@ from pydantic import Field
 from railfix.core.arrays import Floats, Masks
 from railfix.core.settings import Settings
 from railfix.track.geometry import Geometry, geometry_of, windowed_gradients
-from railfix.track.track import Track, kilometrage_breaks
+from railfix.track.track import HEIGHTS_M, Track, kilometrage_breaks
 
 Severity = Literal["error", "warning"]
+#: Coordinates rounded to this are up to half of it off [deg]: 0.6 m.
+_COARSE_DEG: Final = 1e-5
+#: Cant of less than this everywhere was meant to be in another unit [m].
+_LEAST_CANT_M: Final = 5e-4
 
 
 class MapLimits(Settings):
@@ -150,6 +154,16 @@ def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQualit
     return TrackQuality(track=track, limits=limits, geometry=geometry, findings=tuple(findings))
 
 
+def error_note(quality: TrackQuality) -> tuple[str, ...]:
+    """A note on the errors of a map, with the first one; none without errors."""
+    if not quality.errors:
+        return ()
+    return (
+        f"map check: {len(quality.errors)} error(s), {len(quality.warnings)} warning(s); the first error "
+        f"{quality.errors[0].sentence}; see railfix map check",
+    )
+
+
 class _Report:
     """Converter of masks over points or segments to findings, one for each range of neighbours."""
 
@@ -203,6 +217,13 @@ def _spacing(report: _Report, geometry: Geometry, limits: MapLimits) -> Iterator
         values=spacing,
         limit=limits.near_duplicate_m,
     )
+    degrees = np.stack([report.track.latitude_deg, report.track.longitude_deg]) / _COARSE_DEG
+    yield from report.runs(
+        np.full(len(report.track), bool((np.abs(degrees - np.round(degrees)) < 1e-4).all())),
+        "warning",
+        "rounded",
+        "latitude and longitude have five decimals or fewer, so that points are up to 0.6 m off; seven were expected",
+    )
     yield from report.runs(
         spacing > limits.gap_m,
         "error",
@@ -247,11 +268,12 @@ def _kilometrage(report: _Report, track: Track) -> Iterator[Finding]:
         return
     broken = kilometrage_breaks(track.chainage_m, kilometrage)
     change = np.diff(kilometrage)
+    of_length = float(np.diff(track.chainage_m)[broken].sum() / track.chainage_m[-1])
     yield from report.runs(
         broken,
-        "warning",
+        "error" if of_length > 0.5 else "warning",
         "kilometrage break",
-        "the kilometrage changes by {value:.1f} m, which is not the distance",
+        "the kilometrage changes by {value:.4g} m, which is not the distance; metres were expected",
         values=change,
     )
     direction = np.where(broken | (change == 0.0), np.nan, np.sign(change))
@@ -263,6 +285,13 @@ def _kilometrage(report: _Report, track: Track) -> Iterator[Finding]:
 
 
 def _heights(report: _Report, track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
+    yield from report.runs(
+        (track.height_m < HEIGHTS_M[0]) | (track.height_m > HEIGHTS_M[1]),
+        "error",
+        "height",
+        "a height of {value:,.0f} m, where no railway is; is it in millimetres, or does it mean that there is none?",
+        values=track.height_m,
+    )
     with np.errstate(invalid="ignore"):
         steep = np.abs(geometry.gradient_permille) > limits.gradient_permille
         yield from report.runs(
@@ -302,6 +331,14 @@ def _attributes(report: _Report, track: Track, geometry: Geometry, limits: MapLi
             "cant of {value:.3f} m (limit {limit:g} m); the column is in millimetres",
             values=track.cant_m,
             limit=limits.cant_m,
+        )
+        canted = np.abs(track.cant_m) > 0.0
+        yield from report.runs(
+            canted & (np.nanmax(np.abs(track.cant_m), initial=0.0) < _LEAST_CANT_M),
+            "error",
+            "cant",
+            "cant of {value:.2g} m, and nowhere more; is it in metres, where millimetres were expected?",
+            values=track.cant_m,
         )
         sharp = np.abs(track.radius_m) < limits.least_radius_m
         yield from report.runs(

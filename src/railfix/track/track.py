@@ -27,6 +27,8 @@ UNNAMED = "not named (WGS 84 assumed)"
 #: Kilometrage that differs from the length of a segment by more than this, plus a twentieth of
 #: the length, has a break [m]; files give it rounded to the metre.
 KILOMETRAGE_BREAK_M = 1.0
+#: Ellipsoidal heights of railways, tunnels below the sea included [m].
+HEIGHTS_M = (-1000.0, 9000.0)
 #: A log further from a map than this is of another place [m].
 ANOTHER_PLACE_M = 100_000.0
 

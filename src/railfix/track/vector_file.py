@@ -7,6 +7,7 @@ segment, without heights where its coordinates have none.
 from __future__ import annotations
 
 import re
+import warnings
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -17,8 +18,8 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import ending
-from railfix.track.crs import frame_degrees, older_datum_note, used_crs
+from railfix.core.files import ending, open_stream
+from railfix.track.crs import frame_degrees, older_datum_note, unit_of_heights, used_crs
 from railfix.track.heights import check_height_datum, stated_heights
 from railfix.track.segment import ATTRIBUTES, NO_HEIGHTS, MapReading, Segment
 from railfix.track.track import UNNAMED
@@ -26,6 +27,8 @@ from railfix.track.track import UNNAMED
 #: Endings of files that are read here.
 ENDINGS: Final = (".gpkg", ".shp", ".fgb", ".gml", ".gpx", ".kml", ".dxf", ".osm", ".pbf")
 INSTALL: Final = "install it with: pip install 'railfix[maps]'"
+#: Bytes of a text file that are looked at before GDAL reads it.
+_LOOKED_AT: Final = 1 << 20
 #: Columns that name a line, in this order.
 _NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")
 #: Values of OpenStreetMap's tag railway that are tracks on which trains run.
@@ -49,22 +52,41 @@ def read_layers(path: str | PathLike[str], *, geometry: str) -> list[tuple[str |
         import shapely
     except ImportError:
         raise InputFileError(path, f"reading {ending(path)} maps needs pyogrio and shapely; {INSTALL}") from None
+    _check_text(path)
     layers = []
     try:
-        for layer, _ in pyogrio.list_layers(path):
-            meta, _, blob, values = pyogrio.raw.read(path, layer=layer)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Measured", UserWarning)  # measures are no heights and not read
+            found = [pyogrio.raw.read(path, layer=layer) for layer, _ in pyogrio.list_layers(path)]
+        for meta, _, blob, values in found:
             if blob is None and geometry != "none":
                 continue
             size = len(values[0]) if len(values) else 0
-            shapes = np.full(size, None) if blob is None else np.asarray(shapely.from_wkb(blob), dtype=object)
+            with np.errstate(invalid="ignore"):  # of NaN, which is rejected later
+                shapes = np.full(size, None) if blob is None else np.asarray(shapely.from_wkb(blob), dtype=object)
             usable = [k for k, s in enumerate(shapes) if geometry == "none" or (s and s.geom_type.endswith(geometry))]
             fields = [str(name) for name in meta["fields"]]
             rows = [{name: column[k] for name, column in zip(fields, values, strict=True)} for k in usable]
             if usable:
                 layers.append((meta["crs"], rows, shapes[usable]))
-    except pyogrio.errors.DataSourceError as error:
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.FeatureError) as error:
         raise InputFileError(path, f"GDAL cannot read this file ({str(error).splitlines()[0]})") from None
     return layers
+
+
+def _check_text(path: str | PathLike[str]) -> None:
+    """Reject coordinates that GDAL reads as others: decimal commas, heights above the ground."""
+    kind = ending(path)
+    if kind not in (".osm", ".gpx", ".kml"):
+        return
+    with open_stream(path, content="bytes") as stream:
+        text = stream.read(_LOOKED_AT)
+    if comma := re.search(rb"""\bl(?:at|on)\s*=\s*["'][-+\d]+,\d*""", text):
+        raise InputFileError(path, f"{comma[0].decode()}: has a comma in a number; a point was expected")
+    if mode := re.search(rb"<altitudeMode>\s*(relativeTo\w+|clampTo\w+)\s*<", text):
+        raise InputFileError(
+            path, f"its altitudeMode is {mode[1].decode()}, no height of the track; write absolute heights or none"
+        )
 
 
 def read_vector_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
@@ -115,11 +137,22 @@ def plan_segment(
     if len(values) < 2:
         raise InputFileError(source, "a track needs at least two different points")
     crs = reading.crs
+    if crs is None and (np.abs(values[:, :2]) > (360.0, 90.0)).any():
+        raise InputFileError(source, "names no CRS, and its coordinates are no degrees; give --crs")
     used = crs or "EPSG:4326"
     latitude, longitude, frame = frame_degrees(used, values[:, 0], values[:, 1], path=source)
     height, model, datum = np.full(len(values), np.nan), "", NO_HEIGHTS
-    if values.shape[1] == 3 and np.isfinite(values[:, 2]).all() and values[:, 2].any():
-        height, model, datum = stated_heights(values[:, 2], latitude, longitude, reading, path=source)
+    known = np.isfinite(values[:, 2]) if values.shape[1] == 3 else np.zeros(len(values), dtype=np.bool_)
+    if known.any() and not known.all():
+        raise InputFileError(
+            source,
+            f"{int((~known).sum())} of {len(known)} points have no height, the first is point {np.argmin(known) + 1}; "
+            "mend them, or write the line without heights",
+        )
+    if known.any() and values[:, 2].any():
+        height, model, datum = stated_heights(
+            values[:, 2] * unit_of_heights(crs), latitude, longitude, reading, path=source
+        )
     return Segment(
         source=source,
         file=path,

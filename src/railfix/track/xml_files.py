@@ -17,7 +17,14 @@ from railfix.track.elements import CantElement, PlanElement, ProfileElement
 from railfix.track.segment import MapReading, Segment
 from railfix.track.vector_file import INSTALL, plan_segment
 
-_UNITS: Final = {"meter": 1.0, "millimeter": 1e-3, "foot": 0.3048, "USSurveyFoot": 1200.0 / 3937.0}
+_METRIC: Final = (1.0, 1e-3, 1e-2, 1e3)
+_UNITS: Final = {
+    **dict(zip(("meter", "millimeter", "centimeter", "kilometer"), _METRIC, strict=True)),
+    "foot": 0.3048,
+    "USSurveyFoot": 1200.0 / 3937.0,
+    "inch": 0.0254,
+    "mile": 1609.344,
+}
 #: The biquadratic parabola (of InfraModel, Finland) is Helmert's law: the curvature runs by two parabolas.
 _SPIRALS: Final = {
     "clothoid": "linear",
@@ -80,13 +87,16 @@ def read_xml_segments(path: str | PathLike[str], reading: MapReading) -> list[Se
 def _landxml(path: str, root: Any, reading: MapReading) -> list[Segment]:
     unit = root.find(".//{*}Metric")
     unit = root.find(".//{*}Imperial") if unit is None else unit
-    scale = _UNITS.get(unit.get("linearUnit", "meter"), 1.0) if unit is not None else 1.0
+    of_length = "meter" if unit is None else unit.get("linearUnit", "meter")
+    if of_length not in _UNITS:
+        raise InputFileError(path, f"linearUnit is {of_length!r}; one of {', '.join(_UNITS)} was expected")
+    scale = _UNITS[of_length]
     system = root.find(".//{*}CoordinateSystem")
     named = f"EPSG:{system.get('epsgCode')}" if system is not None and system.get("epsgCode") else None
     segments = []
     for number, alignment in enumerate(root.iterfind(".//{*}Alignment"), start=1):
         name = alignment.get("name") or f"alignment {number}"
-        start = float(alignment.get("staStart") or 0.0) * scale
+        start = _number(alignment.get("staStart") or 0.0) * scale
         geometry = alignment.find("{*}CoordGeom")
         if geometry is None:
             continue
@@ -94,12 +104,15 @@ def _landxml(path: str, root: Any, reading: MapReading) -> list[Segment]:
             plan = [_landxml_plan(path, e, scale) for e in _elements(geometry)]
             profile = _landxml_profile(path, alignment.find(".//{*}ProfAlign"), scale, start)
             cant, notes = _landxml_cant(alignment.find(".//{*}Cant"), scale, start)
+            notes += _ignored(alignment, name)
         except KeyError as error:
             raise InputFileError(
                 path, f"alignment {name!r}: cant of transition type {error} is not read; {', '.join(_SPIRALS)} are"
             ) from None
         except (TypeError, ValueError, AttributeError):
-            raise InputFileError(path, f"alignment {name!r}: an element lacks a number that LandXML 1.2 has") from None
+            raise InputFileError(
+                path, f"alignment {name!r}: an element lacks a number that LandXML 1.2 has, or it is none"
+            ) from None
         segments.append(
             segment_of_design(
                 path=path,
@@ -116,6 +129,24 @@ def _landxml(path: str, root: Any, reading: MapReading) -> list[Segment]:
     return segments
 
 
+def _ignored(alignment: Any, name: str) -> tuple[str, ...]:
+    """Notes on what of an alignment is not used."""
+    notes = []
+    if (count := len(alignment.findall(".//{*}ProfAlign"))) > 1:
+        notes.append(f"{name}: the first of {count} profiles is used")
+    if alignment.find("{*}StaEquation") is not None:
+        notes.append(f"{name}: stations are lengths from the start; station equations are not used")
+    return tuple(notes)
+
+
+def _number(text: Any) -> float:
+    """A finite number of a text; ValueError where it is none."""
+    value = float(text)
+    if not np.isfinite(value):
+        raise ValueError(f"{text} is not finite")
+    return value
+
+
 def _elements(parent: Any) -> list[Any]:
     """Children that are neither comments nor extensions of a country or program (`Feature`)."""
     return [e for e in parent if isinstance(e.tag, str) and e.tag.rsplit("}", 1)[-1] != "Feature"]
@@ -123,7 +154,7 @@ def _elements(parent: Any) -> list[Any]:
 
 def _point(element: Any, name: str, scale: float) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Easting and northing of a child; LandXML writes northing first."""
-    north, east = (float(v) for v in element.find(f"{{*}}{name}").text.split()[:2])
+    north, east = (_number(v) for v in element.find(f"{{*}}{name}").text.split()[:2])
     return np.array([east, north]) * scale
 
 
@@ -146,10 +177,10 @@ def _landxml_plan(path: str, element: Any, scale: float) -> PlanElement:
     elif kind == "Spiral" and element.get("spiType") in _SPIRALS:
         middle = _point(element, "PI", scale)
         first, last = (
-            0.0 if element.get(k) == "INF" else side / (float(element.get(k)) * scale)
+            0.0 if element.get(k) == "INF" else side / (_number(element.get(k)) * scale)
             for k in ("radiusStart", "radiusEnd")
         )
-        length, law = float(element.get("length")) * scale, _SPIRALS[element.get("spiType")]
+        length, law = _number(element.get("length")) * scale, _SPIRALS[element.get("spiType")]
         if last == 0.0:  # parabolas are laid out from the tangent at the straight; half the bend is turned by each law
             direction = np.arctan2(*(end - middle)[::-1]) - first * length / 2.0
         else:
@@ -177,8 +208,10 @@ def _landxml_profile(path: str, profile: Any, scale: float, start: float) -> lis
         kind = element.tag.rsplit("}", 1)[-1]
         if kind not in ("PVI", "ParaCurve", "CircCurve"):
             raise InputFileError(path, f"profile element {kind} is not read; PVI, ParaCurve and CircCurve are")
-        place, height = (float(v) * scale for v in element.text.split()[:2])
-        points.append((kind, place - start, height, float(element.get("length") or 0.0) * scale))
+        place, height = (_number(v) * scale for v in element.text.split()[:2])
+        points.append((kind, place - start, height, _number(element.get("length") or 0.0) * scale))
+    if any(b[1] <= a[1] for a, b in pairwise(points)):
+        raise InputFileError(path, "the stations of a profile do not rise from one PVI to the next; put them in order")
     elements: list[ProfileElement] = []
     grades = [(b[2] - a[2]) / (b[1] - a[1]) for a, b in pairwise(points)]
     at = points[0][1]
@@ -213,14 +246,14 @@ def _landxml_cant(cant: Any, scale: float, start: float) -> tuple[list[CantEleme
 
     Without a name the outer rail is raised and the inner one stays at the profile, as track is built. A ramp runs by
     the transition type of the station that it begins at, linearly without one. The applied cant is in millimetres, in
-    inches where lengths are in feet (LandXML 1.2), in metres in InfraModel.
+    inches where lengths are imperial (LandXML 1.2), in metres in InfraModel.
     """
     if cant is None:
         return [], ()
     lowered = {"center": 0.5, "outsideRail": 1.0}.get(cant.get("rotationPoint", "insideRail"), 0.0)
     found = list(cant.iterfind("{*}CantStation"))
-    applied = np.array([float(element.get("appliedCant")) for element in found])
-    unit = 25.4e-3 if 0.3 < scale < 0.31 else 1e-3
+    applied = np.array([_number(element.get("appliedCant")) for element in found])
+    unit = 1e-3 if scale in _METRIC else 25.4e-3
     notes: tuple[str, ...] = ()
     if 0.0 < np.abs(applied).max(initial=0.0) < 1.0:
         unit = scale
@@ -232,7 +265,7 @@ def _landxml_cant(cant: Any, scale: float, start: float) -> tuple[list[CantEleme
         # clockwise is a curve to the right: the left rail is the outer one
         outer, inner = value * (1.0 - lowered), -value * lowered
         rails = (outer, inner) if element.get("curvature") == "cw" else (inner, outer)
-        stations.append((float(element.get("station")) * scale - start, rails))
+        stations.append((_number(element.get("station")) * scale - start, rails))
         laws.append(_SPIRALS[element.get("transitionType", "clothoid")])
     elements = [
         CantElement(start_m=a[0], length_m=b[0] - a[0], left_m=(a[1][0], b[1][0]), right_m=(a[1][1], b[1][1]), law=law)
@@ -246,23 +279,32 @@ def _landxml_cant(cant: Any, scale: float, start: float) -> tuple[list[CantEleme
 
 
 def _railml(path: str, root: Any, reading: MapReading) -> list[Segment]:
-    system = root.find(".//{*}geometricPositioningSystem")
-    definition = system.get("crsDefinition") if system is not None else None
-    named = definition.replace("urn:ogc:def:crs:", "").replace("::", ":") if definition else None
-    reading = replace(reading, crs=used_crs(path, reading.crs, named))
+    systems = {s.get("id"): s.get("crsDefinition") for s in root.iterfind(".//{*}geometricPositioningSystem")}
     segments = []
     for element in root.iterfind(".//{*}netElement"):
-        points: list[tuple[float, list[float]]] = []
-        for intrinsic in element.iterfind(".//{*}intrinsicCoordinate"):
-            place = intrinsic.find("{*}geometricCoordinate")
-            if place is not None:
-                xyz = [float(place.get(k)) for k in "xyz" if place.get(k) is not None]
-                points.append((float(intrinsic.get("intrinsicCoord")), xyz))
-        if len(points) < 2:
+        found = [(i, i.find("{*}geometricCoordinate")) for i in element.iterfind(".//{*}intrinsicCoordinate")]
+        found = [(intrinsic, place) for intrinsic, place in found if place is not None]
+        if len(found) < 2:
             continue
-        size = min(len(xyz) for _, xyz in points)
-        ordered = np.array([xyz[:size] for _, xyz in sorted(points, key=lambda p: p[0])])
-        segments.append(plan_segment(ordered, reading, path=path, name=str(element.get("id"))))
+        name, used = str(element.get("id")), {place.get("positioningSystemRef") for _, place in found}
+        if len(used) > 1:
+            raise InputFileError(path, f"netElement {name!r} has coordinates of {len(used)} systems; give it in one")
+        try:
+            rows = [
+                [_number(i.get("intrinsicCoord")), *(_number(p.get(k)) for k in "xy"), _number(p.get("z", "0"))]
+                for i, p in found
+            ]
+        except (TypeError, ValueError):
+            raise InputFileError(
+                path, f"netElement {name!r}: a coordinate lacks a number that railML 3 has, or it is none"
+            ) from None
+        points = np.array(sorted(rows))[:, 1:]
+        if any(place.get("z") is None for _, place in found):
+            points = points[:, :2]
+        definition = systems.get(used.pop(), next(iter(systems.values()), None))
+        named = definition.replace("urn:ogc:def:crs:", "").replace("::", ":") if definition else None
+        of_element = replace(reading, crs=used_crs(path, reading.crs, named))
+        segments.append(plan_segment(points, of_element, path=path, name=name))
     if not segments:
         raise InputFileError(path, "no netElement of this railML file has geometric coordinates; railML 3 was expected")
     return segments
