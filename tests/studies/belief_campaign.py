@@ -4,7 +4,8 @@
 tests/studies/belief_campaign.py FOLDER ...`` runs folders with a ``case.toml`` that names ``log``, ``nav``, ``track``
 and ``truth`` (a track map and a reference as ``railfix evaluate`` reads them); shipped scenarios of the simulator by
 their names (``city``, ``commercial-run``) at 1 Hz, with the sensors on board that they have. Every trial is the
-pipeline with its defaults from a cold start; ``--mask`` changes the elevation mask, ``--set`` a setting of the filter.
+pipeline with its defaults from a cold start; ``--mask`` changes the elevation mask, ``--set`` a setting of the filter,
+``--thin N`` takes every N-th epoch of a log, as a receiver with a longer interval would have written it.
 
 Whole recordings first (``--whole``), then a cold start every ``--every`` seconds, ``--length`` seconds each; with
 ``--faults`` instead faults of one satellite, one constellation, all Dopplers, all phases, a step of all codes, the map,
@@ -70,13 +71,17 @@ class Case:
     reference_arc_m: np.ndarray
     sensors: SensorSamples | None = None
 
-    def part(self, first: int, end: int) -> Case:
-        """Some epochs of it."""
+    def part(self, first: int, end: int, step: int = 1) -> Case:
+        """Some epochs of it, every `step`-th; what was lost between them is kept."""
+        observations = self.observations[first:end]
+        since = np.maximum(np.arange(0, len(observations.time), step) - step + 1, 0)
+        lost = np.bitwise_or.reduceat(observations.loss_of_lock, since, axis=0)
+        broken = np.logical_or.reduceat(observations.break_before, since)
         return replace(
             self,
-            observations=self.observations[first:end],
-            reference_ecef_m=self.reference_ecef_m[first:end],
-            reference_arc_m=self.reference_arc_m[first:end],
+            observations=replace(observations[::step], loss_of_lock=lost, break_before=broken),
+            reference_ecef_m=self.reference_ecef_m[first:end:step],
+            reference_arc_m=self.reference_arc_m[first:end:step],
         )
 
 
@@ -520,6 +525,7 @@ def main() -> int:
     parser.add_argument("--every", type=float, default=10.0)
     parser.add_argument("--length", type=float, default=150.0)
     parser.add_argument("--mask", type=float, nargs="*", default=[20.0])
+    parser.add_argument("--thin", type=int, default=1)
     parser.add_argument("--set", dest="sets", nargs="*", default=[], help="settings of the filter, name=value")
     parser.add_argument("--faults", action="store_true")
     parser.add_argument("--fault-every", type=float, default=90.0)
@@ -539,6 +545,7 @@ def main() -> int:
             case = known[name]()
         else:
             case = simulated(name) if name in shipped_scenarios() else case_of_folder(Path(name))
+        case = case.part(0, len(case.observations.time), args.thin) if args.thin > 1 else case
         if args.whole:
             show_whole(case, args)
         if args.faults:

@@ -145,11 +145,18 @@ def test_the_bound_of_an_epoch_between_by_hand() -> None:
     np.testing.assert_allclose(levels.amount_m, [7.0 + 0.02 * 2.0, 7.0 + 0.02 * 3.0, np.nan], rtol=0, atol=1e-9)
     np.testing.assert_array_equal(levels.level_noise_m, [3.0, 3.0, np.nan])
     assert after.time == state.time
-    # in doubt the separation, 2 m, is in the standard deviation
-    for own, sigma in ((TrackStatus.TRACKING, 1.5), (TrackStatus.DOUBTFUL, 2.5)):
-        found = replace(found, status=np.full(3, own, dtype=np.int8), sigma_m=np.full(3, 1.5))
+    # in doubt the separation, 2 m, is in the standard deviation; without a level what is beyond three of them
+    branches = TrackStatus.SEVERAL_BRANCHES
+    for own, before, after_m in (
+        (TrackStatus.TRACKING, 1.5, 1.5),
+        (TrackStatus.TRACKING, 0.1, 0.1),
+        (TrackStatus.DOUBTFUL, 1.5, 2.5),
+        (branches, 1.5, 1.5),
+        (branches, 0.1, np.sqrt(0.1**2 + 2.0**2 - 0.3**2)),
+    ):
+        found = replace(found, status=np.full(3, own, dtype=np.int8), sigma_m=np.full(3, before))
         told, _ = carried_levels(found, epochs, none, Tracked.empty(epochs.time[:0], 10), case.line, state, LIMITS)
-        np.testing.assert_allclose(told.sigma_m[:2], sigma)
+        np.testing.assert_allclose(told.sigma_m[:2], after_m)
 
 
 @pytest.mark.requirement("C2")

@@ -80,14 +80,15 @@ def judged(
     places: np.ndarray,
     branch_s: float,
     branch_m: float,
+    dt: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Probabilities after a second of evidence for branches at places, and the part of them by codes."""
+    """Probabilities after an epoch's evidence for branches at places, and the part of them by codes."""
     count = len(places)
     held = memory(np.zeros(count), np.ones(count), log_probability, BRANCH_S=branch_s, BRANCH_M=branch_m)
     held.log_code[:] = log_code
     work = work_space(count)
     work.evidence[:count], work.code_evidence[:count], work.places[:count] = motion, code, places
-    plain("tracking.branches").judge(parameters(TrackingLimits()), held, work, count, 1.0)
+    plain("tracking.branches").judge(parameters(TrackingLimits()), held, work, count, dt)
     return held.log_probability, held.log_code
 
 
@@ -126,6 +127,22 @@ def test_motion_decides_by_the_distance_travelled_and_a_burst_of_it_counts_littl
     assert _after(900, -2.0, 0.0, speed_mps=0.0)[3] == 0.0
     assert _after(2, -1e3, 0.0, speed_mps=100.0)[3] == pytest.approx(-5.0, abs=0.01)
     assert _after(60, -2.0, 0.0)[2] < -15.0
+
+
+@pytest.mark.requirement("C6")
+@pytest.mark.parametrize("motion", [-2.0, -1e3])
+def test_evidence_of_motion_counts_once_a_second_at_any_rate_and_a_long_epoch_once(motion: float) -> None:
+    near, far = np.zeros(2), np.array([[0.0, 0.0, 0.0], [300.0, 0.0, 0.0]])
+
+    def odds(epochs: int, dt: float) -> float:
+        probability = code = near
+        for _ in range(epochs):
+            probability, code = judged(probability, code, np.array([0.0, motion]), near, far, 60.0, 600.0, dt)
+        return float(probability[1] - probability[0])
+
+    assert odds(1, 1.0) == pytest.approx(max(motion, -5.0), abs=0.01)
+    assert odds(10, 0.1) == pytest.approx(odds(1, 1.0), abs=0.01)
+    assert odds(1, 5.0) == pytest.approx(odds(1, 1.0), abs=0.01)
 
 
 @pytest.mark.requirement("C6")

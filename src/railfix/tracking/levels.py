@@ -27,6 +27,8 @@ from railfix.tracking.result import Tracked, TrackStatus, is_bounded
 from railfix.tracking.state import TrackState
 from railfix.tracking.thinned import AccumulatedIncrement, thinned
 
+#: A sub-filter this many standard deviations off is explained by them where a place has no level.
+_EXPLAINED: Final = 3.0
 _KEPT: Final = (
     "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m", "amount_m",
     "status",
@@ -127,9 +129,12 @@ def carried_levels(
     level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
     amount = np.fmax(level, amount + SCALE_BOUND * np.abs(speed) * tau)
     told = _status(tracked.status, status, level)
-    # In doubt the sub-filter furthest off may be the one that is right.
+    # In doubt the sub-filter furthest off may be the one that is right; without a level one that the standard deviation
+    # does not explain.
     doubt = (told == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
-    spread = np.where(doubt, np.nan_to_num(separation), 0.0)
+    unexplained = np.where(is_bounded(told), np.inf, _EXPLAINED * tracked.sigma_m)
+    apart = np.nan_to_num(separation)
+    spread = np.where(doubt, apart, np.sqrt(np.maximum(apart**2 - unexplained**2, 0.0)))
     tracked = replace(
         tracked,
         status=told,

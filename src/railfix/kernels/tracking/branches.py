@@ -41,8 +41,8 @@ def judge(parameters: Parameters, state: KernelState, work: Work, count: int, dt
     With d the distance of a branch from the most probable one, the difference of the evidence counts by
     ``d^2 / (d^2 + map_branch_m^2)``: branches within the error of the map differ in their ranges at every epoch alike.
 
-    Motion (Dopplers, phases, sensors) has errors of seconds: it counts in full, `MOST_MOTION` a second at most, and
-    its odds go no further than ``d^2 / (2 s^2)`` with s^2 = 2 (map_branch_m / 3)^2, nor than one for `MOTION_M` of
+    Motion (Dopplers, phases, sensors) has errors of seconds: at any rate of epochs that of a second counts once, an
+    epoch `MOST_MOTION` at most, and its odds go no further than ``d^2 / (2 s^2)`` with s^2 = 2 (map_branch_m / 3)^2, nor than one for `MOTION_M` of
     travel.
 
     Codes have errors in common to all satellites of one side of a street, for minutes. Their odds go no further than
@@ -58,7 +58,8 @@ def judge(parameters: Parameters, state: KernelState, work: Work, count: int, dt
         if log_probability[h] > log_probability[best]:
             best = h
     first, first_code = log_probability[best], log_code[best]
-    most = MOST_MOTION * max(dt, 1.0)
+    of_second = min(dt, 1.0)
+    most = MOST_MOTION * of_second
     for h in range(count):
         square = 0.0
         for c in range(3):
@@ -66,7 +67,7 @@ def judge(parameters: Parameters, state: KernelState, work: Work, count: int, dt
         part = square / (square + parameters.map_branch_m**2)
         odds = log_probability[h] - log_code[h] - (first - first_code)
         reach = min(MOST_ODDS * square / parameters.map_branch_m**2, travel / MOTION_M)
-        gained = min(max(work.evidence[h] - work.evidence[best], -most), most)
+        gained = min(max(of_second * (work.evidence[h] - work.evidence[best]), -most), most)
         motion = min(max(odds + part * gained, min(odds, -reach)), max(odds, reach))
         odds = log_code[h] - first_code
         reach = independent * square / (2.0 * parameters.code_common_m**2)

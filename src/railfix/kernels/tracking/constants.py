@@ -107,7 +107,7 @@ SPEED_SIGMAS: Final = 4.0
 SWITCH: Final = 3.0
 #: Logarithm of the odds that a difference of one `map_branch_m` can give: 1 / (2 s^2) with s^2 = 2 (1/3)^2.
 MOST_ODDS: Final = 2.25
-#: Largest logarithm of the odds that motion gives in a second: more is a reflection.
+#: Largest logarithm of the odds that motion gives in a second, or in an epoch: more is a reflection.
 MOST_MOTION: Final = 5.0
 #: A hypothesis that leads although its probability was below this within the last seconds (its least logarithm rises
 #: by `LEAST_RISE` a second) has taken over from others that all failed: places are sought again. Not within the first
