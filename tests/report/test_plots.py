@@ -16,7 +16,7 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.reasons import Reason
 from railfix.integrity.stanford import stanford as sorted_epochs
 from railfix.report import plots
-from railfix.report.plots.chart import Band, Bars, Cells, Chart, Line, Marks, Points, RangeBars, SkyEpochs
+from railfix.report.plots.chart import Band, Bars, Cells, Chart, Curve, Marks, Points, RangeBars, SkyEpochs
 from railfix.report.plots.columns import nice_step
 from railfix.report.plots.thinning import extremes, one_per_cell, spread
 from railfix.screens import Cn0Limits
@@ -105,7 +105,7 @@ def test_errors_are_drawn_where_they_are_known_and_the_reference_is_good(errors:
         known = np.isfinite(band.high)
         np.testing.assert_array_equal(band.high[known], [1.0, 1.1, 1.2, 1.3])
         np.testing.assert_array_equal(band.low, -band.high)
-        level = layer(chart, Line, "± protection level")
+        level = layer(chart, Curve, "± protection level")
         assert set(level.y[np.isfinite(level.y)]) == {5.0, 1.5, 6.0}
     assert "60.0 % of the epochs" in over_time.caption
 
@@ -215,7 +215,7 @@ def test_plan_in_metres(positions: pl.DataFrame) -> None:
     np.testing.assert_allclose(good.x, 0.0, atol=0.01)
     np.testing.assert_allclose(layer(chart, Points, "uncertain (1)").y, 0.0, atol=0.01)
     np.testing.assert_allclose(layer(chart, Points, "conventional").x, 5.0, atol=0.01)
-    np.testing.assert_allclose(layer(chart, Line).y, [-20.0, -10.0, 0.0, 10.0, 20.0], atol=0.01)
+    np.testing.assert_allclose(layer(chart, Curve).y, [-20.0, -10.0, 0.0, 10.0, 20.0], atol=0.01)
     assert set(layer(chart, Marks).words) <= {f"{k:,} m" for k in range(1000, 1041)}
     sized = plots.plan(positions, error_m=np.array([0.1, -1.5, 3.0, np.nan, -80.0]))
     counts = {one.label for one in sized.layers if isinstance(one, Points)}
@@ -338,7 +338,7 @@ def test_the_line_is_drawn_in_the_tunnel_over_its_background(positions: pl.DataF
         tunnels_m=[(15.0, 25.0)],
         background=[street, street + 10.0],
     )
-    line, tunnel, below = (layer(chart, Line, name) for name in ("line", "tunnel", "background"))
+    line, tunnel, below = (layer(chart, Curve, name) for name in ("line", "tunnel", "background"))
     assert np.isfinite(line.y).all()
     assert np.ptp(line.y) == pytest.approx(40.0, abs=0.2)
     np.testing.assert_allclose([tunnel.y[0], tunnel.y[-1]], [-5.0, 5.0], atol=0.1)

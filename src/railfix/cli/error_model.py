@@ -12,7 +12,7 @@ from railfix.cli.cn0_curve import place_of
 from railfix.cli.console import console_of_tables
 from railfix.cli.options import OverwriteOption, check_outputs, from_models
 from railfix.core.errors import SettingsError
-from railfix.evaluate.range_errors import ModelInputs, ReferenceStation, error_model_from_runs
+from railfix.evaluate.range_errors import ModelInputs, StationBeside, error_model_from_runs
 from railfix.ranges.error_model import (
     LARGEST_PRIOR,
     ErrorModel,
@@ -29,7 +29,7 @@ from railfix.run import read_record
 def error_model(
     *,
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders that `railfix run` wrote.")],
-    beside: ReferenceStation,
+    beside: StationBeside,
     out: Annotated[Path, typer.Option("--out", metavar="MODEL.toml", help="Error model to write.")],
     fit: ErrorModelFit,
     overwrite: OverwriteOption = False,

@@ -29,7 +29,7 @@ from railfix.run.inputs import RunInputs
 from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
-from railfix.run.record import Provenance, package_versions, run_record
+from railfix.run.record import RunProvenance, package_versions, run_record
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS, ScreenSetup
 from railfix.track.trajectory import Trajectory
@@ -223,7 +223,7 @@ def ablate_files(
         threshold = config.map_offset.note_threshold
         notes = (*left_out, *notes_of(line, navigation, tallies[ALL], logs, note_statistic=threshold))
         wall = clock.perf_counter() - began
-        made_from = Provenance(
+        made_from = RunProvenance(
             files=[entry.result() for entry in entries],
             packages=package_versions(),
             asked=asked or {},

@@ -165,7 +165,7 @@ class Evaluation:
 
 
 @dataclass(kw_only=True)
-class _Part:
+class _EvaluatedPart:
     """One run with its reference and the epochs of each antenna; `facts` are of each antenna, see `EvaluatedRun`.
 
     Its folder has no rows, `level` is the kind and the alarm limit of its protection levels.
@@ -278,7 +278,7 @@ def _part(
     sections: Path | None,
     files: TrackFiles,
     options: EvaluationOptions,
-) -> _Part:
+) -> _EvaluatedPart:
     """Epochs of one run; a reference that was read is kept in `read`."""
     folder = read_run(item.run, table=item.table, conventional=item.conventional, columns=_COLUMNS)
     kind = folder.level_kind if "protection_level_m" in folder.positions.columns else None
@@ -331,7 +331,7 @@ def _part(
     if folder.level_kind is not None and not stated:
         notes.append("the run has no protection_status: levels are taken as usable where the status is ok")
     more = [note for antenna in antennas.values() for note in antenna.errors.notes]
-    return _Part(
+    return _EvaluatedPart(
         folder=replace(folder, positions=folder.positions.clear()),
         level=None if kind is None else (kind, folder.alarm_limit_m),
         reference=source,
@@ -401,7 +401,7 @@ def short_names(paths: Sequence[Path]) -> list[str]:
     return ["/".join(part[-depth:]) for part in parts]
 
 
-def _evaluate(part: _Part, name: str, label: str) -> EvaluatedRun:
+def _evaluate(part: _EvaluatedPart, name: str, label: str) -> EvaluatedRun:
     return EvaluatedRun(
         name=name,
         configuration=label,

@@ -33,7 +33,7 @@ def _freeze(table: Any, length: int) -> None:
     freeze_arrays(table)
 
 
-class _Records(FrozenArrays, NotebookTable):
+class _NavigationRecords(FrozenArrays, NotebookTable):
     """Length, text and freezing of broadcast records."""
 
     satellite: Strings
@@ -50,7 +50,7 @@ class _Records(FrozenArrays, NotebookTable):
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class KeplerRecords(_Records):
+class KeplerRecords(_NavigationRecords):
     """Keplerian records of GPS, QZSS, Galileo and BeiDou, n rows.
 
     Attributes
@@ -128,7 +128,7 @@ class KeplerRecords(_Records):
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class GlonassRecords(_Records):
+class GlonassRecords(_NavigationRecords):
     """State-vector records of GLONASS, n rows.
 
     Attributes

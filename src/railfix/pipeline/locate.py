@@ -48,7 +48,7 @@ class Located:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AntennaRanges:
+class UncorrectedRanges:
     """Corrected ranges of one antenna seen from an approximate place, T epochs by K channels.
 
     Attributes
@@ -70,7 +70,7 @@ class AntennaRanges:
     place_ecef_m: Floats
 
 
-def antenna_ranges(obs: Observations, received: Received, config: Config, book: ChannelBook) -> AntennaRanges:
+def uncorrected_ranges(obs: Observations, received: Received, config: Config, book: ChannelBook) -> UncorrectedRanges:
     """Corrected ranges of one antenna without a track: the approximate place is that of the codes alone.
 
     Parameters
@@ -110,7 +110,7 @@ def antenna_ranges(obs: Observations, received: Received, config: Config, book: 
     sigma = np.hypot(sigma, config.nominal.stated_m(states.accuracy_m))
     usable &= seen.elevation_deg >= config.elevation.mask_deg
     ranges = usable_ranges(states, clean, 1.0 / sigma**2, np.where(usable, 0, 1), channels.groups)
-    return AntennaRanges(
+    return UncorrectedRanges(
         channels=channels,
         ranges=ranges,
         states=states,
@@ -126,16 +126,16 @@ def locate(obs: Observations, received: Received, config: Config, book: ChannelB
     Parameters
     ----------
     obs, received, config, book
-        As for `antenna_ranges`.
+        As for `uncorrected_ranges`.
 
     Returns
     -------
     Located
     """
-    return locate_ranges(obs.time, antenna_ranges(obs, received, config, book), config)
+    return locate_ranges(obs.time, uncorrected_ranges(obs, received, config, book), config)
 
 
-def locate_ranges(time: Datetimes, seen: AntennaRanges, config: Config) -> Located:
+def locate_ranges(time: Datetimes, seen: UncorrectedRanges, config: Config) -> Located:
     """Compute the conventional position of every epoch from corrected ranges; see `locate`."""
     ranges = seen.ranges
     start = np.where(np.isnan(seen.place_ecef_m), _below(ranges), seen.place_ecef_m)

@@ -14,7 +14,7 @@ from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.locate import AntennaRanges, antenna_ranges, locate_ranges
+from railfix.pipeline.locate import UncorrectedRanges, locate_ranges, uncorrected_ranges
 from railfix.pipeline.received import Received
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, thinned_rows
@@ -86,7 +86,7 @@ def survey_epochs(
     A range changes by the carrier phase where it goes on without a slip at every epoch between, else by the mean of
     the Dopplers at both ends.
     """
-    seen = antenna_ranges(obs, received, config, book)
+    seen = uncorrected_ranges(obs, received, config, book)
     located = locate_ranges(obs.time, seen, config)
     slips, after = find_slips(obs, slip_state, frequency_hz=seen.channels.every_frequency_hz, limits=config.slips)
     columns = seen.channels.columns
@@ -110,8 +110,8 @@ def survey_epochs(
 
 
 def _signals(
-    seen: AntennaRanges, time: Datetimes, rows: Indices, usable: Masks, phase: Floats, rate: Floats, broken: Indices,
-    cn0_dbhz: Floats, limits: SurveyLimits, config: Config,
+    seen: UncorrectedRanges, time: Datetimes, rows: Indices, usable: Masks, phase: Floats, rate: Floats,
+    broken: Indices, cn0_dbhz: Floats, limits: SurveyLimits, config: Config,
 ) -> RunSignals:  # fmt: skip
     weak = 10.0 ** ((45.0 - np.where(np.isnan(cn0_dbhz), 45.0, np.minimum(cn0_dbhz, 50.0))) / 10.0)
     used, position, weak = usable[rows], seen.states.position_ecef_m[rows], weak[rows]

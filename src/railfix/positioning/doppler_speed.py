@@ -259,7 +259,7 @@ def _equations(dopplers: Dopplers, ecef_m: Floats, tangent: Floats) -> tuple[Flo
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Fit:
+class _SpeedFit:
     """Speed, drift and variance of the speed (unscaled), residuals, and those over their standard deviation."""
 
     speed: Floats
@@ -270,7 +270,7 @@ class _Fit:
     wsse: Floats
 
 
-def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _Fit:
+def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _SpeedFit:
     weight = np.where(used, 1.0 / sigma**2, 0.0)
     one, h, hh = weight.sum(axis=1), (weight * slope).sum(axis=1), (weight * slope**2).sum(axis=1)
     y, hy = (weight * measured).sum(axis=1), (weight * slope * measured).sum(axis=1)
@@ -283,7 +283,7 @@ def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _Fit:
     own = sigma**2 - np.where(used, fitted, -fitted)
     with np.errstate(invalid="ignore"):
         normalised = residual / np.sqrt(np.where(own > 1e-6 * sigma**2, own, np.nan))
-    return _Fit(
+    return _SpeedFit(
         speed=speed,
         drift=drift,
         variance=one / determinant,
@@ -295,7 +295,7 @@ def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _Fit:
 
 def _without_outliers(
     measured: Floats, slope: Floats, sigma: Floats, offered: Masks, scale: float, limits: DopplerSpeedLimits
-) -> tuple[Masks, _Fit]:
+) -> tuple[Masks, _SpeedFit]:
     """Leave out the worst Doppler of every epoch that has one, until none does."""
     used = offered.copy()
     fit = _fit(measured, slope, sigma, used)

@@ -163,7 +163,7 @@ class SearchIndex:
 
 
 @dataclass
-class _Candidates:
+class _SectionCandidates:
     """Points looked at, sorted by epoch and point, with q and its slope there; n epochs, p points.
 
     Attributes
@@ -216,7 +216,7 @@ def search(
     epochs = len(ranges)
     weight_norm = np.sqrt(ranges.weight.sum(axis=1))
     freedom = np.maximum(ranges.n_used - ranges.n_clocks - 1, 1)
-    candidates: list[_Candidates] = []
+    candidates: list[_SectionCandidates] = []
     evaluations = np.zeros(epochs, dtype=np.int64)
 
     radius = _ball(index, point, weight_norm, freedom, limits)
@@ -264,7 +264,7 @@ def _in_ball(
     weight_norm: Floats,
     epochs: Indices,
     radius: Floats,
-) -> _Candidates:
+) -> _SectionCandidates:
     """Points in the ball of each epoch with q from the quadratic form; exact where that leaves a choice."""
     count, vertex, q, half_gradient, unsure = kernels.search.points_in_balls(
         index.trajectory.ecef_m,
@@ -279,7 +279,7 @@ def _in_ball(
         raise AssertionError(f"an empty ball at epochs {epochs[count == 0]}: the radius is below the nearest point")
     if unsure.any():
         q[unsure] = fit(ranges, index.trajectory.ecef_m[vertex[unsure]], np.repeat(epochs, count)[unsure])
-    return _Candidates(epochs, count, vertex, q, half_gradient, point.matrix, np.repeat(epochs, count))
+    return _SectionCandidates(epochs, count, vertex, q, half_gradient, point.matrix, np.repeat(epochs, count))
 
 
 def _coarse_to_fine(
@@ -289,7 +289,7 @@ def _coarse_to_fine(
     freedom: Integers,
     limits: SectionLimits,
     epochs: Indices,
-) -> tuple[_Candidates, Integers]:
+) -> tuple[_SectionCandidates, Integers]:
     """Return the points that fit as well as noise allows, by dropping stretches of line that fit too badly."""
     points = index.trajectory.ecef_m
     upper = np.full(len(ranges), np.inf)
@@ -317,12 +317,14 @@ def _coarse_to_fine(
     equations = normal_equations(ranges.take(epoch), points[node])
     count = np.bincount(epoch, minlength=len(ranges))[epochs]
     found, every = count > 0, np.arange(len(epoch))
-    return _Candidates(epochs[found], count[found], node, q, -equations.vector, equations.matrix, every), tried[epochs]
+    return _SectionCandidates(epochs[found], count[found], node, q, -equations.vector, equations.matrix, every), tried[
+        epochs
+    ]
 
 
 def _decide(
     epochs: int,
-    parts: list[_Candidates],
+    parts: list[_SectionCandidates],
     trajectory: Trajectory,
     freedom: Integers,
     limits: SectionLimits,

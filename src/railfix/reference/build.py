@@ -95,10 +95,10 @@ def build_references(data: ReferenceData, settings: ReferenceSettings | None = N
             one: judge_pair(pair[0], pair[1], data.distance_m, settings),
             other: judge_pair(pair[1], pair[0], data.distance_m, settings),
         }
-    return {name: _Builder(name, data, settings).built(fixes) for name, fixes in judged.items()}
+    return {name: _ReferenceBuilder(name, data, settings).built(fixes) for name, fixes in judged.items()}
 
 
-class _Builder:
+class _ReferenceBuilder:
     """The work on one antenna."""
 
     def __init__(self, name: str, data: ReferenceData, settings: ReferenceSettings) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railfix.core.timescale import seconds
-from railfix.report.plots.chart import Band, Bars, Cells, Chart, Layer, Line, Marks, Points, RangeBars, SkyEpochs
+from railfix.report.plots.chart import Band, Bars, Cells, Chart, Curve, Layer, Marks, Points, RangeBars, SkyEpochs
 
 _EPOCH_ZERO: Final = np.datetime64("1970-01-01T00:00:00", "ns")
 #: Unknown value of an unsigned 16-bit number.
@@ -60,7 +60,7 @@ def _layer(layer: Layer) -> dict[str, Any]:
             values |= {"x": packed(layer.x), "y": packed(layer.y)}
             if layer.epoch_s is not None:
                 values["epoch"] = packed(layer.epoch_s)
-        case Line():
+        case Curve():
             values |= {"kind": "line", "width": layer.width, "dash": layer.dash}
             values |= {"x": packed(layer.x), "y": packed(layer.y)}
         case Band():

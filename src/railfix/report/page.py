@@ -53,7 +53,7 @@ class _Figure:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Part:
+class _PagePart:
     """Figures under a heading."""
 
     title: str
@@ -67,7 +67,7 @@ class _AntennaPart:
 
     name: str
     anchor: str
-    parts: Sequence[_Part]
+    parts: Sequence[_PagePart]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,9 +78,9 @@ class _RunPart:
     anchor: str
     antenna: str
     headline: Headline
-    overview: _Part
+    overview: _PagePart
     tables: Sequence[Folded]
-    timing: _Part
+    timing: _PagePart
     antennas: Sequence[_AntennaPart]
 
 
@@ -165,7 +165,7 @@ def report_page(
 def charts_page(title: str, charts: Sequence[Chart], tables: Sequence[Block]) -> str:
     """HTML of a page of charts and tables under them."""
     numbers = count()
-    figures = _Part(title="", figures=[_figure(chart, numbers) for chart in charts])
+    figures = _PagePart(title="", figures=[_figure(chart, numbers) for chart in charts])
     return _render("charts.html.j2", title, charts=figures, tables=tables)
 
 
@@ -203,10 +203,10 @@ def _summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> list
     return blocks
 
 
-def _ranges(runs: Sequence[ReportedRun], evaluation: Evaluation | None, numbers: Iterator[int]) -> _Part:
+def _ranges(runs: Sequence[ReportedRun], evaluation: Evaluation | None, numbers: Iterator[int]) -> _PagePart:
     """Range of the errors of all runs."""
     if evaluation is None:
-        return _Part(title="", figures=())
+        return _PagePart(title="", figures=())
     series = {
         f"{run.name}, {antenna}": errors
         for run in runs
@@ -214,7 +214,7 @@ def _ranges(runs: Sequence[ReportedRun], evaluation: Evaluation | None, numbers:
         if (errors := run.errors_of(antenna)) is not None
     }
     chart = error_ranges(series)
-    return _Part(title="", figures=() if chart.empty else (_figure(chart, numbers),))
+    return _PagePart(title="", figures=() if chart.empty else (_figure(chart, numbers),))
 
 
 def _run(
@@ -263,9 +263,9 @@ def _run(
     )
 
 
-def _part(group: Group, numbers: Iterator[int], sky: str, anchor: str, *, width: str = "") -> _Part:
+def _part(group: Group, numbers: Iterator[int], sky: str, anchor: str, *, width: str = "") -> _PagePart:
     figures = [_figure(chart, numbers, group=group, sky=sky, anchor=anchor, width=width) for chart in group.charts]
-    return _Part(title=group.title, figures=figures, absent=group.absent)
+    return _PagePart(title=group.title, figures=figures, absent=group.absent)
 
 
 def _figure(

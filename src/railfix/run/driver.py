@@ -30,7 +30,7 @@ from railfix.run.inputs import Antenna, RunInputs
 from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
-from railfix.run.record import AlongSigma, Figures, Filtered, Levels, Provenance, package_versions, run_record
+from railfix.run.record import AlongSigma, Figures, Filtered, Levels, RunProvenance, package_versions, run_record
 from railfix.run.result_rows import Replays, ResultRows, add_smoothed
 from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sensors import check_filter, read_sensors, units_of_ranges
@@ -153,7 +153,7 @@ def run_files(
         folder.end_parquet(_footer(sources, notes))
         figures = Figures.of(folder, tally, config)
         wall = clock.perf_counter() - began
-        made_from = Provenance(
+        made_from = RunProvenance(
             files=sources, packages=packages.result(), asked=asked or {}, config=config, options=options,
             line=line.facts, navigation=navigation,
         )  # fmt: skip
@@ -429,7 +429,7 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
 
 
 def _footer(files: Iterable[Mapping[str, Any]], notes: Iterable[str]) -> dict[str, str]:
-    """Provenance in short, for the footer of the Parquet files."""
+    """RunProvenance in short, for the footer of the Parquet files."""
     return {
         "railfix": __version__,
         "command": " ".join(sys.argv),

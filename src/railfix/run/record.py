@@ -121,7 +121,7 @@ def _one_by_one(rows: pl.LazyFrame, figures: Mapping[str, pl.Expr]) -> dict[str,
 
 
 @dataclass(frozen=True, kw_only=True)
-class Provenance:
+class RunProvenance:
     """What a run was made from.
 
     Attributes
@@ -173,7 +173,7 @@ class Figures:
 
 
 def run_record(
-    made_from: Provenance, tally: Tally, notes: Sequence[str], *, wall_s: float, figures: Figures | None = None
+    made_from: RunProvenance, tally: Tally, notes: Sequence[str], *, wall_s: float, figures: Figures | None = None
 ) -> dict[str, Any]:
     """Return the content of ``run.json`` as plain values."""
     figures = figures or Figures()

@@ -16,7 +16,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.locate import AntennaRanges, antenna_ranges, locate
+from railfix.pipeline.locate import UncorrectedRanges, locate, uncorrected_ranges
 from railfix.pipeline.received import known_from_start
 from railfix.positioning.standstill_phase import MeanPhases
 from railfix.positioning.which_track import StandstillErrors, StandstillFix, standstill_fix
@@ -101,7 +101,7 @@ def standstill_codes(
     MismatchError: the antenna moves, its log has no place, or it shares no epoch or satellite with the base station.
     """
     received, book = known_from_start(config, navigation=navigation), ChannelBook(config)
-    seen = antenna_ranges(obs, received, config, book)
+    seen = uncorrected_ranges(obs, received, config, book)
     places = locate(obs, received, config, book).ecef_m
     places = places[np.isfinite(places[:, 0])]
     if len(places) < 2:
@@ -119,7 +119,7 @@ def standstill_codes(
     elevation = np.nanmedian(seen.elevation_deg, axis=0)
     nominal = np.hypot(config.nominal.sigma_m(elevation), received.ionosphere_sigma_m * thin_shell_obliquity(elevation))
     if base is not None:
-        other = antenna_ranges(base.observations, received, config, book)
+        other = uncorrected_ranges(base.observations, received, config, book)
         mine, its = _common_epochs(obs, base.observations)
         columns, opposite = _common_channels(seen, other)
         time = obs.time[mine]
@@ -150,7 +150,7 @@ def standstill_codes(
     )
 
 
-def _residual(seen: AntennaRanges, origin_ecef_m: Floats) -> Floats:
+def _residual(seen: UncorrectedRanges, origin_ecef_m: Floats) -> Floats:
     """Observed minus computed codes at a place, the Earth's rotation in transit included; NaN where unused."""
     ranges = seen.ranges
     computed, _ = range_with_rotation(ranges.sat_ecef_m, origin_ecef_m)
@@ -167,7 +167,7 @@ def _common_epochs(obs: Observations, other: Observations) -> tuple[Indices, Ind
     return mine, its
 
 
-def _common_channels(seen: AntennaRanges, other: AntennaRanges) -> tuple[Indices, Indices]:
+def _common_channels(seen: UncorrectedRanges, other: UncorrectedRanges) -> tuple[Indices, Indices]:
     """Channels of two receivers with the same satellites and signals."""
     names = [list(zip(s.channels.satellite.tolist(), s.channels.signal.tolist(), strict=True)) for s in (seen, other)]
     shared = [name for name in names[0] if name in names[1]]
@@ -250,7 +250,7 @@ def _longest_part(values: Floats, lost: Masks, slip: float) -> slice:
 
 
 #: Log, corrected ranges, place, and the epochs and channels to take of it.
-_Side = tuple[Observations, AntennaRanges, Floats, Indices, Indices]
+_Side = tuple[Observations, UncorrectedRanges, Floats, Indices, Indices]
 
 
 def _phases(train: _Side, base: _Side) -> StandstillPhases:

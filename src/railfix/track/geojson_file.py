@@ -31,7 +31,7 @@ RELATION: Final = "netelementA"
 _MEMBERS: Final = ("height_datum", "geoid", "name", "sigma_plan_m", "sigma_height_m")
 
 
-def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any]) -> Iterator[_Line]:
+def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any]) -> Iterator[_GeojsonLine]:
     """Yield every LineString below a GeoJSON object, with the members that apply to it."""
     kind = node.get("type")
     own = {key: node[key] for key in _MEMBERS if key in node}
@@ -56,14 +56,14 @@ def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any
         stated = {key: value for key, value in properties.items() if value is not None}
         yield from _lines(path, geometry, label, inherited | own | stated)
     elif kind == "LineString":
-        yield _Line(path, label, node.get("coordinates"), inherited | own, -1)
+        yield _GeojsonLine(path, label, node.get("coordinates"), inherited | own, -1)
     elif kind == "MultiLineString":
         parts = node.get("coordinates")
         if not isinstance(parts, list) or not parts:
             raise InputFileError(path, f"{label or 'the geometry'} has no coordinates")
         for number, part in enumerate(parts):
             where = f"{label}, part {number + 1}" if label else f"part {number + 1}"
-            yield _Line(path, where, part, inherited | own, number)
+            yield _GeojsonLine(path, where, part, inherited | own, number)
     else:
         where = f"{label}: " if label else ""
         raise InputFileError(
@@ -86,7 +86,7 @@ def _identity(feature: dict[str, Any]) -> dict[str, str]:
     return {"name": name} if name else {}
 
 
-class _Line:
+class _GeojsonLine:
     """Coordinates of one LineString and the properties that apply to it."""
 
     def __init__(self, path: str, label: str, coordinates: Any, properties: dict[str, Any], part: int) -> None:
@@ -188,7 +188,7 @@ def read_geojson_segments(path: str | PathLike[str], reading: MapReading) -> lis
     return segments
 
 
-def _segment(line: _Line, crs: str, reading: MapReading) -> Segment:
+def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
     for wrong, right in misspelt(line.properties, (*OPTIONAL_COLUMNS, "geoid_m", *_MEMBERS)).items():
         if right not in line.properties:
             raise line.error(f"property {wrong!r} is unknown; is {right!r} meant?")
@@ -219,7 +219,7 @@ def _segment(line: _Line, crs: str, reading: MapReading) -> Segment:
 
 
 def _heights(
-    line: _Line, crs: str, latitude: Floats, longitude: Floats, reading: MapReading
+    line: _GeojsonLine, crs: str, latitude: Floats, longitude: Floats, reading: MapReading
 ) -> tuple[Floats, str, str]:
     """Ellipsoidal heights of a line, the geoid used, and the datum of the file."""
     stated = line.text("height_datum")

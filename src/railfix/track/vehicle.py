@@ -110,7 +110,7 @@ class Body:
     roll_rad: Floats
 
 
-class _Line:
+class _VehicleLine:
     """Centreline and roll of a bogie by cant, as functions of chainage; a closed line goes on beyond its ends."""
 
     def __init__(self, track: Track, contact_spacing_m: float) -> None:
@@ -199,7 +199,7 @@ def _turning_side(track: Track) -> Floats:
     return np.concatenate([[0.0], np.where(np.abs(turn) > 1e-5, np.sign(turn), 0.0), [0.0]])
 
 
-def _bogies(line: _Line, middle: Floats, distance_m: float, track: Track) -> tuple[Floats, Floats]:
+def _bogies(line: _VehicleLine, middle: Floats, distance_m: float, track: Track) -> tuple[Floats, Floats]:
     """Find the chainages of the bogies, symmetric about `middle`, at the bogie distance as a chord."""
     half = np.full(len(middle), distance_m / 2.0)
     active = np.arange(len(middle))
@@ -216,7 +216,7 @@ def _bogies(line: _Line, middle: Floats, distance_m: float, track: Track) -> tup
     )
 
 
-def _pose(line: _Line, track: Track, vehicle: Vehicle, middle: Floats) -> Body:
+def _pose(line: _VehicleLine, track: Track, vehicle: Vehicle, middle: Floats) -> Body:
     lower, upper = _bogies(line, middle, vehicle.bogie_distance_m, track)
     first, second = line.at(lower), line.at(upper)
     origin = (first + second) / 2.0
@@ -247,7 +247,7 @@ def _place(body: Body, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
     )
 
 
-def _abeam(line: _Line, body: Body, antenna: Floats, along_m: float) -> Floats:
+def _abeam(line: _VehicleLine, body: Body, antenna: Floats, along_m: float) -> Floats:
     """Find the chainage of the centreline point abeam the antenna: in the plane perpendicular to the body."""
     chainage = (body.lower_m + body.upper_m) / 2.0 + along_m
     for _ in range(_MAX_ITERATIONS):
@@ -258,7 +258,7 @@ def _abeam(line: _Line, body: Body, antenna: Floats, along_m: float) -> Floats:
     raise MismatchError("the line bends so sharply that no point of it is abeam the antenna")
 
 
-def _refine(line: _Line, track: Track, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
+def _refine(line: _VehicleLine, track: Track, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
     """Choose chainages of the body's middle: the points of the track, and more where the path bends between them."""
     half = _end_halves(line, track, vehicle)
     first, last = half[0], line.chainage[-1] - half[1]
@@ -288,7 +288,7 @@ def _refine(line: _Line, track: Track, vehicle: Vehicle, offset: AntennaOffset) 
         middle = np.insert(middle, at[bent] + 1, centre[bent])
 
 
-def _end_halves(line: _Line, track: Track, vehicle: Vehicle) -> tuple[float, float]:
+def _end_halves(line: _VehicleLine, track: Track, vehicle: Vehicle) -> tuple[float, float]:
     """Find the distance of the body's middle from either end at which both bogies are on the track."""
     first, last = 0.0, line.chainage[-1]
     half = np.where(line.open_ends, vehicle.bogie_distance_m / 2.0, 0.0)
@@ -348,7 +348,7 @@ def antenna_trajectory(
             f"vehicle {vehicle.name!r} has no antenna {antenna!r}; it has {', '.join(vehicle.antennas)}"
         )
     offset = vehicle.antennas[antenna]
-    line = _Line(track, vehicle.contact_spacing_m)
+    line = _VehicleLine(track, vehicle.contact_spacing_m)
     middle = _refine(line, track, vehicle, offset)
     body = _pose(line, track, vehicle, middle)
     places = _place(body, vehicle, offset)

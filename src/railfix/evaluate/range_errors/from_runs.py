@@ -40,7 +40,7 @@ from railfix.run.processor import processor_of
 OnChunk = Callable[[str, int], None]
 
 
-class ReferenceStation(Settings):
+class StationBeside(Settings):
     """Reference positions of runs, and a station beside the line, as the command line names them."""
 
     reference: tuple[Path, ...] = input_option("Reference positions, one file for each RUN in order.", metavar="FILE")

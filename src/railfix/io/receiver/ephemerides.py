@@ -90,7 +90,7 @@ def assembled(
     `time`, the last epoch before each subframe, shape (N,), resolves weeks and days; `after` is the first one after
     each, NaT where the piece has none, `first` that of the piece.
     """
-    builder = _Builder(state or Unfinished())
+    builder = _EphemerisBuilder(state or Unfinished())
     builder.waiting = {name: first if np.isnat(at) else at for name, at in builder.waiting.items()}
     after = np.full(len(time), _NEVER) if after is None else after
     pages, counts = _pages(subframes)
@@ -105,7 +105,7 @@ def assembled_rtcm(
     messages: Iterable[tuple[int, int, Mapping[str, float]]], time: Datetimes, state: Unfinished | None = None
 ) -> tuple[Assembled, Unfinished]:
     """Ephemerides of RTCM 3 messages (`rtcm.ephemeris_fields`) received at times, shape (N,), repeated ones once."""
-    builder = _Builder(state or Unfinished())
+    builder = _EphemerisBuilder(state or Unfinished())
     for (_, kind, values), at in zip(messages, time, strict=True):
         satellite = f"{_RTCM_SYSTEMS[kind]}{int(values['number']):02d}"
         if not builder.needs_date(satellite, at):
@@ -220,7 +220,7 @@ def _glonass(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, 
             yield row, k, {**values, "channel": float(part.glonass_channel[row])}
 
 
-class _Builder:
+class _EphemerisBuilder:
     """Latest subframes of all satellites, and the records they complete."""
 
     def __init__(self, state: Unfinished) -> None:

@@ -80,7 +80,7 @@ class Frames:
 
 
 @dataclass(frozen=True)
-class _Candidates:
+class _FrameCandidates:
     """Places where a frame may start, with what its header says."""
 
     name: str
@@ -162,7 +162,7 @@ def _pairs(data: Bytes, first: int, second: int) -> Indices:
     return np.flatnonzero((data[:-1] == first) & (data[1:] == second)) if len(data) > 1 else np.zeros(0, np.intp)
 
 
-def _ubx(data: Bytes) -> _Candidates:
+def _ubx(data: Bytes) -> _FrameCandidates:
     frame = _pairs(data, 0xB5, 0x62)
     length = _at(data, frame + 4) | _at(data, frame + 5) << 8
     plausible = length <= LONGEST_FRAME
@@ -178,10 +178,10 @@ def _ubx(data: Bytes) -> _Candidates:
     sum_b = double[a1] - double[a0] - (a1 - a0) * sums[a0]
     valid[complete] = (sum_a & 255 == data[a1]) & (sum_b & 255 == data[a1 + 1])
     kind = _at(data, frame + 2) << 8 | _at(data, frame + 3)
-    return _Candidates("ubx", frame, kind, start, end, end + 2, valid)
+    return _FrameCandidates("ubx", frame, kind, start, end, end + 2, valid)
 
 
-def _rtcm(data: Bytes) -> _Candidates:
+def _rtcm(data: Bytes) -> _FrameCandidates:
     frame = np.flatnonzero(data == 0xD3)
     high = _at(data, frame + 1)
     frame = frame[high < 4]
@@ -194,7 +194,7 @@ def _rtcm(data: Bytes) -> _Candidates:
     sent = data[stop].astype(np.int64) << 16 | data[stop + 1].astype(np.int64) << 8 | data[stop + 2]
     valid[complete] = crc24q(data, frame[complete], stop) == sent
     kind = _at(data, start) << 4 | _at(data, start + 1) >> 4
-    return _Candidates("rtcm3", frame, kind, start, end, end + 3, valid)
+    return _FrameCandidates("rtcm3", frame, kind, start, end, end + 3, valid)
 
 
 def _crc24_table() -> Integers:
@@ -225,7 +225,7 @@ def crc24q(data: Bytes, start: Indices, end: Indices) -> Integers:
     return crc
 
 
-def _sbf(data: Bytes) -> _Candidates:
+def _sbf(data: Bytes) -> _FrameCandidates:
     frame = _pairs(data, ord("$"), ord("@"))
     length = _at(data, frame + 6) | _at(data, frame + 7) << 8
     plausible = (length >= 8) & (length % 4 == 0) & (length <= LONGEST_FRAME)
@@ -236,10 +236,10 @@ def _sbf(data: Bytes) -> _Candidates:
         sent = int(data[frame[k] + 2]) | int(data[frame[k] + 3]) << 8
         valid[k] = binascii.crc_hqx(data[frame[k] + 4 : end[k]].tobytes(), 0) == sent
     kind = (_at(data, frame + 4) | _at(data, frame + 5) << 8) & 0x1FFF
-    return _Candidates("sbf", frame, kind, frame + 8, end, end, valid)
+    return _FrameCandidates("sbf", frame, kind, frame + 8, end, end, valid)
 
 
-def _nmea(data: Bytes, *, at_end: bool) -> _Candidates:
+def _nmea(data: Bytes, *, at_end: bool) -> _FrameCandidates:
     dollar = np.flatnonzero(data == ord("$"))
     # An address begins with a letter and a letter or digit; any other byte 36 is one of a damaged message.
     dollar = dollar[_ADDRESS[0, _at(data, dollar + 1)] & _ADDRESS[1, _at(data, dollar + 2)]]
@@ -258,7 +258,7 @@ def _nmea(data: Bytes, *, at_end: bool) -> _Candidates:
     frame_end = line_end + (_at(data, line_end) == ord("\n"))
     if not at_end:  # a sentence whose line may go on waits for the rest of it
         frame_end = np.where(line_end >= len(data), len(data) + 1, frame_end)
-    return _Candidates("nmea", frame, np.zeros(len(frame), np.int64), frame, end, frame_end, valid)
+    return _FrameCandidates("nmea", frame, np.zeros(len(frame), np.int64), frame, end, frame_end, valid)
 
 
 def _hex(digit: Bytes) -> Integers:

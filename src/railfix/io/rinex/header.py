@@ -149,13 +149,13 @@ def apply_records(
 
     Parameters are those of `parse_header`; `first_line` is the 1-based number of ``lines[0]``.
     """
-    reader = _Records(path, header, notes)
+    reader = _HeaderRecords(path, header, notes)
     for number, line in enumerate(lines, start=first_line):
         reader.read(line, number)
     return reader.finish()
 
 
-class _Records:
+class _HeaderRecords:
     """Reader of header records into a copy of a header."""
 
     def __init__(self, path: str, header: RinexHeader, notes: list[str] | None) -> None:
@@ -288,12 +288,12 @@ class _Records:
 
 
 _LAYOUT: Final = {
-    "# / TYPES OF OBSERV": _Records.types_2,
-    "SYS / # / OBS TYPES": _Records.types_3,
-    "SYS / SCALE FACTOR": _Records.scale_factor,
-    "TIME OF FIRST OBS": _Records.time_of_first,
-    "SIGNAL STRENGTH UNIT": _Records.strength_unit,
-    "GLONASS SLOT / FRQ #": _Records.glonass_slots,
+    "# / TYPES OF OBSERV": _HeaderRecords.types_2,
+    "SYS / # / OBS TYPES": _HeaderRecords.types_3,
+    "SYS / SCALE FACTOR": _HeaderRecords.scale_factor,
+    "TIME OF FIRST OBS": _HeaderRecords.time_of_first,
+    "SIGNAL STRENGTH UNIT": _HeaderRecords.strength_unit,
+    "GLONASS SLOT / FRQ #": _HeaderRecords.glonass_slots,
 }
 
 

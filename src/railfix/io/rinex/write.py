@@ -161,7 +161,7 @@ def _glonass_slots(channels: Mapping[str, int]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class _Rows:
+class _WrittenRows:
     """Satellites of one constellation, and the channel of each of their columns."""
 
     satellites: tuple[str, ...]
@@ -170,7 +170,7 @@ class _Rows:
     channel: Indices
 
 
-def _rows(piece: Observations, columns: Mapping[str, Sequence[str]]) -> list[_Rows]:
+def _rows(piece: Observations, columns: Mapping[str, Sequence[str]]) -> list[_WrittenRows]:
     names, signals = piece.satellite.tolist(), piece.signal.tolist()
     place = {key: i for i, key in enumerate(zip(names, signals, strict=True))}
     for name, signal in place:
@@ -181,7 +181,7 @@ def _rows(piece: Observations, columns: Mapping[str, Sequence[str]]) -> list[_Ro
         satellites = tuple(sorted({name for name in names if name[0] == system}))
         if satellites:
             channel = [[place.get((name, column[1:]), -1) for column in columns[system]] for name in satellites]
-            rows.append(_Rows(satellites, tuple(columns[system]), np.array(channel, dtype=np.intp)))
+            rows.append(_WrittenRows(satellites, tuple(columns[system]), np.array(channel, dtype=np.intp)))
     return rows
 
 
@@ -197,7 +197,7 @@ def _text_blocks(piece: Observations, columns: Mapping[str, Sequence[str]]) -> I
         yield np.concatenate(flat, axis=1)[np.concatenate(kept, axis=1)].tobytes()
 
 
-def _satellite_lines(part: Observations, row: _Rows) -> tuple[Bytes, Masks]:
+def _satellite_lines(part: Observations, row: _WrittenRows) -> tuple[Bytes, Masks]:
     """Format the lines of one constellation, shape (T, S, width), and flag the bytes to write."""
     epochs, satellites, width = len(part), len(row.satellites), 3 + _FIELD_WIDTH * len(row.columns) + 1
     text = np.full((epochs, satellites, width), _BLANK, dtype=np.uint8)

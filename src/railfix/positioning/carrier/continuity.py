@@ -212,7 +212,7 @@ def _consistent(
 
 
 @dataclass(frozen=True)
-class _Fit:
+class _ContinuityFit:
     """Residuals of all channels, their size in sigmas (of one kept: its own; of one not: its prediction's)."""
 
     residual: Floats
@@ -221,7 +221,7 @@ class _Fit:
     variance: Floats
 
 
-def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floats) -> _Fit:
+def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floats) -> _ContinuityFit:
     """Least squares of the kept channels of each epoch."""
     weight = kept / sigma[:, None] ** 2
     inverse = np.linalg.inv(np.matmul((design * weight[..., None]).swapaxes(1, 2), design) + prior)
@@ -233,7 +233,7 @@ def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floa
     # A channel that no other checks has no residual variance: it cannot be tested.
     checked = np.where(kept, own - spread, own + spread)
     size = np.where(checked > 0.02 * own, np.abs(residual) / np.sqrt(np.maximum(checked, 1e-12)), 0.0)
-    return _Fit(residual=residual, size=size, step=x[:, 0], variance=inverse[:, 0, 0])
+    return _ContinuityFit(residual=residual, size=size, step=x[:, 0], variance=inverse[:, 0, 0])
 
 
 def _worst_out(

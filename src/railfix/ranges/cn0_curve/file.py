@@ -58,7 +58,7 @@ class _Curve(Settings):
         return value
 
 
-class _File(Settings):
+class _CurveFile(Settings):
     """Content of the file."""
 
     format: Literal["railfix C/N0 curve 1"]
@@ -96,7 +96,7 @@ def read_cn0_curve(path: FilePath) -> Cn0Curve:
     InputFileError
         The file is missing, unreadable, no curve, or an entry of it is unknown, missing or out of range.
     """
-    file = read_model_file(_File, path, what="a C/N0 curve", format_name=FORMAT, command="railfix cn0-curve")
+    file = read_model_file(_CurveFile, path, what="a C/N0 curve", format_name=FORMAT, command="railfix cn0-curve")
     means = tuple(
         _mean(path, curve, f"curve {i + 1} ({curve.kind} {curve.signal})") for i, curve in enumerate(file.curve)
     )

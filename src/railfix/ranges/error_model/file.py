@@ -56,7 +56,7 @@ class _Columns(Settings):
     pooled: tuple[Annotated[int, Field(ge=0, lt=len(POOLED))], ...]
 
 
-class _File(Settings):
+class _ErrorModelFile(Settings):
     """Content of the file."""
 
     format: Literal["railfix error model 2"]
@@ -77,7 +77,7 @@ def write_error_model(model: ErrorModel, path: FilePath) -> None:
     OutputError
         The file cannot be written.
     """
-    file = _File(
+    file = _ErrorModelFile(
         format=FORMAT,
         covers=model.covers,
         bins=model.bins,
@@ -104,7 +104,9 @@ def read_error_model(path: FilePath) -> ErrorModel:
     InputFileError
         The file is missing, unreadable, no error model, of version 1, or an entry of it is missing or out of range.
     """
-    file = read_model_file(_File, path, what="an error model", format_name=FORMAT, command="railfix error-model")
+    file = read_model_file(
+        _ErrorModelFile, path, what="an error model", format_name=FORMAT, command="railfix error-model"
+    )
     return ErrorModel(
         bins=file.bins,
         before=_statistics(path, "before", file.before, file.bins),

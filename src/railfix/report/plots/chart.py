@@ -68,7 +68,7 @@ class Points(_Layer):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Line(_Layer):
+class Curve(_Layer):
     """A line through P points, broken where one is NaN."""
 
     x: Floats
@@ -150,7 +150,7 @@ class Marks(_Layer):
     place: Literal["beside", "on"] = "beside"
 
 
-Layer = Points | Line | Band | Bars | Cells | RangeBars | Marks
+Layer = Points | Curve | Band | Bars | Cells | RangeBars | Marks
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,8 +20,8 @@ from railfix.report.plots.chart import (
     Bars,
     Cells,
     Chart,
+    Curve,
     Layer,
-    Line,
     Marks,
     Points,
     RangeBars,
@@ -152,7 +152,7 @@ def _draw(layer: Layer, axes: Axes, chart: Chart) -> None:
     match layer:
         case Points():
             _points(layer, axes, chart)
-        case Line():
+        case Curve():
             _line(layer, axes, chart)
         case Band():
             _band(layer, axes, chart)
@@ -179,7 +179,7 @@ def _points(layer: Points, axes: Axes, chart: Chart) -> None:
     )
 
 
-def _line(layer: Line, axes: Axes, chart: Chart) -> None:
+def _line(layer: Curve, axes: Axes, chart: Chart) -> None:
     style = _DASHES[layer.dash]
     axes.plot(_along(chart, layer.x), layer.y, style, lw=layer.width, color=layer.colour, label=layer.label)
 

@@ -25,8 +25,8 @@ from railfix.report.plots.chart import (
     PURPLE,
     Band,
     Chart,
+    Curve,
     Layer,
-    Line,
     Points,
     RangeBars,
 )
@@ -93,7 +93,7 @@ def _errors(
             levels.append(most)
             name_of = "protection level" if many == 1 else column.removesuffix("_m").replace("_", " ")
             for sign, label in ((1.0, f"± {name_of}"), (-1.0, "")):
-                layers.append(Line(label=label, colour=colour, x=at, y=sign * most, width=1.0, dash="dashed"))
+                layers.append(Curve(label=label, colour=colour, x=at, y=sign * most, width=1.0, dash="dashed"))
             caption.append(f"The {name_of} is finite at {100 * np.isfinite(level).mean():.1f} % of the epochs.")
     failed = errors.filter(~pl.col("status").is_in(PASSED)) if "status" in errors.columns else errors.clear()
     passed = errors.join(failed.select("time_gpst"), on="time_gpst", how="anti") if len(failed) else errors

@@ -10,7 +10,7 @@ import polars as pl
 
 from railfix.core.arrays import Floats
 from railfix.integrity.stanford import Region, Stanford
-from railfix.report.plots.chart import BLACK, BLUE, CYCLE, GREY, RED, Cells, Chart, Layer, Line, Marks, Points
+from railfix.report.plots.chart import BLACK, BLUE, CYCLE, GREY, RED, Cells, Chart, Curve, Layer, Marks, Points
 from railfix.report.plots.columns import floats, since, start_of, words
 from railfix.report.plots.thinning import counts_sentence, spread
 
@@ -63,9 +63,9 @@ def stanford(diagram: Stanford, *, title: str = "Stanford diagram") -> Chart:
         y_label="protection level [m]",
         layers=(
             Cells(label="epochs", colour=BLACK, x_edges=edges, y_edges=edges, counts=diagram.histogram),
-            Line(label="error = level", colour=GREY, x=line, y=line),
-            Line(label=f"alarm limit {limit:g} m", colour=RED, x=line, y=across, dash="dashed"),
-            Line(label="", colour=RED, x=across, y=np.array([0.0, limit]), dash="dashed"),
+            Curve(label="error = level", colour=GREY, x=line, y=line),
+            Curve(label=f"alarm limit {limit:g} m", colour=RED, x=line, y=across, dash="dashed"),
+            Curve(label="", colour=RED, x=across, y=np.array([0.0, limit]), dash="dashed"),
             _regions(diagram, top),
         ),
         x_range=(0.0, top),
@@ -142,7 +142,7 @@ def _levels(
     if layers:
         line = np.array([np.nanmin(x), np.nanmax(x)])
         limit = np.full(2, alarm_limit_m)
-        layers.append(Line(label=f"alarm limit {alarm_limit_m:g} m", colour=RED, x=line, y=limit, dash="dashed"))
+        layers.append(Curve(label=f"alarm limit {alarm_limit_m:g} m", colour=RED, x=line, y=limit, dash="dashed"))
     infinite = int(np.isinf(floats(positions, "protection_level_m")).sum())
     caption = [_count(positions), f"Values beyond {1.2 * largest:.1f} m are cut off"]
     caption[1] += f", {infinite:,} levels are infinite and not drawn." if infinite else "."

@@ -22,8 +22,8 @@ from railfix.report.plots.chart import (
     ORDERED,
     Bars,
     Chart,
+    Curve,
     Layer,
-    Line,
     Marks,
     Points,
 )
@@ -166,12 +166,12 @@ def _background(lines: Sequence[Floats], frame: _LocalFrame, low: Floats, high: 
             parts += [np.where(kept[:, None], plane, np.nan), gap]
     if parts:
         x, y = np.concatenate(parts).T
-        yield Line(label="background", colour="#a5b3a0", x=x, y=y, width=1.0)
+        yield Curve(label="background", colour="#a5b3a0", x=x, y=y, width=1.0)
 
 
 def _line(
     track: Track | None, frame: _LocalFrame, chainage_m: Floats, here: Floats, tunnels_m: Sequence[tuple[float, float]]
-) -> Iterator[Line]:
+) -> Iterator[Curve]:
     """The line between the first and the last position, and its tunnels."""
     if track is None:
         yield _line_of_positions(here, chainage_m)
@@ -185,10 +185,10 @@ def _line(
         return np.interp(at, along, place[:, 0]), np.interp(at, along, place[:, 1])
 
     x, y = piece(float(chainage_m.min()) - _BEYOND_M, float(chainage_m.max()) + _BEYOND_M)
-    yield Line(label="line", colour="#9a9a9a", x=x, y=y, width=4.0)
+    yield Curve(label="line", colour="#9a9a9a", x=x, y=y, width=4.0)
     for number, (first, last) in enumerate(tunnels_m):
         x, y = piece(first, last)
-        yield Line(label="" if number else "tunnel", colour=BLACK, x=x, y=y, width=4.0, dash="dotted")
+        yield Curve(label="" if number else "tunnel", colour=BLACK, x=x, y=y, width=4.0, dash="dotted")
 
 
 def _classes(
@@ -213,7 +213,7 @@ def _sizes(size: Floats, edges: Sequence[float], quantity: str, unknown: str) ->
     return classes
 
 
-def _line_of_positions(here: Floats, chainage_m: Floats) -> Line:
+def _line_of_positions(here: Floats, chainage_m: Floats) -> Curve:
     """Line through the positions: the middle of each short piece, broken at wide gaps."""
     order = np.argsort(chainage_m, kind="stable")
     chainage, place = chainage_m[order], here[order]
@@ -221,7 +221,7 @@ def _line_of_positions(here: Floats, chainage_m: Floats) -> Line:
     first = np.flatnonzero(np.r_[True, np.diff(np.floor(chainage / width)) > 0])
     x, y, at = place[first, 0], place[first, 1], chainage[first]
     gap = np.flatnonzero(np.diff(at) > 20 * width + 50.0) + 1
-    return Line(label="line", colour="#9a9a9a", x=np.insert(x, gap, np.nan), y=np.insert(y, gap, np.nan), width=4.0)
+    return Curve(label="line", colour="#9a9a9a", x=np.insert(x, gap, np.nan), y=np.insert(y, gap, np.nan), width=4.0)
 
 
 def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:

@@ -9,7 +9,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
-from railfix.report.plots.chart import BLACK, BLUE, GREEN, GREY, ORDERED, RED, Chart, Layer, Line, Marks, Points
+from railfix.report.plots.chart import BLACK, BLUE, GREEN, GREY, ORDERED, RED, Chart, Curve, Layer, Marks, Points
 from railfix.report.plots.draw import draw_figure, save_figure
 from railfix.track.network import Network, end_points
 from railfix.track.network_check import NetworkQuality
@@ -86,9 +86,9 @@ def _thin(network: Network, nth: int) -> tuple[Indices, Indices]:
     return kept, np.flatnonzero(np.diff(track[kept])) + 1
 
 
-def _line(label: str, colour: str, place: tuple[Floats, Floats], breaks: Indices) -> Line:
+def _line(label: str, colour: str, place: tuple[Floats, Floats], breaks: Indices) -> Curve:
     east, north = (np.insert(values, breaks, np.nan) for values in place)
-    return Line(label=label, colour=colour, x=east, y=north, width=1.2)
+    return Curve(label=label, colour=colour, x=east, y=north, width=1.2)
 
 
 def _switches(network: Network) -> Indices:

@@ -21,7 +21,7 @@ from railfix.screens import SCREENS, ScreenPicture
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Rows:
+class _ScreenRows:
     """Positions and observations of one antenna; the observations of a column are read when it is drawn."""
 
     positions: pl.DataFrame
@@ -125,7 +125,7 @@ def screens_of(config: Config, positions: pl.DataFrame, observations: pl.LazyFra
         seen_at = seen.select("time_gpst").collect()["time_gpst"].to_numpy()
         epoch = np.searchsorted(time, seen_at).astype(np.int32)
         del seen_at
-        rows = _Rows(positions=mine, observations=seen, epoch=epoch)
+        rows = _ScreenRows(positions=mine, observations=seen, epoch=epoch)
         for name, picture in _pictures(antenna, rows, config):
             if np.isfinite(picture.metric).any():
                 yield RunScreen(
@@ -138,7 +138,7 @@ def screens_of(config: Config, positions: pl.DataFrame, observations: pl.LazyFra
                 )
 
 
-def _pictures(antenna: str, rows: _Rows, config: Config) -> Iterator[tuple[str, ScreenPicture]]:
+def _pictures(antenna: str, rows: _ScreenRows, config: Config) -> Iterator[tuple[str, ScreenPicture]]:
     """Pictures of the active screens and of the protection level, with the names of their files."""
     for screen in SCREENS:
         if screen.name in config.screens:

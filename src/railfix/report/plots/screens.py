@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.timescale import seconds
 from railfix.ranges.cn0_curve import Cn0Curve, Cn0Samples
-from railfix.report.plots.chart import BLACK, RED, Chart, Layer, Line, Points
+from railfix.report.plots.chart import BLACK, RED, Chart, Curve, Layer, Points
 from railfix.report.plots.columns import nice_step
 from railfix.report.plots.draw import draw_chart, save_figure
 from railfix.report.plots.signals import open_sky_chart
@@ -106,7 +106,7 @@ def _screen(
     rows = extremes(at, least, points=_LINE_POINTS)
     for sign in {"both": (1.0, -1.0), "above": (1.0,), "below": (1.0,)}[picture.sides]:
         label = "limit" if sign > 0 else ""
-        layers.append(Line(label=label, colour=BLACK, x=at[rows], y=sign * least[rows], width=1.0))
+        layers.append(Curve(label=label, colour=BLACK, x=at[rows], y=sign * least[rows], width=1.0))
     scale: dict[str, Any] = {}
     if finite and picture.sides != "below" and judged:
         top = 6.0 * float(np.median(least)) if len(least) else 0.0

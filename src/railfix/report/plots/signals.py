@@ -12,7 +12,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.reasons import Reason, first_reason, reason_names
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean
 from railfix.ranges.cn0_curve.curve import satellite_kind
-from railfix.report.plots.chart import BLACK, BLUE, GREY, PURPLE, RED, Cells, Chart, Layer, Line, Points, SkyEpochs
+from railfix.report.plots.chart import BLACK, BLUE, GREY, PURPLE, RED, Cells, Chart, Curve, Layer, Points, SkyEpochs
 from railfix.report.plots.columns import floats, since, start_of, words
 from railfix.screens import Cn0Limits
 
@@ -125,23 +125,23 @@ def _lines(
     yield from _floor(limits)
     if mask_deg is not None:
         edge = np.full(2, mask_deg)
-        yield Line(label=f"mask {mask_deg:g} deg", colour=GREY, x=edge, y=np.array([10.0, 60.0]), dash="dotted")
+        yield Curve(label=f"mask {mask_deg:g} deg", colour=GREY, x=edge, y=np.array([10.0, 60.0]), dash="dotted")
 
 
 def _open_sky(mean: Cn0Mean, limits: Cn0Limits | None) -> Iterator[Layer]:
     """Mean of the open sky, and the threshold below it."""
     at = np.linspace(0.0, 90.0, 181)
     level = mean.at(at)
-    yield Line(label="mean of the open sky", colour=BLUE, x=at, y=level, width=2.0)
+    yield Curve(label="mean of the open sky", colour=BLUE, x=at, y=level, width=2.0)
     if limits is not None and limits.deficit_dbhz is not None:
         label = f"{limits.deficit_dbhz:g} dB below"
-        yield Line(label=label, colour=RED, x=at, y=level - limits.deficit_dbhz, width=2.0, dash="dashed")
+        yield Curve(label=label, colour=RED, x=at, y=level - limits.deficit_dbhz, width=2.0, dash="dashed")
 
 
 def _floor(limits: Cn0Limits | None) -> Iterator[Layer]:
     if limits is not None and limits.floor_dbhz is not None:
         floor, whole = np.full(2, limits.floor_dbhz), np.array([0.0, 90.0])
-        yield Line(label=f"floor {limits.floor_dbhz:g} dB-Hz", colour=PURPLE, x=whole, y=floor, dash="dotted")
+        yield Curve(label=f"floor {limits.floor_dbhz:g} dB-Hz", colour=PURPLE, x=whole, y=floor, dash="dotted")
 
 
 def _mean_of(cells: pl.DataFrame) -> Iterator[Layer]:
@@ -150,7 +150,7 @@ def _mean_of(cells: pl.DataFrame) -> Iterator[Layer]:
     total = np.bincount(piece, weights=cells["total"].to_numpy(), minlength=18)
     mean = np.where(count >= _LEAST, total / np.maximum(count, 1), np.nan)
     middle = np.arange(2.5, 90.0, 5.0)
-    yield Line(label="mean of this run", colour=BLUE, x=middle, y=mean, width=2.0)
+    yield Curve(label="mean of this run", colour=BLUE, x=middle, y=mean, width=2.0)
     yield Points(label="mean of this run", colour=BLUE, x=middle, y=mean, size=6.0)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from railfix.core.timescale import seconds
-from railfix.report.plots.chart import BLUE, GREY, Chart, Line, Points
+from railfix.report.plots.chart import BLUE, GREY, Chart, Curve, Points
 
 
 def processing_time(chunks: Mapping[str, Sequence[Any]], *, title: str = "Time an epoch") -> Chart:
@@ -29,7 +29,7 @@ def processing_time(chunks: Mapping[str, Sequence[Any]], *, title: str = "Time a
         x_label="GPS time",
         y_label="ms an epoch",
         layers=(
-            Line(label="", colour=GREY, x=x, y=mean_ms, width=1.0),
+            Curve(label="", colour=GREY, x=x, y=mean_ms, width=1.0),
             Points(label="mean of a chunk", colour=BLUE, x=x, y=mean_ms, size=6.0),
         ),
         start=start,
