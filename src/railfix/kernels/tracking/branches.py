@@ -41,9 +41,9 @@ def judge(parameters: Parameters, state: KernelState, work: Work, count: int, dt
     With d the distance of a branch from the most probable one, the difference of the evidence counts by
     ``d^2 / (d^2 + map_branch_m^2)``: branches within the error of the map differ in their ranges at every epoch alike.
 
-    Motion (Dopplers, phases, sensors) has errors of seconds: at any rate of epochs that of a second counts once, an
-    epoch `MOST_MOTION` at most, and its odds go no further than ``d^2 / (2 s^2)`` with s^2 = 2 (map_branch_m / 3)^2, nor than one for `MOTION_M` of
-    travel.
+    Motion (Dopplers, phases, sensors) has errors of seconds: that of a second counts once, at any rate of epochs, and
+    by `MOST_MOTION` an epoch at most; its odds go no further than ``d^2 / (2 s^2)`` with s^2 = 2 (map_branch_m / 3)^2,
+    nor than one for `MOTION_M` of travel.
 
     Codes have errors in common to all satellites of one side of a street, for minutes. Their odds go no further than
     ``n d^2 / (2 code_common_m^2)``, what n independent epochs with such an error can say, n being 1 and one more in
