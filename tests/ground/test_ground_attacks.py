@@ -14,13 +14,14 @@ import pytest
 from attacked_line import run_sequence
 from railfix.core.errors import InputFileError
 from railfix.core.settings import load_settings
-from railfix.ground import interlocking, plausibility, shortening
+from railfix.ground import plausibility, reports, shortening
 from railfix.ground.authority import Authority
 from railfix.ground.control import ControlCentre, orders_of
-from railfix.ground.interlocking import Interlocking, InterlockingLimits, extended, report_received, stopped_trains
+from railfix.ground.interlocking import Interlocking, InterlockingLimits, extended, stopped_trains
 from railfix.ground.interlocking_text import from_documents
 from railfix.ground.layout import Layout, LoopStation
 from railfix.ground.on_board import OnBoard, OnBoardLimits
+from railfix.ground.reports import report_received
 from railfix.ground.serve import CentreFile, _check_line
 from railfix.ground.stops import overlaps_stopped, release_train
 from railfix.ground.store import Store
@@ -39,14 +40,10 @@ LENGTH_M = 200.0
 RULES["integrity"] = {plausibility.confirms_rear: {"message.complete and ": ""}}
 RULES["length"] = {
     plausibility.confirms_rear: {"abs(message.length_cm / 100.0 - known.length_m) <= LENGTH_ROUNDING_M": "True"},
-    interlocking.report_received: {
-        "(over_cm / 100.0 + known.length_m)": "(over_cm / 100.0 + message.length_cm / 100.0)"
-    },
+    reports.report_received: {"(over_cm / 100.0 + before.length_m)": "(over_cm / 100.0 + message.length_cm / 100.0)"},
     plausibility.compute_contradiction: {"message.length_cm == 0": "False"},
 }
-RULES["two reports"] = {
-    interlocking.report_received: {"min(facing * rear, facing * before.claimed_m)": "facing * rear"}
-}
+RULES["two reports"] = {reports.report_received: {"min(facing * rear, facing * before.claimed_m)": "facing * rear"}}
 RULES["way"] = {
     plausibility.compute_contradiction: {
         "way > _longest_way_m(known.speed_mps, speed, elapsed, limits)": "False",
@@ -60,9 +57,10 @@ RULES["roll-back"] = {
 RULES["agreed"] = {
     shortening.answer_received: {
         "message.authority < known.asked_number": "False",
-        "direction * (message.authority_end_cm / 100.0 - known.asked_m) > ROUNDING_M": "False",
+        "further - direction * known.asked_m > ROUNDING_M": "False",
     }
 }
+RULES["clock"] = {plausibility.compute_contradiction: {"latest_ns is not None and": "False and"}}
 RULES["turns"] = {OnBoard.receive: {"authority.report <= self.before_turn": "False"}}
 
 
@@ -365,8 +363,8 @@ def test_one_centre_has_a_database(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "seeds",
-    [range(150), pytest.param(range(100_000), marks=pytest.mark.slow)],
-    ids=["150 sequences", "100,000 sequences"],
+    [range(70), pytest.param(range(100_000), marks=pytest.mark.slow)],
+    ids=["70 sequences", "100,000 sequences"],
 )
 def test_no_sequence_leads_to_an_authority_into_a_train(seeds: range) -> None:
     violations, seen = Counter[str](), Counter[str]()
@@ -375,18 +373,26 @@ def test_no_sequence_leads_to_an_authority_into_a_train(seeds: range) -> None:
         violations += line.violations
         seen += line.seen
     assert violations == Counter()
-    assert min(seen[kind] for kind in ("split", "roll-back", "turn", "restart", "jump", "length", "other line")) > 50
+    wrong = ("jump", "jump for long", "length", "other line", "ends", "clock")
+    assert (
+        min(seen[kind] for kind in (*wrong, "split", "roll-back", "turn", "restart", "start on board", "release")) > 20
+    )
     assert seen["extension"] > 3 * len(seeds)
     assert seen["assumption broken"] < 0.1 * len(seeds)
 
 
-@pytest.mark.parametrize("seed", [10137, 13528, 18835, 19765, 25490])
-def test_sequences_that_once_led_into_a_train(seed: int) -> None:
-    """A train that had changed ends and rolled out of its interval was passed over, as it was in no station."""
-    assert not run_sequence(seed).violations
-
-
-@pytest.mark.parametrize(("rule", "seed"), [("integrity", 84), ("length", 27), ("way", 102), ("roll-back", 45)])
-def test_without_a_rule_a_sequence_leads_into_a_train(rule: str, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("rule", "seed", "kind"),
+    [
+        ("integrity", 52, "authority into another train"),
+        ("length", 328, "authority into another train"),
+        ("way", 305, "authority into another train"),
+        ("roll-back", 7, "authority into another train"),
+        ("clock", 95, "impossible way believed"),
+    ],
+)
+def test_without_a_rule_a_sequence_breaks_a_promise(
+    rule: str, seed: int, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     take_out(monkeypatch, rule)
-    assert run_sequence(seed, assumed=False).violations["authority into another train"] > 0
+    assert run_sequence(seed, assumed=False).violations[kind] > 0

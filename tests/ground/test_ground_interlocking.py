@@ -26,7 +26,6 @@ from railfix.ground.interlocking import (
     extended,
     points_reported,
     released,
-    report_received,
     route_requested,
     stopped_trains,
 )
@@ -35,6 +34,7 @@ from railfix.ground.layout import Layout, LoopStation, overlap
 from railfix.ground.layout_network import layout_of
 from railfix.ground.on_board import OnBoard, OnBoardLimits
 from railfix.ground.plausibility import compute_contradiction
+from railfix.ground.reports import report_received
 from railfix.ground.stops import close_section, open_section, release_train, stop_trains
 from railfix.ground.supervision import Supervision
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
@@ -53,10 +53,10 @@ LIMITS = InterlockingLimits(margin_m=20.0, release_s=3.0)
 #: Functions that keep a rule, with the text of each and what stands there without the rule.
 RULES: dict[str, dict[Callable[..., Any], dict[str, str]]] = {
     "train ahead": {_limit_m: {"mine == lane and low < last and first < high": "False"}},
-    "safe rear": {report_received: {"(over_cm / 100.0 + known.length_m)": "0.0"}},
+    "safe rear": {report_received: {"(over_cm / 100.0 + before.length_m)": "0.0"}},
     "sequence": {
         report_received: {
-            "message.sequence <= known.sequence": "False",
+            "message.sequence <= before.sequence": "False",
             "facing * max(both, facing * before.rear_m)": "facing * both",
         },
         compute_contradiction: {
@@ -206,7 +206,7 @@ def test_reports_that_change_nothing(state: Interlocking) -> None:
     # changed ends: only inside the station
     assert report_received(state, message(1, 6, 345.0, facing=-1), LAYOUT).trains[1].direction == 1
     turned = report_received(state, message(1, 6, 230.0, facing=-1), LAYOUT).trains[1]
-    assert (turned.direction, turned.rear_m, turned.end_m) == (-1, 340.0, 220.0)
+    assert (turned.direction, turned.interval_m) == (-1, (340.0, 220.0))
 
 
 def test_an_interval_reaches_to_the_front_where_that_is_beyond_the_authority() -> None:
@@ -482,9 +482,12 @@ def test_a_route_is_taken_back_where_the_train_agrees() -> None:
     assert centre.set_route(1) is None
     (given,) = centre.advance(0.0)
     assert (given.end_cm, given.shortens) == (233_000, False)
-    fast, slow = (OnBoard(direction=1, end_m=2330.0, number=given.number) for _ in range(2))
-    fast.moved(305.0, 20.0)
-    slow.moved(305.0, 3.0)
+    fast, slow = (OnBoard(direction=1, end_m=300.0) for _ in range(2))
+    assert fast.receive(given)
+    assert slow.receive(given)
+    for _ in range(2):
+        fast.moved(305.0, 20.0)
+        slow.moved(305.0, 3.0)
     before = slow.acknowledgement()
     assert centre.ask_route_back(1) is None
     assert centre.set_route(1) == "a shorter authority is being agreed with the train"

@@ -253,7 +253,9 @@ def layout_state() -> Interlocking:
 
 def restored(store: Store, state: Interlocking, sent: list[Authority], now: list[float]) -> ControlCentre:
     moved: list[Any] = []
-    supervision = Supervision(layout=line_with_loops(3), state=state, command=moved.append, routes="by hand")
+    supervision = Supervision(
+        layout=line_with_loops(3), state=state, command=lambda point, _: moved.append(point), routes="by hand"
+    )
     control = ControlCentre.restored(
         supervision, store, judged=True, curves={}, send=lambda _, data: sent.append(Authority.decode(data)),
         clock=lambda: now[0], wall_ns=lambda: 0, times=MonitorLimits(healthy_s=5.0),

@@ -18,8 +18,9 @@ from typing import Any
 from railfix.ground.authority import Authority
 from railfix.ground.interlocking import InterlockingLimits
 from railfix.ground.interlocking_text import from_documents, to_documents
-from railfix.ground.layout import Layout, LoopStation, PointName, overlap
+from railfix.ground.layout import Layout, LoopStation, Piece, PointName, overlap
 from railfix.ground.on_board import OnBoard
+from railfix.ground.stops import release_train
 from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.io.train_message import MessageStatus, TrainMessage
 
@@ -33,29 +34,51 @@ LINE = Layout(
 
 @dataclass(kw_only=True)
 class AttackedTrain:
+    """A train as it is, its tracks as the points have led it, and its end of the links."""
+
     number: int
+    direction: int
     front_m: float
+    tracks: dict[int, int]
     on_board: OnBoard
-    wagons_m: tuple[float, float] | None = None
+    wagons: list[Piece] = field(default_factory=list)
     whole_m: float = LENGTH_M
     sequence: int = 0
     lies: int = 0
-    lie: dict[str, Any] = field(default_factory=dict)
+    kind: str = ""
     offset_m: float = 0.0
+    shift_s: float = 0.0
     held_m: float | None = None
-
-    @property
-    def direction(self) -> int:
-        return self.on_board.direction
 
     def receive(self, authority: Authority) -> None:
         if self.on_board.receive(authority):
             ends = [authority.end_cm / 100.0, *([] if self.held_m is None else [self.held_m])]
-            self.held_m = max(ends, key=lambda end: end * self.direction)
+            direction = self.on_board.direction
+            self.held_m = self.on_board.end_m if authority.shortens else max(ends, key=lambda end: end * direction)
 
     @property
     def rear_m(self) -> float:
         return self.front_m - self.direction * self.whole_m
+
+    def sends(self, values: dict[str, Any], now_s: float) -> TrainMessage:
+        """What `railfix.ground.train` makes of a position: it sees ends change, and acknowledges."""
+        place, taken = values["chainage_cm"] / 100.0, self.on_board.acknowledgement()
+        if values["facing"] != self.on_board.direction and values["standstill"]:
+            self.on_board.turned(values["facing"], place)
+            self.held_m = None
+        self.on_board.reported(self.sequence, now_s)
+        self.on_board.moved(place + self.on_board.direction * BOUND_M, abs(values["speed_cmps"]) / 100.0)
+        return TrainMessage(**values, **taken)
+
+
+@dataclass(kw_only=True)
+class Taken:
+    """Newest report of a train that the centre has taken: place, and when it was sent; None after a restart."""
+
+    place_m: float
+    sent_s: float | None
+    wrong: int = 0
+    right: bool = True
 
 
 @dataclass(kw_only=True)
@@ -73,28 +96,21 @@ class AttackedLine:
             direction = 1 if station == 0 else -1 if station == 2 else (1, -1)[track - 1]
             inner = LINE.stations[station].inner_m
             front = (inner[1] if direction > 0 else inner[0]) - direction * 60.0
+            place: dict[str, Any] = {"direction": direction, "front_m": front}
             supervised.append(
-                standing_train(
-                    number,
-                    direction=direction,
-                    front_m=front,
-                    length_m=LENGTH_M,
-                    bound_m=BOUND_M,
-                    station=station,
-                    track=track,
-                )
+                standing_train(number, **place, length_m=LENGTH_M, bound_m=BOUND_M, station=station, track=track)
             )
-            self.trains[number] = AttackedTrain(
-                number=number, front_m=front, on_board=OnBoard(direction=direction, end_m=front)
-            )
-        self.moving: list[PointName] = []
+            on_board = OnBoard(direction=direction, end_m=front)
+            self.trains[number] = AttackedTrain(number=number, **place, tracks={station: track}, on_board=on_board)
+        self.points: dict[PointName, int] = dict.fromkeys(LINE.points(), 1)
+        self.moving: dict[PointName, int] = {}
         self.centre = Supervision(
-            layout=LINE, state=at_start(LINE, supervised), command=self.moving.append,
+            layout=LINE, state=at_start(LINE, supervised), command=self.moving.__setitem__,
             limits=InterlockingLimits(release_s=0.0),
         )  # fmt: skip
         self.mail: list[tuple[float, int, Callable[[], Any]]] = []
         self.posted = 0
-        self.believed: Counter[int] = Counter()
+        self.taken = {n: Taken(place_m=train.front_m, sent_s=None) for n, train in self.trains.items()}
         self.broken = False
 
     def post(self, deliver: Callable[[], Any], *, certain: bool = False) -> None:
@@ -117,11 +133,16 @@ class AttackedLine:
         self.deliver()
         if self.rng.random() < 0.03:
             self.centre.state = from_documents(to_documents(self.centre.state))
+            self.centre._clocks.clear()
+            for taken in self.taken.values():
+                taken.sent_s = None
             self.seen["restart"] += 1
-        for point in self.moving:
+        self.dispatch(self.rng.choice(list(self.trains.values())))
+        for point, track in list(self.moving.items()):
             if self.rng.random() < 0.6:
-                self.moving.remove(point)
-                self.centre.detected(point)
+                del self.moving[point]
+                self.points[point] = track
+                self.centre.detected(point, track)
                 break
         before = self.centre.state
         for authority in self.centre.advance(self.now_s):
@@ -130,75 +151,133 @@ class AttackedLine:
         self.deliver()
         self.check_held()
 
+    def dispatch(self, train: AttackedTrain) -> None:
+        """What is done by hand: a train is released after a look at it, asked for its route, given one."""
+        event, number = self.rng.random(), train.number
+        known = self.centre.state.trains[number]
+        as_it_is = known.direction == train.direction and not train.wagons and self.taken[number].right
+        if event < 0.3 and known.stop is not None and as_it_is and train.lies == 0:
+            self.centre.state, reason = release_train(self.centre.state, number, LINE)
+            self.seen["release"] += reason is None
+        elif event < 0.35:
+            self.seen["asked back"] += self.centre.ask_route_back(number) is None
+        elif event < 0.45 and known.held:
+            self.centre.set_route(number)
+
     def act(self, train: AttackedTrain) -> None:
         rng = self.rng
         event = rng.random()
         speed = 0.0
         station = LINE.station_at(*sorted((train.front_m, train.rear_m)))
-        if event < 0.01 and train.wagons_m is None:
+        if event < 0.01 and not train.wagons:
             self.seen["split"] += 1
             cut = train.front_m - train.direction * 30.0
-            train.wagons_m, train.whole_m = (cut, train.rear_m), 30.0
+            train.wagons, train.whole_m = LINE.pieces(cut, train.rear_m, train.tracks), 30.0
         elif event < 0.02:
             self.seen["roll-back"] += 1
             train.front_m -= train.direction * rng.uniform(60.0, 300.0)
             train.lies = 0  # the report of a roll-back is right
             self.report(train, 0.0, certain=True)
             return
-        elif event < 0.08 and station is not None and train.wagons_m is None:
+        elif event < 0.08 and station is not None and not train.wagons:
             self.seen["turn"] += 1
-            front = train.rear_m
-            train.on_board.turned(-train.direction, front)
-            train.front_m, train.held_m = front, None
-        elif event < 0.9 and not train.on_board.stopped and train.on_board.answered_s is not None:
+            train.direction, train.front_m = -train.direction, train.rear_m
+        elif event < 0.09:
+            self.seen["start on board"] += 1
+            train.on_board = OnBoard(direction=train.direction, end_m=train.front_m, before_turn=train.sequence)
+            train.held_m = None
+        elif (
+            event < 0.9
+            and not train.on_board.stopped
+            and train.on_board.answered_s is not None
+            and train.on_board.direction == train.direction
+        ):
             room = train.direction * (train.on_board.end_m - train.front_m) - BOUND_M - 1.0
             way = min(max(room, 0.0), SPEED_MPS * STEP_S)
-            train.front_m += train.direction * way
+            self.lead(train, way)
             speed = SPEED_MPS if way > 0.0 else 0.0
         self.report(train, speed)
+
+    def lead(self, train: AttackedTrain, way: float) -> None:
+        """Let a train run, and points lead it where they are."""
+        before, train.front_m = train.front_m, train.front_m + train.direction * way
+        for point in LINE.points_between(*sorted((before, train.front_m))):
+            zone = LINE.zone_m(point)
+            entry = zone[0] if train.direction > 0 else zone[1]
+            if not train.direction * before < train.direction * entry <= train.direction * train.front_m:
+                continue
+            if point in self.moving:
+                self.violations["train on moving points"] += 1
+            if point[1] == -train.direction:
+                train.tracks[point[0]] = self.points[point]
+
+    def lie(self, train: AttackedTrain) -> None:
+        """Begin a wrong report of any kind, or a run of such as a contradiction shows."""
+        rng, ahead = self.rng, train.direction
+        train.kind = kind = rng.choice(("jump", "jump for long", "other line", "length", "ends", "clock"))
+        self.seen[kind] += 1
+        train.lies = 1 if kind in ("jump", "ends") else 8
+        train.shift_s = rng.uniform(20.0, 4000.0) if kind == "clock" else 0.0
+        train.offset_m = {
+            "jump": rng.choice((-1, 1)) * rng.uniform(20.0, 2000.0),
+            "jump for long": ahead * rng.uniform(400.0, 2000.0),
+            "other line": ahead * rng.uniform(0.0, 80.0),
+            "length": 0.0,
+            "ends": rng.choice((-1, 1)) * rng.choice((0.0, LENGTH_M, rng.uniform(0.0, 1000.0))),
+            "clock": ahead * rng.uniform(400.0, 2000.0),
+        }[kind]
 
     def report(self, train: AttackedTrain, speed: float, *, certain: bool = False) -> None:
         rng = self.rng
         if train.lies == 0 and not certain and rng.random() < 0.04:
-            # a single wrong report of any kind, or a run of such as a contradiction shows
-            kind = rng.choice(("jump", "jump for long", "other line", "length"))
-            self.seen[kind] += 1
-            train.lies = 1 if kind == "jump" else 8
-            train.offset_m, train.lie = {
-                "jump": (rng.choice((-1, 1)) * rng.uniform(20.0, 2000.0), {}),
-                "jump for long": (train.direction * rng.uniform(400.0, 2000.0), {}),
-                "other line": (train.direction * rng.uniform(0.0, 80.0), {"line": 2}),
-                "length": (0.0, {"length_cm": rng.choice((0, 1, 1000))}),
-            }[kind]
+            self.lie(train)
         lied = train.lies > 0
         train.lies = max(train.lies - 1, 0)
         train.sequence += 1
-        train.on_board.reported(train.sequence, self.now_s)
-        time_ns = round((1000.0 + self.now_s) * 1e9)
+        offset, shift = (train.offset_m, train.shift_s) if lied else (0.0, 0.0)
+        time_ns = round((1000.0 + self.now_s + shift) * 1e9)
         error = rng.uniform(-BOUND_M, BOUND_M)
-        whole = TrainMessage(
-            train=train.number, sequence=train.sequence, time_ns=time_ns, sent_ns=time_ns, line=1,
-            chainage_cm=round(100 * (train.front_m + error + (train.offset_m if lied else 0.0))), over_cm=501,
-            under_cm=501, speed_cmps=round(train.direction * speed * 100), direction=train.direction if speed else 0,
-            facing=train.direction, standstill=speed == 0.0, status=MessageStatus.POSITION, length_cm=8000,
-            complete=train.wagons_m is None,
-        )  # fmt: skip
-        message = whole.replaced(**train.lie) if lied and train.lie else whole
-        self.post(partial(self.received, message, wrong=lied and abs(train.offset_m) > 0.0), certain=certain)
+        values: dict[str, Any] = {
+            "train": train.number, "sequence": train.sequence, "time_ns": time_ns, "sent_ns": time_ns, "line": 1,
+            "chainage_cm": round(100 * (train.front_m + error + offset)), "over_cm": 501, "under_cm": 501,
+            "speed_cmps": round(train.direction * speed * 100), "direction": train.direction if speed else 0,
+            "facing": train.direction, "standstill": speed == 0.0, "status": MessageStatus.POSITION,
+            "length_cm": 8000, "complete": not train.wagons,
+        }  # fmt: skip
+        if lied:
+            values |= {
+                "ends": {"facing": -train.direction, "standstill": True, "speed_cmps": 0, "direction": 0},
+                "other line": {"line": 2},
+                "length": {"length_cm": rng.choice((0, 1, 1000))},
+            }.get(train.kind, {})
+        wrong = lied and (abs(offset) > 0.0 or train.kind == "ends")
+        deliver = partial(self.received, train.sends(values, self.now_s), wrong=wrong, sent_s=self.now_s)
+        self.post(deliver, certain=certain)
 
-    def received(self, message: TrainMessage, *, wrong: bool) -> None:
+    def received(self, message: TrainMessage, *, wrong: bool, sent_s: float) -> None:
         """Hand a report to the centre; of wrong places that nothing contradicts the second breaks the assumption."""
         number = message.train
+        before = self.taken[number]
         reason = self.centre.report(message, self.now_s)
-        taken = reason is None and self.centre.state.trains[number].stop is None
-        if taken:
-            self.believed[number] = self.believed[number] + 1 if wrong else 0
-            self.broken |= self.believed[number] > 1
+        if reason is not None:
+            return
+        known = self.centre.state.trains[number]
+        if known.stop is not None or known.sequence != message.sequence:
+            self.taken[number].right = not wrong
+            return
+        place = (message.chainage_cm or 0) / 100.0
+        if before.sent_s is not None and message.facing == known.direction:
+            way = message.facing * (place - before.place_m) - 4.0 * BOUND_M
+            if way > 60.0 * (sent_s - before.sent_s + 1.1):
+                self.violations["impossible way believed"] += 1
+        self.taken[number] = Taken(
+            place_m=place, sent_s=sent_s, wrong=before.wrong + 1 if wrong else 0, right=not wrong
+        )
+        self.broken |= self.taken[number].wrong > 1
 
-    def pieces(self, number: int) -> list[tuple[int, float, float]]:
-        train, tracks = self.trains[number], self.centre.state.trains[number].tracks
-        parts = LINE.pieces(train.rear_m, train.front_m, tracks)
-        return parts if train.wagons_m is None else parts + LINE.pieces(*train.wagons_m, tracks)
+    def pieces(self, number: int) -> list[Piece]:
+        train = self.trains[number]
+        return LINE.pieces(train.rear_m, train.front_m, train.tracks) + train.wagons
 
     def check_grant(self, end_before_m: float, authority: Authority) -> None:
         """An authority that is extended leads into no train, and into no wagons."""
@@ -217,7 +296,7 @@ class AttackedLine:
             known = self.centre.state.trains[number]
             end = known.interval_m[1]
             held = end if train.held_m is None else train.held_m
-            if train.direction == known.direction and train.direction * (held - end) > 0.02:
+            if train.on_board.direction == known.direction and known.direction * (held - end) > 0.02:
                 self.violations["train beyond its authority"] += 1
 
 

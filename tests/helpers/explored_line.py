@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from railfix.ground.authority import Authority
 from railfix.ground.interlocking import InterlockingLimits
 from railfix.ground.interlocking_text import from_documents, to_documents
-from railfix.ground.layout import Layout, LoopStation, overlap
+from railfix.ground.layout import Layout, LoopStation, PointName, overlap
 from railfix.ground.on_board import OnBoard
 from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.io.train_message import MessageStatus, TrainMessage
@@ -72,14 +72,16 @@ class World:
     centre: Supervision
     now_s: float = 0.0
     violation: str | None = None
-    moved: list[object] = field(default_factory=list)
+    moved: list[tuple[PointName, int]] = field(default_factory=list)
 
     def copied(self) -> World:
         """A world to go on from: states of the interlocking are never written to."""
         trains = {n: replace(t, on_board=deepcopy(t.on_board)) for n, t in self.trains.items()}
         centre = copy(self.centre)
-        centre.records, centre.refusals, moved = dict(centre.records), Counter(), []
-        centre.command, centre.heard, centre.sent = moved.append, set(), {}
+        centre.records, centre.refusals = dict(centre.records), Counter()
+        centre._clocks = dict(centre._clocks)
+        moved: list[tuple[PointName, int]] = []
+        centre.command, centre.heard, centre.sent = lambda *command: moved.append(command), set(), {}
         return World(trains=trains, centre=centre, now_s=self.now_s, moved=moved)
 
     def report(self, train: ModelTrain, speed_mps: float, **changes: object) -> TrainMessage:
@@ -149,8 +151,8 @@ class World:
 
     def answer(self, late: int | None) -> None:
         """Let points move, the centre extend authorities, and the trains have them, but for one whose comes late."""
-        for point in self.moved:
-            self.centre.detected(point)  # type: ignore[arg-type]
+        for command in self.moved:
+            self.centre.detected(*command)
         self.moved.clear()
         before = self.centre.state
         for authority in self.centre.advance(self.now_s):
@@ -230,7 +232,7 @@ def small_world(*places: tuple[int, int, int]) -> World:
         trains[number] = ModelTrain(number=number, front_m=front, on_board=OnBoard(direction=direction, end_m=front))
     centre = Supervision(layout=LINE, state=at_start(LINE, supervised), limits=InterlockingLimits(release_s=0.0))
     world = World(trains=trains, centre=centre)
-    centre.command = world.moved.append
+    centre.command = lambda *command: world.moved.append(command)
     return world
 
 

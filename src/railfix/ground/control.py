@@ -133,7 +133,7 @@ class ControlCentre:
         supervision.state = replace(supervision.state, stopped=monitor is not None and monitor.stopped)
         for name, point in supervision.state.points.items():
             if point.detected is None:
-                supervision.command(name)
+                supervision.command(name, point.wanted)
         centre.log("centre started again; every train is unknown" if texts else "centre started")
         return centre
 
@@ -164,6 +164,8 @@ class ControlCentre:
         if after_stop is not None and after_stop != stop:
             self.rejected["contradicts what is known of the train"] += 1
             self.log(f"train {number}: stopped, {after_stop}", train=number)
+        if self.supervision.state.trains[number].direction != message.facing and after_stop is None:
+            self.rejected["change of ends outside its station, or of an incomplete train"] += 1
         if known is not None and known.asked_m is not None and self.supervision.state.trains[number].asked_m is None:
             agreed = self.supervision.state.trains[number].held
             self.log(f"train {number}: {'has given its route back' if agreed else 'keeps its route'}", train=number)

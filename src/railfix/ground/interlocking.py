@@ -2,8 +2,8 @@
 
 A pure state machine. Occupied by a train is the interval from its last safe rear end to the end of its authority.
 Authorities are extended up to the nearest of: another train's interval, points that are not locked and detected for
-the train, the end of its route; less a margin. They are shortened by agreement alone (`railfix.ground.shortening`). A
-report that contradicts what is known of its train (`railfix.ground.plausibility`) stops that train and its neighbours.
+the train, the end of its route; less a margin. They are shortened by agreement alone (`railfix.ground.shortening`);
+reports move the intervals (`railfix.ground.reports`).
 It is not a national rule book: no shunting, no overlaps behind signals, no level crossings, no degraded working by
 hand.
 """
@@ -20,8 +20,6 @@ from pydantic import Field
 
 from railfix.core.settings import Settings
 from railfix.ground.layout import Layout, PointName, overlap
-from railfix.ground.plausibility import compute_contradiction, confirms_rear, stop_contradicted
-from railfix.io.train_message import MessageStatus, TrainMessage
 
 
 class InterlockingLimits(Settings):
@@ -187,67 +185,6 @@ class NearbyTrains:
         return (state.trains[number] for number in numbers)
 
 
-def report_received(
-    state: Interlocking, message: TrainMessage, layout: Layout, *, limits: InterlockingLimits | None = None
-) -> Interlocking:
-    """Return the state after a position report.
-
-    The safe rear end moves to what two reports in a row confirm, of a complete train of its configured length. A train
-    that looks the other way than before has changed ends; that counts only at a standstill with its interval inside a
-    station, and the interval still covers where the train stood. A report that contradicts what is known stops the
-    train and moves its interval outward alone.
-    """
-    known = state.trains.get(message.train)
-    placed = message.status in (MessageStatus.POSITION, MessageStatus.COASTING) and message.facing != 0
-    if known is None or not placed:
-        return state
-    chainage_cm, over_cm, under_cm = message.chainage_cm, message.over_cm, message.under_cm
-    if chainage_cm is None or over_cm is None or under_cm is None:  # a bound that is absent is unknown, not 0
-        return state
-    if message.sequence <= known.sequence:
-        return state
-    front, facing = chainage_cm / 100.0, message.facing
-    rear = front - facing * (over_cm / 100.0 + known.length_m)
-    ahead = front + facing * under_cm / 100.0
-    turns = facing != known.direction
-    contradiction = compute_contradiction(known, message, layout, limits=limits or InterlockingLimits())
-    if contradiction is not None:
-        return with_train(state, stop_contradicted(known, contradiction, rear, ahead, message.sequence))
-    if turns and not (message.standstill and layout.station_at(*sorted((rear, ahead))) == known.station):
-        return state
-    confirmed = confirms_rear(known, message)
-    known = replace(
-        known,
-        sequence=message.sequence,
-        standstill=message.standstill,
-        line=message.line,
-        measured_ns=message.time_ns,
-        speed_mps=None if message.speed_cmps is None else abs(message.speed_cmps) / 100.0,
-        claimed_m=rear if confirmed else None,
-    ) if not turns or confirmed else known  # fmt: skip
-    before = state.trains[message.train]
-    if not turns:
-        if confirmed and before.claimed_m is not None and before.stop is None:
-            # one wrong report alone moves no rear end, and a wider bound moves none back
-            both = min(facing * rear, facing * before.claimed_m)
-            known = replace(known, rear_m=facing * max(both, facing * before.rear_m))
-        # of a stopped train the interval only grows
-        front = ahead if before.stop is None else facing * max(facing * ahead, facing * before.front_m)
-        return with_train(state, replace(known, front_m=front))
-    if not confirmed:
-        return state
-    turned = replace(
-        known,
-        direction=facing,
-        rear_m=facing * min(facing * rear, facing * before.front_m),
-        front_m=facing * max(facing * ahead, facing * before.rear_m),
-        end_m=facing * max(facing * ahead, facing * before.rear_m),
-        tracks={known.station: known.tracks[known.station]},
-        asked_m=None,
-    )
-    return with_train(state, turned)
-
-
 def with_train(state: Interlocking, train: TrainInterval) -> Interlocking:
     """Return the state with the newer interval of a train."""
     return replace(state, trains={**state.trains, train.train: train})
@@ -275,8 +212,16 @@ def stopped_trains(state: Interlocking) -> dict[int, str]:
 
 
 def points_reported(state: Interlocking, point: PointName, detected: int | None) -> Interlocking:
-    """Return the state after a detection of points."""
-    return replace(state, points={**state.points, point: replace(state.points[point], detected=detected)})
+    """Return the state after a detection of points; where they lose it under a route, its trains are stopped."""
+    before = state.points[point]
+    state = replace(state, points={**state.points, point: replace(before, detected=detected)})
+    if before.detected == before.wanted != detected:
+        for number in before.locked:
+            train = state.trains[number]
+            state = with_train(
+                state, replace(train, stop=train.stop or "points of its route have lost their detection")
+            )
+    return state
 
 
 def route_requested(

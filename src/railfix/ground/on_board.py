@@ -45,7 +45,8 @@ class OnBoard:
     ----------
     direction : {-1, 1}
     end_m : float [m]
-        End of the authority; it is extended, and shortened where the centre asks for it and the train can stop before.
+        End of the authority, the front end before the first; it is extended, and shortened where the centre asks for it
+        and the train can stop before.
     number : int
         Of the newest authority, -1 before the first.
     stopped : bool
@@ -54,7 +55,8 @@ class OnBoard:
         Newest report from before the last turn, or from before this start: what answers
         it or an older one is refused.
     stops_at_m : float or None [m]
-        Where the train's safe front end would come to rest if it braked now; None: it agrees to no shorter end.
+        Where the train's safe front end would come to rest if it braked now, the further of the last two places; None:
+        it agrees to no shorter end.
     answered_s : float or None [s]
         When the newest report was sent that an authority has answered; None before the first.
     """
@@ -68,6 +70,8 @@ class OnBoard:
     answered_s: float | None = None
     before_turn: int = -1
     _newest: int = -1
+    _granted: bool = False
+    _place_m: float | None = None
     _sent: OrderedDict[int, float] = field(default_factory=OrderedDict)
 
     def reported(self, sequence: int, now_s: float) -> None:
@@ -77,10 +81,15 @@ class OnBoard:
         if len(self._sent) > REMEMBERED:
             self._sent.popitem(last=False)
 
-    def moved(self, safe_front_m: float, speed_mps: float) -> None:
-        """Note where the train's safe front end is, and its speed."""
+    def moved(self, safe_front_m: float | None, speed_mps: float | None) -> None:
+        """Note where the train's safe front end is, and its speed; one wrong place alone agrees to no shorter end."""
+        before, self._place_m, self.stops_at_m = self._place_m, None, None
+        if safe_front_m is None or speed_mps is None:
+            return
         way = speed_mps * self.limits.reaction_s + 0.5 * speed_mps**2 / self.limits.braking_mps2
-        self.stops_at_m = safe_front_m + self.direction * way
+        self._place_m = safe_front_m + self.direction * way
+        if before is not None:
+            self.stops_at_m = self.direction * max(self.direction * self._place_m, self.direction * before)
 
     def receive(self, authority: Authority) -> bool:
         """Take an authority; return whether it counts: it is newer, for this direction, and of this side of a turn.
@@ -92,13 +101,17 @@ class OnBoard:
             return False
         if authority.report <= self.before_turn:
             return False
-        self.number, self.stopped = authority.number, authority.stopped
         end, held = self.direction * authority.end_cm / 100.0, self.direction * self.end_m
-        if authority.shortens:  # never further than before
-            agrees = self.stops_at_m is not None and self.direction * self.stops_at_m <= end
-            self.end_m = self.direction * (min(end, held) if agrees else held)
-        else:
+        agrees = self.stops_at_m is not None and self.direction * self.stops_at_m <= end
+        if authority.shortens and not (agrees or self._granted):
+            return False  # what it held before its start is not known: it brakes until it can agree
+        if not self._granted:
+            self.end_m, self._granted = self.direction * end, True
+        elif not authority.shortens:
             self.end_m = self.direction * max(end, held)
+        elif agrees:
+            self.end_m = self.direction * min(end, held)
+        self.number, self.stopped = authority.number, authority.stopped
         if (sent_s := self._sent.get(authority.report)) is not None:
             self.answered_s = sent_s
         return True
@@ -125,5 +138,6 @@ class OnBoard:
         return None if self.fresh(now_s) else "no fresh authority"
 
     def turned(self, direction: int, front_m: float) -> None:
-        """Begin in the other direction, with no authority beyond the front."""
+        """Begin in the other direction, without an authority."""
         self.direction, self.end_m, self.before_turn = direction, front_m, self._newest
+        self._granted, self.answered_s, self._place_m, self.stops_at_m = False, None, None, None

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 LENGTH_ROUNDING_M: Final = 0.02
 #: Speed against the facing from which a train that does not stand rolls back [m/s].
 ROLLING_MPS: Final = 0.5
+#: Beginning of the reason where a train holds an authority beyond the end of its interval.
+HOLDS_MORE: Final = "the train holds an authority beyond its interval,"
 
 
 def confirms_rear(known: TrainInterval, message: TrainMessage) -> bool:
@@ -27,9 +29,18 @@ def confirms_rear(known: TrainInterval, message: TrainMessage) -> bool:
 
 
 def compute_contradiction(
-    known: TrainInterval, message: TrainMessage, layout: Layout, *, limits: InterlockingLimits
+    known: TrainInterval,
+    message: TrainMessage,
+    layout: Layout,
+    *,
+    limits: InterlockingLimits,
+    granted: int,
+    latest_ns: int | None = None,
 ) -> str | None:
-    """Return what a placed report contradicts, None where it may be right."""
+    """Return what a placed report contradicts, None where it may be right.
+
+    `granted` is the number of the last authorities, `latest_ns` the train's clock at most, by the centre's own clock.
+    """
     assert message.chainage_cm is not None
     assert message.over_cm is not None
     assert message.under_cm is not None
@@ -42,9 +53,15 @@ def compute_contradiction(
         return f"the bounds of the place are wider than {limits.widest_m:g} m"
     if not layout.stations[0].begin_m - over <= front <= layout.stations[-1].end_m + under:
         return f"the place {front:.0f} m is not on the line"
+    if (message.authority or 0) > granted:
+        return f"the train holds authority {message.authority}, the centre's database ends at {granted}"
     if message.facing != known.direction:
+        if not message.standstill:
+            return "the train has changed ends while it runs"
         return _turn_contradiction(known, message.facing, front, over, under)
     direction = known.direction
+    if message.authority_end_cm is not None and direction * (message.authority_end_cm / 100.0 - known.end_m) > 0.02:
+        return f"{HOLDS_MORE} to {message.authority_end_cm / 100.0:.0f} m"
     speed = None if message.speed_cmps is None else abs(message.speed_cmps) / 100.0
     if speed is not None and speed > limits.speed_mps:
         return f"the speed {speed:.0f} m/s is above {limits.speed_mps:g} m/s"
@@ -52,10 +69,12 @@ def compute_contradiction(
     elapsed = 0.0 if known.measured_ns is None else (message.time_ns - known.measured_ns) / 1e9
     if elapsed < 0.0:
         return "the place is older than that of the report before"
+    if latest_ns is not None and known.measured_ns is not None:  # a clock that was set forward makes no way possible
+        elapsed = max(min(elapsed, (latest_ns - known.measured_ns) / 1e9), 0.0)
     way = direction * (front - known.front_m) - over
     if way > _longest_way_m(known.speed_mps, speed, elapsed, limits):
         return f"the train has moved {way:.0f} m or more in {elapsed:.1f} s"
-    if direction * front - over > max(direction * known.end_m, direction * known.front_m):
+    if direction * front - over > direction * known.end_m:
         return "the train is beyond its authority"
     if direction * front + under < direction * known.rear_m + known.length_m:
         return "the train has rolled back"
@@ -63,9 +82,13 @@ def compute_contradiction(
     return "the train runs backward" if backward and not message.standstill else None
 
 
-def stop_contradicted(known: TrainInterval, reason: str, rear: float, ahead: float, sequence: int) -> TrainInterval:
+def stop_contradicted(
+    known: TrainInterval, message: TrainMessage, reason: str, rear: float, ahead: float
+) -> TrainInterval:
     """Return a train that is stopped; where it may really be outside its interval, the interval grows."""
-    stopped = replace(known, stop=known.stop or reason, sequence=sequence, claimed_m=None)
+    stopped = replace(
+        known, stop=known.stop or reason, sequence=message.sequence, standstill=message.standstill, claimed_m=None
+    )
     direction = known.direction
     if reason.startswith("the train has changed ends"):
         ends = direction * rear, direction * ahead
@@ -75,6 +98,8 @@ def stop_contradicted(known: TrainInterval, reason: str, rear: float, ahead: flo
         return replace(stopped, rear_m=direction * min(direction * rear, direction * known.rear_m))
     if reason == "the train is beyond its authority":
         return replace(stopped, front_m=direction * max(direction * ahead, direction * known.front_m))
+    if reason.startswith(HOLDS_MORE) and message.authority_end_cm is not None:
+        return replace(stopped, end_m=message.authority_end_cm / 100.0)
     return stopped
 
 

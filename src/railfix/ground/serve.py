@@ -234,17 +234,17 @@ class SimulatedPoints:
 
     move_s: float
     clock: Callable[[], float]
-    _until: dict[PointName, float] = field(default_factory=dict)
+    _moving: dict[PointName, tuple[float, int]] = field(default_factory=dict)
 
-    def command(self, point: PointName) -> None:
-        """Begin to move points."""
-        self._until[point] = self.clock() + self.move_s
+    def command(self, point: PointName, track: int) -> None:
+        """Begin to move points to a track."""
+        self._moving[point] = self.clock() + self.move_s, track
 
-    def detected(self) -> list[PointName]:
-        """Return the points that have come to their position since the last call."""
-        done = [point for point, until in self._until.items() if until <= self.clock()]
-        for point in done:
-            del self._until[point]
+    def detected(self) -> list[tuple[PointName, int]]:
+        """Return the points that have come to their track since the last call."""
+        done = [(point, track) for point, (until, track) in self._moving.items() if until <= self.clock()]
+        for point, _ in done:
+            del self._moving[point]
         return done
 
 
@@ -378,8 +378,8 @@ async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
     loop = asyncio.get_running_loop()
     due = loop.time()
     while True:
-        for point in points.detected():
-            control.supervision.detected(point)
+        for point, track in points.detected():
+            control.supervision.detected(point, track)
         control.step()
         due = max(due + STEP_S, loop.time())
         await asyncio.sleep(due - loop.time())

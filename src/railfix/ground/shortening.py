@@ -49,7 +49,8 @@ def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
     if message.authority is None or message.authority_end_cm is None or message.authority < known.asked_number:
         return state
     direction = known.direction
-    if direction * (message.authority_end_cm / 100.0 - known.asked_m) > ROUNDING_M:
+    further = max(direction * message.authority_end_cm / 100.0, direction * known.front_m)
+    if further - direction * known.asked_m > ROUNDING_M:  # it holds more, or is further than it agrees to
         return with_train(state, replace(known, asked_m=None))
     base, end = known.station - direction, direction * max(direction * known.asked_m, direction * known.front_m)
     tracks = {station: track for station, track in known.tracks.items() if station != known.station}

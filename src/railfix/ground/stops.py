@@ -31,7 +31,10 @@ def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
 
 
 def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Interlocking, str | None]:
-    """Return the state with the stop of one train released by hand, and the reason of a refusal."""
+    """Return the state with the stop of one train released by hand, and the reason of a refusal.
+
+    Points under its interval, which a train that has rolled back has passed, are locked for it again.
+    """
     known = state.trains.get(train)
     if known is None or known.stop is None:
         return state, f"train {train} is not stopped"
@@ -39,7 +42,17 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
         return state, f"train {train} does not stand still"
     if any(_touches(known, block, layout) for block in state.closed):
         return state, f"the section where train {train} is or may run is closed"
-    released_state = with_train(state, replace(known, stop=None))
+    points = dict(state.points)
+    low, high = known.span_m
+    for name in layout.points_between(low, high):
+        first, last = layout.zone_m(name)
+        if first < high and low < last:
+            if not points[name].wanted == points[name].detected == known.tracks.get(name[0]):
+                return state, f"points {layout.stations[name[0]].name} under its interval are not set for train {train}"
+            points[name] = replace(points[name], locked={**points[name].locked, train: None})
+    direction = known.direction  # where the train ran too far, its authority now ends there
+    end = direction * max(direction * known.end_m, direction * known.front_m)
+    released_state = with_train(replace(state, points=points), replace(known, stop=None, end_m=end))
     if overlaps_stopped(released_state, layout) != released_state:
         return state, f"the interval of train {train} meets another one"
     return released_state, None

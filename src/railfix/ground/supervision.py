@@ -24,11 +24,11 @@ from railfix.ground.interlocking import (
     extended,
     points_reported,
     released,
-    report_received,
     route_requested,
     stopped_trains,
 )
 from railfix.ground.layout import Layout, PointName
+from railfix.ground.reports import report_received
 from railfix.ground.shortening import answer_received, ask_route_back
 from railfix.ground.stops import overlaps_stopped
 from railfix.io.train_message import TrainMessage
@@ -37,6 +37,8 @@ from railfix.io.train_message import TrainMessage
 ROUTE_AHEAD_M = 700.0
 #: A train is sent an authority at its report, at a stop, and otherwise this often [s].
 AUTHORITY_S = 1.0
+#: Largest drift between clocks of a train and of the centre, and error of a clock that is not noticed [s].
+CLOCK_DRIFT, CLOCK_TOLERANCE_S = 1e-4, 1.0
 
 
 @dataclass(kw_only=True)
@@ -48,7 +50,7 @@ class Supervision:
     layout : Layout
     state : Interlocking
     command : callable
-        Called with points that have to move; `detected` is called when they have.
+        Called with points that have to move and the track they are to lead to; `detected` takes what they report.
     routes : {"automatic", "by hand"}
     records : dict of int to TrainRecord
     refusals : Counter of str
@@ -62,7 +64,7 @@ class Supervision:
 
     layout: Layout
     state: Interlocking
-    command: Callable[[PointName], None] = lambda _: None
+    command: Callable[[PointName, int], None] = lambda *_: None
     routes: Literal["automatic", "by hand"] = "automatic"
     limits: InterlockingLimits = field(default_factory=InterlockingLimits)
     centre: CentreLimits = field(default_factory=CentreLimits)
@@ -71,6 +73,7 @@ class Supervision:
     routes_set: int = 0
     heard: set[int] = field(default_factory=set)
     sent: dict[int, tuple[float, bool]] = field(default_factory=dict)
+    _clocks: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     def report(self, message: TrainMessage, now_s: float) -> Rejection | None:
         """Take a report; return why it does not count, None where it does."""
@@ -79,14 +82,24 @@ class Supervision:
         record = self.records.get(message.train, TrainRecord(train=message.train))
         self.records[message.train], reason = record_received(record, message, now_s, limits=self.centre)
         if reason is None:
-            self.state = report_received(self.state, message, self.layout, limits=self.limits)
+            self.state = report_received(
+                self.state, message, self.layout, limits=self.limits, latest_ns=self._latest_ns(message, now_s)
+            )
             self.state = answer_received(self.state, message)
             self.heard.add(message.train)
         return reason
 
-    def detected(self, point: PointName) -> None:
-        """Take the detection of points in the position they were commanded to."""
-        self.state = points_reported(self.state, point, self.state.points[point].wanted)
+    def _latest_ns(self, message: TrainMessage, now_s: float) -> int | None:
+        """Return the train's clock at most, by the delays of the reports before; None before the first."""
+        before = self._clocks.get(message.train)
+        apart_s = now_s - message.sent_ns / 1e9
+        least_s = apart_s if before is None else before[0] + CLOCK_DRIFT * (now_s - before[1])
+        self._clocks[message.train] = min(apart_s, least_s), now_s
+        return None if before is None else round((now_s - least_s + CLOCK_TOLERANCE_S) * 1e9)
+
+    def detected(self, point: PointName, track: int | None) -> None:
+        """Take what points are detected at: a track, None where they are at neither end."""
+        self.state = points_reported(self.state, point, track)
 
     def set_route(self, train: int, **step: Any) -> str | None:
         """Set a route to the next station; return the reason of a refusal.
@@ -101,7 +114,7 @@ class Supervision:
             return reason
         self.routes_set += 1
         for point in moved:
-            self.command(point)
+            self.command(point, self.state.points[point].wanted)
         return None
 
     def ask_route_back(self, train: int) -> str | None:

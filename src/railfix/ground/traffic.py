@@ -145,7 +145,7 @@ class Traffic:
     centre_works: bool = True
     now_s: float = 0.0
     violations: Counter[str] = field(default_factory=Counter)
-    moving: dict[PointName, float] = field(default_factory=dict)
+    moving: dict[PointName, tuple[float, int]] = field(default_factory=dict)
     _stopped_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -188,19 +188,19 @@ class Traffic:
         """Take an authority on board."""
         self.trains[authority.train].on_board.receive(authority)
 
-    def command(self, name: PointName) -> None:
-        """Move points; they are detected in their new position after some seconds."""
-        self.moving[name] = self.now_s + self.random.uniform(3.0, 7.0)
+    def command(self, name: PointName, track: int) -> None:
+        """Move points; they are detected at their new track after some seconds."""
+        self.moving[name] = self.now_s + self.random.uniform(3.0, 7.0), track
         low, high = self.layout.zone_m(name)
         for train in self.trains.values():
             if min(train.rear_m, train.front_m) < high and low < max(train.rear_m, train.front_m):
                 self.violations["points moved under a train"] += 1
 
     def _field(self) -> None:
-        for name, until in list(self.moving.items()):
+        for name, (until, track) in list(self.moving.items()):
             if self.now_s >= until and self.centre_works:
                 del self.moving[name]
-                self.centre.detected(name)
+                self.centre.detected(name, track)
 
     def _lead(self, train: SimulatedTrain, before_m: float) -> None:
         """Let points lead a train that runs onto them."""

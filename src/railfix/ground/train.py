@@ -119,11 +119,11 @@ class _Desk:
                 self._on_board.turned(message.facing, front)
         if self._on_board is not None:
             self._on_board.reported(self._sequence, now_s)
+            ahead = speed = None
             if message.chainage_cm is not None and message.under_cm is not None and message.speed_cmps is not None:
-                ahead = message.chainage_cm + self._on_board.direction * message.under_cm
-                self._on_board.moved(ahead / 100.0, abs(message.speed_cmps) / 100.0)
-            else:
-                self._on_board.stops_at_m = None
+                ahead = (message.chainage_cm + self._on_board.direction * message.under_cm) / 100.0
+                speed = abs(message.speed_cmps) / 100.0
+            self._on_board.moved(ahead, speed)
         place = None if message.chainage_cm is None else message.chainage_cm / 100.0
         links.send(encode(message), chainage_m=place, direction=message.facing)
 
