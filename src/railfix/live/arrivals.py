@@ -53,6 +53,7 @@ async def next_arrival(
 ) -> Item | None:
     """The next item that the pumps have put; None after `wait_s`, or when one has ended by an error."""
     if not queue.empty():
+        await asyncio.sleep(0)  # signals act also where data come faster than they are processed
         return queue.get_nowait()
     getting = asyncio.ensure_future(queue.get())
     running = [pump for pump in pumps if not pump.done()]

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from railfix import kernels
 from railfix.core.errors import ChannelsDisagreeError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
@@ -25,6 +26,8 @@ from railfix.live.settings import LiveSettings
 from railfix.pipeline.processor import EpochProcessor
 from railfix.ranges.sbas import SbasMessages
 
+#: First word of the second channel.
+_READY: Final = "ready"
 #: Stages in the order of processing, by the arrays that tell them apart.
 STAGES: Final[dict[str, tuple[str, ...]]] = {
     "corrected ranges": ("corrected_code_m", "sigma_m", "elevation_deg"),
@@ -66,7 +69,9 @@ def _second_channel(
 ) -> None:
     """The second process: carries out calls until the connection closes."""
     engine = LiveEngine(processor, settings, sensors)
+    kernels.load()
     gc.freeze()  # as the first channel's
+    connection.send(_READY)
     while True:
         try:
             name, arguments, keywords = connection.recv()
@@ -88,6 +93,9 @@ class TwoChannels(LiveEngine):
         self._process = context.Process(target=_second_channel, args=(other, processor, settings, sensors), daemon=True)
         self._process.start()
         other.close()
+        # before there is anything to process: waiting for it later would hold up data, and the end by a signal
+        if self._recv() != _READY:
+            raise ChannelsDisagreeError("the second channel does not start; no message is sent")
 
     def start(self, *, now_ns: int) -> None:
         """As `LiveEngine.start`."""
@@ -126,12 +134,14 @@ class TwoChannels(LiveEngine):
         """
         self._call("poll", now_ns=now_ns, sent_ns=sent_ns)
         outputs = super().poll(now_ns=now_ns, sent_ns=sent_ns)
+        compare(digests(outputs), self._recv())
+        return outputs
+
+    def _recv(self) -> Any:
         try:
-            theirs = self._connection.recv()
+            return self._connection.recv()
         except (EOFError, OSError):
             raise ChannelsDisagreeError("the second channel has ended; no message is sent") from None
-        compare(digests(outputs), theirs)
-        return outputs
 
     def _call(self, name: str, *arguments: Any, **keywords: Any) -> None:
         try:
@@ -140,11 +150,10 @@ class TwoChannels(LiveEngine):
             raise ChannelsDisagreeError("the second channel has ended; no message is sent") from None
 
     def close(self) -> None:
-        """End the second channel."""
+        """End the second channel: at once, as it holds nothing that is kept."""
         self._connection.close()
+        self._process.kill()
         self._process.join(timeout=5.0)
-        if self._process.is_alive():
-            self._process.terminate()
 
 
 def compare(ours: list[dict[str, str]], theirs: list[dict[str, str]]) -> None:

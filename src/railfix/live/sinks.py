@@ -10,6 +10,8 @@ import asyncio
 import queue
 import socket
 import sys
+import threading
+import time
 from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +28,8 @@ from railfix.live.settings import LiveSettings
 _LARGEST_BACKLOG: Final = 1 << 20
 #: Longest wait for the answer of an MQTT broker [s].
 _ANSWER_S: Final = 10.0
+#: Longest wait for messages that a broker has not taken at the end [s].
+_LEFT_S: Final = 2.0
 _HELP: Final = (
     "expected FORM@TARGET, FORM one of json, cbor, nmea, tpv, etcs, positions, train, TARGET -, a file, udp://, "
     "tcp-server:// or mqtt://"
@@ -149,12 +153,16 @@ class MqttTarget:
         self._sent.append(self._client.publish(self.topic, data, qos=0))
 
     def close(self) -> None:
-        """Send what is left, and disconnect."""
+        """Send what is left within `_LEFT_S`, and disconnect."""
+        until = time.monotonic() + _LEFT_S
         for info in self._sent:
             if self._client.is_connected():
-                info.wait_for_publish(1.0)
+                info.wait_for_publish(max(until - time.monotonic(), 0.0))
         self._client.disconnect()
-        self._client.loop_stop()
+        # a broker that reads no more would hold the end up for as long as its connection lives
+        ending = threading.Thread(target=self._client.loop_stop, daemon=True)
+        ending.start()
+        ending.join(max(until - time.monotonic(), 0.5))
 
 
 class OutletSink(Outlet[LiveOutput]):
