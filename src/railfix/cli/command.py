@@ -149,6 +149,7 @@ def run_program(app: typer.Typer) -> NoReturn:
     for name, handler in (("SIGTERM", _raise_exit), ("SIGHUP", _raise_exit), ("SIGPIPE", _end_at_closed_pipe)):
         if number := getattr(signal, name, None):
             signal.signal(number, handler)
+    sys.unraisablehook = _raise_again
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
         try:
@@ -171,6 +172,20 @@ def _raise_exit(number: int, _frame: object) -> None:
     """End by way of an exception, so that staging folders are removed."""
     signal.signal(number, signal.SIG_IGN)
     raise SystemExit(SIGNALLED + number)
+
+
+def _raise_again(unraisable: Any) -> None:
+    """Raise an exit once more that was raised, and lost, in a callback of the compiler or in a destructor."""
+    end = unraisable.exc_value
+    if not isinstance(end, SystemExit) or not hasattr(signal, "setitimer"):
+        sys.__unraisablehook__(unraisable)
+        return
+
+    def raise_end(*_: object) -> None:
+        raise SystemExit(end.code)
+
+    signal.signal(signal.SIGALRM, raise_end)
+    signal.setitimer(signal.ITIMER_REAL, 0.05)
 
 
 def _end_at_closed_pipe(number: int, _frame: object) -> None:

@@ -56,9 +56,13 @@ def prepare_kernels() -> bool:
     environment = {**os.environ, kernels.FILTER_ALONE: "1"}
     if kernels.FILTER in missing:
         with subprocess.Popen([sys.executable, "-c", _PROGRAM], env=environment, stderr=subprocess.PIPE) as other:
-            _run(_STAGES)
-            _say(f"single epochs compiled after {time.monotonic() - begin:.0f} s; the filter still is")
-            _, error = other.communicate()
+            try:
+                _run(_STAGES)
+                _say(f"single epochs compiled after {time.monotonic() - begin:.0f} s; the filter still is")
+                _, error = other.communicate()
+            except BaseException:  # as the end by a signal, which would wait for it
+                other.kill()
+                raise
         if other.returncode:
             raise RuntimeError(f"the filter cannot be compiled: {error.decode(errors='replace').strip()}")
     else:
