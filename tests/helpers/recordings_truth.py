@@ -73,6 +73,12 @@ def smartloc_truth(recordings: Path) -> Truth:
     return SMARTLOC_START + timedelta(rows[:, 0]), rows[:, 1:]
 
 
+def smartloc_rinex_truth(folder: Path) -> Truth:
+    """smartLoc Berlin as recorded: ECEF, seconds from the log's first epoch."""
+    rows = np.loadtxt(folder / "Berlin_Potsdamer_Platz_RTK_GT.txt", usecols=range(1, 5))
+    return np.datetime64("2016-06-06T11:10:41.7", "ns") + timedelta(rows[:, 0]), rows[:, 1:]
+
+
 def japan_truth(recordings: Path) -> Truth:
     """mosaic-X5 in Japan, 1 Hz: RTK positions, fixed ones only."""
     log = read_positions(_folder(recordings, "japan_mosaic") / "rtklib_rtk_ref_l1_GE.pos")

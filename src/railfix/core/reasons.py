@@ -92,6 +92,10 @@ class Status(IntEnum):
     #: A position, but the 3-D positions of the last minutes lie beside or above the line: the map is wrong here, or it
     #: is another track.
     MAP_OFFSET = 10
+    #: A position that passed every check, but interference with the signals is suspected: jamming.
+    JAMMING_SUSPECTED = 11
+    #: A position, but the signals may be those of a spoofer: nothing bounds its error.
+    SPOOFING_SUSPECTED = 12
 
     @property
     def text(self) -> str:
@@ -100,9 +104,11 @@ class Status(IntEnum):
 
 
 #: Statuses of positions that failed a check; `Config.failed_checks` keeps or drops their coordinates.
-CHECK_FAILED: Final = (Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN)
+CHECK_FAILED: Final = (Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN, Status.SPOOFING_SUSPECTED)
 #: Statuses that come with coordinates (those of `CHECK_FAILED` unless they are dropped).
-POSITIONED: Final = (Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET, *CHECK_FAILED)
+POSITIONED: Final = (
+    Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET, Status.JAMMING_SUSPECTED, *CHECK_FAILED,
+)  # fmt: skip
 
 
 #: Reasons of screens that are added to the package, by name in lower case.

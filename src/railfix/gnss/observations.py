@@ -85,6 +85,11 @@ class Observations(NotebookTable):
     break_before : ndarray of bool, shape (T,)
         True where epochs must not be differenced with the one before: power failure (epoch flag
         1), new site or moving antenna (2, 3), start of another file after a gap.
+    receiver_alarm : ndarray of uint8, shape (T,)
+        The receiver's own indicators: 1 jamming, 2 spoofing, 3 both; 0 where there is none, or the log has no such
+        message.
+    front_end_gain : ndarray, shape (T,)
+        Of the front end's gain control, in the receiver's unit; NaN where the log does not have it.
     header : ObservationHeader
     problems : tuple of str
         Messages about faults that were skipped (file, line, fault); at most `MAX_PROBLEMS`, then one
@@ -105,6 +110,8 @@ class Observations(NotebookTable):
     cn0_dbhz: Floats
     loss_of_lock: Bytes
     break_before: Masks
+    receiver_alarm: Bytes = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
+    front_end_gain: Floats = field(default_factory=lambda: np.zeros(0))
     header: ObservationHeader = field(default_factory=ObservationHeader)
     problems: tuple[str, ...] = ()
     problem_count: int = 0
@@ -114,6 +121,10 @@ class Observations(NotebookTable):
         epochs, channels = len(self.time), len(self.satellite)
         if len(self.signal) != channels:
             raise ValueError(f"signal has {len(self.signal)} channels, satellite has {channels}")
+        if not len(self.receiver_alarm):
+            object.__setattr__(self, "receiver_alarm", np.zeros(epochs, dtype=np.uint8))
+        if not len(self.front_end_gain):
+            object.__setattr__(self, "front_end_gain", np.full(epochs, np.nan))
         if len(self.break_before) != epochs:
             raise ValueError(f"break_before has {len(self.break_before)} epochs, time has {epochs}")
         for name in ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock"):
@@ -163,6 +174,8 @@ class Observations(NotebookTable):
             signal=self.signal[channels],
             **{name: getattr(self, name)[epochs][:, channels] for name in arrays},
             break_before=self.break_before[epochs],
+            receiver_alarm=self.receiver_alarm[epochs],
+            front_end_gain=self.front_end_gain[epochs],
             header=self.header,
         )
 
@@ -254,6 +267,8 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         signal=np.array([k[1] for k in keys], dtype="<U2"),
         loss_of_lock=lock,
         break_before=np.concatenate([p.break_before for p in parts]),
+        receiver_alarm=np.concatenate([p.receiver_alarm for p in parts]),
+        front_end_gain=np.concatenate([p.front_end_gain for p in parts]),
         header=_join_header(parts),
         problems=_join_problems(parts),
         problem_count=sum(p.problem_count for p in parts),

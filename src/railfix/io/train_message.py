@@ -59,6 +59,14 @@ class Source(IntFlag):
     SBAS = 512
 
 
+class SuspectedInterference(IntEnum):
+    """Interference with the signals of satellites that the train suspects."""
+
+    NONE = 0
+    JAMMING = 1
+    SPOOFING = 2
+
+
 class TrainMessage(Settings):
     """One position message.
 
@@ -101,6 +109,8 @@ class TrainMessage(Settings):
         Number of the newest authority that the train has taken: its acknowledgement to the ground side.
     authority_end_cm : int or None [cm]
         Where the authority ends that the train holds, rounded away from it.
+    interference : SuspectedInterference or None
+        None from trains that do not look for it.
     """
 
     train: Unsigned
@@ -125,6 +135,7 @@ class TrainMessage(Settings):
     sigma_cm: Unsigned | None = None
     authority: Unsigned | None = None
     authority_end_cm: Signed | None = None
+    interference: SuspectedInterference | None = None
 
     @model_validator(mode="after")
     def _place_with_bounds(self) -> Self:
@@ -204,6 +215,8 @@ def _validate(values: dict[str, Any]) -> TrainMessage:
 def _plain(message: TrainMessage) -> dict[str, Any]:
     values = message.model_dump()
     values["status"], values["sources"] = int(message.status), int(message.sources)
+    if message.interference is not None:
+        values["interference"] = int(message.interference)
     return values
 
 
@@ -212,6 +225,8 @@ def to_json(message: TrainMessage) -> str:
     values = _plain(message)
     values["status"] = message.status.name.lower()
     values["sources"] = [source.name.lower() for source in Source if source in message.sources and source.name]
+    if message.interference is not None:
+        values["interference"] = message.interference.name.lower()
     return json.dumps({"version": VERSION, **values}, separators=(",", ":"))
 
 
@@ -229,8 +244,10 @@ def from_json(line: str) -> TrainMessage:
         for name in values["sources"]:
             sources |= Source[str(name).upper()]
         values["sources"] = sources
+        if values.get("interference") is not None:
+            values["interference"] = SuspectedInterference[str(values["interference"]).upper()]
     except (KeyError, TypeError):
-        raise MessageError("has an unknown status or source") from None
+        raise MessageError("has an unknown status, source or interference") from None
     return _validate(values)
 
 

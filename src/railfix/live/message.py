@@ -10,7 +10,7 @@ import numpy as np
 from railfix.core.reasons import Status
 from railfix.core.timescale import GPS_EPOCH
 from railfix.integrity.protection import LevelStatus
-from railfix.io.train_message import MessageStatus, Source, TrainMessage
+from railfix.io.train_message import MessageStatus, Source, SuspectedInterference, TrainMessage
 from railfix.live.settings import LiveSettings
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.results import AntennaResult, Result
@@ -101,8 +101,15 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
         length_cm=_up_cm(settings.length_m),
         status=status,
         sources=sources,
+        interference=_suspected(result),
         **values,  # type: ignore[arg-type]
     )
+
+
+def _suspected(result: Result) -> SuspectedInterference | None:
+    """The worst interference of the antennas at the last epoch; None where it is not looked for."""
+    found = [int(a.interference.suspicion[-1]) for a in result.antennas.values() if a.interference is not None]
+    return SuspectedInterference(max(found)) if found else None
 
 
 def _name_sources(track: AlongTrack) -> Source:
@@ -153,7 +160,7 @@ def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple
 def _has_passed(antenna: AntennaResult) -> bool:
     """Whether the last single epoch passed every check and raises no alarm."""
     alarm = antenna.protection is not None and antenna.protection.status[-1] == LevelStatus.ALARM
-    return int(antenna.status[-1]) == Status.OK and not alarm
+    return int(antenna.status[-1]) in (Status.OK, Status.JAMMING_SUSPECTED) and not alarm
 
 
 def _level_m(antenna: AntennaResult) -> float:

@@ -82,6 +82,7 @@ def along_track(
     )  # fmt: skip
     beside = (tracked.status == TrackStatus.TRACKING) & single.map_offset
     tracked = doubted(tracked, beside, TrackStatus.MAP_OFFSET)
+    tracked = doubted(tracked, single.spoofed & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
     inside = on_line_m(tracked, trajectory)
     ecef = trajectory.at_arc(inside)
     latitude, longitude, height = geodetic_from_ecef(ecef)

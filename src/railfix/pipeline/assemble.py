@@ -88,6 +88,7 @@ def antenna_results(
         raim=replace(solution.raim, protection_level_m=np.where(has, solution.raim.protection_level_m, np.nan)),
         protection=None if protection is None else judged(protection, solution.status, has, chainage, config),
         map_offset=solution.map_offset,
+        interference=solution.interference,
         clocks=corrected.clocks,
         clock_offset_m=solution.ties.offset_m,
         clock_offset_sigma_m=solution.ties.sigma_m,

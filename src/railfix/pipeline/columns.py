@@ -20,7 +20,7 @@ Source = TypeVar("Source")
 #: Unit by the last part of a name.
 UNITS: Final[Mapping[str, str]] = {
     "m": "m", "mm": "mm", "mps": "m/s", "mps2": "m/s^2", "deg": "deg", "dbhz": "dB-Hz", "permille": "permille",
-    "1pm": "1/m", "s": "s",
+    "1pm": "1/m", "s": "s", "db": "dB",
 }  # fmt: skip
 #: Decimals of a number in CSV files, 0.1 mm for lengths, and of an angle.
 DECIMALS: Final = 4

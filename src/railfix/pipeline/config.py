@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 from pydantic import Field, create_model, field_validator, model_validator
 
 from railfix.core.settings import Settings, load_settings, validated
+from railfix.integrity.interference import InterferenceLimits
 from railfix.integrity.protection import RiskBudget
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.positioning.carrier import ContinuityLimits, CycleSlipLimits, PhaseLimits, SmoothingLimits
@@ -159,6 +160,8 @@ class Config(ScreenSettings):
         Selection of the ranges of an epoch that agree with each other; clock offsets and noise are estimated from them.
     map_offset : MapOffsetLimits
         Test of the map against the 3-D positions of the last minutes.
+    interference : InterferenceLimits
+        Signs of jamming and spoofing.
     sbas : tuple of path, or "stream"
         Logs of SBAS messages, or "stream" for those that the receivers pass on: their corrections take the place of
         the models, and satellites without a valid one are rejected. Empty: no SBAS.
@@ -231,6 +234,7 @@ class Config(ScreenSettings):
     lasting_errors: LastingErrorLimits = LastingErrorLimits()
     robust_fit: RobustFitLimits = RobustFitLimits()
     map_offset: MapOffsetLimits = MapOffsetLimits()
+    interference: InterferenceLimits = InterferenceLimits()
     noise: CodeNoise = CodeNoise()
     sbas: tuple[Path, ...] | Literal["stream"] = ()
     sbas_prn: int | Literal["best"] = "best"

@@ -10,6 +10,7 @@ import numpy as np
 from railfix.core.arrays import Codes, Datetimes, Floats, Masks
 from railfix.core.display import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
+from railfix.integrity.interference import Suspicion
 from railfix.pipeline.return_gate import ReturnState
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import SensorState
@@ -63,6 +64,8 @@ class SingleEpochs:
         The train is away from the line: `railfix.pipeline.off_map`.
     map_offset : ndarray of bool
         3-D positions of the last minutes lie beside or above the line.
+    spoofed : ndarray of bool
+        Spoofing is suspected.
     """
 
     noise_scale: Floats
@@ -71,6 +74,7 @@ class SingleEpochs:
     near_ecef_m: Floats
     off_map: Masks
     map_offset: Masks
+    spoofed: Masks
 
 
 def single_epochs(result: AntennaResult, off_map: Masks, limits: MapOffsetLimits) -> SingleEpochs:
@@ -82,6 +86,9 @@ def single_epochs(result: AntennaResult, off_map: Masks, limits: MapOffsetLimits
         near_ecef_m=result.conventional_ecef_m,
         off_map=off_map,
         map_offset=beyond_threshold(result.map_offset, limits),
+        spoofed=np.zeros(len(result), dtype=bool)
+        if result.interference is None
+        else result.interference.suspicion == Suspicion.SPOOFING_SUSPECTED,
     )
 
 

@@ -29,6 +29,7 @@ from railfix.pipeline.config import SCREEN_NAMES, Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
 from railfix.pipeline.filter_result import AlongTrack, FilterState, single_epochs
+from railfix.pipeline.interference_stage import judge_interference
 from railfix.pipeline.received import Received, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
 from railfix.pipeline.second_codes import combined
@@ -276,6 +277,10 @@ class EpochProcessor:
         pair = self._pair(ranges)
         ranges = judge_pairs(self.screens, pair, ranges)
         corrected, solution, own_states = solve(with_screens(corrected, ranges), antennas, self.config, own_states)
+        solution, signs = judge_interference(
+            corrected, solution, antennas, [own.interference for own in own_states], self.config.interference
+        )
+        own_states = [replace(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
         solved = SolvedChunk(
             results=self._results(antennas, corrected, solution, pair, ranges),
             ranges={name: rows_of(corrected, rows) for name, rows in zip(names, parts, strict=True)},

@@ -12,6 +12,7 @@ import polars as pl
 
 from railfix.core.arrays import Floats
 from railfix.core.reasons import Status
+from railfix.integrity.interference import Suspicion, cause_text
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
 from railfix.pipeline.along_track import innovations
@@ -217,6 +218,23 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "map_offset_statistic",
             "square of that offset in its own sigmas; status `map_offset` from 13.8 on",
             lambda r: r.map_offset.statistic,
+        ),
+        Column(
+            "interference",
+            "`none`, `jamming_suspected` or `spoofing_suspected`, also where the status has something else to report",
+            lambda r: None if r.interference is None else r.interference.suspicion,
+            words=tuple(s.name.lower() for s in Suspicion),
+        ),
+        Column(
+            "interference_causes",
+            "signs of it joined by `+`, see `railfix.integrity.interference.Cause`",
+            lambda r: None if r.interference is None else cause_text(r.interference.causes),
+            dtype=pl.String(),
+        ),
+        Column(
+            "cn0_fall_db",
+            "median fall of C/N0 of the satellites below their recent peak",
+            lambda r: None if r.interference is None else r.interference.power.fall_db,
         ),
         Column("conventional_x_m", "3-D single point, ECEF", lambda r: r.conventional_ecef_m[:, 0]),
         Column("conventional_y_m", "3-D single point, ECEF", lambda r: r.conventional_ecef_m[:, 1]),

@@ -16,6 +16,7 @@ from railfix.integrity.protection import ProtectionLevel
 from railfix.integrity.raim import Outcome
 from railfix.pipeline.carrier_stage import CarrierState
 from railfix.pipeline.filter_result import AlongTrack, FilterState
+from railfix.pipeline.interference_stage import Interference, InterferenceState
 from railfix.pipeline.off_map import OffMapState
 from railfix.pipeline.received import Received
 from railfix.positioning.carrier import PhasePositions
@@ -112,6 +113,7 @@ class AntennaState(NotebookTable):
         Last epoch; NaT before the first.
     two_frequencies : TwoFrequencyState
         Mean differences of the two codes of satellites.
+    interference : InterferenceState
     """
 
     noise: NoiseState = field(default_factory=NoiseState)
@@ -123,6 +125,7 @@ class AntennaState(NotebookTable):
     carrier: CarrierState | None = None
     ended: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     two_frequencies: TwoFrequencyState = field(default_factory=TwoFrequencyState)
+    interference: InterferenceState = field(default_factory=InterferenceState)
 
     def __repr__(self) -> str:
         screens = ", ".join(sorted(self.screens)) or "none"
@@ -216,6 +219,8 @@ class AntennaResult(NotebookTable):
         Protection levels along the line; None where they are off.
     map_offset : MapOffset
         Mean offset of the 3-D positions of the last minutes from the line.
+    interference : Interference or None
+        Jamming and spoofing suspected; None where that is off.
     clocks : tuple of str
         Letter of each receiver clock of the results above, length G.
     clock_offset_m, clock_offset_sigma_m : ndarray, shape (T, G) [m]
@@ -263,6 +268,7 @@ class AntennaResult(NotebookTable):
     raim: RaimResult
     protection: ProtectionResult | None
     map_offset: MapOffset
+    interference: Interference | None
     clocks: tuple[str, ...]
     clock_offset_m: Floats
     clock_offset_sigma_m: Floats

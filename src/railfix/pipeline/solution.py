@@ -18,6 +18,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.conventional import validate_point
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
+from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.lasting_errors import lasting_errors
 from railfix.pipeline.level_stage import low_sides, protection_levels, unresolved_alternatives
 from railfix.pipeline.off_map import OffMapState, off_map_epochs
@@ -68,6 +69,8 @@ class Solution:
     map_offset : MapOffset
     off_map : ndarray of bool, shape (T,)
         The train is away from the line: `railfix.pipeline.off_map`.
+    interference : Interference or None
+        Of `railfix.pipeline.interference_stage`, which comes after; None where it is off.
     """
 
     point: SinglePoint
@@ -84,6 +87,7 @@ class Solution:
     protection: ProtectionResult | None
     map_offset: MapOffset
     off_map: Masks
+    interference: Interference | None = None
 
 
 def solve(

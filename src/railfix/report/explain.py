@@ -38,6 +38,8 @@ SINGLE_STATUS: Final[Mapping[str, str]] = {
     "antennas_disagree": "the positions of the two antennas are not as far apart as the antennas are",
     "uncertain": "its standard deviation is over the limit",
     "map_offset": "positions of the last minutes lie beside the line: the map is wrong here, or it is another track",
+    "jamming_suspected": "passed every check, but the signals are jammed (column interference_causes)",
+    "spoofing_suspected": "the signals may be those of a spoofer (column interference_causes)",
 }
 #: What the status of the filter says.
 FILTER_STATUS: Final[Mapping[str, str]] = {
@@ -51,6 +53,7 @@ FILTER_STATUS: Final[Mapping[str, str]] = {
     "map_offset": "positions of the last minutes lie beside the line: the map is wrong here, or it is another track",
     "antennas_disagree": "not as far from the other antenna's place as the antennas are apart",
     "doubtful": "measurements contradict the place, or what bounds it: nothing bounds its error",
+    "spoofing_suspected": "the signals may be those of a spoofer: nothing bounds its error",
 }
 #: Columns of `Explanation.satellites` that are computed here.
 WITHOUT: Final = ("without_shift_m", "without_sigma_m")

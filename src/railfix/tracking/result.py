@@ -38,6 +38,8 @@ class TrackStatus(IntEnum):
     ANTENNAS_DISAGREE = constants.ANTENNAS_DISAGREE
     #: One place, but measurements, the velocity or a sub-filter contradict it: nothing bounds its error.
     DOUBTFUL = constants.DOUBTFUL
+    #: One place, but the signals may be those of a spoofer: nothing bounds its error.
+    SPOOFING_SUSPECTED = constants.SPOOFING_SUSPECTED
 
     @property
     def text(self) -> str:

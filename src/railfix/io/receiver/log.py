@@ -18,6 +18,7 @@ from railfix.gnss.observations import Observations
 from railfix.io.receiver import rtcm, sbf, ubx
 from railfix.io.receiver.ephemerides import Assembled, Unfinished, assembled, assembled_rtcm, merged, navigation_of
 from railfix.io.receiver.framing import Frames, find_frames
+from railfix.io.receiver.indicators import Indicators, indicators_at
 from railfix.io.receiver.measurements import Measurements, Tracking, observations_of
 from railfix.io.receiver.subframes import SbasFrames, joined_subframes, sbas_frames
 
@@ -46,7 +47,7 @@ class StreamState:
 
     `glonass_channels` are the frequency channels by satellite number that 1020 messages gave; `observed`: whether there
     was an epoch of the receiver's own format; `kind`: the messages that the observations are taken from; `clock`: the
-    last time that it gave, of an epoch or another message.
+    last time that it gave, of an epoch or another message; `indicators`: the last ones of jamming and spoofing.
     """
 
     rest: bytes = b""
@@ -57,6 +58,7 @@ class StreamState:
     observed: bool = False
     kind: str = ""
     clock: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    indicators: Indicators = field(default_factory=Indicators)
 
 
 def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[LogPiece, StreamState]:
@@ -83,6 +85,10 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Lo
     measurements = taken[kind] if kind in taken else ubx.rawx_measurements(find_frames(buffer[:0]))
     unused = _of_other_kinds(frames, kind) if kind else {**raw.skipped, **msm.skipped}
     measurements = replace(measurements, skipped={**measurements.skipped, **unused, **_of_old_kinds(frames)})
+    places = msm_places if kind == _MSM else _places(frames, native)
+    epochs_at = places[len(places) - len(measurements.time) :]
+    alarm, gain, indicators = indicators_at(frames, epochs_at, state.indicators)
+    measurements = replace(measurements, alarm=alarm, gain=gain)
     dated = _date(frames, raw, _places(frames, native), observed=state.observed)
     records, sbas, subframes, messages = _navigation(frames, dated, _Dated(msm_places, msm.time), state)
     last = measurements.time[-1] if len(measurements.time) else state.time
@@ -104,6 +110,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Lo
         observed=state.observed or len(raw.time) > 0,
         kind=kind,
         clock=dated.times[-1] if len(dated.times) else state.clock,
+        indicators=indicators,
     )
     return piece, after
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings
 from railfix.gnss.observations import ObservationHeader, Observations
 
 #: RINEX loss-of-lock bits: lock lost since the epoch before; half-cycle ambiguity possible.
@@ -40,6 +42,8 @@ class Measurements:
     leap_seconds : int or None
     receiver : str
     skipped : mapping of str to int
+    alarm, gain : ndarray, shape (T,), or None
+        Indicators at each epoch (`Observations.receiver_alarm`, `Observations.front_end_gain`).
     """
 
     time: Datetimes
@@ -57,6 +61,8 @@ class Measurements:
     leap_seconds: int | None = None
     receiver: str = ""
     skipped: Mapping[str, int] = field(default_factory=dict)
+    alarm: Bytes | None = None
+    gain: Floats | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,10 +119,18 @@ def observations_of(measurements: Measurements, tracking: Tracking | None = None
         cn0_dbhz=grid(measurements.cn0_dbhz),
         loss_of_lock=np.where(np.isnan(phase), 0, indicator).astype(np.uint8),
         break_before=np.zeros(shape[0], dtype=bool),
+        receiver_alarm=_at_epochs(measurements.alarm, rising, 0),
+        front_end_gain=_at_epochs(measurements.gain, rising, np.nan),
         header=_header(measurements, satellite, signal),
         skipped=skipped,
     )
     return observations, _tracking_after(observations, tracking, channels, lock, polarity)
+
+
+def _at_epochs(values: NDArray[Any] | None, rising: Masks, absent: float) -> NDArray[Any]:
+    """Values of the epochs that are kept; those of a log without them."""
+    kind = np.float64 if np.isnan(absent) else np.uint8
+    return np.full(int(rising.sum()), absent, dtype=kind) if values is None else values[rising]
 
 
 def _tracking_after(

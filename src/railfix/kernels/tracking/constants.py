@@ -20,6 +20,7 @@ OFF_MAP: Final = 6
 MAP_OFFSET: Final = 7
 ANTENNAS_DISAGREE: Final = 8
 DOUBTFUL: Final = 9
+SPOOFING_SUSPECTED: Final = 10
 
 # Prediction.
 #: Standard deviation of the clock of the codes about the median of an epoch [m].

@@ -1,0 +1,23 @@
+"""Jamming and spoofing suspected from observations, positions and the receiver's own indicators."""
+
+from railfix.integrity.interference.limits import CAUSES, Cause, InterferenceLimits, Suspicion, cause_text, suspicion
+from railfix.integrity.interference.motion import MotionSigns, MotionState, motion_signs
+from railfix.integrity.interference.power import PowerSigns, PowerState, power_signs
+from railfix.integrity.interference.timing import HeldState, held
+
+__all__ = [
+    "CAUSES",
+    "Cause",
+    "HeldState",
+    "InterferenceLimits",
+    "MotionSigns",
+    "MotionState",
+    "PowerSigns",
+    "PowerState",
+    "Suspicion",
+    "cause_text",
+    "held",
+    "motion_signs",
+    "power_signs",
+    "suspicion",
+]

@@ -1,0 +1,131 @@
+"""Causes of suspected interference, and the limits of their tests."""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+from typing import Final, Literal
+
+import numpy as np
+from pydantic import Field
+
+from railfix.core.arrays import Bits, Codes, Strings
+from railfix.core.settings import Settings
+
+
+class Suspicion(IntEnum):
+    """Interference of an epoch; spoofing outranks jamming."""
+
+    NONE = 0
+    JAMMING_SUSPECTED = 1
+    SPOOFING_SUSPECTED = 2
+
+
+class Cause(IntFlag):
+    """Signs of interference; one epoch may have several."""
+
+    NONE = 0
+    #: The receiver reports jamming: UBX MON-RF, MON-HW and SEC-SIG (critical), SBF RFStatus (not cancelled).
+    RECEIVER_JAMMING = 1 << 0
+    #: C/N0 of all satellites has fallen by nearly the same amount.
+    CN0_FALL = 1 << 1
+    #: The gain of the receiver's front end has fallen.
+    GAIN_FALL = 1 << 2
+    #: The receiver reports spoofing: UBX SEC-SIG (affirmed), SBF RFStatus.
+    RECEIVER_SPOOFING = 1 << 3
+    #: All satellites have the same C/N0, as from one transmitter.
+    EQUAL_CN0 = 1 << 4
+    #: The receiver clock steps against the Dopplers, or its drift steps.
+    CLOCK_JUMP = 1 << 5
+    #: The 3-D velocity changes faster than a train can.
+    SPEED_JUMP = 1 << 6
+    #: The 3-D position moves farther than a train can.
+    POSITION_JUMP = 1 << 7
+    #: Constellations, each by itself, place antenna or clock apart.
+    CONSTELLATIONS_PART = 1 << 8
+    #: Consistent 3-D positions have left the map sideways.
+    LEFT_MAP = 1 << 9
+
+
+_JAMMING: Final = Cause.RECEIVER_JAMMING | Cause.CN0_FALL | Cause.GAIN_FALL
+#: Causes in the order of their bits.
+CAUSES: Final = tuple(cause for cause in Cause if cause)
+
+
+class InterferenceLimits(Settings):
+    """Limits of the signs of interference.
+
+    On the recordings no sign occurs; their largest statistics are printed by ``tests/studies/interference_trials.py``.
+
+    Attributes
+    ----------
+    use : {"on", "off"}
+    least_satellites : int
+        Satellites that a statement on "all" takes.
+    fall_db : float [dB]
+        Median fall of C/N0 below its recent peak.
+    spread_db : float [dB]
+        Largest standard deviation of the falls: a jammer raises the noise of all channels alike, walls and roofs
+        do not.
+    peak_decay_db_per_min : float [dB/min]
+        How fast a peak is forgotten.
+    known_after_s : float [s]
+        A satellite is compared once it has been tracked for so long.
+    gain_fall : float
+        Fall of the front end's gain as a share of its recent peak; 14 % within a start without interference.
+    equal_db : float [dB]
+        Standard deviation of C/N0 over the satellites below which they are equal; in open sky 1.2 dB and more.
+    clock_jump_m : float [m]
+        Step of the codes against the Dopplers, whole milliseconds left out. Clocks of phones step by 30 m.
+    drift_jump_mps, speed_jump_mps, position_jump_m, off_map_m : float
+        Least jumps and least distance from the line. A yard is some 100 m wide.
+    jump_sigmas, part_sigmas : float
+        The same in standard deviations; and of the difference of two constellations.
+    acceleration_mps2, max_speed_mps : float
+        Of a train; position jumps are beyond what these allow.
+    longest_gap_s : float [s]
+        Epochs farther apart are not compared.
+    largest_speed_sigma_mps, largest_sigma_m : float
+        Velocities and positions with larger standard deviations are not compared.
+    hold_s, part_hold_s : float [s]
+        How long a fall, equal C/N0 and distance from the map last before they count; and parted constellations.
+    jamming_release_s, spoofing_release_s : float [s]
+        How long a suspicion stays after its last sign: a jump is over in one epoch, what it began is not.
+    """
+
+    use: Literal["on", "off"] = "on"
+    least_satellites: int = Field(default=6, ge=5)
+    fall_db: float = Field(default=5.0, gt=0)
+    spread_db: float = Field(default=1.5, gt=0)
+    peak_decay_db_per_min: float = Field(default=1.0, gt=0)
+    known_after_s: float = Field(default=10.0, ge=0)
+    gain_fall: float = Field(default=0.3, gt=0, lt=1)
+    equal_db: float = Field(default=0.8, gt=0)
+    clock_jump_m: float = Field(default=60.0, gt=0)
+    drift_jump_mps: float = Field(default=10.0, gt=0)
+    speed_jump_mps: float = Field(default=5.0, gt=0)
+    position_jump_m: float = Field(default=30.0, gt=0)
+    off_map_m: float = Field(default=100.0, gt=0)
+    jump_sigmas: float = Field(default=10.0, gt=0)
+    part_sigmas: float = Field(default=15.0, gt=0)
+    acceleration_mps2: float = Field(default=2.0, gt=0)
+    max_speed_mps: float = Field(default=100.0, gt=0)
+    longest_gap_s: float = Field(default=10.0, gt=0)
+    largest_speed_sigma_mps: float = Field(default=2.0, gt=0)
+    largest_sigma_m: float = Field(default=30.0, gt=0)
+    hold_s: float = Field(default=3.0, gt=0)
+    part_hold_s: float = Field(default=10.0, gt=0)
+    jamming_release_s: float = Field(default=10.0, ge=0)
+    spoofing_release_s: float = Field(default=300.0, ge=0)
+
+
+def cause_text(causes: Bits) -> Strings:
+    """Return the names of the causes of each epoch joined by ``+``, blank without any, same shape."""
+    words, which = np.unique(causes, return_inverse=True)
+    texts = ["+".join(str(cause.name).lower() for cause in CAUSES if cause & word) for word in words.tolist()]
+    return np.array(texts, dtype=np.str_)[which.reshape(causes.shape)] if texts else np.zeros(causes.shape, "<U1")
+
+
+def suspicion(causes: Bits) -> Codes:
+    """Return the `Suspicion` of epochs by their causes, same shape."""
+    spoofing, jamming = (causes & ~int(_JAMMING)) != 0, causes != 0
+    return np.where(spoofing, np.int8(Suspicion.SPOOFING_SUSPECTED), jamming.astype(np.int8))

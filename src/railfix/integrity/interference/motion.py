@@ -1,0 +1,344 @@
+"""Signs of interference in clock, velocity and position: steps that no train and no oscillator makes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
+from railfix.core.timescale import seconds
+from railfix.integrity.interference.limits import InterferenceLimits
+from railfix.integrity.interference.power import _median
+
+_TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
+#: Steps of receiver clocks by whole milliseconds are none of interference [m].
+_MILLISECOND_M: Final = SPEED_OF_LIGHT * 1e-3
+#: Redundant ranges or Dopplers that their noise is taken from: fewer can agree by chance.
+_LEAST_FREEDOM: Final = 3
+#: Least noise of Dopplers [m/s].
+_LEAST_MPS: Final = 0.05
+#: Weight of the unknowns by themselves, for what a satellite is missing for.
+_RIDGE: Final = 1e-9
+#: Unknowns that two constellations give by themselves: position and clock.
+_SIZE: Final = 4
+
+
+class MotionInputs(NamedTuple):
+    """Ranges of one antenna: T epochs by K channels.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    break_before : ndarray of bool, shape (T,)
+    channel : ndarray of str, shape (K,)
+    group : ndarray of int, shape (K,)
+        Receiver clock of each channel.
+    near_ecef_m : ndarray, shape (T, 3) [m]
+        Position, right to some kilometres; NaN without one.
+    sat_ecef_m, sat_velocity_mps : ndarray, shape (T, K, 3)
+    code_m : ndarray, shape (T, K) [m]
+        As observed.
+    rate_mps : ndarray, shape (T, K) [m/s]
+        ``-lambda D``.
+    corrected_code_m, sigma_m : ndarray, shape (T, K) [m]
+    used : ndarray of bool, shape (T, K)
+        Channels without a reason against them.
+    noise_scale : ndarray, shape (T,)
+    clock_offset_m, clock_sigma_m : ndarray, shape (T, G) [m]
+        Known offsets between the receiver clocks, and their sigmas.
+    off_line_m : ndarray, shape (T,) [m]
+        Distance of the 3-D position from the line across it; NaN beyond an end.
+    """
+
+    time: Datetimes
+    break_before: Masks
+    channel: Strings
+    group: Indices
+    near_ecef_m: Floats
+    sat_ecef_m: Floats
+    sat_velocity_mps: Floats
+    code_m: Floats
+    rate_mps: Floats
+    corrected_code_m: Floats
+    sigma_m: Floats
+    used: Masks
+    noise_scale: Floats
+    clock_offset_m: Floats
+    clock_sigma_m: Floats
+    off_line_m: Floats
+
+
+class Fix(NamedTuple):
+    """Positions and velocities of T epochs, each with its standard deviation; NaN where there is none."""
+
+    time: Datetimes
+    ecef_m: Floats  # (T, 3)
+    sigma_m: Floats
+    velocity_mps: Floats  # (T, 4), with the drift of the clock
+    velocity_sigma_mps: Floats
+
+    def take(self, rows: Indices | slice) -> Fix:
+        """Return those of some epochs."""
+        return Fix(*(values[rows] for values in self))
+
+
+def _no_fix() -> Fix:
+    nothing = np.full(1, np.nan)
+    return Fix(
+        np.full(1, np.datetime64("NaT", "ns")), np.full((1, 3), np.nan), nothing, np.full((1, 4), np.nan), nothing
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionState:
+    """State after a chunk.
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+        Last epoch; NaT before the first.
+    channel : ndarray of str, shape (K,)
+    code_m, rate_mps : ndarray, shape (K,)
+        Last ones of each channel.
+    since : ndarray of datetime64[ns], shape (K,)
+        When they were observed.
+    position, velocity : Fix
+        Last ones that were good enough to compare with, one epoch each.
+    on_map : bool
+        A position has been on the map.
+    """
+
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))
+    code_m: Floats = field(default_factory=lambda: np.zeros(0))
+    rate_mps: Floats = field(default_factory=lambda: np.zeros(0))
+    since: Datetimes = field(default_factory=lambda: np.zeros(0, dtype="datetime64[ns]"))
+    position: Fix = field(default_factory=_no_fix)
+    velocity: Fix = field(default_factory=_no_fix)
+    on_map: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionSigns:
+    """Statistics of T epochs; NaN where there is nothing to compare.
+
+    Attributes
+    ----------
+    clock_jump_m : ndarray, shape (T,) [m]
+        Median change of the codes against the Dopplers, less whole milliseconds.
+    drift_jump_mps, speed_jump_mps, position_jump_m : ndarray, shape (T,)
+        Changes since the last epoch that was good enough, beyond what train and oscillator allow.
+    drift_jump_sigmas, speed_jump_sigmas, position_jump_sigmas : ndarray, shape (T,)
+    part_sigmas : ndarray, shape (T,)
+        Largest difference of two constellations' own positions and clocks, in standard deviations.
+    off_line_m, off_line_sigmas : ndarray, shape (T,)
+        Distance of the 3-D position from the line, once a position has been on it.
+    """
+
+    clock_jump_m: Floats
+    drift_jump_mps: Floats
+    drift_jump_sigmas: Floats
+    speed_jump_mps: Floats
+    speed_jump_sigmas: Floats
+    position_jump_m: Floats
+    position_jump_sigmas: Floats
+    part_sigmas: Floats
+    off_line_m: Floats
+    off_line_sigmas: Floats
+
+
+def motion_signs(
+    inputs: MotionInputs, state: MotionState, limits: InterferenceLimits
+) -> tuple[MotionSigns, MotionState]:
+    """Return the statistics of clock, velocity and position of T epochs, and the state to pass on."""
+    if not len(inputs.time):
+        return MotionSigns(**{item.name: np.zeros(0) for item in fields(MotionSigns)}), state
+    fixes = fixes_of(inputs)
+    position, last_position = _before(fixes, state.position, fixes.sigma_m <= limits.largest_sigma_m)
+    velocity, last_velocity = _before(fixes, state.velocity, fixes.velocity_sigma_mps <= limits.largest_speed_sigma_mps)
+    speed, speed_sigmas, drift, drift_sigmas = _speed_jump(fixes, velocity, limits)
+    jump, jump_sigmas = _position_jump(fixes, position, velocity, limits)
+    clock, last_codes = _clock_jump(inputs, state, limits)
+    on_line = inputs.off_line_m < np.fmax(limits.position_jump_m, 3.0 * fixes.sigma_m)
+    been = np.logical_or.accumulate(np.concatenate([[state.on_map], on_line]))
+    off = np.where(been[1:], inputs.off_line_m, np.nan)
+    signs = MotionSigns(
+        clock_jump_m=clock,
+        drift_jump_mps=drift,
+        drift_jump_sigmas=drift_sigmas,
+        speed_jump_mps=speed,
+        speed_jump_sigmas=speed_sigmas,
+        position_jump_m=jump,
+        position_jump_sigmas=jump_sigmas,
+        part_sigmas=_parts(inputs, limits.least_satellites - 1),
+        off_line_m=off,
+        off_line_sigmas=np.maximum(off - limits.position_jump_m, 0.0) / fixes.sigma_m,
+    )
+    after = MotionState(
+        time=inputs.time[-1],
+        channel=inputs.channel,
+        code_m=last_codes[0],
+        rate_mps=last_codes[1],
+        since=last_codes[2],
+        position=last_position,
+        velocity=last_velocity,
+        on_map=bool(been[-1]),
+    )
+    return signs, after
+
+
+def fixes_of(inputs: MotionInputs) -> Fix:
+    """Return positions and velocities by least squares from all ranges together, no satellite excluded.
+
+    One reflected signal widens the standard deviations, so that nothing is compared; the signals of one transmitter
+    agree.
+    """
+    near, sight, misfit = _misfit(inputs)
+    groups = np.arange(inputs.group.max(initial=-1) + 1)
+    clocks = (inputs.group[:, None] == groups).astype(np.float64)
+    design = np.concatenate([-sight, np.broadcast_to(clocks, (len(near), *clocks.shape))], axis=2)
+    weight = np.where(inputs.used, 1.0 / inputs.sigma_m**2, 0.0)
+    step, covariance, scale = _fit(design, misfit, weight, least=_LEAST_FREEDOM)
+    scale = np.maximum(scale, inputs.noise_scale)
+    moving = (sight * inputs.sat_velocity_mps).sum(axis=2)
+    rate = inputs.rate_mps - moving
+    known = inputs.used & np.isfinite(rate)
+    ones = np.ones((*sight.shape[:2], 1))
+    velocity, of_velocity, noise = _fit(
+        np.concatenate([-sight, ones], axis=2), rate, known.astype(np.float64), least=_LEAST_FREEDOM
+    )
+    return Fix(
+        inputs.time,
+        near + step[:, :3],
+        scale * _length(covariance),
+        velocity,
+        np.maximum(noise, _LEAST_MPS) * _length(of_velocity),
+    )
+
+
+def _misfit(inputs: MotionInputs) -> tuple[Floats, Floats, Floats]:
+    """Return positions (T, 3), unit vectors to the satellites (T, K, 3) and codes less ranges (T, K)."""
+    near = inputs.near_ecef_m
+    to_satellite = inputs.sat_ecef_m - near[:, None, :]
+    distance = np.linalg.norm(to_satellite, axis=2)
+    turn = inputs.sat_ecef_m[..., 0] * near[:, None, 1] - inputs.sat_ecef_m[..., 1] * near[:, None, 0]
+    return near, to_satellite / distance[..., None], inputs.corrected_code_m - distance - _TURN * turn
+
+
+def _fit(design: Floats, value: Floats, weight: Floats, *, least: int) -> tuple[Floats, Floats, Floats]:
+    """Return solutions (T, P), covariances (T, P, P) and noise scales (T,) of weighted least squares.
+
+    NaN where fewer than `least` values are redundant. Unknowns without a value are 0.
+    """
+    has = (weight > 0) & np.isfinite(value) & np.isfinite(design).all(axis=2)
+    rows = np.where(has[..., None], design, 0.0)
+    y, w = np.where(has, value, 0.0), np.where(has, weight, 0.0)
+    weighted = rows * w[..., None]
+    normal = rows.swapaxes(1, 2) @ weighted
+    unknown = np.diagonal(normal, axis1=1, axis2=2) > 0.0
+    size = design.shape[2]
+    ridge = np.where(unknown, _RIDGE, 1.0)
+    covariance = np.linalg.inv(normal + ridge[:, :, None] * np.eye(size))
+    solution = (covariance @ (weighted * y[..., None]).sum(axis=1)[..., None])[..., 0]
+    left = y - (rows @ solution[..., None])[..., 0]
+    freedom = np.count_nonzero(has, axis=1) - np.count_nonzero(unknown, axis=1)
+    redundant = (freedom >= least) & unknown[:, :3].all(axis=1)
+    scale = np.sqrt((w * left**2).sum(axis=1) / np.maximum(freedom, 1))
+    return np.where(redundant[:, None], solution, np.nan), covariance, np.where(redundant, scale, np.nan)
+
+
+def _length(covariance: Floats) -> Floats:
+    """Return the square root of the first three variances together, shape (T,)."""
+    return np.asarray(np.sqrt(np.trace(covariance[:, :3, :3], axis1=1, axis2=2)))
+
+
+def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
+    """Return the last good fix before each epoch, and the last one of all."""
+    everything = Fix(*(np.concatenate([a, b]) for a, b in zip(start, fixes, strict=True)))
+    row = np.where(np.concatenate([[True], good]), np.arange(len(good) + 1), 0)
+    latest = np.maximum.accumulate(row)
+    return everything.take(latest[:-1]), everything.take(latest[-1:])
+
+
+def _speed_jump(now: Fix, before: Fix, limits: InterferenceLimits) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return changes of velocity and clock drift beyond what is possible, each also in standard deviations."""
+    dt = seconds(now.time - before.time)
+    near = np.where(dt <= limits.longest_gap_s, 1.0, np.nan)
+    sigma = np.hypot(now.velocity_sigma_mps, before.velocity_sigma_mps)
+    sigma = np.where(now.velocity_sigma_mps <= limits.largest_speed_sigma_mps, sigma, np.nan) * near
+    change = now.velocity_mps - before.velocity_mps
+    allowed = limits.acceleration_mps2 * dt
+    speed = np.maximum(np.linalg.norm(change[:, :3], axis=1) - allowed, 0.0)
+    drift = np.maximum(np.abs(change[:, 3]) - allowed, 0.0)
+    return speed, speed / sigma, drift, drift / sigma
+
+
+def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimits) -> tuple[Floats, Floats]:
+    """Return the distance from where the last position and velocity lead to, beyond a train's reach; also in sigmas."""
+    dt = seconds(now.time - before.time)
+    velocity = np.where((moving.time == before.time)[:, None], moving.velocity_mps[:, :3], np.nan)
+    slow = np.isnan(velocity[:, 0])
+    expected = before.ecef_m + np.where(slow[:, None], 0.0, velocity) * dt[:, None]
+    reach = np.where(slow, limits.max_speed_mps, 0.5 * limits.acceleration_mps2 * dt) * dt
+    sigma = np.hypot(now.sigma_m, before.sigma_m)
+    sigma = np.where((now.sigma_m <= limits.largest_sigma_m) & (dt <= limits.longest_gap_s), sigma, np.nan)
+    jump = np.maximum(np.linalg.norm(now.ecef_m - expected, axis=1) - reach, 0.0)
+    return jump, jump / sigma
+
+
+def _clock_jump(
+    inputs: MotionInputs, state: MotionState, limits: InterferenceLimits
+) -> tuple[Floats, tuple[Floats, Floats, Datetimes]]:
+    """Return the median change of the codes against the Dopplers, less whole milliseconds, shape (T,) [m].
+
+    Since the last code of each channel; and these codes, Dopplers and times after the last epoch.
+    """
+    channels = len(inputs.channel)
+    code, rate = np.full(channels, np.nan), np.full(channels, np.nan)
+    since = np.full(channels, np.datetime64("NaT", "ns"))
+    _, here, there = np.intersect1d(inputs.channel, state.channel, return_indices=True)
+    code[here], rate[here], since[here] = state.code_m[there], state.rate_mps[there], state.since[there]
+    codes, rates = np.vstack([code, inputs.code_m]), np.vstack([rate, inputs.rate_mps])
+    has = np.isfinite(codes) & np.isfinite(rates)
+    when = np.vstack([since, np.where(has[1:], inputs.time[:, None], np.datetime64("NaT", "ns"))])
+    row = np.maximum.accumulate(np.where(has, np.arange(len(codes))[:, None], 0), axis=0)
+    before, column = row[:-1], np.arange(channels)
+    dt = seconds(inputs.time[:, None] - when[before, column])
+    broken = np.cumsum(np.concatenate([[0], inputs.break_before]))
+    near = (dt <= limits.longest_gap_s) & (broken[1:, None] == broken[before])
+    change = codes[1:] - codes[before, column] - (rates[1:] + rates[before, column]) / 2.0 * dt
+    change = np.where(near, change, np.nan)
+    enough = np.count_nonzero(np.isfinite(change), axis=1) >= limits.least_satellites
+    step = np.where(enough, _median(change), np.nan)
+    last = row[-1]
+    kept = np.where(broken[-1] == broken[last], 0.0, np.nan)  # nothing is compared across a break
+    after = codes[last, column] + kept, rates[last, column], when[last, column]
+    return np.asarray(step - np.round(step / _MILLISECOND_M) * _MILLISECOND_M), after
+
+
+def _parts(inputs: MotionInputs, least: int) -> Floats:
+    """Return the largest difference of two constellations' positions and clocks, in standard deviations, shape (T,)."""
+    near, sight, misfit = _misfit(inputs)
+    design = np.concatenate([-sight, np.ones((*sight.shape[:2], 1))], axis=2)
+    found = []
+    for clock in range(int(inputs.group.max(initial=-1)) + 1):
+        used = inputs.used & (inputs.group == clock)
+        weight = np.where(used & (np.count_nonzero(used, axis=1) >= least)[:, None], 1.0 / inputs.sigma_m**2, 0.0)
+        step, covariance, scale = _fit(design, misfit, weight, least=1)
+        covariance = covariance * (np.maximum(scale, inputs.noise_scale) ** 2)[:, None, None]
+        step[:, 3] -= inputs.clock_offset_m[:, clock]
+        covariance[:, 3, 3] += inputs.clock_sigma_m[:, clock] ** 2
+        found.append((step, covariance))
+    largest = np.full(len(near), np.nan)
+    for k, (one, of_one) in enumerate(found):
+        for other, of_other in found[:k]:
+            difference, both = one - other, of_one + of_other
+            fine = np.isfinite(difference).all(axis=1) & np.isfinite(both).all(axis=(1, 2))
+            both = np.where(fine[:, None, None], both, np.eye(_SIZE))
+            inverse = np.linalg.inv(both)
+            square = ((inverse @ difference[..., None])[..., 0] * difference).sum(axis=1)
+            largest = np.fmax(largest, np.where(fine, np.sqrt(np.maximum(square, 0.0)), np.nan))
+    return largest

@@ -1,0 +1,133 @@
+"""Receivers' own indicators of jamming and spoofing, and the gain of their front ends.
+
+Sources: u-blox F9 HPG 1.32 interface description (UBX-22008968), 3.14.5 MON-RF, 3.14.2 MON-HW; u-blox X20 HPG 2.00
+(SEC-SIG, versions 1 and 2); Septentrio mosaic-X5 reference guide 4.14, 4.2.14 (RFStatus, ReceiverStatus).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Bytes, Floats, Integers
+from railfix.io.receiver.framing import Frames
+
+MON_RF: Final = 0x0A38
+MON_HW: Final = 0x0A09
+SEC_SIG: Final = 0x2709
+RF_STATUS: Final = 4092
+RECEIVER_STATUS: Final = 4014
+
+#: Bits of `Observations.receiver_alarm`.
+JAMMING, SPOOFING = 1, 2
+#: u-blox states that count: jamming is critical, spoofing is affirmed. State 2 (warning, indicated) was sent for 571 of
+#: 581 s of a recording without interference.
+_CERTAIN: Final = 3
+#: Septentrio: a band with interference that is not cancelled.
+_NOT_MITIGATED: Final = 8
+_MON_HW_BYTES: Final = 60
+#: u-blox: bytes of a block of MON-RF after the four of the head.
+_BLOCK: Final = 24
+#: Septentrio: first block of bands or front ends after the time stamp (6 bytes).
+_BANDS, _FRONT_ENDS = 12, 24
+_NO_GAIN: Final = -128
+
+
+@dataclass(frozen=True, kw_only=True)
+class Indicators:
+    """Last indicators of each kind of message so far: alarm bits, and the gain, NaN where none has it."""
+
+    alarm: Mapping[int, int] = field(default_factory=dict)
+    gain: float = np.nan
+
+
+def indicators_at(frames: Frames, places: Integers, before: Indicators) -> tuple[Bytes, Floats, Indicators]:
+    """Return alarm bits and gain at places of the stream, shape (T,) each, and the last indicators of all.
+
+    Parameters
+    ----------
+    frames : Frames
+    places : ndarray of int, shape (T,)
+        Rising; each has what the messages before it report.
+    before : Indicators
+        Of the bytes before these.
+    """
+    found = sorted(_messages(frames))
+    alarm, gain = dict(before.alarm), before.gain
+    alarms, gains = np.zeros(len(places), dtype=np.uint8), np.full(len(places), np.nan)
+    ends = np.searchsorted([place for place, *_ in found], places) if found else np.zeros(len(places), dtype=int)
+    done = 0
+    for epoch, end in enumerate([*ends.tolist(), len(found)]):
+        for _, kind, bits, own_gain in found[done:end]:
+            alarm[kind] = bits
+            gain = gain if np.isnan(own_gain) else own_gain
+        done = max(done, end)
+        if epoch < len(places):
+            alarms[epoch], gains[epoch] = np.bitwise_or.reduce([0, *alarm.values()]), gain
+    return alarms, gains, Indicators(alarm=alarm, gain=gain)
+
+
+def _messages(frames: Frames) -> Iterator[tuple[int, int, int, float]]:
+    """Yield place in the stream, kind, alarm bits and gain of each message."""
+    readers = {
+        ("ubx", MON_RF): _mon_rf,
+        ("ubx", MON_HW): _mon_hw,
+        ("ubx", SEC_SIG): _sec_sig,
+        ("sbf", RF_STATUS): _rf_status,
+        ("sbf", RECEIVER_STATUS): _receiver_status,
+    }
+    for (protocol, kind), read in readers.items():
+        for k in frames.of(protocol, kind).tolist():
+            values = read(frames.data[frames.start[k] : frames.end[k]])
+            if values is not None:
+                yield int(frames.frame_start[k]), kind, *values
+
+
+def _mon_rf(data: Bytes) -> tuple[int, float] | None:
+    """Jamming of any band, gain of the first."""
+    if len(data) < 4 + _BLOCK or len(data) != 4 + _BLOCK * int(data[1]):
+        return None
+    blocks = data[4:].reshape(-1, _BLOCK)
+    jammed = bool(((blocks[:, 1] & 3) >= _CERTAIN).any())
+    return JAMMING * jammed, float(blocks[0, 14]) + 256.0 * float(blocks[0, 15])
+
+
+def _mon_hw(data: Bytes) -> tuple[int, float] | None:
+    """Jamming and gain of receivers up to the M8."""
+    if len(data) != _MON_HW_BYTES:
+        return None
+    return JAMMING * ((int(data[22]) >> 2 & 3) >= _CERTAIN), float(data[18]) + 256.0 * float(data[19])
+
+
+def _sec_sig(data: Bytes) -> tuple[int, float] | None:
+    """Jamming and spoofing, each where its detection is on."""
+    if len(data) >= 12 and data[0] == 1:
+        jamming, spoofing = int(data[4]), int(data[8])
+    elif len(data) >= 4 and data[0] == 2:
+        jamming, spoofing = int(data[1]), int(data[1]) >> 3
+    else:
+        return None
+    bits = JAMMING * (jamming & 1 == 1 and (jamming >> 1 & 3) >= _CERTAIN)
+    return bits | SPOOFING * (spoofing & 1 == 1 and (spoofing >> 1 & 7) >= _CERTAIN), np.nan
+
+
+def _rf_status(data: Bytes) -> tuple[int, float] | None:
+    """Interference that is not cancelled; signals that mislead or are not authentic."""
+    if len(data) < _BANDS:
+        return None
+    count, size, flags = int(data[6]), int(data[7]), int(data[8])
+    if size < 7 or len(data) < _BANDS + count * size:
+        return None
+    modes = data[_BANDS : _BANDS + count * size].reshape(count, size)[:, 6] & 15
+    return JAMMING * bool((modes == _NOT_MITIGATED).any()) | SPOOFING * (flags & 3 != 0), np.nan
+
+
+def _receiver_status(data: Bytes) -> tuple[int, float] | None:
+    """Gain of the first front end [dB]."""
+    if len(data) < _FRONT_ENDS or int(data[20]) < 1 or len(data) < _FRONT_ENDS + int(data[21]):
+        return None
+    gain = int(data[_FRONT_ENDS + 1 : _FRONT_ENDS + 2].view(np.int8)[0])
+    return 0, np.nan if gain == _NO_GAIN else float(gain)

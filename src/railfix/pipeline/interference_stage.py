@@ -1,0 +1,195 @@
+"""Interference of each epoch: the signs of `railfix.integrity.interference` on the ranges and positions of a chunk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from railfix.core.arrays import Bits, Codes, Floats, Masks, changed, read_only
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.reasons import Reason, Status
+from railfix.integrity.interference import (
+    CAUSES,
+    Cause,
+    HeldState,
+    InterferenceLimits,
+    MotionSigns,
+    MotionState,
+    PowerSigns,
+    PowerState,
+    Suspicion,
+    held,
+    motion_signs,
+    power_signs,
+    suspicion,
+)
+from railfix.integrity.interference.motion import MotionInputs
+from railfix.positioning.antenna_rows import AntennaRows, rows_of
+
+if TYPE_CHECKING:
+    from railfix.pipeline.corrected_ranges import CorrectedRanges
+    from railfix.pipeline.solution import Solution
+    from railfix.positioning.section_search import SearchIndex
+
+#: Reasons given because ranges contradict others: those of a spoofer do.
+_CONTRADICTED: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.ALONE_ON_ITS_CLOCK)
+_NOT_ITS_SIGNAL: Final = int(Reason.OTHER_SIGNAL_TAKEN)
+#: Statuses of positions that spoofing outranks, and those that jamming does.
+_UNDER_SPOOFING: Final = (
+    Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN,
+    Status.MAP_OFFSET,
+)  # fmt: skip
+_UNDER_JAMMING: Final = (Status.OK,)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InterferenceState:
+    """State of the signs after a chunk."""
+
+    power: PowerState = field(default_factory=PowerState)
+    motion: MotionState = field(default_factory=MotionState)
+    held: HeldState = field(default_factory=HeldState)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interference:
+    """Interference of T epochs.
+
+    Attributes
+    ----------
+    causes : ndarray of int64, shape (T,)
+        `Cause` bits, each for as long as its time of release.
+    power : PowerSigns
+    motion : MotionSigns
+    """
+
+    causes: Bits
+    power: PowerSigns
+    motion: MotionSigns
+
+    @property
+    def suspicion(self) -> Codes:
+        """`Suspicion` of each epoch, shape (T,)."""
+        return suspicion(self.causes)
+
+
+def find_interference(
+    corrected: CorrectedRanges,
+    solution: Solution,
+    index: SearchIndex,
+    state: InterferenceState,
+    limits: InterferenceLimits,
+) -> tuple[Interference, InterferenceState]:
+    """Return the interference of the epochs of one antenna, and the state to pass on.
+
+    Parameters
+    ----------
+    corrected : CorrectedRanges
+        With all reasons.
+    solution : Solution
+        Of the same epochs.
+    index : SearchIndex
+        Of the antenna's trajectory.
+    state : InterferenceState
+    limits : InterferenceLimits
+    """
+    observations, reason = corrected.observations, corrected.reason
+    channel = np.char.add(corrected.satellite, corrected.signal)
+    taken = (reason & _NOT_ITS_SIGNAL) == 0
+    cn0 = np.where(taken & np.isfinite(corrected.code_m), corrected.cn0_dbhz, np.nan)
+    power, power_state = power_signs(corrected.time, channel, cn0, observations.front_end_gain, state.power, limits)
+    clocks = list(corrected.clocks)
+    arc, offset = index.trajectory.nearest(solution.point.ecef_m)
+    inside = (arc > 0.0) & (arc < index.trajectory.arc_m[-1])
+    motion, motion_state = motion_signs(
+        MotionInputs(
+            time=corrected.time,
+            break_before=corrected.break_before,
+            channel=channel,
+            group=np.array([clocks.index(letter) for letter in corrected.channels.clock.tolist()], dtype=np.intp),
+            near_ecef_m=solution.point.ecef_m,
+            sat_ecef_m=corrected.satellites.position_ecef_m,
+            sat_velocity_mps=corrected.satellites.velocity_ecef_mps,
+            code_m=np.where(taken, corrected.code_m, np.nan),
+            rate_mps=-SPEED_OF_LIGHT / corrected.frequency_hz * corrected.doppler_hz,
+            corrected_code_m=corrected.corrected_code_m,
+            sigma_m=corrected.sigma_m,
+            used=(reason & ~_CONTRADICTED) == 0,
+            noise_scale=solution.noise_scale,
+            clock_offset_m=solution.ties.offset_m,
+            clock_sigma_m=solution.ties.sigma_m,
+            off_line_m=np.where(inside, offset, np.nan),
+        ),
+        state.motion,
+        limits,
+    )
+    signs = _signs(observations.receiver_alarm, power, motion, limits)
+    hold, release = _times(limits)
+    _, stays, held_state = held(corrected.time, signs, state.held, hold_s=hold, release_s=release)
+    causes = (stays * np.array([int(cause) for cause in CAUSES])).sum(axis=1, dtype=np.int64)
+    after = InterferenceState(power=power_state, motion=motion_state, held=held_state)
+    return Interference(causes=causes, power=power, motion=motion), after
+
+
+def _signs(alarm: Codes, power: PowerSigns, motion: MotionSigns, limits: InterferenceLimits) -> Masks:
+    """Return which signs the epochs show by themselves, shape (T, causes)."""
+    sigmas = limits.jump_sigmas
+    by_cause = {
+        Cause.RECEIVER_JAMMING: (alarm & 1) != 0,
+        Cause.CN0_FALL: (power.fall_db >= limits.fall_db) & (power.spread_db <= limits.spread_db),
+        Cause.GAIN_FALL: power.gain_fall >= limits.gain_fall,
+        Cause.RECEIVER_SPOOFING: (alarm & 2) != 0,
+        Cause.EQUAL_CN0: power.difference_db <= limits.equal_db,
+        Cause.CLOCK_JUMP: (np.abs(motion.clock_jump_m) >= limits.clock_jump_m)
+        | ((motion.drift_jump_mps >= limits.drift_jump_mps) & (motion.drift_jump_sigmas >= sigmas)),
+        Cause.SPEED_JUMP: (motion.speed_jump_mps >= limits.speed_jump_mps) & (motion.speed_jump_sigmas >= sigmas),
+        Cause.POSITION_JUMP: (motion.position_jump_m >= limits.position_jump_m)
+        & (motion.position_jump_sigmas >= sigmas),
+        Cause.CONSTELLATIONS_PART: motion.part_sigmas >= limits.part_sigmas,
+        Cause.LEFT_MAP: (motion.off_line_m >= limits.off_map_m) & (motion.off_line_sigmas >= sigmas),
+    }
+    return np.stack([by_cause[cause] for cause in CAUSES], axis=1)
+
+
+@lru_cache
+def _times(limits: InterferenceLimits) -> tuple[Floats, Floats]:
+    """Return times of holding and of release by cause [s]."""
+    hold = {
+        Cause.CN0_FALL: limits.hold_s, Cause.GAIN_FALL: limits.hold_s, Cause.EQUAL_CN0: limits.hold_s,
+        Cause.LEFT_MAP: limits.hold_s, Cause.CONSTELLATIONS_PART: limits.part_hold_s,
+    }  # fmt: skip
+    release = {
+        Suspicion.JAMMING_SUSPECTED: limits.jamming_release_s,
+        Suspicion.SPOOFING_SUSPECTED: limits.spoofing_release_s,
+    }
+    kinds = suspicion(np.array(CAUSES, dtype=np.int64)).tolist()
+    return (
+        read_only(np.array([hold.get(cause, 0.0) for cause in CAUSES])),
+        read_only(np.array([release[Suspicion(kind)] for kind in kinds])),
+    )
+
+
+def judge_interference(
+    corrected: CorrectedRanges,
+    solution: Solution,
+    antennas: AntennaRows,
+    states: list[InterferenceState],
+    limits: InterferenceLimits,
+) -> tuple[Solution, list[InterferenceState]]:
+    """Return positions with interference and its statuses, and the new state of each antenna."""
+    if limits.use == "off":
+        return solution, states
+
+    def of_antenna(index: SearchIndex, rows: slice, state: InterferenceState) -> tuple[Interference, InterferenceState]:
+        return find_interference(rows_of(corrected, rows), rows_of(solution, rows), index, state, limits)
+
+    found, after = antennas.each_with_state(of_antenna, states)
+    kind, status = found.suspicion, solution.status
+    jammed = (kind == Suspicion.JAMMING_SUSPECTED) & np.isin(status, _UNDER_JAMMING)
+    spoofed = (kind == Suspicion.SPOOFING_SUSPECTED) & np.isin(status, _UNDER_SPOOFING)
+    status = np.where(jammed, np.int8(Status.JAMMING_SUSPECTED), status)
+    status = np.where(spoofed, np.int8(Status.SPOOFING_SUSPECTED), status)
+    return changed(solution, status=status, interference=found), after

@@ -1,0 +1,208 @@
+"""Signs of interference: arrays against loops over epochs, least squares against numpy's, any cutting into chunks."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.timescale import timedelta
+from railfix.integrity.interference import (
+    Cause,
+    HeldState,
+    InterferenceLimits,
+    MotionState,
+    PowerState,
+    Suspicion,
+    cause_text,
+    held,
+    motion_signs,
+    power_signs,
+    suspicion,
+)
+from railfix.integrity.interference.motion import MotionInputs
+
+LIMITS = InterferenceLimits()
+START = np.datetime64("2024-03-05T03:10:00", "ns")
+EDGES = (0, 1, 7, 20, 21, 40)
+
+
+def times(count: int) -> np.ndarray:
+    return START + timedelta(np.arange(count, dtype=float))
+
+
+@pytest.mark.requirement("B8")
+def test_falls_of_cn0_are_those_of_a_loop_over_satellites_whatever_the_chunks() -> None:
+    rng = np.random.default_rng(3)
+    cn0 = 44.0 + rng.standard_normal((40, 9)).round(2)
+    cn0[rng.random(cn0.shape) < 0.1] = np.nan
+    cn0[25:, :] -= 7.0
+    gain = np.where(np.arange(40) < 25, 5000.0, 3000.0)
+    channel, time = np.array([f"G{k:02d}1C" for k in range(9)]), times(40)
+    expected = np.full((40, 2), np.nan)
+    for k in range(40):
+        falls = []
+        for m in range(9):
+            seen = [i for i in range(k + 1) if np.isfinite(cn0[i, m])]
+            if np.isfinite(cn0[k, m]) and k - seen[0] >= LIMITS.known_after_s:
+                peak = max(cn0[i, m] - (k - i) * LIMITS.peak_decay_db_per_min / 60.0 for i in seen)
+                falls.append(peak - cn0[k, m])
+        if len(falls) >= LIMITS.least_satellites:
+            expected[k] = np.median(falls), np.std(falls)
+    state, parts = PowerState(), []
+    for a, b in itertools.pairwise(EDGES):
+        signs, state = power_signs(time[a:b], channel, cn0[a:b], gain[a:b], state, LIMITS)
+        parts.append(signs)
+    whole, _ = power_signs(time, channel, cn0, gain, PowerState(), LIMITS)
+    for item in fields(whole):
+        cut = np.concatenate([getattr(part, item.name) for part in parts])
+        np.testing.assert_array_equal(cut, getattr(whole, item.name), err_msg=item.name)
+    np.testing.assert_allclose(np.stack([whole.fall_db, whole.spread_db], axis=1), expected, atol=1e-6)
+    assert np.isfinite(expected[20:]).sum() > 30
+    assert whole.gain_fall[30] == pytest.approx(0.4, abs=0.001)
+
+
+@pytest.mark.requirement("B8")
+def test_what_holds_and_what_stays_are_those_of_a_loop_whatever_the_chunks() -> None:
+    rng = np.random.default_rng(5)
+    step = rng.choice([0.2, 1.0, 30.0], 200)
+    time = START + timedelta(np.cumsum(step))
+    signs = rng.random((200, 2)) < 0.8
+    hold, release = np.array([3.0, 0.0]), np.array([4.0, 10.0])
+    expected = np.zeros((2, 200, 2), dtype=bool)
+    for c in range(2):
+        run, last = 0.0, -np.inf
+        for k in range(200):
+            passed = float((time[k] - time[max(k - 1, 0)]) / np.timedelta64(1, "s"))
+            run = run + min(passed, hold[c] / 2.0) if signs[k, c] else 0.0
+            now = float((time[k] - START) / np.timedelta64(1, "s"))
+            if signs[k, c] and run >= hold[c] - 1e-9:
+                expected[0, k, c], last = True, now
+            expected[1, k, c] = now - last <= release[c]
+    state, parts = HeldState(), []
+    for a, b in zip([0, 1, 50, 51, 120], [1, 50, 51, 120, 200], strict=True):
+        *found, state = held(time[a:b], signs[a:b], state, hold_s=hold, release_s=release)
+        parts.append(found)
+    for k in range(2):
+        np.testing.assert_array_equal(np.concatenate([part[k] for part in parts]), expected[k])
+    assert expected[0, :, 0].any()
+    assert not expected[0, :, 0].all()
+
+
+def scene(*, epochs: int = 40, jump: float = 0.0, clock: float = 0.0, parted: float = 0.0) -> MotionInputs:
+    """Twelve satellites of two constellations seen by an antenna at 20 m/s; from epoch 25 on something jumps."""
+    rng = np.random.default_rng(11)
+    sight = rng.standard_normal((12, 3))
+    sight[:, 0] = np.abs(sight[:, 0]) + 0.3
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    time, now = times(epochs), np.arange(epochs, dtype=float)
+    later = now >= 25
+    velocity = np.array([0.0, 20.0, 0.0])
+    ecef = np.array([6.378e6, 0.0, 0.0]) + now[:, None] * velocity + later[:, None] * np.array([0.0, 0.0, jump])
+    sat = ecef[:1, None, :] + 2.2e7 * sight + now[:, None, None] * np.array([0.0, 300.0, 2000.0])
+    sat = np.broadcast_to(sat, (epochs, 12, 3))
+    to_satellite = sat - ecef[:, None, :]
+    distance = np.linalg.norm(to_satellite, axis=2)
+    turn = 7.2921151467e-5 / SPEED_OF_LIGHT * (sat[..., 0] * ecef[:, None, 1] - sat[..., 1] * ecef[:, None, 0])
+    group = np.arange(12) // 6
+    corrected = distance + turn + 100.0 + group * 8.0 + 0.5 * rng.standard_normal(distance.shape)
+    corrected += later[:, None] * (group == 1) * (sight[:, 1] * parted)
+    unit = to_satellite / distance[..., None]
+    rate = (unit * (np.array([0.0, 300.0, 2000.0]) - velocity)).sum(axis=2) + 3.0
+    return MotionInputs(
+        time=time,
+        break_before=np.zeros(epochs, dtype=bool),
+        channel=np.array([f"{'GE'[k // 6]}{k:02d}1C" for k in range(12)]),
+        group=group,
+        near_ecef_m=ecef + 5.0,
+        sat_ecef_m=sat,
+        sat_velocity_mps=np.broadcast_to(np.array([0.0, 300.0, 2000.0]), sat.shape),
+        code_m=corrected + later[:, None] * clock,
+        rate_mps=rate + 0.05 * rng.standard_normal(rate.shape),
+        corrected_code_m=corrected,
+        sigma_m=np.full(distance.shape, 0.5),
+        used=np.ones(distance.shape, dtype=bool),
+        noise_scale=np.ones(epochs),
+        clock_offset_m=np.broadcast_to(np.array([0.0, 8.0]), (epochs, 2)),
+        clock_sigma_m=np.broadcast_to(np.array([0.0, 1.0]), (epochs, 2)),
+        off_line_m=np.full(epochs, 1.0),
+    )
+
+
+@pytest.mark.requirement("B8")
+@pytest.mark.parametrize(
+    ("change", "name", "least"),
+    [
+        ({"jump": 80.0}, "position_jump_m", 60.0),
+        ({"clock": 200.0}, "clock_jump_m", 190.0),
+        ({"parted": 60.0}, "part_sigmas", 15.0),
+    ],
+)
+def test_a_jump_shows_in_its_own_statistic_alone_at_its_epoch(
+    change: dict[str, float], name: str, least: float
+) -> None:
+    quiet, _ = motion_signs(scene(), MotionState(), LIMITS)
+    found, _ = motion_signs(scene(**change), MotionState(), LIMITS)
+    assert np.nanmax(np.abs(getattr(quiet, name))) < 0.3 * least
+    assert abs(getattr(found, name)[25]) > least
+    assert not (np.abs(getattr(found, name)[:25]) > 0.3 * least).any()
+    others = {"position_jump_sigmas", "speed_jump_sigmas", "drift_jump_sigmas"} - {name.replace("_m", "_sigmas")}
+    for other in others:
+        assert not (getattr(found, other) > LIMITS.jump_sigmas).any(), other
+
+
+@pytest.mark.requirement("B8")
+def test_a_clock_that_steps_by_milliseconds_does_not_count() -> None:
+    found, _ = motion_signs(scene(clock=2e-3 * SPEED_OF_LIGHT), MotionState(), LIMITS)
+    assert np.nanmax(np.abs(found.clock_jump_m)) < 5.0
+
+
+@pytest.mark.requirement("B8")
+def test_statistics_of_motion_are_the_same_whatever_the_chunks() -> None:
+    inputs = scene(jump=80.0, clock=200.0, parted=60.0)
+    whole, _ = motion_signs(inputs, MotionState(), LIMITS)
+    state, parts = MotionState(), []
+    of_channels = {"channel", "group"}
+    for a, b in itertools.pairwise(EDGES):
+        part = MotionInputs(*(v if n in of_channels else v[a:b] for n, v in inputs._asdict().items()))
+        signs, state = motion_signs(part, state, LIMITS)
+        parts.append(signs)
+    for item in fields(whole):
+        cut = np.concatenate([getattr(part, item.name) for part in parts])
+        np.testing.assert_allclose(cut, getattr(whole, item.name), rtol=1e-9, atol=1e-6, err_msg=item.name)
+
+
+@pytest.mark.requirement("B8")
+def test_parted_constellations_are_those_of_two_fits_by_numpy() -> None:
+    inputs = scene(parted=60.0)
+    found, _ = motion_signs(inputs, MotionState(), LIMITS)
+    k, solved = 30, []
+    near = inputs.near_ecef_m[k]
+    for g in range(2):
+        own = inputs.group == g
+        los = inputs.sat_ecef_m[k, own] - near
+        distance = np.linalg.norm(los, axis=1)
+        turn = (
+            7.2921151467e-5
+            / SPEED_OF_LIGHT
+            * (inputs.sat_ecef_m[k, own, 0] * near[1] - inputs.sat_ecef_m[k, own, 1] * near[0])
+        )
+        design = np.column_stack([-los / distance[:, None], np.ones(own.sum())])
+        misfit = inputs.corrected_code_m[k, own] - distance - turn
+        x, left, *_ = np.linalg.lstsq(design, misfit, rcond=None)
+        scale = max(np.sqrt(left[0] / 0.25 / (own.sum() - 4)), 1.0)
+        covariance = np.linalg.inv(design.T @ design / 0.25) * scale**2
+        covariance[3, 3] += inputs.clock_sigma_m[k, g] ** 2
+        solved.append((x - np.array([0.0, 0.0, 0.0, inputs.clock_offset_m[k, g]]), covariance))
+    difference, both = solved[0][0] - solved[1][0], solved[0][1] + solved[1][1]
+    assert found.part_sigmas[k] == pytest.approx(np.sqrt(difference @ np.linalg.solve(both, difference)), rel=1e-6)
+
+
+@pytest.mark.requirement("B8")
+def test_causes_have_words_and_spoofing_outranks_jamming() -> None:
+    causes = np.array([0, int(Cause.CN0_FALL), int(Cause.CN0_FALL | Cause.EQUAL_CN0)])
+    assert cause_text(causes).tolist() == ["", "cn0_fall", "cn0_fall+equal_cn0"]
+    assert suspicion(causes).tolist() == [Suspicion.NONE, Suspicion.JAMMING_SUSPECTED, Suspicion.SPOOFING_SUSPECTED]

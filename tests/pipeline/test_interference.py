@@ -1,0 +1,127 @@
+"""Jamming and spoofing of a simulated train: statuses of single epochs, of the filter, and of the live message."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import pipeline_cases
+import signal_attacks
+from railfix.core.reasons import Status
+from railfix.gnss.observations import Observations
+from railfix.integrity.interference import Cause, Suspicion
+from railfix.integrity.protection import LevelStatus
+from railfix.live.message import message_of
+from railfix.live.settings import LiveSettings
+from railfix.pipeline.processor import Result
+from railfix.tracking import TrackStatus
+from railfix.tracking.result import is_bounded
+from signal_attacks import Scene
+
+#: Epoch of the attacks, at 1 Hz: the train runs.
+AT = 60
+
+
+@cache
+def scene() -> Scene:
+    log = pipeline_cases.clean_observations()["front"][::10]
+    truth = pipeline_cases.clean_truth().filter(antenna="front")[::10]
+    return Scene.of(log, pipeline_cases.clean_navigation(), truth.select("x_m", "y_m", "z_m").to_numpy())
+
+
+def result_of(log: Observations, **settings: object) -> Result:
+    return pipeline_cases.processor({"filter": "off", **settings}).process({"front": log})[0]
+
+
+@pytest.mark.requirement("B8")
+def test_a_train_without_interference_has_none() -> None:
+    found = result_of(scene().observations)["front"]
+    assert (found.interference.suspicion == Suspicion.NONE).all()
+    assert (found.status == Status.OK).any()
+
+
+@pytest.mark.requirement("B8")
+def test_a_jammer_passed_at_50_m_is_suspected_from_5_db_on_and_released_after_it() -> None:
+    rng = np.random.default_rng(1)
+    found = result_of(signal_attacks.jammed(scene(), AT, -15.0, rng))["front"]
+    fall = signal_attacks.fall_db(scene(), AT, -15.0)
+    jammed = np.flatnonzero(found.interference.suspicion == Suspicion.JAMMING_SUSPECTED)
+    first = int(np.argmax(fall >= 5.0))
+    assert first <= jammed[0] <= first + 8
+    assert fall[: jammed[0] + 1].max() < 12.0, "before the fall is deep"
+    assert jammed[-1] <= np.flatnonzero(fall >= 4.0)[-1] + 12
+    assert (found.status[jammed] == Status.JAMMING_SUSPECTED).any()
+    assert not (found.interference.suspicion == Suspicion.SPOOFING_SUSPECTED).any()
+
+
+@pytest.mark.requirement("B8")
+def test_walls_that_weaken_half_of_the_satellites_are_no_jammer() -> None:
+    log = scene().observations
+    side = np.arange(len(log.satellite)) % 2 == 0
+    behind = (np.arange(len(log)) >= AT)[:, None] & side
+    found = result_of(pipeline_cases.replace(log, cn0_dbhz=log.cn0_dbhz - 12.0 * behind))["front"]
+    assert not found.interference.suspicion.any()
+
+
+@pytest.mark.requirement("B8")
+def test_repeated_signals_are_suspected_at_their_first_epoch_and_no_level_is_promised() -> None:
+    log = signal_attacks.repeated(scene(), AT, (120.0, -90.0), 200.0)
+    found = result_of(log)["front"]
+    spoofed = np.flatnonzero(found.interference.suspicion == Suspicion.SPOOFING_SUSPECTED)
+    assert spoofed[0] == AT + 2, "the first epoch after two seconds without lock"
+    assert spoofed[-1] == len(log) - 1
+    assert set(found.status[AT + 2 :].tolist()) <= {
+        int(Status.SPOOFING_SUSPECTED),
+        int(Status.TOO_FEW_SATELLITES),
+        5,
+        6,
+    }
+    assert found.interference.causes[AT + 2] & (Cause.POSITION_JUMP | Cause.CLOCK_JUMP)
+    positioned = found.status == Status.SPOOFING_SUSPECTED
+    assert (found.protection.status[positioned] == LevelStatus.ALARM).all()
+    dropped = result_of(log, failed_checks="drop")["front"]
+    assert np.isnan(dropped.chainage_m[positioned]).all()
+
+
+@pytest.mark.requirement("B8")
+def test_a_pull_by_one_transmitter_is_suspected_and_one_constellation_parts() -> None:
+    rng = np.random.default_rng(2)
+    pulled = result_of(signal_attacks.pulled(scene(), AT, 0.5, power="equal", rng=rng))["front"]
+    first = int(np.argmax(pulled.interference.suspicion > 0))
+    assert AT + 2 <= first <= AT + 15
+    parted = result_of(signal_attacks.pulled(scene(), AT, 2.0, systems="E", rng=rng))["front"]
+    first = int(np.argmax(parted.interference.suspicion > 0))
+    assert AT + 10 <= first <= AT + 60
+    assert parted.interference.causes[first] == Cause.CONSTELLATIONS_PART
+
+
+@pytest.mark.requirement("B8")
+def test_the_receivers_own_alarm_counts_and_all_can_be_turned_off() -> None:
+    log = scene().observations
+    alarm = np.zeros(len(log), dtype=np.uint8)
+    alarm[AT : AT + 3], alarm[100:] = 1, 2
+    log = pipeline_cases.replace(log, receiver_alarm=alarm)
+    found = result_of(log)["front"].interference.suspicion
+    assert (found[AT : AT + 12] == Suspicion.JAMMING_SUSPECTED).all()
+    assert (found[:AT] == 0).all()
+    assert (found[AT + 13 : 100] == 0).all()
+    assert (found[100:] == Suspicion.SPOOFING_SUSPECTED).all()
+    assert result_of(log, interference={"use": "off"})["front"].interference is None
+
+
+@pytest.mark.slow
+@pytest.mark.requirement("B8")
+def test_the_filter_gives_no_bound_and_the_message_says_why() -> None:
+    log = signal_attacks.repeated(scene(), AT, (120.0, -90.0), 200.0)[: AT + 20]
+    whole, _ = pipeline_cases.processor().process({"front": log})
+    tracked = whole.fusion["front"].tracked
+    spoofed = whole["front"].interference.suspicion == Suspicion.SPOOFING_SUSPECTED
+    assert spoofed.sum() > 15
+    assert not is_bounded(tracked.status[spoofed]).any()
+    assert (tracked.status[spoofed] == TrackStatus.SPOOFING_SUSPECTED).any()
+    assert not np.isfinite(tracked.level_m[spoofed]).any()
+    message = message_of(whole, LiveSettings(), sequence=1, sent_ns=0)
+    assert message.interference == Suspicion.SPOOFING_SUSPECTED
+    assert message.over_cm is None
