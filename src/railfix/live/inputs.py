@@ -79,6 +79,6 @@ class LiveInputs(Settings):
         named = {f"track {k}": path for k, path in enumerate(self.track)}
         given = {
             "vehicle": self.vehicle, "ranging units": self.ranging_units, "cn0 curve": self.config.cn0_curve,
-            "error model": self.config.error_model,
+            "error model": self.config.error_model, "integrity support": self.config.integrity_support,
         }  # fmt: skip
         return named | {name: path for name, path in given.items() if path is not None}

@@ -89,6 +89,7 @@ def antenna_results(
         protection=None if protection is None else judged(protection, solution.status, has, chainage, config),
         map_offset=solution.map_offset,
         interference=solution.interference,
+        araim=solution.araim,
         clocks=corrected.clocks,
         clock_offset_m=solution.ties.offset_m,
         clock_offset_sigma_m=solution.ties.sigma_m,

@@ -22,13 +22,14 @@ from collections.abc import Mapping
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, create_model, field_validator, model_validator
 
 from railfix.core.settings import Settings, load_settings, validated
 from railfix.integrity.interference import InterferenceLimits
 from railfix.integrity.protection import RiskBudget
+from railfix.integrity.protection.araim import AraimBudget
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.positioning.carrier import ContinuityLimits, CycleSlipLimits, PhaseLimits, SmoothingLimits
 from railfix.positioning.constrained import ConstrainedLimits
@@ -179,6 +180,11 @@ class Config(ScreenSettings):
         Whether positions get a protection level along the line with its parts (`railfix.integrity.protection`).
     risk : RiskBudget
         Integrity risk per hour, its shares, and the fault probabilities that the level assumes.
+    integrity_support : path or None
+        Integrity support message (TOML, ``docs/protection-level.md``): its satellites have ARAIM levels besides,
+        along the track and in 3-D. Not with SBAS.
+    araim : AraimBudget
+        Allocation of the risk of these.
     alarm_limit_m : float
         Largest protection level of an available position. P4 takes a car length, 20 m.
     no_level_m : tuple of (float, float) [m]
@@ -243,6 +249,8 @@ class Config(ScreenSettings):
     nominal: NominalErrors = NominalErrors()
     protection: Literal["on", "off"] = "on"
     risk: RiskBudget = RiskBudget()
+    integrity_support: Path | None = None
+    araim: AraimBudget = AraimBudget()
     alarm_limit_m: float = Field(default=20.0, gt=0, le=1e5)
     no_level_m: tuple[tuple[float, float], ...] = ()
     raim_protection: Literal["on", "off"] = "off"
@@ -292,6 +300,12 @@ class Config(ScreenSettings):
         if "code" not in value or len(set(value)) != len(value):
             raise ValueError("name each measurement once, code among them: places are sought by codes")
         return tuple(name for name in FILTER_SOURCES if name in value)
+
+    @model_validator(mode="after")
+    def _support_without_sbas(self) -> Self:
+        if self.integrity_support is not None and self.sbas:
+            raise ValueError("integrity_support states what SBAS does: give one of the two")
+        return self
 
     @cached_property
     def local_risk(self) -> RiskBudget:

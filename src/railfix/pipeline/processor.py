@@ -18,9 +18,11 @@ import numpy as np
 from railfix.core.arrays import Masks, changed
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
+from railfix.integrity.protection.support import IntegritySupport
 from railfix.motion.samples import GroundUnits, SensorSamples
 from railfix.pipeline.along_track import along_track, checked
 from railfix.pipeline.antenna_order import AntennaOrder
+from railfix.pipeline.araim_stage import with_araim
 from railfix.pipeline.assemble import antenna_results, with_coordinates
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
@@ -103,6 +105,8 @@ class EpochProcessor:
         The line itself, for places by its changes of gradient and curvature in the filter along the track.
     units : GroundUnits, optional
         Surveyed stations of two-way ranges, for the filter along the track.
+    support : IntegritySupport, optional
+        Integrity support message, for ARAIM levels.
     screens : sequence of Screen, optional
         Screens of one's own, used with their limits beside those of `config`; their verdicts are in
         `AntennaResult.screens`, without columns of the tables (those of installed packages have them).
@@ -137,6 +141,7 @@ class EpochProcessor:
         cn0_curve: Cn0Curve | None = None,
         track: Track | None = None,
         units: GroundUnits | None = None,
+        support: IntegritySupport | None = None,
         screens: Sequence[Screen[Any]] = (),
     ) -> None:
         if not trajectories:
@@ -156,7 +161,7 @@ class EpochProcessor:
         self.received = known_from_start(config, navigation=navigation, messages=messages)
         self._channels = ChannelBook(config)
         self.indices = {name: SearchIndex(t) for name, t in self.trajectories.items()}
-        self._error_model = error_model
+        self._error_model, self._support = error_model, support
         if taken := [s.name for s in screens if s.name in SCREEN_NAMES]:
             raise ValueError(f"there is a screen {taken[0]} already; give it another name")
         chosen = (*(s for s in SCREENS if s.name in config.screens), *screens)
@@ -281,6 +286,7 @@ class EpochProcessor:
             corrected, solution, antennas, [own.interference for own in own_states], self.config.interference
         )
         own_states = [replace(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
+        solution = with_araim(corrected, solution, antennas, self._support, self.config)
         solved = SolvedChunk(
             results=self._results(antennas, corrected, solution, pair, ranges),
             ranges={name: rows_of(corrected, rows) for name, rows in zip(names, parts, strict=True)},

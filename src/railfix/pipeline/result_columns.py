@@ -179,6 +179,21 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             lambda r: None if r.protection is None else r.protection.status,
             words=tuple(s.name.lower() for s in LevelStatus),
         ),
+        Column(
+            "araim_level_m",
+            "ARAIM with the integrity support message: along the line, the map as a constraint",
+            lambda r: None if r.araim is None else r.araim.along.level_m[:, 0],
+        ),
+        Column(
+            "araim_horizontal_m",
+            "the same of a 3-D position from these ranges, without the map: horizontal",
+            lambda r: None if r.araim is None else r.araim.horizontal_m,
+        ),
+        Column(
+            "araim_vertical_m",
+            "the same, vertical",
+            lambda r: None if r.araim is None else r.araim.space.level_m[:, 2],
+        ),
         *(_position_column(c) for screen in SCREENS for c in screen.columns if c.table == "positions"),
         Column(
             "conventional_status",

@@ -13,6 +13,7 @@ from railfix.core.display import NotebookTable, html_list, html_table, median_te
 from railfix.core.reasons import Status
 from railfix.gnss.orbits import SatelliteStates
 from railfix.integrity.protection import ProtectionLevel
+from railfix.integrity.protection.araim import AraimResult
 from railfix.integrity.raim import Outcome
 from railfix.pipeline.carrier_stage import CarrierState
 from railfix.pipeline.filter_result import AlongTrack, FilterState
@@ -221,6 +222,8 @@ class AntennaResult(NotebookTable):
         Mean offset of the 3-D positions of the last minutes from the line.
     interference : Interference or None
         Jamming and spoofing suspected; None where that is off.
+    araim : AraimResult or None
+        ARAIM levels; None without an integrity support message.
     clocks : tuple of str
         Letter of each receiver clock of the results above, length G.
     clock_offset_m, clock_offset_sigma_m : ndarray, shape (T, G) [m]
@@ -269,6 +272,7 @@ class AntennaResult(NotebookTable):
     protection: ProtectionResult | None
     map_offset: MapOffset
     interference: Interference | None
+    araim: AraimResult | None
     clocks: tuple[str, ...]
     clock_offset_m: Floats
     clock_offset_sigma_m: Floats

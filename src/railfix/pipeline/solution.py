@@ -12,6 +12,7 @@ from scipy.special import chdtri, expit
 from railfix.core.arrays import Codes, Floats, Masks, changed
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
+from railfix.integrity.protection.araim import AraimResult
 from railfix.integrity.raim import LinearModel
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
@@ -71,6 +72,8 @@ class Solution:
         The train is away from the line: `railfix.pipeline.off_map`.
     interference : Interference or None
         Of `railfix.pipeline.interference_stage`, which comes after; None where it is off.
+    araim : AraimResult or None
+        Of `railfix.pipeline.araim_stage`, which comes after; None without an integrity support message.
     """
 
     point: SinglePoint
@@ -88,6 +91,7 @@ class Solution:
     map_offset: MapOffset
     off_map: Masks
     interference: Interference | None = None
+    araim: AraimResult | None = None
 
 
 def solve(

@@ -68,7 +68,7 @@ class RunRecord:
             if isinstance(used.get(group), dict):
                 used[group] = {key: value for key, value in used[group].items() if key != name}
         config = self._this_version(lambda: parse_config(used, source="settings_used"))
-        files = {name: self.located(name) for name in ("cn0_curve", "error_model", "sbas")}
+        files = {name: self.located(name) for name in ("cn0_curve", "error_model", "integrity_support", "sbas")}
         changes = {name: tuple(paths) if name == "sbas" else paths[0] for name, paths in files.items() if paths}
         return config.replaced(**changes) if changes else config
 

@@ -101,7 +101,7 @@ class RunInputs(InputFiles):
     truth : Path or None
         Reference positions, for `ablate` alone.
     config : Path or None
-    cn0_curve, error_model : Path or None
+    cn0_curve, error_model, integrity_support : Path or None
     sbas : tuple of Path
         Named by the settings (`with_settings`).
     """
@@ -132,6 +132,7 @@ class RunInputs(InputFiles):
     config: Path | None = None
     cn0_curve: Path | None = None
     error_model: Path | None = None
+    integrity_support: Path | None = None
     sbas: tuple[Path, ...] = ()
     truth: Path | None = input_option(
         "Reference positions: CSV with named columns (`antenna` where there are two) or RTKLIB .pos; only those of "
@@ -154,7 +155,12 @@ class RunInputs(InputFiles):
     def with_settings(self, config: Config) -> Self:
         """Return the same with the files that settings name."""
         sbas = () if config.sbas == "stream" else config.sbas
-        return self.replaced(cn0_curve=config.cn0_curve, error_model=config.error_model, sbas=sbas)
+        return self.replaced(
+            cn0_curve=config.cn0_curve,
+            error_model=config.error_model,
+            integrity_support=config.integrity_support,
+            sbas=sbas,
+        )
 
     def _with_own_sbas(self, config: Config) -> Config:
         """Return settings in which ``sbas = "stream"`` is replaced by the receivers' logs, whose messages are meant.

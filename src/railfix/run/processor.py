@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from railfix.core.errors import SettingsError
 from railfix.gnss.navigation import Navigation
+from railfix.integrity.protection.support import read_integrity_support
 from railfix.motion.samples import GroundUnits
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor
@@ -65,4 +66,5 @@ def processor_of(
         cn0_curve=None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve),
         track=track,
         units=units,
+        support=None if config.integrity_support is None else read_integrity_support(config.integrity_support),
     )

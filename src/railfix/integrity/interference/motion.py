@@ -82,7 +82,8 @@ class Fix(NamedTuple):
 
     def take(self, rows: Indices | slice) -> Fix:
         """Return those of some epochs."""
-        return Fix(*(values[rows] for values in self))
+        time, ecef, sigma, velocity, velocity_sigma = self
+        return Fix(time[rows], ecef[rows], sigma[rows], velocity[rows], velocity_sigma[rows])
 
 
 def _no_fix() -> Fix:
@@ -257,7 +258,8 @@ def _length(covariance: Floats) -> Floats:
 
 def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
     """Return the last good fix before each epoch, and the last one of all."""
-    everything = Fix(*(np.concatenate([a, b]) for a, b in zip(start, fixes, strict=True)))
+    time, *numbers = (np.concatenate([a, b]) for a, b in zip(start, fixes, strict=True))
+    everything = Fix(time, *numbers)
     row = np.where(np.concatenate([[True], good]), np.arange(len(good) + 1), 0)
     latest = np.maximum.accumulate(row)
     return everything.take(latest[:-1]), everything.take(latest[-1:])

@@ -1,0 +1,263 @@
+"""ARAIM: multiple-hypothesis solution separation with an integrity support message, along the track and in 3-D.
+
+The algorithm of the EU-U.S. Working Group C (milestone 3 report, annex A; ADD 3.0): for each fault mode k the position
+without its satellites, with `S_k = (G' W_k G)^-1 G' W_k`, W of the integrity sigmas,
+
+- `sigma_k^2 = [(G' W_k G)^-1]_qq`, bias `b_k = sum_i |S_k,qi| b_i`,
+- threshold `T_k = K_fa sqrt(sum_i (S_k,qi - S_0,qi)^2 sigma_acc,i^2)` with the accuracy sigmas,
+- level L: `2 Q((L - b_0) / sigma_0) + sum_k p_k Q((L - T_k - b_k) / sigma_k) = PHMI_q (1 - P_unmonitored / PHMI)`.
+
+A map is one more constraint (Wenz 2024): two observations, of the offsets across and up, with the sigmas of the map,
+that a wrong map makes faulty together; the position along the track is then the component of interest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+from pydantic import Field
+from scipy.special import ndtr
+
+from railfix.core.arrays import Floats, Integers, Masks
+from railfix.core.settings import Settings
+from railfix.integrity.protection.risk import one_sided_k, set_sums
+
+#: Halvings of the interval of a level: 1e4 m to less than a tenth of a micrometre.
+_HALVINGS: Final = 48
+_LONGEST_M: Final = 1e4
+#: Numbers of the largest array that a block of epochs holds.
+_BLOCK_SIZE: Final = 4_000_000
+#: Determinants below this share of the product of the diagonal are those of singular matrices.
+_SINGULAR: Final = 1e-12
+
+
+class AraimBudget(Settings):
+    """Allocation of integrity and continuity risk; defaults of ADD 3.0 for LPV-200, along the track those of vertical.
+
+    Attributes
+    ----------
+    phmi_along, phmi_vertical, phmi_horizontal : float
+        Probability of hazardously misleading information in an approach or a sample.
+    false_alarm_along, false_alarm_vertical, false_alarm_horizontal : float
+        Probability that noise alone makes the separations inconsistent.
+    unmonitored : float
+        Probability up to which fault modes may be left out; more satellites at a time become modes until it is kept.
+    most_faults : int
+        Satellites, constellations and the map that are faulty at a time, at most, in a mode.
+    map_prior : float
+        Probability that the map is wrong; 0: no such mode.
+    """
+
+    phmi_along: float = Field(default=9.8e-8, gt=0, lt=1)
+    phmi_vertical: float = Field(default=9.8e-8, gt=0, lt=1)
+    phmi_horizontal: float = Field(default=2e-9, gt=0, lt=1)
+    false_alarm_along: float = Field(default=3.9e-6, gt=0, lt=1)
+    false_alarm_vertical: float = Field(default=3.9e-6, gt=0, lt=1)
+    false_alarm_horizontal: float = Field(default=9e-8, gt=0, lt=1)
+    unmonitored: float = Field(default=8e-8, gt=0, lt=1)
+    most_faults: int = Field(default=2, ge=1, le=3)
+    map_prior: float = Field(default=1e-4, ge=0, lt=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AraimGeometry:
+    """Observations of T epochs, N of them: ranges, and with a map its two constraints.
+
+    Attributes
+    ----------
+    design : ndarray, shape (T, N, P)
+        Change of each observation with the P unknowns, position first, then a clock a constellation.
+    sigma_int_m, sigma_acc_m : ndarray, shape (T, N) [m]
+        Standard deviations for integrity and accuracy; NaN where not used.
+    bias_m : ndarray, shape (T, N) [m]
+    prior : ndarray, shape (N,)
+        Of a fault of the observation alone; 0: none.
+    together : ndarray of bool, shape (C, N)
+        Observations that one fault makes faulty together: of constellations, of the map.
+    together_prior : ndarray, shape (C,)
+    """
+
+    design: Floats
+    sigma_int_m: Floats
+    sigma_acc_m: Floats
+    bias_m: Floats
+    prior: Floats
+    together: Masks
+    together_prior: Floats
+
+    @property
+    def used(self) -> Masks:
+        """Observations with both sigmas, shape (T, N)."""
+        return np.asarray(np.isfinite(self.sigma_int_m) & np.isfinite(self.sigma_acc_m))
+
+
+@dataclass(frozen=True, kw_only=True)
+class AraimLevels:
+    """Levels of T epochs, for Q components of the position.
+
+    Attributes
+    ----------
+    level_m : ndarray, shape (T, Q) [m]
+        NaN without a position, infinite where faults that nothing checks are likelier than the risk allows.
+    sigma_int_m, sigma_acc_m : ndarray, shape (T, Q) [m]
+        Of the position with all observations.
+    modes : ndarray of int, shape (T,)
+        Fault modes.
+    unmonitored : ndarray, shape (T,)
+        Probability of what is no mode, or leaves no position.
+    """
+
+    level_m: Floats
+    sigma_int_m: Floats
+    sigma_acc_m: Floats
+    modes: Integers
+    unmonitored: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class AraimResult:
+    """ARAIM of T epochs; NaN without a position.
+
+    Attributes
+    ----------
+    along : AraimLevels
+        Along the track, with the map as a constraint.
+    space : AraimLevels
+        East, north and up, without the map.
+    """
+
+    along: AraimLevels
+    space: AraimLevels
+
+    @property
+    def horizontal_m(self) -> Floats:
+        """Horizontal level of the 3-D position, shape (T,) [m]."""
+        return np.asarray(np.hypot(self.space.level_m[:, 0], self.space.level_m[:, 1]))
+
+
+def araim_levels(
+    geometry: AraimGeometry,
+    phmi: Sequence[float],
+    false_alarm: Sequence[float],
+    budget: AraimBudget,
+) -> AraimLevels:
+    """Return the levels of the first Q unknowns.
+
+    Parameters
+    ----------
+    geometry : AraimGeometry
+    phmi, false_alarm : sequence of float, length Q
+        Of each component.
+    budget : AraimBudget
+    """
+    epochs, count = geometry.sigma_int_m.shape
+    events = _events(geometry)
+    sets = [list(s) for size in range(1, budget.most_faults + 1) for s in combinations(range(len(events)), size)]
+    masks = np.array([events[s].any(axis=0) for s in sets], dtype=bool).reshape(len(sets), count)
+    size = np.array([len(s) for s in sets])
+    block = max(1, _BLOCK_SIZE // max(1, (len(sets) + 1) * count * geometry.design.shape[2]))
+    parts = []
+    for first in range(0, max(epochs, 1), block):
+        rows = slice(first, first + block)
+        parts.append(_block(geometry, rows, sets, masks, size, np.array([phmi, false_alarm]), budget))
+    return AraimLevels(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in AraimLevels.__dataclass_fields__}
+    )
+
+
+def _events(geometry: AraimGeometry) -> Masks:
+    """Return single observations, then those that are faulty together, shape (E, N)."""
+    return np.concatenate([np.eye(len(geometry.prior), dtype=bool), geometry.together])
+
+
+def _block(
+    geometry: AraimGeometry,
+    rows: slice,
+    sets: list[list[int]],
+    masks: Masks,
+    size: Integers,
+    risks: Floats,
+    budget: AraimBudget,
+) -> AraimLevels:
+    """Return the levels of a block of epochs."""
+    used, design = geometry.used[rows], geometry.design[rows]
+    components = risks.shape[1]
+    prior = _event_priors(geometry, used)
+    probability = np.stack([prior[:, s].prod(axis=1) for s in sets], axis=1) if sets else np.zeros((len(used), 0))
+    order, beyond = _order(prior, budget)
+    probability = np.where(size[None, :] <= order[:, None], probability, 0.0)
+    out = np.concatenate([np.zeros((1, masks.shape[1]), dtype=bool), masks])
+    kept = used[:, None, :] & ~out
+    # modes that take nothing away, or nothing else than a smaller one, are those of the faults that it has
+    weight = np.where(kept, 1.0 / np.where(used, geometry.sigma_int_m[rows], 1.0)[:, None] ** 2, 0.0)
+    gain, sigma = _gains(design, weight, components)
+    acc = np.where(used, geometry.sigma_acc_m[rows], 0.0)[:, None, None]
+    bias = (np.abs(gain) * np.where(used, geometry.bias_m[rows], 0.0)[:, None, None]).sum(axis=3)
+    apart = np.sqrt(((gain - gain[:, :1]) ** 2 * acc**2).sum(axis=3))
+    lost = ~np.isfinite(sigma[:, 1:]).all(axis=2)
+    beyond = beyond + np.where(lost, probability, 0.0).sum(axis=1)
+    probability = np.where(lost, 0.0, probability)
+    modes = np.count_nonzero(probability, axis=1)
+    k = one_sided_k(risks[1] / (2.0 * np.maximum(modes, 1)[:, None]))
+    offset = np.concatenate(
+        [bias[:, :1], np.where(lost[..., None], 0.0, bias[:, 1:] + k[:, None] * apart[:, 1:])], axis=1
+    )
+    weights = np.concatenate([np.full((len(used), 1), 2.0), probability], axis=1)
+    total = budget.phmi_along if components == 1 else budget.phmi_vertical + budget.phmi_horizontal
+    asked = risks[0] * np.maximum(1.0 - beyond / total, 0.0)[:, None]
+    level = _solve(offset, np.where(np.isfinite(sigma), sigma, 1.0), weights, asked)
+    known = np.isfinite(sigma[:, 0])
+    return AraimLevels(
+        level_m=np.where(known, np.where(asked > 0.0, level, np.inf), np.nan),
+        sigma_int_m=np.where(known, sigma[:, 0], np.nan),
+        sigma_acc_m=np.where(known, np.sqrt((gain[:, 0] ** 2 * acc[:, 0] ** 2).sum(axis=2)), np.nan),
+        modes=modes,
+        unmonitored=beyond,
+    )
+
+
+def _event_priors(geometry: AraimGeometry, used: Masks) -> Floats:
+    """Return the probability of each event, shape (T, E); 0 where none of its observations is used."""
+    alone = np.where(used, geometry.prior, 0.0)
+    some = (used[:, None] & geometry.together).any(axis=2)
+    return np.concatenate([alone, np.where(some, geometry.together_prior, 0.0)], axis=1)
+
+
+def _order(prior: Floats, budget: AraimBudget) -> tuple[Integers, Floats]:
+    """Return how many events at a time are modes (T,), and a bound of the probability of more."""
+    more = set_sums(prior, budget.most_faults + 1)[:, 2:]
+    enough = more <= budget.unmonitored
+    order = np.where(enough.any(axis=1), np.argmax(enough, axis=1) + 1, budget.most_faults)
+    return order, more[np.arange(len(more)), order - 1]
+
+
+def _gains(design: Floats, weight: Floats, components: int) -> tuple[Floats, Floats]:
+    """Return rows of S (T, F, Q, N) and sigmas (T, F, Q) of each mode; NaN sigmas where it leaves no position."""
+    normal = np.einsum("tnp,tfn,tnr->tfpr", design, weight, design, optimize=True)
+    diagonal = np.diagonal(normal, axis1=2, axis2=3)
+    # a clock without observations is left out, as if known
+    free = diagonal > 0.0
+    normal = normal + np.where(free, 0.0, 1.0)[..., None] * np.eye(design.shape[2])
+    scale = np.sqrt(np.where(free, diagonal, 1.0))
+    scaled = normal / scale[..., None] / scale[..., None, :]
+    regular = (np.linalg.det(scaled) > _SINGULAR) & free[..., :components].all(axis=2)
+    inverse = np.linalg.inv(np.where(regular[..., None, None], scaled, np.eye(design.shape[2])))
+    covariance = inverse / scale[..., None] / scale[..., None, :]
+    gain = np.einsum("tfqp,tnp,tfn->tfqn", covariance[:, :, :components], design, weight, optimize=True)
+    variance = np.diagonal(covariance, axis1=2, axis2=3)[..., :components]
+    return np.where(regular[..., None, None], gain, 0.0), np.where(regular[..., None], np.sqrt(variance), np.nan)
+
+
+def _solve(offset: Floats, sigma: Floats, weight: Floats, risk: Floats) -> Floats:
+    """Return the levels (T, Q) at which the tails (T, F, Q) use up the risk, from above, by halving."""
+    low, high = np.zeros(risk.shape), np.full(risk.shape, _LONGEST_M)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        spent = (weight[..., None] * ndtr((offset - middle[:, None]) / sigma)).sum(axis=1)
+        over = spent > risk
+        low, high = np.where(over, middle, low), np.where(over, high, middle)
+    return np.where(high >= _LONGEST_M, np.inf, high)
