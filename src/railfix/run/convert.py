@@ -12,6 +12,7 @@ from railfix.core.errors import OutputError
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.logs import read_navigation, scan_observations
 from railfix.io.rinex import write_navigation, write_observations
+from railfix.io.rinex.write_navigation import with_written_messages
 from railfix.run.options import LogReading
 from railfix.run.output import Overwrite, check_output_file
 
@@ -49,11 +50,13 @@ def convert_logs(
         lines.append(f"wrote {out}: {epochs:,} epochs, RINEX {version}")
         lines += [f"passed over: {count:,} {what}" for what, count in sorted(skipped.items())]
     if nav_out is not None:
-        navigation = read_navigation(logs, date=date)
+        navigation, left_out = with_written_messages(read_navigation(logs, date=date))
         write_navigation(navigation, nav_out, version=version)
         records = len(navigation.kepler) + len(navigation.glonass)
         lines.append(f"wrote {nav_out}: {records:,} ephemerides, RINEX {version}")
-        lines += [f"passed over: {count:,} {what}" for what, count in sorted(navigation.skipped.items())]
+        lines += [
+            f"passed over: {count:,} {what}" for what, count in sorted({**navigation.skipped, **left_out}.items())
+        ]
     return lines
 
 

@@ -79,11 +79,11 @@ class IntegritySupport(Settings):
     def arrays(self, satellites: Sequence[str]) -> SupportArrays:
         """Return the statements on satellites; NaN for constellations without one."""
         of_each = [self.satellite.get(name) or self.constellation.get(name[0]) for name in satellites]
-        values = [
+        ura, ure, bias, prior = (
             np.array([np.nan if each is None else getattr(each, name) for each in of_each], dtype=np.float64)
             for name in ("sigma_ura_m", "sigma_ure_m", "bias_m", "prior")
-        ]
-        return SupportArrays(*values, {k: each.constellation_prior for k, each in self.constellation.items()})
+        )
+        return SupportArrays(ura, ure, bias, prior, {k: c.constellation_prior for k, c in self.constellation.items()})
 
 
 def read_integrity_support(path: FilePath) -> IntegritySupport:

@@ -23,6 +23,7 @@ from railfix.io.receiver.records import (
     Record,
     Values,
     beidou_record,
+    cnav_record,
     frame_time,
     galileo_record,
     glonass_record,
@@ -38,6 +39,11 @@ _E5A_SOURCE: Final = 1 << 1 | 1 << 8
 #: Constellation of RTCM ephemeris messages.
 _RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1045: "E", 1046: "E", 1020: "R"}
 _UBX_E5B: Final = (5, 6)
+_UBX_E5A: Final = (3, 4)
+#: Signals with CNAV: L2C and L5.
+_CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}
+#: Numbers of F/NAV pages and of CNAV messages among those of a satellite come after these.
+_FNAV_FROM, _CNAV_FROM = 200, 300
 #: Time from the beginning of a GLONASS frame in which its strings 1 to 4 come.
 _STRINGS_S: Final = 15.0
 #: Longest time from the last epoch to the string that counts as received then.
@@ -166,8 +172,8 @@ def _nonzero(counts: Counter[str]) -> dict[str, int]:
 
 
 def _lnav(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
-    civil = part.signal == 0
-    counts[f"{part.satellite[0][0]} CNAV"] += int(np.count_nonzero(~civil))
+    letter, civil = str(part.satellite[0][0]), part.signal == 0
+    yield from _cnav(part, letter, counts)
     bits = packed_words(part.words, drop=6, keep=24)
     number = unsigned(bits, 43, 3)
     valid = civil & (unsigned(bits, 0, 8) == 0x8B)
@@ -178,9 +184,39 @@ def _lnav(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Val
             yield row, k, values
 
 
+def _cnav(part: Subframes, letter: str, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
+    cnav = np.isin(part.signal, _CNAV_SIGNALS[letter])
+    counts[f"{letter} pages of other messages"] += int(np.count_nonzero(~cnav & (part.signal != 0)))
+    if not cnav.any():
+        return
+    bits = packed_words(part.words, drop=0, keep=32)
+    valid = cnav & (unsigned(bits, 0, 8) == 0x8B) & nav_messages.has_crc(bits, nav_messages.CNAV_CHECKED)
+    counts[f"{letter} CNAV without valid CRC"] += int(np.count_nonzero(cnav & ~valid))
+    kind = unsigned(bits, 14, 6)
+    for k, layout in nav_messages.CNAV.items():
+        # a message of type 61 of QZSS is one of type 30
+        rows = np.flatnonzero(valid & ((kind == k) | ((kind == 61) & (k == 30) & (letter == "J"))))
+        for row, values in _rows(bits, rows, nav_messages.CNAV_HEAD | layout):
+            yield row, _CNAV_FROM + k, values
+
+
+def _fnav(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
+    fnav = np.isin(part.signal, _UBX_E5A)
+    if not fnav.any():
+        return
+    bits = packed_words(part.words, drop=0, keep=32)
+    valid = fnav & nav_messages.has_crc(bits, nav_messages.FNAV_CHECKED)
+    counts["E pages without valid CRC"] += int(np.count_nonzero(fnav & ~valid))
+    kind = unsigned(bits, 0, 6)
+    for k, layout in nav_messages.FNAV.items():
+        for row, values in _rows(bits, np.flatnonzero(valid & (kind == k)), layout):
+            yield row, _FNAV_FROM + k, values
+
+
 def _inav(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
     inav = np.isin(part.signal, (1, *_UBX_E5B))
-    counts["E F/NAV"] += int(np.count_nonzero(~inav))
+    yield from _fnav(part, counts)
+    counts["E pages of other messages"] += int(np.count_nonzero(~inav & ~np.isin(part.signal, _UBX_E5A)))
     bits, valid = nav_messages.inav_words(part.words)
     counts["E pages without valid CRC"] += int(np.count_nonzero(inav & ~valid))
     kind = unsigned(bits, 0, 6)
@@ -265,6 +301,8 @@ class _EphemerisBuilder:
             self._ionosphere_gps(letter, values)
             return
         make = {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}.get(letter)
+        if number > _FNAV_FROM:
+            make = self._galileo_f if letter == "E" else self._modernised
         record = (make or (self._d2 if number > 100 else self._d1))(satellite, time)
         if letter == "R" and record is None and self._parts(satellite, (1, 2, 3, 4)) is not None:
             self.waiting[satellite] = after
@@ -319,6 +357,24 @@ class _EphemerisBuilder:
         for part in parts:
             values |= part
         return galileo_record(satellite, values, time) if f"E{int(values['number']):02d}" == satellite else None
+
+    def _galileo_f(self, satellite: str, time: np.datetime64) -> Record | None:
+        parts = self._parts(satellite, tuple(range(_FNAV_FROM + 1, _FNAV_FROM + 5)))
+        if parts is None or len({part["iod"] for part in parts}) != 1:
+            return None
+        values = {**parts[3], **parts[2], **parts[1], **parts[0], "source": float(_E5A_SOURCE)}
+        return galileo_record(satellite, values, time) if f"E{int(values['number']):02d}" == satellite else None
+
+    def _modernised(self, satellite: str, _: np.datetime64) -> Record | None:
+        """Record of CNAV; its three messages are of one issue where their reference times are one."""
+        parts = self._parts(satellite, tuple(_CNAV_FROM + k for k in nav_messages.CNAV))
+        if parts is None or not parts[0]["toe_sow_s"] == parts[1]["toe_sow_s"] == parts[2]["toc_s"]:
+            return None
+        letter, number = satellite[0], f"{int(parts[0]['number']):02d}"
+        if number != satellite[1:]:
+            return None
+        self.klobuchar.setdefault(letter, np.array([parts[2][f"ion{k}"] for k in range(8)]))
+        return cnav_record(satellite, {**parts[2], **parts[1], **parts[0]})
 
     def _d1(self, satellite: str, time: np.datetime64) -> Record | None:
         parts = self._parts(satellite, (1, 2, 3))

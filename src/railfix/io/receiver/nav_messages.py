@@ -1,10 +1,10 @@
-"""Navigation messages, bit by bit: GPS and QZSS LNAV, Galileo I/NAV, BeiDou D1 and D2, GLONASS strings.
+"""Navigation messages, bit by bit: GPS and QZSS LNAV and CNAV, Galileo I/NAV and F/NAV, BeiDou D1 and D2, GLONASS.
 
 Each function takes the bits of many messages of one kind and returns their fields, scaled, as arrays.
 Angles are turned from semicircles into radians.
 
-Sources: IS-GPS-200N, 20.3.3; IS-QZSS-PNT-005, 4.1.2; Galileo OS SIS ICD 2.1, 4.3.5; BDS-SIS-ICD-B1I 3.0, 5.2 and 5.3;
-GLONASS ICD L1, L2 5.1, 4.4.
+Sources: IS-GPS-200N, 20.3.3 and 30.3.3; IS-QZSS-PNT-005, 4.1.2 and 4.3.2; Galileo OS SIS ICD 2.1, 4.2.3 and 4.3.5;
+BDS-SIS-ICD-B1I 3.0, 5.2 and 5.3; GLONASS ICD L1, L2 5.1, 4.4.
 """
 
 from __future__ import annotations
@@ -121,6 +121,106 @@ INAV: Final[dict[int, dict[str, Field]]] = {
     },
     6: {"tow_s": (105, 20, 1.0, "u")},
 }
+#: CNAV messages of 300 bits; PRN, type and TOW count are in all of them.
+CNAV_HEAD: Final[dict[str, Field]] = {
+    "number": (8, 6, 1.0, "u"),
+    "type": (14, 6, 1.0, "u"),
+    "tow_s": (20, 17, 6.0, "u"),
+}
+CNAV: Final[dict[int, dict[str, Field]]] = {
+    10: {
+        "week": (38, 13, 1.0, "u"),
+        "health": (51, 3, 1.0, "u"),
+        "top": (54, 11, 300.0, "u"),
+        "accuracy_index": (65, 5, 1.0, "s"),
+        "toe_sow_s": (70, 11, 300.0, "u"),
+        "delta_a": (81, 26, 2.0**-9, "s"),
+        "a_dot": (107, 25, 2.0**-21, "s"),
+        "delta_n": (132, 17, 2.0**-44 * _PI, "s"),
+        "delta_n_dot": (149, 23, 2.0**-57 * _PI, "s"),
+        "m0": (172, 33, 2.0**-32 * _PI, "s"),
+        "eccentricity": (205, 33, 2.0**-34, "u"),
+        "omega": (238, 33, 2.0**-32 * _PI, "s"),
+    },
+    11: {
+        "toe_sow_s": (38, 11, 300.0, "u"),
+        "omega0": (49, 33, 2.0**-32 * _PI, "s"),
+        "i0": (82, 33, 2.0**-32 * _PI, "s"),
+        "delta_omega_dot": (115, 17, 2.0**-44 * _PI, "s"),
+        "i_dot": (132, 15, 2.0**-44 * _PI, "s"),
+        "cis": (147, 16, 2.0**-30, "s"),
+        "cic": (163, 16, 2.0**-30, "s"),
+        "crs": (179, 24, 2.0**-8, "s"),
+        "crc": (203, 24, 2.0**-8, "s"),
+        "cus": (227, 21, 2.0**-30, "s"),
+        "cuc": (248, 21, 2.0**-30, "s"),
+    },
+    30: {
+        "ned_0": (49, 5, 1.0, "s"),
+        "ned_1": (54, 3, 1.0, "u"),
+        "ned_2": (57, 3, 1.0, "u"),
+        "toc_s": (60, 11, 300.0, "u"),
+        "af0_s": (71, 26, 2.0**-35, "s"),
+        "af1": (97, 20, 2.0**-48, "s"),
+        "af2": (117, 10, 2.0**-60, "s"),
+        "group_delay_1_s": (127, 13, 2.0**-35, "s"),
+        **{f"inter_signal_{k}": (140 + 13 * k, 13, 2.0**-35, "s") for k in range(4)},
+        **{
+            f"ion{k}": (192 + 8 * k, 8, factor, "s")
+            for k, factor in enumerate(_p(-30, -27, -24, -24) + _p(11, 14, 16, 16))
+        },
+        "week_top": (256, 8, 1.0, "u"),
+    },
+}
+#: A group delay of CNAV that is not available (IS-GPS-200N, 30.3.3.3.1.1).
+CNAV_NO_DELAY_S: Final = -4096 * 2.0**-35
+#: Semi-major axes [m] that CNAV refers to, and rate of the node [rad/s] (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
+CNAV_AXIS_M: Final = {"G": 26_559_710.0, "J": 42_164_200.0}
+CNAV_OMEGA_DOT: Final = -2.6e-9 * _PI
+#: Galileo F/NAV pages of 244 bits, by page type.
+FNAV: Final[dict[int, dict[str, Field]]] = {
+    1: {
+        "number": (6, 6, 1.0, "u"),
+        "iod": (12, 10, 1.0, "u"),
+        "toc_s": (22, 14, 60.0, "u"),
+        "af0_s": (36, 31, 2.0**-34, "s"),
+        "af1": (67, 21, 2.0**-46, "s"),
+        "af2": (88, 6, 2.0**-59, "s"),
+        "accuracy": (94, 8, 1.0, "u"),
+        "group_delay_1_s": (143, 10, 2.0**-32, "s"),
+        "e5a_health": (153, 2, 1.0, "u"),
+        "week": (155, 12, 1.0, "u"),
+        "tow_s": (167, 20, 1.0, "u"),
+        "e5a_invalid": (187, 1, 1.0, "u"),
+    },
+    2: {
+        "iod": (6, 10, 1.0, "u"),
+        "m0": (16, 32, 2.0**-31 * _PI, "s"),
+        "omega_dot": (48, 24, 2.0**-43 * _PI, "s"),
+        "eccentricity": (72, 32, 2.0**-33, "u"),
+        "sqrt_a": (104, 32, 2.0**-19, "u"),
+        "omega0": (136, 32, 2.0**-31 * _PI, "s"),
+        "i_dot": (168, 14, 2.0**-43 * _PI, "s"),
+    },
+    3: {
+        "iod": (6, 10, 1.0, "u"),
+        "i0": (16, 32, 2.0**-31 * _PI, "s"),
+        "omega": (48, 32, 2.0**-31 * _PI, "s"),
+        "delta_n": (80, 16, 2.0**-43 * _PI, "s"),
+        "cuc": (96, 16, 2.0**-29, "s"),
+        "cus": (112, 16, 2.0**-29, "s"),
+        "crc": (128, 16, 2.0**-5, "s"),
+        "crs": (144, 16, 2.0**-5, "s"),
+        "toe_sow_s": (160, 14, 60.0, "u"),
+    },
+    4: {
+        "iod": (6, 10, 1.0, "u"),
+        "cic": (16, 16, 2.0**-29, "s"),
+        "cis": (32, 16, 2.0**-29, "s"),
+    },
+}
+#: Bits of CNAV messages and F/NAV pages before their CRC.
+CNAV_CHECKED, FNAV_CHECKED = 276, 214
 #: BeiDou: seconds of week and subframe number of D1 and D2 (10 words of 30 bits, parity included).
 BDS_HEAD: Final[dict[str, Field]] = {"tow_s": (((18, 8), (30, 12)), 20, 1.0, "u"), "subframe": (15, 3, 1.0, "u")}
 D1: Final[dict[int, dict[str, Field]]] = {
@@ -256,6 +356,15 @@ def inav_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> tuple
     sent = fields(odd, {"crc": (82, 24, 1.0, "u")})["crc"]
     valid = (even[:, 0] == 0) & (odd[:, 0] == 1) & (even[:, 1] == 0) & (odd[:, 1] == 0) & (crc == sent)
     return np.concatenate([even[:, 2:114], odd[:, 2:18]], axis=1), valid
+
+
+def has_crc(bits: Bytes, checked: int) -> Masks:
+    """Whether the 24 bits after the first `checked` are their CRC-24Q, shape (N,)."""
+    before = np.zeros((len(bits), -checked % 8), dtype=np.uint8)
+    data = np.packbits(np.concatenate([before, bits[:, :checked]], axis=1), axis=1)
+    start = np.arange(len(data)) * data.shape[1]
+    crc = crc24q(data.reshape(-1), start, start + data.shape[1])
+    return np.asarray(crc == fields(bits, {"crc": (checked, 24, 1.0, "u")})["crc"])
 
 
 def sisa_m(index: Floats) -> Floats:

@@ -41,6 +41,22 @@ def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record:
     return _raw(satellite, "LNAV", epoch, numbers), _issue(values, "iodc", "toe_sow_s", "toc_s", "health")
 
 
+def cnav_record(satellite: str, values: Values) -> Record:
+    """Record of GPS or QZSS from the fields of CNAV messages 10, 11 and 30 (13 bits of the week: no date is needed)."""
+    sent = from_week(int(values["week"]), values["tow_s"])
+    toc = nearest_week(values["toc_s"], sent)
+    delays = ("group_delay_1_s", *(f"inter_signal_{k}" for k in range(4)))
+    numbers = {
+        **values,
+        **{name: np.nan if values[name] == nav_messages.CNAV_NO_DELAY_S else values[name] for name in delays},
+        "sqrt_a": float(np.sqrt(nav_messages.CNAV_AXIS_M[satellite[0]] + values["delta_a"])),
+        "omega_dot": nav_messages.CNAV_OMEGA_DOT + values["delta_omega_dot"],
+        "transmitted": values["tow_s"],
+        "week": float(int(values["week"]) // 256 * 256 + int(values["week_top"])),
+    }
+    return _raw(satellite, "CNAV", toc, numbers), _issue(values, "toe_sow_s", "top", "health", "m0", "af0_s")
+
+
 def galileo_record(satellite: str, values: Values, time: np.datetime64) -> Record:
     """Record of Galileo: I/NAV from the fields of its words 1 to 5 or of RTCM 1046, F/NAV from those of RTCM 1045."""
     week, epoch = _week_and_toc(values, int(values["week"]) + _GALILEO_WEEK_MINUS_GPS, time)

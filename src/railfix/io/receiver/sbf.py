@@ -1,7 +1,8 @@
 """Septentrio SBF blocks as arrays: measurements, navigation pages, the receiver's own positions.
 
 Source: mosaic-X5 reference guide 4.14, sections 4.1.9 (satellites), 4.1.10 (signals), 4.2.1 (MeasEpoch), 4.2.2
-(GPSRawCA, GALRawINAV, BDSRaw, GLORawCA, QZSRawL1CA, GEORawL1), 4.2.8 (PVTGeodetic, PVTCartesian).
+(GPSRawCA, GPSRawL2C, GPSRawL5, GALRawFNAV, GALRawINAV, BDSRaw, GLORawCA, QZSRawL1CA, QZSRawL2C, QZSRawL5, GEORawL1),
+4.2.8 (PVTGeodetic, PVTCartesian).
 """
 
 from __future__ import annotations
@@ -26,15 +27,25 @@ MEAS_EPOCH: Final = 4027
 PVT_CARTESIAN: Final = 4006
 PVT_GEODETIC: Final = 4007
 GPS_RAW_CA: Final = 4017
+GPS_RAW_L2C: Final = 4018
+GPS_RAW_L5: Final = 4019
 GEO_RAW_L1: Final = 4020
+GAL_RAW_FNAV: Final = 4022
 GAL_RAW_INAV: Final = 4023
 GLO_RAW_CA: Final = 4026
 BDS_RAW: Final = 4047
 QZS_RAW_L1CA: Final = 4066
+QZS_RAW_L2C: Final = 4067
+QZS_RAW_L5: Final = 4068
 #: Navigation pages: constellation, and UBX signal number by SBF signal number (None: of all signals).
 _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
     GPS_RAW_CA: ("G", None),
     QZS_RAW_L1CA: ("J", None),
+    GPS_RAW_L2C: ("G", {3: 3}),
+    GPS_RAW_L5: ("G", {4: 7}),
+    QZS_RAW_L2C: ("J", {7: 5}),
+    QZS_RAW_L5: ("J", {26: 9}),
+    GAL_RAW_FNAV: ("E", {20: 4}),
     GAL_RAW_INAV: ("E", {17: 1, 21: 5, 22: 5}),
     BDS_RAW: ("C", {28: 0, 29: 2, 30: 4}),
     GLO_RAW_CA: ("R", None),

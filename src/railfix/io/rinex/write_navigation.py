@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
 from os import PathLike
 from typing import Final, Literal
 
@@ -97,6 +99,19 @@ def write_navigation(
         if version != "3.04":
             target.write(_ionosphere_records(navigation).encode("ascii"))
         target.write("".join(body[order].tolist()).encode("ascii"))
+
+
+def with_written_messages(navigation: Navigation) -> tuple[Navigation, dict[str, int]]:
+    """Return the records of messages that can be written, and the number of the others by constellation and message.
+
+    CNAV and CNV have numbers that `Navigation` does not keep.
+    """
+    kepler = navigation.kepler
+    kept = np.isin(kepler.message, _WRITTEN)
+    kinds = zip(kepler.satellite[~kept].tolist(), kepler.message[~kept].tolist(), strict=True)
+    left_out = Counter(f"{satellite[0]} {message} ephemerides, which are not written" for satellite, message in kinds)
+    columns = {item.name: getattr(kepler, item.name)[kept] for item in fields(kepler)}
+    return replace(navigation, kepler=KeplerRecords(**columns)), dict(left_out)
 
 
 def _ionosphere_records(navigation: Navigation) -> str:

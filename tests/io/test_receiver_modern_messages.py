@@ -1,0 +1,122 @@
+"""CNAV and F/NAV pages of receivers: from broadcast records, against cssrlib's reading, whole and cut streams.
+
+`tests/references/nav_pages.json` was written by ``python tests/references/make_nav_page_references.py`` with
+cssrlib 1.2.1, which reads the same pages.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pytest
+
+from conftest import ROOT
+from nav_pages import cnav_pages, fnav_pages, sbf_page, ubx_page
+from railfix.gnss.navigation import Navigation
+from railfix.io import read_navigation
+from railfix.io.receiver.ephemerides import merged, navigation_of
+from railfix.io.receiver.log import StreamState, decode
+from railfix.run.convert import convert_logs
+
+pytestmark = pytest.mark.requirement("A11")
+
+REFERENCE: Final = json.loads((ROOT / "tests" / "references" / "nav_pages.json").read_text(encoding="utf-8"))
+#: Records that pages are made of; numbers as a receiver of 2025 had them, not whole units of the last place.
+CNAV: Final[dict[str, float]] = REFERENCE["cnav"]["given"]
+FNAV: Final[dict[str, float]] = REFERENCE["fnav"]["given"]
+
+
+def navigation(data: bytes, *, step: int | None = None) -> Navigation:
+    """Records of a stream, whole or in blocks of so many bytes."""
+    state, parts = StreamState(), []
+    step = step or len(data)
+    for first in range(0, len(data), step):
+        piece, state = decode(data[first : first + step], state, at_end=first + step >= len(data))
+        parts.append(piece.ephemerides)
+    return navigation_of(merged(parts))
+
+
+def stream(pages: list[np.ndarray], system: str, number: int, *, protocol: str) -> bytes:
+    make = ubx_page if protocol == "ubx" else sbf_page
+    return b"".join(make(page, system, number) for page in pages)
+
+
+@pytest.mark.parametrize("protocol", ["ubx", "sbf"])
+def test_cnav_pages_give_the_record_they_are_made_of_and_cssrlibs(protocol: str) -> None:
+    found = navigation(stream(cnav_pages(CNAV, 30), "G", 30, protocol=protocol))
+    record, expected = found.kepler, REFERENCE["cnav"]["cssrlib"]
+    assert (record.satellite.tolist(), record.message.tolist()) == (["G30"], ["CNAV"])
+    for name, value in expected.items():
+        got = (
+            float(getattr(record, name)[0])
+            if not name.startswith("isc_")
+            else float(record.inter_signal_s[0, int(name[4:])])
+        )
+        assert got == pytest.approx(value, rel=1e-12, abs=1e-22), name
+    given = {"af0_s": 2.0**-36, "m0": 1e-9, "i0": 1e-9, "omega_dot": 2.0**-44, "crs": 2.0**-9}
+    for name, half in given.items():
+        assert getattr(record, name)[0] == pytest.approx(CNAV[name], abs=half * np.pi), name
+    assert record.health[0] == CNAV["health"]
+    assert record.toc[0] == record.toe[0] == np.datetime64("2025-02-15T17:30:00", "ns")
+    assert set(found.klobuchar) == {"G"}
+
+
+@pytest.mark.parametrize("protocol", ["ubx", "sbf"])
+def test_fnav_pages_give_the_record_they_are_made_of_and_cssrlibs(protocol: str) -> None:
+    found = navigation(stream(fnav_pages(FNAV, 5), "E", 5, protocol=protocol))
+    record, expected = found.kepler, REFERENCE["fnav"]["cssrlib"]
+    assert (record.satellite.tolist(), record.message.tolist()) == (["E05"], ["FNAV"])
+    for name, value in expected.items():
+        assert float(getattr(record, name)[0]) == pytest.approx(value, rel=1e-12, abs=1e-22), name
+    assert record.data_source[0] == 0b1_0000_0010, "E5a, clock of E5a and E1"
+    assert record.accuracy_m[0] == pytest.approx(3.12)
+    assert record.health[0] == 1 << 4 | 0 << 3
+
+
+def test_a_stream_cut_anywhere_and_with_repeated_pages_gives_the_same_record_once() -> None:
+    data = b"".join(
+        stream(cnav_pages(CNAV, 30) * 2, "G", 30, protocol=protocol)
+        + stream(fnav_pages(FNAV, 5) * 2, "E", 5, protocol=protocol)
+        for protocol in ("ubx", "sbf")
+    )
+    for step in (37, 100, len(data)):
+        found = navigation(data, step=step)
+        assert sorted(zip(found.kepler.satellite.tolist(), found.kepler.message.tolist(), strict=True)) == [
+            ("E05", "FNAV"),
+            ("G30", "CNAV"),
+        ]
+
+
+def test_an_unavailable_group_delay_is_unknown_and_qzss_has_its_own_axis() -> None:
+    absent: dict[str, Any] = {**CNAV, "inter_signal_1": -4096 * 2.0**-35, "sqrt_a": 6493.5}
+    pages = cnav_pages(absent, 2, system="J")
+    found = navigation(stream(pages, "J", 2, protocol="ubx")).kepler
+    assert np.isnan(found.inter_signal_s[0, 1])
+    assert np.isfinite(found.inter_signal_s[0, [0, 2, 3]]).all()
+    assert found.sqrt_a[0] == pytest.approx(6493.5, abs=1e-6)
+
+
+def test_convert_leaves_cnav_out_and_says_so(tmp_path: Path) -> None:
+    log, out = tmp_path / "a.ubx", tmp_path / "a.rnx"
+    log.write_bytes(
+        stream(cnav_pages(CNAV, 30), "G", 30, protocol="ubx") + stream(fnav_pages(FNAV, 5), "E", 5, protocol="ubx")
+    )
+    lines = convert_logs((log,), out=None, nav_out=out, rinex="4")
+    assert "passed over: 1 G CNAV ephemerides, which are not written" in lines
+    again = read_navigation([out]).kepler
+    assert (again.satellite.tolist(), again.message.tolist()) == (["E05"], ["FNAV"])
+
+
+def test_damaged_mixed_and_foreign_pages_make_no_record() -> None:
+    pages = cnav_pages(CNAV, 30)
+    broken = [page.copy() for page in pages]
+    broken[1][100] ^= 1
+    assert not len(navigation(stream(broken, "G", 30, protocol="ubx")).kepler)
+    other = cnav_pages({**CNAV, "toe_sow_s": CNAV["toe_sow_s"] + 7200.0}, 30)
+    assert not len(navigation(stream([pages[0], other[1], pages[2]], "G", 30, protocol="ubx")).kepler)
+    assert not len(navigation(stream(pages, "G", 29, protocol="ubx")).kepler)
+    later = fnav_pages({**FNAV, "iod": 90.0}, 5)
+    assert not len(navigation(stream([*fnav_pages(FNAV, 5)[:3], later[3]], "E", 5, protocol="ubx")).kepler)
