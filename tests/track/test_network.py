@@ -164,9 +164,9 @@ def test_cost_of_a_position_does_not_grow_with_the_network() -> None:
         net.near(log.latitude_deg, log.longitude_deg)
         times = []
         for _ in range(5):
-            begin = time.perf_counter()
+            begin = time.process_time()
             net.near(log.latitude_deg, log.longitude_deg)
-            times.append(time.perf_counter() - begin)
+            times.append(time.process_time() - begin)
         spent.append(min(times))
     assert spent[1] < 4.0 * spent[0]
 

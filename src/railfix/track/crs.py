@@ -66,10 +66,16 @@ def kind_of_frame(crs: str) -> Kind:
     return "older datum" if operation_of(crs) is None else "moves with its plate"
 
 
+@lru_cache(maxsize=64)
+def _system(crs: str) -> CRS:
+    """The system of a name, which takes PROJ a millisecond to find; CRSError when it knows none."""
+    return CRS.from_user_input(crs)
+
+
 def known_crs(crs: str, *, path: str | PathLike[str] = "") -> CRS:
     """The system of a name, asked for in a file; SettingsError when PROJ does not know it."""
     try:
-        return CRS.from_user_input(crs)
+        return _system(crs)
     except CRSError:
         where = f"{path}: " if path else ""
         raise SettingsError(
@@ -110,6 +116,7 @@ def vertical_of(crs: str | None) -> CRS | None:
     return system.sub_crs_list[1] if system is not None and system.is_compound else None
 
 
+@lru_cache(maxsize=64)
 def geodetic_of(crs: str) -> CRS:
     """The geodetic frame that a CRS is based on."""
     geodetic = known_crs(crs).geodetic_crs
@@ -171,6 +178,14 @@ def frame_degrees(crs: str, x: Floats, y: Floats, *, path: str) -> tuple[Floats,
 
 def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> None:
     """Reject points outside the area of use of a CRS's frame, of which a projection may be used beyond its own."""
+    south, north, west, east = _bounds(crs)
+    if (
+        south <= latitude_deg.min()
+        and latitude_deg.max() <= north
+        and west <= longitude_deg.min()
+        and longitude_deg.max() <= east
+    ):
+        return
     finite = np.isfinite(latitude_deg) & np.isfinite(longitude_deg) & (np.abs(latitude_deg) <= 90.0)
     if not finite.all():
         raise InputFileError(
@@ -188,6 +203,15 @@ def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: 
         f"{area.south:g} to {area.north:g}, longitude {area.west:g} to {area.east:g}); "
         + ("latitude and longitude are swapped" if swapped else f"is {crs} the right CRS?"),
     )
+
+
+@lru_cache(maxsize=64)
+def _bounds(crs: str) -> tuple[float, float, float, float]:
+    """South, north, west and east of the area of use of a CRS's frame, with the margin; nothing lies in it without."""
+    area = geodetic_of(crs).area_of_use
+    if area is None:
+        return (np.inf, -np.inf, np.inf, -np.inf)
+    return (area.south - MARGIN_DEG, area.north + MARGIN_DEG, area.west - MARGIN_DEG, area.east + MARGIN_DEG)
 
 
 def _check_scale(crs: str, frame: str, xy: Floats, latitude: Floats, longitude: Floats, *, path: str) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Final, cast
 
@@ -35,6 +35,8 @@ _NEAR_WAY_M: Final = 5_000.0
 _SAMPLE_M: Final = 50.0
 #: Nearest samples examined for each position at first; more where these do not reach as far as asked.
 _SAMPLES: Final = 32
+#: Properties that the connections do not change.
+_OF_POINTS: Final = ("first_point", "points_m", "chainage_m", "length_m", "height_m", "_way", "_index")
 #: Tracks that a message names one by one.
 _NAMED: Final = 8
 
@@ -84,6 +86,12 @@ class Network:
     tracks: tuple[Segment, ...]
     links: tuple[Link, ...]
     notes: tuple[str, ...] = ()
+
+    def connected(self, links: tuple[Link, ...], note: str) -> Network:
+        """The network with other connections, and a note on them; what is known of its points is kept."""
+        network = replace(self, links=links, notes=(note,))
+        vars(network).update({name: vars(self)[name] for name in _OF_POINTS if name in vars(self)})
+        return network
 
     @cached_property
     def names(self) -> tuple[str, ...]:

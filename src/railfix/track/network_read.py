@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import ending
+from railfix.core.files import ending, read_text
 from railfix.track.geojson_file import RELATION
 from railfix.track.network import Link, Network, end_points
 from railfix.track.read import read_segments
@@ -53,10 +53,9 @@ def network_of(
     relations = [relation for path in paths for relation in _relations(path)]
     if relations:
         return _of_relations(tracks, relations, str(paths[0]))
-    divided, cuts = _divide(tracks, tolerance_m)
-    network = Network(tracks=tuple(divided), links=())
+    network, cuts = _divide(Network(tracks=tuple(tracks), links=()), tolerance_m)
     note = f"connections from ends within {tolerance_m:g} m; {cuts} tracks divided where the end of another meets them"
-    return replace(network, links=links_of_ends(network, tolerance_m=tolerance_m), notes=(note,))
+    return network.connected(links_of_ends(network, tolerance_m=tolerance_m), note)
 
 
 def _relations(path: str | PathLike[str]) -> list[Relation]:
@@ -64,6 +63,8 @@ def _relations(path: str | PathLike[str]) -> list[Relation]:
     if ending(path) in (".xml", ".railml"):
         return read_railml_relations(path)
     if ending(path) not in (".geojson", ".json", ".gpkg", ".fgb"):
+        return []
+    if "json" in ending(path) and RELATION not in read_text(path):
         return []
     relations = []
     for _, rows, _ in read_layers(path, geometry="none"):
@@ -129,9 +130,9 @@ def is_route(segments: Sequence[Segment]) -> bool:
     return bool((np.einsum("ij,ij->i", outward[:-1, 1], outward[1:, 0]) < -np.cos(_LARGEST_TURN_RAD)).all())
 
 
-def _divide(tracks: list[Segment], tolerance_m: float) -> tuple[list[Segment], int]:
+def _divide(whole: Network, tolerance_m: float) -> tuple[Network, int]:
     """Tracks divided at inner points on which the end of another track lies, and how many were divided."""
-    whole = Network(tracks=tuple(tracks), links=())
+    tracks = whole.tracks
     latitude = np.array([[t.latitude_deg[0], t.latitude_deg[-1]] for t in tracks]).ravel()
     longitude = np.array([[t.longitude_deg[0], t.longitude_deg[-1]] for t in tracks]).ravel()
     near = whole.near(latitude, longitude, within_m=tolerance_m)
@@ -140,6 +141,8 @@ def _divide(tracks: list[Segment], tolerance_m: float) -> tuple[list[Segment], i
         other, place = int(near.track[end, column]), float(near.chainage_m[end, column])
         if other != end // 2 and tolerance_m < place < whole.length_m[other] - tolerance_m:
             cuts.setdefault(other, []).append(place)
+    if not cuts:
+        return whole, 0
     parts: list[Segment] = []
     for k, track in enumerate(tracks):
         if k not in cuts:
@@ -151,7 +154,7 @@ def _divide(tracks: list[Segment], tolerance_m: float) -> tuple[list[Segment], i
         bounds = [0.0, *places, float(way[-1])]
         for number, (low, high) in enumerate(pairwise(bounds), start=1):
             parts.append(_part(track, way, low, high, number))
-    return parts, len(cuts)
+    return Network(tracks=tuple(parts), links=()), len(cuts)
 
 
 def _part(track: Segment, way: Floats, low: float, high: float, number: int) -> Segment:

@@ -19,11 +19,11 @@ SAME_POINT_M = 0.05
 MAX_GAP_M = 1.0
 
 
-def _ends(segment: Segment) -> Floats:
-    """Return first and last point, shape (2, 3) [m]; in plan where the segment has no heights."""
-    i = [0, -1]
-    height = np.nan_to_num(segment.height_m[i])
-    return ecef_from_geodetic(segment.latitude_deg[i], segment.longitude_deg[i], height)
+def _ends(segments: Sequence[Segment]) -> Floats:
+    """Return first and last points, shape (n, 2, 3) [m]; in plan where a segment has no heights."""
+    columns = ("latitude_deg", "longitude_deg", "height_m")
+    ends = np.array([[getattr(s, name)[[0, -1]] for name in columns] for s in segments])
+    return ecef_from_geodetic(ends[:, 0], ends[:, 1], np.nan_to_num(ends[:, 2]))
 
 
 def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list[Segment]:
@@ -41,13 +41,13 @@ def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list
             f"{max_gap_m:g} m; give the segments in the order of the route, or make a route of a network with "
             "'railfix map route'",
         )
-    return [s.reversed() if turned else s for s, turned in zip(segments, _turn(segments, max_gap_m), strict=True)]
+    turned = _turn(_ends(segments), max_gap_m)
+    return [s.reversed() if backwards else s for s, backwards in zip(segments, turned, strict=True)]
 
 
-def _turn(segments: Sequence[Segment], max_gap_m: float) -> list[bool]:
-    """Whether each segment must be reversed to begin at the end of the one before."""
-    ends = [_ends(segment) for segment in segments]
-    turned = [False] * len(segments)
+def _turn(ends: Floats, max_gap_m: float) -> list[bool]:
+    """Whether each segment, of ends of shape (n, 2, 3), must be reversed to begin at the end of the one before."""
+    turned = [False] * len(ends)
     if len(ends) > 1:
         distance = np.linalg.norm(ends[0][:, None] - ends[1][None, :], axis=-1).min(axis=1)
         turned[0] = bool(distance[0] < distance[1] and distance[1] > max_gap_m)
@@ -59,13 +59,12 @@ def _turn(segments: Sequence[Segment], max_gap_m: float) -> list[bool]:
 
 def first_gap(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> tuple[int, float] | None:
     """The first segment that does not meet the one before, and the gap [m]; None where all meet."""
-    turned = _turn(segments, max_gap_m)
-    for k in range(1, len(segments)):
-        here, there = _ends(segments[k - 1]), _ends(segments[k])
-        size = float(np.linalg.norm(there[1 if turned[k] else 0] - here[0 if turned[k - 1] else 1]))
-        if not size <= max_gap_m:
-            return k, size
-    return None
+    ends = _ends(segments)
+    backwards = np.array(_turn(ends, max_gap_m), dtype=np.intp)
+    rows = np.arange(1, len(ends))
+    size = np.linalg.norm(ends[rows, backwards[1:]] - ends[rows - 1, 1 - backwards[:-1]], axis=-1)
+    wide = np.flatnonzero(~(size <= max_gap_m))
+    return (int(wide[0]) + 1, float(size[wide[0]])) if len(wide) else None
 
 
 def join(
@@ -83,10 +82,11 @@ def join(
     earlier has none.
     """
     pieces = orient(segments, max_gap_m=max_gap_m)
+    ends = _ends(pieces)
     kept: list[dict[str, Floats]] = []
     for k, piece in enumerate(pieces):
         columns = {key: getattr(piece, key) for key in ("latitude_deg", "longitude_deg", "height_m", *ATTRIBUTES)}
-        if k and np.linalg.norm(_ends(piece)[0] - _ends(pieces[k - 1])[1]) < SAME_POINT_M:
+        if k and np.linalg.norm(ends[k, 0] - ends[k - 1, 1]) < SAME_POINT_M:
             for key in ATTRIBUTES:
                 if np.isnan(kept[-1][key][-1]):
                     kept[-1][key] = np.append(kept[-1][key][:-1], columns[key][0])

@@ -57,7 +57,10 @@ def read_layers(path: str | PathLike[str], *, geometry: str) -> list[tuple[str |
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Measured", UserWarning)  # measures are no heights and not read
-            found = [pyogrio.raw.read(path, layer=layer) for layer, _ in pyogrio.list_layers(path)]
+            found = [
+                pyogrio.raw.read(path, layer=layer, read_geometry=geometry != "none")
+                for layer, _ in pyogrio.list_layers(path)
+            ]
         for meta, _, blob, values in found:
             if blob is None and geometry != "none":
                 continue
@@ -165,7 +168,7 @@ def plan_segment(
         geoid=model,
         metadata={"name": name, **(stated or {})},
         notes=older_datum_note(crs),
-        **{key: np.full(len(values), np.nan) for key in ATTRIBUTES},
+        **dict.fromkeys(ATTRIBUTES, np.full(len(values), np.nan)),
     )
 
 
