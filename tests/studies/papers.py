@@ -10,17 +10,18 @@ import importlib
 import re
 import sys
 import tomllib
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final
 
 import paths
+from p1_page import SINGLE, figures
 
 TABLE: Final = paths.ROOT / "docs" / "papers.md"
 DATA: Final[dict[str, Any]] = tomllib.loads(
     (paths.ROOT / "tests" / "references" / "papers.toml").read_text(encoding="utf-8")
 )
-RESULTS: Final = paths.ROOT / "tests" / "references" / "results"
 
 
 def named(where: str) -> object:
@@ -66,16 +67,18 @@ def document() -> str:
     lines = [
         "# The five papers, item by item",
         "",
-        "Written by `python tests/studies/papers.py` from `tests/references/papers.toml`. Each item: what is asked and",
-        "reached, what does it, and the test; one without a test is open.",
+        "Written by `python tests/studies/papers.py` from `tests/references/papers.toml` and kept outputs. An item",
+        "without a test is open.",
+        "",
+        "| item | asked | reached | function, test |",
+        "|---|---|---|---|",
     ]
     for paper, title in DATA["papers"].items():
-        lines += ["", f"## {paper}", "", title, ""]
+        lines.append(f"| **{paper}** {title} | | | |")
         for item in (item for item in DATA["item"] if item["paper"] == paper):
-            figures = {"asked": item.get("asked", ""), "reached": reached(item)}
-            text = "; ".join([item["what"], *(f"{name}: {figure}" for name, figure in figures.items() if figure)])
             test = f"`{item['test']}`" if "test" in item else "**open**"
-            lines += [f"- {text}", f"  `{item['where']}`", f"  {test}"]
+            cells = (item["what"], item.get("asked", ""), reached(item), f"`{item['where']}`<br>{test}")
+            lines.append(f"| {' | '.join(cells)} |".replace("|  |", "| |").replace("|  |", "| |"))
     lines += ["", "## Where we read the papers differently", ""]
     for found in DATA["difference"]:
         why = f" Why: {found['why']}." if found["why"] else ""
@@ -89,41 +92,48 @@ def reached(item: dict[str, Any]) -> str:
     return FIGURES[text]() if text.startswith("@") else text
 
 
-def _row(part: str, heading: str, name: str) -> list[str]:
-    """Figures of a way in the table under a heading of a part of P1's experiment."""
-    text = (RESULTS / f"p1-{part}.txt").read_text(encoding="utf-8")
-    block = text[text.index(heading) :]
-    (line,) = [line for line in block.splitlines()[:40] if line.startswith(name)][:1]
-    return line.removeprefix(name).split()
-
-
 def _largest() -> str:
-    names = ("conventional", "validated", "RTKLIB", "p1", "strict")
-    cells = [f"{name} {_row('corrected', 'all data', f'G       {name}, SBAS')[8]}" for name in names]
-    return f"{', '.join(cells)} m ([table](p1-results.md))"
+    cells = [f"{name} {figures('corrected', 'all data', f'G       {name}, SBAS')[8]}" for name in SINGLE]
+    return f"{', '.join(cells)} m"
 
 
 def _rate() -> str:
-    names = ("conventional", "validated", "RTKLIB", "p1", "strict")
-    cells = [f"{name} {_row('corrected', 'ways without tunnels', f'G       {name}, SBAS')[0]}" for name in names]
-    return f"{', '.join(cells)} % ([table](p1-results.md))"
+    cells = [f"{name} {figures('corrected', 'ways without tunnels', f'G       {name}, SBAS')[0]}" for name in SINGLE]
+    return f"{', '.join(cells)} %"
 
 
-def _saif() -> str:
-    text = (RESULTS / "p1-test-line.txt").read_text(encoding="utf-8")
-    line = next(line for line in text.splitlines() if line.startswith("G with L1-SAIF"))
-    rate, mean, std, *_ = line.removeprefix("G with L1-SAIF").split()
-    return f"{rate} %, {mean} / {std} m ([test line](p1-results.md))"
+def _table_4(*names: str) -> str:
+    rows = [figures("test-line", "table 4", f"{name} ") for name in names]
+    rates, errors = (", ".join(row[0] for row in rows), ", ".join(f"{row[1]} / {row[2]}" for row in rows))
+    return f"{rates} %; {errors} m"
+
+
+def _figure_7() -> str:
+    cells = figures("test-line", "figure 7", "all ")
+    return f"mean {cells[6]} m; conventional {cells[0]}, RTKLIB {cells[3]}"
+
+
+def _seeds() -> str:
+    under = {way: figures("seeds", "lines", f"G+J    {way} ")[-3:] for way in ("strict", "RTKLIB")}
+    return f"none over 10 m on {' '.join(under['strict'])} (`strict`, G+J); RTKLIB {under['RTKLIB'][0]}"
 
 
 def _p4() -> str:
     text = (paths.ROOT / "docs" / "p4-experiment.md").read_text(encoding="utf-8")
     cells = next(line for line in text.splitlines() if line.startswith("ESBC, GPS       0.0")).split()
-    return f"p95 {cells[9]} and {cells[12]} m, least squares {cells[-2]} and {cells[-1]} m ([table](p4-experiment.md))"
+    return f"p95 {cells[9]} and {cells[12]} m, least squares {cells[-2]} and {cells[-1]} m"
 
 
 #: Figures that kept outputs hold.
-FIGURES: Final = {"@largest": _largest, "@rate": _rate, "@saif": _saif, "@p4": _p4}
+FIGURES: Final[dict[str, Callable[[], str]]] = {
+    "@largest": _largest,
+    "@rate": _rate,
+    "@figure7": _figure_7,
+    "@table4": partial(_table_4, "G", "G+J"),
+    "@saif": partial(_table_4, "G with L1-SAIF"),
+    "@seeds": _seeds,
+    "@p4": _p4,
+}
 
 
 def main() -> int:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import p1_experiment
+import p1_page
 import p1_seeds
 import p1_static
 from conftest import ROOT
@@ -27,6 +28,25 @@ def shown(part: str) -> list[str]:
 
 def printed(part: str, folder: Path) -> list[str]:
     return "\n".join(p1_experiment.report(part, folder)).rstrip().splitlines()
+
+
+@pytest.mark.requirement("D2")
+def test_the_page_shows_the_kept_outputs() -> None:
+    text = p1_page.PAGE.read_text(encoding="utf-8")
+    assert p1_page.page(text) == text, "run python tests/studies/p1_page.py"
+    # the row of the preset p1 with GPS, by eye from p1-commercial.txt
+    assert "| | p1 | 90.80 | 2.55 | 2.12 | 47.9 | 56 |" in text
+
+
+@pytest.mark.requirement("D2")
+@pytest.mark.parametrize("part", p1_page.PARTS)
+def test_the_picture_of_the_lines_has_every_way_with_its_interval(part: str) -> None:
+    found = p1_page.lines_of(part)
+    rows = [line for line in shown(part) if " of 20" in line]
+    assert len(found) == len(rows) >= 10
+    for one in found:
+        for middle, low, high in (one.share, one.largest_m):
+            assert low <= middle <= high
 
 
 needs_rtklib = pytest.mark.skipif(PROGRAM is None, reason=ABSENT)
