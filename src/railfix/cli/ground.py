@@ -14,12 +14,16 @@ from rich.table import Table
 
 from railfix.cli.command import Command, Commands
 from railfix.cli.console import console_of_tables, show_files
-from railfix.cli.options import OverwriteOption, check_outputs
+from railfix.cli.options import check_outputs, from_models
 from railfix.core.errors import MismatchError, OutputError, SettingsError
+from railfix.core.settings import Settings, option
+from railfix.ground.monitor import MonitorLimits
+from railfix.ground.on_board import OnBoardLimits
+from railfix.ground.triangle import TriangleLimits
+from railfix.run.output import Overwrite
 
 if TYPE_CHECKING:
-    from railfix.ground.monitor import MonitorLimits, Order
-    from railfix.ground.triangle import TriangleLimits
+    from railfix.ground.monitor import Order
 
 app = typer.Typer(
     cls=Commands,
@@ -40,8 +44,30 @@ def ground() -> None:
     """
 
 
+class MonitorChoices(Settings):
+    """What is judged, and where the results go."""
+
+    nav: tuple[Path, ...] = option(
+        "RINEX navigation file; repeat it for several. Streams may bring their own.", (), metavar="FILE"
+    )
+    out: Path = option("Folder for monitor.csv and triangle.png.", metavar="DIR")
+    point: tuple[str, ...] = option(
+        "Known point of a receiver, in the order of the logs; from the headers of the logs without it.",
+        (),
+        metavar="LAT,LON,HEIGHT",
+    )
+    live: bool = option("Judge streams as they arrive, once a second.", False)
+    for_s: float | None = option("With --live: end after this time.", None, name="--for", metavar="S", ge=0)
+    overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
+
+
 @app.command("monitor", cls=Command)
+@from_models
 def monitor(
+    choices: MonitorChoices,
+    limits: TriangleLimits,
+    times: MonitorLimits,
+    *,
     logs: Annotated[
         list[str],
         typer.Argument(
@@ -49,29 +75,6 @@ def monitor(
             help="RINEX observation files of the three receivers; with --live their streams, as of `railfix live`.",
         ),
     ],
-    *,
-    nav: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--nav", metavar="FILE", help="RINEX navigation file; repeat it for several. Streams may bring their own."
-        ),
-    ] = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for monitor.csv and triangle.png.")],
-    point: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="LAT,LON,HEIGHT",
-            help="Known point of a receiver, in the order of the logs; from the headers of the logs without it.",
-        ),
-    ] = None,
-    radius: Annotated[float, typer.Option(metavar="M", help="Radius of the circle of allowable error.")] = 12.0,
-    side: Annotated[float, typer.Option(metavar="M", help="Largest deviation of the vector between two fixes.")] = 6.0,
-    late: Annotated[float, typer.Option(metavar="S", help="Time after which three fixes are late.")] = 3.0,
-    live: Annotated[bool, typer.Option("--live", help="Judge streams as they arrive, once a second.")] = False,
-    for_seconds: Annotated[
-        float | None, typer.Option("--for", metavar="S", min=0.0, help="With --live: end after this time.")
-    ] = None,
-    overwrite: OverwriteOption = False,
 ) -> None:
     """Judge satellite positioning by three receivers at known points.
 
@@ -86,26 +89,23 @@ def monitor(
 
     Exit codes as `railfix --help` says; 5 where the logs have no satellite or no epoch in common.
     """
-    from railfix.ground.monitor import MonitorLimits
     from railfix.ground.monitor_log import draw_triangle, monitor_log
     from railfix.ground.station_fixes import station_fixes
-    from railfix.ground.triangle import TriangleLimits, Verdict
+    from railfix.ground.triangle import Verdict
     from railfix.io import read_navigation, read_observations
 
     if len(logs) != 3:
         raise SettingsError(f"{len(logs)} logs were given; a triangle has three receivers")
-    try:
-        limits, times = TriangleLimits(radius_m=radius, side_m=side), MonitorLimits(late_s=late)
-    except ValueError as error:
-        raise SettingsError(f"--radius, --side, --late: {str(error).splitlines()[-2].strip()}") from None
+    out, point, nav = choices.out, choices.point, choices.nav
     files = [out / "monitor.csv", out / "triangle.png"]
     if out.exists():
-        inputs = [*(Path(log) for log in logs), *(nav or [])]
+        inputs = [*(Path(log) for log in logs), *nav]
+        overwrite = choices.overwrite == "replace"
         check_outputs((files[0], "any"), (files[1], "any"), overwrite=overwrite, inputs=inputs)
-    if point is not None and len(point) != 3:
+    if len(point) not in (0, 3):
         raise SettingsError(f"--point was given {len(point)} times; give it once for each receiver")
-    if live:
-        _monitor_live(logs, point, nav, files[0], limits=limits, times=times, for_s=for_seconds)
+    if choices.live:
+        _monitor_live(logs, choices, files[0], limits=limits, times=times)
         return
     if not nav:
         raise SettingsError("--nav is missing: logs need navigation files")
@@ -141,14 +141,7 @@ def monitor(
 
 
 def _monitor_live(
-    sources: list[str],
-    point: list[str] | None,
-    nav: list[Path] | None,
-    path: Path,
-    *,
-    limits: TriangleLimits,
-    times: MonitorLimits,
-    for_s: float | None,
+    sources: list[str], choices: MonitorChoices, path: Path, *, limits: TriangleLimits, times: MonitorLimits
 ) -> None:
     """Judge streams until they end, or for a time; rows go to a file and orders are printed as they come."""
     import asyncio
@@ -161,12 +154,12 @@ def _monitor_live(
     from railfix.io import read_navigation
     from railfix.live.sources import check_source, is_file
 
-    if point is None:
+    if not choices.point:
         raise SettingsError("--point is missing: streams name no known points; give it once for each receiver")
     for source in sources:
         check_source(source)
-    points = np.stack([place_of(text, "--point") for text in point])
-    navigation = read_navigation(nav) if nav else None
+    points = np.stack([place_of(text, "--point") for text in choices.point])
+    navigation = read_navigation(choices.nav) if choices.nav else None
     monitor, counts, console = LiveMonitor(limits=limits, times=times), Counter[str](), console_of_tables()
     recorded = all(is_file(source) for source in sources)
 
@@ -193,7 +186,7 @@ def _monitor_live(
 
     async def session() -> None:
         tasks = [asyncio.create_task(work()), asyncio.create_task(watch())]
-        done, _ = await asyncio.wait(tasks[:1], timeout=for_s)
+        done, _ = await asyncio.wait(tasks[:1], timeout=choices.for_s)
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -217,12 +210,19 @@ def _monitor_live(
     show_files(console, [path])
 
 
+class KeyChoices(Settings):
+    """Trains that get keys."""
+
+    train: tuple[int, ...] = option("Trains, from 1.", metavar="N")
+    days: int = option("Validity of the certificates.", 365, metavar="DAYS", ge=1)
+
+
 @app.command("keys", cls=Command)
+@from_models
 def keys(
-    out: Annotated[Path, typer.Argument(metavar="DIR", help="Empty folder for the keys; made where absent.")],
+    choices: KeyChoices,
     *,
-    train: Annotated[list[int], typer.Option(metavar="N", help="Number of a train; repeat it for several.")],
-    days: Annotated[int, typer.Option(metavar="DAYS", min=1, help="Validity of the certificates.")] = 365,
+    out: Annotated[Path, typer.Argument(metavar="DIR", help="Empty folder for the keys; made where absent.")],
 ) -> None:
     """Make keys and certificates of a centre and its trains.
 
@@ -235,28 +235,27 @@ def keys(
     """
     from railfix.ground.keys import write_keys
 
-    if not all(0 < number < 1 << 32 for number in train):
+    if not all(0 < number < 1 << 32 for number in choices.train):
         raise SettingsError("--train: a number from 1 to 4294967295 was expected")
-    show_files(console_of_tables(), write_keys(out, sorted(set(train)), valid_days=days))
+    show_files(console_of_tables(), write_keys(out, sorted(set(choices.train)), valid_days=choices.days))
+
+
+class DemoChoices(Settings):
+    """Demonstration."""
+
+    seed: int = option("Seed of losses and noise.", 1, metavar="N", ge=0)
+    speed: float = option("Simulated seconds a second.", 6.0, metavar="X", ge=1, le=50)
+    port: int = option("Of the page; 0 takes a free one.", 0, metavar="PORT", ge=0, le=65535)
+    hold: float = option("Keep the page after the end for this time.", 0.0, metavar="S", ge=0, le=3600)
+    coverage: Path | None = option(
+        "Picture of the links: response rates along the line, round trips over time and place.", None, metavar="PNG"
+    )
+    overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
 
 
 @app.command("demo", cls=Command)
-def demo(
-    *,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of losses and noise.")] = 1,
-    speed: Annotated[float, typer.Option(metavar="X", min=1.0, max=50.0, help="Simulated seconds a second.")] = 6.0,
-    port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="Of the page; 0 takes a free one.")] = 0,
-    hold: Annotated[
-        float, typer.Option(metavar="S", min=0.0, max=3600.0, help="Keep the page after the end for this time.")
-    ] = 0.0,
-    coverage: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="PNG", help="Picture of the links: response rates along the line, round trips over time and place."
-        ),
-    ] = None,
-    overwrite: OverwriteOption = False,
-) -> None:
+@from_models
+def demo(choices: DemoChoices) -> None:
     """Show two trains, two lossy links each, a centre with its page, and a satellite fault.
 
     The trains meet in a passing loop; one bearer fails, then both of one train; at the end a satellite drifts away, the
@@ -272,7 +271,7 @@ def demo(
 
     from railfix.ground.demo import run_demo
 
-    check_outputs((coverage, "picture"), overwrite=overwrite, inputs=[])
+    check_outputs((choices.coverage, "picture"), overwrite=choices.overwrite == "replace", inputs=[])
     console, password = console_of_tables(), secrets.token_urlsafe(12)
 
     def announce(url: str) -> None:
@@ -280,12 +279,18 @@ def demo(
         console.print(f"password for orders: {password}", soft_wrap=True)
 
     async def keep(_: str) -> None:
-        await asyncio.sleep(hold)
+        await asyncio.sleep(choices.hold)
 
     try:
         figures = asyncio.run(
             run_demo(
-                seed=seed, speed=speed, port=port, password=password, announce=announce, keep=keep, picture=coverage
+                seed=choices.seed,
+                speed=choices.speed,
+                port=choices.port,
+                password=password,
+                announce=announce,
+                keep=keep,
+                picture=choices.coverage,
             )
         )
     except OSError as error:
@@ -293,20 +298,22 @@ def demo(
     _show_figures(figures)
 
 
+class CentreChoices(Settings):
+    """Page of a centre, and its end."""
+
+    page: str = option("Of the page; port 0 takes a free one.", "127.0.0.1:8000", metavar="HOST:PORT")
+    password: Path | None = option(
+        "Password for orders in its first line; a new one is printed without it.", None, metavar="FILE"
+    )
+    for_s: float | None = option("End after this time; else at a signal.", None, name="--for", metavar="S", ge=0)
+
+
 @app.command("centre", cls=Command)
+@from_models
 def centre(
-    path: Annotated[Path, typer.Argument(metavar="CENTRE.toml", help="Line, trains, keys and addresses.")],
+    choices: CentreChoices,
     *,
-    page: Annotated[
-        str, typer.Option(metavar="HOST:PORT", help="Of the page; port 0 takes a free one.")
-    ] = "127.0.0.1:8000",
-    password: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Password for orders in its first line; a new one is printed without it."),
-    ] = None,
-    for_seconds: Annotated[
-        float | None, typer.Option("--for", metavar="S", min=0.0, help="End after this time; else at a signal.")
-    ] = None,
+    path: Annotated[Path, typer.Argument(metavar="CENTRE.toml", help="Line, trains, keys and addresses.")],
 ) -> None:
     r"""Supervise the trains of a line: reports in, authorities out, points and routes, with a page.
 
@@ -333,11 +340,11 @@ def centre(
 
     from railfix.ground.serve import parse_address, read_password, run_centre
 
-    console = console_of_tables()
+    console, password = console_of_tables(), choices.password
     try:
-        address = parse_address(page)
+        address = parse_address(choices.page)
     except ValueError as error:
-        raise SettingsError(f"--page {page!r}: {error}") from None
+        raise SettingsError(f"--page {choices.page!r}: {error}") from None
     word = secrets.token_urlsafe(12) if password is None else read_password(password)
 
     def announce(url: str) -> None:
@@ -345,32 +352,31 @@ def centre(
         if password is None:
             console.print(f"password for orders: {word}", soft_wrap=True)
 
-    figures = asyncio.run(run_centre(path, page=address, password=word, for_s=for_seconds, announce=announce))
+    figures = asyncio.run(run_centre(path, page=address, password=word, for_s=choices.for_s, announce=announce))
     _show_figures(figures)
 
 
+class TrainChoices(Settings):
+    """A train's end of the links."""
+
+    keys: Path = option("authority.pem and the train's own two files.", metavar="DIR")
+    centre: tuple[str, ...] = option("Centre's address: of bearer A, then of B.", metavar="HOST:PORT")
+    local: tuple[str, ...] = option(
+        "Own address on a bearer: of A, then of B; else the system chooses.", (), metavar="HOST"
+    )
+    integrity: Path | None = option(
+        'The train\'s integrity device writes "complete" here at least every 2 s.', None, metavar="FILE"
+    )
+    for_s: float | None = option("End after this time.", None, name="--for", metavar="S", ge=0)
+
+
 @app.command("train", cls=Command)
+@from_models
 def train(
-    number: Annotated[int, typer.Argument(metavar="N", min=1, help="Number of the train.")],
+    choices: TrainChoices,
+    limits: OnBoardLimits,
     *,
-    keys: Annotated[Path, typer.Option(metavar="DIR", help="authority.pem and the train's own two files.")],
-    centre: Annotated[
-        list[str], typer.Option("--centre", metavar="HOST:PORT", help="Centre's address: of bearer A, then of B.")
-    ],
-    local: Annotated[
-        list[str] | None,
-        typer.Option(metavar="HOST", help="Own address on a bearer: of A, then of B; else the system chooses."),
-    ] = None,
-    fresh: Annotated[
-        float, typer.Option(metavar="S", min=1.0, help="Time limit of authorities: older ones brake the train.")
-    ] = 15.0,
-    integrity: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help='The train\'s integrity device writes "complete" here at least every 2 s.'),
-    ] = None,
-    for_seconds: Annotated[
-        float | None, typer.Option("--for", metavar="S", min=0.0, help="End after this time.")
-    ] = None,
+    number: Annotated[int, typer.Argument(metavar="N", min=1, help="Number of the train.")],
 ) -> None:
     """Carry the positions of a train to the centre over two links, and its authorities back.
 
@@ -384,26 +390,25 @@ def train(
     import asyncio
 
     from railfix.ground.links import BEARERS
-    from railfix.ground.on_board import OnBoardLimits
     from railfix.ground.serve import parse_address
     from railfix.ground.train import run_train
 
-    hosts = local or ["0.0.0.0", "0.0.0.0"]
-    if len(centre) != 2 or len(hosts) != 2:
+    hosts = choices.local or ("0.0.0.0", "0.0.0.0")
+    if len(choices.centre) != 2 or len(hosts) != 2:
         raise SettingsError("--centre and --local are given twice: for bearer A, then for B")
     try:
-        addresses = dict(zip(BEARERS, map(parse_address, centre), strict=True))
+        addresses = dict(zip(BEARERS, map(parse_address, choices.centre), strict=True))
     except ValueError as error:
         raise SettingsError(f"--centre: {error}") from None
     work = run_train(
         number,
-        keys,
+        choices.keys,
         addresses,
         dict(zip(BEARERS, hosts, strict=True)),
         write=lambda line: print(line, flush=True),
-        limits=OnBoardLimits(fresh_s=fresh),
-        integrity=integrity,
-        for_s=for_seconds,
+        limits=limits,
+        integrity=choices.integrity,
+        for_s=choices.for_s,
     )
     asyncio.run(work)
 

@@ -142,7 +142,8 @@ def _option(name: str, field: Any, path: tuple[str, ...]) -> _Option:
     elif not several and field.default is not None and not field.is_required():
         default = field.default
     if numbers:
-        helped += f" Numbers with commas, or repeated; {','.join(f'{value:g}' for value in field.default)} by default."
+        shown = "" if field.is_required() else f"; {','.join(f'{value:g}' for value in field.default)} by default"
+        helped += f" Numbers with commas, or repeated{shown}."
     annotation: Any = list[str] if numbers else list[kind] if several else kind  # type: ignore[valid-type]
     if default is None:
         annotation = annotation | None

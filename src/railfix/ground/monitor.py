@@ -10,7 +10,7 @@ from enum import Enum
 
 from pydantic import Field
 
-from railfix.core.settings import Settings
+from railfix.core.settings import Settings, option
 from railfix.ground.triangle import STOPPING, Verdict
 
 
@@ -39,7 +39,7 @@ class MonitorLimits(Settings):
         Healthy time before a stop can be released.
     """
 
-    late_s: float = Field(default=3.0, gt=0, le=5.0)
+    late_s: float = option("Time after which three fixes are late.", 3.0, name="--late", metavar="S", gt=0, le=5.0)
     settle_s: float = Field(default=10.0, ge=0)
     healthy_s: float = Field(default=300.0, gt=0)
 

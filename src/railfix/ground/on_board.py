@@ -9,7 +9,7 @@ from typing import Final
 
 from pydantic import Field
 
-from railfix.core.settings import Settings
+from railfix.core.settings import Settings, option
 from railfix.ground.authority import Authority
 
 #: Reports of which the time of sending is remembered.
@@ -29,7 +29,9 @@ class OnBoardLimits(Settings):
         Time before the brakes act, with that since the newest report.
     """
 
-    fresh_s: float = Field(default=15.0, gt=0)
+    fresh_s: float = option(
+        "Time limit of authorities: older ones brake the train.", 15.0, name="--fresh", metavar="S", gt=0
+    )
     braking_mps2: float = Field(default=0.5, gt=0)
     reaction_s: float = Field(default=3.0, ge=0)
 

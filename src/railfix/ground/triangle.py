@@ -13,10 +13,10 @@ from enum import IntEnum
 from typing import Final, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from railfix.core.arrays import Codes, Floats, Integers, Masks, freeze_arrays
-from railfix.core.settings import Settings
+from railfix.core.settings import Settings, option
 
 #: Receivers of each side of the triangle.
 SIDES: Final = ((0, 1), (1, 2), (2, 0))
@@ -61,8 +61,8 @@ class TriangleLimits(Settings):
         Largest deviation of the vector between two fixes from that between their points.
     """
 
-    radius_m: float = Field(default=12.0, gt=0)
-    side_m: float = Field(default=6.0, gt=0)
+    radius_m: float = option("Radius of the circle of allowable error.", 12.0, name="--radius", metavar="M", gt=0)
+    side_m: float = option("Largest deviation of the vector between two fixes.", 6.0, name="--side", metavar="M", gt=0)
 
     @model_validator(mode="after")
     def _side_within_twice_the_radius(self) -> Self:
