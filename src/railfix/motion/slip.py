@@ -67,12 +67,12 @@ class SlipLimits(Settings):
     map_limit : float
         Sine of the pitch against the line's: 0.1 m/s2 of wheel against train.
     noise_sigmas, noise_s : float
-        The limit is never less than so many standard deviations of that difference while the wheel rolls, learnt over
-        such a time: a body that pitches shakes its accelerometer too, the more the higher it is mounted.
+        The limit is at least so many standard deviations of that difference while the wheel rolls, over such a time: a
+        body that pitches shakes its accelerometer too, the more the higher it is mounted.
     confirm_s : float
         Time over the limit after which a slip is one.
     latch_mps, latch_share, latch_s : float
-        A slip ends when wheel and inertia agree within the larger of a speed and a share of it for so long.
+        A slip ends when wheel and inertia agree within a speed or a share of it for so long.
     carry_drift_mps2 : float
         The two may differ by so much more a second of the carry: 1e-3 of gravity, the offset of the accelerometer and
         the error of the pitch together.
@@ -92,7 +92,7 @@ class SlipLimits(Settings):
     settling_s : float
         After a stop the body comes to rest on its suspension for so long; its pitch then is the one of the standstill.
     rolling_limit, rolling_s, rolling_mps : float
-        Change of the apparent pitch at standstill, its duration, and the speed carried by then, that mean rolling away.
+        Change of the apparent pitch at standstill, duration, and carried speed that mean rolling away.
     """
 
     rule: Literal["map", "p2"] = "map"

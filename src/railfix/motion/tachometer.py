@@ -41,7 +41,7 @@ class TachometerLimits(Settings):
     silence_s : float
         Time without a pulse after which there is no output.
     jitter_s, resolution_s : float
-        Standard deviation of a pulse's instant, and the step of the clock that measures it.
+        Standard deviation of a pulse's instant, and the step of its clock.
     """
 
     wheel_diameter_m: float = Field(default=0.86, gt=0.2, lt=2.0)

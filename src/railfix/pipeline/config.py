@@ -116,8 +116,7 @@ class Config(ScreenSettings):
     signals : mapping of str to tuple of str
         Signals of each constellation in order of preference; the first one observed is used.
     frequencies : {"one", "two"}
-        Whether a second code of each satellite, where there is one, is combined with the first (not with SBAS, whose
-        corrections are those of one frequency).
+        Whether a second code of each satellite is combined with the first (not with SBAS).
     two_frequencies : TwoFrequencyLimits
         Limits of that.
     screens : tuple of str
@@ -137,14 +136,13 @@ class Config(ScreenSettings):
     dilution_limit : float
         Largest along-track dilution [m/m] of a position.
     off_map_risk : float
-        Probability that noise alone makes the ranges fit the line so much worse than the 3-D position that it is off
-        the map; the noise is judged by the residuals of the 3-D fit.
+        Probability that noise alone puts a position off the map; the noise is judged by the residuals of the 3-D fit.
     off_map_s : float [s]
-        Time of positions off the map after which the filter gives up its place, and of others after which it begins
-        anew. On the recordings, with a right map, no two positions in a row are off it.
+        Time off the map after which the filter gives up its place, and on it after which it begins anew. On the
+        recordings, with a right map, no two positions in a row are off it.
     track_risk : float
-        Probability of another track than the route's, or of none of the map, above which no position on a network is
-        `ok` or `tracking` or has a level. `railfix which-track` allows the same.
+        Probability of another track above which no position on a network is `ok` or `tracking` or has a level. `railfix
+        which-track` allows the same.
     ionosphere : {"klobuchar", "off"}
         Model of the delay.
     troposphere : {"saastamoinen", "off"}
@@ -152,7 +150,7 @@ class Config(ScreenSettings):
     max_ephemeris_age_s : float or None
         Tighter limit on the age of a record than its own validity.
     map_plan_sigma_m, map_height_sigma_m : float or None
-        In place of the track's own map error, which P1 has as 0.30 m and 0.60 m (4.1(3)).
+        In place of the track's own map error (P1 4.1(3): 0.30 m, 0.60 m).
     noise_scale : NoiseScaleLimits
         Estimation of the receiver's noise from the residuals.
     lasting_errors : LastingErrorLimits

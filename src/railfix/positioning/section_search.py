@@ -41,11 +41,11 @@ class SectionLimits(Settings):
     Attributes
     ----------
     ambiguity_risk : float
-        Probability that noise alone makes the true place fit this much worse than the best one.
-        Chi-square, one degree of freedom. P1 3.2: wrong sections on sharp curves.
+        Probability that noise makes the true place fit this much worse than the best one. Chi-square, one degree of
+        freedom. P1 3.2: wrong sections on sharp curves.
     reach_risk : float
-        Other places are looked for as far as noise makes them fit worse with this probability: further than they are
-        ambiguous, for a fault of one range can hide that much.
+        Other places are sought as far as noise has this probability: further than they are ambiguous, for a fault of
+        one range can hide that much.
     separation_m : float
         Least distance along the line between two distinct places.
     redundancy : int

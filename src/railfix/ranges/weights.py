@@ -96,8 +96,7 @@ class NominalErrors(Settings):
     ionosphere_sigma_m : float
         Vertical delay that Klobuchar's model leaves. Mostly common to all satellites, taken as independent.
     typical_ionosphere_sigma_m : float
-        Added to it, and to the sigma of the ranges, while typical coefficients stand in for those of Klobuchar's model:
-        what the two models differ by.
+        Added to it, and to the ranges, with typical coefficients: what the two models differ by.
     troposphere_sigma_m : float
         Vertical delay that the standard atmosphere leaves (DO-229D A.4.2.4: 0.12 m).
     """

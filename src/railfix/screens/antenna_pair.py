@@ -63,9 +63,9 @@ class AntennaPairLimits(Settings):
     limit_m : float [m]
         Largest difference from what is expected; P1 table 6: 5.
     elevation_error_deg, azimuth_error_deg : float [deg]
-        By which the satellite's direction from the car body may be wrong; P1 2.3(3): 3 and 3.5.
+        Error of the satellite's direction from the car body; P1 2.3(3): 3 and 3.5.
     clocks : {"common", "median"}
-        Whether the receivers have one clock by hardware, or its difference is the median of each constellation.
+        One clock by hardware, or the median of each constellation.
     least_satellites : int
         "median": satellites of a constellation that both antennas need.
     tag_tolerance_s : float [s]

@@ -71,8 +71,8 @@ class DopplerLimits(Settings):
     longest_interval_s : float [s]
         Over a longer interval the screen cannot judge.
     hold_s : float [s]
-        Time for which a satellite stays rejected after a jump unless it returns to its old level; 0
-        rejects only the epochs of the jumps out and back, which is exactly P1's test.
+        How long a satellite stays rejected after a jump; 0 rejects only the epochs of the jumps out and back, which is
+        exactly P1's test.
     least_satellites : int
         Satellites of one clock needed to take its step out.
     verdict : {"weigh", "reject"}

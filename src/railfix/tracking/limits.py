@@ -19,9 +19,8 @@ class TrackingLimits(Settings):
         Standard deviation and correlation time of the acceleration along the track (R. A. Singer, 1970). Trains
         brake and accelerate with up to 1.3 m/s2 and hold it for some seconds; cars with more, for shorter.
     service_acceleration_mps2, trusted_satellites : float, int
-        Without a sensor the speed by fewer satellites is not believed beyond this acceleration since the last one that
-        was: one wall, or a station roof, can leave reflections alone, and they then agree with
-        each other (`possible_speed`).
+        Without a sensor the speed by fewer satellites is not believed beyond this acceleration: one wall, or a station
+        roof, can leave reflections alone, and they then agree with each other (`possible_speed`).
     degrees_of_freedom : float
         Of Student's t that measurement errors follow: 4 is the least integer with a finite kurtosis bound of the
         score, and what urban code errors look like.
@@ -37,11 +36,11 @@ class TrackingLimits(Settings):
     code_white_share : float
         White part of a code's error, over its standard deviation; per second, not per epoch.
     code_period_s : float
-        Codes count once in this time where phases or Dopplers of four satellites carry the place on: their errors
-        last for a minute, so the epochs between tell nothing new. 0 takes those of every epoch.
+        Codes count once in this time where phases or Dopplers carry the place on: their errors last for a minute, so
+        the epochs between tell nothing new. 0 takes those of every epoch.
     slow_code_m, slow_code_s : float
-        Displacement along the line by errors of orbits and ionosphere, and how long it lasts: about 1 m a satellite
-        with a dilution of one; averaging over epochs does not take it away.
+        Displacement by orbits and ionosphere, and how long it lasts: about 1 m a satellite with a dilution of one;
+        averaging over epochs does not take it away.
     doppler_floor_mps, doppler_zenith_mps : float
         ``sigma^2 = floor^2 + (zenith 10^((45 - C/N0) / 20))^2`` of a Doppler.
     doppler_error_mps, doppler_error_share, doppler_correlation_s : float
@@ -50,23 +49,23 @@ class TrackingLimits(Settings):
     phase_floor_m, phase_zenith_m : float
         The same of the change of a carrier phase over an epoch.
     phase_walk_m : float
-        Displacement in the square root of a second by what changes the phases of all satellites slowly: ionosphere,
-        troposphere, orbits and clocks, 0.5 mm/s along the line for half an hour.
+        Displacement in the square root of a second by slow errors of all phases: ionosphere, troposphere, orbits and
+        clocks, 0.5 mm/s along the line for half an hour.
     clock_walk_mps : float
         Change of the drift of the receiver's clock in the square root of a second: 1.7e-9 of the frequency,
         what quartz oscillators without an oven show when shaken.
     offset_walk_m : float
-        Change of the offset between the codes of two constellations in the square root of a second.
+        Change of the offset between two constellations in the square root of a second.
     offset_prior_m : float
         Standard deviation of such an offset before anything is known beside the first epoch's median.
     map_roughness_m, map_correlation_m : float
-        Local error of the map across the track and in height, and the length over which it changes: with it the
-        change of the carrier phase cannot claim more than the shape of the line is known to.
+        Local error of the map across and up, and the length over which it changes: with it the change of the carrier
+        phase cannot claim more than the shape of the line is known to.
     map_scale_m : float
         Error of a length along the map [m per square root of m]; a larger one is learnt where the codes show it.
     map_misfit_sigmas, map_misfit_s, map_misfit_kept_s : float
-        The codes show it where the mean of their innovations over `map_misfit_s` exceeds so many of its sigmas; what
-        was learnt is forgotten within `map_misfit_kept_s`.
+        It is shown by a mean innovation over `map_misfit_s` of so many of its sigmas; what was learnt is forgotten
+        within `map_misfit_kept_s`.
     map_absolute_m : float
         Length over which the absolute error of the map changes (sigmas are those of the trajectory).
     map_branch_m : float
@@ -77,7 +76,7 @@ class TrackingLimits(Settings):
     code_common_s, code_common_travel_m : float
         Time and distance over which that error lasts.
     branch_floor, branch_floor_m : float
-        Codes alone leave a branch within this distance of the most probable one at least this probability.
+        Codes alone leave a branch this near at least this probability.
     decided_travel_m : float
         Hypotheses are dropped only after this much travel: before, motion does not separate branches.
     least_probability : float
@@ -91,10 +90,10 @@ class TrackingLimits(Settings):
     gap_s : float
         Time without measurements after which places are sought again beside the predicted one.
     lost_motion_weight, lost_motion_s, lost_code_weight, lost_code_s : float
-        The track is lost when the mean weight of Dopplers and phases, or of codes, was below these for so long; 1 is
-        the weight of an error of one standard deviation. Epochs above them count down.
+        The track is lost when the mean weight of motion, or of codes, was below these for so long; 1 is the weight of
+        an error of one standard deviation. Epochs above them count down.
     bend_m : float
-        Where motion contradicts the track at an epoch, places so far before and behind (and twice as far) are tried.
+        Where motion contradicts the track, places so far (and twice as far) before and behind are tried.
     level : {"on", "off"}
         Whether a bank of sub-filters gives a protection level; it costs as many filters as there are satellites.
     level_period_s : float
@@ -115,19 +114,19 @@ class TrackingLimits(Settings):
     level_motion_prior : float
         Probability that all Dopplers, or all phases, are wrong together at such a sample. An assumption.
     level_map_prior, level_map_m : float, float
-        Probability that the map is wrong by more than its sigma there, and by how much, across and up. An assumption.
+        Probability that the map is wrong by more than its sigma, and by how much. An assumption.
     level_passes : int
         Rounds of reweighting of the sub-filters.
     level_doubt_s, level_doubt_code_s : float
-        A filter that its own Dopplers and phases, or its codes, contradict for longer bounds nothing; mean weights are
-        those of a lost track. A contradiction of single epochs is noise, which is in the standard deviation.
+        A filter that its own motion, or codes, contradict for longer bounds nothing; mean weights are those of a lost
+        track. A contradiction of single epochs is noise, which is in the standard deviation.
     level_start_s : float
-        After a start no level before one place has a probability of 0.99, for at most so long; none for so long after
-        the track was lost.
+        After a start no level before one place has a probability of 0.99, at most so long; none for so long after the
+        track was lost.
     level_hold_s : float
         A level that is withheld comes back so long after the last contradiction.
     end_doubt_s : float
-        At an open end of the line, pushed beyond it with motion in doubt for so long, the track is lost.
+        At an open end, pushed beyond it with motion in doubt for so long, the track is lost.
     expired_sigma_m : float
         Standard deviation from which on a predicted place is no position.
     """

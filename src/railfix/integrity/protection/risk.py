@@ -87,21 +87,20 @@ class RiskBudget(Settings):
         Of the risk, that faults which are not hypotheses may have together: where they are likelier, further ones
         become hypotheses, up to four satellites at a time and three shared faults (constellation, side, map).
     exclusion_share : float
-        Of the risk, kept for epochs with one and (as much again) with two satellites excluded.
+        Of the risk, for epochs with one, and as much again with two satellites excluded.
     false_alarm : float
         Probability in an epoch that noise alone makes the separations inconsistent; P4: 1e-3.
     satellite_prior : mapping of str to float
         Probability that a satellite of a constellation (its letter) is faulty at a time: its own signal.
     local_prior : float
-        The same of a fault by local causes that the screens left, on top of
-        that: multipath, interference. An assumption until measured on the line (P1 7).
+        The same of a fault by local causes, on top of that: multipath, interference. An assumption until measured on
+        the line (P1 7).
     map_prior : float
-        Probability that the map at a place is wrong by more than its stated error: the next track, heights without
-        the geoid, another reference frame. An assumption; 0: no such hypothesis.
+        Probability that the map is wrong by more than its stated error: the next track, heights without the geoid,
+        another reference frame. An assumption; 0: no such hypothesis.
     side_prior : float
-        Probability that one reflection makes the low satellites of one side of the track faulty together:
-        `SUPPORTED_SIDE_PRIOR`. No data supports a smaller one, and every output of the levels then says so; 0: no such
-        hypothesis.
+        Probability that the low satellites of one side of the track are faulty together: `SUPPORTED_SIDE_PRIOR`. No
+        data supports a smaller one, and every output of the levels then says so; 0: no such hypothesis.
     side_elevation_deg : float
         Elevation up to which satellites count as low: of a wall as high as it is away.
     priors : {"assumed", "measured"}

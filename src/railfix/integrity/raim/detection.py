@@ -29,7 +29,7 @@ class RaimLimits(Settings):
     Attributes
     ----------
     mode : {"chi_square", "fixed"}
-        Threshold from a false-alarm rate (P4), or P1's fixed limit on the sum of squared residuals.
+        False-alarm rate (P4), or P1's fixed limit.
     false_alarm : float
         Probability that noise alone is called a fault; P4: 0.001. An excluded satellite's own
         error must be over what noise reaches with this probability (chi-square mode).

@@ -154,12 +154,12 @@ class SbasLimits(Settings):
         Time-outs: those of precision approach (shorter, the default), or of en route to non-precision
         approach.
     type0 : {"stop", "as_type2"}
-        Type 0 stops the use of its sender for 60 s, or holds fast corrections unless it is empty (systems under test).
+        Type 0 stops its sender for 60 s, or holds fast corrections unless empty.
     range_rate : {"mops", "off"}
-        Fast corrections change with the rate of the last two of them (DO-229D, A.4.4.3), or stay as sent.
+        Fast corrections change with their rate (DO-229D, A.4.4.3), or stay as sent.
     incomplete : {"reject", "inflate"}
-        Without degradation data (types 7, 10, and 28 where sent) a satellite is rejected, or has sigma UDRE plus 8 m
-        (DO-229D, J.2.2) and the shortest time-out of fast corrections.
+        Without degradation data a satellite is rejected, or has sigma UDRE plus 8 m (DO-229D, J.2.2) and the shortest
+        time-out.
     max_udrei : int or None
         Largest UDREI used; None is 11 for precision approach and 13 en route.
     message_s : float
