@@ -224,7 +224,8 @@ def pages() -> dict[Path, str]:
     general = (
         "Keys of the configuration file (TOML), by its tables, each with its default, or one for all keys of an entry. "
         "`--set` takes `table.key=value`. Names end with their [unit](columns.md). Numbers are above 0 unless other "
-        "bounds follow; `[0, 1)` includes 0. The filter has [settings of its own](settings-filter.md)."
+        "bounds follow; `[0, 1)` includes 0. P1 to P5 are [papers](papers.md). The filter has "
+        "[settings of its own](settings-filter.md)."
     )
     every = list(_setting_cells("", Config()))
     of_filter = [cell for cell in every if f"{cell[0]}.{cell[1]}".lstrip(".").startswith(FILTER)]
