@@ -150,7 +150,7 @@ class Config(ScreenSettings):
     max_ephemeris_age_s : float or None
         Tighter limit on the age of a record than its own validity.
     map_plan_sigma_m, map_height_sigma_m : float or None
-        In place of the track's own map error (P1 4.1(3): 0.30 m, 0.60 m).
+        In place of the track's own map error (P1: 0.30 m, 0.60 m).
     noise_scale : NoiseScaleLimits
         Estimation of the receiver's noise from the residuals.
     lasting_errors : LastingErrorLimits
@@ -195,7 +195,7 @@ class Config(ScreenSettings):
     clock_offsets, single_point, section, constrained
         Limits of these stages.
     carrier : {"off", "smoothed", "float"}
-        Use of the carrier phase (A5): none; codes smoothed by it; or code and phase together with float
+        Use of the carrier phase: none; codes smoothed by it; or code and phase together with float
         ambiguities, from this and earlier epochs. On recordings smoothing helps most on a phone, float
         ambiguities under open sky; in towns, where arcs last seconds, neither removes large errors.
     phase_sigma_m : float
