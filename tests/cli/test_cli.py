@@ -15,6 +15,7 @@ from conftest import ROOT
 from railfix import __version__
 from railfix.cli import app
 from railfix.core import errors
+from railfix.core.commit import version_text
 
 RUNNER = CliRunner(env={"COLUMNS": "200", "TERM": "dumb", "NO_COLOR": "1"})
 COMMANDS = [
@@ -72,7 +73,8 @@ def test_without_arguments_the_manual_is_shown() -> None:
 
 def test_version() -> None:
     result = RUNNER.invoke(app, ["--version"])
-    assert (result.exit_code, result.output) == (0, f"railfix {__version__}\n")
+    assert (result.exit_code, result.output) == (0, version_text() + "\n")
+    assert re.fullmatch(rf"railfix {__version__} \(commit (unknown|[0-9a-f]{{40}}(\+changed)?)\)\n", result.output)
 
 
 @pytest.mark.parametrize(
@@ -98,7 +100,7 @@ def test_the_module_runs_as_a_program() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "railfix", "--version"], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    assert done.stdout == f"railfix {__version__}\n"
+    assert done.stdout == version_text() + "\n"
 
 
 def test_the_manual_does_not_load_what_only_runs_need() -> None:

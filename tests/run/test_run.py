@@ -14,6 +14,7 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from broken_bench import EPOCHS, Bench, bench_in
+from railfix.core.commit import source_commit
 from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status, reason_text
 from railfix.evaluate import evaluate_run
@@ -132,6 +133,7 @@ def test_the_record_names_what_was_read(record: dict[str, Any]) -> None:
         assert item["bytes"] == len(content)
         assert item["sha256"] == hashlib.sha256(content).hexdigest()
     assert record["versions"]["railfix"]
+    assert record["versions"]["commit"] == source_commit()
     assert record["versions"]["numpy"] == np.__version__
     assert record["settings_used"] == Config().as_dict()
     positioned = sum(antenna["epochs_with_position"] for antenna in record["antennas"].values())

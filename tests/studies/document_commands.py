@@ -75,17 +75,23 @@ def options_of(command: Any) -> set[str]:
 
 
 @cache
-def every_option() -> set[str]:
-    """Return the options of all commands, however deep."""
+def every_command() -> dict[str, set[str]]:
+    """Return the options of all commands, however deep, by the command's words."""
 
-    def below(command: Any, context: Any) -> Iterator[str]:
-        yield from options_of(command)
+    def below(command: Any, context: Any, words: str) -> Iterator[tuple[str, set[str]]]:
+        yield words, options_of(command)
         if isinstance(command, TyperGroup):
             for name in command.list_commands(context):
                 _, inner, _ = command.resolve_command(context, [name])
-                yield from below(inner, inner.make_context(name, [], parent=context, **_CONTEXT))
+                yield from below(inner, inner.make_context(name, [], parent=context, **_CONTEXT), f"{words} {name}")
 
-    return set(below(_group(), _group().make_context("railfix", [], **_CONTEXT))) | {"--help", "-h", "--version"}
+    context = _group().make_context("railfix", [], **_CONTEXT)
+    return dict(below(_group(), context, "railfix"))
+
+
+def every_option() -> set[str]:
+    """Return the options of all commands."""
+    return set().union(*every_command().values()) | {"--help", "-h", "--version"}
 
 
 def wrong_with(line: Shown) -> str | None:

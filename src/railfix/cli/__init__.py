@@ -10,8 +10,8 @@ from typing import Annotated, ClassVar
 
 import typer
 
-from railfix import __version__
 from railfix.cli.command import LazyCommands, run_program
+from railfix.core.commit import version_text
 
 
 class _Program(LazyCommands):
@@ -54,7 +54,7 @@ app = typer.Typer(
 
 def _print_version(*, asked: bool) -> None:
     if asked:
-        typer.echo(f"railfix {__version__}")
+        typer.echo(version_text())
         raise typer.Exit
 
 
@@ -67,7 +67,7 @@ def railfix(
             "--version",
             callback=lambda asked: _print_version(asked=asked),
             is_eager=True,
-            help="Print the version and end.",
+            help="Print the version with its commit and end.",
         ),
     ] = False,
 ) -> None:

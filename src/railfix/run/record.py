@@ -12,6 +12,7 @@ from typing import Any, Final
 import polars as pl
 
 from railfix import __version__
+from railfix.core.commit import source_commit
 from railfix.core.reasons import Status
 from railfix.gnss.navigation import Navigation
 from railfix.kernels import numba_version
@@ -181,7 +182,12 @@ def run_record(
     observed = sum(antenna.observed for antenna in tally.antennas.values())
     ok = sum(antenna.status[Status.OK.text] for antenna in tally.antennas.values())
     return {
-        "versions": {"railfix": __version__, "python": platform.python_version(), **made_from.packages},
+        "versions": {
+            "railfix": __version__,
+            "commit": source_commit(),
+            "python": platform.python_version(),
+            **made_from.packages,
+        },
         "platform": platform.platform(),
         "kernels": numba_version(),
         "command": sys.argv,

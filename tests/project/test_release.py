@@ -1,0 +1,157 @@
+"""A release can be checked: its commit, two builds with one hash, its list of components."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import subprocess
+import sys
+from importlib.metadata import distribution, version
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from packaging.requirements import Requirement
+
+from conftest import ROOT
+from public_names import KEPT, public_names
+from python_matrix import PROJECT, interpreter, supported_versions
+from railfix.core.commit import checked_out_commit
+from railfix.core.files import file_sha256
+from reproducible_build import built_twice
+from sbom import bill_of_materials
+
+
+def git(folder: Path, *words: str) -> str:
+    who = ["-c", "user.name=A", "-c", "user.email=a@example.org"]
+    return subprocess.run(
+        ["git", "-C", folder, *who, *words], capture_output=True, text=True, check=True
+    ).stdout.strip()
+
+
+def test_the_commit_of_a_checkout_is_what_git_says(tmp_path: Path) -> None:
+    root, other = tmp_path / "root", tmp_path / "other"
+    root.mkdir()
+    assert checked_out_commit(root) == ""
+    git(root, "init", "-q")
+    assert checked_out_commit(root) == ""  # a branch without a commit
+    git(root, "commit", "-q", "--allow-empty", "-m", "one")
+    first = git(root, "rev-parse", "HEAD")
+    assert checked_out_commit(root) == first
+    git(root, "worktree", "add", "-q", "-b", "area/side", str(other))
+    git(other, "commit", "-q", "--allow-empty", "-m", "two")
+    assert checked_out_commit(other) == git(other, "rev-parse", "HEAD") != first
+    git(root, "pack-refs", "--all")
+    git(other, "pack-refs", "--all")
+    assert (checked_out_commit(root), checked_out_commit(other)) == (first, git(other, "rev-parse", "HEAD"))
+    git(root, "checkout", "-q", "--detach")
+    assert checked_out_commit(root) == first
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="a source archive has no commit to build from")
+def test_two_builds_have_one_hash_and_know_their_commit(tmp_path: Path) -> None:
+    hashes = built_twice(tmp_path)
+    assert sorted(len(found) for found in hashes.values()) == [2, 3]  # one more wheel, from the source archive
+    assert all(len(set(found)) == 1 for found in hashes.values()), hashes
+    (wheel,) = (tmp_path / "0").glob("*.whl")
+    install = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "-q",
+        "--no-index",
+        "--no-deps",
+        "--target",
+        str(tmp_path / "site"),
+    ]
+    subprocess.run([*install, str(wheel)], check=True)
+    surroundings = os.environ | {"PYTHONPATH": str(tmp_path / "site"), "PATH": ""}  # no git
+    command = [sys.executable, "-m", "railfix", "--version"]
+    said = subprocess.run(command, cwd=tmp_path, env=surroundings, capture_output=True, text=True, check=True).stdout
+    changed = "+changed" if git(ROOT, "status", "--porcelain") else ""
+    assert said == f"railfix {version('railfix')} (commit {git(ROOT, 'rev-parse', 'HEAD')}{changed})\n"
+
+
+def check(listed: dict[str, Any]) -> str:
+    """What the validator of CycloneDX says, "" where nothing is wrong."""
+    validators = pytest.importorskip("cyclonedx.validation.json")
+    schema = pytest.importorskip("cyclonedx.schema").SchemaVersion
+    return str(validators.JsonStrictValidator(schema.V1_6).validate_str(json.dumps(listed)) or "")
+
+
+def test_the_list_of_components_is_valid_and_the_same_each_time() -> None:
+    listed = bill_of_materials()
+    assert check(listed) == ""
+    assert listed == bill_of_materials()
+    broken = copy.deepcopy(listed)
+    del broken["components"][0]["name"]
+    assert "name" in check(broken)
+
+
+def test_the_list_has_what_is_installed_and_all_of_it() -> None:
+    wheel = ROOT / "pyproject.toml"
+    listed = bill_of_materials(["maps"], wheel)
+    entries = {entry["name"]: entry for entry in listed["components"]}
+    asked = [Requirement(text) for text in distribution("railfix").requires or []]
+    direct = {r.name.lower() for r in asked if r.marker is None or r.marker.evaluate({"extra": "maps"})}
+    assert {"numba", "rasterio"} <= direct <= set(entries)
+    assert not {"pytest", "sphinx", "starlette", "railfix"} & set(entries)
+    assert entries["llvmlite"]["version"] == version("llvmlite")  # asked for by numba alone
+    assert all(entry["purl"] == f"pkg:pypi/{name}@{version(name)}" for name, entry in entries.items())
+    depends = {item["ref"]: item["dependsOn"] for item in listed["dependencies"]}
+    railfix = listed["metadata"]["component"]
+    assert set(depends[railfix["purl"]]) == {entries[name]["purl"] for name in direct}
+    assert set(depends) == {entry["purl"] for entry in [railfix, *entries.values()]}
+    reached, waiting = set(), [railfix["purl"]]
+    while waiting:
+        reached.add(name := waiting.pop())
+        waiting += set(depends[name]) - reached
+    assert reached == set(depends)
+    assert railfix["hashes"] == [{"alg": "SHA-256", "content": file_sha256(wheel)}]
+    assert all(entry["licenses"] for entry in listed["components"])
+
+
+def test_a_public_name_that_is_gone_is_in_the_changes() -> None:
+    changes = (ROOT / "docs" / "changes.md").read_text(encoding="utf-8")
+    gone = set(KEPT.read_text(encoding="utf-8").splitlines()) - set(public_names())
+    missing = sorted(name for name in gone if name.removeprefix("railfix.") not in changes)
+    assert missing == [], "docs/changes.md does not say what became of them"
+
+
+def test_recipe_and_citation_are_those_of_the_package() -> None:
+    recipe = yaml.safe_load((ROOT / ".ci" / "conda" / "recipe.yaml").read_text(encoding="utf-8"))
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert recipe["context"]["version"] == citation["version"] == version("railfix")
+    assert "doi" not in citation
+    python, *needed = recipe["requirements"]["run"]
+    assert python == f"python {PROJECT['requires-python']}"
+    renamed = {"matplotlib-base": "matplotlib"}  # the part without a window system
+    found = [Requirement(" ".join([renamed.get(name, name), *more])) for name, *more in map(str.split, needed)]
+    assert found == [Requirement(text) for text in PROJECT["dependencies"]]
+
+
+def test_the_container_installs_the_wheel_and_runs_as_a_user() -> None:
+    text = (ROOT / ".ci" / "Containerfile").read_text(encoding="utf-8")
+    lines = [line.split(maxsplit=1) for line in text.splitlines() if line and not line.startswith("#")]
+    assert [word for word, _ in lines] == "ARG FROM COPY RUN RUN USER WORKDIR ENTRYPOINT CMD".split()
+    values = dict(lines)
+    assert values["ARG"].removeprefix("PYTHON=") in supported_versions()
+    assert values["USER"] == "railfix"
+    assert json.loads(values["ENTRYPOINT"]) == ["railfix"]
+
+
+def test_interpreters_are_those_that_run(tmp_path: Path) -> None:
+    assert supported_versions() == ["3.11", "3.12", "3.13", "3.14"]
+    own = ".".join(map(str, sys.version_info[:2]))
+    (tmp_path / f"python{own}").symlink_to(sys.executable)
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / f"python{own}").write_text("#!/bin/sh\nexit 127\n")
+    (broken / f"python{own}").chmod(0o755)
+    (tmp_path / "python3.99").symlink_to(sys.executable)  # another version than its name says
+    assert interpreter(own, [broken, tmp_path]) == tmp_path / f"python{own}"
+    assert interpreter("3.99", [tmp_path]) is None
