@@ -16,12 +16,14 @@ import pytest
 #: A table as wide as those of `railfix evaluate`, and one with a column an antenna.
 _SCRIPT = """
 from rich.table import Table
-from railfix.cli.console import console_of_tables, plain_table
+from railfix.cli.console import console_of_tables, show_table
+from railfix.core.tables import Table as Data
 console = console_of_tables()
-table = plain_table("run", "antenna", *(f"figure {k} m" for k in range(15)), text=2)
-for row in range(3):
-    table.add_row("2024-03-05/results", "front", *(f"{1000 * row + 13.73 * k:.2f}" for k in range(15)))
-console.print(table)
+head = ["run", "antenna", *(f"figure {k} m" for k in range(15))]
+rows = [
+    ["2024-03-05/results", "front", *(f"{1000 * row + 13.73 * k:.2f}" for k in range(15))] for row in range(3)
+]
+show_table(console, Data(name="wide", head=head, rows=rows, numeric=range(2, 17)))
 table = Table("")
 for name in ("front", "rear", "middle", "other"):
     table.add_column(name, justify="right")

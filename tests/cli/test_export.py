@@ -16,10 +16,13 @@ from typing import Final
 from xml.etree import ElementTree
 
 import numpy as np
+import pandas
 import polars as pl
 import pyarrow.parquet
+import pyogrio
 import pytest
-from pyproj import Transformer
+import shapely
+from pyproj import CRS, Transformer
 from typer.testing import CliRunner
 
 from railfix.cli import app
@@ -201,6 +204,50 @@ def test_positions_read_back_to_a_millimetre(results: Path, tmp_path: Path, endi
     assert level.is_infinite().any() == (table == "train")
     expected = [None if v is None or math.isinf(v) else pytest.approx(v, abs=1e-3) for v in level]
     assert [p.level_m for p in points] == expected
+
+
+@pytest.mark.parametrize("ending", [ending for ending in READERS if ending != ".parquet"])
+def test_gdal_shows_the_positions_as_a_gis_does(results: Path, tmp_path: Path, ending: str) -> None:
+    """GDAL opens each file by its content: points with heights, in WGS 84, at the places and times of the run."""
+    out = tmp_path / f"run{ending}"
+    export(results, out)
+    rows = pl.read_parquet(results / "train.parquet").drop_nulls("x_m").sort("antenna", "time_gpst")
+    names = ["track_points"] if ending == ".gpx" else [str(name) for name, _ in pyogrio.list_layers(out)]
+    parts = [pyogrio.raw.read(out, layer=name) for name in names]
+    points = [shapely.from_wkb(geometry) for _, _, geometry, _ in parts]
+    place = shapely.get_coordinates(np.concatenate(points), include_z=True)
+    for meta, *_ in parts:
+        assert CRS(meta["crs"]).to_epsg() in (4326, 4979)
+    field = {".gpx": "time", ".kml": "timestamp"}.get(ending, "time_utc")
+    times = np.concatenate([values[list(meta["fields"]).index(field)] for meta, _, _, values in parts])
+    times = times.astype("datetime64[ms]")
+    utc = rows["time_gpst"].dt.cast_time_unit("ms").to_numpy() - np.timedelta64(LEAP)
+    expected = rows.select("longitude_deg", "latitude_deg", "height_m").to_numpy()
+    seen, true = np.lexsort((place[:, 0], times)), np.lexsort((expected[:, 0], utc))
+    np.testing.assert_array_equal(times[seen], utc[true].astype("datetime64[ms]"))
+    np.testing.assert_allclose(place[seen, :2], expected[true, :2], rtol=0.0, atol=1e-8)
+    if ending == ".gpx":  # GDAL has heights of GPX as a field
+        place[:, 2] = np.concatenate([values[list(meta["fields"]).index("ele")] for meta, _, _, values in parts])
+    np.testing.assert_allclose(place[seen, 2], expected[true, 2], rtol=0.0, atol=1e-3)
+
+
+def test_geoparquet_and_the_tables_of_a_run_in_pandas_and_xarray(results: Path, tmp_path: Path) -> None:
+    """The tables that other tools read: pandas by way of pyarrow, shapely for the geometry, xarray from pandas."""
+    export(results, tmp_path / "run.parquet")
+    frame = pandas.read_parquet(tmp_path / "run.parquet")
+    rows = pl.read_parquet(results / "train.parquet").drop_nulls("x_m")
+    column = next(name for name in frame.columns if frame[name].map(type).eq(bytes).all())
+    place = shapely.get_coordinates(shapely.from_wkb(frame[column]), include_z=True)
+    np.testing.assert_allclose(np.sort(place[:, 0]), np.sort(rows["longitude_deg"].to_numpy()), rtol=0.0, atol=1e-8)
+    table = pandas.read_parquet(results / "train.parquet")
+    text = pandas.read_csv(results / "train.csv", parse_dates=["time_gpst"])
+    assert len(table) == len(text) == 400
+    assert (text["time_gpst"] == table["time_gpst"]).all()
+    cube = table.set_index(["antenna", "time_gpst"]).to_xarray()
+    assert dict(cube.sizes) == {"antenna": 2, "time_gpst": 200}
+    front = rows.filter(antenna="front")["chainage_m"].to_numpy()
+    seen = cube["chainage_m"].sel(antenna="front").dropna("time_gpst").to_numpy()
+    assert set(front) <= set(seen)
 
 
 def test_the_frame_is_stated_in_every_file(results: Path, tmp_path: Path) -> None:

@@ -38,87 +38,18 @@ from railfix.evaluate.epochs import travelled, with_missing
 from railfix.evaluate.outages import OUTAGE_COLUMNS
 from railfix.evaluate.run_folder import tables_of
 from railfix.evaluate.sections import read_sections
-from railfix.io.reference_log import AntennaReference, reference_table
+from railfix.io.reference_log import AntennaReference
 from railfix.run import run_files
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import Track, read_track, write_track_csv
-from railfix.track.trajectory import Trajectory
+from run_made import LINE, START, at, reference, write_reference, write_run
 
 pytestmark = pytest.mark.requirement("D2")
-
-START = np.datetime64("2024-03-05T01:00:00", "ns")
-#: 2 km, level and straight, points every 10 m.
-LINE = Track.from_ecef(synthetic.enu_to_ecef(np.stack([np.arange(0, 2001, 10.0), *np.zeros((2, 201))], axis=1)))
-PATH = Trajectory.from_track(LINE)
 
 
 def limits_of(found: dict[str, float], name: str) -> tuple[float, float]:
     """Lower and upper limit of one figure."""
     return found[name.format("_low")], found[name.format("_high")]
-
-
-def at(chainage: np.ndarray) -> np.ndarray:
-    return PATH.at_arc(PATH.arc_at_chainage(chainage))
-
-
-def reference(time_s: np.ndarray, chainage: np.ndarray, **columns: object) -> dict[str, AntennaReference]:
-    blank = np.full(len(time_s), np.nan)
-    whole = {
-        "time": START + timedelta(time_s),
-        "ecef_m": at(chainage),
-        "chainage_m": chainage,
-        "speed_mps": blank,
-        "sigma_m": blank,
-        "source": np.full(len(time_s), "truth"),
-        "environment": np.full(len(time_s), ""),
-    }
-    return {"front": AntennaReference(**whole | columns)}  # type: ignore[arg-type]
-
-
-def write_reference(path: Path, references: dict[str, AntennaReference]) -> None:
-    reference_table(references).write_csv(path, float_precision=4, datetime_format="%Y-%m-%dT%H:%M:%S%.9f")
-
-
-def write_run(
-    folder: Path,
-    time_s: np.ndarray,
-    chainage: np.ndarray,
-    *,
-    conventional: np.ndarray | None = None,
-    status: list[str] | None = None,
-    track: Path | None = None,
-    chainage_of: str = "antenna",
-    settings: dict | None = None,
-    **columns: np.ndarray,
-) -> Path:
-    """A run folder of one antenna; NaN where there is no position."""
-    folder.mkdir(parents=True)
-    conventional = chainage if conventional is None else conventional
-    has = np.isfinite(chainage)
-    rows = {
-        "time_gpst": START + timedelta(np.asarray(time_s, dtype=np.float64)),
-        "antenna": ["front"] * len(time_s),
-        "status": status or np.where(has, "ok", "too_few_satellites").tolist(),
-        "chainage_m": chainage,
-        "along_sigma_m": np.where(has, 2.0, np.nan),
-        "n_used": np.where(has, 8, 2),
-        "conventional_chainage_m": conventional,
-    }
-    for prefix, values in (("", chainage), ("conventional_", conventional)):
-        place = at(values)
-        rows |= {f"{prefix}{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
-    pl.DataFrame(rows | columns, nan_to_null=True).write_parquet(folder / "positions.parquet")
-    entries = []
-    if track is not None:
-        digest = hashlib.sha256(track.read_bytes()).hexdigest()
-        entries = [{"input": "track", "path": str(track), "bytes": track.stat().st_size, "sha256": digest}]
-    record = {
-        "inputs": entries,
-        "settings_used": settings or {"preset": "default", "screens": ["elevation"]},
-        "line": {"track": {"name": "straight"}, "chainage_of": {"front": chainage_of}},
-    }
-    (folder / "run.json").write_text(json.dumps(record))
-    return folder
 
 
 def test_errors_and_rates_by_hand(tmp_path: Path):
@@ -742,7 +673,7 @@ def rows_of_document(antenna: str, columns: int) -> list[list[str]]:
 def test_the_document_shows_what_the_demonstration_gives(tmp_path: Path):
     run_files(demo_inputs(), out=tmp_path / "run")
     found = evaluate_run(tmp_path / "run")
-    names = {"on the map": "constrained", "of status ok": "constrained_ok", "conventional": "conventional"}
+    names = {"on the map": "constrained", "on the map ok": "constrained_ok", "conventional": "conventional"}
     figures = ("mean_m", "std_m", "p50_m", "p95_m", "max_m")
     for antenna in ("front", "rear"):
         rows = rows_of_document(antenna, 8)
@@ -858,7 +789,7 @@ def test_levels_go_into_files_named_by_what_they_rest_on(tmp_path: Path):
     arguments = ["evaluate", str(run), "--reference", str(tmp_path / "truth.csv"), "--out", str(out)]
     result = CliRunner().invoke(app, [*arguments, "--alarm-limit", "5", "--alarm-limit", "30"])
     assert result.exit_code == 0, result.output
-    assert "Errors over their level: 5, of them 3 usable; all are in beyond_sbas.csv" in result.output
+    assert "Errors above their level (sbas): 5, of them 3 usable" in result.output
     assert "error +9.00 m, level 2.00 m (one_fault), status ambiguous" in result.output
     counts = pl.read_csv(out / "stanford_sbas.csv").filter(grouping="all")
     assert counts["alarm_limit_m"].to_list() == [5.0, 12.0, 30.0] * 2

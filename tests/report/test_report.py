@@ -16,9 +16,10 @@ import pytest
 from typer.testing import CliRunner
 
 from railfix.cli import app
+from railfix.core.tables import number, share
+from railfix.evaluate.tables import error_tables, evaluation_of, group_tables, level_tables
 from railfix.pipeline.config import parse_config
 from railfix.report import read_runs, report_page, write_report
-from railfix.report.content import number, share
 from railfix.report.encode import packed, script_json
 from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, NO_TIMES
 from railfix.report.protection import NO_LEVELS
@@ -160,6 +161,25 @@ def test_figures_of_merit_are_the_evaluations(document: str, folder: Path) -> No
     assert NO_REFERENCE not in document
 
 
+def test_the_terminal_and_the_page_show_the_same_tables(document: str, folder: Path) -> None:
+    """Every cell of the evaluation of single epochs: in the page, and what `railfix evaluate` prints."""
+    words = ["evaluate", str(folder), "--reference", str(demo_truth()), "--table", "positions"]
+    printed = RUNNER.invoke(app, words, env={"COLUMNS": "500"}).output
+    _, evaluation = read_runs([folder], [demo_truth()])
+    assert evaluation is not None
+    part = evaluation_of(evaluation, folder.name)
+    tables = [*error_tables(part), *group_tables(part), *level_tables(part, worst=20)]
+    names = ["figures-of-merit", "intervals", "stanford-separation", "above-level-separation"]
+    assert set(names) <= {table.name for table in tables}
+    for table in tables:
+        assert f'<table data-name="{table.name}">' in document
+        for row in table.rows:
+            cells = [f'{mark}">{cell}</td>' for mark, cell in zip(["n"] * len(row), row, strict=True)]
+            assert [k for k in table.numeric if cells[k] not in document] == []
+            if table.name == "figures-of-merit" and row[0] != "all":
+                assert " ".join(row).translate(str.maketrans("−–", "--")) in " ".join(printed.split())
+
+
 def test_nothing_is_fetched_and_nothing_unescaped(document: str, page: Page) -> None:
     assert fetched(document) == []
     assert not [tag for tag, _ in page.elements if tag in ("link", "img", "iframe", "object", "embed", "base")]
@@ -213,8 +233,11 @@ def test_errors_over_their_level_are_listed(folder: Path, tmp_path: Path) -> Non
         pl.col("status").cast(pl.String) == "ok", pl.col("protection_status").cast(pl.String) != "alarm"
     )
     assert len(over) > 20
-    assert f"Errors above their level: {len(over):,}, of them {len(usable):,} usable; the 20 largest" in document
-    listed = document.split("Errors above their level")[1].split("</table>")[0]
+    assert (
+        f"Errors above their level (separation): {len(over):,}, of them {len(usable):,} usable; the 20 largest"
+        in document
+    )
+    listed = document.split("Errors above their level (separation)")[1].split("</table>")[0]
     assert listed.count("<tr>") == 1 + 20
     worst = over.select(size=(pl.col("chainage_m") - pl.col("true_m")).abs()).max().item()
     assert f"{worst:.2f}</td>" in listed.split("<tr>")[2]
@@ -349,7 +372,7 @@ def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tm
     assert f"<dd>{level:.1f} m</dd>" in document
     assert f", filtered {beyond:,}</dd>" in document
     assert "Stanford diagram, usable levels (filter along the track)" in document
-    assert "filter-stanford-by-antenna" in document
+    assert "filter-stanford-train" in document
 
 
 def test_hostile_words_stay_words(folder: Path, tmp_path: Path) -> None:

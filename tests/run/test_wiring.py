@@ -15,13 +15,14 @@ import polars as pl
 import pytest
 
 from railfix.core.reasons import Reason, Status
+from railfix.core.tables import listing
+from railfix.evaluate.tables import _ERRORS
 from railfix.io.rinex import read_observations, write_observations
 from railfix.pipeline.config import Config
 from railfix.pipeline.results import Result
 from railfix.pipeline.tables import observations_table, positions_table
 from railfix.pipeline.train_table import train_table
 from railfix.report.runs import ReportedRun
-from railfix.report.tables import _merit as merit_row
 from railfix.report.tables import budget, summary
 from railfix.run import RunOptions, RunSummary, run_files
 from railfix.run.processor import processor_of
@@ -221,13 +222,12 @@ def test_the_report_states_both_rates() -> None:
 
 @pytest.mark.requirement("D2")
 def test_a_row_of_merits_has_each_figure_once() -> None:
-    names = ["errors", "rate", "mean_m", "std_m", "p50_m", "p95_m", "p99_m", "max_m", "wrong_places"]
-    figures = {name: float(k + 1) for k, name in enumerate([*names, "normalised_rms", "normalised_p95"])}
-    limits = {f"{name}_{end}": None for name in ("rate", "mean", "p95") for end in ("low", "high")}
-    limits |= {f"{name}_{end}_m": None for name in ("mean", "p95") for end in ("low", "high")}
-    row = {**figures, **limits, "rate": 0.5, "position": "constrained", "antenna": "front"}
-    expected = ["front", "on the map", "1", "50.00 %", *(f"{k:.2f}" for k in range(3, 9)), "9", "10.00", "11.00"]
-    assert merit_row(row, "antenna") == expected
+    names = "counted rate rate_of_run mean_m std_m rms_m p50_m p95_m p99_m max_m max_at_chainage_m wrong_places".split()
+    names += ["normalised_rms", "normalised_p95"]
+    row = {"position": "on the map", **{name: float(k + 1) for k, name in enumerate(names)}}
+    (cells,) = listing("one", pl.DataFrame([row]), _ERRORS).rows
+    shares, lengths = [f"{100 * k:.2f}" for k in (2, 3)], [f"{k:.2f}" for k in range(5, 11)]
+    assert cells == ["on the map", "1", *shares, "+4.00", *lengths, "11 m", "12", "13.00", "14.00"]
 
 
 @pytest.mark.requirement("B6")

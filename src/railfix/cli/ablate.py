@@ -6,9 +6,10 @@ from typing import Annotated
 
 from rich.console import Console
 
-from railfix.cli.console import console_of_tables, plain_table, progress_bar, show_files, show_notes
+from railfix.cli.console import console_of_tables, progress_bar, show_files, show_notes, show_table
 from railfix.cli.options import OutOption, Without, from_models
 from railfix.cli.settings import Choices, settings_of
+from railfix.core.tables import Table, number, percent
 from railfix.evaluate import Score
 from railfix.evaluate.ablation import Ablation, Effect, ablate_files
 from railfix.run import RunInputs, RunOptions
@@ -62,38 +63,34 @@ def show_ablation(ablation: Ablation) -> None:
     """One table an antenna, the notes, and where the results are."""
     console = console_of_tables()
     for antenna in dict.fromkeys(effect.antenna for effect in ablation.effects):
-        effects = [effect for effect in ablation.effects if effect.antenna == antenna]
-        console.print(f"{antenna}: {effects[0].epochs:,} epochs", markup=False)
-        _show(console, effects)
+        _show(console, [effect for effect in ablation.effects if effect.antenna == antenna])
     show_notes(console, ablation.notes)
     show_files(console, ablation.files.values())
 
 
 def _show(console: Console, effects: list[Effect]) -> None:
-    scored = effects[0].coordinates is not None
-    heads = ["rate\n%", "ok\n%", "sats\nused", "sigma\np50 m"]
+    head, scored = ["screens", "rate\n%", "ok\n%", "sats\nused", "sigma\np50 m"], effects[0].coordinates is not None
     if scored:
-        heads += [f"{head}\n{of}" for of in ("all", "ok") for head in ("p50", "p95", "max", "wrong")]
-    filtered = any(effect.sources for effect in effects)
-    if scored and filtered:
-        heads += [f"{head}\nno sats" for head in ("p50", "p95", "max")] + ["p95\n/sigma"]
-    table = plain_table("screens", *heads, text=1)
+        head += [f"{name}\n{of}" for of in ("all", "ok") for name in ("p50", "p95", "max", "wrong")]
+    filtered = scored and any(effect.sources for effect in effects)
+    if filtered:
+        head += [f"{name}\nno sats" for name in ("p50", "p95", "max")] + ["p95\n/sigma"]
+    rows = []
     for effect in effects:
-        cells = [f"{100 * effect.rate:.2f}", f"{100 * effect.ok_rate:.2f}", f"{effect.n_used:.2f}"]
-        cells.append(f"{effect.sigma_p50_m:.2f}")
+        cells = [percent(effect.rate), percent(effect.ok_rate), number(effect.n_used), number(effect.sigma_p50_m)]
         for figures in (effect.coordinates, effect.ok):
             cells += _errors(figures) if figures is not None else []
-        if scored and filtered:
-            cells += _errors(effect.outage)[:3] if effect.outage is not None else ["-"] * 3
-            cells.append(f"{effect.normalised_p95:.2f}")
-        table.add_row(effect.choice, *cells)
+        if filtered:
+            cells += (_errors(effect.outage) if effect.outage is not None else ["-"] * 4)[:3]
+            cells.append(number(effect.normalised_p95))
+        rows.append([effect.choice, *cells])
+    caption = f"{effects[0].antenna}: {effects[0].epochs:,} epochs"
     if scored:
-        console.print("errors along the line in metres, wrong positions in per cent; all: every epoch with coordinates")
-    console.print(table)
+        caption += "; errors along the line in metres, wrong positions in per cent; all: every epoch with coordinates"
+    show_table(console, Table(name="ablation", head=head, rows=rows, caption=caption, numeric=range(1, len(head))))
 
 
 def _errors(figures: Score) -> list[str]:
     if not figures.positions:
         return ["-"] * 4
-    lengths = [f"{value:.2f}" for value in (figures.p50_m, figures.p95_m)]
-    return [*lengths, f"{figures.max_m:.1f}", f"{100 * figures.wrong_place:.2f}"]
+    return [number(figures.p50_m), number(figures.p95_m), number(figures.max_m, 1), percent(figures.wrong_place)]

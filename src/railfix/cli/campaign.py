@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
-from railfix.cli.console import console_of_tables, prepare_kernels, show_files
+from railfix.cli.console import console_of_tables, prepare_kernels, show_files, show_notes, show_table, show_verdict
 from railfix.cli.options import OutOption
 from railfix.core.errors import MismatchError, NoPositionError, SettingsError
+from railfix.report.campaign import report_campaign, write_campaign_page
 from railfix.run.campaign import run_campaign
 
 
@@ -44,11 +44,14 @@ def campaign(
         track = ["line.csv"]
         vehicle = "car.toml"
         config = "settings.toml"
+        reference = "logs/{train}/{day}/truth.csv"
 
     `track`, `vehicle` and the sensors' tables (`tachometer`, `inertial`, `radar`) may have fields too.
 
     Into DIR come `runs/train=A/day=2024-03-05/` with the files of `railfix run` for each run (together one
-    hive-partitioned data set), and `campaign.csv` with one row per run. A run that fails is a row with its error.
+    hive-partitioned data set), `campaign.csv` with one row per run, and `campaign.html`, a page on all of them: lines,
+    errors (with `reference`) and levels by run, and the worst ten epochs with their explanations. A run that fails is
+    a row with its error.
     Runs whose results are there, of the same inputs and settings, are not repeated.
 
     Example:
@@ -67,15 +70,14 @@ def campaign(
         prepare_kernels()
         table = run_campaign(path, out=out, executor=executor, progress=progress, lost=lost)
     failed = table.filter(status="failed")
+    report = report_campaign(table, out)
+    page = write_campaign_page(report, out / "campaign.html", title=f"railfix campaign: {path.stem}")
     console = console_of_tables()
-    shown = Table(*(name for name in table.columns if name != "folder"), show_edge=False)
-    for row in table.iter_rows(named=True):
-        cells = (row[name] for name in row if name != "folder")
-        shown.add_row(
-            *("" if cell is None else f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in cells)
-        )
-    console.print(shown)
-    show_files(console, [out / "campaign.csv"])
+    show_verdict(console, [*report.sentences, f"next: open {page}"])
+    for found in report.tables:
+        show_table(console, found)
+    show_notes(console, report.notes)
+    show_files(console, [out / "campaign.csv", page])
     if len(failed) == len(table):
         raise NoPositionError(f"every run has failed; the first: {failed['error'][0]}")
     if len(failed):

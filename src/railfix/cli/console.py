@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column as TableColumn
 from rich.table import Table
+from rich.text import Text
 
 from railfix import kernels
 from railfix.cli.verdict import verdict_of_run
 from railfix.core.reasons import Status
+from railfix.core.tables import Table as Data
 
 if TYPE_CHECKING:
     from railfix.run import RunSummary
@@ -35,6 +37,8 @@ def prepare_kernels() -> None:
 
 #: Width of tables where the output is no terminal, so that no cell is cut or folded.
 _FILE_WIDTH: Final = 500
+#: Signs of a page in the characters of every terminal.
+_PLAIN: Final = str.maketrans("−–", "--")
 
 
 class TableConsole(Console):
@@ -90,39 +94,20 @@ def console_of_tables() -> Console:
     return console
 
 
-#: Head, column and format of a column of a table.
-Column = tuple[str, str, Callable[[Any], str]]
-
-
-def plain_table(*heads: str, text: int) -> Table:
-    """A table without a frame whose first columns are text and the others numbers."""
-    table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    for number, head in enumerate(heads):
-        table.add_column(head, justify="left" if number < text else "right", no_wrap=True, overflow="fold")
-    return table
-
-
-def listed(rows: Iterable[Mapping[str, Any]], columns: Sequence[Column]) -> Table:
-    """A plain table of rows; the first columns, of format `str`, are text."""
-    table = plain_table(*(head for head, _, _ in columns), text=sum(form is str for _, _, form in columns))
-    for row in rows:
-        table.add_row(*(form(row[column]) for _, column, form in columns))
-    return table
-
-
-def count(value: int) -> str:
-    """A whole number with thousands separators."""
-    return f"{value:,}"
-
-
-def percent(share: float | None) -> str:
-    """A share in per cent, without the sign of it."""
-    return "-" if share is None else f"{100 * share:.2f}"
-
-
-def metres(value: float | None, *, sign: str = "") -> str:
-    """A length to the centimetre; "-" where there is none."""
-    return "-" if value is None else f"{value:{sign}.2f}"
+def show_table(console: Console, table: Data, *, most: int | None = None) -> None:
+    """Print a table of results under its caption, at most so many rows."""
+    console.print(table.caption, markup=False, soft_wrap=True)
+    if not table.rows:
+        return
+    shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    for number, head in enumerate(table.head):
+        justify: Literal["left", "right"] = "right" if number in table.numeric else "left"
+        shown.add_column(head, justify=justify, no_wrap=True, overflow="fold")
+    for row in table.rows[:most]:
+        shown.add_row(*(Text(cell.translate(_PLAIN)) for cell in row))
+    console.print(shown)
+    if most is not None and len(table.rows) > most:
+        console.print(f"  the first {most} of {len(table.rows)}; all are in the files (--out)")
 
 
 def show_verdict(console: Console, lines: Iterable[str]) -> None:

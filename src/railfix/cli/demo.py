@@ -7,13 +7,11 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
-from railfix.cli.console import console_of_tables, prepare_kernels, progress_bar, show_summary
-from railfix.cli.evaluate_tables import outages
+from railfix.cli.console import console_of_tables, prepare_kernels, progress_bar, show_summary, show_table
 from railfix.cli.options import OverwriteOption, overwriting
 from railfix.evaluate import Evaluation
-from railfix.evaluate.run_folder import POSITIONS_TABLE
+from railfix.evaluate.tables import error_tables
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import prior_basis_text
 from railfix.report import read_runs, write_page
@@ -66,25 +64,8 @@ def demo(
 def show_errors(evaluation: Evaluation) -> None:
     """Print errors along the line: on the map, of those that passed every check, and of the conventional position."""
     console = console_of_tables()
-    console.print("Error along the line in metres, + toward its end; conventional: from unscreened ranges")
-    table = Table()
-    for head in ("antenna", "position", "rate", "mean", "std", "p50", "p95", "largest"):
-        table.add_column(head, justify="left" if head in ("antenna", "position") else "right")
-    rows = evaluation.figures.filter(grouping="all", epochs_of="own").sort("antenna", maintain_order=True)
-    names = {"constrained": "on the map", "constrained_ok": "on the map, ok", "conventional": "conventional"}
-    filtered = {run.name for run in evaluation.runs if run.table != POSITIONS_TABLE}
-    for row in rows.iter_rows(named=True):
-        of_filter = row["run"] in filtered
-        if row["antenna"] != "all" and row["position"] in (("constrained",) if of_filter else names):
-            name = "filtered" if of_filter else names[row["position"]]
-            lengths = (row[name] for name in ("mean_m", "std_m", "p50_m", "p95_m", "max_m"))
-            cells = ("-" if value is None else f"{value:.2f}" for value in lengths)
-            rate = "-" if row["rate"] is None else f"{100 * row['rate']:.2f} %"
-            table.add_row(row["antenna"], name, rate, *cells)
-    console.print(table)
-    if evaluation.outages is not None and len(evaluation.outages):
-        console.print("In the tunnel, without satellites, the filter along the track goes on:")
-        console.print(outages(evaluation.outages))
+    for table in error_tables(evaluation):
+        show_table(console, table)
     show_levels(evaluation, console)
 
 

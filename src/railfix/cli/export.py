@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from railfix.cli.console import console_of_tables, count, show_files
+from railfix.cli.console import console_of_tables, show_files
 from railfix.cli.options import OverwriteOption, check_outputs
 from railfix.core.errors import InputFileError
 from railfix.evaluate.run_folder import TABLES, read_run, tables_of
@@ -64,7 +64,6 @@ def export(
     description = f"Antenna positions of railfix, {what}, {folder.line_name}; {frame}, heights above the ellipsoid"
     written = write_positions(rounded(folder.positions), out, description=description)
     console = console_of_tables()
-    rows = count(len(folder.positions))
-    console.print(f"{count(written)} positions of {rows} epochs and antennas, {what}", markup=False)
+    console.print(f"{written:,} positions of {len(folder.positions):,} epochs and antennas, {what}", markup=False)
     console.print(f"{frame}, heights above the ellipsoid", markup=False)
     show_files(console, [path for path in (out, style) if path is not None])

@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
 import polars as pl
 import typer
-from rich.table import Table
 
-from railfix.cli.console import console_of_tables, metres, percent, show_files, show_verdict
+from railfix.cli.console import console_of_tables, show_files, show_table, show_verdict
 from railfix.cli.options import OverwriteOption, check_outputs
 from railfix.core.errors import SettingsError
+from railfix.core.tables import Column, count, listing, number, percent
 
 #: Share of the epochs of a stretch within the alarm limit from which satellites serve there.
 _SERVED: Final = 0.95
+_COLUMNS: Final[Sequence[Column]] = (
+    ("chainage m", "from_m", count),
+    ("epochs", "epochs", count),
+    ("satellites", "satellites_median", count),
+    ("least (5 %)", "satellites_p5", count),
+    ("rejected %", "rejected_share", percent),
+    ("3-D off m", "reflection_p95_m", number),
+    ("ok %", "ok_share", percent),
+    ("filter %", "tracking_share", percent),
+    ("level m", "level_median_m", number),
+    ("level 95 % m", "level_p95_m", number),
+    ("served %", "within_limit_share", percent),
+)
 
 
 def service(
@@ -60,16 +74,7 @@ def service(
     else:
         verdict.append("the runs have no filter and no levels; the shares are those of single epochs")
     show_verdict(console, verdict)
-    table = Table(
-        "chainage m", "epochs", "satellites", "least (5 %)", "rejected %", "3-D off m", "ok %", "filter %", "level m",
-        "level 95 % m", "served %", show_edge=False,
-    )  # fmt: skip
-    for row in found.iter_rows(named=True):
-        satellites = [f"{row[n]:.0f}" for n in ("satellites_median", "satellites_p5")]
-        table.add_row(
-            f"{row['from_m']:.0f}", f"{row['epochs']:,}", *satellites, percent(row["rejected_share"]),
-            metres(row["reflection_p95_m"]), percent(row["ok_share"]), percent(row["tracking_share"]),
-            metres(row["level_median_m"]), metres(row["level_p95_m"]), percent(row["within_limit_share"]),
-        )  # fmt: skip
-    console.print(table)
+    show_table(
+        console, listing("service", found, _COLUMNS, f"By stretch of {stretch:g} m; served: a level within the limit")
+    )
     show_files(console, [path for path in (out, picture) if path is not None])

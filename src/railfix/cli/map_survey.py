@@ -7,11 +7,11 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.table import Table
 
-from railfix.cli.console import console_of_tables, show_notes, show_verdict
+from railfix.cli.console import console_of_tables, show_notes, show_table, show_verdict
 from railfix.cli.options import LenientOption, OverwriteOption, Without, check_outputs, from_models
 from railfix.cli.settings import Choices, settings_of
+from railfix.core.tables import Table, count, number
 from railfix.run.options import ColumnNames, LogReading
 from railfix.track.survey.runs import SurveyLimits
 
@@ -86,12 +86,26 @@ def survey(
             f"{weak.mean():.0%} of it is worse than twice the median: more runs there, or a receiver of two bands, help"
         )
     show_verdict(console, verdict)
-    table = Table("run", "positions", "way m", "sigma, of that stated", show_edge=False)
-    for run, ecef, scale in zip(surveyed.runs, result.runs_ecef_m, result.scale, strict=True):
-        way = float(np.linalg.norm(np.diff(ecef, axis=0), axis=1).sum())
-        positions = int(np.isfinite(run.ecef_m[:, 0]).sum())
-        table.add_row(Path(run.name).name, f"{positions:,}", f"{way:,.0f}", f"{scale:.2f}")
-    console.print(table)
+    rows = [
+        [
+            Path(run.name).name,
+            count(int(np.isfinite(run.ecef_m[:, 0]).sum())),
+            count(float(np.linalg.norm(np.diff(ecef, axis=0), axis=1).sum())),
+            number(scale),
+        ]
+        for run, ecef, scale in zip(surveyed.runs, result.runs_ecef_m, result.scale, strict=True)
+    ]
+    head = ["run", "positions", "run m", "sigma / stated"]
+    show_table(
+        console,
+        Table(
+            name="survey",
+            head=head,
+            rows=rows,
+            caption="Runs, with their errors across as a share of the standard deviation that they state",
+            numeric=range(1, 4),
+        ),
+    )
     show_notes(console, [*track.provenance.notes, *surveyed.notes])
     if picture is not None:
         console.print(f"picture: {picture}", markup=False, soft_wrap=True)

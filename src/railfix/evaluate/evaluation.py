@@ -382,8 +382,8 @@ def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str | 
 
 
 def _settings(folder: RunFolder) -> dict[str, Any]:
-    """Settings of a run, with the table where it is not that of single epochs."""
-    return folder.settings | ({} if folder.table == POSITIONS_TABLE else {"table": folder.table})
+    """Settings of a run, with the table."""
+    return folder.settings | {"table": folder.table}
 
 
 def _names(folders: Sequence[RunFolder]) -> list[str]:

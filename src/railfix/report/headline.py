@@ -10,10 +10,10 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats
+from railfix.core.tables import number, share
 from railfix.evaluate import Evaluation
 from railfix.evaluate.figures import PASSED
 from railfix.evaluate.run_folder import floats
-from railfix.report.content import number, share
 from railfix.report.runs import ReportedRun
 from railfix.report.tables import figures_of
 

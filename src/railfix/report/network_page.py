@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 
 from railfix.core.files import write_whole
-from railfix.report.content import Block, Notes, Sentence, Table, number, share
+from railfix.core.tables import Table, number, share
+from railfix.report.content import Block, Notes, Sentence
 from railfix.report.page import charts_page
 from railfix.report.plots.network import network_plan
 from railfix.track.network import Network

@@ -162,11 +162,11 @@ def report_page(
     )
 
 
-def charts_page(title: str, charts: Sequence[Chart], tables: Sequence[Block]) -> str:
-    """HTML of a page of charts and tables under them."""
+def charts_page(title: str, charts: Sequence[Chart], tables: Sequence[Block], *, lead: Sequence[Block] = ()) -> str:
+    """HTML of a page of sentences, charts, and tables under them."""
     numbers = count()
     figures = _PagePart(title="", figures=[_figure(chart, numbers) for chart in charts])
-    return _render("charts.html.j2", title, charts=figures, tables=tables)
+    return _render("charts.html.j2", title, charts=figures, tables=tables, lead=lead)
 
 
 def _render(template: str, title: str, **content: Any) -> str:

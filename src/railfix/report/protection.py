@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-import polars as pl
 
-from railfix.evaluate import Evaluation, EvaluationOptions, Integrity
+from railfix.core.tables import Table, number, share
+from railfix.evaluate import Evaluation, EvaluationOptions
 from railfix.evaluate.integrity import LEVELS_OF, positions_diagram
 from railfix.evaluate.run_folder import floats
+from railfix.evaluate.tables import evaluation_of, level_tables
 from railfix.pipeline.level_stage import prior_basis_text
-from railfix.report.content import Absent, Block, Folded, Sentence, Table, number, share
+from railfix.report.content import Absent, Block
 from railfix.report.runs import ReportedRun
-from railfix.report.tables import level_sizes
 
 #: Number of listed epochs with an error above the level.
 WORST: Final = 20
@@ -27,14 +28,6 @@ _EXPLAINED: Final = (
     "Usable levels: status ok and no alarm; every other position counts as having an infinite level. All: every "
     "finite level, whatever its status."
 )
-_REGIONS: Final = {
-    "nominal": "nominal",
-    "misleading": "misleading",
-    "hazardously_misleading": "hazard. misl.",
-    "unavailable": "unavailable",
-    "unavailable_misleading": "unavail. misl.",
-    "no_position": "no position",
-}
 
 
 def protection(run: ReportedRun, evaluation: Evaluation | None) -> list[Block]:
@@ -44,29 +37,11 @@ def protection(run: ReportedRun, evaluation: Evaluation | None) -> list[Block]:
         return [Absent(NO_LEVELS)]
     if evaluation is None:
         return [_assumptions(run, kind), _availability(run)]
-    name = run.name_in(evaluation)
-    counts = evaluation.integrity[kind]
-    rows = counts.stanford.filter(pl.col("run") == name, pl.col("antenna") != "all")
-    caption = f"Levels and errors: epochs in each region of the Stanford diagram. {_EXPLAINED}"
-    return [
-        _assumptions(run, kind),
-        _stanford("antenna", rows.filter(grouping="all"), caption),
-        *_environments(rows.filter(pl.col("grouping") == "environment", pl.col("own_limit"))),
-        *level_sizes(evaluation, name),
-        _worst(counts, name, kind),
-        *_of_the_filter(run, evaluation),
-    ]
-
-
-def _of_the_filter(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
-    """The same of the levels of the filter along the track; nothing where it has none."""
-    name = run.name_in(evaluation, "train")
-    if not name or "train" not in evaluation.integrity:
-        return []
-    counts = evaluation.integrity["train"]
-    rows = counts.stanford.filter(pl.col("antenna") != "all", run=name, grouping="all")
-    caption = "The same of the filter along the track. Usable levels: status tracking or coasting"
-    return [_stanford("antenna", rows, f"{caption}.", of="filter-"), _worst(counts, name, "train", of="filter-")]
+    tables: list[Block] = [_assumptions(run, kind)]
+    for name, of in ((run.name_in(evaluation), ""), (run.name_in(evaluation, "train"), "filter-")):
+        found = level_tables(evaluation_of(evaluation, name), worst=WORST) if name else []
+        tables += [replace(table, name=f"{of}{table.name}") for table in found]
+    return tables
 
 
 def _assumptions(run: ReportedRun, kind: str) -> Table:
@@ -104,79 +79,6 @@ def _priors(priors: Any) -> str:
 
 def _value(value: Any, unit: str = "") -> str:
     return "not recorded" if not isinstance(value, int | float) else f"{value:.4g}{unit}"
-
-
-def _environments(rows: pl.DataFrame) -> list[Block]:
-    if rows["group"].n_unique() < 2:
-        return []
-    table = _stanford("environment", rows.sort("antenna", maintain_order=True), "At the alarm limit of the run.")
-    return [Folded("Protection level by environment", [table])]
-
-
-def _stanford(first: str, rows: pl.DataFrame, caption: str, *, of: str = "") -> Table:
-    grouped = first == "environment"
-    shown = [*_REGIONS, *(["unjudged"] if rows["unjudged"].sum() else [])]
-    head = [first, "levels", "limit, m", "epochs", *(_REGIONS.get(name, name) for name in shown), "available"]
-    head += [] if grouped else ["15 s", "60 s"]
-    cells = []
-    for row in rows.iter_rows(named=True):
-        line = [
-            f"{row['group']}, {row['antenna']}" if grouped else str(row["antenna"]),
-            str(row["levels_of"]),
-            f"{row['alarm_limit_m']:g}{' (own)' if row['own_limit'] and not grouped else ''}",
-            number(row["epochs"], 0),
-            *(number(row[name], 0) for name in shown),
-            share(row["availability"]),
-        ]
-        cells.append(line if grouped else [*line, share(row["continuity_15_s"]), share(row["continuity_60_s"])])
-    meaning = "Available: share of all epochs, tunnels included"
-    meaning += "" if grouped else "; 15 s, 60 s: share of windows beginning at an available epoch that stay available"
-    return Table(
-        name=f"{of}stanford-by-{first}",
-        head=head,
-        rows=cells,
-        caption=f"{caption} {meaning}.",
-        numeric=range(2, len(head)),
-        marked=[k for k, row in enumerate(rows.iter_rows(named=True)) if row["own_limit"] and not grouped],
-    )
-
-
-def _worst(counts: Integrity, name: str, kind: str, *, of: str = "") -> Block:
-    """The epochs whose error exceeds the level most."""
-    beyond = counts.beyond.filter(pl.col("run") == name)
-    if not len(beyond):
-        return Sentence(f"No error {'of the filter ' if of else ''}exceeds its level, usable or not.")
-    usable = int(beyond["usable"].sum())
-    head = "time|antenna|chainage|environment|error|level|parts|set by|verdict|status|satellites|usable".split("|")
-    rows = []
-    for row in beyond.head(WORST).iter_rows(named=True):
-        parts = (row[f"{kind}_{part}"] for part in ("fault_free_m", "one_fault_m", "two_faults_m"))
-        rows.append(
-            [
-                row["time_gpst"].isoformat(sep=" ", timespec="milliseconds"),
-                str(row["antenna"]),
-                number(row["chainage_m"], 0),
-                str(row["environment"]),
-                number(row["error_m"]),
-                number(row[f"{kind}_level_m"]),
-                " / ".join(number(part, 1) for part in parts),
-                _word(row[f"{kind}_cause"]),
-                _word(row[f"{kind}_status"]),
-                _word(row["status"]),
-                number(row["n_used"], 0),
-                "yes" if row["usable"] else "no",
-            ]
-        )
-    caption = (
-        f"Errors above their level: {len(beyond):,}, of them {usable:,} usable"
-        f"{f'; the {WORST} largest excesses' if len(beyond) > WORST else ''}. Metres; parts: without a fault, "
-        "one fault, two faults"
-    )
-    return Table(name=f"{of}above-level", head=head, rows=rows, caption=caption, numeric=[2, 4, 5, 6, 10])
-
-
-def _word(value: str | None) -> str:
-    return (value or "not recorded").replace("_", " ")
 
 
 def _availability(run: ReportedRun) -> Table:

@@ -4,32 +4,16 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
-from functools import partial
 from typing import Any
 
-import polars as pl
-
+from railfix.core.tables import Table, count, number, share
 from railfix.evaluate import Evaluation
 from railfix.evaluate.run_folder import flattened
-from railfix.report.content import (
-    Absent,
-    Block,
-    Column,
-    Folded,
-    Notes,
-    ReportedCommand,
-    Sentence,
-    Table,
-    count,
-    listing,
-    number,
-    share,
-)
+from railfix.evaluate.tables import error_tables, evaluation_of, group_tables
+from railfix.report.content import Absent, Block, Folded, Notes, ReportedCommand, Sentence
 from railfix.report.runs import ReportedRun
-
-_POSITION_NAMES = {"constrained": "on the map", "constrained_ok": "on the map, ok", "conventional": "conventional"}
-_NAMED = pl.col("position").replace(_POSITION_NAMES)
 
 
 def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table:
@@ -182,31 +166,8 @@ def budget(run: ReportedRun) -> list[Block]:
 
 
 def merits(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
-    """Figures of merit and intervals of one run, on the map beside conventional."""
-    figures = evaluation.figures.filter(run=run.name_in(evaluation), epochs_of="own")
-    confidence = f"{100 * evaluation.options.confidence:g} %"
-    head = "antenna|position|errors|rate|mean|std|p50|p95|p99|largest|over 50 m|rms / sigma|p95 / sigma".split("|")
-    numeric = range(2, len(head))
-    blocks: list[Block] = [
-        Table(
-            name="figures-of-merit",
-            head=head,
-            rows=[_merit(row, "antenna") for row in figures.filter(grouping="all").iter_rows(named=True)],
-            caption=f"Errors along the line in metres, + toward its end; [{confidence} limits from blocks of time]",
-            numeric=numeric,
-        )
-    ]
-    for grouping, word in (("environment", "environment"), ("speed", "speed"), ("satellites", "satellites used")):
-        rows = figures.filter(pl.col("grouping") == grouping, pl.col("position") != "constrained_ok")
-        if rows["group"].n_unique() > 1:
-            grouped = Table(
-                name=f"figures-by-{grouping}",
-                head=[word, *head[1:]],
-                rows=[_merit(row, "group", antenna=str(row["antenna"])) for row in rows.iter_rows(named=True)],
-                numeric=numeric,
-            )
-            blocks.append(Folded(f"By {word}", [grouped]))
-    return [*blocks, _intervals(evaluation, run.name_in(evaluation))]
+    """Figures of merit of one run, on the map beside conventional."""
+    return _with_groups(evaluation_of(evaluation, run.name_in(evaluation)))
 
 
 def filter_tables(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
@@ -214,114 +175,15 @@ def filter_tables(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
     name = run.name_in(evaluation, "train")
     if not name:
         return [Absent("The run has no filter along the track (railfix run --filter off).")]
-    figures = evaluation.figures.filter(pl.col("grouping").is_in(["all", "signals"]), run=name, epochs_of="own")
-    rows = figures.filter(pl.col("position") == "constrained").sort("antenna", "grouping", maintain_order=True)
-    filtered: list[Column] = [
-        ("antenna", "antenna", str),
-        ("epochs", "group", str),
-        ("epochs", "epochs", count),
-        ("rate", "rate_of_run", share),
-        *((head, f"{head}_m", number) for head in ("mean", "std", "p50", "p95", "p99")),
-        ("largest", "max_m", number),
-        ("p95 / sigma", "normalised_p95", number),
-    ]
-    caption = "Errors along the line of the filter along the track, in metres; rate: share of all epochs"
-    blocks: list[Block] = [listing("filter", rows, filtered, caption)]
-    if evaluation.outages is not None and len(outages := evaluation.outages.filter(run=name)):
-        outages = outages.with_columns(
-            pl.col("begin_gpst").dt.strftime("%H:%M:%S"), pl.col("carried_by").fill_null("").replace("", "prediction")
-        )
-        passed = (
-            ("antenna", "antenna", str),
-            ("begin", "begin_gpst", str),
-            ("environment", "environment", str),
-            ("carried by", "carried_by", str),
-            ("lasting, s", "duration_s", partial(number, digits=1)),
-            ("way", "travelled_m", count),
-            ("p95", "outage_p95_m", number),
-            ("largest", "outage_max_m", number),
-            ("at its end", "end_error_m", number),
-            ("sigma there", "end_sigma_m", number),
-        )
-        blocks.append(listing("outages", outages, passed, "Stretches without satellites, in metres"))
-    if evaluation.branches is not None and len(branches := evaluation.branches.filter(run=name)):
-        stated = (
-            ("antenna", "antenna", str),
-            ("stated probability", "probability", str),
-            ("positions", "judged", count),
-            ("mean of it", "probability_mean", share),
-            ("right", "right_share", share),
-            ("wrong", "wrong_places", count),
-            ("blocks", "blocks", count),
-            ("with a wrong one", "wrong_blocks", count),
-        )
-        caption = "Stated probability of the place against the share of places within 50 m of the reference"
-        blocks.append(listing("branches", branches, stated, caption))
-    return blocks
+    return _with_groups(evaluation_of(evaluation, name), of="filter-")
 
 
-def _merit(row: Mapping[str, Any], first: str, antenna: str = "") -> list[str]:
-    where = f"{antenna} {_POSITION_NAMES[row['position']]}".strip()
-    return [
-        str(row[first]),
-        where,
-        count(row["errors"]),
-        share(row["rate"]) + _limits(row["rate_low"], row["rate_high"], per_cent=True),
-        number(row["mean_m"]) + _limits(row["mean_low_m"], row["mean_high_m"]),
-        number(row["std_m"]),
-        number(row["p50_m"]),
-        number(row["p95_m"]) + _limits(row["p95_low_m"], row["p95_high_m"]),
-        number(row["p99_m"]),
-        number(row["max_m"]),
-        count(row["wrong_places"]),
-        number(row["normalised_rms"]),
-        number(row["normalised_p95"]),
-    ]
-
-
-def _limits(low: float | None, high: float | None, *, per_cent: bool = False) -> str:
-    if low is None or high is None:
-        return ""
-    ends = (share(low, 1), share(high, 1)) if per_cent else (number(low), number(high))
-    return f"\n[{ends[0]} to {ends[1]}]"
-
-
-def _intervals(evaluation: Evaluation, name: str) -> Block:
-    rows = evaluation.intervals.filter(pl.col("run") == name) if "run" in evaluation.intervals.columns else None
-    if rows is None or not len(rows):
-        return Absent("There are no two consecutive positions, so there are no intervals.")
-    columns: list[Column] = [
-        ("antenna", "antenna", str),
-        ("position", "position", str),
-        ("intervals", "intervals", count),
-        *((head, f"interval_{head}_m", number) for head in ("mean", "p50", "p95", "p99")),
-        ("largest", "interval_max_m", number),
-        ("gap p95, s", "gap_p95_s", number),
-        ("largest, s", "gap_max_s", number),
-    ]
-    caption = "Positioning interval: distance travelled between consecutive positions, in metres"
-    return listing("intervals", rows.with_columns(_NAMED), columns, caption)
-
-
-def level_sizes(evaluation: Evaluation, name: str) -> list[Block]:
-    """Percentiles of the protection levels of a run, and counts of errors above them."""
-    if evaluation.levels is None:
-        return []
-    rows = evaluation.levels.filter(pl.col("run") == name) if "run" in evaluation.levels.columns else evaluation.levels
-    columns = (
-        ("level", "level", str),
-        ("antenna", "antenna", str),
-        ("position", "position", str),
-        ("positions", "positions", count),
-        ("finite", "with_level", count),
-        ("p50", "level_p50_m", number),
-        ("p95", "level_p95_m", number),
-        ("errors", "errors", count),
-        ("over the level", "over_level", count),
-        ("share", "over_level_share", partial(share, digits=3)),
+def _with_groups(evaluation: Evaluation, *, of: str = "") -> list[Block]:
+    tables, groups = (
+        [replace(table, name=f"{of}{table.name}") for table in found]
+        for found in (error_tables(evaluation), group_tables(evaluation))
     )
-    caption = "Protection levels in metres, and errors above them"
-    return [listing("levels", rows.with_columns(_NAMED), columns, caption)]
+    return [*tables, *(Folded(table.caption.split(";")[0], [table]) for table in groups)]
 
 
 def _plain(value: Any) -> float | None:

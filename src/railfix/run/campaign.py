@@ -48,6 +48,8 @@ class Campaign(Settings):
         Patterns of the track's files, joined to a route in this order.
     vehicle, tachometer, inertial, radar : str
         Patterns, each of one file a run; may be empty.
+    reference : str
+        Pattern of the reference trajectory of a run, for the page on the campaign; may be empty.
     config : Path or None
     options : RunOptions
         Of every run.
@@ -62,13 +64,14 @@ class Campaign(Settings):
     tachometer: str = ""
     inertial: str = ""
     radar: str = ""
+    reference: str = ""
     config: Path | None = None
     options: RunOptions = RunOptions()
 
 
 #: Patterns of several files a run, and of one.
 _MANY: Final = ("front", "rear", "nav", "sp3")
-_ONE: Final = ("vehicle", "tachometer", "inertial", "radar")
+_ONE: Final = ("vehicle", "tachometer", "inertial", "radar", "reference")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +83,7 @@ class CampaignRun:
     config: Config
     options: RunOptions
     out: Path
+    reference: Path | None = None
 
     @property
     def done(self) -> bool:
@@ -135,13 +139,17 @@ def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
                 raise SettingsError(f"{path}: {name} has {len(files[name])} files for {values}; one was expected")
         of_run: dict[str, Any] = {name: files[name] for name in _MANY}
         of_run |= {name: next(iter(files[name]), None) for name in _ONE}
+        reference = of_run.pop("reference")
         inputs = RunInputs(
             **of_run,
             track=tuple(file for k in range(len(campaign.track)) for file in files[f"track {k}"]),
             config=None if campaign.config is None else folder / campaign.config,
         )
         place = out.joinpath("runs", *(f"{name}={value}" for name, value in values.items()))
-        runs.append(CampaignRun(fields=values, inputs=inputs, config=config, options=campaign.options, out=place))
+        run = CampaignRun(
+            fields=values, inputs=inputs, config=config, options=campaign.options, out=place, reference=reference
+        )
+        runs.append(run)
     return runs
 
 
@@ -174,8 +182,8 @@ def run_campaign(
     Returns
     -------
     polars.DataFrame
-        The fields, `status` ("done", "failed"), `error`, `epochs`, `positioning_rate`, `ok_rate`, `wall_s`, `folder`
-        (below `out`).
+        The fields, `status` ("done", "failed"), `error`, `epochs`, `positioning_rate`, `ok_rate`, `wall_s`,
+        `reference`, `folder` (below `out`).
 
     Raises
     ------
@@ -222,7 +230,8 @@ def position_run(run: CampaignRun) -> dict[str, Any]:
 def _row(run: CampaignRun, **values: Any) -> dict[str, Any]:
     """Return the row of a run."""
     absent = dict.fromkeys(("error", "epochs", "positioning_rate", "ok_rate", "wall_s"))
-    return {**run.fields, "status": "done", **absent, **values}
+    reference = None if run.reference is None else str(run.reference)
+    return {**run.fields, "status": "done", **absent, **values, "reference": reference}
 
 
 def _find(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:

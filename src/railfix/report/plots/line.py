@@ -31,10 +31,10 @@ from railfix.report.plots.columns import floats, nice_step, points, since, start
 from railfix.report.plots.thinning import counts_sentence, one_per_cell, spread
 from railfix.track import Track
 
-_ECEF: Final = ("x_m", "y_m", "z_m")
+ECEF: Final = ("x_m", "y_m", "z_m")
 #: Limits between classes of error size and of protection level [m].
-_ERROR_CLASSES: Final = (1.0, 2.0, 5.0, 10.0)
-_LEVEL_CLASSES: Final = (5.0, 10.0, 20.0, 40.0)
+ERROR_CLASSES: Final = (1.0, 2.0, 5.0, 10.0)
+LEVEL_CLASSES: Final = (5.0, 10.0, 20.0, 40.0)
 #: The line is drawn this far beyond the first and the last position [m].
 _BEYOND_M: Final = 30.0
 _TRACK_PIECES: Final = 1500
@@ -71,12 +71,12 @@ def plan(
         Longitude and latitude of lines to draw below, see `railfix.report.background`.
     title : str
     """
-    ecef, conventional = points(positions, *_ECEF), points(positions, *(f"conventional_{name}" for name in _ECEF))
+    ecef, conventional = points(positions, *ECEF), points(positions, *(f"conventional_{name}" for name in ECEF))
     has = np.isfinite(ecef[:, 0])
     name, labels = "plan", ("east [m]", "north [m]")
     if not has.any():
         return Chart(name=name, title=title, caption="", x_label=labels[0], y_label=labels[1], layers=(), equal=True)
-    frame = _LocalFrame.around(ecef[has])
+    frame = LocalFrame.around(ecef[has])
     here, there = frame.plane(ecef), frame.plane(conventional)
     low, high = here[has].min(axis=0), here[has].max(axis=0)
     margin = max(0.25 * float((high - low).max()), 50.0)
@@ -118,12 +118,12 @@ def plan(
 
 
 def _filter(
-    placed: pl.DataFrame, filtered: pl.DataFrame, frame: _LocalFrame, cell: float, start: np.datetime64
+    placed: pl.DataFrame, filtered: pl.DataFrame, frame: LocalFrame, cell: float, start: np.datetime64
 ) -> Iterator[Points]:
     """Filtered positions of the epochs that have none of their own."""
     alone = filtered.join(placed, on="time_gpst", how="anti").filter(pl.col("x_m").is_not_null())
     if len(alone):
-        place = frame.plane(points(alone, *_ECEF))
+        place = frame.plane(points(alone, *ECEF))
         kept = one_per_cell(place[:, 0], place[:, 1], cell=cell)
         label = f"filtered, no position of its own ({len(alone):,})"
         epoch = since(alone, start)[kept]
@@ -131,7 +131,7 @@ def _filter(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _LocalFrame:
+class LocalFrame:
     """East and north at a point of the line."""
 
     origin_ecef_m: Floats
@@ -141,7 +141,7 @@ class _LocalFrame:
     height_m: float
 
     @classmethod
-    def around(cls, ecef_m: Floats) -> _LocalFrame:
+    def around(cls, ecef_m: Floats) -> LocalFrame:
         """Frame at the mean of points, shape (P, 3)."""
         origin = ecef_m.mean(axis=0)
         latitude, longitude, height = (float(value) for value in geodetic_from_ecef(origin))
@@ -153,7 +153,7 @@ class _LocalFrame:
         return np.asarray((ecef_m - self.origin_ecef_m) @ self.axes[:2].T)
 
 
-def _background(lines: Sequence[Floats], frame: _LocalFrame, low: Floats, high: Floats) -> Iterator[Layer]:
+def _background(lines: Sequence[Floats], frame: LocalFrame, low: Floats, high: Floats) -> Iterator[Layer]:
     """Lines of the background within a box."""
     parts: list[Floats] = []
     gap = np.full((1, 2), np.nan)
@@ -170,7 +170,7 @@ def _background(lines: Sequence[Floats], frame: _LocalFrame, low: Floats, high: 
 
 
 def _line(
-    track: Track | None, frame: _LocalFrame, chainage_m: Floats, here: Floats, tunnels_m: Sequence[tuple[float, float]]
+    track: Track | None, frame: LocalFrame, chainage_m: Floats, here: Floats, tunnels_m: Sequence[tuple[float, float]]
 ) -> Iterator[Curve]:
     """The line between the first and the last position, and its tunnels."""
     if track is None:
@@ -196,15 +196,15 @@ def _classes(
 ) -> tuple[list[tuple[str, str, Masks]], str]:
     """Label, colour and rows of each class of positions, and the quantity."""
     if error_m is not None:
-        return _sizes(np.abs(error_m), _ERROR_CLASSES, "error", "no reference"), "the size of their error"
+        return size_classes(np.abs(error_m), ERROR_CLASSES, "error", "no reference"), "the size of their error"
     if level_m is not None:
-        return _sizes(level_m, _LEVEL_CLASSES, "level", "no level"), "their protection level"
+        return size_classes(level_m, LEVEL_CLASSES, "level", "no level"), "their protection level"
     status = words(positions, "status")
     present = [s.text for s in Status if (status == s.text).any()]
     return [(name, CYCLE[i % len(CYCLE)], status == name) for i, name in enumerate(present)], "their status"
 
 
-def _sizes(size: Floats, edges: Sequence[float], quantity: str, unknown: str) -> list[tuple[str, str, Masks]]:
+def size_classes(size: Floats, edges: Sequence[float], quantity: str, unknown: str) -> list[tuple[str, str, Masks]]:
     """Classes of sizes, from small to large."""
     classes = [(unknown, BLACK, np.isnan(size))]
     for low, high, colour in zip((0.0, *edges), (*edges, np.inf), ORDERED, strict=True):

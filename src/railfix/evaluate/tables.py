@@ -1,0 +1,322 @@
+"""Tables of an evaluation: those that ``railfix evaluate`` prints, and those of the report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
+import polars as pl
+
+from railfix.core.tables import Column, Table, count, listing, number, percent, signed
+from railfix.evaluate.evaluation import Evaluation
+from railfix.evaluate.figures import WITH_SATELLITES
+from railfix.evaluate.integrity import Integrity
+from railfix.evaluate.scores import WRONG_PLACE_M
+
+_NAMES: Final = {"constrained": "on the map", "constrained_ok": "on the map, ok", "conventional": "conventional"}
+_POSITION: Final = pl.col("position").replace(_NAMES)
+#: The run, or the configuration whose runs are together.
+_OF: Final = pl.when(pl.col("run") != "all").then("run").otherwise("configuration").alias("of")
+#: Groupings in the order shown, with their captions.
+_GROUPINGS: Final = {
+    "configuration": "By configuration, its runs together",
+    "line": "By line, the runs of a configuration together",
+    "environment": "By environment",
+    "speed": "By speed",
+    "signals": "With and without satellites (tunnels and other outages)",
+    "satellites": "By satellites used",
+    "status": "By status",
+    "section": "By section of the line",
+}
+_LEVELS_OF: Final = (
+    "usable: status ok and no alarm (of the filter: tracking or coasting), every other position as without a bound; "
+    "all: every finite level"
+)
+_AVAILABLE: Final = (
+    "available: share of all epochs, tunnels included; 15 s, 60 s: share of windows beginning at an available epoch "
+    "that stay available"
+)
+
+
+def _text(value: str) -> str:
+    """A text of numbers, in a column of numbers."""
+    return value
+
+
+_POSITIONS: Final[Column] = ("position", "position", str)
+_PLACE: Final = partial(number, digits=0, unit=" m")
+_ERRORS: Final[Sequence[Column]] = (
+    _POSITIONS,
+    ("epochs", "counted", count),
+    ("rate %", "rate", percent),
+    ("of run %", "rate_of_run", percent),
+    ("mean", "mean_m", signed),
+    *((name, f"{name}_m", number) for name in ("std", "rms", "p50", "p95", "p99", "max")),
+    ("at", "max_at_chainage_m", _PLACE),
+    (f"over {WRONG_PLACE_M:g} m", "wrong_places", count),
+    ("rms /sigma", "normalised_rms", number),
+    ("p95 /sigma", "normalised_p95", number),
+)
+_LIMITS: Final[Sequence[Column]] = (
+    _POSITIONS,
+    ("blocks", "blocks", count),
+    ("rate %", "rate_limits", _text),
+    ("mean m", "mean_limits", _text),
+    ("p95 m", "p95_limits", _text),
+)
+_INTERVALS: Final[Sequence[Column]] = (
+    _POSITIONS,
+    ("intervals", "intervals", count),
+    ("standing", "standing", count),
+    *((f"{name} m", f"interval_{name}_m", number) for name in ("p50", "p95", "max")),
+    ("at", "interval_max_chainage_m", _PLACE),
+    ("p95 s", "gap_p95_s", number),
+    ("longest s", "gap_max_s", number),
+)
+_LEVELS: Final[Sequence[Column]] = (
+    ("level", "level", str),
+    _POSITIONS,
+    ("positions", "positions", count),
+    ("finite %", "level_share", percent),
+    ("p50", "level_p50_m", number),
+    ("p95", "level_p95_m", number),
+    ("errors", "errors", count),
+    ("over the level", "over_level", count),
+)
+_OUTAGES: Final[Sequence[Column]] = (
+    ("begin", "begin_gpst", str),
+    ("environment", "environment", str),
+    ("carried by", "carried_by", str),
+    ("lasting s", "duration_s", partial(number, digits=1)),
+    ("run m", "travelled_m", count),
+    ("rate %", "rate", percent),
+    *((name, f"outage_{name}_m", number) for name in ("p50", "p95", "max")),
+    ("at its end", "end_error_m", signed),
+    ("sigma there", "end_sigma_m", number),
+    ("max /sigma", "largest_normalised", number),
+)
+_BRANCHES: Final[Sequence[Column]] = (
+    ("probability", "probability", str),
+    ("positions", "judged", count),
+    ("stated %", "probability_mean", percent),
+    ("right %", "right_share", percent),
+    ("wrong", "wrong_places", count),
+    ("blocks", "blocks", count),
+    ("with a wrong one", "wrong_blocks", count),
+)
+_STANFORD: Final[Sequence[Column]] = (
+    ("levels", "levels_of", str),
+    ("limit m", "limit", _text),
+    ("epochs", "epochs", count),
+    ("nominal", "nominal", count),
+    ("misleading", "misleading", count),
+    ("hazard.\nmisl.", "hazardously_misleading", count),
+    ("unavail.", "unavailable", count),
+    ("unavail.\nmisl.", "unavailable_misleading", count),
+    ("unjudged", "unjudged", count),
+    ("no\nposition", "no_position", count),
+    ("available\n%", "availability", percent),
+    ("of\nobserved %", "availability_of_observed", percent),
+    ("blocks\nbeyond", "beyond_blocks", count),
+    ("15 s %", "continuity_15_s", percent),
+    ("60 s %", "continuity_60_s", percent),
+)
+
+
+def evaluation_of(evaluation: Evaluation, name: str) -> Evaluation:
+    """Return the part of an evaluation that is on one of its runs."""
+
+    def own(rows: pl.DataFrame) -> pl.DataFrame:
+        return rows.filter(pl.col("run") == name) if "run" in rows.columns else rows
+
+    def own_or_none(rows: pl.DataFrame | None) -> pl.DataFrame | None:
+        return None if rows is None else own(rows)
+
+    return replace(
+        evaluation,
+        figures=own(evaluation.figures),
+        intervals=own(evaluation.intervals),
+        levels=own_or_none(evaluation.levels),
+        outages=own_or_none(evaluation.outages),
+        branches=own_or_none(evaluation.branches),
+        integrity={
+            kind: replace(found, stanford=stanford, beyond=own(found.beyond))
+            for kind, found in evaluation.integrity.items()
+            if len(stanford := own(found.stanford))
+        },
+    )
+
+
+def error_tables(evaluation: Evaluation) -> list[Table]:
+    """Tables of errors: overall, confidence limits, intervals, outages and stated probabilities."""
+    overall, options = _together(evaluation.figures.filter(grouping="all")), evaluation.options
+    paths = [run.path for run in evaluation.runs]
+    again = [run.name for k, run in enumerate(evaluation.runs) if run.path in paths[:k]]
+    # conventional positions are the same in every table of a run
+    new = (pl.col("position") != "conventional") | ~pl.col("run").is_in(again)
+    overall = overall.filter(new | (pl.col("epochs_of") == "common"))
+    caption = "Errors along the line in metres, + toward its end; sigma: the stated standard deviation"
+    tables = [listing("figures-of-merit", _in_order(overall), [*_where(overall), *_ERRORS], caption)]
+    if len(limited := overall.filter(pl.col("mean_low_m").is_not_null())):
+        caption = (
+            f"Limits of {100 * options.confidence:g} % confidence, from blocks of {options.block_s:g} s drawn "
+            f"{options.replicates:,} times"
+        )
+        tables.append(listing("limits", _in_order(limited), [*_where(limited), *_LIMITS], caption))
+    if len(intervals := evaluation.intervals):
+        caption = "Metres run and seconds passed between two positions"
+        intervals = _pooled(intervals).filter(new)
+        columns = [*_where(intervals), *_INTERVALS]
+        tables.append(listing("intervals", intervals.with_columns(_POSITION, _OF), columns, caption))
+    if evaluation.outages is not None and len(evaluation.outages):
+        tables.append(outages(evaluation.outages))
+    if (rows := evaluation.branches) is not None and len(rows):
+        caption = f"Stated probability of the place against the share of places within {WRONG_PLACE_M:g} m"
+        tables.append(listing("branches", rows.with_columns(_OF), [*_where(rows), *_BRANCHES], caption))
+    return tables
+
+
+def group_tables(evaluation: Evaluation) -> list[Table]:
+    """Errors by configuration, line, environment, speed and so on, on the map beside conventional."""
+    tables, runs = [], evaluation.runs
+    apart = len({run.configuration for run in runs}) == len(runs)
+    for grouping, caption in _GROUPINGS.items():
+        if apart and grouping in ("configuration", "line"):
+            continue
+        rows = evaluation.figures.filter(grouping=grouping, epochs_of="own")
+        if grouping in ("environment", "speed"):
+            rows = _pooled(rows)
+        trivial = {"environment": "unknown", "signals": WITH_SATELLITES}.get(grouping)
+        if len(rows) and rows["group"].unique().to_list() != [trivial]:
+            tables.append(_group(grouping, rows, caption))
+    return tables
+
+
+def level_tables(evaluation: Evaluation, *, worst: int) -> list[Table]:
+    """Tables of protection levels, and of the epochs whose error exceeds them most, at most `worst` of a kind."""
+    tables = []
+    if (rows := evaluation.levels) is not None and len(rows):
+        columns = [*_where(rows), *_LEVELS]
+        caption = "Protection levels in metres, and errors above them"
+        tables.append(listing("levels", rows.with_columns(_POSITION, _OF), columns, caption))
+    for kind, found in evaluation.integrity.items():
+        overall = _pooled(found.stanford.filter(grouping="all"))
+        caption = f"Protection levels ({kind}) against errors: epochs in each region of the Stanford diagram. "
+        tables.append(_stanford(f"stanford-{kind}", overall, f"{caption}{_LEVELS_OF}; {_AVAILABLE}"))
+        by = _pooled(found.stanford.filter(pl.col("own_limit"), grouping="environment", levels_of="usable"))
+        by = by.filter(antenna="all") if "all" in by["antenna"] else by
+        if by["group"].n_unique() > 1:
+            caption = "The same by environment, usable, at the alarm limit of the run"
+            tables.append(_stanford(f"stanford-{kind}-by-environment", by, caption, ("environment", "group", str)))
+        tables.append(_beyond(found, kind, worst))
+    return tables
+
+
+def outages(rows: pl.DataFrame) -> Table:
+    """Table of stretches without satellites."""
+    shown = rows.with_columns(
+        _OF,
+        pl.col("begin_gpst").dt.strftime("%H:%M:%S"),
+        pl.col("carried_by").fill_null("").replace("", "prediction"),
+        rate=pl.col("positions") / pl.col("epochs"),
+    )
+    caption = "Stretches without satellites, as the filter along the track passes them; errors in metres"
+    return listing("outages", shown, [*_where(rows), *_OUTAGES], caption)
+
+
+def _where(rows: pl.DataFrame) -> list[Column]:
+    """Columns of the run and antenna; rows of one run do not name it."""
+    antenna: Column = ("antenna", "antenna", str)
+    return [antenna] if rows["run"].n_unique() == 1 and "all" not in rows["run"] else [("run", "of", str), antenna]
+
+
+def _pooled(rows: pl.DataFrame) -> pl.DataFrame:
+    """Return the rows of all runs of a configuration together, those of the runs where each has its own."""
+    runs = rows.filter(pl.col("run") != "all")
+    several = "all" in rows["run"] and runs["run"].n_unique() > runs["configuration"].n_unique()
+    return rows.filter(run="all") if several else runs
+
+
+def _together(rows: pl.DataFrame) -> pl.DataFrame:
+    """Return the rows of several runs for both antennas together."""
+    several = rows["run"].n_unique() > 1 and "all" in rows["antenna"]
+    return rows.filter(antenna="all") if several else rows
+
+
+def _in_order(rows: pl.DataFrame) -> pl.DataFrame:
+    """Rows of each run and antenna, those on common epochs only where they are not every one's own."""
+    order = {name: number for number, name in enumerate(_NAMES)}
+    parts: Iterator[pl.DataFrame] = (
+        mine.filter(epochs_of="own")
+        if mine.filter(pl.col("position") != "constrained_ok")["positions"].n_unique() == 1
+        else mine.with_columns(_order=pl.col("position").replace_strict(order))
+        .sort("epochs_of", "_order", descending=[True, False])
+        .drop("_order")
+        for mine in rows.partition_by("run", "antenna", maintain_order=True)
+    )
+    common = pl.when(pl.col("epochs_of") == "common").then(pl.lit(", epochs of both")).otherwise(pl.lit(""))
+    return pl.concat(parts).with_columns(
+        _OF,
+        _POSITION + common,
+        counted=pl.when(pl.col("epochs_of") == "own").then("observed").otherwise("positions"),
+        rate_limits=_range("rate_low", "rate_high", 100.0),
+        mean_limits=_range("mean_low_m", "mean_high_m"),
+        p95_limits=_range("p95_low_m", "p95_high_m"),
+    )
+
+
+def _range(low: str, high: str, scale: float = 1.0) -> pl.Expr:
+    """Both ends of an interval as a text."""
+    ends = (pl.col(name).mul(scale).map_elements(number, return_dtype=pl.String) for name in (low, high))
+    return pl.concat_str(*ends, separator=" to ")
+
+
+def _group(grouping: str, rows: pl.DataFrame, caption: str) -> Table:
+    """Constrained and conventional of each group in one row."""
+    keys = ["run", "configuration", "line", "antenna", "group"]
+    left, right = (rows.filter(position=position) for position in ("constrained", "conventional"))
+    both = left.join(right, on=keys, how="left", suffix="_conventional", maintain_order="left")
+    # one antenna beside both together tells nothing new of the groups
+    both = both.filter(antenna="all") if "all" in both["antenna"] else both
+    # without satellites nothing is observed: every epoch counts
+    counted, rate = ("epochs", "rate_of_run") if grouping == "signals" else ("observed", "rate")
+    columns: list[Column] = [*_where(both), ("group", "group", str), ("epochs", counted, count)]
+    for conv, suffix in (("", ""), ("conv.\n", "_conventional")):
+        columns += [(f"{conv}rate %", f"{rate}{suffix}", percent), (f"{conv}mean", f"mean_m{suffix}", signed)]
+        columns += [(f"{conv}{name}", f"{name}_m{suffix}", number) for name in ("std", "p50", "p95", "max")]
+    return listing(f"figures-by-{grouping}", both.with_columns(_OF), columns, f"{caption}; errors in metres")
+
+
+def _stanford(name: str, rows: pl.DataFrame, caption: str, *first: Column) -> Table:
+    """Epochs of each region of the Stanford diagram; rows at the run's own alarm limit are marked."""
+    own = rows["own_limit"].to_list()
+    limits = [f"{limit:g}{' (own)' if its else ''}" for limit, its in zip(rows["alarm_limit_m"], own, strict=True)]
+    shown = rows.with_columns(_OF, pl.Series("limit", limits, dtype=pl.String))
+    marked = [] if first else [k for k, its in enumerate(own) if its]
+    return listing(name, shown, [*_where(rows), *first, *_STANFORD], caption, marked=marked)
+
+
+def _beyond(found: Integrity, kind: str, worst: int) -> Table:
+    """The epochs whose error exceeds the level most."""
+    beyond, usable = found.beyond, int(found.beyond["usable"].sum())
+    parts = [pl.col(f"{kind}_{part}").map_elements(partial(number, digits=1), return_dtype=pl.String, skip_nulls=False)
+             for part in ("fault_free_m", "one_fault_m", "two_faults_m")]  # fmt: skip
+    shown = beyond.head(worst).with_columns(
+        pl.col("time_gpst").dt.strftime("%Y-%m-%d %H:%M:%S%.3f"),
+        pl.col(f"{kind}_cause", f"{kind}_status", "status").cast(pl.String).fill_null("not recorded"),
+        usable=pl.when("usable").then(pl.lit("yes")).otherwise(pl.lit("no")),
+        of="run",
+        parts=pl.concat_str(*parts, separator=" / "),
+    )
+    columns: list[Column] = [
+        ("time, GPS", "time_gpst", str), *_where(beyond), ("environment", "environment", str),
+        ("set by", f"{kind}_cause", str), ("verdict", f"{kind}_status", str), ("status", "status", str),
+        ("usable", "usable", str), ("chainage m", "chainage_m", count), ("error m", "error_m", signed),
+        ("level m", f"{kind}_level_m", number), ("no fault / one / two m", "parts", _text),
+        ("satellites", "n_used", count),
+    ]  # fmt: skip
+    caption = f"Errors above their level ({kind}): {len(beyond):,}, of them {usable:,} usable"
+    caption += f"; the {worst} largest excesses" if len(beyond) > worst else ""
+    return listing(f"above-level-{kind}", shown, columns, caption)
