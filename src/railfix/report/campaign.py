@@ -98,7 +98,7 @@ def report_campaign(runs: pl.DataFrame, out: Path) -> CampaignReport:
     pieces = pl.concat(epochs, how="diagonal") if epochs else pl.DataFrame()
     quantity = next((name for name in _QUANTITIES if len(done) and done[f"{name}_p95"].is_not_null().any()), "")
     named: list[Column] = [(field, field, str) for field in fields]
-    columns = [*named, ("status", "status", str), *_FIGURES]
+    columns: list[Column] = [*named, ("status", "status", str), *_FIGURES]
     caption = "Runs; rate and ok: single epochs with observations; the rest: the filter along the track where it is on"
     tables = [listing("runs", whole, columns, caption)]
     if len(failed := whole.filter(status="failed")):
