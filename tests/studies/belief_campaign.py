@@ -163,7 +163,7 @@ def smartloc_rinex_truth(folder: Path) -> recordings_truth.Truth:
     return start + (np.round(rows[:, 0], 3) * 1e9).astype("timedelta64[ns]"), rows[:, 1:]
 
 
-def _recordings(data: Path) -> dict[str, Callable[[], Case]]:
+def recordings(data: Path) -> dict[str, Callable[[], Case]]:
     road = data / "kinematic"
     tst, pixel, japan = road / "urbannav_tst", road / "gsdc_pixel5_a", next(iter(road.glob("japan_mosaic*")))
     berlin = road / "smartloc_berlin_rinex"
@@ -537,7 +537,7 @@ def main() -> int:
     args = parser.parse_args()
     given = "\n".join(args.sets)
     args.settings = {"tracking": tomllib.loads(given)} if given else {}
-    known = _recordings(paths.DATA) if paths.DATA.is_dir() else {}
+    known = recordings(paths.DATA) if paths.DATA.is_dir() else {}
     if not args.faults:
         print(HEAD)
     for name in args.folders or list(known):

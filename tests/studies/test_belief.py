@@ -20,7 +20,7 @@ from railfix.tracking import TrackStatus
 
 @lru_cache(maxsize=2)
 def _case(data: Path, name: str) -> Case:
-    return belief_campaign._recordings(data)[name]()
+    return belief_campaign.recordings(data)[name]()
 
 
 def _start(data: Path, name: str, begin_s: float, length_s: float) -> Case:
