@@ -73,6 +73,7 @@ def memory(
         covariance=covariance,
         log_probability=log_probability.copy(),
         log_code=np.zeros(count),
+        log_recent=np.zeros(count),
         scalars=values,
     )
     return cast(layout.KernelState, made)

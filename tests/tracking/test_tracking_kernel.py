@@ -131,7 +131,7 @@ def test_with_normal_errors_the_update_is_kalmans_and_its_evidence_the_density()
     state.covariance[:, :, 0] *= 0.3
     state.covariance[:, 0] *= 0.3
     state.log_scale = (0.0, 0.0)
-    for name in ("log_probability", "log_code", "log_least", "origin_m"):
+    for name in ("log_probability", "log_code", "log_least", "log_recent", "origin_m"):
         setattr(state, name, np.repeat(getattr(state, name), 2) + np.log(0.5) * (name == "log_probability"))
     epochs = part(case.epochs, slice(20, 21))
     chunk = prepare_chunk(epochs, state, limits)

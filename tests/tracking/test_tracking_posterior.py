@@ -146,6 +146,38 @@ def test_evidence_of_motion_counts_once_a_second_at_any_rate_and_a_long_epoch_on
 
 
 @pytest.mark.requirement("C6")
+@pytest.mark.parametrize(
+    ("apart_m", "along_m", "goes"),
+    [(5.0, 350.0, 1), (5.0, -61.0, 1), (5.0, 5.0, 0), (8.9, 350.0, 1), (9.1, 350.0, 0), (18.0, 350.0, 0)],
+)
+def test_of_laps_within_the_error_of_the_map_codes_of_the_last_half_minute_choose(
+    apart_m: float, along_m: float, goes: int
+) -> None:
+    """The choice is no evidence: probabilities are those without it, and what codes said is forgotten."""
+    branches = plain("tracking.branches")
+    held, work = memory(np.zeros(2), np.ones(2), np.log([0.6, 0.4]), BRANCH_S=60.0, BRANCH_M=600.0), work_space(2)
+    work.places[:2], work.new_mean[1, 0] = [[0.0, 0.0, 0.0], [apart_m, 0.0, 0.0]], along_m
+
+    def after(seconds_: int, code: float) -> int:
+        for _ in range(seconds_):
+            held.log_probability[:], held.log_code[:], work.code_evidence[:2] = np.log([0.6, 0.4]), 0.0, [0.0, code]
+            before = held.log_recent.copy()
+            branches.judge(parameters(TrackingLimits()), held, work, 2, 1.0)
+            assert (np.abs(held.log_recent) <= 3.0).all()
+            if not code:
+                np.testing.assert_allclose(held.log_recent, before * np.exp(-1.0 / 30.0))
+        return int(branches.leading(held, 2))
+
+    assert after(1, 0.5) == 0
+    assert after(60, 0.5) == goes
+    bare, _ = judged(np.log([0.6, 0.4]), np.zeros(2), np.zeros(2), np.zeros(2), work.places[:2], 60.0, 600.0)
+    held.log_probability[:], held.log_code[:], work.code_evidence[:2] = np.log([0.6, 0.4]), 0.0, 0.0
+    branches.judge(parameters(TrackingLimits()), held, work, 2, 1.0)
+    np.testing.assert_allclose(held.log_probability, bare)
+    assert after(200, 0.0) == 0
+
+
+@pytest.mark.requirement("C6")
 def test_what_codes_said_of_a_branch_far_away_does_not_hold_once_it_is_near() -> None:
     limits = TrackingLimits()
     probability, code = np.array([0.0, -60.0]), np.array([0.0, -60.0])

@@ -44,7 +44,7 @@ SINGLE_STATUS: Final[Mapping[str, str]] = {
 #: What the status of the filter says.
 FILTER_STATUS: Final[Mapping[str, str]] = {
     "tracking": "one place, from measurements of this epoch",
-    "several_branches": "several places are possible; the most probable one is given",
+    "several_branches": "several places are possible; one of the most probable is given",
     "coasting": "predicted: no measurement of this epoch is believed",
     "lost": "measurements contradict the track: places are sought again",
     "expired": "no place: predicted too far",

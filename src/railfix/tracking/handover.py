@@ -95,6 +95,7 @@ class Handover:
             log_probability=row_major(state.log_probability),
             log_code=row_major(state.log_code),
             log_least=row_major(state.log_least),
+            log_recent=row_major(state.log_recent),
             code_bias=row_major(state.code_bias),
             origin_m=row_major(state.origin_m),
             offset_known=row_major(state.offset_known),
@@ -145,6 +146,7 @@ class Handover:
         self._take_back_bank(state, *idle)
         state.log_probability = memory.log_probability[kept].copy()
         state.log_code, state.log_least = memory.log_code[kept].copy(), memory.log_least[kept].copy()
+        state.log_recent = memory.log_recent[kept].copy()
         state.origin_m = memory.origin_m[kept].copy()
         state.code_bias, state.offset_known = memory.code_bias, memory.offset_known
         state.time, origin = chunk.time[done - 1], chunk.time[0]
@@ -282,7 +284,7 @@ def _work_space(
         "information": (room, size, size), "after": (room, size, size), "change": (room, size),
         "weight": (room, most), "residual": (room, most), "fitted": (room, most), "new_mean": (room, unknowns + 1),
         "new_covariance": (room, unknowns, unknowns), "log_before": (room,), "log_after": (room,),
-        "evidence": (room,), "code_evidence": (room,), "joined": (4, room), "branch": (room, 3),
+        "evidence": (room,), "code_evidence": (room,), "joined": (5, room), "branch": (room, 3),
         "pushed": (room,), "variance": (most,), "masked": (most,),
         "system": (room, size, size), "factor": (size, size), "lower": (size, size), "right": (max(size, room),),
         "diagonal": (size,), "with_clock": (size,),

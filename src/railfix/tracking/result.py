@@ -18,7 +18,7 @@ class TrackStatus(IntEnum):
 
     #: One place, from measurements of this epoch.
     TRACKING = constants.TRACKING
-    #: Another place of the line is more probable than the risk; the most probable one is given.
+    #: Another place of the line is more probable than the risk; one of the most probable is given.
     SEVERAL_BRANCHES = constants.SEVERAL_BRANCHES
     #: Predicted: no measurement of this epoch, or none that is believed.
     COASTING = constants.COASTING

@@ -67,7 +67,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         state.mean, state.covariance = begin(arc, sigma, satellites, line, limits)
         state.log_probability, state.origin_m = np.full(len(arc), -np.log(max(len(arc), 1))), arc
         state.log_code, state.branch_s, state.branch_m = np.zeros(len(arc)), 0.0, 0.0
-        state.log_least = state.log_probability
+        state.log_least, state.log_recent = state.log_probability, np.zeros(len(arc))
         return Sought(lost=False, parent=np.full(len(arc), -1), splits=None)
     mean, covariance = state.mean, state.covariance
     parent: Indices = np.arange(len(mean))
@@ -113,7 +113,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
     state.mean, state.covariance, state.origin_m = together[0], together[1], together[3]
     state.log_probability = together[2] - np.logaddexp.reduce(together[2])
     state.log_code, state.branch_s, state.branch_m = together[4], 0.0, 0.0
-    state.log_least = state.log_probability
+    state.log_least, state.log_recent = state.log_probability, np.zeros(len(state.log_probability))
     parent = np.full(state.hypotheses, -1)
     if not lost:
         parent = np.array([k if item is None else item.parent for k, item in enumerate(splits)])
@@ -139,6 +139,7 @@ def _try_beside(state: TrackState, limits: TrackingLimits) -> int:
     state.covariance = np.concatenate([state.covariance, covariance])
     state.log_probability = log_probability - np.logaddexp.reduce(log_probability)
     state.log_least = np.concatenate([state.log_least, np.zeros(len(mean))])
+    state.log_recent = np.concatenate([state.log_recent, np.zeros(len(mean))])
     state.log_code = np.concatenate([state.log_code, np.full(len(mean), state.log_code[best])])
     state.origin_m = np.concatenate([state.origin_m, mean[:, StateIndex.ARC]])
     return len(mean)

@@ -110,6 +110,8 @@ class TrackState:
         Mean innovation of each satellite's codes (`railfix.kernels.tracking.learning`).
     log_least : ndarray, shape (H,)
         Least logarithm of the probability lately: it rises with time (`railfix.kernels.tracking.constants.LEAST_RISE`).
+    log_recent : ndarray, shape (H,)
+        Evidence of the codes lately against laps within the error of the map (`RECENT_S` there); no probability.
     branch_s, branch_m : float [s], [m]
         Time and distance since the hypotheses began.
     origin_m : ndarray, shape (H,) [m]
@@ -163,6 +165,7 @@ class TrackState:
     log_code: Floats = field(default_factory=lambda: np.empty(0))
     code_bias: Floats = field(default_factory=lambda: np.empty(0))
     log_least: Floats = field(default_factory=lambda: np.empty(0))
+    log_recent: Floats = field(default_factory=lambda: np.empty(0))
     across: float = 0.0
     step_s: float = 0.0
     withheld_s: float = 0.0
@@ -205,7 +208,7 @@ class TrackState:
         """Begin anew: no hypothesis, no sub-filter, no clock known, nothing learnt of noise and map."""
         width = SATELLITES + len(self.satellite)
         self.mean, self.covariance = np.empty((0, width)), np.empty((0, width, width))
-        self.log_probability = self.log_code = self.log_least = self.origin_m = np.empty(0)
+        self.log_probability = self.log_code = self.log_least = self.log_recent = self.origin_m = np.empty(0)
         self.branch_s = self.branch_m = self.across = self.step_s = self.motion_misfit = 0.0
         self.offset_known = np.zeros(len(CLOCKS), dtype=np.bool_)
         self.code_bias = np.zeros(len(self.satellite))

@@ -148,13 +148,3 @@ def log_sum(values: Floats, size: int) -> float:
     for i in range(size):
         total += math.exp(values[i] - largest)
     return float(largest + math.log(total))
-
-
-@borrowing
-def most_probable(values: Floats, size: int, switch: float) -> int:
-    """Return the most probable hypothesis; the first unless another is `switch` times as probable."""
-    best = 0
-    for i in range(1, size):
-        if values[i] > values[best]:
-            best = i
-    return best if values[best] > values[0] + math.log(switch) else 0

@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 
 from railfix.kernels.compiling import borrowing
-from railfix.kernels.tracking.algebra import log_sum, most_probable
+from railfix.kernels.tracking.algebra import log_sum
 from railfix.kernels.tracking.constants import (
+    ALIKE,
     MOST_MOTION,
     MOST_ODDS,
     MOTION_M,
     MOTION_SATELLITES,
+    RECENT_MOST,
+    RECENT_S,
     SWITCH,
 )
 from railfix.kernels.tracking.course import point_at
@@ -49,6 +52,8 @@ def judge(parameters: Parameters, state: KernelState, work: Work, count: int, dt
     ``n d^2 / (2 code_common_m^2)``, what n independent epochs with such an error can say, n being 1 and one more in
     `code_common_s` or `code_common_travel_m`; between branches that are closer than `branch_floor_m` now never below
     `branch_floor`, whatever was gained while they were apart.
+
+    Between laps within `ALIKE` times map_branch_m what codes say now is kept as `log_recent`, for `leading` alone.
     """
     log_probability, log_code, places, after = state.log_probability, state.log_code, work.places, work.right
     travel = state.scalars[BRANCH_M]
@@ -60,6 +65,7 @@ def judge(parameters: Parameters, state: KernelState, work: Work, count: int, dt
     first, first_code = log_probability[best], log_code[best]
     of_second = min(dt, 1.0)
     most = MOST_MOTION * of_second
+    kept = math.exp(-dt / RECENT_S)
     for h in range(count):
         square = 0.0
         for c in range(3):
@@ -75,11 +81,27 @@ def judge(parameters: Parameters, state: KernelState, work: Work, count: int, dt
         code = min(max(odds + part * gained, min(odds, -reach)), max(odds, reach))
         if square < parameters.branch_floor_m**2:
             code = min(max(code, math.log(parameters.branch_floor)), -math.log(parameters.branch_floor))
+        recent = kept * state.log_recent[h]
+        beside = abs(work.new_mean[h, ARC] - work.new_mean[best, ARC]) > parameters.start_separation_m
+        if beside and square < (ALIKE * parameters.map_branch_m) ** 2:
+            recent += part * gained
+        state.log_recent[h] = min(max(recent, -RECENT_MOST), RECENT_MOST)
         work.joined[0, h] = code
         after[h] = motion + work.joined[0, h]
     total = log_sum(after, count)
     for h in range(count):
         log_probability[h], log_code[h] = after[h] - total, work.joined[0, h]
+
+
+@borrowing
+def leading(state: KernelState, count: int) -> int:
+    """Return the hypothesis to go by: the first unless another is `SWITCH` as probable with what codes said lately."""
+    log_probability, recent, best = state.log_probability, state.log_recent, 0
+    for i in range(1, count):
+        if log_probability[i] + recent[i] > log_probability[best] + recent[best]:
+            best = i
+    lead = log_probability[best] + recent[best] - log_probability[0] - recent[0]
+    return best if lead > math.log(SWITCH) else 0
 
 
 @borrowing
@@ -91,7 +113,7 @@ def keep_hypotheses(state: KernelState, parameters: Parameters, work: Work, coun
     mean, covariance, log_probability = state.mean, state.covariance, state.log_probability
     origin, ranked, kept, joined = state.origin_m, work.ranked, work.kept, work.joined
     n = mean.shape[1]
-    first = most_probable(log_probability, count, SWITCH)
+    first = leading(state, count)
     ranked[0] = first
     for k in range(count):
         if k == first:
@@ -104,7 +126,7 @@ def keep_hypotheses(state: KernelState, parameters: Parameters, work: Work, coun
     size = 0
     for k in range(count):
         joined[0, k], joined[1, k] = log_probability[k], origin[k]
-        joined[2, k], joined[3, k] = state.log_code[k], state.log_least[k]
+        joined[2, k], joined[3, k], joined[4, k] = state.log_code[k], state.log_least[k], state.log_recent[k]
     for r in range(count):
         k, twin = ranked[r], -1
         for j in range(size):
@@ -138,6 +160,7 @@ def keep_hypotheses(state: KernelState, parameters: Parameters, work: Work, coun
     for j in range(size):
         k = kept[j]
         origin[j], state.log_code[j], state.log_least[j] = joined[1, k], joined[2, k], joined[3, k]
+        state.log_recent[j] = joined[4, k]
         for c in range(n):
             work.new_mean[j, c] = mean[k, c]
             for e in range(n):

@@ -106,6 +106,11 @@ SPEED_SIGMAS: Final = 4.0
 # Branches.
 #: How much more probable another place must be to be gone by: near-equal ones would take turns.
 SWITCH: Final = 3.0
+#: Among laps within so many `map_branch_m` of each other, which nothing tells apart for good, the filter goes by the
+#: one that codes have preferred lately: a mean of so many seconds, of odds whose logarithm is no larger than this.
+ALIKE: Final = 1.5
+RECENT_S: Final = 30.0
+RECENT_MOST: Final = 3.0
 #: Logarithm of the odds that a difference of one `map_branch_m` can give: 1 / (2 s^2) with s^2 = 2 (1/3)^2.
 MOST_ODDS: Final = 2.25
 #: Largest logarithm of the odds that motion gives in a second, or in an epoch: more is a reflection.

@@ -159,6 +159,7 @@ class KernelState(NamedTuple):
     log_probability: Floats
     log_code: Floats
     log_least: Floats
+    log_recent: Floats
     code_bias: Floats
     origin_m: Floats
     offset_known: Masks

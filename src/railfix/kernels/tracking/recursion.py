@@ -9,8 +9,8 @@ import math
 
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import borrowing, kernel
-from railfix.kernels.tracking.algebra import invert, most_probable, restart
-from railfix.kernels.tracking.branches import keep_hypotheses, reweigh
+from railfix.kernels.tracking.algebra import invert, restart
+from railfix.kernels.tracking.branches import keep_hypotheses, leading, reweigh
 from railfix.kernels.tracking.clocks import start_clocks
 from railfix.kernels.tracking.constants import (
     ACROSS_DOUBT,
@@ -29,7 +29,6 @@ from railfix.kernels.tracking.constants import (
     RELINEARISED,
     SCALE_BOUND,
     SEVERAL_BRANCHES,
-    SWITCH,
     TAKEOVER,
     TAKEOVER_AFTER_S,
     TRACKING,
@@ -191,7 +190,7 @@ def _measure(
         scalars[CODED] = epochs.time_s[t]
     for i in range(rows.counts[0]):
         state.offset_known[epochs.offset[rows.codes[i]]] = True
-    best = most_probable(state.log_probability, count, SWITCH)
+    best = leading(state, count)
     found = learn(epochs, parameters, state, rows, work, t, best, shift, dt, code_s)
     write_rows(outputs, rows, work, t, best, 1.0)
     if len(bank.running):
@@ -224,7 +223,7 @@ def _update(
     count, nc = int(state.scalars[HYPOTHESES]), rows.counts[0]
     gnss = nc + rows.counts[1] + rows.counts[2]
     size = nc + COMBINED + rows.counts[3]
-    going = most_probable(state.log_probability, count, SWITCH)
+    going = leading(state, count)
     shift, doubtful = 0.0, False
     for turn in range(1 + RELINEARISED):
         furthest = 0.0
@@ -384,7 +383,7 @@ def advance(
             )
         else:
             _coast(epochs, t, line, parameters, active, state, bank, work, room)
-            best = most_probable(state.log_probability, int(scalars[HYPOTHESES]), SWITCH)
+            best = leading(state, int(scalars[HYPOTHESES]))
             scalars[WITHHELD] = max(scalars[WITHHELD] - dt, 0.0)
         aided = measured and rows.counts[0] > 0
         lost = part == REST_LOST
