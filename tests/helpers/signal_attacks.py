@@ -114,6 +114,9 @@ def pulled(
     # where the train stands, the direction is that of the epoch before
     row = np.maximum.accumulate(np.where(np.isfinite(along[:, 0]), np.arange(len(along)), 0))
     along = along[row]
+    # a train that turns back keeps the direction of the line
+    turned = np.where((along[1:] * along[:-1]).sum(axis=1) < 0.0, -1.0, 1.0)
+    along *= np.cumprod(np.concatenate([[1.0], turned]))[:, None]
     chosen = np.isin(scene.observations.system, list(systems or "GJEC"))
     begun = np.arange(len(since)) >= at
     longer = scene.longer_m(scene.ecef_m + (rate_mps * since)[:, None] * along) * chosen

@@ -15,6 +15,7 @@ from railfix.io.train_message import (
     MessageError,
     MessageStatus,
     Source,
+    SuspectedInterference,
     TrainMessage,
     decode,
     encode,
@@ -89,7 +90,15 @@ def test_size_and_keys_of_a_message() -> None:
     assert KEYS["sigma_cm"] == 20
     assert KEYS["authority"] == 21
     assert KEYS["authority_end_cm"] == 22
-    assert len(KEYS) == 22
+    assert KEYS["interference"] == 23
+    assert len(KEYS) == 23
+
+
+@pytest.mark.requirement("B8")
+@pytest.mark.parametrize("suspected", [None, *SuspectedInterference])
+def test_suspected_interference_comes_back(suspected: SuspectedInterference | None) -> None:
+    message = PLACED.model_copy(update={"interference": suspected})
+    assert decode(encode(message)) == from_json(to_json(message)) == message
 
 
 def test_a_key_sent_twice_is_damage() -> None:

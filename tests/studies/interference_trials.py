@@ -49,7 +49,7 @@ Attack = Callable[[Scene, int, np.random.Generator], Observations]
 
 
 def _jammer(scene: Scene, at: int, rng: np.random.Generator) -> Observations:
-    return signal_attacks.jammed(scene, at, rng.uniform(-20.0, 10.0), rng)
+    return signal_attacks.jammed(scene, at, rng.uniform(-20.0, -8.0), rng)
 
 
 def _meacon(scene: Scene, at: int, rng: np.random.Generator) -> Observations:
@@ -70,7 +70,7 @@ def _one_constellation(scene: Scene, at: int, rng: np.random.Generator) -> Obser
 
 
 ATTACKS: Final[dict[str, Attack]] = {
-    "jammer passed at 50 m, -20 to 10 dBm": _jammer,
+    "jammer passed at 50 m, -20 to -8 dBm": _jammer,
     "meaconing, 30 to 500 m later": _meacon,
     "pull of 0.5 m/s, one transmitter's C/N0": _pull,
     "pull of 0.5 m/s, C/N0 as before": _pull_with_own_power,

@@ -198,7 +198,7 @@ def _block(
     acc = np.where(used, geometry.sigma_acc_m[rows], 0.0)[:, None, None]
     bias = (np.abs(gain) * np.where(used, geometry.bias_m[rows], 0.0)[:, None, None]).sum(axis=3)
     apart = np.sqrt(((gain - gain[:, :1]) ** 2 * acc**2).sum(axis=3))
-    lost = ~np.isfinite(sigma[:, 1:]).all(axis=2)
+    lost = np.asarray(~np.isfinite(sigma[:, 1:]).all(axis=2))
     beyond = beyond + np.where(lost, probability, 0.0).sum(axis=1)
     probability = np.where(lost, 0.0, probability)
     modes = np.count_nonzero(probability, axis=1)

@@ -8,7 +8,7 @@ earlier pieces left unfinished, so that a stream cut anywhere gives the same rec
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -300,13 +300,18 @@ class _EphemerisBuilder:
         if letter in "GJ" and number == 4:
             self._ionosphere_gps(letter, values)
             return
-        make = {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}.get(letter)
-        if number > _FNAV_FROM:
-            make = self._galileo_f if letter == "E" else self._modernised
-        record = (make or (self._d2 if number > 100 else self._d1))(satellite, time)
+        record = self._maker(letter, number)(satellite, time)
         if letter == "R" and record is None and self._parts(satellite, (1, 2, 3, 4)) is not None:
             self.waiting[satellite] = after
         self.issue(record, time)
+
+    def _maker(self, letter: str, number: int) -> Callable[[str, np.datetime64], Record | None]:
+        """Return what makes a record of the message that a subframe is of."""
+        if number > _FNAV_FROM:
+            return self._galileo_f if letter == "E" else self._modernised
+        if letter == "C":
+            return self._d2 if number > 100 else self._d1
+        return {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}[letter]
 
     def settle(self, until: np.datetime64 | None) -> None:
         """Append records of GLONASS strings whose next epoch came within their frame, up to a time or all known."""
