@@ -3,8 +3,9 @@
 The demonstration's logs go as UBX through two TCP connections at their own pace to `railfix live` in a process of its
 own, over and over with later tags; the messages come back as datagrams::
 
-    python tests/benchmarks/bench_messages.py [--seconds 600] [--filter track|off] [--channels 1|2]
+    python tests/benchmarks/bench_messages.py [--seconds 600] [--filter track|off] [--channels 1|2] [--mqtt]
 
+With --mqtt they come back over a broker (mosquitto) instead.
 Prints percentiles of the time between two messages and how many were missing or too much, for each quarter as well.
 """
 
@@ -14,11 +15,14 @@ import argparse
 import asyncio
 import contextlib
 import os
+import queue
+import shutil
 import socket
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,6 +37,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 from ubx_made import rawx
 
 PERIOD_S = 0.1
+#: For the first message: kernels that are not on disk are compiled before.
+LONGEST_WAIT_S = 300.0
 
 
 async def served(log: Observations, began: float, until: float, ready: asyncio.Queue[int]) -> None:
@@ -68,15 +74,47 @@ async def both(began: float, until: float, ports: list[int], started: threading.
     await asyncio.gather(*tasks)
 
 
+def datagrams() -> tuple[str, Callable[[], bytes]]:
+    """Return the target of datagrams, and a function that waits for the next."""
+    receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    receiver.bind(("127.0.0.1", 0))
+    receiver.settimeout(LONGEST_WAIT_S)
+    return f"udp://127.0.0.1:{receiver.getsockname()[1]}", lambda: receiver.recv(4000)
+
+
+def published(held: contextlib.ExitStack) -> tuple[str, Callable[[], bytes]]:
+    """Return the target of a broker's topic, and a function that waits for its next message."""
+    from paho.mqtt import client, enums
+
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    program = shutil.which("mosquitto") or "/usr/sbin/mosquitto"
+    broker = subprocess.Popen([program, "-p", str(port)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    held.callback(broker.terminate)
+    time.sleep(2.0)
+    arrived = queue.Queue[bytes]()
+    reader = client.Client(enums.CallbackAPIVersion.VERSION2)
+    reader.on_message = lambda _client, _data, message: arrived.put(message.payload)
+    reader.on_connect = lambda *_: reader.subscribe("railfix")
+    reader.connect("127.0.0.1", port)
+    reader.loop_start()
+    held.callback(reader.loop_stop)
+    return f"mqtt://127.0.0.1:{port}/railfix", lambda: arrived.get(timeout=LONGEST_WAIT_S)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--filter", choices=("track", "off"), default="track")
     parser.add_argument("--channels", choices=("1", "2"), default="1")
+    parser.add_argument("--mqtt", action="store_true", help="messages over a broker")
     options = parser.parse_args()
-    receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    receiver.bind(("127.0.0.1", 0))
-    receiver.settimeout(300.0)  # kernels that are not on disk are compiled first
+    with contextlib.ExitStack() as held:
+        measure(options, *(published(held) if options.mqtt else datagrams()))
+
+
+def measure(options: argparse.Namespace, target: str, receive: Callable[[], bytes]) -> None:
+    """Run the session and print what arrived."""
     began = time.monotonic() + 15.0  # after the program has started
     until, ports, started = began + options.seconds, list[int](), threading.Event()
     threading.Thread(target=lambda: asyncio.run(both(began, until, ports, started)), daemon=True).start()
@@ -86,16 +124,18 @@ def main() -> None:
     words += ["--track", str(files["track"]), "--vehicle", str(files["vehicle"])]
     words += ["--front", f"tcp://127.0.0.1:{ports[0]}", "--rear", f"tcp://127.0.0.1:{ports[1]}"]
     words += ["--filter", options.filter, "--channels", options.channels]
-    words += ["--send", f"cbor@udp://127.0.0.1:{receiver.getsockname()[1]}"]
+    words += ["--send", f"cbor@{target}"]
     process = subprocess.Popen(words, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
     arrived, messages = [], []
     try:
         while time.monotonic() < until:
-            messages.append(decode(receiver.recv(4000)))
+            messages.append(decode(receive()))
             arrived.append(time.monotonic())
     finally:
         process.terminate()
+        ending = time.monotonic()
         process.wait(20)
+    print(f"ended {time.monotonic() - ending:.1f} s after SIGTERM")
     at = np.array(arrived)
     within = (at > began + 5.0) & (at < until - 1.0)  # the first epochs fill caches
     between = np.diff(at[within]) * 1e3
