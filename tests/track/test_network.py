@@ -23,6 +23,7 @@ from railfix.track.network_match import match, read_plan_positions
 from railfix.track.network_read import links_of_ends, read_network
 from railfix.track.network_route import route_of
 from report_page import Page, browser, fetched, opened
+from route_matcher import matched_track
 
 pytestmark = pytest.mark.requirement("A10")
 INFRABEL = {"latitude_deg": "latitude", "longitude_deg": "longitude", "time_gpst": "timestamp"}
@@ -220,6 +221,15 @@ def test_infrabel_positions_are_on_the_track_that_is_known_of_them(infrabel: Net
     assert first.right_with_errors > 0.95
     assert last.known < 10
     assert last.fixed_m > 1.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["28554_L36-A_to_L36C-A", "28573_L36-A_to_L36C-A_to_L25N-B", "28876_L36-B"])
+def test_as_many_positions_lie_on_tracks_as_by_shortest_routes(infrabel: Network, recordings: Path, name: str) -> None:
+    """Another matcher, which has no probabilities; one position in 600 lies at a joint of tracks of 6 m."""
+    log = read_plan_positions(recordings / "rail" / "infrabel" / f"log_{name}.csv", columns=INFRABEL)
+    _, offset = matched_track(infrabel, log)
+    assert (np.abs(match(infrabel, log).offset_m) <= 5.0).sum() >= (np.abs(offset) <= 5.0).sum() - 1
 
 
 def test_page_has_the_network_its_faults_and_the_run(tmp_path: Path) -> None:

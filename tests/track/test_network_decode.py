@@ -17,6 +17,8 @@ from railfix.track import network_decode
 from railfix.track.network import Candidates, Network
 from railfix.track.network_decode import COMMON_S, Residuals, Transitions, decode
 from railfix.track.network_match import PlanLog, match
+from railfix.track.network_read import links_of_ends
+from railfix.track.segment import Segment
 
 pytestmark = pytest.mark.requirement("A10")
 #: Every 20 s: positions that count in full.
@@ -199,3 +201,29 @@ def test_of_recorded_errors_on_networks_what_is_stated_at_99_percent_is_right(na
         assert right[share >= 0.99].all()
         certain += int((share >= 0.99).sum())
     assert certain > len(errors.time)
+
+
+@pytest.mark.parametrize("begin", [100.0, 101.7])
+def test_a_short_track_of_a_switch_is_not_passed_over(begin: float) -> None:
+    """Of 21 m, with two positions on it: the tracks before and after it do not reach there."""
+
+    def track(name: str, first: float, last: float) -> Segment:
+        x = np.linspace(first, last, 1 + int((last - first) / 10.0))
+        return segment(name, *to_degrees(x, np.zeros(len(x))))
+
+    net = Network(tracks=(track("W", 0.0, 500.0), track("S", 500.0, 521.0), track("E", 521.0, 1000.0)), links=())
+    net = replace(net, links=links_of_ends(net))
+    x = np.arange(begin, 900.0, 12.2)
+    latitude, longitude = to_degrees(x, np.full(len(x), 1.7))
+    log = PlanLog(
+        path="log",
+        time=np.datetime64("2024-01-01", "ns") + np.arange(len(x)) * np.timedelta64(400, "ms"),
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        sigma_m=np.full(len(x), np.nan),
+    )
+    matched = match(net, log)
+    on_it = (x > 500.0) & (x < 521.0)
+    assert on_it.sum() == 2
+    assert (matched.track == 1).tolist() == on_it.tolist()
+    assert np.abs(matched.offset_m) == pytest.approx(1.7, abs=0.01)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -36,8 +36,11 @@ _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2
 #: Difference of way and distance at which a joint is half as probably passed as where they agree [m].
 _PASSING_M: Final = 5.0
-#: What a change of track has to gain, in positions on the right track.
+#: What a change of track has to gain, in positions on the right track; less over a joint, known by its probability: on
+#: a short track of a switch there are one or two positions.
 _CHANGE: Final = 0.5
+_CHANGE_AT_JOINT: Final = 0.05
+_AT_JOINT: Final = 0.01
 #: Time over which the common error lasts [s].
 COMMON_S: Final = 600.0
 #: Balls of the urn of one horizontal axis, and of the vertical one: a quarter of them is the variance in steps.
@@ -98,7 +101,7 @@ class Transitions:
         self._leaves = to_end[:-1] <= self._reach[:, None]
         self._enters = to_end[1:] <= self._reach[:, None]
 
-    @cached_property
+    @property
     def changes(self) -> Masks:
         """Whether each passage is to another track, or to or from none, shape (n - 1, m + 1, m + 1)."""
         state = np.column_stack([np.where(self._track < 0, -2, self._track), np.full(len(self._track), -1)])
@@ -245,7 +248,7 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
     firsts: dict[int, Floats | None] = {0: None}
     if n > length:
         firsts |= {k: at.share for k, at in _forward(residuals, moves, lattice, 0, None, n) if k and k % length == 0}
-    probability, pairs = np.empty((n, m + 1)), np.empty((n - 1, m + 1, m + 1))
+    probability, gains, changes = np.empty((n, m + 1)), np.empty((n - 1, m + 1, m + 1)), moves.changes
     after = expected = np.ones((m + 1, *lattice.first.shape))
     move = np.eye(m + 1)
     for start in reversed(firsts):
@@ -256,13 +259,15 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
                 seconds = float(residuals.seconds[k + 1])
                 if k == start + length - 1:
                     move = moves(k)
-                pairs[k] = move * (lattice.later(at.share, seconds).reshape(m + 1, -1) @ expected.reshape(m + 1, -1).T)
+                pairs = move * (lattice.later(at.share, seconds).reshape(m + 1, -1) @ expected.reshape(m + 1, -1).T)
+                cost = np.where(move < _AT_JOINT, _CHANGE, _CHANGE_AT_JOINT)
+                gains[k] = pairs / pairs.sum() - np.where(changes[k], cost, 0.0)
                 after = (move @ lattice.earlier(expected, seconds).reshape(m + 1, -1)).reshape(after.shape)
                 after /= after.max()
             probability[k] = (at.share * after).sum(axis=(1, 2))
             expected, move = at.likelihood * after, at.move
     probability /= probability.sum(axis=1, keepdims=True)
-    return _sequence(probability, pairs, moves.changes), probability
+    return _sequence(probability, gains), probability
 
 
 @dataclass(frozen=True)
@@ -295,12 +300,12 @@ def _forward(
         yield k, _At(share, likelihood, move)
 
 
-def _sequence(probability: Floats, pairs: Floats, changes: Masks) -> Indices:
-    """The sequence of which the most neighbouring pairs are expected to be right, less `_CHANGE` for each change."""
+def _sequence(probability: Floats, gains: Floats) -> Indices:
+    """The sequence of the largest gains: neighbouring pairs expected to be right, less what changes have to gain."""
     n, states = probability.shape
     best, back = np.zeros(states), np.zeros((n, states), dtype=np.intp)
     for k in range(1, n):
-        total = best[:, None] + pairs[k - 1] / pairs[k - 1].sum() - np.where(changes[k - 1], _CHANGE, 0.0)
+        total = best[:, None] + gains[k - 1]
         back[k] = np.argmax(total, axis=0)
         best = total[back[k], np.arange(states)]
     path = np.zeros(n, dtype=np.intp)
