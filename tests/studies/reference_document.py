@@ -36,7 +36,7 @@ from railfix.run.route import ON_TRACK_COLUMNS, TRACK_COLUMNS
 from railfix.tracking import TrackStatus
 
 DOCS: Final = paths.ROOT / "docs"
-WRITTEN: Final = "Written by `python tests/studies/reference_document.py` from the docstrings."
+WRITTEN: Final = "Written by `python tests/studies/reference_document.py`."
 ENDINGS: Final = tuple(f"`_{ending}`" + ("" if ending == unit else f" {unit}") for ending, unit in UNITS.items())
 SIGNS: Final = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 #: Prefixes of the settings of the filter along the track.
@@ -193,13 +193,13 @@ def run_columns() -> str:
     common = {
         name: column for name, column in POSITION_COLUMNS.items() if _meaning(TRAIN_COLUMNS, name) == column.meaning
     }
-    lines += _columns("Columns of both `positions` and `train`", common)
-    lines += _columns("Columns of `positions.csv` and `positions.parquet`", POSITION_COLUMNS, without=common)
-    lines += _columns("Columns of `train.csv` and `train.parquet`", TRAIN_COLUMNS, without=common)
-    lines += _columns("Further columns of `train.*` with `--smooth`", SMOOTHED_COLUMNS)
-    lines += _columns("Further columns of `positions.*` and `train.*` of a run on a network", ON_TRACK_COLUMNS)
-    lines += _columns("Columns of `tracks.csv` and `tracks.parquet`", TRACK_COLUMNS)
-    lines += _columns("Columns of `observations.parquet`", OBSERVATION_COLUMNS, without=("time_gpst", "antenna"))
+    lines += _columns("Both `positions` and `train`", common)
+    lines += _columns("`positions.csv`, `positions.parquet`", POSITION_COLUMNS, without=common)
+    lines += _columns("`train.csv`, `train.parquet`", TRAIN_COLUMNS, without=common)
+    lines += _columns("`train.*` with `--smooth`", SMOOTHED_COLUMNS)
+    lines += _columns("`positions.*` and `train.*` on a network", ON_TRACK_COLUMNS)
+    lines += _columns("`tracks.csv`, `tracks.parquet`", TRACK_COLUMNS)
+    lines += _columns("`observations.parquet`", OBSERVATION_COLUMNS, without=("time_gpst", "antenna"))
     return "\n".join(lines) + "\n"
 
 
