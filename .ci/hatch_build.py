@@ -27,8 +27,12 @@ class CommitHook(BuildHookInterface):
         if archived.is_file():
             shutil.copy(archived, path)
         else:
-            changed = "+changed" if self._git("status", "--porcelain") else ""
-            path.write_text(f"{self._git('rev-parse', 'HEAD')}{changed}\n", encoding="ascii")
+            try:
+                changed = "+changed" if self._git("status", "--porcelain") else ""
+                path.write_text(f"{self._git('rev-parse', 'HEAD')}{changed}\n", encoding="ascii")
+            except (OSError, subprocess.CalledProcessError) as error:
+                self.app.display_warning(f"the commit stays unknown: {error}")
+                return
         build_data["force_include"][str(path)] = PLACES[self.target_name]
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:  # noqa: ARG002

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import os
+import runpy
 import subprocess
 import sys
 from importlib.metadata import distribution, version
@@ -48,6 +49,35 @@ def test_the_commit_of_a_checkout_is_what_git_says(tmp_path: Path) -> None:
     assert (checked_out_commit(root), checked_out_commit(other)) == (first, git(other, "rev-parse", "HEAD"))
     git(root, "checkout", "-q", "--detach")
     assert checked_out_commit(root) == first
+
+
+def commit_in_build(root: Path, *, version: str = "standard", target: str = "wheel") -> dict[str, str]:
+    """What the build hook would pack in a folder, as texts by their places."""
+    hook_class = runpy.run_path(str(ROOT / ".ci" / "hatch_build.py"))["CommitHook"]
+    hook = hook_class(str(root), {}, None, None, str(root / "dist"), target)
+    data: dict[str, Any] = {"force_include": {}}
+    hook.initialize(version, data)
+    packed = {place: Path(path).read_text() for path, place in data["force_include"].items()}
+    hook.finalize(version, data, "")
+    assert not hook.folder.exists()
+    return packed
+
+
+def test_a_build_packs_the_commit_and_goes_on_without_git(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert commit_in_build(tmp_path) == {}
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "commit", "-q", "--allow-empty", "-m", "one")
+    commit = git(tmp_path, "rev-parse", "HEAD")
+    assert commit_in_build(tmp_path) == {"railfix/_commit.txt": f"{commit}\n"}
+    assert commit_in_build(tmp_path, target="sdist") == {".ci/commit.txt": f"{commit}\n"}
+    assert commit_in_build(tmp_path, version="editable") == {}
+    (tmp_path / "new").touch()
+    assert commit_in_build(tmp_path) == {"railfix/_commit.txt": f"{commit}+changed\n"}
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert commit_in_build(tmp_path) == {}
+    (tmp_path / ".ci").mkdir()
+    (tmp_path / ".ci" / "commit.txt").write_text("of the archive\n")
+    assert commit_in_build(tmp_path) == {"railfix/_commit.txt": "of the archive\n"}
 
 
 @pytest.mark.slow
