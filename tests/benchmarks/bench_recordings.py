@@ -26,7 +26,7 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--filter", choices=("off", "track"), default="track")
     args = parser.parse_args()
-    known = belief_campaign.recordings(paths.DATA)
+    known = belief_campaign.cases(paths.DATA)
     for name in args.names:
         case = known[name]()
         rates = []

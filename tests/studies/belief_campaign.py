@@ -1,8 +1,7 @@
 """Cold starts and faults: what the filter states against what is true.
 
 ``python tests/studies/belief_campaign.py`` runs the recordings beside the checkout; ``python
-tests/studies/belief_campaign.py FOLDER ...`` runs folders with a ``case.toml`` that names ``log``, ``nav``, ``track``
-and ``truth`` (a track map and a reference as ``railfix evaluate`` reads them); shipped scenarios of the simulator by
+tests/studies/belief_campaign.py FOLDER ...`` runs cases of ``railfix benchmark``; shipped scenarios of the simulator by
 their names (``city``, ``commercial-run``) at 1 Hz, with the sensors on board that they have. Every trial is the
 pipeline with its defaults from a cold start; ``--mask`` changes the elevation mask, ``--set`` a setting of the filter,
 ``--thin N`` takes every N-th epoch of a log, as a receiver with a longer interval would have written it.
@@ -25,6 +24,7 @@ import tempfile
 import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -40,6 +40,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.settings import write_toml
 from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference, straight_distance
+from railfix.evaluate.benchmark import read_case
 from railfix.gnss.navigation import Navigation, glonass_channels
 from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz
@@ -163,45 +164,54 @@ def smartloc_rinex_truth(folder: Path) -> recordings_truth.Truth:
     return start + (np.round(rows[:, 0], 3) * 1e9).astype("timedelta64[ns]"), rows[:, 1:]
 
 
-def recordings(data: Path) -> dict[str, Callable[[], Case]]:
+@dataclass(frozen=True)
+class Recording:
+    """Files of a recording beside the checkout, and what reads its reference."""
+
+    log: Path
+    nav: list[Path]
+    truth: Callable[[], recordings_truth.Truth]
+
+
+def recordings(data: Path) -> dict[str, Recording]:
+    """Recordings beside the checkout by name."""
     road = data / "kinematic"
     tst, pixel, japan = road / "urbannav_tst", road / "gsdc_pixel5_a", next(iter(road.glob("japan_mosaic*")))
     berlin = road / "smartloc_berlin_rinex"
-    urban = recordings_truth.urbannav_truth
+    nav, truth = [tst / "hksc137c.nav"], partial(recordings_truth.urbannav_truth, tst)
     return {
-        "m8t": lambda: made(
-            "m8t", tst / "20210517.light-urban.tste.ublox.m8t.GC.obs", [tst / "hksc137c.nav"], urban(tst), None
+        "m8t": Recording(tst / "20210517.light-urban.tste.ublox.m8t.GC.obs", nav, truth),
+        "f9p": Recording(tst / "20210517.light-urban.tste.ublox.f9p.obs", nav, truth),
+        "pixel": Recording(
+            pixel / "Pixel5_a.21o", [pixel / "hour1180.21n"], partial(recordings_truth.gsdc_truth, pixel)
         ),
-        "f9p": lambda: made(
-            "f9p", tst / "20210517.light-urban.tste.ublox.f9p.obs", [tst / "hksc137c.nav"], urban(tst), None
+        "japan": Recording(
+            japan / "SEPT265G.21O", [japan / "SEPT2650.21P"], partial(recordings_truth.japan_truth, japan)
         ),
-        "pixel": lambda: made(
-            "pixel", pixel / "Pixel5_a.21o", [pixel / "hour1180.21n"], recordings_truth.gsdc_truth(pixel), None
-        ),
-        "japan": lambda: made(
-            "japan", japan / "SEPT265G.21O", [japan / "SEPT2650.21P"], recordings_truth.japan_truth(japan), None
-        ),
-        "berlin": lambda: made(
-            "berlin",
+        "berlin": Recording(
             berlin / "Berlin_Potsdamer_Platz.obs.gz",
             [berlin / "brdc1580.16n.gz", berlin / "brdc1580.16g.gz"],
-            smartloc_rinex_truth(berlin),
-            None,
+            partial(smartloc_rinex_truth, berlin),
         ),
     }
 
 
+def cases(data: Path) -> dict[str, Callable[[], Case]]:
+    """Recordings beside the checkout by name, read when called."""
+    return {name: partial(_read, name, files) for name, files in recordings(data).items()}
+
+
+def _read(name: str, files: Recording) -> Case:
+    return made(name, files.log, files.nav, files.truth(), None)
+
+
 def case_of_folder(folder: Path) -> Case:
-    """The case that a folder's ``case.toml`` names."""
-    given = tomllib.loads((folder / "case.toml").read_text(encoding="utf-8"))
-    missing = sorted({"log", "nav", "track", "truth"} - set(given))
-    if missing:
-        raise SystemExit(f"{folder / 'case.toml'}: {', '.join(missing)} missing; expected log, nav, track and truth")
-    nav = [given["nav"]] if isinstance(given["nav"], str) else given["nav"]
-    reference = read_reference(folder / given["truth"], ["front"])["front"]
-    trajectory = Trajectory.from_track(read_track(folder / given["track"]))
+    """The case of the benchmark in a folder."""
+    case = read_case(folder)
+    reference = read_reference(case.truth, ["front"])["front"]
+    trajectory = Trajectory.from_track(read_track(case.inputs.track))
     truth = (reference.time, reference.ecef_m)
-    return made(folder.name, folder / given["log"], [folder / n for n in nav], truth, trajectory)
+    return made(folder.name, case.inputs.front[0], list(case.inputs.nav), truth, trajectory)
 
 
 def run(case: Case, settings: dict[str, Any], *, first: int = 0) -> Judged:
@@ -537,7 +547,7 @@ def main() -> int:
     args = parser.parse_args()
     given = "\n".join(args.sets)
     args.settings = {"tracking": tomllib.loads(given)} if given else {}
-    known = recordings(paths.DATA) if paths.DATA.is_dir() else {}
+    known = cases(paths.DATA) if paths.DATA.is_dir() else {}
     if not args.faults:
         print(HEAD)
     for name in args.folders or list(known):

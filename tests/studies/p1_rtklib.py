@@ -16,8 +16,8 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats
-from railfix.core.timescale import seconds
+from railfix.core.arrays import Floats
+from railfix.evaluate.benchmark.programs import rows_at_epochs
 from railfix.gnss.observations import Observations
 from railfix.io.position_log import read_positions
 from railfix.io.rinex import write_navigation, write_observations
@@ -56,7 +56,6 @@ def single_points(
     """
     assert PROGRAM is not None, ABSENT
     time = np.concatenate([part.time for part in parts])
-    interval = seconds(time[1] - time[0])
     ionosphere, troposphere, ephemeris = _MODELS[messages is not None]
     floors = ",".join([f"{floor_dbhz:g}"] * 9)
     with tempfile.TemporaryDirectory() as name:
@@ -74,15 +73,5 @@ def single_points(
         command = [PROGRAM, "-k", folder / "run.conf", "-o", out, *files]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         theirs = read_positions(out)
-    # RTKLIB takes its clock out of the tags
-    return at_epochs(time, float(interval), theirs.time, theirs.ecef_m)
-
-
-def at_epochs(time: Datetimes, interval_s: float, found: Datetimes, ecef_m: Floats) -> Floats:
-    """Return positions at the epochs nearest to their tags, NaN elsewhere, shape (T, 3) [m]."""
-    place = np.full((len(time), 3), np.nan)
-    index = np.clip(np.searchsorted(time, found), 1, len(time) - 1)
-    index -= (found - time[index - 1]) < (time[index] - found)
-    near = np.abs(seconds(found - time[index])) < 0.4 * interval_s
-    place[index[near]] = ecef_m[near]
-    return place
+    row = rows_at_epochs(time, theirs.time)
+    return np.where((row >= 0)[:, None], theirs.ecef_m[row], np.nan)

@@ -2,10 +2,11 @@
 
 The wheel `gnss-benchmark` (MIT) has a drive of 20 minutes through a town (Septentrio mosaic-X5, 1 Hz, November 2020)
 and a station 14 km away. RTKLIB's `rnx2rtkp` makes the ground truth from both, forward and backward (mostly float: some
-decimetres), `railfix map from-positions` the map. Neither settings nor constants were chosen with it. Then::
+decimetres), `railfix map from-positions` the map. It is held out: no test reads it, and neither settings nor constants
+were chosen with it. Then::
 
     python tests/studies/belief_campaign.py FOLDER --whole --every 20 --mask 20 10 --calibration
-    railfix run --front FOLDER/rover.rnx --nav FOLDER/nav.rnx --track FOLDER/track.csv --out FOLDER/results
+    railfix benchmark FOLDER --out OUT
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ import zipfile
 from pathlib import Path
 
 import polars as pl
+
+from railfix.evaluate.benchmark import write_case
 
 WHEEL = "gnss-benchmark==2.3.0"
 INSIDE = "gnss_benchmark/datasets/mosaicx5_multi_dynamic"
@@ -39,7 +42,21 @@ OPTIONS = {
 }
 #: Positions with a larger standard deviation in height are no truth [m].
 LARGEST_SIGMA_M = 1.5
-CASE = 'log = "rover.rnx"\nnav = "nav.rnx"\ntrack = "track.csv"\ntruth = "truth.csv"\n'
+CASE = {
+    "licence": "MIT",
+    "fetch": "python tests/studies/public_recording.py FOLDER (wheel gnss-benchmark 2.3.0)",
+    "held_out": True,
+    "files": {"front": ["rover.rnx"], "nav": ["nav.rnx"], "track": ["track.csv"], "truth": "truth.csv"},
+    "scenario": {
+        "date": "2020-11-29",
+        "environment": "town and roads around it",
+        "vehicle": "car",
+        "receiver": "Septentrio mosaic-X5",
+        "rate_hz": 1.0,
+        "reference": "RTKLIB, kinematic, both directions, station at 14 km",
+        "reference_accuracy_m": 0.5,
+    },
+}
 
 
 def truth_of(solution: Path) -> pl.DataFrame:
@@ -71,7 +88,7 @@ def main() -> None:
     truth.write_csv(folder / "truth.csv")
     words = ["map", "from-positions", folder / "truth.csv", "--out", folder / "track.csv", "--overwrite"]
     subprocess.run([sys.executable, "-m", "railfix", *words], check=True)
-    (folder / "case.toml").write_text(CASE)
+    write_case(folder, CASE)
     print(f"{len(truth)} positions of ground truth; case: {folder}")
 
 

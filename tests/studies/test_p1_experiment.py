@@ -13,7 +13,7 @@ import p1_seeds
 import p1_static
 from conftest import ROOT
 from p1_ride import Bench, Found, Passage, Way, intervals_m, ridden
-from p1_rtklib import ABSENT, PROGRAM, at_epochs
+from p1_rtklib import ABSENT, PROGRAM
 from p1_static import STARTS, Subsets, joined, subsets
 from railfix.core.reasons import Status
 from test_p4_experiment import assert_same
@@ -82,15 +82,6 @@ def test_intervals_over_lines_hold_the_mean_as_often_as_they_say() -> None:
     weights = random.uniform(0.5, 2.0, 20)
     bounds = [p1_seeds.interval(random.normal(5.0, 1.0, 20), weights)[1:] for _ in range(80)]
     assert 0.85 <= np.mean([low <= 5.0 <= high for low, high in bounds]) <= 0.99
-
-
-@pytest.mark.requirement("A6")
-def test_positions_of_another_program_go_to_the_nearest_epoch_or_none() -> None:
-    time = np.datetime64("2024-12-09T00:00:00", "ns") + np.arange(6) * np.timedelta64(100, "ms")
-    found = time[[0, 2, 3]] + np.array([1, -30, 45]) * np.timedelta64(1, "ms")
-    place = at_epochs(time, 0.1, found, np.arange(9.0).reshape(3, 3))
-    np.testing.assert_array_equal(place[[0, 2]], [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])
-    assert np.isnan(place[[1, 3, 4, 5]]).all()
 
 
 @pytest.mark.slow

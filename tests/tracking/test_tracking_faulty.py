@@ -58,7 +58,7 @@ def test_a_code_that_stays_wrong_is_left_out_and_comes_back(size_m: float) -> No
 @pytest.mark.parametrize("by", ["single epochs", "the filter"])
 def test_a_faulty_satellite_of_a_recording_is_named_within_150_s(recordings: Path, satellite: str, by: str) -> None:
     """The filter takes over what single epochs have found, and finds it alone where these do not look for it."""
-    case = belief_campaign._recordings(recordings)["f9p"]().part(0, 200)
+    case = belief_campaign.cases(recordings)["f9p"]().part(0, 200)
     obs = case.observations
     obs = replace(obs, code_m=obs.code_m + 20.0 * (obs.satellite == satellite))
     alone = {"lasting_errors": {"most_satellites": 0}} if by == "the filter" else {}

@@ -23,6 +23,7 @@ class _Program(LazyCommands):
         "explain": "Explain one epoch of a run: its satellites, sigma, level and status.",
         "export": "Write positions of a run for maps: KML, GPX, GeoJSON, GeoPackage, GeoParquet.",
         "campaign": "Position many logs side by side, resumable.",
+        "benchmark": "Run a folder of cases, judge railfix and other programs by the same code.",
         "demo": "Position the demonstration log and compare it with its ground truth.",
         "ablate": "Compare choices of screens on a log: all, none, each alone, all but each.",
         "evaluate": "Compute errors of runs against references.",

@@ -60,15 +60,9 @@ def campaign(
 
     Exit codes as `railfix --help` says; 5 where some runs have failed, 7 where every one has.
     """
-
-    def progress(*, done: int, failed: int, total: int, left_s: float) -> None:
-        minutes, seconds = divmod(round(left_s), 60)
-        typer.echo(f"{done} of {total} runs, {failed} failed, {minutes} min {seconds:02d} s left", err=True)
-        sys.stderr.flush()
-
-    with _executor(workers, scheduler) as (executor, lost):
+    with executor_of(workers, scheduler) as (executor, lost):
         prepare_kernels()
-        table = run_campaign(path, out=out, executor=executor, progress=progress, lost=lost)
+        table = run_campaign(path, out=out, executor=executor, progress=show_progress, lost=lost)
     failed = table.filter(status="failed")
     report = report_campaign(table, out)
     page = write_campaign_page(report, out / "campaign.html", title=f"railfix campaign: {path.stem}")
@@ -84,8 +78,15 @@ def campaign(
         raise MismatchError(f"{len(failed)} of {len(table)} runs failed; the first: {failed['error'][0]}")
 
 
+def show_progress(*, done: int, failed: int, total: int, left_s: float) -> None:
+    """Print how many runs are done, and the time left."""
+    minutes, seconds = divmod(round(left_s), 60)
+    typer.echo(f"{done} of {total} runs, {failed} failed, {minutes} min {seconds:02d} s left", err=True)
+    sys.stderr.flush()
+
+
 @contextmanager
-def _executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
+def executor_of(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
     """Give the executor, and the errors by which it reports that a worker process is gone.
 
     SettingsError: there is no such scheduler, or `distributed` is not installed.

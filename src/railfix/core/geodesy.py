@@ -88,6 +88,26 @@ def enu_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Floats:
     return axes
 
 
+def sigma_along(sigma_enu_m: Floats, ecef_m: Floats, direction: Floats) -> Floats:
+    """Compute the standard deviation along a direction from those east, north and up, uncorrelated.
+
+    Parameters
+    ----------
+    sigma_enu_m : ndarray, shape (T, 3) [m]
+    ecef_m : ndarray, shape (T, 3) [m]
+        Place, for the directions of east, north and up.
+    direction : ndarray, shape (T, 3)
+        Unit vectors in ECEF.
+
+    Returns
+    -------
+    ndarray, shape (T,) [m]
+    """
+    latitude, longitude, _ = geodetic_from_ecef(ecef_m)
+    components = np.einsum("tij,tj->ti", enu_axes(latitude, longitude), direction)
+    return np.asarray(np.sqrt(np.sum((components * sigma_enu_m) ** 2, axis=1)))
+
+
 def elevation_azimuth(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tuple[Floats, Floats]:
     """Compute elevation and azimuth of satellites at receivers.
 

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import sigma_along
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
 from railfix.reference.matching import MatchedReference, match
@@ -205,9 +205,7 @@ def _along_sigma(
     sigma_enu_m: Floats, ecef_m: Floats, trajectory: Trajectory, matched: MatchedReference, settings: ReferenceSettings
 ) -> Floats:
     """Standard deviation along the track from those east, north and up."""
-    latitude, longitude, _ = geodetic_from_ecef(ecef_m)
-    direction = np.einsum("fij,fj->fi", enu_axes(latitude, longitude), trajectory.tangent[matched.section])
-    sigma = np.sqrt(np.sum((direction * sigma_enu_m) ** 2, axis=1))
+    sigma = sigma_along(sigma_enu_m, ecef_m, trajectory.tangent[matched.section])
     return np.where(np.isnan(sigma), settings.fix_sigma_m, np.maximum(sigma, settings.fix_floor_m))
 
 

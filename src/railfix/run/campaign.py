@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import time as clock
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -190,7 +190,18 @@ def run_campaign(
     InputFileError, SettingsError, OutputError
         See `read_campaign`; the folder has other files in it.
     """
-    runs = read_campaign(path, out)
+    return position_runs(read_campaign(path, out), out=out, executor=executor, progress=progress, lost=lost)
+
+
+def position_runs(
+    runs: Sequence[CampaignRun],
+    *,
+    out: Path,
+    executor: Executor,
+    progress: CampaignProgress | None = None,
+    lost: tuple[type[Exception], ...] = (BrokenExecutor,),
+) -> pl.DataFrame:
+    """Position runs below the folder ``out / "runs"``; parameters, result and errors as `run_campaign`."""
     if out.is_dir() and any(out.iterdir()) and not (out / "runs").is_dir():
         raise OutputError(f"{out}: the folder is not empty, nor that of a campaign; name another one")
     began, results = clock.perf_counter(), {}

@@ -1,0 +1,222 @@
+"""Cases of a benchmark (``case.toml``): files of a run with their hashes, ground truth, licence and source."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import Field
+
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.files import file_sha256, read_text
+from railfix.core.settings import Settings, load_settings, validated, write_toml
+from railfix.evaluate.options import EvaluationOptions
+from railfix.pipeline.config import Config
+from railfix.run.inputs import Antenna, RunInputs
+from railfix.run.options import ColumnNames, RunOptions
+
+#: File that makes a folder a case.
+CASE_FILE: Final = "case.toml"
+_KIND: Final = "a case of a benchmark"
+#: Files of a run that are settings: one configuration is that of all cases.
+_SETTINGS: Final = ("config", "cn0_curve", "error_model", "sbas")
+
+
+class OtherPositions(Settings):
+    """Positions of another program: RTKLIB, NMEA, CSV or another kind that `railfix.io.nmea.read_any_positions` reads.
+
+    Attributes
+    ----------
+    file : Path
+    antenna : {"front", "rear"}
+    columns : ColumnNames
+        Of a CSV file with other names.
+    """
+
+    file: Path
+    antenna: Antenna = "front"
+    columns: ColumnNames = Field(default_factory=ColumnNames)
+
+
+class Scenario(Settings):
+    """Description of a test scenario for record and replay (EN 16803-2, EN 16803-1: set-up, trajectory, environment).
+
+    Attributes
+    ----------
+    date, place, environment, trajectory : str
+        Of the recording; "deep urban", "line with two tunnels".
+    vehicle, antenna, receiver, signals : str
+        Set-up conditions.
+    rate_hz, duration_s : float or None [Hz], [s]
+    reference : str
+        System of the ground truth.
+    reference_accuracy_m : float or None [m]
+        Its standard deviation.
+    """
+
+    date: str = ""
+    place: str = ""
+    environment: str = ""
+    trajectory: str = ""
+    vehicle: str = ""
+    antenna: str = ""
+    receiver: str = ""
+    signals: str = ""
+    rate_hz: float | None = Field(None, gt=0.0)
+    duration_s: float | None = Field(None, gt=0.0)
+    reference: str = ""
+    reference_accuracy_m: float | None = Field(None, gt=0.0)
+
+
+class CaseFile(Settings):
+    """Content of ``case.toml``; files are relative to its folder.
+
+    Attributes
+    ----------
+    licence, fetch : str
+        Licence of the data; how to get them.
+    held_out : bool
+        The case is for the benchmark alone: no test reads it and no setting was chosen with it.
+    files : RunInputs
+        As the options of `railfix run`, with the ground truth as `truth`.
+    sha256 : mapping of str to str
+        SHA-256 of every file of `files` and `positions`, by its name there.
+    positions : mapping of str to OtherPositions
+        Positions by the name of the program.
+    scenario : Scenario
+    options : RunOptions
+    evaluation : EvaluationOptions
+    """
+
+    licence: str = Field(min_length=1)
+    fetch: str = Field(min_length=1)
+    held_out: bool
+    files: RunInputs
+    sha256: dict[str, str]
+    positions: dict[str, OtherPositions] = Field(default_factory=dict)
+    scenario: Scenario = Scenario()
+    options: RunOptions = RunOptions()
+    evaluation: EvaluationOptions = EvaluationOptions()
+
+    def named(self) -> Iterator[Path]:
+        """Every file, as written."""
+        yield from self.files.paths
+        yield from (other.file for other in self.positions.values())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A case with its files where they are.
+
+    Attributes
+    ----------
+    name : str
+        That of its folder.
+    folder : Path
+    content : CaseFile
+    inputs : RunInputs
+        Without the ground truth.
+    truth : Path
+    """
+
+    name: str
+    folder: Path
+    content: CaseFile
+    inputs: RunInputs
+    truth: Path
+
+    def check_hashes(self) -> None:
+        """Check that every file is the one that the case was made of.
+
+        Raises
+        ------
+        InputFileError
+            A file is missing, or its hash is another.
+        SettingsError
+            ``case.toml`` has no hash of a file.
+        """
+        for name in self.content.named():
+            path, stated = self.folder / name, self.content.sha256.get(str(name))
+            if stated is None:
+                raise SettingsError(f"{self.folder / CASE_FILE}: sha256 has no entry for {name}; add its SHA-256")
+            if not path.is_file():
+                raise InputFileError(path, f"there is no such file; fetch it: {self.content.fetch}")
+            if (found := file_sha256(path)) != stated.lower():
+                raise InputFileError(
+                    path, f"has the SHA-256 {found[:12]}..., {CASE_FILE} states {stated[:12]}...; fetch it again: "
+                    f"{self.content.fetch}"
+                )  # fmt: skip
+
+
+def read_case(folder: Path) -> Case:
+    """Read the case in a folder.
+
+    Raises
+    ------
+    InputFileError
+        ``case.toml`` cannot be read.
+    SettingsError
+        It is not that of a case: a key is missing, misspelt or out of range.
+    """
+    path = folder / CASE_FILE
+    content = load_settings(CaseFile, path, what=_KIND)
+    if content.files.truth is None:
+        raise SettingsError(f"{path}: setting files.truth is missing; name the ground truth")
+    if given := [name for name in _SETTINGS if getattr(content.files, name)]:
+        raise SettingsError(f"{path}: files.{given[0]} is a setting; all cases have one configuration (--config)")
+    root = folder.absolute()
+    placed: dict[str, Any] = {}
+    for name in RunInputs.model_fields:
+        value = getattr(content.files, name)
+        if value is not None:
+            placed[name] = tuple(root / path for path in value) if isinstance(value, tuple) else root / value
+    truth = placed.pop("truth")
+    return Case(name=folder.resolve().name, folder=folder, content=content, inputs=RunInputs(**placed), truth=truth)
+
+
+def read_cases(folder: Path) -> list[Case]:
+    """Read the cases in the folders of a folder, or the one in the folder itself, in order of their names.
+
+    Raises
+    ------
+    InputFileError, SettingsError
+        There is no case, or one is not what it should be (`read_case`).
+    """
+    if not folder.is_dir():
+        raise InputFileError(folder, "there is no such folder; expected one of folders with a case.toml")
+    folders = (
+        [folder] if (folder / CASE_FILE).is_file() else sorted(path.parent for path in folder.glob(f"*/{CASE_FILE}"))
+    )
+    if not folders:
+        raise InputFileError(folder, f"no folder in it has a {CASE_FILE}; railfix benchmark --help shows one")
+    return [read_case(path) for path in folders]
+
+
+def write_case(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write the ``case.toml`` of a folder from its content without hashes, which are computed.
+
+    Raises
+    ------
+    InputFileError
+        A file that it names cannot be read.
+    SettingsError
+        The content is not that of a case.
+    """
+    case = validated(CaseFile, {**content, "sha256": {}}, source=str(folder / CASE_FILE))
+    hashes = {str(name): file_sha256(folder / name) for name in case.named()}
+    write_toml(folder / CASE_FILE, {**content, "sha256": hashes}, what=_KIND)
+
+
+def check_not_fitted(config: Config, cases: Sequence[Case]) -> None:
+    """Raise MismatchError where a file of the settings was fitted on a file of a held-out case.
+
+    C/N0 curves and error models record the SHA-256 of the files that they were made from.
+    """
+    files = [path for path in (config.cn0_curve, config.error_model) if path is not None]
+    for path in files:
+        text = read_text(path)
+        for case in cases:
+            if case.content.held_out and any(digest.lower() in text for digest in case.content.sha256.values()):
+                raise MismatchError(f"{path}: was made from the held-out case {case.name}; make it from others")

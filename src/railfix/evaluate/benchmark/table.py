@@ -1,0 +1,251 @@
+"""Run all cases of a benchmark with one configuration: one table of railfix and of other programs."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import polars as pl
+
+from railfix import __version__
+from railfix.core.errors import RailfixError
+from railfix.core.files import write_whole
+from railfix.core.timescale import seconds
+from railfix.evaluate.benchmark.cases import Case, check_not_fitted, read_cases
+from railfix.evaluate.benchmark.programs import RTKLIB_SINGLE, write_program_run, write_rtklib_single_point
+from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_runs
+from railfix.evaluate.figures import ALL, FIGURE_COLUMNS, positioned
+from railfix.evaluate.integrity import STANFORD_COLUMNS
+from railfix.evaluate.run_folder import POSITIONS_TABLE, tables_of
+from railfix.io.nmea import read_any_positions
+from railfix.io.position_log import PositionLog
+from railfix.pipeline.config import Config
+from railfix.run.campaign import CampaignProgress, CampaignRun, position_runs
+from railfix.run.inputs import Antenna
+
+#: Rows of railfix: name, table and kind of position.
+_OWN: Final = (
+    ("railfix filter", "train", "constrained"),
+    ("railfix single epochs", POSITIONS_TABLE, "constrained"),
+    ("railfix 3-D single point", POSITIONS_TABLE, "conventional"),
+)
+_OF_FIGURES: Final = (
+    "observed", "rate", "p50_m", "p95_m", "max_m", "distance_p50_m", "distance_p95_m", "distance_max_m",
+    "wrong_places", "normalised_p95",
+)  # fmt: skip
+_OF_STANFORD: Final = (
+    "alarm_limit_m", "judged", "nominal", "misleading", "hazardously_misleading", "unavailable",
+    "unavailable_misleading", "availability", "continuity_15_s",
+)  # fmt: skip
+#: Columns of the table with their meaning; those of `railfix evaluate` are its figures.
+BENCHMARK_COLUMNS: Final[dict[str, str]] = {
+    "case": "name of the folder",
+    "held_out": "no test reads the case, no setting was chosen with it",
+    "position": "positions that are judged; those of other programs are moved to the nearest point of the line",
+    "antenna": "`front` or `rear`; `all` for both together",
+    **{name: FIGURE_COLUMNS[name] for name in _OF_FIGURES},
+    "time_to_first_s": "from the first epoch with observations to the first position",
+    "over_level": "errors above their level without an alarm (levels `usable`)",
+    "over_level_alarm": "errors above their level where the run had raised an alarm or a doubt",
+    **{name: f"{STANFORD_COLUMNS[name]} (levels `usable`, own limit)" for name in _OF_STANFORD},
+    "error": "why there is no result",
+}
+#: Names in the table that people read: column, head, feature of EN 16803-1, decimals, factor.
+_SHOWN: Final = (
+    ("observed", "epochs", "", 0, 1),
+    ("rate", "rate %", "Availability", 1, 100),
+    ("p50_m", "along p50", "Accuracy", 2, 1),
+    ("p95_m", "p95", "Accuracy", 2, 1),
+    ("max_m", "max", "Accuracy", 1, 1),
+    ("distance_p50_m", "straight p50", "Accuracy", 2, 1),
+    ("distance_p95_m", "p95", "Accuracy", 2, 1),
+    ("distance_max_m", "max", "Accuracy", 1, 1),
+    ("wrong_places", "wrong places", "Accuracy", 0, 1),
+    ("normalised_p95", "error/sigma p95", "Accuracy", 2, 1),
+    ("over_level", "over level", "Integrity", 0, 1),
+    ("over_level_alarm", "with alarm", "Integrity", 0, 1),
+    ("hazardously_misleading", "hazardous", "Integrity", 0, 1),
+    ("availability", "level in limit %", "Availability", 1, 100),
+    ("continuity_15_s", "15 s %", "Continuity", 1, 100),
+    ("time_to_first_s", "first s", "TTFF", 1, 1),
+)
+
+
+def run_benchmark(
+    folder: Path,
+    config: Config,
+    *,
+    out: Path,
+    executor: Executor,
+    progress: CampaignProgress | None = None,
+    lost: tuple[type[Exception], ...] = (BrokenExecutor,),
+) -> tuple[pl.DataFrame, tuple[str, ...]]:
+    """Run the cases of a folder with one configuration, and judge them and the positions of other programs.
+
+    Into `out` come ``benchmark.csv``, ``benchmark.json`` (with the settings, and hashes, licences and scenarios of the
+    cases), ``benchmark.md``, and the folders of the runs: those of railfix in ``runs``, those of others in
+    ``programs``. Runs whose results are there, of the same inputs and settings, are not repeated.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of cases (`railfix.evaluate.benchmark.read_cases`).
+    config : Config
+        Settings of every case.
+    out, executor, progress, lost
+        As `railfix.run.campaign.run_campaign`.
+
+    Returns
+    -------
+    table : polars.DataFrame
+        `BENCHMARK_COLUMNS`, by case, then by position.
+    notes : tuple of str
+
+    Raises
+    ------
+    InputFileError, SettingsError
+        See `read_cases`; a file is not the one that its hash states: nothing is run then.
+    MismatchError
+        The settings were made from files of a held-out case.
+    OutputError
+        See `run_campaign`.
+    """
+    cases = read_cases(folder)
+    check_not_fitted(config, cases)
+    for case in cases:
+        case.check_hashes()
+    runs = [
+        CampaignRun(
+            fields={"case": case.name},
+            inputs=case.inputs,
+            config=config,
+            options=case.content.options,
+            out=out.absolute() / "runs" / f"case={case.name}",
+        )
+        for case in cases
+    ]
+    done = position_runs(runs, out=out, executor=executor, progress=progress, lost=lost)
+    rows: list[dict[str, Any]] = []
+    notes: list[str] = []
+    for case, run, result in zip(cases, runs, done.iter_rows(named=True), strict=True):
+        try:
+            if result["error"] is not None:
+                raise RailfixError(result["error"])
+            found, more = _judge(case, run, out.absolute() / "programs" / f"case={case.name}")
+        except RailfixError as error:
+            found, more = [{"error": " ".join(str(error).split())}], []
+        rows += [{"case": case.name, "held_out": case.content.held_out, **row} for row in found]
+        notes += [f"{case.name}: {note}" for note in more]
+    table = pl.DataFrame(
+        [{name: row.get(name) for name in BENCHMARK_COLUMNS} for row in rows], infer_schema_length=None
+    )
+    _write(table, notes, cases, config, out)
+    return table, tuple(notes)
+
+
+def _judge(case: Case, run: CampaignRun, out: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    """Evaluate railfix and the other programs on one case; rows and notes."""
+    tables = tables_of(run.out)
+    items = [RunAndReference(run=run.out, reference=case.truth, configuration=name, table=name) for name in tables]
+    others, notes = _programs(case, run, out)
+    items += [RunAndReference(run=path, reference=case.truth, configuration=name) for name, path in others.items()]
+    evaluation = evaluate_runs(items, options=case.content.evaluation)
+    by_name = {found.configuration: found for found in evaluation.runs}
+    rows = [_row(evaluation, by_name[table], name, kind) for name, table, kind in _OWN if table in tables]
+    return rows + [_row(evaluation, by_name[name], name, "constrained") for name in others], notes
+
+
+def _programs(case: Case, run: CampaignRun, out: Path) -> tuple[dict[str, Path], list[str]]:
+    """Write the positions of other programs as folders of runs, by name; notes."""
+    out.mkdir(parents=True, exist_ok=True)
+    notes: list[str] = []
+    single = out / "rtklib-single.pos"
+    note = write_rtklib_single_point(case.inputs, run.config, single)
+    logs: dict[str, tuple[PositionLog, Antenna]] = (
+        {} if note else {RTKLIB_SINGLE: (read_any_positions(single), "front")}
+    )
+    notes += [note] if note else []
+    for name, other in case.content.positions.items():
+        columns = other.columns.names
+        logs[name] = read_any_positions(case.folder.absolute() / other.file, columns=columns), other.antenna
+    folders = {name: out / re.sub(r"[^\w.-]+", "_", name) for name in logs}
+    for name, (log, antenna) in logs.items():
+        write_program_run(log, run.out, folders[name], antenna)
+        notes += [f"{name}: {text}" for text in log.notes]
+    return folders, notes
+
+
+def _row(evaluation: Evaluation, run: EvaluatedRun, name: str, kind: str) -> dict[str, Any]:
+    """Return the row of one kind of position of one run, of both antennas where there are two."""
+    figures = evaluation.figures.filter(run=run.name, grouping=ALL, epochs_of="own", position=kind)
+    antenna = ALL if ALL in figures["antenna"] else figures["antenna"][0]
+    row = figures.filter(antenna=antenna).row(0, named=True)
+    found: dict[str, Any] = {"position": name, "antenna": antenna, **{column: row[column] for column in _OF_FIGURES}}
+    found["time_to_first_s"] = _time_to_first(evaluation.epochs.filter(run=run.name), kind)
+    for levels in evaluation.integrity.values() if kind == "constrained" else ():
+        of_run = levels.stanford.filter(run=run.name, antenna=antenna, grouping=ALL, own_limit=True)
+        counts = {row["levels_of"]: row for row in of_run.iter_rows(named=True)}
+        if counts:
+            usable = counts["usable"]
+            found |= {column: usable[column] for column in _OF_STANFORD}
+            found["over_level"] = usable["beyond"]
+            found["over_level_alarm"] = counts["all"]["beyond"] - usable["beyond"]
+    return found
+
+
+def _time_to_first(epochs: pl.DataFrame, kind: str) -> float | None:
+    """Time from the first epoch with observations to the first with a position [s]; None where there is none."""
+    observed, placed = (epochs.filter(mask)["time_gpst"].to_numpy() for mask in (pl.col("observed"), positioned(kind)))
+    return float(seconds(placed.min() - observed.min())) if len(observed) and len(placed) else None
+
+
+def _cells(row: Mapping[str, Any]) -> Iterator[str]:
+    """Texts of one row of the table that people read."""
+    yield f"{row['case']}{' (held out)' if row['held_out'] else ''}"
+    yield row["position"] or f"failed: {row['error']}"
+    for column, _, _, decimals, factor in _SHOWN:
+        yield "-" if row[column] is None else f"{factor * row[column]:,.{decimals}f}"
+
+
+def heads() -> tuple[list[str], list[str]]:
+    """Heads of the table that people read, and the performance feature of EN 16803-1 of each column."""
+    return ["case", "position", *(head for _, head, *_ in _SHOWN)], ["", "", *(name for _, _, name, *_ in _SHOWN)]
+
+
+def shown_rows(table: pl.DataFrame) -> list[list[str]]:
+    """Rows of the table that people read; "-" where a column has no value."""
+    return [list(_cells(row)) for row in table.iter_rows(named=True)]
+
+
+def markdown_table(table: pl.DataFrame) -> str:
+    """Return the table in Markdown; the second line of the heads has the features of EN 16803-1."""
+    names, features = heads()
+    lines = [names, ["---", "---", *["---:"] * len(_SHOWN)], ["EN 16803-1", "", *features[2:]], *shown_rows(table)]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _write(table: pl.DataFrame, notes: Sequence[str], cases: Sequence[Case], config: Config, out: Path) -> None:
+    """Write the table as CSV, JSON and Markdown."""
+    write_whole(out / "benchmark.csv", table.write_csv(), what="table of the benchmark")
+    write_whole(out / "benchmark.md", markdown_table(table), what="table of the benchmark")
+    about = {case.name: case.content.model_dump(mode="json", include=_ABOUT) for case in cases}
+    record = {
+        "railfix": __version__,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "columns": BENCHMARK_COLUMNS,
+        "en_16803_1": {column: feature for column, _, feature, *_ in _SHOWN if feature},
+        "cases": about,
+        "settings_used": config.as_dict(),
+        "notes": list(notes),
+        "rows": table.to_dicts(),
+    }
+    write_whole(out / "benchmark.json", json.dumps(record, indent=2, allow_nan=False) + "\n", what="benchmark")
+
+
+#: What ``benchmark.json`` records of a case.
+_ABOUT: Final = {"held_out", "licence", "fetch", "sha256", "scenario"}
