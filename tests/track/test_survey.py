@@ -114,6 +114,22 @@ def test_laps_of_a_ring_are_one_closed_line() -> None:
     assert np.percentile(across_m(survey, line), 95) < 4.5
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("apart_m", "other"), [(16.0, True), (1.0, False)])
+def test_the_track_beside_is_not_averaged_into_the_line(apart_m: float, other: bool) -> None:
+    """There on one track, back on one to the left of it; on the same one, but for the antenna, they make one line."""
+    line = open_line()
+    way = np.gradient(line[:, :2], axis=0)
+    left = np.stack([-way[:, 1], way[:, 0]], axis=1) / np.linalg.norm(way, axis=1, keepdims=True)
+    beside = line + np.pad(apart_m * left, ((0, 0), (0, 1)))
+    out, back = np.arange(0.0, 2090.0, 15.0), np.arange(2090.0, 0.0, -16.0)
+    runs = [run_over(line, out, 1, sigma_m=1.0), run_over(line, out + 7.0, 2, sigma_m=1.0)]
+    survey = survey_line([*runs, run_over(beside, back, 3, sigma_m=1.0)])
+    assert any("another track, left out" in note for note in survey.track.provenance.notes) == other
+    assert np.percentile(across_m(survey, line), 95) < 2.0
+    assert (survey.beside_m > 1000.0) == other
+
+
 def test_a_branch_is_reported_and_left_out() -> None:
     line = open_line()
     branch = np.concatenate([line[:700], line[700] + np.arange(1, 500)[:, None] * np.array([-0.7, 0.7, 0.0])])

@@ -13,12 +13,25 @@ from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.track.from_positions import ANTENNA_PATH
 from railfix.track.survey.adjustment import Adjusted, adjust
 from railfix.track.survey.equations import ReferenceLine
-from railfix.track.survey.passes import Course, Leg, Pass, Ties, find_course, find_legs, find_passes, find_ties
+from railfix.track.survey.passes import (
+    Course,
+    Leg,
+    Pass,
+    Ties,
+    find_course,
+    find_legs,
+    find_passes,
+    find_ties,
+    without_other_track,
+)
 from railfix.track.survey.runs import SurveyLimits, SurveyRun
 from railfix.track.track import Provenance, Track
 
 #: Adjustments with the line; after each of them the passes are found again.
 _ROUNDS: Final = 3
+#: The directions have a track each where they lie apart by more than so many standard deviations of what a run may be
+#: off: three of the difference of two.
+_OTHER_TRACK: Final = 3.0 * 2.0**0.5
 #: Way over which a change of direction is looked for [m].
 _TURN_M: Final = 40.0
 #: Points that show the direction at an end of the line.
@@ -85,6 +98,7 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
     adjusted = adjust(runs, near, limits=limits) if any(run.signals is not None for run in runs) else None
     positions = near if adjusted is None else adjusted.ecef_m
     course: Course | None = None
+    tolerance = _OTHER_TRACK * max(float(np.hypot(run.common_sigma_m[0], limits.apart_m)) for run in runs)
     for k in range(_ROUNDS):
         local = [(ecef - origin) @ axes.T for ecef in positions]
         legs = [leg for r, run in enumerate(runs) for leg in find_legs(r, local[r], run.seconds, limits, _TURN_M)]
@@ -92,6 +106,9 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
             raise ValueError(f"no run moves by {limits.spacing_m:g} m; positions of a line were expected")
         course = find_course(legs, limits) if course is None else course
         passes, beside = find_passes(course, legs, limits)
+        whole = sum(len(each.place) for each in passes)
+        passes, apart = without_other_track(course, legs, passes, limits, tolerance)
+        beside += limits.spacing_m * (whole - sum(len(each.place) for each in passes))
         ties = find_ties(course, legs, passes)
         line = _reference_line(course, origin, axes)
         adjusted = adjust(
@@ -103,7 +120,15 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
         positions = adjusted.ecef_m
     assert adjusted is not None
     assert course is not None
-    return _survey(runs, legs, passes, ties, adjusted, course, moved, beside, name)
+    found = _survey(runs, legs, passes, ties, adjusted, course, moved, beside, name)
+    if not apart:
+        return found
+    note = (
+        f"the runs of one direction lie {apart:.1f} m beside those of the other: another track, left out; give the "
+        "runs of each track by themselves"
+    )
+    notes = (*found.track.provenance.notes, note)
+    return replace(found, track=replace(found.track, provenance=replace(found.track.provenance, notes=notes)))
 
 
 def _filled(run: SurveyRun) -> Floats:

@@ -333,6 +333,33 @@ def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tu
     return passes, beside
 
 
+def without_other_track(
+    course: Course, legs: Sequence[Leg], passes: Sequence[Pass], limits: SurveyLimits, tolerance_m: float
+) -> tuple[list[Pass], float]:
+    """Return the passes of one track, and how far those of the other direction lie beside it [m]; 0 where they do not.
+
+    The directions have a track each where the medians of their distances from the course differ by more than the
+    tolerance and most of one lies on one side of the other. The direction with more passes is kept.
+    """
+    across: dict[int, Floats] = {}
+    for sign in (1, -1):
+        found = [
+            match_points(course, legs[each.leg].at(each.arc_m), limits.same_line_m)[2]
+            for each in passes
+            if each.sign == sign
+        ]
+        across[sign] = np.concatenate([*found, np.zeros(0)])
+        across[sign] = across[sign][np.isfinite(across[sign])]
+    if min(len(values) for values in across.values()) * limits.spacing_m < _SEAM_M:
+        return list(passes), 0.0
+    kept = 1 if len(across[1]) >= len(across[-1]) else -1
+    beside = across[-kept] - np.median(across[kept])
+    distance = float(np.median(beside))
+    if abs(distance) <= tolerance_m or float((np.sign(beside) == np.sign(distance)).mean()) < _MOSTLY:
+        return list(passes), 0.0
+    return [each for each in passes if each.sign == kept], abs(distance)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Ties:
     """Where runs pass the points of the line, m ties.
