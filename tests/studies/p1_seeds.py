@@ -4,6 +4,7 @@ Run ``python tests/studies/p1_seeds.py PART`` for the tables of docs/p1-results.
 
 ======== ===========================================================================
 seeds    the first ten minutes of twenty lines and places of seeds of their own: station, tall buildings, town
+city     twenty runs of the scenario `city`, whose surroundings are fitted to recordings, of the same seeds
 screens  the lines of P1's chapter 5 with preset `p1`, each screen left out in turn
 ======== ===========================================================================
 """
@@ -18,11 +19,24 @@ from typing import Final
 
 import numpy as np
 
-from p1_experiment import DEFAULT, GOAL_M, HEAD, WAYS, YARDSTICK, commercial, everywhere, extent, row
-from p1_ride import Campaign, Way, together
+from p1_experiment import (
+    DEFAULT,
+    FILTERED,
+    GOAL_M,
+    HEAD,
+    WAYS,
+    YARDSTICK,
+    commercial,
+    everywhere,
+    extent,
+    main_table,
+    row,
+)
+from p1_ride import Bench, Campaign, Way, cn0_curve, ridden, together
 from p1_rtklib import ABSENT, PROGRAM
 from railfix.core.arrays import Floats
 from railfix.screens import SCREENS
+from railfix.simulate.scenario_file import load_recipe
 
 #: Seeds that no setting was chosen on.
 SEEDS: Final = tuple(range(501, 521))
@@ -30,6 +44,9 @@ SYSTEMS: Final = ("G", "GJ")
 DURATION_S: Final = 600.0
 #: Conventional, RTKLIB's and railfix's positions.
 SEED_WAYS: Final = (*WAYS[:3], Way("p1", {"preset": "p1"}), Way("strict", DEFAULT, "checked", largest_sigma_m=10.0))
+#: In the city the filter too; GPS, and with BeiDou as its receivers have it.
+CITY_WAYS: Final = (*SEED_WAYS, Way("filter", FILTERED, "filtered"))
+CITY_SYSTEMS: Final = ("G", "GC")
 #: Without each screen of P1 in turn.
 _NAMES: Final = tuple(screen.name for screen in SCREENS)
 SCREEN_WAYS: Final = (
@@ -43,6 +60,7 @@ SCREEN_WAYS: Final = (
 )
 #: Draws of the bootstrap over the lines.
 _DRAWS: Final = 4000
+PARTS: Final = ("seeds", "city", "screens")
 
 
 def interval(values: Floats, weights: Floats) -> tuple[float, float, float]:
@@ -78,7 +96,7 @@ def seeds_report(campaigns: Sequence[Campaign]) -> Iterator[str]:
         ]
         spread = f"{np.median(most):.1f}, {min(most):.1f} .. {max(most):.1f}"
         under = sum(value < GOAL_M for value in most)
-        yield f"{'+'.join(letters):7s}{name:14s}{cells[0]:>27s}{cells[1]:>27s}{spread:>36s}  {under:d} of {len(most)}"
+        yield f"{'+'.join(letters):7s}{name:14s}{cells[0]:>27s} {cells[1]:>26s}{spread:>36s}  {under:d} of {len(most)}"
 
 
 def screens_report(campaign: Campaign) -> Iterator[str]:
@@ -95,16 +113,33 @@ def report(part: str, folder: Path) -> Iterator[str]:
     if part == "screens":
         yield from screens_report(commercial(folder, ways=SCREEN_WAYS, systems=SYSTEMS))
         return
+    make = city if part == "city" else first_minutes
     campaigns = []
-    for k, seed in enumerate(SEEDS):
-        campaigns.append(commercial(folder, (k % 4,), seed, SEED_WAYS, SYSTEMS, DURATION_S))
+    for number, seed in enumerate(SEEDS):
+        campaigns.append(make(folder, number))
         print(f"seed {seed}", file=sys.stderr, flush=True)
     yield from seeds_report(campaigns)
+    if part == "city":
+        yield "\nall lines"
+        yield from main_table(together(campaigns), everywhere)
+
+
+def first_minutes(folder: Path, number: int) -> Campaign:
+    """First minutes of a run of the scenario p1-commercial on a line and place of a seed."""
+    return commercial(folder, (number % 4,), SEEDS[number], SEED_WAYS, SYSTEMS, DURATION_S)
+
+
+def city(folder: Path, number: int) -> Campaign:
+    """Run of the scenario city on a line and place of a seed."""
+    seed = SEEDS[number]
+    changes = {"seed": seed, "place_seed": seed, "line": {"generated": {"seed": seed}}}
+    scenario = load_recipe("city").scenario(changes=changes)
+    return ridden(Bench(scenario, f"city-{seed}", CITY_WAYS, CITY_SYSTEMS, cn0_curve(folder, "city")))
 
 
 def main(arguments: Sequence[str]) -> int:
-    if len(arguments) != 1 or arguments[0] not in ("seeds", "screens"):
-        print("give one of seeds, screens", file=sys.stderr)
+    if len(arguments) != 1 or arguments[0] not in PARTS:
+        print(f"give one of {', '.join(PARTS)}", file=sys.stderr)
         return 2
     with tempfile.TemporaryDirectory() as folder:
         for line in report(arguments[0], Path(folder)):

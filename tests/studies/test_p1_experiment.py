@@ -71,7 +71,7 @@ def test_a_whole_part_is_as_they_were(part: str, tmp_path: Path) -> None:
 @needs_rtklib
 @pytest.mark.slow
 @pytest.mark.requirement("D2")
-@pytest.mark.parametrize("part", ["screens", "seeds"])
+@pytest.mark.parametrize("part", ["screens", "seeds", "city"])
 def test_screens_and_unseen_lines_are_as_they_were(part: str, tmp_path: Path) -> None:
     assert_same("\n".join(p1_seeds.report(part, tmp_path)).splitlines(), shown(part))
 
