@@ -33,7 +33,7 @@ _BLOCKS: Final = (
     ("filtered", "G+J+E", "", ("filter", "filter, wheel, inertial")),
 )
 #: Parts with twenty lines each, and the titles of their panels.
-PARTS: Final = {"seeds": "twenty lines"}
+PARTS: Final = {"seeds": "twenty lines", "city": "twenty lines in a city"}
 _COLOURS: Final = ("#0072b2", "#d55e00")
 _LINE: Final = re.compile(
     r"(?P<systems>\S+) +(?P<way>\S+) +[\d.]+ \([^)]*\) +(?P<mean>[\d.]+) \((?P<low>[\d.]+) \.\. (?P<high>[\d.]+)\) +"
@@ -115,10 +115,10 @@ def draw() -> Figure:
             axes.grid(alpha=0.3)
             axes.set_title(title, fontsize="medium")
         row[0].set_xscale("symlog", linthresh=1.0)
-        row[0].set_xlim(left=0.0)
         row[1].set_xscale("log")
         row[1].axvline(10.0, color="#808080", lw=0.8)
         row[1].legend(loc="lower right")
+    panels[-1, 0].set_xlim(left=0.0)
     panels[-1, 0].set_xlabel("errors over 10 m, of 10 000 (95 % interval)")
     panels[-1, 1].set_xlabel("largest error of a line [m] (least to most)")
     return figure
