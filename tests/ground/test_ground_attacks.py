@@ -27,7 +27,7 @@ from railfix.ground.stops import overlaps_stopped, release_train
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.ground.train import _Desk, is_complete
-from railfix.ground.triangle import Verdict
+from railfix.ground.triangle import TriangleVerdict
 from railfix.io.train_message import MessageStatus, TrainMessage, decode
 from test_ground_interlocking import RULES, take_out
 
@@ -249,28 +249,28 @@ def test_the_worst_verdict_between_two_steps_counts_and_old_ones_do_not(tmp_path
         control = centre(store, judged=True)
         assert control.monitor is not None
         control.monitor = replace(control.monitor, stopped=False)
-        control.judge(Verdict.SPOOFING, age_s=60.0)
-        control.judge(Verdict.HEALTHY)
+        control.judge(TriangleVerdict.SPOOFING, age_s=60.0)
+        control.judge(TriangleVerdict.HEALTHY)
         control.step()
         assert not control.supervision.state.stopped
-        control.judge(Verdict.SPOOFING)
-        control.judge(Verdict.HEALTHY)
+        control.judge(TriangleVerdict.SPOOFING)
+        control.judge(TriangleVerdict.HEALTHY)
         control.step()
         assert control.supervision.state.stopped
-        assert control.monitor.cause is Verdict.SPOOFING
+        assert control.monitor.cause is TriangleVerdict.SPOOFING
 
 
-@pytest.mark.parametrize("later", [Verdict.HEALTHY, Verdict.MONITOR_LOST, Verdict.JAMMING])
-def test_spoofing_is_not_lost_behind_an_absent_fix(tmp_path: Path, later: Verdict) -> None:
+@pytest.mark.parametrize("later", [TriangleVerdict.HEALTHY, TriangleVerdict.MONITOR_LOST, TriangleVerdict.JAMMING])
+def test_spoofing_is_not_lost_behind_an_absent_fix(tmp_path: Path, later: TriangleVerdict) -> None:
     with Store(f"sqlite:///{tmp_path / 'centre.db'}") as store:
         control = centre(store, judged=True)
         assert control.monitor is not None
         control.monitor = replace(control.monitor, stopped=False)
-        for verdict in (Verdict.SPOOFING, later):
+        for verdict in (TriangleVerdict.SPOOFING, later):
             control.judge(verdict)
         control.step()
         assert control.supervision.state.stopped
-        assert control.monitor.cause is Verdict.SPOOFING
+        assert control.monitor.cause is TriangleVerdict.SPOOFING
 
 
 def test_an_authority_from_before_a_start_on_board_is_refused() -> None:

@@ -35,7 +35,7 @@ from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
 from railfix.ground.train import run_train
-from railfix.ground.triangle import Verdict
+from railfix.ground.triangle import TriangleVerdict
 from railfix.io.train_message import encode, to_json
 
 pytestmark = pytest.mark.requirement("F2")
@@ -271,26 +271,26 @@ def test_routes_and_the_release_by_hand(
     control, sent, now = centre
     orders = orders_of(control)
 
-    def seconds(count: int, verdict: Verdict | None) -> None:
+    def seconds(count: int, verdict: TriangleVerdict | None) -> None:
         for _ in range(count):
             now[0] += 1.0
             if verdict is not None:
                 control.judge(verdict)
             control.step()
 
-    seconds(1, Verdict.HEALTHY)
+    seconds(1, TriangleVerdict.HEALTHY)
     assert sent[-1].stopped  # a first start has to be released
     assert orders["route"]({"train": 1}) == "satellite positioning is suspended"
     assert (orders["release"]({}) or "").startswith("healthy for 0 s")
-    seconds(6, Verdict.HEALTHY)
+    seconds(6, TriangleVerdict.HEALTHY)
     assert orders["release"]({}) is None
-    seconds(1, Verdict.HEALTHY)
+    seconds(1, TriangleVerdict.HEALTHY)
     assert not sent[-1].stopped
     assert {a.train: a.end_cm for a in sent[-2:]} == {1: 42_000, 2: 308_000}  # no route without an order
     assert orders["route"]({"train": "1"}) == "train: a number was expected"
     assert orders["route"]({"train": 5}) == "there is no train 5"
     assert orders["route"]({"train": 1}) is None
-    seconds(1, Verdict.HEALTHY)
+    seconds(1, TriangleVerdict.HEALTHY)
     assert sent[-2].end_cm == 192_000
     assert "A" in control.point_name((0, 1))
     for line in ("stop released by hand", "train 1: route asked for by hand", "train 1: route to B, track 1"):
@@ -309,7 +309,7 @@ def test_routes_and_the_release_by_hand(
     seconds(1, None)
     again = restored(control.store, layout_state(), sent, now)  # as after a kill
     assert again.monitor is not None
-    assert (again.monitor.stopped, again.monitor.cause) == (True, Verdict.MONITOR_LOST)
+    assert (again.monitor.stopped, again.monitor.cause) == (True, TriangleVerdict.MONITOR_LOST)
     assert again.supervision.state.trains[1].end_m == 1920.0
     assert again.moved == [(1, -1)]  # type: ignore[attr-defined]
     numbers = [a.number for a in sent]

@@ -27,7 +27,7 @@ from railfix.ground.triangle import (
     SIDES,
     STOPPING,
     TriangleLimits,
-    Verdict,
+    TriangleVerdict,
     _verdicts,
     compare_triangle,
     limits_for_false_stops,
@@ -43,22 +43,22 @@ LIMITS = TriangleLimits(radius_m=12.0, side_m=6.0)
 TIMES = MonitorLimits()
 
 
-def table_verdict(inside: tuple[bool, ...], small: tuple[bool, ...], coincide: bool) -> tuple[Verdict, int]:
+def table_verdict(inside: tuple[bool, ...], small: tuple[bool, ...], coincide: bool) -> tuple[TriangleVerdict, int]:
     """The table of docs/ground-triangle.md, written a second time by counting; sides are 01, 12, 20."""
     outside, large = inside.count(False), small.count(False)
     between = {frozenset({0, 2}): 0, frozenset({0, 1}): 1, frozenset({1, 2}): 2}
     shared = between.get(frozenset(k for k in range(3) if not small[k]), -1) if large == 2 else -1
     if outside == 0 and large == 0:
-        return Verdict.HEALTHY, -1
+        return TriangleVerdict.HEALTHY, -1
     if outside == 0 and large in (1, 2):
-        return Verdict.RECEIVER_DRIFTING, shared
+        return TriangleVerdict.RECEIVER_DRIFTING, shared
     if outside == 1 and shared >= 0 and not inside[shared]:
-        return Verdict.ONE_RECEIVER, shared
+        return TriangleVerdict.ONE_RECEIVER, shared
     if outside == 3 and large == 0:
-        return Verdict.SATELLITES_OR_JAMMING, -1
+        return TriangleVerdict.SATELLITES_OR_JAMMING, -1
     if outside >= 2 and coincide:
-        return Verdict.SPOOFING, -1
-    return Verdict.GROUND_LOST, -1
+        return TriangleVerdict.SPOOFING, -1
+    return TriangleVerdict.GROUND_LOST, -1
 
 
 def test_truth_table_of_all_combinations() -> None:
@@ -67,7 +67,7 @@ def test_truth_table_of_all_combinations() -> None:
         verdict, receiver = _verdicts(
             np.array([True]), np.array([inside]), np.array([small]), np.array([coincide]), np.array([False])
         )
-        assert (Verdict(int(verdict[0])), int(receiver[0])) == table_verdict(inside, small, coincide)
+        assert (TriangleVerdict(int(verdict[0])), int(receiver[0])) == table_verdict(inside, small, coincide)
 
 
 OUT, FAR = np.array([20.0, 0.0]), np.array([300.0, 40.0])
@@ -76,21 +76,21 @@ OUT, FAR = np.array([20.0, 0.0]), np.array([300.0, 40.0])
 @pytest.mark.parametrize(
     ("moved", "verdict", "receiver"),
     [
-        (np.zeros((3, 2)), Verdict.HEALTHY, -1),
-        (np.array([[0, 0], [8.0, 0], [0, 0]]), Verdict.RECEIVER_DRIFTING, 1),
-        (np.array([[0, 0], [0, 0], OUT]), Verdict.ONE_RECEIVER, 2),
-        (np.array([OUT, OUT, OUT]), Verdict.SATELLITES_OR_JAMMING, -1),
-        (FAR - PLAN_M, Verdict.SPOOFING, -1),
-        (PLAN_M[0] - PLAN_M, Verdict.SPOOFING, -1),
-        (np.array([OUT, OUT, [9.0, 0]]), Verdict.GROUND_LOST, -1),
-        (np.array([OUT, -OUT, [0, 0]]), Verdict.GROUND_LOST, -1),
-        (np.array([[12.5, 0], [8.0, 0], [8.0, 0]]), Verdict.GROUND_LOST, -1),
-        (np.array([[0, 0], [np.nan, 0], [0, 0]]), Verdict.MONITOR_LOST, -1),
+        (np.zeros((3, 2)), TriangleVerdict.HEALTHY, -1),
+        (np.array([[0, 0], [8.0, 0], [0, 0]]), TriangleVerdict.RECEIVER_DRIFTING, 1),
+        (np.array([[0, 0], [0, 0], OUT]), TriangleVerdict.ONE_RECEIVER, 2),
+        (np.array([OUT, OUT, OUT]), TriangleVerdict.SATELLITES_OR_JAMMING, -1),
+        (FAR - PLAN_M, TriangleVerdict.SPOOFING, -1),
+        (PLAN_M[0] - PLAN_M, TriangleVerdict.SPOOFING, -1),
+        (np.array([OUT, OUT, [9.0, 0]]), TriangleVerdict.GROUND_LOST, -1),
+        (np.array([OUT, -OUT, [0, 0]]), TriangleVerdict.GROUND_LOST, -1),
+        (np.array([[12.5, 0], [8.0, 0], [8.0, 0]]), TriangleVerdict.GROUND_LOST, -1),
+        (np.array([[0, 0], [np.nan, 0], [0, 0]]), TriangleVerdict.MONITOR_LOST, -1),
     ],
 )
-def test_moved_fixes(moved: np.ndarray, verdict: Verdict, receiver: int) -> None:
+def test_moved_fixes(moved: np.ndarray, verdict: TriangleVerdict, receiver: int) -> None:
     result = compare_triangle(PLAN_M, (PLAN_M + moved)[None], limits=LIMITS)
-    assert (Verdict(int(result.verdict[0])), int(result.receiver[0])) == (verdict, receiver)
+    assert (TriangleVerdict(int(result.verdict[0])), int(result.receiver[0])) == (verdict, receiver)
 
 
 def test_distance_and_bearing_of_a_turned_triangle() -> None:
@@ -113,7 +113,7 @@ def test_nan_never_reads_as_inside(values: list[float], absent: int) -> None:
     fixes[0, absent // 2, absent % 2] = np.nan
     with np.errstate(invalid="ignore"):
         result = compare_triangle(PLAN_M, fixes, limits=LIMITS)
-    assert result.verdict[0] == Verdict.MONITOR_LOST
+    assert result.verdict[0] == TriangleVerdict.MONITOR_LOST
 
 
 def test_a_triangle_too_small_for_its_limits_is_rejected() -> None:
@@ -142,11 +142,11 @@ def test_false_stops_stay_below_the_rate_that_was_set(per_sample: float) -> None
 
 FAULTS = ("satellite ramp", "satellite clock step", "one receiver", "drift inside", "jamming", "spoofing")
 CAUSES = {
-    "satellite ramp": Verdict.SATELLITES_OR_JAMMING,
-    "satellite clock step": Verdict.SATELLITES_OR_JAMMING,
-    "one receiver": Verdict.ONE_RECEIVER,
-    "jamming": Verdict.JAMMING,
-    "spoofing": Verdict.SPOOFING,
+    "satellite ramp": TriangleVerdict.SATELLITES_OR_JAMMING,
+    "satellite clock step": TriangleVerdict.SATELLITES_OR_JAMMING,
+    "one receiver": TriangleVerdict.ONE_RECEIVER,
+    "jamming": TriangleVerdict.JAMMING,
+    "spoofing": TriangleVerdict.SPOOFING,
 }
 
 
@@ -174,7 +174,7 @@ def test_cause_and_time_to_alert_of_faults(fault: str) -> None:
         fixes = simulated_fixes(rng, common_m=common, moved_m=moved)
         log = monitor_log(fixes, limits=LIMITS)
         verdicts = log.triangle.verdict
-        assert (verdicts[:20] == Verdict.HEALTHY).all()
+        assert (verdicts[:20] == TriangleVerdict.HEALTHY).all()
         if fault == "drift inside":
             # the circles alone, P3's method, see nothing; the sides of the raw fixes do
             assert (log.triangle.error_m[:, 2][since >= 17] < LIMITS.radius_m).all()
@@ -191,41 +191,43 @@ def test_cause_and_time_to_alert_of_faults(fault: str) -> None:
         assert begun <= stopped <= begun + 6.0
         state = MonitorState(stopped=False)
         for k, value in enumerate(verdicts.tolist()):
-            state, _ = advance(state, float(k), Verdict(value), receiver=int(log.triangle.receiver[k]), limits=TIMES)
+            state, _ = advance(
+                state, float(k), TriangleVerdict(value), receiver=int(log.triangle.receiver[k]), limits=TIMES
+            )
         assert state.cause is CAUSES[fault], seed
         if fault == "one receiver":
             assert state.receiver == 1
 
 
 def test_a_stop_is_latched_and_released_by_hand_after_healthy_time() -> None:
-    state, orders = advance(MonitorState(stopped=False), 1.0, Verdict.SPOOFING, limits=TIMES)
+    state, orders = advance(MonitorState(stopped=False), 1.0, TriangleVerdict.SPOOFING, limits=TIMES)
     assert orders == (Order.SUSPEND, Order.STOP)
     for now in range(2, 400):
         before = release(state, float(now - 1), limits=TIMES)
         assert before[2] is not None or now > 302
-        state, orders = advance(state, float(now), Verdict.HEALTHY, limits=TIMES)
+        state, orders = advance(state, float(now), TriangleVerdict.HEALTHY, limits=TIMES)
         assert orders == ()
         assert state.stopped
-        assert state.cause is Verdict.SPOOFING
+        assert state.cause is TriangleVerdict.SPOOFING
     assert release(state, 410.0, limits=TIMES)[2] is not None  # the fixes are late
     state, orders, reason = release(state, 399.0, limits=TIMES)
     assert (state.stopped, orders, reason) == (False, (Order.RESUME,), None)
 
 
 def test_healthy_time_begins_again_after_an_absent_fix() -> None:
-    state, _ = advance(MonitorState(stopped=False), 0.0, Verdict.GROUND_LOST, limits=TIMES)
+    state, _ = advance(MonitorState(stopped=False), 0.0, TriangleVerdict.GROUND_LOST, limits=TIMES)
     for now in range(1, 301):
-        state, _ = advance(state, float(now), None if now == 150 else Verdict.HEALTHY, limits=TIMES)
+        state, _ = advance(state, float(now), None if now == 150 else TriangleVerdict.HEALTHY, limits=TIMES)
     assert release(state, 300.0, limits=TIMES)[2] == "healthy for 149 s of the 300 s before a release"
 
 
 def test_nothing_from_a_receiver_stops_after_the_late_time() -> None:
-    state, _ = advance(MonitorState(stopped=False), 0.0, Verdict.HEALTHY, limits=TIMES)
+    state, _ = advance(MonitorState(stopped=False), 0.0, TriangleVerdict.HEALTHY, limits=TIMES)
     state, orders = advance(state, 3.0, None, limits=TIMES)
     assert orders == ()
     state, orders = advance(state, 3.1, None, limits=TIMES)
     assert orders == (Order.SUSPEND, Order.STOP)
-    assert state.cause is Verdict.MONITOR_LOST
+    assert state.cause is TriangleVerdict.MONITOR_LOST
     with pytest.raises(ValueError, match="ran back"):
         advance(replace(state, complete_s=5.0), 4.0, None, limits=TIMES)
 
@@ -328,7 +330,7 @@ def test_a_receiver_without_satellites_gives_no_fix_and_all_three_are_jamming() 
     assert fixes.cn0_fallen.all()
     assert np.isnan(fixes.fixes_m).all()
     triangle = compare_triangle(PLAN_M, fixes.fixes_m, limits=LIMITS, cn0_fallen=fixes.cn0_fallen)
-    assert triangle.verdict[0] == Verdict.JAMMING
+    assert triangle.verdict[0] == TriangleVerdict.JAMMING
     # one receiver alone is behind: nothing comes out, and the older epochs are dropped when it is back
     for second in range(23, 26):
         for k in (0, 1):

@@ -11,11 +11,11 @@ import pytest
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import timedelta
 from railfix.integrity.interference import (
-    Cause,
     HeldState,
     InterferenceLimits,
-    MotionState,
+    MotionSignState,
     PowerState,
+    Sign,
     Suspicion,
     cause_text,
     held,
@@ -144,8 +144,8 @@ def scene(*, epochs: int = 40, jump: float = 0.0, clock: float = 0.0, parted: fl
 def test_a_jump_shows_in_its_own_statistic_alone_at_its_epoch(
     change: dict[str, float], name: str, least: float
 ) -> None:
-    quiet, _ = motion_signs(scene(), MotionState(), LIMITS)
-    found, _ = motion_signs(scene(**change), MotionState(), LIMITS)
+    quiet, _ = motion_signs(scene(), MotionSignState(), LIMITS)
+    found, _ = motion_signs(scene(**change), MotionSignState(), LIMITS)
     assert np.nanmax(np.abs(getattr(quiet, name))) < 0.3 * least
     assert abs(getattr(found, name)[25]) > least
     assert not (np.abs(getattr(found, name)[:25]) > 0.3 * least).any()
@@ -156,15 +156,15 @@ def test_a_jump_shows_in_its_own_statistic_alone_at_its_epoch(
 
 @pytest.mark.requirement("B8")
 def test_a_clock_that_steps_by_milliseconds_does_not_count() -> None:
-    found, _ = motion_signs(scene(clock=2e-3 * SPEED_OF_LIGHT), MotionState(), LIMITS)
+    found, _ = motion_signs(scene(clock=2e-3 * SPEED_OF_LIGHT), MotionSignState(), LIMITS)
     assert np.nanmax(np.abs(found.clock_jump_m)) < 5.0
 
 
 @pytest.mark.requirement("B8")
 def test_statistics_of_motion_are_the_same_whatever_the_chunks() -> None:
     inputs = scene(jump=80.0, clock=200.0, parted=60.0)
-    whole, _ = motion_signs(inputs, MotionState(), LIMITS)
-    state, parts = MotionState(), []
+    whole, _ = motion_signs(inputs, MotionSignState(), LIMITS)
+    state, parts = MotionSignState(), []
     of_channels = {"channel", "group"}
     for a, b in itertools.pairwise(EDGES):
         part = MotionInputs(*(v if n in of_channels else v[a:b] for n, v in inputs._asdict().items()))
@@ -178,7 +178,7 @@ def test_statistics_of_motion_are_the_same_whatever_the_chunks() -> None:
 @pytest.mark.requirement("B8")
 def test_parted_constellations_are_those_of_two_fits_by_numpy() -> None:
     inputs = scene(parted=60.0)
-    found, _ = motion_signs(inputs, MotionState(), LIMITS)
+    found, _ = motion_signs(inputs, MotionSignState(), LIMITS)
     k, solved = 30, []
     near = inputs.near_ecef_m[k]
     for g in range(2):
@@ -203,6 +203,6 @@ def test_parted_constellations_are_those_of_two_fits_by_numpy() -> None:
 
 @pytest.mark.requirement("B8")
 def test_causes_have_words_and_spoofing_outranks_jamming() -> None:
-    causes = np.array([0, int(Cause.CN0_FALL), int(Cause.CN0_FALL | Cause.EQUAL_CN0)])
+    causes = np.array([0, int(Sign.CN0_FALL), int(Sign.CN0_FALL | Sign.EQUAL_CN0)])
     assert cause_text(causes).tolist() == ["", "cn0_fall", "cn0_fall+equal_cn0"]
     assert suspicion(causes).tolist() == [Suspicion.NONE, Suspicion.JAMMING_SUSPECTED, Suspicion.SPOOFING_SUSPECTED]

@@ -11,7 +11,7 @@ import pipeline_cases
 import signal_attacks
 from railfix.core.reasons import Status
 from railfix.gnss.observations import Observations
-from railfix.integrity.interference import Cause, Suspicion
+from railfix.integrity.interference import Sign, Suspicion
 from railfix.integrity.protection import LevelStatus
 from railfix.live.message import message_of
 from railfix.live.settings import LiveSettings
@@ -78,7 +78,7 @@ def test_repeated_signals_are_suspected_at_their_first_epoch_and_no_level_is_pro
         5,
         6,
     }
-    assert found.interference.causes[AT + 2] & (Cause.POSITION_JUMP | Cause.CLOCK_JUMP)
+    assert found.interference.causes[AT + 2] & (Sign.POSITION_JUMP | Sign.CLOCK_JUMP)
     positioned = found.status == Status.SPOOFING_SUSPECTED
     assert (found.protection.status[positioned] == LevelStatus.ALARM).all()
     dropped = result_of(log, failed_checks="drop")["front"]
@@ -94,7 +94,7 @@ def test_a_pull_by_one_transmitter_is_suspected_and_one_constellation_parts() ->
     parted = result_of(signal_attacks.pulled(scene(), AT, 2.0, systems="E", rng=rng))["front"]
     first = int(np.argmax(parted.interference.suspicion > 0))
     assert AT + 10 <= first <= AT + 60
-    assert parted.interference.causes[first] == Cause.CONSTELLATIONS_PART
+    assert parted.interference.causes[first] == Sign.CONSTELLATIONS_PART
 
 
 @pytest.mark.requirement("B8")

@@ -8,10 +8,11 @@ from typing import Annotated
 import typer
 
 from railfix.cli.campaign import executor_of, show_progress
-from railfix.cli.console import console_of_tables, plain_table, prepare_kernels, show_files, show_notes
+from railfix.cli.console import console_of_tables, prepare_kernels, show_files, show_notes, show_table
 from railfix.cli.options import OutOption, from_models
 from railfix.cli.settings import Choices, settings_of
 from railfix.core.errors import MismatchError, NoPositionError
+from railfix.core.tables import Table
 from railfix.evaluate.benchmark.table import heads, run_benchmark, shown_rows
 
 
@@ -63,12 +64,15 @@ def benchmark(
         prepare_kernels()
         table, notes = run_benchmark(folder, config, out=out, executor=executor, progress=show_progress, lost=lost)
     console = console_of_tables()
-    names, features = heads()
-    shown = plain_table(*("\n".join(pair) for pair in zip(names, features, strict=True)), text=2)
-    for row in shown_rows(table):
-        shown.add_row(*row)
-    console.print("Errors in metres along the line and straight; second line: performance feature of EN 16803-1")
-    console.print(shown)
+    head = ["\n".join(pair) for pair in zip(*heads(), strict=True)]
+    shown = Table(
+        name="benchmark",
+        head=head,
+        rows=shown_rows(table),
+        caption="Errors in metres along the line and straight; second line: performance feature of EN 16803-1",
+        numeric=range(2, len(head)),
+    )
+    show_table(console, shown)
     show_notes(console, notes)
     show_files(console, [out / f"benchmark.{kind}" for kind in ("csv", "json", "md")])
     failed = table["error"].drop_nulls()

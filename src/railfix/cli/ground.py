@@ -91,7 +91,7 @@ def monitor(
     """
     from railfix.ground.monitor_log import draw_triangle, monitor_log
     from railfix.ground.station_fixes import station_fixes
-    from railfix.ground.triangle import Verdict
+    from railfix.ground.triangle import TriangleVerdict
     from railfix.io import read_navigation, read_observations
 
     if len(logs) != 3:
@@ -130,7 +130,7 @@ def monitor(
     console = console_of_tables()
     table = Table("verdict", "epochs")
     for value, count in zip(*np.unique(result.triangle.verdict, return_counts=True), strict=True):
-        table.add_row(Verdict(int(value)).name.lower(), str(count))
+        table.add_row(TriangleVerdict(int(value)).name.lower(), str(count))
     console.print(table)
     for time, order, cause, receiver in result.orders:
         named = "" if receiver < 0 else f", receiver {receiver}"
@@ -150,7 +150,7 @@ def _monitor_live(
     from railfix.cli.cn0_curve import place_of
     from railfix.ground.monitor_log import LiveMonitor
     from railfix.ground.station_streams import stream_fixes
-    from railfix.ground.triangle import Verdict
+    from railfix.ground.triangle import TriangleVerdict
     from railfix.io import read_navigation
     from railfix.live.sources import check_source, is_file
 
@@ -176,7 +176,7 @@ def _monitor_live(
             judged, orders = monitor.judge(fixes, tag_s if recorded else time.monotonic())
             judged.table().write_csv(file, include_header=not counts)
             file.flush()
-            counts[Verdict(int(judged.triangle.verdict[0])).name.lower()] += 1
+            counts[TriangleVerdict(int(judged.triangle.verdict[0])).name.lower()] += 1
             show(orders, np.datetime_as_string(fixes.time[0], unit="s"))
 
     async def watch() -> None:

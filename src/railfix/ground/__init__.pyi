@@ -17,7 +17,7 @@ from .on_board import OnBoard, OnBoardLimits
 from .reference_curve import ReferenceCurve
 from .station_fixes import StationFixes, station_fixes
 from .supervision import Supervision
-from .triangle import TriangleLimits, TriangleResult, Verdict, compare_triangle, limits_for_false_stops
+from .triangle import TriangleLimits, TriangleResult, TriangleVerdict, compare_triangle, limits_for_false_stops
 
 __all__ = [
     "Authority",
@@ -39,7 +39,7 @@ __all__ = [
     "TrainState",
     "TriangleLimits",
     "TriangleResult",
-    "Verdict",
+    "TriangleVerdict",
     "advance",
     "compare_triangle",
     "extended",

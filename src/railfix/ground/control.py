@@ -21,7 +21,7 @@ from railfix.ground.reference_curve import ReferenceCurve
 from railfix.ground.stops import close_section, open_section, release_train, stop_trains
 from railfix.ground.store import DatabaseError, Store
 from railfix.ground.supervision import Supervision
-from railfix.ground.triangle import STOPPING, Verdict
+from railfix.ground.triangle import STOPPING, TriangleVerdict
 from railfix.ground.web import Order
 from railfix.io.train_message import MessageError, TrainMessage, decode
 
@@ -31,11 +31,11 @@ RETRY_S = 1.0
 _CAUSE = "cause of the stop"
 
 
-def _severity(verdict: Verdict) -> int:
+def _severity(verdict: TriangleVerdict) -> int:
     """Return the rank of a verdict: of those between two steps the one with the highest counts."""
-    if verdict in (Verdict.MONITOR_LOST, Verdict.JAMMING):
+    if verdict in (TriangleVerdict.MONITOR_LOST, TriangleVerdict.JAMMING):
         return 2  # a fix is absent: that stops only once it is late
-    return 3 if verdict in STOPPING else int(verdict is not Verdict.HEALTHY)
+    return 3 if verdict in STOPPING else int(verdict is not TriangleVerdict.HEALTHY)
 
 
 @dataclass(kw_only=True)
@@ -105,8 +105,8 @@ class ControlCentre:
     database: str | None = None
     _failed_s: float = 0.0
     _routes: dict[int, int] = field(init=False)
-    _verdict: tuple[Verdict, int] | None = None
-    _judged: Verdict | None = None
+    _verdict: tuple[TriangleVerdict, int] | None = None
+    _judged: TriangleVerdict | None = None
     _saved: Interlocking | None = None
     _saved_sequences: dict[int, int] = field(default_factory=dict)
 
@@ -126,7 +126,9 @@ class ControlCentre:
             supervision.records = store.records()
             if judged:
                 cause = store.document(_CAUSE)
-                monitor = MonitorState(stopped=state.stopped, cause=Verdict[cause] if state.stopped and cause else None)
+                monitor = MonitorState(
+                    stopped=state.stopped, cause=TriangleVerdict[cause] if state.stopped and cause else None
+                )
         centre = cls(supervision=supervision, store=store, monitor=monitor, **rest)
         if monitor is not None:
             centre.monitor = replace(monitor, complete_s=centre.clock(), since_s=centre.clock())
@@ -178,7 +180,7 @@ class ControlCentre:
         elif before.state is TrainState.UNKNOWN:
             self.log(f"train {number}: heard", train=number)
 
-    def judge(self, verdict: Verdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
+    def judge(self, verdict: TriangleVerdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
         """Take a verdict on satellite positioning, of fixes of an age; of those between two steps the worst counts.
 
         Fixes older than `MonitorLimits.late_s`, or from the future by as much, are no verdict.

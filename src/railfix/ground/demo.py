@@ -30,7 +30,7 @@ from railfix.ground.simulated_triangle import PLAN_M, simulated_fixes
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start
 from railfix.ground.traffic import SimulatedTrain, Traffic, line_with_loops
-from railfix.ground.triangle import TriangleLimits, Verdict, compare_triangle
+from railfix.ground.triangle import TriangleLimits, TriangleVerdict, compare_triangle
 from railfix.ground.web import PageServer, Sessions, page_app
 from railfix.io.train_message import TrainMessage, encode
 
@@ -51,7 +51,7 @@ class LinkedTraffic(Traffic):
     ----------
     links : dict of int to TrainLinks
     control : ControlCentre
-    verdicts : list of (Verdict, int)
+    verdicts : list of (TriangleVerdict, int)
         Of the triangle, one a second.
     rest_s : float or None [s]
         When all trains stood still after a stop.
@@ -59,7 +59,7 @@ class LinkedTraffic(Traffic):
 
     links: dict[int, TrainLinks]
     control: ControlCentre
-    verdicts: list[tuple[Verdict, int]]
+    verdicts: list[tuple[TriangleVerdict, int]]
     rest_s: float | None = None
 
     def step(self) -> None:
@@ -82,14 +82,14 @@ class LinkedTraffic(Traffic):
         self.control.step()
 
 
-def _verdicts(seed: int) -> list[tuple[Verdict, int]]:
+def _verdicts(seed: int) -> list[tuple[TriangleVerdict, int]]:
     """Return the verdicts of the triangle, one a second; a satellite drifts away from `FAULT_S` on."""
     epochs = int(END_S) + 1
     common = np.zeros((epochs, 9))
     common[:, 3] = 8.0 * np.clip(np.arange(epochs) - FAULT_S, 0.0, None)
     fixes = simulated_fixes(np.random.default_rng(seed), epochs=epochs, common_m=common)
     result = compare_triangle(PLAN_M, fixes.fixes_m, limits=TriangleLimits())
-    return [(Verdict(int(v)), int(r)) for v, r in zip(result.verdict, result.receiver, strict=True)]
+    return [(TriangleVerdict(int(v)), int(r)) for v, r in zip(result.verdict, result.receiver, strict=True)]
 
 
 def _traffic(

@@ -11,7 +11,7 @@ from enum import Enum
 from pydantic import Field
 
 from railfix.core.settings import Settings, option
-from railfix.ground.triangle import STOPPING, Verdict
+from railfix.ground.triangle import STOPPING, TriangleVerdict
 
 
 class Order(Enum):
@@ -52,8 +52,8 @@ class MonitorState:
     ----------
     stopped : bool
         True before the first healthy period was released, and from a stop to its release.
-    cause : Verdict or None
-        Verdict that stopped the trains; None at the start.
+    cause : TriangleVerdict or None
+        TriangleVerdict that stopped the trains; None at the start.
     receiver : int
         Receiver that the cause names, -1 where it names none.
     since_s : float [s]
@@ -67,7 +67,7 @@ class MonitorState:
     """
 
     stopped: bool = True
-    cause: Verdict | None = None
+    cause: TriangleVerdict | None = None
     receiver: int = -1
     since_s: float = 0.0
     complete_s: float = 0.0
@@ -76,7 +76,7 @@ class MonitorState:
 
 
 def advance(
-    state: MonitorState, now_s: float, verdict: Verdict | None, *, receiver: int = -1, limits: MonitorLimits
+    state: MonitorState, now_s: float, verdict: TriangleVerdict | None, *, receiver: int = -1, limits: MonitorLimits
 ) -> tuple[MonitorState, tuple[Order, ...]]:
     """Return the state after a sample, and the orders to be sent.
 
@@ -85,7 +85,7 @@ def advance(
     state : MonitorState
     now_s : float [s]
         Clock of the monitor, which never runs backwards (monotonic).
-    verdict : Verdict or None
+    verdict : TriangleVerdict or None
         Of the newest fixes; None where nothing has come since.
     receiver : int
         Receiver that the verdict names.
@@ -98,27 +98,27 @@ def advance(
     """
     if now_s < state.complete_s:
         raise ValueError(f"the clock of the monitor ran back from {state.complete_s} s to {now_s} s")
-    absent = verdict in (None, Verdict.MONITOR_LOST, Verdict.JAMMING)
+    absent = verdict in (None, TriangleVerdict.MONITOR_LOST, TriangleVerdict.JAMMING)
     if absent:
         state = replace(state, healthy_since_s=None)
         if now_s - state.complete_s <= limits.late_s:
             return state, ()
-        return _stop(state, now_s, verdict or Verdict.MONITOR_LOST, -1, limits)
+        return _stop(state, now_s, verdict or TriangleVerdict.MONITOR_LOST, -1, limits)
     assert verdict is not None
-    state = replace(state, complete_s=now_s, warning=receiver if verdict is Verdict.RECEIVER_DRIFTING else -1)
+    state = replace(state, complete_s=now_s, warning=receiver if verdict is TriangleVerdict.RECEIVER_DRIFTING else -1)
     if verdict in STOPPING:
         return _stop(replace(state, healthy_since_s=None), now_s, verdict, receiver, limits)
-    if verdict is not Verdict.HEALTHY:
+    if verdict is not TriangleVerdict.HEALTHY:
         return replace(state, healthy_since_s=None), ()
     since = now_s if state.healthy_since_s is None else state.healthy_since_s
     return replace(state, healthy_since_s=since), ()
 
 
 def _stop(
-    state: MonitorState, now_s: float, cause: Verdict, receiver: int, limits: MonitorLimits
+    state: MonitorState, now_s: float, cause: TriangleVerdict, receiver: int, limits: MonitorLimits
 ) -> tuple[MonitorState, tuple[Order, ...]]:
     if state.stopped and state.cause is not None:
-        if state.cause is Verdict.GROUND_LOST and now_s - state.since_s <= limits.settle_s:
+        if state.cause is TriangleVerdict.GROUND_LOST and now_s - state.since_s <= limits.settle_s:
             return replace(state, cause=cause, receiver=receiver), ()
         return state, ()  # latched with its cause
     return replace(state, stopped=True, cause=cause, receiver=receiver, since_s=now_s), (Order.SUSPEND, Order.STOP)

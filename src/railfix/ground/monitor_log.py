@@ -11,7 +11,7 @@ import polars as pl
 from railfix.core.errors import SettingsError
 from railfix.ground.monitor import MonitorLimits, MonitorState, Order, advance
 from railfix.ground.station_fixes import StationFixes
-from railfix.ground.triangle import SIDES, TriangleLimits, TriangleResult, Verdict, compare_triangle
+from railfix.ground.triangle import SIDES, TriangleLimits, TriangleResult, TriangleVerdict, compare_triangle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,20 +22,20 @@ class MonitoredLog:
     ----------
     fixes : StationFixes
     triangle : TriangleResult
-    orders : tuple of (datetime64, Order, Verdict, int)
+    orders : tuple of (datetime64, Order, TriangleVerdict, int)
         Orders to the trains, with the cause and the receiver it names.
     """
 
     fixes: StationFixes
     triangle: TriangleResult
-    orders: tuple[tuple[np.datetime64, Order, Verdict, int], ...]
+    orders: tuple[tuple[np.datetime64, Order, TriangleVerdict, int], ...]
 
     def table(self) -> pl.DataFrame:
         """One row an epoch: verdict, receiver, errors of the fixes and of the sides."""
         triangle = self.triangle
         columns: dict[str, object] = {
             "time_gpst": self.fixes.time,
-            "verdict": [Verdict(value).name.lower() for value in triangle.verdict],
+            "verdict": [TriangleVerdict(value).name.lower() for value in triangle.verdict],
             "receiver": triangle.receiver,
             "n_satellites": self.fixes.n_satellites,
         }
@@ -60,7 +60,7 @@ def monitor_log(
     seconds = (fixes.time - fixes.time[0]) / np.timedelta64(1, "s")
     state, orders = MonitorState(stopped=False), []
     for k, now in enumerate(seconds.tolist()):
-        verdict = Verdict(int(triangle.verdict[k]))
+        verdict = TriangleVerdict(int(triangle.verdict[k]))
         state, given = advance(state, now, verdict, receiver=int(triangle.receiver[k]), limits=times)
         orders += [(fixes.time[k], order, state.cause or verdict, state.receiver) for order in given]
     # one stop, latched: its cause may have become more exact after the orders
@@ -113,7 +113,7 @@ class LiveMonitor:
     def judge(self, fixes: StationFixes, now_s: float) -> tuple[MonitoredLog, tuple[Order, ...]]:
         """Take one epoch; return it judged, and the orders to be sent; SettingsError as `monitor_log`."""
         triangle = _compare(fixes, self.limits)
-        verdict, receiver = Verdict(int(triangle.verdict[0])), int(triangle.receiver[0])
+        verdict, receiver = TriangleVerdict(int(triangle.verdict[0])), int(triangle.receiver[0])
         self.state, orders = advance(self.state, now_s, verdict, receiver=receiver, limits=self.times)
         return MonitoredLog(fixes=fixes, triangle=triangle, orders=()), orders
 

@@ -36,7 +36,7 @@ from railfix.ground.reference_curve import ReferenceCurve
 from railfix.ground.station_streams import stream_fixes
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
-from railfix.ground.triangle import TriangleLimits, Verdict, compare_triangle
+from railfix.ground.triangle import TriangleLimits, TriangleVerdict, compare_triangle
 from railfix.ground.web import PageServer, Sessions, page_app
 from railfix.io import read_navigation
 from railfix.track.network_read import read_network
@@ -397,7 +397,7 @@ async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> No
                 fixes.points_m, fixes.fixes_m, limits=triangle.limits, cn0_fallen=fixes.cn0_fallen
             )
             age_s = float((utc_to_gpst(np.datetime64(time.time_ns(), "ns")) - fixes.time[0]) / np.timedelta64(1, "s"))
-            control.judge(Verdict(int(result.verdict[0])), int(result.receiver[0]), age_s=age_s)
+            control.judge(TriangleVerdict(int(result.verdict[0])), int(result.receiver[0]), age_s=age_s)
         control.log("triangle: every stream has ended")
     except (RailfixError, ValueError) as error:
         control.log(f"triangle: {' '.join(str(error).split())}")

@@ -24,8 +24,8 @@ SIDES: Final = ((0, 1), (1, 2), (2, 0))
 YEAR_S: Final = 31_557_600.0
 
 
-class Verdict(IntEnum):
-    """Verdict on one set of three fixes; every one from `ONE_RECEIVER` on stops the trains."""
+class TriangleVerdict(IntEnum):
+    """TriangleVerdict on one set of three fixes; every one from `ONE_RECEIVER` on stops the trains."""
 
     #: Every fix inside its circle, every side as it should be.
     HEALTHY = 0
@@ -46,7 +46,7 @@ class Verdict(IntEnum):
 
 
 #: Verdicts that stop the trains.
-STOPPING: Final = frozenset(verdict for verdict in Verdict if verdict >= Verdict.ONE_RECEIVER)
+STOPPING: Final = frozenset(verdict for verdict in TriangleVerdict if verdict >= TriangleVerdict.ONE_RECEIVER)
 
 
 class TriangleLimits(Settings):
@@ -121,7 +121,7 @@ class TriangleResult:
     bearing_error_deg : ndarray, shape (T, 3) [deg]
         Deviation of its bearing, clockwise, in [-180, 180).
     verdict : ndarray of int8, shape (T,)
-        `Verdict`.
+        `TriangleVerdict`.
     receiver : ndarray of int, shape (T,)
         Receiver that the verdict names, -1 where it names none.
     """
@@ -207,15 +207,15 @@ def _verdicts(
             (outside >= 2) & coincide,
         ],
         [
-            Verdict.JAMMING,
-            Verdict.MONITOR_LOST,
-            Verdict.HEALTHY,
-            Verdict.RECEIVER_DRIFTING,
-            Verdict.ONE_RECEIVER,
-            Verdict.SATELLITES_OR_JAMMING,
-            Verdict.SPOOFING,
+            TriangleVerdict.JAMMING,
+            TriangleVerdict.MONITOR_LOST,
+            TriangleVerdict.HEALTHY,
+            TriangleVerdict.RECEIVER_DRIFTING,
+            TriangleVerdict.ONE_RECEIVER,
+            TriangleVerdict.SATELLITES_OR_JAMMING,
+            TriangleVerdict.SPOOFING,
         ],
-        Verdict.GROUND_LOST,
+        TriangleVerdict.GROUND_LOST,
     ).astype(np.int8)
-    names_one = np.isin(verdict, [Verdict.RECEIVER_DRIFTING, Verdict.ONE_RECEIVER])
+    names_one = np.isin(verdict, [TriangleVerdict.RECEIVER_DRIFTING, TriangleVerdict.ONE_RECEIVER])
     return verdict, np.where(names_one, named, -1).astype(np.int64)

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Codes, Floats, Masks, changed, read_only
+from railfix.core.arrays import Bits, Bytes, Codes, Floats, Masks, changed, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
 from railfix.integrity.interference import (
     CAUSES,
-    Cause,
     HeldState,
     InterferenceLimits,
     MotionSigns,
-    MotionState,
+    MotionSignState,
     PowerSigns,
     PowerState,
+    Sign,
     Suspicion,
     held,
     motion_signs,
@@ -50,7 +50,7 @@ class InterferenceState:
     """State of the signs after a chunk."""
 
     power: PowerState = field(default_factory=PowerState)
-    motion: MotionState = field(default_factory=MotionState)
+    motion: MotionSignState = field(default_factory=MotionSignState)
     held: HeldState = field(default_factory=HeldState)
 
 
@@ -61,7 +61,7 @@ class Interference:
     Attributes
     ----------
     causes : ndarray of int64, shape (T,)
-        `Cause` bits, each for as long as its time of release.
+        `Sign` bits, each for as long as its time of release.
     power : PowerSigns
     motion : MotionSigns
     """
@@ -134,22 +134,22 @@ def find_interference(
     return Interference(causes=causes, power=power, motion=motion), after
 
 
-def _signs(alarm: Codes, power: PowerSigns, motion: MotionSigns, limits: InterferenceLimits) -> Masks:
+def _signs(alarm: Bytes, power: PowerSigns, motion: MotionSigns, limits: InterferenceLimits) -> Masks:
     """Return which signs the epochs show by themselves, shape (T, causes)."""
     sigmas = limits.jump_sigmas
     by_cause = {
-        Cause.RECEIVER_JAMMING: (alarm & 1) != 0,
-        Cause.CN0_FALL: (power.fall_db >= limits.fall_db) & (power.spread_db <= limits.spread_db),
-        Cause.GAIN_FALL: power.gain_fall >= limits.gain_fall,
-        Cause.RECEIVER_SPOOFING: (alarm & 2) != 0,
-        Cause.EQUAL_CN0: power.difference_db <= limits.equal_db,
-        Cause.CLOCK_JUMP: (np.abs(motion.clock_jump_m) >= limits.clock_jump_m)
+        Sign.RECEIVER_JAMMING: (alarm & 1) != 0,
+        Sign.CN0_FALL: (power.fall_db >= limits.fall_db) & (power.spread_db <= limits.spread_db),
+        Sign.GAIN_FALL: power.gain_fall >= limits.gain_fall,
+        Sign.RECEIVER_SPOOFING: (alarm & 2) != 0,
+        Sign.EQUAL_CN0: power.difference_db <= limits.equal_db,
+        Sign.CLOCK_JUMP: (np.abs(motion.clock_jump_m) >= limits.clock_jump_m)
         | ((motion.drift_jump_mps >= limits.drift_jump_mps) & (motion.drift_jump_sigmas >= sigmas)),
-        Cause.SPEED_JUMP: (motion.speed_jump_mps >= limits.speed_jump_mps) & (motion.speed_jump_sigmas >= sigmas),
-        Cause.POSITION_JUMP: (motion.position_jump_m >= limits.position_jump_m)
+        Sign.SPEED_JUMP: (motion.speed_jump_mps >= limits.speed_jump_mps) & (motion.speed_jump_sigmas >= sigmas),
+        Sign.POSITION_JUMP: (motion.position_jump_m >= limits.position_jump_m)
         & (motion.position_jump_sigmas >= sigmas),
-        Cause.CONSTELLATIONS_PART: motion.part_sigmas >= limits.part_sigmas,
-        Cause.LEFT_MAP: (motion.off_line_m >= limits.off_map_m) & (motion.off_line_sigmas >= sigmas),
+        Sign.CONSTELLATIONS_PART: motion.part_sigmas >= limits.part_sigmas,
+        Sign.LEFT_MAP: (motion.off_line_m >= limits.off_map_m) & (motion.off_line_sigmas >= sigmas),
     }
     return np.stack([by_cause[cause] for cause in CAUSES], axis=1)
 
@@ -158,8 +158,8 @@ def _signs(alarm: Codes, power: PowerSigns, motion: MotionSigns, limits: Interfe
 def _times(limits: InterferenceLimits) -> tuple[Floats, Floats]:
     """Return times of holding and of release by cause [s]."""
     hold = {
-        Cause.CN0_FALL: limits.hold_s, Cause.GAIN_FALL: limits.hold_s, Cause.EQUAL_CN0: limits.hold_s,
-        Cause.LEFT_MAP: limits.hold_s, Cause.CONSTELLATIONS_PART: limits.part_hold_s,
+        Sign.CN0_FALL: limits.hold_s, Sign.GAIN_FALL: limits.hold_s, Sign.EQUAL_CN0: limits.hold_s,
+        Sign.LEFT_MAP: limits.hold_s, Sign.CONSTELLATIONS_PART: limits.part_hold_s,
     }  # fmt: skip
     release = {
         Suspicion.JAMMING_SUSPECTED: limits.jamming_release_s,

@@ -242,7 +242,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "interference_causes",
-            "signs of it joined by `+`, see `railfix.integrity.interference.Cause`",
+            "signs of it joined by `+`, see `railfix.integrity.interference.Sign`",
             lambda r: None if r.interference is None else cause_text(r.interference.causes),
             dtype=pl.String(),
         ),

@@ -64,10 +64,10 @@ class Scenario(Settings):
     antenna: str = ""
     receiver: str = ""
     signals: str = ""
-    rate_hz: float | None = Field(None, gt=0.0)
-    duration_s: float | None = Field(None, gt=0.0)
+    rate_hz: float | None = Field(default=None, gt=0.0)
+    duration_s: float | None = Field(default=None, gt=0.0)
     reference: str = ""
-    reference_accuracy_m: float | None = Field(None, gt=0.0)
+    reference_accuracy_m: float | None = Field(default=None, gt=0.0)
 
 
 class CaseFile(Settings):

@@ -184,7 +184,7 @@ def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> s
             f"pos1-tropopt=saas\npos1-sateph=brdc\npos1-navsys={sum(_SYSTEMS[name] for name in config.systems)}\n"
             "out-solformat=xyz\nout-timesys=gpst\nout-timeform=hms\nout-timendec=6\n"
         )
-        command = [program, "-k", folder / "single.conf", "-o", out, *files]
+        command = [program, "-k", str(folder / "single.conf"), "-o", str(out), *map(str, files)]
         try:
             subprocess.run(command, check=True, capture_output=True, timeout=_LONGEST_S)
         except (subprocess.SubprocessError, OSError) as error:

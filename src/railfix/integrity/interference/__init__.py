@@ -1,19 +1,26 @@
 """Jamming and spoofing suspected from observations, positions and the receiver's own indicators."""
 
-from railfix.integrity.interference.limits import CAUSES, Cause, InterferenceLimits, Suspicion, cause_text, suspicion
-from railfix.integrity.interference.motion import MotionSigns, MotionState, motion_signs
+from railfix.integrity.interference.limits import (
+    CAUSES,
+    InterferenceLimits,
+    Sign,
+    Suspicion,
+    cause_text,
+    suspicion,
+)
+from railfix.integrity.interference.motion import MotionSigns, MotionSignState, motion_signs
 from railfix.integrity.interference.power import PowerSigns, PowerState, power_signs
 from railfix.integrity.interference.timing import HeldState, held
 
 __all__ = [
     "CAUSES",
-    "Cause",
     "HeldState",
     "InterferenceLimits",
+    "MotionSignState",
     "MotionSigns",
-    "MotionState",
     "PowerSigns",
     "PowerState",
+    "Sign",
     "Suspicion",
     "cause_text",
     "held",

@@ -20,7 +20,7 @@ class Suspicion(IntEnum):
     SPOOFING_SUSPECTED = 2
 
 
-class Cause(IntFlag):
+class Sign(IntFlag):
     """Signs of interference; one epoch may have several."""
 
     NONE = 0
@@ -46,9 +46,9 @@ class Cause(IntFlag):
     LEFT_MAP = 1 << 9
 
 
-_JAMMING: Final = Cause.RECEIVER_JAMMING | Cause.CN0_FALL | Cause.GAIN_FALL
+_JAMMING: Final = Sign.RECEIVER_JAMMING | Sign.CN0_FALL | Sign.GAIN_FALL
 #: Causes in the order of their bits.
-CAUSES: Final = tuple(cause for cause in Cause if cause)
+CAUSES: Final = tuple(cause for cause in Sign if cause)
 
 
 class InterferenceLimits(Settings):

@@ -94,7 +94,7 @@ def _no_fix() -> Fix:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionState:
+class MotionSignState:
     """State after a chunk.
 
     Attributes
@@ -152,8 +152,8 @@ class MotionSigns:
 
 
 def motion_signs(
-    inputs: MotionInputs, state: MotionState, limits: InterferenceLimits
-) -> tuple[MotionSigns, MotionState]:
+    inputs: MotionInputs, state: MotionSignState, limits: InterferenceLimits
+) -> tuple[MotionSigns, MotionSignState]:
     """Return the statistics of clock, velocity and position of T epochs, and the state to pass on."""
     if not len(inputs.time):
         return MotionSigns(**{item.name: np.zeros(0) for item in fields(MotionSigns)}), state
@@ -178,7 +178,7 @@ def motion_signs(
         off_line_m=off,
         off_line_sigmas=np.maximum(off - limits.position_jump_m, 0.0) / fixes.sigma_m,
     )
-    after = MotionState(
+    after = MotionSignState(
         time=inputs.time[-1],
         channel=inputs.channel,
         code_m=last_codes[0],
@@ -292,7 +292,7 @@ def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimit
 
 
 def _clock_jump(
-    inputs: MotionInputs, state: MotionState, limits: InterferenceLimits
+    inputs: MotionInputs, state: MotionSignState, limits: InterferenceLimits
 ) -> tuple[Floats, tuple[Floats, Floats, Datetimes]]:
     """Return the median change of the codes against the Dopplers, less whole milliseconds, shape (T,) [m].
 
