@@ -25,8 +25,7 @@ def test_each_hazard_and_condition_has_a_test_that_exists_or_says_that_it_is_not
     assert numbers == [f"H{k}" for k in range(1, 18)] + [f"C{k}" for k in range(1, 12)]
     assert [test for _, _, tests in rows for test in tests if test not in TESTS] == []
     without = [number for number, _, tests in rows if not tests]
-    unchecked = re.findall(r"\| (C\d+) \|[^|]*\| \*\*not checked\*\*", TEXT)
-    assert without == unchecked == ["C11"]
+    assert without == re.findall(r"\| (C\d+) \|[^|]*\| \*\*not checked\*\*", TEXT)
 
 
 def test_statuses_and_reasons_of_the_tables_exist() -> None:
