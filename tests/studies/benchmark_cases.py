@@ -91,7 +91,8 @@ the map made from the ground truth, every setting at its default. [How to](how-t
   *EN 16803-1* names the performance feature of each column.
 - *RTKLIB single point* is `rnx2rtkp` with the same mask and constellations, its positions moved to the nearest point of
   the line and judged by the same code.
-- Held-out cases are read by no test, and no setting was chosen with them; the others were seen while railfix was made.
+- Cases marked *held out* are read by no test, and no setting was chosen with them
+  (`python tests/studies/public_recording.py CASES/town` makes one); the others were seen while railfix was made.
 
 {table}{notes}"""
 
