@@ -378,6 +378,7 @@ def served() -> Iterator[dict[bytes, int]]:
     loop.close()
 
 
+@pytest.mark.slow
 def test_the_command_with_tables_and_with_streams_is_the_run(served: dict[bytes, int], tmp_path: Path) -> None:
     """`railfix live` with the tables of `railfix run`, and with their rows over TCP: the same places."""
     out = tmp_path / "sim"

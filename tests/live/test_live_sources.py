@@ -418,6 +418,7 @@ def test_a_file_is_replayed_at_its_speed(log: bytes, tmp_path: Path) -> None:
     assert arrivals[-1] - arrivals[0] > 0.9 * 0.1 * (EPOCHS - 1) / 2.0
 
 
+@pytest.mark.slow
 def test_two_files_keep_their_distance_in_a_replay(tmp_path: Path) -> None:
     """The rear log begins 4 s after the front one: its epochs are due with those of the front antenna, 1 s later."""
     files = demo_files()

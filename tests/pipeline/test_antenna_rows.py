@@ -84,7 +84,10 @@ def _logs(case: str) -> dict[str, Observations]:
 def _missing(obs: Observations, every: int) -> Observations:
     """The log without every so manieth epoch."""
     kept = np.arange(len(obs)) % every != every - 1
-    arrays = ("time", "code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock", "break_before")
+    arrays = (
+        "time", "code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock", "break_before", "receiver_alarm",
+        "front_end_gain",
+    )  # fmt: skip
     return replace(obs, **{name: getattr(obs, name)[kept] for name in arrays})
 
 

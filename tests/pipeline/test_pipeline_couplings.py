@@ -294,7 +294,7 @@ def test_the_noise_of_a_3d_fit_is_that_of_its_redundant_ranges() -> None:
     order = np.argsort(-fault_free().elevation_deg[0])
     gps = [s for s in fault_free().satellite[order].tolist() if s[0] == "G"][:6]
     noisy = with_code(only(log, gps), rng.normal(0.0, 40.0, (len(log), only(log, gps).code_m.shape[1])))
-    found = front_alone(noisy, {"screens": ["elevation"]})
+    found = front_alone(noisy, {"screens": ["elevation"], "interference": {"use": "off"}})
     shown = np.maximum(1.0, found.single_point.wsse / (found.n_used - 4))
     lost = (found.constrained.wsse - found.single_point.wsse) / shown > chi2.isf(1e-6, 2)
     inside = found.constrained.overshoot_m == 0

@@ -538,7 +538,7 @@ def test_the_demonstration_ends_with_numbers_and_the_page(tmp_path: Path) -> Non
     last = result.output.strip().splitlines()[-1]
     assert last.endswith("report.html")
     assert result.output.count("conventional") >= 2
-    assert result.output.count("on the map, ok") == 2
+    assert result.output.count("on the map, ok") == 6
     assert result.output.count("protection level (separation), ") == 2
     assert "within the alarm limit of 20 m at" in result.output
     written = sorted(path.name for path in (tmp_path / "demo").iterdir())

@@ -24,8 +24,8 @@ from railfix.track.vehicle import (
     PATH_TOLERANCE_M,
     AntennaOffset,
     Vehicle,
-    _Line,
     _pose,
+    _VehicleLine,
     antenna_trajectory,
     read_vehicle,
 )
@@ -214,7 +214,7 @@ def test_chords_of_the_path_stay_near_the_antenna(ramp: float) -> None:
 def _dense(track: Track) -> Floats:
     """The antenna every half metre, without the path's points."""
     car, middle = vehicle(), np.arange(10.0, track.chainage_m[-1] - 10.0, 0.5)
-    pose = _pose(_Line(track, car.contact_spacing_m), track, car, middle)
+    pose = _pose(_VehicleLine(track, car.contact_spacing_m), track, car, middle)
     return pose.origin + OFFSET.along_m * pose.forward + OFFSET.across_m * pose.right + OFFSET.up_m * pose.up
 
 

@@ -125,8 +125,9 @@ class Observations(NotebookTable):
             object.__setattr__(self, "receiver_alarm", np.zeros(epochs, dtype=np.uint8))
         if not len(self.front_end_gain):
             object.__setattr__(self, "front_end_gain", np.full(epochs, np.nan))
-        if len(self.break_before) != epochs:
-            raise ValueError(f"break_before has {len(self.break_before)} epochs, time has {epochs}")
+        for name in ("break_before", "receiver_alarm", "front_end_gain"):
+            if len(getattr(self, name)) != epochs:
+                raise ValueError(f"{name} has {len(getattr(self, name))} epochs, time has {epochs}")
         for name in ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock"):
             shape = getattr(self, name).shape
             if shape != (epochs, channels):
