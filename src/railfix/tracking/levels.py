@@ -132,9 +132,9 @@ def carried_levels(
     # In doubt the sub-filter furthest off may be the one that is right; without a level one that the standard deviation
     # does not explain.
     doubt = (told == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
-    unexplained = np.where(is_bounded(told), np.inf, _EXPLAINED * tracked.sigma_m)
+    explained = np.where(is_bounded(told), np.inf, _EXPLAINED * tracked.sigma_m)
     apart = np.nan_to_num(separation)
-    spread = np.where(doubt, apart, np.sqrt(np.maximum(apart**2 - unexplained**2, 0.0)))
+    spread = np.where(doubt, apart, np.sqrt(np.maximum(apart**2 - explained**2, 0.0)))
     tracked = replace(
         tracked,
         status=told,
