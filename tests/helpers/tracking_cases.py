@@ -39,6 +39,14 @@ def bent_line(length_m: float = 3000.0, *, turn_deg: float = 60.0) -> Trajectory
     return Trajectory.from_track(Track.from_ecef(points))
 
 
+def corner_line() -> Trajectory:
+    """A level line that turns by 90 degrees within 10 m at 600 m, points every 5 m."""
+    bearing = np.radians(30.0 + 90.0 * np.clip((np.arange(0.0, 1200.0, 5.0) - 600.0) / 10.0, 0.0, 1.0))
+    east, north = (np.concatenate([[0.0], np.cumsum(f(bearing) * 5.0)]) for f in (np.sin, np.cos))
+    axes = enu_axes(np.array(LATITUDE), np.array(LONGITUDE))
+    return Trajectory.from_track(Track.from_ecef(ORIGIN_M[0] + east[:, None] * axes[0] + north[:, None] * axes[1]))
+
+
 @dataclass(frozen=True)
 class Ride:
     """Epochs with their truth."""
@@ -126,6 +134,14 @@ def reflected(ride: Ride, epoch: int, *, satellites: int = 3) -> GnssEpochs:
     rate[epoch] = np.where(np.isfinite(rate[epoch]), 30.0, np.nan)
     joined[epoch : epoch + 2] = False
     return replace(epochs, code_m=code, phase_m=phase, rate_mps=rate, phase_joined=joined)
+
+
+def with_codes_behind(ride: Ride, metres: float, until_m: float) -> GnssEpochs:
+    """Codes of a place so far behind, up to an arc length."""
+    here, there = (ride.line.at(ride.arc_m - behind)[0] for behind in (0.0, metres))
+    away, near = (range_with_rotation(ride.epochs.sat_ecef_m, place[:, None, :])[0] for place in (there, here))
+    code = ride.epochs.code_m + np.where(ride.arc_m < until_m, 1.0, 0.0)[:, None] * (away - near)
+    return replace(ride.epochs, code_m=code)
 
 
 def part(epochs: GnssEpochs, which: slice) -> GnssEpochs:

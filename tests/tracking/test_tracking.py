@@ -10,7 +10,7 @@ import pytest
 from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.state import TrackState
 from railfix.tracking.transition import singer_step
-from tracking_cases import Ride, bent_line, part, reflected, ride, wheel, without_epochs
+from tracking_cases import Ride, bent_line, corner_line, part, reflected, ride, wheel, with_codes_behind, without_epochs
 
 
 def _in_parts(ride: Ride, cuts: list[int]) -> tuple[list[Tracked], TrackState | None]:
@@ -199,6 +199,20 @@ def test_probabilities_sum_to_one_and_motion_decides() -> None:
     assert np.exp(state.log_probability).sum() == pytest.approx(1.0)
     assert np.nanmax(result.probability) <= 1.0 + 1e-12
     assert np.abs(result.arc_m - arc)[-20:].max() < 8.0
+
+
+@pytest.mark.requirement("E5")
+@pytest.mark.parametrize("seed", range(3))
+def test_a_place_10_m_behind_a_corner_is_corrected_within_10_s(seed: int) -> None:
+    """Along the street before it the train that has turned seems to stand: places beside are tried and taken."""
+    case = ride(
+        75, trajectory=corner_line(), start_m=300.0, rate_hz=5.0, noise=1.0, code_sigma_m=6.0, seed=seed,
+        speed_mps=lambda t: np.full(len(t), 6.0),
+    )  # fmt: skip
+    result, _ = track(with_codes_behind(case, 10.0, 600.0), case.line)
+    error, corner = np.abs(result.arc_m - case.arc_m), int(np.searchsorted(case.arc_m, 600.0))
+    assert error[corner - 1] > 8.0
+    assert error[corner + 50 :].max() < 5.0
 
 
 @pytest.mark.requirement("E5")

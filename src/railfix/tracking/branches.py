@@ -169,13 +169,11 @@ def beside(mean: Floats, covariance: Floats, limits: TrackingLimits) -> tuple[Fl
     limits : TrackingLimits
     """
     steps = limits.bend_m * np.array([-2.0, -1.0, 1.0, 2.0])
-    means = np.repeat(mean[None], len(steps), axis=0)
-    means[:, StateIndex.ARC] += steps
-    covariances = np.repeat(covariance[None], len(steps), axis=0)
-    for unknown, sigma in (
-        (StateIndex.ARC, 0.5 * limits.bend_m),
-        (StateIndex.SPEED, _BEND_SPEED_MPS),
-        (StateIndex.ACCELERATION, limits.acceleration_mps2),
-    ):
-        covariances[:, unknown, unknown] += sigma**2
+    gain = np.zeros(len(mean))
+    gain[[StateIndex.ARC, StateIndex.PREVIOUS_ARC]] = 1.0
+    means = mean + gain * steps[:, None]
+    wider = covariance + np.outer(gain, gain) * (0.5 * limits.bend_m) ** 2
+    for unknown, sigma in ((StateIndex.SPEED, _BEND_SPEED_MPS), (StateIndex.ACCELERATION, limits.acceleration_mps2)):
+        wider[unknown, unknown] += sigma**2
+    covariances = np.repeat(wider[None], len(steps), axis=0)
     return means, covariances, np.full(len(steps), np.log(_BESIDE_SHARE / len(steps)))

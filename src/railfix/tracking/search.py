@@ -9,7 +9,14 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices
 from railfix.core.timescale import seconds
-from railfix.kernels.tracking.constants import ACROSS_DOUBT, ACROSS_LOST, ACROSS_TAKEN, BESIDE_AFTER_S, STEP_HELD_S
+from railfix.kernels.tracking.constants import (
+    ACROSS_DOUBT,
+    ACROSS_LOST,
+    ACROSS_TAKEN,
+    BESIDE_AFTER_S,
+    MOTION_FIT,
+    STEP_HELD_S,
+)
 from railfix.tracking.branches import begin, beside, places, split
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
@@ -76,7 +83,8 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
     gap = bool(seconds(chunk.time[epoch] - state.measured) > limits.gap_s)
     wide = covariance[:, StateIndex.ARC, StateIndex.ARC] > limits.start_sigma_m**2
     if not (lost or (gap and wide.any())):
-        if state.weak_motion_s >= BESIDE_AFTER_S or state.across >= ACROSS_DOUBT:
+        contradicted = state.weak_motion_s >= BESIDE_AFTER_S or state.across >= ACROSS_DOUBT
+        if contradicted or state.motion_misfit > 1.0 - MOTION_FIT:
             parent = np.append(parent, np.full(_try_beside(state, limits), -1))
         return Sought(lost=False, parent=parent, splits=None)
     arc, sigma = places(chunk, epoch, line, limits)

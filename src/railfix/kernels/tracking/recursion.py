@@ -25,6 +25,7 @@ from railfix.kernels.tracking.constants import (
     FREED_SIGMAS,
     LEAST_RISE,
     LOST,
+    MOTION_FIT,
     MOVED_M,
     RELINEARISED,
     SCALE_BOUND,
@@ -49,6 +50,7 @@ from railfix.kernels.tracking.layout import (
     HYPOTHESES,
     MAP_LOG_VARIANCE,
     MEASURED,
+    MOTION_MISFIT,
     OF_EPOCH,
     OPEN,
     PREDICTION,
@@ -100,6 +102,7 @@ def _needs_search(epochs: Epochs, t: int, parameters: Parameters, state: KernelS
     lost = scalars[WEAK_MOTION] >= parameters.lost_motion_s or scalars[WEAK_CODE] >= parameters.lost_code_s
     lost = lost or scalars[ACROSS] >= ACROSS_LOST
     beside = scalars[WEAK_MOTION] >= BESIDE_AFTER_S or scalars[ACROSS] >= ACROSS_DOUBT
+    beside = beside or scalars[MOTION_MISFIT] > 1.0 - MOTION_FIT
     coded = False
     for k in range(epochs.has.shape[2]):
         coded = coded or epochs.has[0, t, k]
