@@ -133,7 +133,12 @@ class Problem:
         return float((np.delete(residual, np.flatnonzero(out)) ** 2).sum()) / scale**2
 
     def rank_without(self, without: tuple[int, ...]) -> int:
-        keep = np.delete(np.arange(len(self.observed)), np.flatnonzero(np.isin(self.channels, without)))
+        """Rank of what is left; a prior of an untied clock tells nothing."""
+        untied = len(self.channels) + np.flatnonzero(
+            (np.abs(self.design[len(self.channels) :]) @ self.scale_of) >= UNTIED_M
+        )
+        left_out = [*np.flatnonzero(np.isin(self.channels, without)), *untied]
+        keep = np.delete(np.arange(len(self.observed)), left_out)
         return int(np.linalg.matrix_rank(self.design[keep], tol=1e-7))
 
 
@@ -203,7 +208,7 @@ class Candidate:
 def candidates(case: Problem, size: int, limits: RaimLimits, scale: float) -> Iterator[Candidate]:
     """Subsets of one size that may be excluded, by the rule as written, each solved again."""
     limit = chi2.isf(limits.false_alarm, case.freedom - size) if limits.mode == "chi_square" else limits.fixed_limit_m2
-    full = np.linalg.matrix_rank(case.design, tol=1e-7)
+    full = case.rank_without(())
     start, _, _ = case.solve()
     for members in combinations(case.channels, size):
         if case.rank_without(members) < full:
