@@ -120,7 +120,7 @@ def test_a_few_satellites_of_one_wall_do_not_stop_the_train() -> None:
     assert result.speed_mps[80] == pytest.approx(15.0, abs=2.0)
     assert error[80:].max() < 4.0
     believed, _ = track(epochs, case.line, limits=TrackingLimits(trusted_satellites=0))
-    assert np.abs(believed.arc_m - case.arc_m)[80:85].min() > 8.0
+    assert np.abs(believed.arc_m - case.arc_m)[80:82].min() > 8.0
 
 
 @pytest.mark.requirement("E5")

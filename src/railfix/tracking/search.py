@@ -84,7 +84,8 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
     wide = covariance[:, StateIndex.ARC, StateIndex.ARC] > limits.start_sigma_m**2
     if not (lost or (gap and wide.any())):
         contradicted = state.weak_motion_s >= BESIDE_AFTER_S or state.across >= ACROSS_DOUBT
-        if contradicted or state.motion_misfit > 1.0 - MOTION_FIT:
+        contradicted = contradicted or state.motion_misfit > 1.0 - MOTION_FIT
+        if contradicted and state.measured >= state.time:
             parent = np.append(parent, np.full(_try_beside(state, limits), -1))
         return Sought(lost=False, parent=parent, splits=None)
     arc, sigma = places(chunk, epoch, line, limits)

@@ -77,11 +77,10 @@ def learn(
     code, motion = mean_weights(rows, work.variance, work, best)
     weak = motion < parameters.lost_motion_weight
     scalars[WEAK_MOTION] = scalars[WEAK_MOTION] + dt if weak else max(scalars[WEAK_MOTION] - MOTION_LEAK * dt, 0.0)
-    if not math.isnan(motion):
-        misfit = 1.0 - motion
-        for j in range(rows.counts[3]):
-            misfit = 0.0 if rows.sensors[j] < FORCE_ROW else misfit
-        scalars[MOTION_MISFIT] += (1.0 - math.exp(-dt / MOTION_FIT_S)) * (misfit - scalars[MOTION_MISFIT])
+    misfit = 0.0 if math.isnan(motion) else 1.0 - motion
+    for j in range(rows.counts[3]):
+        misfit = 0.0 if rows.sensors[j] < FORCE_ROW else misfit
+    scalars[MOTION_MISFIT] += (1.0 - math.exp(-dt / MOTION_FIT_S)) * (misfit - scalars[MOTION_MISFIT])
     if code_s > 0.0:
         weak = code < parameters.lost_code_weight
         gone = max(scalars[WEAK_CODE] - CODE_LEAK * code_s, 0.0)

@@ -103,6 +103,7 @@ def _needs_search(epochs: Epochs, t: int, parameters: Parameters, state: KernelS
     lost = lost or scalars[ACROSS] >= ACROSS_LOST
     beside = scalars[WEAK_MOTION] >= BESIDE_AFTER_S or scalars[ACROSS] >= ACROSS_DOUBT
     beside = beside or scalars[MOTION_MISFIT] > 1.0 - MOTION_FIT
+    beside = beside and scalars[MEASURED] > epochs.time_s[t] - 1.5 * epochs.interval_s[t]
     coded = False
     for k in range(epochs.has.shape[2]):
         coded = coded or epochs.has[0, t, k]
