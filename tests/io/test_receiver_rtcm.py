@@ -186,3 +186,18 @@ def test_ten_days_in_one_piece() -> None:
     assert not piece.measurements.skipped
     toe = navigation_of(piece.ephemerides).glonass.toe
     assert toe.tolist() == (np.array(days) + np.timedelta64(75 * 60 + 18, "s")).astype("M8[ns]").tolist()
+
+
+@pytest.mark.requirement("A12")
+@pytest.mark.parametrize("kind", [1005, 1006])
+def test_the_position_of_a_base_station_is_that_of_its_last_message(kind: int) -> None:
+    """The example of message 1005 of RTCM 10403.3 (section 4.2), and the same as 1006."""
+    x, y, z = 1114104.5999, -4850729.7108, 3975521.4643
+    data = bytes.fromhex("d300133ed7d30202980edeef34b4bd62ac0941986f33360b98")
+    if kind == 1006:
+        fields = [(round(value * 1e4) & (1 << 38) - 1, 38) for value in (x, y, z)]
+        gap = (0, 2)
+        data = rtcm_message([(1006, 12), (2003, 12), (8, 10), fields[0], gap, fields[1], gap, fields[2], (15000, 16)])
+    piece, state = decode(data, StreamState(), at_end=True)
+    assert piece.station == pytest.approx((x, y, z), abs=1e-4)
+    assert decode(b"", state)[0].station == piece.station

@@ -14,7 +14,7 @@ import recordings_truth
 from railfix.cli import app
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.evaluate.range_errors import (
-    BaseStation,
+    CommonErrors,
     ModelInputs,
     base_station,
     base_station_from_files,
@@ -27,7 +27,8 @@ from railfix.gnss.observations import Observations
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
-from railfix.pipeline.processor import EpochProcessor, conditions_of
+from railfix.pipeline.corrected_ranges import conditions_of
+from railfix.pipeline.processor import EpochProcessor
 from railfix.ranges.error_model import ErrorModelFit, read_error_model, write_error_model
 from railfix.run import RunOptions, read_record, run_files
 from railfix.run.driver import open_inputs
@@ -66,7 +67,7 @@ def test_too_few_ranges_have_no_clock() -> None:
 
 
 def test_a_station_speaks_between_its_epochs_and_of_its_satellites() -> None:
-    station = BaseStation(
+    station = CommonErrors(
         name="x",
         time=EPOCH + np.array([0, 30, 90]) * np.timedelta64(1, "s"),
         satellite=np.array(["E01", "G01"]),

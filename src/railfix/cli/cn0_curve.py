@@ -10,11 +10,9 @@ from rich.table import Table
 
 from railfix.cli.console import console_of_tables, show_files, show_notes
 from railfix.cli.options import LenientOption, OverwriteOption, check_outputs
-from railfix.core.arrays import Floats
-from railfix.core.errors import SettingsError
-from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import validated
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, CurveFit, cn0_curve_from_log, write_cn0_curve
+from railfix.run.base_station import place_of
 
 
 def cn0_curve(
@@ -65,17 +63,6 @@ def cn0_curve(
     write_cn0_curve(fitted.curve, out)
     _print_curve(fitted.curve, fitted.notes)
     show_files(console_of_tables(), outputs)
-
-
-def place_of(text: str, option: str) -> Floats:
-    """Return a position given as LAT,LON,HEIGHT on the command line, ECEF, shape (3,) [m]."""
-    try:
-        latitude, longitude, height = (float(part) for part in text.split(","))
-    except ValueError:
-        raise SettingsError(f"{option} {text!r}: expected LAT,LON,HEIGHT, for example 35.63,139.74,60") from None
-    if not (-90.0 <= latitude <= 90.0 and -180.0 <= longitude <= 360.0 and -1e4 < height < 1e5):
-        raise SettingsError(f"{option} {text!r}: latitude, longitude in degrees and height in metres were expected")
-    return ecef_from_geodetic(latitude, longitude, height)
 
 
 def _print_curve(curve: Cn0Curve, notes: tuple[str, ...]) -> None:

@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from railfix.cli.cn0_curve import place_of
 from railfix.cli.console import console_of_tables
 from railfix.cli.options import OverwriteOption, check_outputs, from_models
 from railfix.core.errors import SettingsError
@@ -23,6 +22,7 @@ from railfix.ranges.error_model import (
     write_error_model,
 )
 from railfix.run import read_record
+from railfix.run.base_station import place_of
 
 
 @from_models

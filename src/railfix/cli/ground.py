@@ -111,7 +111,7 @@ def monitor(
         raise SettingsError("--nav is missing: logs need navigation files")
     observations = [read_observations(path) for path in logs]
     if point:
-        from railfix.cli.cn0_curve import place_of
+        from railfix.run.base_station import place_of
 
         points = np.stack([place_of(text, "--point") for text in point])
     else:
@@ -147,12 +147,12 @@ def _monitor_live(
     import asyncio
     import time
 
-    from railfix.cli.cn0_curve import place_of
     from railfix.ground.monitor_log import LiveMonitor
     from railfix.ground.station_streams import stream_fixes
     from railfix.ground.triangle import TriangleVerdict
     from railfix.io import read_navigation
     from railfix.live.sources import check_source, is_file
+    from railfix.run.base_station import place_of
 
     if not choices.point:
         raise SettingsError("--point is missing: streams name no known points; give it once for each receiver")

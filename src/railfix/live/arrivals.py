@@ -13,7 +13,7 @@ from railfix.io.receiver.log import StreamState
 from railfix.io.receiver.recognise import head_of, is_receiver_log
 from railfix.io.rinex import scan_observations
 from railfix.live.settings import LiveSettings
-from railfix.live.sources import Connected, Lost, is_file, read_source
+from railfix.live.sources import Connected, Lost, Place, is_file, read_source
 from railfix.live.stream import ReceivedData, ReceiverState, receive_bytes, single_epochs
 
 Item = TypeVar("Item")
@@ -27,9 +27,9 @@ def fresh_state(source: str, date: np.datetime64 | None = None) -> ReceiverState
 
 
 async def arrivals(
-    source: str, state: ReceiverState, settings: LiveSettings
+    source: str, state: ReceiverState, settings: LiveSettings, place: Place | None = None
 ) -> AsyncIterator[ReceivedData | Connected | Lost]:
-    """What a source's data complete, item by item, and the breaks of its connection."""
+    """What a source's data complete, item by item, and the breaks of its connection; `place` as for `read_source`."""
     path = source.removeprefix("file:")
     if source != "-" and is_file(source) and not is_receiver_log(head_of(path)):
         for piece in scan_observations(path, epochs=200):
@@ -37,7 +37,7 @@ async def arrivals(
                 yield ReceivedData(epochs=(epoch,), after=state)
                 await asyncio.sleep(0)
         return
-    async for part in read_source(source, settings):
+    async for part in read_source(source, settings, place):
         if isinstance(part, bytes):
             for item in receive_bytes(part, state):
                 state = item.after

@@ -117,6 +117,11 @@ class TwoChannels(LiveEngine):
         super().add_sbas(messages)
         self._call("add_sbas", messages)
 
+    def add_base(self, epoch: Observations) -> None:
+        """As `LiveEngine.add_base`."""
+        super().add_base(epoch)
+        self._call("add_base", epoch)
+
     def add_samples(self, sensed: Sensed) -> None:
         """As `LiveEngine.sense`."""
         super().add_samples(sensed)

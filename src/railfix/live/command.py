@@ -9,11 +9,12 @@ import signal
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from railfix import kernels
+from railfix.core.arrays import Floats
 from railfix.core.errors import OutputError, SettingsError
 from railfix.io.logs import read_navigation
 from railfix.live.channels import TwoChannels
@@ -35,6 +36,7 @@ from railfix.live.warm_up import prepare_kernels
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
+from railfix.run.base_station import place_of
 from railfix.run.driver import time_of
 from railfix.run.output import check_not_input
 from railfix.run.processor import processor_of
@@ -216,8 +218,11 @@ def _prepare(inputs: LiveInputs, tables: SensorSamples) -> tuple[OpenedLine, Epo
     at = time_of(navigation)
     if at is None:
         at = np.datetime64("now", "ns") if inputs.logs.instant is None else inputs.logs.instant
-    line = open_line(inputs.track, inputs.vehicle, antennas=tuple(inputs.sources), reading=inputs.reading, at=at)
-    return line, processor_of(config, navigation, line.trajectories, track=line.track, units=units)
+    line = open_line(inputs.track, inputs.vehicle, antennas=inputs.antennas, reading=inputs.reading, at=at)
+    base: Floats | Literal["stream"] | None = None
+    if inputs.base is not None:
+        base = "stream" if inputs.base_place is None else place_of(inputs.base_place, "--base-place")
+    return line, processor_of(config, navigation, line.trajectories, track=line.track, units=units, base_ecef_m=base)
 
 
 def _check_reference(line: OpenedLine, live: LiveSettings) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.observations import Observations
+from railfix.gnss.observations import Observations, concatenate
 from railfix.io.train_message import TrainMessage
 from railfix.kernels import load
 from railfix.live.lag import Lag
@@ -78,11 +78,12 @@ class EngineState:
 
 @dataclass(frozen=True, kw_only=True)
 class _FromSatellites:
-    """Records and SBAS messages; `heard` counts such arrivals."""
+    """Records, SBAS messages and epochs of a base station; `heard` counts such arrivals."""
 
     heard: int
     navigation: Navigation | None = None
     messages: SbasMessages | None = None
+    base: Observations | None = None
 
     def with_later(self, later: _FromSatellites) -> _FromSatellites:
         """Both together."""
@@ -91,7 +92,10 @@ class _FromSatellites:
             navigation = later.navigation if navigation is None else merged_navigation(navigation, later.navigation)
         if later.messages is not None:
             messages = later.messages if messages is None else messages.joined(later.messages)
-        return _FromSatellites(heard=later.heard, navigation=navigation, messages=messages)
+        base = [part for part in (self.base, later.base) if part is not None]
+        return _FromSatellites(
+            heard=later.heard, navigation=navigation, messages=messages, base=concatenate(base) if base else None
+        )
 
 
 @dataclass(frozen=True)
@@ -141,6 +145,7 @@ class LiveEngine:
         self._saved: EngineState | None = None
         self._from_satellites: deque[_FromSatellites] = deque()
         self._heard = self._heard_at_push = 0
+        self._based_to: np.datetime64 | None = None
         self._samples = SensorSamples()
         self._heard_to = dict.fromkeys(sensors, np.datetime64("NaT", "ns"))
         self._sequence = 0
@@ -157,6 +162,14 @@ class LiveEngine:
     def add_sbas(self, messages: SbasMessages) -> None:
         """Take SBAS messages; they are used from the next epoch on."""
         self._hear(_FromSatellites(heard=self._heard + 1, messages=messages))
+
+    def add_base(self, epoch: Observations) -> None:
+        """Take an epoch of the base station; it is used from the next epoch on."""
+        if self._based_to is not None and epoch.time[0] <= self._based_to:
+            self.counts["base station out of order"] += 1
+            return
+        self._based_to = epoch.time[-1]
+        self._hear(_FromSatellites(heard=self._heard + 1, base=epoch))
 
     def add_samples(self, sensed: Sensed) -> None:
         """Take samples of a sensor on board that was named when the engine was made."""
@@ -390,6 +403,7 @@ class LiveEngine:
             self._state,
             navigation=news.navigation,
             messages=news.messages,
+            base=news.base,
             sensors=self._samples_until(self._done_ns) if self._heard_to else None,
         )
         self._tell_changes((self._state.received or self.processor.received).notes)

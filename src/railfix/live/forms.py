@@ -68,6 +68,12 @@ def nmea_bytes(output: LiveOutput) -> bytes:
     return b"".join(map(_sentence, sentences))
 
 
+def gga_sentence(output: LiveOutput) -> bytes:
+    """Return the GGA sentence of a valid position; empty without one."""
+    valid = output.message.status in (MessageStatus.POSITION, MessageStatus.COASTING)
+    return nmea_bytes(output).split(b"\r\n")[0] + b"\r\n" if valid and _geodetic(output) is not None else b""
+
+
 def tpv_bytes(output: LiveOutput) -> bytes:
     """A report of gpsd's class TPV as a line of JSON; heights are above the ellipsoid (altHAE)."""
     place = _geodetic(output)

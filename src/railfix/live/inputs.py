@@ -24,13 +24,21 @@ class LiveInputs(Settings):
 
     front: str = input_option(
         "Stream of the front antenna's receiver: a file, tcp://HOST:PORT, serial:DEVICE?baud=115200, "
-        "ntrip://[USER:PASSWORD@]HOST:PORT/MOUNT, or - (standard input).",
+        "ntrip://[USER:PASSWORD@]HOST:PORT/MOUNT (ntrips:// over TLS), or - (standard input).",
         metavar="SOURCE",
     )
     track: tuple[Path, ...] = input_option("Track map; repeat it for a route.", metavar="TRACK")
     rear: str | None = input_option("The same of the rear antenna.", None, metavar="SOURCE")
     vehicle: Path | None = input_option("Vehicle of the antennas.", None, metavar="TOML")
     nav: tuple[Path, ...] = input_option("Navigation files known from the start.", (), metavar="FILE")
+    base: str | None = input_option(
+        "Stream of a base station: RTCM 3 (MSM, and 1005 or 1006 with its position) or as of --front.",
+        None,
+        metavar="SOURCE",
+    )
+    base_place: str | None = option(
+        "Position of the base station; from its stream or header without it.", None, metavar="LAT,LON,HEIGHT"
+    )
     tachometer: str | None = input_option(
         "Pulses of a tachometer: the rows of the table of `railfix run` as lines of CSV, header first, from a "
         "source as of --front; or the whole table, a file. A row with the time alone says that no pulse came.",
@@ -64,9 +72,15 @@ class LiveInputs(Settings):
     logs: LogReading = Field(default_factory=LogReading)
 
     @property
-    def sources(self) -> dict[Literal["front", "rear"], str]:
-        """Streams by antenna."""
-        return {"front": self.front} if self.rear is None else {"front": self.front, "rear": self.rear}
+    def antennas(self) -> tuple[Literal["front", "rear"], ...]:
+        """Antennas with a stream."""
+        return ("front",) if self.rear is None else ("front", "rear")
+
+    @property
+    def sources(self) -> dict[str, str]:
+        """Streams by antenna, and of the base station."""
+        given = {"front": self.front, "rear": self.rear, "base": self.base}
+        return {name: source for name, source in given.items() if source is not None}
 
     @property
     def sensors(self) -> dict[Sensor, str]:

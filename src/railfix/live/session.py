@@ -16,6 +16,7 @@ import numpy as np
 from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
 from railfix.live.arrivals import arrivals, fresh_state, next_arrival
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
+from railfix.live.forms import gga_sentence
 from railfix.live.metrics import Metrics
 from railfix.live.sensor_lines import FOREVER, Sensed, SensorLines
 from railfix.live.sinks import Sink
@@ -30,6 +31,9 @@ _LONGEST_QUEUE: Final = 64
 _BETWEEN_COLLECTIONS: Final = 100
 #: How often the status is shown [s].
 _STATUS_S: Final = 0.5
+
+#: Name of the source that is a base station.
+BASE: Final = "base"
 
 _LOG: Final = logging.getLogger("railfix.live")
 _Queue = asyncio.Queue[tuple[str, ReceivedData | None] | Sensed]
@@ -74,7 +78,8 @@ async def run_session(
     Parameters
     ----------
     sources : mapping of str to str
-        By antenna; see `railfix.live.sources.read_source`. RINEX observation files are replayed as well.
+        By antenna, and of a base station (`BASE`); see `railfix.live.sources.read_source`.
+        RINEX observation files are replayed as well.
     speed : float or None
         For recorded files: times as fast as recorded. None: as fast as they go; the clock is then that of the time
         tags (set `LiveSettings.no_input` to "skip" for one message an epoch and no more).
@@ -132,7 +137,8 @@ async def run_session(
 class _Session:
     """A session at work: what it consists of, the states of its streams, and when things were done last (monotonic).
 
-    `read_to_ns` has the latest tag taken from each source that has not ended, -1 before the first.
+    `read_to_ns` has the latest tag taken from each source that has not ended, -1 before the
+    first; `place` is the last position as a GGA sentence, for a virtual base station.
     """
 
     engine: LiveEngine
@@ -141,6 +147,7 @@ class _Session:
     hooks: Hooks
     streams: dict[str, ReceiverState] = field(default_factory=dict)
     read_to_ns: dict[str, int] = field(default_factory=dict)
+    place: bytes = b""
     saved: float = field(default_factory=time.monotonic)
     shown: float = 0.0
     since_collection: int = 0
@@ -209,7 +216,8 @@ class _Session:
 
     async def received(self, name: str, source: str) -> AsyncIterator[ReceivedData]:
         """What a source's data complete, item by item; breaks of its connection are logged and counted."""
-        async for item in arrivals(source, self.streams[name], self.engine.settings):
+        place = (lambda: self.place) if name == BASE else None
+        async for item in arrivals(source, self.streams[name], self.engine.settings, place):
             if isinstance(item, ReceivedData):
                 yield item
             else:
@@ -244,6 +252,9 @@ class _Session:
         tag_ns = -1
         for epoch in received.epochs:
             tag_ns = int((epoch.time[0] - GPS_EPOCH).astype(np.int64))
+            if name == BASE:
+                self.engine.add_base(epoch)
+                continue
             self.engine.push(name, epoch, now_ns=tag_ns if now_ns is None else now_ns)
         return tag_ns
 
@@ -254,6 +265,8 @@ class _Session:
         if outputs:
             self.metrics.took(time.perf_counter() - began, outputs)
         for output in outputs:
+            if self.engine.settings.gga_s > 0.0:
+                self.place = gga_sentence(output) or self.place
             for sink in self.sinks:
                 sink.send(output)
             if self.hooks.observe is not None:
@@ -323,9 +336,12 @@ class _InTurn:
     def __init__(self, read_to_ns: Mapping[str, int]) -> None:
         self._read_to_ns = read_to_ns
 
-    async def wait(self, name: str, _: np.datetime64) -> None:
-        """Wait until no other file is behind this one."""
-        while self._read_to_ns[name] > min(self._read_to_ns.values()):
+    async def wait(self, name: str, tag: np.datetime64) -> None:
+        """Wait until no other file is behind this one, and that of a base station has been read up to the tag."""
+        tag_ns = int((tag - GPS_EPOCH).astype(np.int64))
+        while self._read_to_ns[name] > min(self._read_to_ns.values()) or (
+            name != BASE and self._read_to_ns.get(BASE, tag_ns) < tag_ns
+        ):
             await asyncio.sleep(0)
 
     def ended(self, name: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
@@ -31,6 +32,10 @@ class LiveSettings(Settings):
     reconnect_first_s, reconnect_longest_s : float [s]
     silence_s : float [s]
         A connection without a byte for so long counts as broken.
+    gga_s : float [s]
+        How often the caster of the base station is sent the train's position (GGA), for a virtual station; 0: never.
+    ntrip_certificates : path or None
+        Certificates (PEM) that casters over TLS may have beside those that the system trusts.
     waiting : int
         Messages that may wait for a slow target; further ones are dropped for it and counted.
     behind_s : float [s]
@@ -67,6 +72,8 @@ class LiveSettings(Settings):
     reconnect_first_s: float = Field(default=1.0, gt=0.0, le=600.0)
     reconnect_longest_s: float = Field(default=30.0, gt=0.0, le=3600.0)
     silence_s: float = Field(default=30.0, gt=0.0, le=3600.0)
+    gga_s: float = Field(default=0.0, ge=0.0, le=3600.0)
+    ntrip_certificates: Path | None = None
     waiting: int = Field(default=100, ge=1, le=100_000)
     behind_s: float = Field(default=5.0, ge=0.5, le=3600.0)
     state_every_s: float = Field(default=5.0, gt=0.0, le=3600.0)

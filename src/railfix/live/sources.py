@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import base64
 import io
+import ssl
 import sys
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,17 +20,26 @@ from railfix.core.files import open_stream
 from railfix.live.settings import LiveSettings
 
 Item = TypeVar("Item")
+#: The present position as a GGA sentence, empty while there is none.
+Place = Callable[[], bytes]
+#: What is said to the other end of a connection, until cancelled.
+Said = Callable[[asyncio.StreamWriter], Coroutine[None, None, None]]
 
 _BLOCK = 4096
 _FORMS = (
-    "a file, tcp://HOST:PORT, serial:DEVICE?baud=115200, ntrip://[USER:PASSWORD@]HOST:PORT/MOUNT, or - (standard input)"
+    "a file, tcp://HOST:PORT, serial:DEVICE?baud=115200, ntrip://[USER:PASSWORD@]HOST:PORT/MOUNT (ntrips:// over TLS), "
+    "or - (standard input)"
 )
+#: NTRIP, plain and over TLS.
+_NTRIP = ("ntrip", "ntrips")
 #: Longest wait for a connection, and for the first line of an answer [s].
 _CONNECT_S = 10.0
 #: Longest wait for a byte of a serial line in one call [s].
 _SERIAL_S = 0.05
 #: Wait for what has come already [s].
 _ONCE_MORE_S = 0.02
+#: Wait for a first position to send to a caster [s].
+_NO_PLACE_S = 1.0
 #: Longest header of a caster's answer [bytes].
 _HEADER_BYTES = 65_536
 
@@ -57,12 +67,12 @@ def check_source(source: str) -> None:
     SettingsError
     """
     parts = urlsplit(source)
-    if parts.scheme in ("tcp", "ntrip"):
+    if parts.scheme in ("tcp", *_NTRIP):
         try:
             port = parts.port
         except ValueError:
             port = None
-        if not parts.hostname or port is None or (parts.scheme == "ntrip" and not parts.path.strip("/")):
+        if not parts.hostname or port is None or (parts.scheme in _NTRIP and not parts.path.strip("/")):
             raise SettingsError(f"source {hidden(source)!r}: expected {_FORMS}")
     elif parts.scheme == "serial":
         _baud(source)
@@ -72,7 +82,7 @@ def check_source(source: str) -> None:
 
 def is_file(source: str) -> bool:
     """Whether a source is a recorded file."""
-    return source != "-" and urlsplit(source).scheme not in ("tcp", "ntrip", "serial")
+    return source != "-" and urlsplit(source).scheme not in ("tcp", "serial", *_NTRIP)
 
 
 def hidden(source: str) -> str:
@@ -81,9 +91,12 @@ def hidden(source: str) -> str:
     return source if parts.password is None else source.replace(f":{parts.password}@", ":***@", 1)
 
 
-async def read_source(source: str, settings: LiveSettings) -> AsyncIterator[bytes | Connected | Lost]:
+async def read_source(
+    source: str, settings: LiveSettings, place: Place | None = None
+) -> AsyncIterator[bytes | Connected | Lost]:
     """Bytes of a source as they arrive; connections that break are opened again, see `LiveSettings.reconnect`.
 
+    `place` gives the present GGA sentence, which a caster is sent every `LiveSettings.gga_s`; none while it is empty.
     InputFileError: when the source cannot be opened, or breaks and is not opened again.
     """
     parts = urlsplit(source)
@@ -96,7 +109,8 @@ async def read_source(source: str, settings: LiveSettings) -> AsyncIterator[byte
     else:
         opened: dict[str, Callable[[], AsyncIterator[bytes]]] = {
             "tcp": lambda: _tcp(source, b"", settings.silence_s),
-            "ntrip": lambda: _ntrip(source, settings.silence_s),
+            "ntrip": lambda: _ntrip(source, settings, place),
+            "ntrips": lambda: _ntrip(source, settings, place),
             "serial": lambda: _serial(source, settings.silence_s),
         }
         async for part in _keep_open(opened[parts.scheme], settings):
@@ -150,14 +164,25 @@ async def _within(seconds: float, call: Callable[[], Awaitable[Item]]) -> Item:
         return await call()
 
 
-async def _tcp(source: str, request: bytes, silence_s: float) -> AsyncIterator[bytes]:
-    """Empty bytes once connected, then what arrives."""
+async def _tcp(
+    source: str, request: bytes, silence_s: float, *, tls: ssl.SSLContext | None = None, said: Said | None = None
+) -> AsyncIterator[bytes]:
+    """Empty bytes once connected, then what arrives; `said` goes on saying things to the other end meanwhile."""
     parts = urlsplit(source)
     try:
         async with asyncio.timeout(_CONNECT_S):
-            reader, writer = await asyncio.open_connection(parts.hostname, parts.port)
+            reader, writer = await asyncio.open_connection(parts.hostname, parts.port, ssl=tls)
+    except ssl.SSLCertVerificationError as error:
+        why = f"its certificate is not accepted ({error.verify_message})"
+        hint = "; a certificate of its own goes into --live ntrip_certificates=FILE"
+        raise InputFileError(hidden(source), why + hint) from None
+    except ssl.SSLError as error:
+        reason = (error.reason or str(error)).lower().replace("_", " ")
+        raise InputFileError(hidden(source), f"does not speak TLS there ({reason}); is it ntrip://?") from None
     except (OSError, TimeoutError) as error:
-        raise InputFileError(hidden(source), f"cannot be connected to ({error or 'no answer'})") from None
+        over = "" if tls is None else " over TLS"
+        raise InputFileError(hidden(source), f"cannot be connected to{over} ({str(error) or 'no answer'})") from None
+    saying = None if said is None else asyncio.create_task(said(writer))
     try:
         if request:
             writer.write(request)
@@ -170,12 +195,20 @@ async def _tcp(source: str, request: bytes, silence_s: float) -> AsyncIterator[b
     except OSError as error:
         raise InputFileError(hidden(source), f"the connection broke ({error})") from None
     finally:
+        if saying is not None:
+            saying.cancel()
         writer.close()
 
 
-async def _ntrip(source: str, silence_s: float) -> AsyncIterator[bytes]:
-    """A mount point of an NTRIP caster, version 2, or 1 where the caster answers so."""
+async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> AsyncIterator[bytes]:
+    """A mount point of an NTRIP caster, version 2, or 1 where the caster answers so.
+
+    With `LiveSettings.gga_s` it is told where the train is: in the request where that is known (NTRIP 2), and as lines
+    from then on, for the virtual station that it makes there.
+    """
     parts = urlsplit(source)
+    if settings.gga_s == 0.0:
+        place = None
     head = [
         f"GET {parts.path} HTTP/1.1",
         f"Host: {parts.hostname}:{parts.port}",
@@ -186,9 +219,22 @@ async def _ntrip(source: str, silence_s: float) -> AsyncIterator[bytes]:
     if parts.username is not None:
         login = f"{unquote(parts.username)}:{unquote(parts.password or '')}"
         head.append("Authorization: Basic " + base64.b64encode(login.encode()).decode())
+    if place is not None and (sentence := place()):
+        head.append("Ntrip-GGA: " + sentence.decode("ascii").strip())
     request = ("\r\n".join(head) + "\r\n\r\n").encode()
     answer, answered, body = b"", False, None
-    async for data in _tcp(source, request, silence_s):
+    open_to_lines = asyncio.Event()
+
+    async def report(writer: asyncio.StreamWriter) -> None:
+        await open_to_lines.wait()
+        while place is not None and not writer.is_closing():
+            if sentence := place():
+                writer.write(sentence)
+            await asyncio.sleep(settings.gga_s if sentence else min(settings.gga_s, _NO_PLACE_S))
+
+    tls = _tls(source, settings.ntrip_certificates) if parts.scheme == "ntrips" else None
+    said = None if place is None else report
+    async for data in _tcp(source, request, settings.silence_s, tls=tls, said=said):
         if answered:
             if content := data if body is None else body.take(data):
                 yield content
@@ -209,11 +255,25 @@ async def _ntrip(source: str, silence_s: float) -> AsyncIterator[bytes]:
         else:
             continue
         answered = True
+        open_to_lines.set()
         yield b""
         if content := rest if body is None else body.take(rest):
             yield content
     if not answered:
-        raise InputFileError(hidden(source), "the caster has closed the connection without an answer")
+        hint = "" if tls is not None else "; does it expect TLS (ntrips://)?"
+        raise InputFileError(hidden(source), f"the caster has closed the connection without an answer{hint}")
+
+
+def _tls(source: str, certificates: Path | None) -> ssl.SSLContext:
+    """TLS with the certificates that the system trusts, and those of a file."""
+    context = ssl.create_default_context()
+    if certificates is not None:
+        try:
+            context.load_verify_locations(certificates)
+        except OSError as error:
+            why = "holds no certificate in PEM" if isinstance(error, ssl.SSLError) else str(error.strerror)
+            raise SettingsError(f"ntrip_certificates: {certificates}: {why}; needed for {hidden(source)}") from None
+    return context
 
 
 def _refuse(source: str, first: bytes) -> InputFileError:

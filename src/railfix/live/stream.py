@@ -13,7 +13,7 @@ from railfix.gnss.observations import Observations
 from railfix.io.receiver import rtcm, sbf, ubx
 from railfix.io.receiver.ephemerides import navigation_of
 from railfix.io.receiver.framing import find_frames
-from railfix.io.receiver.log import StreamState, decode
+from railfix.io.receiver.log import StreamState, at_station, decode
 from railfix.io.receiver.measurements import Tracking, observations_of
 from railfix.io.receiver.subframes import SbasFrames
 
@@ -88,7 +88,7 @@ def _receive(data: bytes, state: ReceiverState) -> ReceivedData:
     )
     records = piece.ephemerides
     return ReceivedData(
-        epochs=single_epochs(observations),
+        epochs=single_epochs(at_station(observations, piece.station)),
         navigation=navigation_of(records) if records.records or records.klobuchar else None,
         sbas=piece.sbas if len(piece.sbas) else None,
         skipped_bytes=piece.skipped_bytes,

@@ -41,6 +41,7 @@ from railfix.positioning.robust_fit import RobustFitLimits
 from railfix.positioning.section_search import SectionLimits
 from railfix.positioning.single_point import SinglePointLimits
 from railfix.positioning.two_frequencies import TwoFrequencyLimits
+from railfix.ranges.base_station import BaseLimits
 from railfix.ranges.sbas import SbasLimits
 from railfix.ranges.weights import DEFAULT_SIGNALS, CodeNoise, NominalErrors
 from railfix.screens import SCREENS
@@ -194,9 +195,10 @@ class Config(ScreenSettings):
         Limits of the weights and the screens.
     clock_offsets, single_point, section, constrained
         Limits of these stages.
-    carrier : {"off", "smoothed", "float"}
+    carrier : {"off", "smoothed", "float", "fixed"}
         Use of the carrier phase: none; codes smoothed by it; or code and phase together with float
-        ambiguities, from this and earlier epochs. On recordings smoothing helps most on a phone, float
+        ambiguities, from this and earlier epochs, and with integer ones beside a base station ("fixed").
+        On recordings smoothing helps most on a phone, float
         ambiguities under open sky; in towns, where arcs last seconds, neither removes large errors.
     phase_sigma_m : float
         Standard deviation of a phase at the zenith, multipath included.
@@ -210,6 +212,8 @@ class Config(ScreenSettings):
         Noise of motion and measurements of that filter.
     sensors : SensorLimits
         Noise of the sensors on board, and the wheel of the tachometer.
+    base : BaseLimits
+        Limits of the differences with a base station.
     slips, smoothing, continuity, phase
         Limits of the stages of the carrier phase.
     """
@@ -243,6 +247,7 @@ class Config(ScreenSettings):
     sbas: tuple[Path, ...] | Literal["stream"] = ()
     sbas_prn: int | Literal["best"] = "best"
     sbas_limits: SbasLimits = SbasLimits()
+    base: BaseLimits = BaseLimits()
     error_model: Path | None = None
     nominal: NominalErrors = NominalErrors()
     protection: Literal["on", "off"] = "on"
@@ -252,7 +257,7 @@ class Config(ScreenSettings):
     alarm_limit_m: float = Field(default=20.0, gt=0, le=1e5)
     no_level_m: tuple[tuple[float, float], ...] = ()
     raim_protection: Literal["on", "off"] = "off"
-    carrier: Literal["off", "smoothed", "float"] = "off"
+    carrier: Literal["off", "smoothed", "float", "fixed"] = "off"
     phase_sigma_m: float = Field(default=0.01, gt=0)
     slips: CycleSlipLimits = CycleSlipLimits()
     smoothing: SmoothingLimits = SmoothingLimits()

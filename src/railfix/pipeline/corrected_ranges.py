@@ -24,7 +24,8 @@ from railfix.positioning.section_search import SearchIndex, search
 from railfix.positioning.single_point import SinglePointLimits, single_point
 from railfix.positioning.two_frequencies import Combined, SecondCodes
 from railfix.ranges.atmospheric_delays import SeenFrom, modelled_delays
-from railfix.ranges.error_model import ErrorModel
+from railfix.ranges.base_station import BaseDifferences
+from railfix.ranges.error_model import Conditions, ErrorModel
 from railfix.ranges.sbas_delays import SBAS_SIGNAL, corrected_satellites, sbas_delays
 from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m, first_available
 from railfix.screens import AntennaRanges, Screened, Verdict, suspicion_sigma_m
@@ -62,6 +63,8 @@ class CorrectedRanges(AntennaRanges):
         How the two were combined.
     slips : Slips or None
         Of all channels of the observations, where the carrier phase is used.
+    base : BaseDifferences or None
+        What a base station has subtracted.
     """
 
     observations: Observations
@@ -76,6 +79,7 @@ class CorrectedRanges(AntennaRanges):
     second: SecondCodes | None = None
     combined: Combined | None = None
     slips: Slips | None = None
+    base: BaseDifferences | None = None
 
     @property
     def columns(self) -> Indices:
@@ -190,12 +194,20 @@ def correct_ranges(
         delays = sbas_delays(sbas, fixes, obs.time, seen, frequency)
         beyond = nominal = delays.sigma_m
         reason = np.where(observed, reason | delays.reason, reason)
-    second = None
-    if sbas is None:
+    second = base = None
+    if received.base is not None:
+        base = received.base.at(obs.time, satellite, signal, anchor, config.base)
+    elif sbas is None:
         air = delays.ionosphere_m, delays.troposphere_m
         second = second_codes(obs, channels, states, received, seen.elevation_deg, *air, config)
     clean = clean - delays.ionosphere_m - delays.troposphere_m
-    sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), beyond)
+    if base is not None:
+        differenced = np.isfinite(base.code_m)
+        clean = np.where(differenced, clean - base.code_m, clean)
+        nominal, beyond = (np.where(differenced, base.sigma_m, each) for each in (nominal, beyond))
+        beyond = np.where(differenced, beyond, np.hypot(beyond, config.noise.floor_sigma_m))
+    noise = config.noise if base is None else config.noise.replaced(floor_sigma_m=0.0)
+    sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=noise), beyond)
     bound, bias = np.zeros(code.shape), np.zeros(code.shape)
     if error_model is not None:
         bound, bias = _by_error_model(error_model, seen, cn0, antennas)
@@ -225,6 +237,7 @@ def correct_ranges(
         bias_m=bias,
         reason=np.where(uncorrected, int(Reason.NO_CORRECTION), reason),
         second=second,
+        base=base,
     )
 
 
@@ -297,3 +310,16 @@ def usable_ranges(
 def without(ranges: Ranges, dropped: Masks) -> Ranges:
     """Return the ranges with weight 0 where `dropped`, shape (T, M)."""
     return replace(ranges, weight=np.where(dropped, 0.0, ranges.weight))
+
+
+def conditions_of(config: Config) -> Conditions:
+    """Settings that the errors of the ranges depend on: the conditions of an error model made from such a run."""
+    return Conditions(
+        systems=config.systems,
+        signals={letter: config.signals.get(letter, ()) for letter in config.systems},
+        screens=config.screens,
+        elevation_mask_deg=config.elevation.mask_deg,
+        codes="smoothed" if config.carrier == "smoothed" else "raw",
+        ionosphere="sbas" if config.sbas else config.ionosphere,
+        troposphere="sbas" if config.sbas else config.troposphere,
+    )

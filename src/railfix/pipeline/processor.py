@@ -11,11 +11,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Masks, changed
+from railfix.core.arrays import Floats, Masks, changed
+from railfix.core.errors import SettingsError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.integrity.protection.support import IntegritySupport
@@ -24,11 +25,12 @@ from railfix.pipeline.along_track import along_track, checked
 from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.araim_stage import with_araim
 from railfix.pipeline.assemble import antenna_results, with_coordinates
+from railfix.pipeline.base_station import BaseStation
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.compared import filter_verdicts, judge_pairs, position_verdicts, with_screens
 from railfix.pipeline.config import SCREEN_NAMES, Config
-from railfix.pipeline.corrected_ranges import CorrectedRanges, correct_ranges
+from railfix.pipeline.corrected_ranges import CorrectedRanges, conditions_of, correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
 from railfix.pipeline.filter_result import AlongTrack, FilterState, single_epochs
 from railfix.pipeline.interference_stage import judge_interference
@@ -40,7 +42,7 @@ from railfix.pipeline.solution import Solution, solve
 from railfix.positioning.antenna_rows import AntennaRows, rows_of, stack_observations
 from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.cn0_curve import Cn0Curve
-from railfix.ranges.error_model import Conditions, ErrorModel, condition_differences
+from railfix.ranges.error_model import ErrorModel, condition_differences
 from railfix.ranges.sbas import SbasMessages
 from railfix.screens import SCREENS, AntennaRanges, ObservationScreen, PairedEpochs, Screen, ScreenSetup, in_order
 from railfix.screens.pairs import pair_antennas
@@ -99,6 +101,8 @@ class EpochProcessor:
         Surveyed stations of two-way ranges, for the filter along the track.
     support : IntegritySupport, optional
         Integrity support message, for ARAIM levels.
+    base_ecef_m : ndarray, shape (3,) [m], or "stream", optional
+        Position of a base station, in the frame of the satellites; "stream": that of its observations' headers.
     screens : sequence of Screen, optional
         Screens of one's own, used with their limits beside those of `config`; their verdicts are in
         `AntennaResult.screens`, without columns of the tables (those of installed packages have them).
@@ -134,6 +138,7 @@ class EpochProcessor:
         track: Track | None = None,
         units: GroundUnits | None = None,
         support: IntegritySupport | None = None,
+        base_ecef_m: Floats | Literal["stream"] | None = None,
         screens: Sequence[Screen[Any]] = (),
     ) -> None:
         if not trajectories:
@@ -154,6 +159,7 @@ class EpochProcessor:
         self._channels = ChannelBook(config)
         self.indices = {name: SearchIndex(t) for name, t in self.trajectories.items()}
         self._error_model, self._support = error_model, support
+        self._base = None if base_ecef_m is None else BaseStation(config, base_ecef_m)
         if taken := [s.name for s in screens if s.name in SCREEN_NAMES]:
             raise ValueError(f"there is a screen {taken[0]} already; give it another name")
         chosen = (*(s for s in SCREENS if s.name in config.screens), *screens)
@@ -185,6 +191,10 @@ class EpochProcessor:
     def _inactive_notes(self) -> tuple[str, ...]:
         """Return one sentence for each part of the settings that cannot work as asked."""
         notes = [note for screen, limits in self.screens for note in screen.notes(limits, self.setup)]
+        if self.config.carrier == "fixed" and self._base is None:
+            raise SettingsError("carrier = fixed: integers need a base station; give one (--base), or carrier = float")
+        if self.config.sbas and self._base is not None:
+            raise SettingsError("both SBAS and a base station correct the ranges; give one of the two")
         conditions = None if self._error_model is None else self._error_model.conditions
         if conditions and (differences := condition_differences(conditions, conditions_of(self.config))):
             notes.append(f"error model: made under other conditions than this run's: {'; '.join(differences)}")
@@ -194,7 +204,7 @@ class EpochProcessor:
                 "error model: it does not state how often low satellites of one side are faulty together "
                 "(faults.side_upper), as one of an earlier version; railfix error-model measures it"
             )
-        if self.config.protection == "on" and self.config.carrier == "float":
+        if self.config.protection == "on" and self.config.carrier in ("float", "fixed"):
             notes.append("protection level: asked for, but there is none for positions from code and phase together")
         return tuple(notes)
 
@@ -213,6 +223,7 @@ class EpochProcessor:
         navigation: Navigation | None = None,
         messages: SbasMessages | None = None,
         sensors: SensorSamples | None = None,
+        base: Observations | None = None,
     ) -> tuple[Result, State]:
         """Return the positions of one chunk, and the state to pass on with the next one.
 
@@ -230,6 +241,8 @@ class EpochProcessor:
         sensors : SensorSamples, optional
             Samples of the sensors on board since the chunk before, for the filter along the track. An antenna without
             observations in this chunk has them with its next one.
+        base : Observations, optional
+            Of the base station since the chunk before, up to the last epoch of this one.
 
         Raises
         ------
@@ -239,7 +252,7 @@ class EpochProcessor:
             As the class.
         """
         solved, state = self.single_epochs(
-            observations, state, navigation=navigation, messages=messages, sensors=sensors
+            observations, state, navigation=navigation, messages=messages, sensors=sensors, base=base
         )
         return self.along_track(solved, state)
 
@@ -251,6 +264,7 @@ class EpochProcessor:
         navigation: Navigation | None = None,
         messages: SbasMessages | None = None,
         sensors: SensorSamples | None = None,
+        base: Observations | None = None,
     ) -> tuple[SolvedChunk, State]:
         """Return the single epochs of one chunk: the part of `process` before the filter; parameters are the same."""
         unknown = sorted(set(observations) - set(self.trajectories))
@@ -259,13 +273,18 @@ class EpochProcessor:
         state = state or State()
         for name, part in observations.items():
             _check_rising(name, part, state.antennas.get(name))
+        began = min((part.time[0] for part in observations.values() if len(part)), default=np.datetime64("NaT", "ns"))
         received = receive(
             state.received or self.received,
             self.config,
-            min((part.time[0] for part in observations.values() if len(part)), default=np.datetime64("NaT", "ns")),
+            began,
             navigation=navigation,
             messages=messages,
         )
+        base_state = None
+        if self._base is not None:
+            base_state = self._base.received(base, received, state.base, began)
+            received = replace(received, base=base_state.errors, notes=(*received.notes, *base_state.notes))
         names, (obs, parts) = tuple(observations), stack_observations(list(observations.values()))
         antennas = AntennaRows(tuple(self.indices[name] for name in names), parts)
         channels = self._channels.of(obs, received.navigation)
@@ -290,7 +309,7 @@ class EpochProcessor:
         after = dict(state.antennas)
         for name, part, own in zip(names, observations.values(), own_states, strict=True):
             after[name] = replace(own, ended=part.time[-1] if len(part) else own.ended)
-        return solved, replace(state, received=received, antennas=after)
+        return solved, replace(state, received=received, antennas=after, base=base_state)
 
     def along_track(self, solved: SolvedChunk, state: State) -> tuple[Result, State]:
         """Return the results of one chunk with those of the filter, where it is on: the second part of `process`.
@@ -407,19 +426,6 @@ class EpochProcessor:
             self.trajectories["rear"],
             tolerance_s=self.config.antenna_pair.tag_tolerance_s,
         )
-
-
-def conditions_of(config: Config) -> Conditions:
-    """Settings that the errors of the ranges depend on: the conditions of an error model made from such a run."""
-    return Conditions(
-        systems=config.systems,
-        signals={letter: config.signals.get(letter, ()) for letter in config.systems},
-        screens=config.screens,
-        elevation_mask_deg=config.elevation.mask_deg,
-        codes="smoothed" if config.carrier == "smoothed" else "raw",
-        ionosphere="sbas" if config.sbas else config.ionosphere,
-        troposphere="sbas" if config.sbas else config.troposphere,
-    )
 
 
 def _threads(antennas: int) -> ThreadPoolExecutor | None:

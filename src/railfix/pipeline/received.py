@@ -14,6 +14,7 @@ from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.orbits.record_selection import VALIDITY_S, validity_s
 from railfix.pipeline.config import Config
 from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR
+from railfix.ranges.base_station import BaseErrors
 from railfix.ranges.sbas import SbasCorrections, SbasMessages, SbasState
 
 Records = TypeVar("Records", KeplerRecords, GlonassRecords)
@@ -65,6 +66,8 @@ class Received:
         Standard deviation of the vertical delay by coefficients that were not received; else 0.
     notes : tuple of str
         Data that were asked for, and the data used in their place, one sentence each.
+    base : BaseErrors or None
+        Range errors that a base station has measured.
     """
 
     navigation: Navigation = field(default_factory=no_navigation)
@@ -73,6 +76,7 @@ class Received:
     klobuchar: Floats | None = None
     ionosphere_sigma_m: float = 0.0
     notes: tuple[str, ...] = ()
+    base: BaseErrors | None = None
 
 
 def known_from_start(

@@ -110,6 +110,17 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             lambda r: r.raim.protection_level_m,
         ),
         Column(
+            "integers_fixed",
+            "differences of carrier phases fixed to whole cycles; 0: float or codes (`carrier = fixed`)",
+            lambda r: None if r.phase is None else r.phase.n_fixed,
+            dtype=pl.Int16(),
+        ),
+        Column(
+            "integer_risk_ppm",
+            "probability that one of them is wrong, or of the best candidates where none is fixed [1e-6]",
+            lambda r: None if r.phase is None else 1e6 * r.phase.integer_risk,
+        ),
+        Column(
             "protection_level_m",
             "along the line: the error exceeds it with the stated risk, all hypotheses together; "
             "infinite where `protection_cause` says why, empty where a fault is left",

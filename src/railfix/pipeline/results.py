@@ -15,6 +15,7 @@ from railfix.gnss.orbits import SatelliteStates
 from railfix.integrity.protection import ProtectionLevel
 from railfix.integrity.protection.araim import AraimResult
 from railfix.integrity.raim import Outcome
+from railfix.pipeline.base_station import BaseState
 from railfix.pipeline.carrier_stage import CarrierState
 from railfix.pipeline.filter_result import AlongTrack, FilterState
 from railfix.pipeline.interference_stage import Interference, InterferenceState
@@ -140,6 +141,8 @@ class State(NotebookTable):
     Attributes
     ----------
     antennas : mapping of str to AntennaState
+    base : BaseState or None
+        Of the base station.
     received : Received or None
         Navigation records and SBAS messages so far; None: those that the processor was made with.
     fusion : mapping of str to FilterState
@@ -148,6 +151,7 @@ class State(NotebookTable):
 
     antennas: Mapping[str, AntennaState] = field(default_factory=dict)
     received: Received | None = None
+    base: BaseState | None = None
     fusion: Mapping[str, FilterState] = field(default_factory=dict)
 
     def __repr__(self) -> str:

@@ -164,7 +164,7 @@ def solve(
         raim = with_p4_level(raim, model, scale, config)
     corrected = corrected.rejected(raim.excluded, Reason.FAULT_EXCLUDED)
     level, open_elsewhere = None, np.zeros(len(ranges), dtype=bool)
-    if config.protection == "on" and config.carrier != "float":
+    if config.protection == "on" and config.carrier not in ("float", "fixed"):
         section = np.maximum(constrained.section, 0)
         heading = antennas.each(lambda index, rows: index.trajectory.heading_deg[section[rows]])
         sides = low_sides(corrected, heading, config.risk.side_elevation_deg)
@@ -175,7 +175,7 @@ def solve(
     variance = epoch_variance(scale, constrained.wsse, redundancy, limits=config.noise_scale)
     nominal = _nominal_variance_m2(model, corrected, config)
     phase, carriers = None, [state.carrier for state in states]
-    if config.carrier == "float":
+    if config.carrier in ("float", "fixed"):
 
         def own_phase(
             index: SearchIndex, rows: slice, state: CarrierState | None
@@ -185,6 +185,7 @@ def solve(
 
         phase, carriers = antennas.each_with_state(own_phase, carriers)
         arc, exact, total, variance = phase.arc_m, phase.noise_sigma_m, phase.sigma_m, scale**2
+        nominal = np.where(phase.n_fixed > 0, 0.0, nominal)  # satellites and atmosphere are in the integers' noise
     along_sigma = np.sqrt(variance * exact**2 + (total**2 - exact**2) + nominal)
     judged = own_sigma if phase is None else along_sigma
     along_sigma = np.sqrt(along_sigma**2 + _ambiguity_variance_m2(ranges, antennas, place, arc, config))

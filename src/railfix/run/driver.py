@@ -23,6 +23,7 @@ from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import basis_of, level_facts, prior_basis_text, risk_of
 from railfix.pipeline.processor import EpochProcessor, SolvedChunk, State
+from railfix.run.base_station import BaseLog, base_log
 from railfix.run.beside import without_beside
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.chunks import aligned, read_ahead
@@ -131,7 +132,11 @@ def run_files(
         entries, packages = inputs.entries(hashing, out), beside.submit(package_versions)
         navigation, line, logs = open_inputs(inputs, options, config)
         sensors, units = sensors_of(inputs)
-        processor = processor_of(config, navigation, line.trajectories, track=line.track, units=units)
+        base = base_log(inputs.base, options)
+        processor = processor_of(
+            config, navigation, line.trajectories, track=line.track, units=units,
+            base_ecef_m=None if base is None else base.ecef_m,
+        )  # fmt: skip
         rows = ResultRows(
             folder=folder,
             line=line,
@@ -139,7 +144,7 @@ def run_files(
             checks=SensorChecks() if sensors else None,
             replays={name: Replays() for name in logs} if options.smooth == "on" else {},
         )
-        tally = _position(logs, sensors, processor, rows, beside, progress)
+        tally = _position(logs, _Beside(sensors, base), processor, rows, beside, progress)
         if rows.replays:
             add_smoothed(rows.replays, processor, folder)
         causes = _causes(tally, logs, processor, config, line)
@@ -246,9 +251,17 @@ def sensors_of(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
     return samples, units_of_ranges(samples, inputs.ranging_units, ranging=inputs.ranging)
 
 
+@dataclass(frozen=True)
+class _Beside:
+    """What is measured beside the antennas: by sensors on board, and by a base station."""
+
+    sensors: SensorSamples
+    base: BaseLog | None
+
+
 def _position(
     logs: Mapping[Antenna, Log],
-    sensors: SensorSamples,
+    others: _Beside,
     processor: EpochProcessor,
     rows: ResultRows,
     beside: Executor,
@@ -264,7 +277,7 @@ def _position(
     written: Future[None] | None = None
     chunks = read_ahead(aligned({name: log.parts() for name, log in logs.items()}))
     began = clock.perf_counter()
-    for solved in read_ahead(_single_epochs(chunks, sensors, processor)):
+    for solved in read_ahead(_single_epochs(chunks, others, processor)):
         result, state = processor.along_track(solved, state)
         if rows.line.route is not None:
             result = without_beside(result, rows.line.route, processor.config)
@@ -284,13 +297,14 @@ def _position(
 
 
 def _single_epochs(
-    chunks: Iterator[dict[str, Observations]], sensors: SensorSamples, processor: EpochProcessor
+    chunks: Iterator[dict[str, Observations]], others: _Beside, processor: EpochProcessor
 ) -> Iterator[SolvedChunk]:
-    """Yield the single epochs of chunks, each with the samples of the sensors up to its end."""
+    """Yield the single epochs of chunks, each with what sensors and base station measured up to its end."""
     after, state = np.datetime64("NaT", "ns"), State()
     for chunk in chunks:
         end = max(own.time[-1] for own in chunk.values() if len(own))
-        solved, state = processor.single_epochs(chunk, state, sensors=sensors.between(after, end))
+        sensors, base = others.sensors.between(after, end), None if others.base is None else others.base.until(end)
+        solved, state = processor.single_epochs(chunk, state, sensors=sensors, base=base)
         after = end
         yield solved
 

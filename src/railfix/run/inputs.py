@@ -87,6 +87,8 @@ class RunInputs(InputFiles):
     ----------
     front, rear : tuple of Path
         RINEX observation files of each antenna, in order of time; `rear` may be empty.
+    base : tuple of Path
+        Observations of a base station; may be empty.
     nav, sp3 : tuple of Path
         Navigation files; precise orbits, which may be empty.
     track : tuple of Path
@@ -113,6 +115,11 @@ class RunInputs(InputFiles):
     track: tuple[Path, ...] = track_option()
     rear: tuple[Path, ...] = input_option(
         "Observation file of the rear antenna, where there is one.", (), metavar="OBS"
+    )
+    base: tuple[Path, ...] = input_option(
+        "Observations of a base station: its errors are subtracted from the ranges; repeat it for several files.",
+        (),
+        metavar="OBS",
     )
     sp3: tuple[Path, ...] = input_option("Precise orbits and clocks, used in place of the broadcast ones.", ())
     heights: Path | None = heights_option()
@@ -188,7 +195,8 @@ class RunInputs(InputFiles):
             A file is missing, a folder, or cannot be opened; or the same log is given twice.
         """
         self.check_files()
-        check_given_once((f"--{name}", path) for name, paths in self.logs.items() for path in paths)
+        logs = {**self.logs, "base": self.base}
+        check_given_once((f"--{name}", path) for name, paths in logs.items() for path in paths)
         check_given_once(("--track", path) for path in self.track)
 
 

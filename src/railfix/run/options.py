@@ -97,6 +97,11 @@ class RunOptions(Settings):
 
     start: datetime | None = option("First epoch, GPS time.", None, metavar="TIME")
     end: datetime | None = option("Epochs before this time only, GPS time.", None, metavar="TIME")
+    base_place: str | None = option(
+        "Position of the base station, in the frame of the satellites; from its header without it.",
+        None,
+        metavar="LAT,LON,HEIGHT",
+    )
     observations: Literal["skip", "write"] = option(
         "Also write observations.parquet: one row per epoch, satellite and signal, with its reason.",
         "skip",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
+from railfix.core.arrays import Floats
 from railfix.core.errors import SettingsError
 from railfix.gnss.navigation import Navigation
 from railfix.integrity.protection.support import read_integrity_support
@@ -38,10 +40,12 @@ def processor_of(
     *,
     track: Track | None = None,
     units: GroundUnits | None = None,
+    base_ecef_m: Floats | Literal["stream"] | None = None,
 ) -> EpochProcessor:
     """Return a processor with all navigation records and the contents of the files that the settings name.
 
     `track` is the line itself, for places by its features; `units` are the surveyed stations of two-way ranges.
+    `base_ecef_m`: position of a base station; "stream": that of the headers of its observations.
 
     Raises
     ------
@@ -66,5 +70,6 @@ def processor_of(
         cn0_curve=None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve),
         track=track,
         units=units,
+        base_ecef_m=base_ecef_m,
         support=None if config.integrity_support is None else read_integrity_support(config.integrity_support),
     )

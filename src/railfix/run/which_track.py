@@ -24,6 +24,7 @@ from railfix.positioning.which_track import (
     YardTrack,
     track_posterior,
 )
+from railfix.run.base_station import place_of
 from railfix.run.inputs import InputFiles, input_option
 from railfix.run.options import LogReading, TrackReading
 from railfix.run.sources import Log
@@ -183,7 +184,9 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     navigation = read_navigation(inputs.nav, date=options.logs.instant)
     base = None
     if options.base_place is not None:
-        base = StandstillBase(observations=_observations(inputs.base, options), ecef_m=_place(options.base_place))
+        base = StandstillBase(
+            observations=_observations(inputs.base, options), ecef_m=place_of(options.base_place, "--base-place")
+        )
     codes: list[StandstillCodes] = []
     for paths in (inputs.front, inputs.rear):
         if paths:
@@ -231,18 +234,6 @@ def _observations(paths: tuple[Path, ...], options: WhichTrackOptions) -> Observ
     if not parts:
         raise InputFileError(paths[0], "there is no epoch in the time asked for")
     return concatenate(parts)
-
-
-def _place(text: str) -> Floats:
-    try:
-        latitude, longitude, height = (float(v) for v in text.split(","))
-    except ValueError:
-        raise SettingsError(f"--base-place {text!r}: expected LATITUDE,LONGITUDE,HEIGHT (ellipsoidal)") from None
-    if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0 and abs(height) < 1e4):
-        raise SettingsError(
-            f"--base-place {text!r}: expected a latitude to 90, a longitude to 360 and a height in metres"
-        )
-    return ecef_from_geodetic(latitude, longitude, height)
 
 
 def _prior(inputs: WhichTrackInputs, options: WhichTrackOptions, network: Network) -> TrackPrior:

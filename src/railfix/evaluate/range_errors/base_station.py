@@ -10,27 +10,16 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Strings
 from railfix.core.errors import InputFileError
-from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef, range_with_rotation
-from railfix.core.reasons import Reason
 from railfix.evaluate.bracket import bracket
-from railfix.evaluate.range_errors.robust_clock import robust_clock
 from railfix.gnss.observations import Observations
 from railfix.io.logs import scan_observations
-from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
-from railfix.pipeline.channels import ChannelBook
-from railfix.pipeline.corrected_ranges import correct_ranges
+from railfix.pipeline.base_station import BaseStation
+from railfix.pipeline.carrier_stage import CarrierState
 from railfix.pipeline.processor import EpochProcessor
-from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.section_search import SearchIndex
-from railfix.track import Track
-from railfix.track.trajectory import Trajectory
-
-#: Half length of the north-south track through the station on which its ranges are corrected [deg]; about 50 m.
-_HALF_LINE_DEG = 0.0005
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaseStation:
+class CommonErrors:
     """Common errors by satellite, B epochs of the station by S satellites.
 
     Attributes
@@ -66,7 +55,7 @@ class BaseStation:
 
 def base_station(
     parts: Iterable[Observations], processor: EpochProcessor, position_ecef_m: Floats, *, name: str
-) -> BaseStation:
+) -> CommonErrors:
     """Common range errors from the log of a station at a known position.
 
     Its pseudoranges are corrected like those of the train, with the same settings, and smoothed by carrier phase
@@ -81,30 +70,16 @@ def base_station(
     position_ecef_m : ndarray, shape (3,) [m]
     name : str
     """
-    latitude, longitude, height = (float(x) for x in geodetic_from_ecef(position_ecef_m))
-    ends = ecef_from_geodetic(latitude + np.array([-1.0, 1.0]) * _HALF_LINE_DEG, longitude, height)
-    index = SearchIndex(Trajectory.from_track(Track.from_ecef(ends)))
-    config, received = processor.config, processor.received
-    book = ChannelBook(config)
-    state, phases = CarrierState(), False
+    station, carrier, phases = BaseStation(processor.config, position_ecef_m), CarrierState(), False
     times: list[Datetimes] = []
     errors: list[dict[str, Floats]] = []
     for obs in parts:
-        corrected = correct_ranges(obs, book.of(obs, received.navigation), config, received, AntennaRows.of(index))
-        corrected, state = with_slips(corrected, config, state)
-        corrected, state = smoothed(corrected, config, state)
+        measured, carrier = station.errors(obs, processor.received, carrier, position_ecef_m)
         phases |= bool(np.isfinite(obs.phase_cycles).any())
-        distance, _ = range_with_rotation(corrected.satellites.position_ecef_m, position_ecef_m)
-        residual = np.where(corrected.reason == Reason.USED, corrected.corrected_code_m - distance, np.nan)
-        clock = robust_clock(residual, corrected.sigma_m, corrected.groups).clock_m
-        owner = np.zeros(residual.shape[1], dtype=np.intp)
-        for g, group in enumerate(corrected.groups):
-            owner[group] = g
-        error = residual - clock[:, owner]
         of_satellite: dict[str, Floats] = {}
-        for k, satellite in enumerate(corrected.satellite.tolist()):
-            before = of_satellite.get(satellite)
-            of_satellite[satellite] = error[:, k] if before is None else np.where(np.isnan(before), error[:, k], before)
+        for k, satellite in enumerate(measured.satellite.tolist()):
+            error, before = measured.code_m[:, k], of_satellite.get(satellite)
+            of_satellite[satellite] = error if before is None else np.where(np.isnan(before), error, before)
         times.append(obs.time)
         errors.append(of_satellite)
     names = sorted({satellite for part in errors for satellite in part})
@@ -114,7 +89,7 @@ def base_station(
         for part, empty in zip(errors, blank, strict=True)
         if names
     ]
-    return BaseStation(
+    return CommonErrors(
         name=name,
         time=np.concatenate(times) if times else np.empty(0, dtype="datetime64[ns]"),
         satellite=np.array(names, dtype=np.str_),
@@ -125,7 +100,7 @@ def base_station(
 
 def base_station_from_files(
     paths: Sequence[Path], processor: EpochProcessor, *, position_ecef_m: Floats | None = None
-) -> BaseStation:
+) -> CommonErrors:
     """Common range errors from RINEX files; the position is that of the header where none is given.
 
     Raises

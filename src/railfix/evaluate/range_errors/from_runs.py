@@ -14,10 +14,11 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError
 from railfix.core.files import file_sha256
 from railfix.core.settings import Settings, option
-from railfix.evaluate.range_errors.base_station import BaseStation, base_station_from_files
+from railfix.evaluate.range_errors.base_station import CommonErrors, base_station_from_files
 from railfix.evaluate.range_errors.gather import GatherLimits, joined, range_errors
 from railfix.io.reference_log import read_reference
-from railfix.pipeline.processor import State, conditions_of
+from railfix.pipeline.corrected_ranges import conditions_of
+from railfix.pipeline.processor import State
 from railfix.ranges.error_model import (
     Conditions,
     ErrorModel,
@@ -159,7 +160,7 @@ def _run_errors(
     references = read_reference(source.reference, tuple(past.inputs.logs), columns=source.columns)
     processor = processor_of(past.config.replaced(filter="off"), navigation, line.trajectories)
     state = State()
-    base: BaseStation | None = None
+    base: CommonErrors | None = None
     if source.base:
         base = base_station_from_files(source.base, processor, position_ecef_m=source.base_position_ecef_m)
     parts: list[ErrorSamples] = []

@@ -15,11 +15,11 @@ from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference
-from railfix.evaluate.range_errors.base_station import BaseStation
-from railfix.evaluate.range_errors.robust_clock import robust_clock
+from railfix.evaluate.range_errors.base_station import CommonErrors
 from railfix.io.reference_log import AntennaReference
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.normal_equations import clock_groups
+from railfix.positioning.robust_clock import robust_clock
 from railfix.ranges.error_model import ErrorSamples
 from railfix.track.trajectory import Trajectory
 
@@ -84,7 +84,7 @@ def range_errors(
     result: AntennaResult,
     trajectory: Trajectory,
     reference: AntennaReference,
-    base: BaseStation | None = None,
+    base: CommonErrors | None = None,
     *,
     limits: GatherLimits | None = None,
     block_s: float = 30.0,
@@ -101,7 +101,7 @@ def range_errors(
     trajectory : Trajectory
         Of the antenna; gives the azimuth of the vehicle.
     reference : AntennaReference
-    base : BaseStation, optional
+    base : CommonErrors, optional
         Without one, satellite and atmospheric errors remain.
     limits : GatherLimits, optional
     block_s : float [s]

@@ -31,11 +31,15 @@ _MSM: Final = "RTCM 3 MSM"
 
 @dataclass(frozen=True, kw_only=True)
 class LogPiece:
-    """What one block of a receiver log holds, with bytes outside frames, failed checksums, and bytes read."""
+    """What one block of a receiver log holds, with bytes outside frames, failed checksums, and bytes read.
+
+    `station`: position of a base station known by its end.
+    """
 
     measurements: Measurements
     ephemerides: Assembled
     sbas: SbasFrames
+    station: tuple[float, float, float] | None = None
     skipped_bytes: int = 0
     bad_checksums: int = 0
     bytes: int = 0
@@ -47,7 +51,8 @@ class StreamState:
 
     `glonass_channels` are the frequency channels by satellite number that 1020 messages gave; `observed`: whether there
     was an epoch of the receiver's own format; `kind`: the messages that the observations are taken from; `clock`: the
-    last time that it gave, of an epoch or another message; `indicators`: the last ones of jamming and spoofing.
+    last time that it gave, of an epoch or another message; `indicators`: the last ones of jamming and spoofing;
+    `station`: position of a base station (RTCM 1005, 1006).
     """
 
     rest: bytes = b""
@@ -59,6 +64,7 @@ class StreamState:
     kind: str = ""
     clock: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     indicators: Indicators = field(default_factory=Indicators)
+    station: tuple[float, float, float] | None = None
 
 
 def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[LogPiece, StreamState]:
@@ -92,7 +98,9 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Lo
     dated = _date(frames, raw, _places(frames, native), observed=state.observed)
     records, sbas, subframes, messages = _navigation(frames, dated, _Dated(msm_places, msm.time), state)
     last = measurements.time[-1] if len(measurements.time) else state.time
+    station = rtcm.station_ecef_m(frames) or state.station
     piece = LogPiece(
+        station=station,
         measurements=measurements,
         ephemerides=records,
         sbas=sbas,
@@ -111,6 +119,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Lo
         kind=kind,
         clock=dated.times[-1] if len(dated.times) else state.clock,
         indicators=indicators,
+        station=station,
     )
     return piece, after
 
@@ -219,6 +228,13 @@ def scan_pieces(
                 return
 
 
+def at_station(observations: Observations, station: tuple[float, float, float] | None) -> Observations:
+    """Return observations with the position of their base station in the header, where it is known."""
+    if station is None:
+        return observations
+    return replace(observations, header=replace(observations.header, approximate_ecef_m=np.array(station)))
+
+
 def scan_receiver_log(
     path: FilePath, *, date: np.datetime64 | None = None, progress: Callable[[float], None] | None = None
 ) -> Iterator[Observations]:
@@ -237,7 +253,7 @@ def scan_receiver_log(
         counts = {"bytes outside messages": piece.skipped_bytes, "messages with a bad checksum": piece.bad_checksums}
         skipped = {**observations.skipped, **{what: n for what, n in counts.items() if n}}
         epochs += len(observations)
-        yield replace(observations, skipped=skipped)
+        yield replace(at_station(observations, piece.station), skipped=skipped)
     if not frames_seen:
         raise InputFileError(path, "holds no UBX, RTCM 3, SBF or NMEA message with a valid checksum")
     if not epochs:

@@ -197,6 +197,16 @@ def bits_of(frames: Frames, chosen: Indices, length: int) -> Bytes:
     return np.unpackbits(np.where(inside, data, 0).astype(np.uint8), axis=1)
 
 
+def station_ecef_m(frames: Frames) -> tuple[float, float, float] | None:
+    """Return the antenna reference point of the last message 1005 or 1006, ECEF [m]; None without one."""
+    chosen = frames.of("rtcm3", 1005, 1006)
+    if not len(chosen):
+        return None
+    bits = bits_of(frames, chosen[-1:], 152)
+    x, y, z = (float(signed(bits, first, 38)[0]) * 1e-4 for first in (34, 74, 114))
+    return x, y, z
+
+
 def completes_epoch(frames: Frames, chosen: Indices) -> Masks:
     """Whether multiple signal messages are the last ones of their epoch (DF393 is 0), shape (len(chosen),)."""
     return np.asarray(bits_of(frames, chosen, 56)[:, 54] == 0)

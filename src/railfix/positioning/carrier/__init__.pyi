@@ -1,9 +1,10 @@
 # The names of `railfix.positioning.carrier`, imported at their first use (lazy-loader).
 
-from .ambiguities import ArcAmbiguities, PhaseLimits, PhasePositions
-from .arcs import ArcState, number_arcs
+from .ambiguities import ArcAmbiguities, PhaseLimits, PhasePositions, repeats_of
+from .arcs import ArcState, last_arcs, number_arcs
 from .continuity import ContinuityLimits, ContinuityState, TrackJumps, track_jumps
 from .filtered import PhaseState, phase_positions
+from .integers import Fixed, IntegerChannels, fix_integers
 from .observation_model import Phases, corrected_phase_m
 from .slips import CycleSlipLimits, CycleSlipState, SlipReason, Slips, find_slips
 from .smoothing import SmoothedCodes, SmoothingLimits, SmoothingState, smooth_codes
@@ -15,6 +16,8 @@ __all__ = [
     "ContinuityState",
     "CycleSlipLimits",
     "CycleSlipState",
+    "Fixed",
+    "IntegerChannels",
     "PhaseLimits",
     "PhasePositions",
     "PhaseState",
@@ -27,8 +30,11 @@ __all__ = [
     "TrackJumps",
     "corrected_phase_m",
     "find_slips",
+    "fix_integers",
+    "last_arcs",
     "number_arcs",
     "phase_positions",
+    "repeats_of",
     "smooth_codes",
     "track_jumps",
 ]

@@ -10,7 +10,7 @@ squares over all epochs of a run (`tests/helpers/phase_run.py`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -55,6 +55,10 @@ class PhaseLimits(Settings):
         Linearisations of `phase_positions`; each has its own state, so that results do not depend on chunks.
     forget_s : float
         An arc that `phase_positions` has not observed for this long starts again.
+    integer_risk : float
+        Beside a base station: largest probability of a wrong integer with which ambiguities are fixed.
+    no_integer_prior : float
+        Probability that phases are no whole cycles (multipath, half a cycle), before they are compared with any.
     largest_sigma_m : float
         Epochs whose noise along the line is larger have no position.
     """
@@ -65,6 +69,8 @@ class PhaseLimits(Settings):
     correlation_s: float = Field(default=20.0, ge=0)
     passes: int = Field(default=2, ge=1)
     forget_s: float = Field(default=600.0, gt=0)
+    integer_risk: float = Field(default=1e-4, gt=0, lt=0.5)
+    no_integer_prior: float = Field(default=1e-2, gt=0, lt=1)
     largest_sigma_m: float = Field(default=1e3, gt=0)
 
 
@@ -121,6 +127,10 @@ class PhasePositions:
         Of the arc of each used phase, as known at the epoch.
     n_codes, n_phases : ndarray of int, shape (T,)
         Used.
+    n_fixed : ndarray of int, shape (T,)
+        Differences of ambiguities fixed to whole cycles.
+    integer_risk : ndarray, shape (T,)
+        Probability that one of these is wrong, or of the best candidates where none is fixed; NaN without any.
     arcs : ArcAmbiguities or None
         All arcs of a run, or those alive after the last epoch (`phase_positions`); None in results, row by row.
     iterations : int
@@ -136,6 +146,8 @@ class PhasePositions:
     ambiguity_sigma_m: Floats
     n_codes: Integers
     n_phases: Integers
+    n_fixed: Integers
+    integer_risk: Floats
     arcs: ArcAmbiguities | None
     iterations: int
 
@@ -163,7 +175,7 @@ def startable(ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Flo
         groups=ranges.groups,
         ties=ranges.ties,
     )
-    silent = Phases(phase_m=phases.phase_m, weight=np.where(at[:, None], phases.weight, 0.0), arc_id=phases.arc_id)
+    silent = replace(phases, weight=np.where(at[:, None], phases.weight, 0.0))
     return without, silent, np.where(at, np.clip(arc_m, 0.0, trajectory.arc_m[-1]), 0.0)
 
 
@@ -195,8 +207,8 @@ def assembled(
     ambiguity_m: Floats,
     variance_m2: Floats,
     arcs: ArcAmbiguities,
+    fixes: tuple[Integers, Floats],
     *,
-    iterations: int,
     limits: PhaseLimits,
 ) -> PhasePositions:
     """Return the positions of a run, NaN where there is none."""
@@ -213,6 +225,8 @@ def assembled(
         ambiguity_sigma_m=np.where(phase, np.sqrt(np.where(phase, variance_m2, 1.0)), np.nan),
         n_codes=np.count_nonzero(code, axis=1).astype(np.int64),
         n_phases=np.count_nonzero(phase, axis=1).astype(np.int64),
+        n_fixed=np.where(has, fixes[0], 0),
+        integer_risk=np.where(has, fixes[1], np.nan),
         arcs=arcs,
-        iterations=iterations,
+        iterations=limits.passes,
     )

@@ -82,6 +82,13 @@ def number_arcs(
     return np.where(has_phase, names + count, NO_ARC), ArcState(count=before)
 
 
+def last_arcs(satellite: Strings, signal: Strings, state: ArcState | None) -> Integers:
+    """Return the number of the last arc of each channel, shape (M,); `NO_ARC` for channels without one."""
+    count = {} if state is None else state.count
+    codes = [channel_code(str(a), str(b)) for a, b in zip(satellite.tolist(), signal.tolist(), strict=True)]
+    return np.array([(code << COUNT_BITS) + count[code] if code in count else NO_ARC for code in codes], dtype=np.int64)
+
+
 def channel_of(arc_id: Integers) -> Integers:
     """Channel code of each arc."""
     return np.asarray(arc_id >> COUNT_BITS)

@@ -28,6 +28,7 @@ from railfix.positioning.carrier.ambiguities import (
     startable,
 )
 from railfix.positioning.carrier.arcs import channel_of
+from railfix.positioning.carrier.integers import IntegerChannels, fix_integers
 from railfix.positioning.carrier.observation_model import (
     Linearised,
     Phases,
@@ -114,9 +115,12 @@ def phase_positions(
     started = np.isfinite(arc_m_start)
     ranges, phases, arc = startable(ranges, phases, trajectory, arc_m_start)
     cuts = _cuts(hop_of(time, limits), phases)
+    integers, phases = phases.integers, replace(phases, integers=None)  # the last pass fixes
     after: list[Memory] = []
     pieces: list[PhasePositions] = []
-    for before in memories:
+    for number, before in enumerate(memories, 1):
+        if number == len(memories):
+            phases = replace(phases, integers=integers)
         pieces, places, memory = [], [], before
         for rows in cuts:
             inputs = _Inputs(time[rows], ranges.take(rows), phases.take(rows), arc[rows], started[rows])
@@ -185,6 +189,10 @@ def _segment(
     covariance[:, :count, :count] = inverse_of_arcs(matrix, held[:, :count])
     value = np.zeros((len(matrix), count + 1, 3))
     value[:, :count] = covariance[:, :count, :count] @ right
+    floats = (np.zeros((count, count)), np.zeros(count))
+    if len(value):
+        floats = covariance[-1, :count, :count].copy(), value[-1, :count, 0].copy()
+    fixes = _fix_epochs(value, covariance, index, phases, trajectory, limits)
     among = covariance[row[:, None], index[:, :, None], index[:, None, :]]
     before = np.asarray([memory.time], dtype="datetime64[ns]")
     repeats = repeats_of(np.concatenate([before, inputs.time]), limits)[1:]
@@ -197,8 +205,7 @@ def _segment(
         seen[place] = inputs.time[last_row]
     now = inputs.time[-1] if len(inputs.time) else memory.time
     left = _without(replace(kept, time=now, seen=seen), _find_superseded(memory.arc_id))
-    end = value[-1, :count, 0] if len(value) else np.zeros(count)
-    last = covariance[-1, :count, :count] if len(value) else np.zeros((count, count))
+    last, end = floats
     running = np.isin(memory.arc_id, left.arc_id)
     arcs = ArcAmbiguities(
         arc_id=left.arc_id,
@@ -207,10 +214,31 @@ def _segment(
     )
     piece = assembled(
         arc, inputs.started, own, lin,
-        base[index] + value[row, index, 0], covariance[row, index, index], arcs,
-        iterations=limits.passes, limits=limits,
+        base[index] + value[row, index, 0], covariance[row, index, index], arcs, fixes, limits=limits,
     )  # fmt: skip
     return piece, arc, left
+
+
+def _fix_epochs(
+    value: Floats, covariance: Floats, index: Indices, phases: Phases, trajectory: Trajectory, limits: PhaseLimits
+) -> tuple[Integers, Floats]:
+    """Fix ambiguities in place, epoch by epoch; return how many differences, and the risk."""
+    count, risk = np.zeros(len(index), dtype=np.int64), np.full(len(index), np.nan)
+    integers = phases.integers
+    if integers is None:
+        return count, risk
+    for k, arcs in enumerate(index):
+        used = np.flatnonzero(phases.weight[k] > 0)
+        at = arcs[used]
+        fixed = fix_integers(
+            value[k, at], covariance[k][np.ix_(at, at)], phases.weight[k, used],
+            IntegerChannels(wavelength_m=integers.wavelength_m[used], group=integers.group[used]),
+            (trajectory.sigma_plan_m, trajectory.sigma_height_m),
+            largest_risk=limits.integer_risk, no_integer_prior=limits.no_integer_prior,
+        )  # fmt: skip
+        value[k, at], covariance[k][np.ix_(at, at)] = fixed.value_m, fixed.covariance_m2
+        count[k], risk[k] = fixed.count, fixed.risk
+    return count, risk
 
 
 def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:

@@ -28,6 +28,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.geodesy import range_with_rotation
+from railfix.positioning.carrier.integers import IntegerChannels
 from railfix.positioning.normal_equations import ClockTies, Ranges
 from railfix.track.trajectory import Trajectory
 
@@ -56,15 +57,19 @@ class Phases:
     arc_id : ndarray of int64, shape (T, M)
         The same number along an unbroken stretch of one channel's phase, and nowhere else
         (`arcs.number_arcs`).
+    integers : IntegerChannels or None
+        None leaves all ambiguities real numbers.
     """
 
     phase_m: Floats
     weight: Floats
     arc_id: Integers
+    integers: IntegerChannels | None = None
 
     def take(self, epochs: Masks | Indices | slice) -> Phases:
         """The phases of some epochs."""
-        return Phases(phase_m=self.phase_m[epochs], weight=self.weight[epochs], arc_id=self.arc_id[epochs])
+        arrays = {name: getattr(self, name)[epochs] for name in ("phase_m", "weight", "arc_id")}
+        return replace(self, **arrays)
 
 
 def corrected_phase_m(phase_m: Floats, sat_clock_m: Floats, ionosphere_m: Floats, troposphere_m: Floats) -> Floats:

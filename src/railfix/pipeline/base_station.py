@@ -1,0 +1,132 @@
+"""Range errors of a base station from its observations, corrected like those of the train."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Final, Literal
+
+import numpy as np
+
+from railfix.core.arrays import Floats
+from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef, range_with_rotation
+from railfix.core.reasons import Reason
+from railfix.core.timescale import timedelta
+from railfix.gnss.observations import Observations
+from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
+from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.config import Config
+from railfix.pipeline.corrected_ranges import correct_ranges
+from railfix.pipeline.received import Received
+from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.carrier import corrected_phase_m, number_arcs
+from railfix.positioning.robust_clock import robust_clock
+from railfix.positioning.section_search import SearchIndex
+from railfix.ranges.base_station import BaseErrors
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
+
+#: Half length of the north-south track through the station on which its ranges are corrected [deg]; about 50 m.
+_HALF_LINE_DEG: Final = 0.0005
+#: Positions of a station that differ by no more are the same [m].
+_SAME_PLACE_M: Final = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseState:
+    """Errors of a base station so far, None before the first, and state of its carrier-phase stages."""
+
+    errors: BaseErrors | None = None
+    carrier: CarrierState = field(default_factory=CarrierState)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the station lacks, one sentence."""
+        return (
+            () if self.errors is not None else ("base station: no epoch of known position so far, nothing subtracted",)
+        )
+
+
+class BaseStation:
+    """A base station at a known position.
+
+    Its pseudoranges are corrected like those of the train, with the same settings, and smoothed by carrier phase
+    where available, which reduces the station's own noise. The station's own multipath remains.
+
+    Parameters
+    ----------
+    config : Config
+    ecef_m : ndarray, shape (3,) [m], or "stream"
+        In the frame of the satellites; "stream": of the headers of its observations. A station that moves by more
+        than a centimetre (the next virtual one) begins anew.
+    """
+
+    def __init__(self, config: Config, ecef_m: Floats | Literal["stream"]) -> None:
+        self._config = config.replaced(frequencies="one")
+        self._ecef_m = None if isinstance(ecef_m, str) else np.asarray(ecef_m, dtype=np.float64)
+        self._antenna: tuple[Floats, AntennaRows] | None = None
+        self._book = ChannelBook(self._config)
+
+    def received(
+        self, obs: Observations | None, received: Received, state: BaseState | None, began: np.datetime64
+    ) -> BaseState:
+        """Return the state after more observations of the station, without what no epoch from `began` on needs."""
+        state = state or BaseState()
+        if obs is not None and len(obs):
+            place = obs.header.approximate_ecef_m if self._ecef_m is None else self._ecef_m
+            if not np.isfinite(place).all():
+                return state
+            errors = state.errors
+            if errors is not None and np.linalg.norm(errors.ecef_m - place) > _SAME_PLACE_M:
+                errors, state = None, BaseState()
+            new, carrier = self.errors(obs, received, state.carrier, place)
+            state = BaseState(errors=new if errors is None else errors.joined(new), carrier=carrier)
+        if np.isnat(began) or state.errors is None:
+            return state
+        kept = timedelta(np.array(2.0 * self._config.base.longest_age_s))
+        return replace(state, errors=state.errors.kept_from(began - kept))
+
+    def _rows(self, ecef_m: Floats) -> AntennaRows:
+        """A short line through the station."""
+        if self._antenna is None or np.any(self._antenna[0] != ecef_m):
+            latitude, longitude, height = (float(x) for x in geodetic_from_ecef(ecef_m))
+            ends = ecef_from_geodetic(latitude + np.array([-1.0, 1.0]) * _HALF_LINE_DEG, longitude, height)
+            index = SearchIndex(Trajectory.from_track(Track.from_ecef(ends)))
+            self._antenna = ecef_m, AntennaRows.of(index)
+        return self._antenna[1]
+
+    def errors(
+        self, obs: Observations, received: Received, carrier: CarrierState, ecef_m: Floats
+    ) -> tuple[BaseErrors, CarrierState]:
+        """Return the errors of some epochs, and the state of the carrier-phase stages after them."""
+        own = replace(received, base=None)
+        channels = self._book.of(obs, received.navigation)
+        corrected = correct_ranges(obs, channels, self._config, own, self._rows(ecef_m))
+        corrected, carrier = with_slips(corrected, self._config, carrier)
+        corrected, carrier = smoothed(corrected, self._config, carrier)
+        slips = corrected.slips
+        assert slips is not None
+        used = corrected.reason == Reason.USED
+        distance, _ = range_with_rotation(corrected.satellites.position_ecef_m, ecef_m)
+        residual = np.where(used, corrected.corrected_code_m - distance, np.nan)
+        clock = robust_clock(residual, corrected.sigma_m, corrected.groups).clock_m
+        of_channel = np.repeat(np.arange(len(corrected.groups)), [g.stop - g.start for g in corrected.groups])
+        phase = corrected_phase_m(
+            slips.phase_m[:, corrected.columns], corrected.satellites.clock_m, corrected.ionosphere_m,
+            corrected.troposphere_m,
+        )  # fmt: skip
+        known = np.isfinite(clock)
+        common = np.where(known, clock, 0.0)[np.arange(len(clock)), known.argmax(axis=1)] if known.size else 0.0
+        phase = np.where(used, phase - distance - np.reshape(common, (-1, 1)), np.nan)
+        arc, arcs = number_arcs(
+            slips.slip[:, corrected.columns], np.isfinite(phase), corrected.satellite, corrected.signal, carrier.arcs
+        )
+        errors = BaseErrors(
+            ecef_m=ecef_m,
+            time=obs.time,
+            satellite=corrected.satellite,
+            signal=corrected.signal,
+            code_m=residual - clock[:, of_channel],
+            phase_m=phase,
+            arc=arc,
+        )
+        return errors, replace(carrier, arcs=arcs)

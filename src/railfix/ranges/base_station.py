@@ -1,0 +1,171 @@
+"""Range errors measured by a base station at a known position, and their differences with a train's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from pydantic import Field
+
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Strings
+from railfix.core.settings import Settings
+from railfix.core.timescale import seconds, timedelta
+
+#: An epoch of the base station counts for those of the train up to this time before it [s]: clocks of receivers differ.
+_SAME_S: Final = 0.05
+
+
+class BaseLimits(Settings):
+    """Limits of the differences with a base station.
+
+    Attributes
+    ----------
+    longest_age_s, phase_age_s : float [s]
+        Age up to which the newest code errors, and phases, of the station are used. Without selective availability
+        errors of codes change by centimetres in 30 s, phases by millimetres in a second.
+    sigma_m : float [m]
+        Standard deviation that a difference keeps beside the train's own noise: the station's smoothed multipath.
+    per_km_m : float [m]
+        Added for each kilometre between the two: ionosphere, troposphere and orbits seen from elsewhere.
+    longest_km : float [km]
+        Distance from which on the station is not used.
+    drift_m : float [m/sqrt(s)]
+        Random walk of the differences of phases, in place of `PhaseLimits.drift_m`.
+    """
+
+    longest_age_s: float = Field(default=60.0, gt=0, le=600)
+    phase_age_s: float = Field(default=1.1, gt=0, le=30)
+    sigma_m: float = Field(default=0.3, gt=0)
+    per_km_m: float = Field(default=0.004, ge=0)
+    longest_km: float = Field(default=100.0, gt=0)
+    drift_m: float = Field(default=0.001, ge=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseDifferences:
+    """What a base station subtracts from the ranges of a train, T epochs by K channels.
+
+    Attributes
+    ----------
+    code_m, phase_m : ndarray, shape (T, K) [m]
+        NaN where the station has none that is new enough.
+    arc : ndarray of int64, shape (T, K)
+        Number of the arc of the station's phase.
+    sigma_m : ndarray, shape (T, K) [m]
+        Standard deviation of the errors of satellite and atmosphere that the difference of codes keeps.
+    """
+
+    code_m: Floats
+    phase_m: Floats
+    arc: Integers
+    sigma_m: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseErrors:
+    """Errors of the ranges of a base station by channel, B epochs by S channels.
+
+    Attributes
+    ----------
+    ecef_m : ndarray, shape (3,) [m]
+    time : ndarray of datetime64[ns], shape (B,)
+    satellite, signal : ndarray of str, shape (S,)
+    code_m : ndarray, shape (B, S) [m]
+        Corrected code less range and receiver clock of its constellation; NaN where not observed.
+    phase_m : ndarray, shape (B, S) [m]
+        The same of the phase, less one clock for all constellations, with its ambiguity.
+    arc : ndarray of int64, shape (B, S)
+        Number of the arc of each phase.
+    """
+
+    ecef_m: Floats
+    time: Datetimes
+    satellite: Strings
+    signal: Strings
+    code_m: Floats
+    phase_m: Floats
+    arc: Integers
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def joined(self, later: BaseErrors) -> BaseErrors:
+        """Return these errors and later ones, with the channels of both."""
+        parts = (self, later)
+        keys = sorted({key for part in parts for key in part.keys})
+        return replace(
+            later,
+            time=np.concatenate([part.time for part in parts]),
+            satellite=np.array([satellite for satellite, _ in keys], dtype="<U3"),
+            signal=np.array([signal for _, signal in keys], dtype="<U2"),
+            code_m=np.concatenate([_on(part.code_m, part.keys, keys, np.nan) for part in parts]),
+            phase_m=np.concatenate([_on(part.phase_m, part.keys, keys, np.nan) for part in parts]),
+            arc=np.concatenate([_on(part.arc, part.keys, keys, -1) for part in parts]),
+        )
+
+    @property
+    def keys(self) -> list[tuple[str, str]]:
+        """Satellite and signal of each channel."""
+        return list(zip(self.satellite.tolist(), self.signal.tolist(), strict=True))
+
+    def kept_from(self, time: np.datetime64) -> BaseErrors:
+        """Return the errors of epochs from `time` on, and of channels that have any."""
+        rows = self.time >= time
+        seen = np.isfinite(self.code_m[rows]).any(axis=0)
+        return replace(
+            self,
+            time=self.time[rows],
+            satellite=self.satellite[seen],
+            signal=self.signal[seen],
+            **{name: getattr(self, name)[rows][:, seen] for name in ("code_m", "phase_m", "arc")},
+        )
+
+    def at(
+        self, time: Datetimes, satellite: Strings, signal: Strings, receiver_ecef_m: Floats, limits: BaseLimits
+    ) -> BaseDifferences:
+        """Return the newest errors at the epochs of a train, by its channels.
+
+        A channel that the station has on another signal of the same band takes that one: a constant of the
+        constellation is the difference.
+
+        Parameters
+        ----------
+        time : ndarray of datetime64[ns], shape (T,)
+        satellite, signal : ndarray of str, shape (K,)
+        receiver_ecef_m : ndarray, shape (T, 3) [m]
+            Approximate places of the train.
+        limits : BaseLimits
+        """
+        shape = (len(time), len(satellite))
+        of_band = {(name, code[:1]): k for k, (name, code) in enumerate(self.keys)}
+        own = {key: k for k, key in enumerate(self.keys)}
+        wanted = zip(satellite.tolist(), signal.tolist(), strict=True)
+        column = np.array([own.get(key, of_band.get((key[0], key[1][:1]), -1)) for key in wanted], dtype=np.intp)
+        row = np.searchsorted(self.time, time + timedelta(np.array(_SAME_S)), side="right") - 1
+        distance_km = np.linalg.norm(receiver_ecef_m - self.ecef_m, axis=1) / 1e3
+        if not len(self) or not len(self.satellite):
+            nothing = np.full(shape, np.nan)
+            return BaseDifferences(code_m=nothing, phase_m=nothing, arc=np.full(shape, -1), sigma_m=nothing)
+        age = np.where(row >= 0, seconds(time - self.time[row]), np.inf)
+        near = (distance_km <= limits.longest_km)[:, None] & (column >= 0)
+        at = np.ix_(row, column)
+        code = np.where(near & (age <= limits.longest_age_s)[:, None], self.code_m[at], np.nan)
+        fresh = near & (age <= limits.phase_age_s)[:, None]
+        sigma = np.hypot(limits.sigma_m, limits.per_km_m * distance_km)
+        return BaseDifferences(
+            code_m=code,
+            phase_m=np.where(fresh, self.phase_m[at], np.nan),
+            arc=np.where(fresh, self.arc[at], -1),
+            sigma_m=np.broadcast_to(sigma[:, None], shape),
+        )
+
+
+def _on(values: Floats, own: Sequence[tuple[str, str]], keys: Sequence[tuple[str, str]], blank: float) -> Floats:
+    """Return values of channels on those of another list."""
+    place = {key: k for k, key in enumerate(keys)}
+    columns: Indices = np.array([place[key] for key in own], dtype=np.intp)
+    full = np.full((len(values), len(keys)), blank, dtype=values.dtype)
+    full[:, columns] = values
+    return full
