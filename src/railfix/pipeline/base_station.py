@@ -8,6 +8,7 @@ from typing import Final, Literal
 import numpy as np
 
 from railfix.core.arrays import Floats
+from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef, range_with_rotation
 from railfix.core.reasons import Reason
 from railfix.core.timescale import timedelta
@@ -27,6 +28,7 @@ from railfix.track.trajectory import Trajectory
 
 #: Half length of the north-south track through the station on which its ranges are corrected [deg]; about 50 m.
 _HALF_LINE_DEG: Final = 0.0005
+_NO_EPOCH: Final = "base station: no epoch of known position so far, nothing subtracted"
 #: Positions of a station that differ by no more are the same [m].
 _SAME_PLACE_M: Final = 0.01
 
@@ -41,9 +43,12 @@ class BaseState:
     @property
     def notes(self) -> tuple[str, ...]:
         """What the station lacks, one sentence."""
-        return (
-            () if self.errors is not None else ("base station: no epoch of known position so far, nothing subtracted",)
-        )
+        return () if self.errors is not None else (_NO_EPOCH,)
+
+    def beside(self, received: Received) -> Received:
+        """Return what is known, with the errors of the station and what it lacks."""
+        notes = tuple(note for note in received.notes if note != _NO_EPOCH)
+        return replace(received, base=self.errors, notes=(*notes, *self.notes))
 
 
 class BaseStation:
@@ -130,3 +135,11 @@ class BaseStation:
             arc=arc,
         )
         return errors, replace(carrier, arcs=arcs)
+
+
+def check_base(config: Config, base: BaseStation | None) -> None:
+    """Raise SettingsError where settings need a base station that is not there, or replace one that is."""
+    if config.carrier == "fixed" and base is None:
+        raise SettingsError("carrier = fixed: integers need a base station; give one (--base), or carrier = float")
+    if config.sbas and base is not None:
+        raise SettingsError("both SBAS and a base station correct the ranges; give one of the two")

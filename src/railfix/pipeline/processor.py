@@ -16,7 +16,6 @@ from typing import Any, Literal
 import numpy as np
 
 from railfix.core.arrays import Floats, Masks, changed
-from railfix.core.errors import SettingsError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.integrity.protection.support import IntegritySupport
@@ -25,7 +24,7 @@ from railfix.pipeline.along_track import along_track, checked
 from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.araim_stage import with_araim
 from railfix.pipeline.assemble import antenna_results, with_coordinates
-from railfix.pipeline.base_station import BaseStation
+from railfix.pipeline.base_station import BaseStation, check_base
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.compared import filter_verdicts, judge_pairs, position_verdicts, with_screens
@@ -191,10 +190,7 @@ class EpochProcessor:
     def _inactive_notes(self) -> tuple[str, ...]:
         """Return one sentence for each part of the settings that cannot work as asked."""
         notes = [note for screen, limits in self.screens for note in screen.notes(limits, self.setup)]
-        if self.config.carrier == "fixed" and self._base is None:
-            raise SettingsError("carrier = fixed: integers need a base station; give one (--base), or carrier = float")
-        if self.config.sbas and self._base is not None:
-            raise SettingsError("both SBAS and a base station correct the ranges; give one of the two")
+        check_base(self.config, self._base)
         conditions = None if self._error_model is None else self._error_model.conditions
         if conditions and (differences := condition_differences(conditions, conditions_of(self.config))):
             notes.append(f"error model: made under other conditions than this run's: {'; '.join(differences)}")
@@ -284,7 +280,7 @@ class EpochProcessor:
         base_state = None
         if self._base is not None:
             base_state = self._base.received(base, received, state.base, began)
-            received = replace(received, base=base_state.errors, notes=(*received.notes, *base_state.notes))
+            received = base_state.beside(received)
         names, (obs, parts) = tuple(observations), stack_observations(list(observations.values()))
         antennas = AntennaRows(tuple(self.indices[name] for name in names), parts)
         channels = self._channels.of(obs, received.navigation)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.gnss.observations import Observations, concatenate
+from railfix.motion.samples import SensorSamples
 from railfix.run.options import RunOptions
 from railfix.run.sources import Log
 
@@ -73,6 +75,14 @@ class BaseLog:
                 self._waiting = part[count:]
                 return
             self._waiting = next(self._parts, None)
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What is measured beside the antennas: by sensors on board, and by a base station."""
+
+    sensors: SensorSamples
+    base: BaseLog | None
 
 
 def base_log(paths: tuple[Path, ...], options: RunOptions) -> BaseLog | None:

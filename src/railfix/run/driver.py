@@ -23,7 +23,7 @@ from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import basis_of, level_facts, prior_basis_text, risk_of
 from railfix.pipeline.processor import EpochProcessor, SolvedChunk, State
-from railfix.run.base_station import BaseLog, base_log
+from railfix.run.base_station import Beside, base_log
 from railfix.run.beside import without_beside
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.chunks import aligned, read_ahead
@@ -144,7 +144,7 @@ def run_files(
             checks=SensorChecks() if sensors else None,
             replays={name: Replays() for name in logs} if options.smooth == "on" else {},
         )
-        tally = _position(logs, _Beside(sensors, base), processor, rows, beside, progress)
+        tally = _position(logs, Beside(sensors, base), processor, rows, beside, progress)
         if rows.replays:
             add_smoothed(rows.replays, processor, folder)
         causes = _causes(tally, logs, processor, config, line)
@@ -251,17 +251,9 @@ def sensors_of(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
     return samples, units_of_ranges(samples, inputs.ranging_units, ranging=inputs.ranging)
 
 
-@dataclass(frozen=True)
-class _Beside:
-    """What is measured beside the antennas: by sensors on board, and by a base station."""
-
-    sensors: SensorSamples
-    base: BaseLog | None
-
-
 def _position(
     logs: Mapping[Antenna, Log],
-    others: _Beside,
+    others: Beside,
     processor: EpochProcessor,
     rows: ResultRows,
     beside: Executor,
@@ -297,7 +289,7 @@ def _position(
 
 
 def _single_epochs(
-    chunks: Iterator[dict[str, Observations]], others: _Beside, processor: EpochProcessor
+    chunks: Iterator[dict[str, Observations]], others: Beside, processor: EpochProcessor
 ) -> Iterator[SolvedChunk]:
     """Yield the single epochs of chunks, each with what sensors and base station measured up to its end."""
     after, state = np.datetime64("NaT", "ns"), State()

@@ -1,0 +1,324 @@
+"""Dual-frequency SBAS on L5 (ICAO Annex 10, 8th edition, appendix B, 3.5.14; ED-259A): corrections of satellites.
+
+Messages of 250 bits with preambles of four bits. Types 31 (mask), 32 (orbit and clock with covariance), 34 to 36
+(integrity) and 37 (degradation and the scale of the integrity indicator) are decoded; 39, 40 (orbit of the SBAS
+satellite itself), 42 and 47 are recognised and counted. The corrections are for ionosphere-free ranges of L1 C/A and
+L5, E1 and E5a; biases between the signals are in the clock correction.
+
+The layouts of type 31, preambles and parity agree in two sources; those of types 32 to 37, the order of constellations
+in type 37 and the sum of the degradations stand in one public source each, and no public log was at hand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Bytes, Datetimes, Floats, Integers, Strings
+from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta
+from railfix.ranges.sbas.decode import BitField, Layout, read_fields
+from railfix.ranges.sbas.messages import carried_parity, message_parity
+
+#: First four bits of six successive messages.
+PREAMBLES: Final = (0x5, 0xC, 0x6, 0x9, 0x3, 0xA)
+TYPE_NAMES: Final = {
+    0: "do not use for safety",
+    31: "satellite mask",
+    32: "orbit, clock and covariance",
+    34: "integrity, changes",
+    35: "integrity, first 53 satellites",
+    36: "integrity, the others",
+    37: "degradation and scale",
+    39: "SBAS satellite's orbit, first part",
+    40: "SBAS satellite's orbit, second part",
+    42: "network time",
+    47: "almanac",
+    62: "internal test",
+    63: "null",
+}
+#: Satellites of one mask.
+AUGMENTED: Final = 92
+_FIRST: Final = 53
+#: Indicators without a sigma: not monitored is left out of type 32, 15 is do not use.
+DO_NOT_USE: Final = 15
+#: Sigma by indicator 0 to 14: least value and step [m].
+SIGMA_LEAST_M: Final = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 4.0, 6.0)
+SIGMA_STEP_M: Final = (0.0625, 0.125, 0.125, 0.125, 0.125, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5, 0.5, 1.0, 3.0, 6.0)
+#: Constellations of type 37 in order.
+_DEGRADED: Final = ("G", "R", "E", "C", "S", "")
+#: A mask, and an indicator, is valid for so long [s]; type 0 stops the sender for so long.
+MASK_S, INDICATOR_S, STOP_S = 600.0, 12.0, 60.0
+
+_HEAD: Final = {"preamble": BitField(0, 4), "type": BitField(4, 6)}
+LAYOUTS: Final[dict[int, Layout]] = {
+    31: {"member": BitField(10, 1, number=214), "iodm": BitField(224, 2)},
+    32: {
+        "slot": BitField(10, 8),
+        "iodn": BitField(18, 10),
+        "position_m": BitField(28, 11, 0.0625, True, 3),
+        "clock_m": BitField(61, 12, 0.03125, True),
+        "velocity_mps": BitField(73, 8, 2.0**-11, True, 3),
+        "drift_mps": BitField(97, 9, 2.0**-12, True),
+        "time_of_day_s": BitField(106, 13, 16.0),
+        "exponent": BitField(119, 3, 1.0),
+        "diagonal": BitField(122, 9, 1.0, False, 4),
+        "upper": BitField(158, 10, 1.0, True, 6),
+        "dfrei": BitField(218, 4),
+        "rate_share": BitField(222, 4),
+    },
+    34: {"change": BitField(10, 2, number=AUGMENTED), "dfrei": BitField(194, 4, number=7), "iodm": BitField(224, 2)},
+    35: {"dfrei": BitField(10, 4, number=_FIRST), "iodm": BitField(224, 2)},
+    36: {"dfrei": BitField(10, 4, number=AUGMENTED - _FIRST), "iodm": BitField(224, 2)},
+    37: {
+        "valid_32_s": BitField(10, 6, 6.0),
+        "valid_40_s": BitField(16, 6, 6.0),
+        "en_route_m": BitField(22, 6, 0.5),
+        "covariance": BitField(28, 7, 0.1),
+        "interval_s": BitField(35, 5, 6.0, False, 6, 21),
+        "step_m": BitField(40, 8, 0.01, False, 6, 21),
+        "rate_mps": BitField(48, 8, 0.0002, False, 6, 21),
+        "scale": BitField(161, 4, None, False, 15),
+        "time": BitField(221, 3),
+    },
+}
+_UPPER: Final = ([0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3])
+
+
+class DfmcState(IntEnum):
+    """Why a satellite has no correction."""
+
+    OK = 0
+    #: Type 0: the whole service must not be used.
+    STOPPED = 1
+    NO_MASK = 2
+    NOT_IN_MASK = 3
+    NO_CORRECTION = 4
+    TIMED_OUT = 5
+    #: Indicator 15.
+    DO_NOT_USE = 6
+    #: Type 37 is missing: neither scale nor time-outs are known.
+    NO_DEGRADATION = 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class DfmcCorrections:
+    """Corrections of T epochs by K satellites.
+
+    Attributes
+    ----------
+    state : ndarray of int8, shape (T, K)
+        `DfmcState`.
+    issue : ndarray of int, shape (T, K)
+        Issue of data of the record that the correction belongs to; -1 without one.
+    position_m : ndarray, shape (T, K, 3) [m]
+        Added to the broadcast position.
+    clock_m : ndarray, shape (T, K) [m]
+        Added to c times the broadcast clock, without group delays.
+    sigma_m : ndarray, shape (T, K) [m]
+        Sigma by the indicator and its scale, before covariance and degradation.
+    factor : ndarray, shape (T, K, 4, 4)
+        Upper triangular factor of the covariance.
+    growth_m : ndarray, shape (T, K) [m]
+        Degradation of the correction since it was sent.
+    constant : ndarray, shape (T, K)
+        Added to the factor along a line of sight.
+    """
+
+    state: Integers
+    issue: Integers
+    position_m: Floats
+    clock_m: Floats
+    sigma_m: Floats
+    factor: Floats
+    growth_m: Floats
+    constant: Floats
+
+    def sigma_along_m(self, line_of_sight: Floats) -> Floats:
+        """Standard deviation of corrected ranges along unit vectors to the satellites, shape (T, K) [m]."""
+        sight = np.concatenate([line_of_sight, np.ones((*self.state.shape, 1))], axis=-1)
+        projected = np.einsum("tkij,tkj->tki", self.factor, sight)
+        ratio = np.sqrt(np.einsum("tki,tki->tk", projected, projected)) + self.constant
+        # degradations are added to the sigma itself, which is never less than the root of their squares
+        return np.asarray(self.sigma_m * ratio + self.growth_m)
+
+
+def slot_satellite(slot: int) -> str:
+    """Satellite of a slot of the mask; empty where it is reserved."""
+    for letter, first, last, number in (("G", 1, 32, 1), ("R", 38, 69, 1), ("E", 75, 110, 1), ("S", 120, 158, 20)):
+        if first <= slot <= last:
+            return f"{letter}{slot - first + number:02d}"
+    return f"C{slot - 158:02d}" if 159 <= slot <= 195 else ""
+
+
+def message_types(bits: Bytes) -> Integers:
+    """Types of L5 messages, shape (N,); -1 for those without one of the six preambles or with a wrong parity."""
+    head = read_fields(bits, _HEAD)
+    good = np.isin(head["preamble"], PREAMBLES) & (message_parity(bits) == carried_parity(bits))
+    return np.where(good, head["type"], -1)
+
+
+def residual_ionosphere_m(elevation_deg: Floats) -> Floats:
+    """Standard deviation that ionosphere-free ranges keep of the ionosphere [m] (ED-259A)."""
+    return np.asarray(40.0 / (261.0 + elevation_deg**2) + 0.018)
+
+
+def _newest(sent: Datetimes, time: Datetimes) -> tuple[Integers, Floats]:
+    """Row of the newest of some messages at epochs, -1 without one, and its age, infinite then [s]."""
+    row = np.searchsorted(sent, time, side="right") - 1
+    ages = seconds(time - np.append(sent, np.datetime64("NaT", "ns"))[row])
+    return row, np.where(row >= 0, ages, np.inf)
+
+
+class DfmcService:
+    """Corrections by the L5 messages of one SBAS satellite at any epochs; a message counts from its reception on.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (N,)
+        Reception, rising.
+    bits : ndarray of uint8, shape (N, 32)
+        Messages from their first bit on, as `SbasMessages.bits`.
+
+    Attributes
+    ----------
+    counts : dict of str to int
+        Messages by what became of them.
+    """
+
+    def __init__(self, time: Datetimes, bits: Bytes) -> None:
+        kinds = message_types(bits)
+        self.counts = {
+            "rejected" if kind < 0 else f"type {kind} {TYPE_NAMES.get(kind, 'unknown')}": int(np.sum(kinds == kind))
+            for kind in np.unique(kinds).tolist()
+        }
+        self._time = {kind: time[kinds == kind] for kind in (0, *LAYOUTS)}
+        self._read = {kind: read_fields(bits[kinds == kind], layout) for kind, layout in LAYOUTS.items()}
+        self._indicators = self._all_indicators()
+
+    def at(self, time: Datetimes, satellite: Strings) -> DfmcCorrections:
+        """Return the corrections of satellites at epochs.
+
+        Parameters
+        ----------
+        time : ndarray of datetime64[ns], shape (T,)
+        satellite : ndarray of str, shape (K,)
+        """
+        shape = (len(time), len(satellite))
+        names = np.array([slot_satellite(int(slot)) for slot in self._read[32]["slot"]], dtype="<U3")
+        stop = self._newest(0, time, STOP_S) >= 0
+        since = _newest(self._time[0], time)[1]
+        mask, ten = self._newest(31, time, MASK_S), self._newest(37, time, np.inf)
+        result = {
+            "state": np.zeros(shape, dtype=np.int8), "issue": np.full(shape, -1), "position_m": np.zeros((*shape, 3)),
+            "clock_m": np.zeros(shape), "sigma_m": np.full(shape, np.nan), "factor": np.zeros((*shape, 4, 4)),
+            "growth_m": np.zeros(shape), "constant": np.zeros(shape),
+        }  # fmt: skip
+        for k, name in enumerate(satellite.tolist()):
+            own = {key: values[:, k] for key, values in result.items()}
+            slots, rank = self._slots(name, mask)
+            rows = np.flatnonzero(names == name)
+            newest, age = _newest(self._time[32][rows], time)
+            row, has = np.append(rows, 0)[newest], (newest >= 0) & (age < since)
+            age = np.where(has, age, np.inf)
+            valid = np.append(self._read[37]["valid_32_s"], 0.0)[ten]
+            dfrei = self._indicator(time, mask, rank, (row, age))
+            own["state"][:] = np.select(
+                [stop, mask < 0, ~slots, ten < 0, ~has, (age > valid) | (dfrei < 0), dfrei >= DO_NOT_USE],
+                [
+                    DfmcState.STOPPED, DfmcState.NO_MASK, DfmcState.NOT_IN_MASK, DfmcState.NO_DEGRADATION,
+                    DfmcState.NO_CORRECTION, DfmcState.TIMED_OUT, DfmcState.DO_NOT_USE,
+                ],
+                DfmcState.OK,
+            )  # fmt: skip
+            good = np.flatnonzero(own["state"] == DfmcState.OK)
+            if len(good):
+                self._correct(own, good, (time, row, ten, dfrei), name)
+        return DfmcCorrections(**result)
+
+    def _correct(
+        self, own: dict[str, Floats], good: Integers, at: tuple[Datetimes, Integers, Integers, Integers], name: str
+    ) -> None:
+        """Fill in the corrections of one satellite at the epochs that have one."""
+        time, row, ten, dfrei = (values[good] for values in at)
+        sent, scale = {key: values[row] for key, values in self._read[32].items()}, self._read[37]
+        reference = self._time[32][row]
+        midnight = reference.astype("datetime64[D]").astype("datetime64[ns]")
+        offset = sent["time_of_day_s"] - seconds(reference - midnight)
+        reference = reference + timedelta(offset - SECONDS_PER_DAY * np.rint(offset / SECONDS_PER_DAY))
+        moved_s = seconds(time - reference)
+        own["issue"][good] = sent["iodn"]
+        own["position_m"][good] = sent["position_m"] + sent["velocity_mps"] * moved_s[:, None]
+        own["clock_m"][good] = sent["clock_m"] + sent["drift_mps"] * moved_s
+        code = scale["scale"][ten, dfrei]
+        own["sigma_m"][good] = np.array(SIGMA_LEAST_M)[dfrei] + code * np.array(SIGMA_STEP_M)[dfrei]
+        unit = np.exp2(sent["exponent"] - 5.0)
+        factor = np.zeros((len(good), 4, 4))
+        factor[:, range(4), range(4)], factor[:, _UPPER[0], _UPPER[1]] = sent["diagonal"], sent["upper"]
+        own["factor"][good] = factor * unit[:, None, None]
+        own["constant"][good] = scale["covariance"][ten] * unit
+        kind = _DEGRADED.index(name[0])
+        age = seconds(time - self._time[32][row])
+        interval = scale["interval_s"][ten, kind]
+        steps = np.where(interval > 0.0, np.floor(age / np.where(interval > 0.0, interval, 1.0)), 0.0)
+        rate = scale["rate_mps"][ten, kind] * (sent["rate_share"] + 1.0) / 16.0
+        own["growth_m"][good] = steps * scale["step_m"][ten, kind] + rate * age
+
+    def _newest(self, kind: int, time: Datetimes, longest_s: float) -> Integers:
+        """Row of the newest message of a type, -1 without one that is new enough."""
+        row, age = _newest(self._time[kind], time)
+        return np.where(age <= longest_s, row, -1)
+
+    def _slots(self, name: str, mask: Integers) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.bool_]], Integers]:
+        """Whether a satellite is in the mask in force, and its rank among those that are."""
+        slot = next((s for s in range(1, 215) if slot_satellite(s) == name), 0)
+        if not slot or not len(self._time[31]):
+            return np.zeros(len(mask), dtype=np.bool_), np.zeros(len(mask), dtype=np.int64)
+        member = self._read[31]["member"][mask]
+        return (mask >= 0) & (member[:, slot - 1] == 1), member[:, : slot - 1].sum(axis=1)
+
+    def _all_indicators(self) -> tuple[Datetimes, Integers, Integers]:
+        """Times, issue of the mask and indicators of all satellites of types 34 to 36; -1 where one says nothing.
+
+        Type 34: 0 nothing new, 1 an indicator of its own, 2 one more than before (-2 here), 3 do not use.
+        """
+        times, issues, values = [], [], []
+        for kind in (34, 35, 36):
+            fields = self._read[kind]
+            table = np.full((len(self._time[kind]), AUGMENTED), -1, dtype=np.int64)
+            if kind == 34:
+                change = fields["change"]
+                rank = np.cumsum(change == 1, axis=1) - 1
+                given = np.take_along_axis(fields["dfrei"], np.clip(rank, 0, 6), axis=1)
+                table = np.select([(change == 1) & (rank < 7), change == 2, change == 3], [given, -2, DO_NOT_USE], -1)
+            else:
+                table[:, :_FIRST] = fields["dfrei"] if kind == 35 else -1
+                table[:, _FIRST:] = fields["dfrei"] if kind == 36 else -1
+            times.append(self._time[kind])
+            issues.append(fields["iodm"])
+            values.append(table)
+        time = np.concatenate(times)
+        order = np.argsort(time, kind="stable")
+        return time[order], np.concatenate(issues)[order], np.concatenate(values)[order]
+
+    def _indicator(self, time: Datetimes, mask: Integers, rank: Integers, sent: tuple[Integers, Floats]) -> Integers:
+        """Indicator in force: of type 32, or of a later message of types 34 to 36; -1 where it is too old."""
+        row, age = sent
+        received, issue, values = self._indicators
+        result = np.full(len(time), -1, dtype=np.int64)
+        for t in range(len(time)):
+            if mask[t] < 0 or not np.isfinite(age[t]):
+                continue
+            began = self._time[32][row[t]]
+            current, renewed = int(self._read[32]["dfrei"][row[t]]), began
+            first, last = np.searchsorted(received, [began, time[t]], side="right")
+            for i in range(int(first), int(last)):
+                if issue[i] != self._read[31]["iodm"][mask[t]]:
+                    continue
+                value, renewed = int(values[i, rank[t]]), received[i]
+                current = min(current + 1, DO_NOT_USE - 1) if value == -2 and current < DO_NOT_USE else current
+                current = value if value >= 0 else current
+            result[t] = current if seconds(np.array([time[t] - renewed]))[0] <= INDICATOR_S else -1
+        return result

@@ -1,0 +1,141 @@
+"""Dual-frequency SBAS: layouts, corrections in force, integrity, traps."""
+
+import numpy as np
+import pytest
+
+from railfix.ranges.sbas.dfmc import DfmcService, DfmcState, message_types, residual_ionosphere_m, slot_satellite
+from railfix.ranges.sbas.messages import with_parity
+from railfix.simulate.sbas import dfmc
+
+pytestmark = pytest.mark.requirement("C5")
+START = np.datetime64("2026-03-01T06:00:00", "ns")
+#: Satellites of the mask: G05, G12, E03.
+SLOTS = (5, 12, 77)
+TOD_S = 6 * 3600.0
+
+
+def service(*messages: tuple[float, np.ndarray]) -> DfmcService:
+    time = START + np.array([round(t * 1e9) for t, _ in messages], dtype="timedelta64[ns]")
+    return DfmcService(time, np.array([bits for _, bits in messages], dtype=np.uint8))
+
+
+def standard(*more: tuple[float, np.ndarray], **parameters: object) -> DfmcService:
+    """A mask, type 37, and a correction of G05 with rates."""
+    moved, rates = (1.0, -2.5, 0.0625, -3.125), (0.01, 0.0, -0.005, 0.02)
+    sent = dfmc.correction(2, 5, 77, moved, rates, time_of_day_s=TOD_S)
+    first = [(0.0, dfmc.mask(0, SLOTS)), (1.0, dfmc.parameters(1, **parameters)), (2.0, sent)]  # type: ignore[arg-type]
+    return service(*sorted([*first, *more], key=lambda item: item[0]))
+
+
+def at(found: DfmcService, second: float, satellite: str = "G05"):  # type: ignore[no-untyped-def]
+    return found.at(np.array([START + np.timedelta64(round(second * 1e9), "ns")]), np.array([satellite]))
+
+
+def test_slots_name_satellites() -> None:
+    assert [slot_satellite(s) for s in (1, 32, 33, 38, 75, 110, 120, 158, 159, 195, 200)] == [
+        "G01", "G32", "", "R01", "E01", "E36", "S20", "S58", "C01", "C37", "",
+    ]  # fmt: skip
+
+
+def test_a_message_by_hand() -> None:
+    """Type 32 bit by bit: slot 5, issue 77, x -1 step of 1/16 m, clock +2 steps of 1/32 m, all else zero."""
+    text = f"{0x6:04b}{32:06b}" + f"{5:08b}{77:010b}" + "1" * 11 + "0" * 22 + f"{2:012b}" + "0" * 33
+    text += f"{round(TOD_S / 16):013b}" + "101" + f"{4:09b}" + "0" * 27 + "0" * 60 + f"{3:04b}" + "1111"
+    assert len(text) == 226
+    written = dfmc.correction(
+        2, 5, 77, (-0.0625, 0, 0, 0.0625), time_of_day_s=TOD_S, covariance=(5, np.diag([4.0, 0, 0, 0])), dfrei=3
+    )
+    assert "".join(f"{b:08b}" for b in written)[:226] == text
+    assert message_types(written[None]).tolist() == [32]
+
+
+def test_corrections_move_with_their_rates_and_belong_to_an_issue() -> None:
+    found = at(standard(), 10.0)
+    assert found.state[0, 0] == DfmcState.OK
+    assert found.issue[0, 0] == 77
+    quantised = np.round(np.array([0.01, 0.0, -0.005]) * 2**11) / 2**11
+    np.testing.assert_allclose(found.position_m[0, 0], [1.0, -2.5, 0.0625] + 10.0 * quantised)
+    assert found.clock_m[0, 0] == pytest.approx(-3.125 + 10.0 * round(0.02 * 2**12) / 2**12)
+    # indicator 3, code 0: 0.5 m; the factor is the unit matrix, a line of sight along x has a factor of sqrt(2)
+    assert found.sigma_along_m(np.array([[[1.0, 0.0, 0.0]]]))[0, 0] == pytest.approx(0.5 * np.sqrt(2.0))
+
+
+def test_sigma_grows_by_scale_covariance_and_age() -> None:
+    found = at(standard(scale=4, covariance=0.5, degradation=(6.0, 0.02, 0.001)), 12.5)
+    age = 10.5
+    expected = (0.5 + 4 * 0.125) * (np.sqrt(2.0) + 0.5) + np.floor(age / 6.0) * 0.02 + 0.001 * age
+    assert found.sigma_along_m(np.array([[[0.0, 1.0, 0.0]]]))[0, 0] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("second", "satellite", "state"),
+    [
+        (1.5, "G05", DfmcState.NO_CORRECTION),
+        (3.0, "G12", DfmcState.NO_CORRECTION),
+        (3.0, "G07", DfmcState.NOT_IN_MASK),
+        (3.0, "J01", DfmcState.NOT_IN_MASK),
+        (-1.0, "G05", DfmcState.NO_MASK),
+        (0.5, "G05", DfmcState.NO_DEGRADATION),
+        (15.0, "G05", DfmcState.TIMED_OUT),
+    ],
+)
+def test_what_is_missing_has_a_name(second: float, satellite: str, state: DfmcState) -> None:
+    assert at(standard(), second, satellite).state[0, 0] == state
+
+
+@pytest.mark.parametrize(
+    ("message", "state", "sigma"),
+    [
+        (dfmc.integrity(0, [4, 3, 3]), DfmcState.OK, 0.625),
+        (dfmc.integrity(0, [15, 3, 3]), DfmcState.DO_NOT_USE, np.nan),
+        (dfmc.integrity(0, [15, 3, 3], iodm=1), DfmcState.OK, 0.5),  # of another mask
+        (dfmc.changes(0, [0, 1, 3], [9]), DfmcState.OK, 0.5),
+        (dfmc.changes(0, [1, 0, 0], [6]), DfmcState.OK, 1.0),
+        (dfmc.changes(0, [2, 0, 0]), DfmcState.OK, 0.625),
+        (dfmc.changes(0, [3, 0, 0]), DfmcState.DO_NOT_USE, np.nan),
+        (dfmc.message(63, 0), DfmcState.OK, 0.5),
+    ],
+)
+def test_later_indicators_count(message: np.ndarray, state: DfmcState, sigma: float) -> None:
+    found = at(standard((5.0, message)), 6.0)
+    assert found.state[0, 0] == state
+    np.testing.assert_allclose(found.sigma_m[0, 0], sigma)
+
+
+def test_the_last_of_many_satellites_is_in_type_36() -> None:
+    slots = [*range(1, 33), *range(75, 111)]  # 68 satellites: E36 is number 67
+    grades = [15] * 14 + [7]
+    found = service(
+        (0.0, dfmc.mask(0, slots)),
+        (1.0, dfmc.parameters(1)),
+        (2.0, dfmc.correction(2, 110, 5, (0, 0, 0, 0), time_of_day_s=TOD_S)),
+        (3.0, dfmc.integrity(3, grades, kind=36)),
+    )
+    assert at(found, 4.0, "E36").sigma_m[0, 0] == pytest.approx(1.25)
+
+
+def test_type_0_stops_the_service_and_what_came_before_it() -> None:
+    """Also where it carries the content of another type, as in tests of a service."""
+    content = dfmc.integrity(5, [3, 3, 3])
+    content[0] = (content[0] & 0xF0) | 0  # the type is 0 now
+    content[1] &= 0x3F
+    stop = with_parity(content[None])[0]
+    found = standard((5.0, stop))
+    assert at(found, 4.0).state[0, 0] == DfmcState.OK
+    assert at(found, 6.0).state[0, 0] == DfmcState.STOPPED
+    again = standard((5.0, stop), (66.0, dfmc.integrity(0, [3, 3, 3])))
+    assert at(again, 67.0).state[0, 0] == DfmcState.NO_CORRECTION  # the correction was sent before the stop
+
+
+def test_broken_and_foreign_messages_are_counted_and_left_out() -> None:
+    broken, foreign = dfmc.mask(0, SLOTS).copy(), dfmc.mask(0, SLOTS).copy()
+    broken[10] ^= 4
+    foreign[0] = 0x53 ^ 0xF0  # no preamble of L5
+    unknown = dfmc.message(61, 3)
+    found = service((0.0, broken), (1.0, foreign), (2.0, unknown), (3.0, dfmc.message(47, 4)))
+    assert found.counts == {"rejected": 2, "type 47 almanac": 1, "type 61 unknown": 1}
+    assert at(found, 4.0).state[0, 0] == DfmcState.NO_MASK
+
+
+def test_residual_ionosphere() -> None:
+    np.testing.assert_allclose(residual_ionosphere_m(np.array([5.0, 90.0])), [40 / 286 + 0.018, 40 / 8361 + 0.018])
