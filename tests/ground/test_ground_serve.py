@@ -36,7 +36,7 @@ from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
 from railfix.ground.train import run_train
 from railfix.ground.triangle import TriangleVerdict
-from railfix.io.train_message import encode, to_json
+from railfix.io.train_message import MessageStatus, SuspectedInterference, encode, to_json
 
 pytestmark = pytest.mark.requirement("F2")
 
@@ -423,3 +423,23 @@ def test_a_wrong_file_of_a_centre_is_one_sentence(
     open_to_all.write_text("secret")
     done = CliRunner().invoke(app, ["centre", str(tmp_path / "line.toml"), "--password", str(open_to_all)])
     assert "others can read it" in " ".join(done.output.split())
+
+
+def test_interference_that_a_train_suspects_is_an_alarm_until_it_ends(
+    centre: tuple[ControlCentre, list[Authority], list[float]],
+) -> None:
+    """Also in reports without a place, which change nothing else."""
+    control, _, _ = centre
+    train = SimulatedTrain(number=1, front_m=400.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=400.0))
+    good = train.message(0.0)
+    kinds = (SuspectedInterference.NONE, SuspectedInterference.SPOOFING, SuspectedInterference.NONE, None)
+    shown = []
+    for number, kind in enumerate(kinds):
+        status = MessageStatus.DOUBTFUL if kind else MessageStatus.POSITION
+        control.report(1, encode(good.replaced(sequence=10 + number, interference=kind, status=status)))
+        shown.append((control.alarms, control.snapshot()["trains"][0]["interference"]))
+    clear = ([], "none")
+    assert shown == [clear, (["train 1 suspects spoofing"], "spoofing"), clear, clear]
+    assert [line.split(": ", 2)[2] for line in control.lines if "suspected" in line] == [
+        "spoofing suspected", "spoofing no longer suspected",
+    ]  # fmt: skip

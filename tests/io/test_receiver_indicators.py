@@ -146,3 +146,25 @@ def test_a_recorded_stream_has_no_alarm_and_the_gain_of_pyubx2(recordings: Path)
             expected.append(gain)
     assert not log.receiver_alarm.any()
     np.testing.assert_array_equal(log.front_end_gain[-500:], expected[-500:])
+
+
+@pytest.mark.parametrize(
+    ("events", "alarm"),
+    [
+        ([], 0),
+        ([(500, 0, 0)], 2),  # a simulated signal since 500 s
+        ([(500, 0, 0), (3, 0, 1)], 0),  # and no more for 3 s
+        ([(3, 0, 1), (500, 0, 0)], 0),  # whatever the order
+        ([(20, 4, 0)], 1),
+        ([(20, 5, 0), (10, 0, 0)], 3),
+        ([(4, 5, 2)], 1),  # a single trigger, which has no end
+        ([(40, 5, 2)], 0),
+        ([(1, 1, 0), (1, 2, 0), (1, 3, 0)], 0),  # what tunnels make, too
+    ],
+)
+def test_the_log_of_events_counts_until_an_event_has_ended(events: list[tuple[int, int, int]], alarm: int) -> None:
+    body = struct.pack("<BB6x", 1, len(events)) + b"".join(struct.pack("<IBBxx", *event) for event in events)
+    data = frame(0x2710, body)
+    parsed = UBXReader.parse(data)
+    assert [getattr(parsed, f"timeElapsed_{k:02d}") for k in range(1, len(events) + 1)] == [e[0] for e in events]
+    assert last_of(data)[0] == alarm

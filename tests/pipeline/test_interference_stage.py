@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -125,3 +126,25 @@ def test_the_filter_gives_no_bound_and_the_message_says_why() -> None:
     message = message_of(whole, LiveSettings(), sequence=1, sent_ns=0)
     assert message.interference == Suspicion.SPOOFING_SUSPECTED
     assert message.over_cm is None
+
+
+@pytest.mark.requirement("B8")
+def test_at_10_hz_it_is_looked_for_once_a_second_whatever_the_chunks() -> None:
+    log = pipeline_cases.clean_observations()["front"][:45]
+    alarm = np.zeros(len(log), dtype=np.uint8)
+    alarm[13], alarm[25] = 1, 2
+    log = replace(log, receiver_alarm=alarm)
+    processor = pipeline_cases.processor({"filter": "off"})
+    whole = processor.process({"front": log})[0]["front"].interference
+    assert whole is not None
+    jamming = (whole.causes & int(Sign.RECEIVER_JAMMING)) != 0
+    spoofing = (whole.causes & int(Sign.RECEIVER_SPOOFING)) != 0
+    tenths = np.round((log.time - log.time[0]) / np.timedelta64(100, "ms")).astype(int)
+    assert tenths[np.argmax(jamming)] == 20
+    assert tenths[np.argmax(spoofing)] == 30
+    state, parts = None, []
+    for part in np.split(np.arange(len(log)), (1, 14, 20, 21, 26)):
+        result, state = processor.process({"front": log[part[0] : part[-1] + 1]}, state)
+        parts.append(result["front"].interference)
+    np.testing.assert_array_equal(np.concatenate([part.causes for part in parts]), whole.causes)
+    np.testing.assert_allclose(np.concatenate([part.power.fall_db for part in parts]), whole.power.fall_db)

@@ -23,7 +23,7 @@ from railfix.ground.store import DatabaseError, Store
 from railfix.ground.supervision import Supervision
 from railfix.ground.triangle import STOPPING, TriangleVerdict
 from railfix.ground.web import Order
-from railfix.io.train_message import MessageError, TrainMessage, decode
+from railfix.io.train_message import MessageError, SuspectedInterference, TrainMessage, decode
 
 #: Time between attempts to write to a database that fails [s].
 RETRY_S = 1.0
@@ -87,6 +87,8 @@ class ControlCentre:
         Trains that are ordered to stop.
     database : str or None
         Why the database does not take the state: nothing is granted meanwhile, and the trains stop in time.
+    interference : dict of int to SuspectedInterference
+        What the newest report of each train suspects.
     """
 
     supervision: Supervision
@@ -103,6 +105,7 @@ class ControlCentre:
     stop_s: float | None = None
     stops: dict[int, StopOrder] = field(default_factory=dict)
     database: str | None = None
+    interference: dict[int, SuspectedInterference] = field(default_factory=dict)
     _failed_s: float = 0.0
     _routes: dict[int, int] = field(init=False)
     _verdict: tuple[TriangleVerdict, int] | None = None
@@ -158,6 +161,8 @@ class ControlCentre:
         known = self.supervision.state.trains.get(number)
         stop = None if known is None else known.stop
         before = self.supervision.records.get(number, TrainRecord(train=number))
+        if message.sequence > before.sequence:
+            self._hear_interference(message)
         reason = self.supervision.report(message, self.clock())
         if reason is not None:
             self.rejected[reason.value] += 1
@@ -179,6 +184,20 @@ class ControlCentre:
             self.log(f"train {number}: heard again, place jumps by {after.jump_m or 0.0:.1f} m", train=number)
         elif before.state is TrainState.UNKNOWN:
             self.log(f"train {number}: heard", train=number)
+
+    def _hear_interference(self, message: TrainMessage) -> None:
+        """Note what a train suspects, also in a report without a place, and log where that changes."""
+        before = self.interference.get(message.train, SuspectedInterference.NONE)
+        now = message.interference or SuspectedInterference.NONE
+        if now is not before:
+            word = f"{now.name.lower()} suspected" if now else f"{before.name.lower()} no longer suspected"
+            self.log(f"train {message.train}: {word}", train=message.train)
+        self.interference[message.train] = now
+
+    @property
+    def alarms(self) -> list[str]:
+        """Interference that trains suspect, a sentence each."""
+        return [f"train {n} suspects {kind.name.lower()}" for n, kind in sorted(self.interference.items()) if kind]
 
     def judge(self, verdict: TriangleVerdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
         """Take a verdict on satellite positioning, of fixes of an age; of those between two steps the worst counts.
@@ -325,6 +344,7 @@ class ControlCentre:
             trains.append({
                 "number": number, "state": record.state.value, "shown": record.shown_m, "speed": abs(speed) / 100.0,
                 "direction": train.direction, "rear": rear, "front": front, "end": train.end_m, "jump": record.jump_m,
+                "interference": self.interference.get(number, SuspectedInterference.NONE).name.lower(),
                 "stop": None if number not in stopped else f"{stopped[number]}; {self.stops.get(number, 'not sent')}",
                 "pieces": [[0 if lane == 0 else 2 - lane % 2, low, high] for lane, low, high in pieces],
             })  # fmt: skip

@@ -152,7 +152,7 @@ async def run_demo(
                 for n, train in trains.items()
                 for bearer, meter in train.meters.items()
             ]  # fmt: skip
-            return {**control.snapshot(), "links": links, "alarms": [], "done": done}
+            return {**control.snapshot(), "links": links, "alarms": control.alarms, "done": done}
 
         page = PageServer(page_app(snapshot, orders_of(control), sessions=Sessions(password=password)), port=port)
         await page.start()

@@ -294,7 +294,7 @@ async def run_centre(
         done = False
 
         def snapshot() -> dict[str, Any]:
-            alarms = [text for text in (control.database, links.alarm) if text is not None]
+            alarms = [*(text for text in (control.database, links.alarm) if text is not None), *control.alarms]
             return {**control.snapshot(), "links": _heard(control, links), "alarms": alarms, "done": done}
 
         app = page_app(snapshot, orders_of(control), sessions=Sessions(password=password))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
@@ -11,6 +11,7 @@ import numpy as np
 from railfix.core.arrays import Bits, Bytes, Codes, Floats, Masks, changed, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
+from railfix.core.timescale import GPS_EPOCH
 from railfix.integrity.interference import (
     CAUSES,
     HeldState,
@@ -27,7 +28,7 @@ from railfix.integrity.interference import (
     suspicion,
 )
 from railfix.integrity.interference.motion import MotionInputs
-from railfix.positioning.antenna_rows import AntennaRows, rows_of
+from railfix.positioning.antenna_rows import AntennaRows, joined, rows_of
 
 if TYPE_CHECKING:
     from railfix.pipeline.corrected_ranges import CorrectedRanges
@@ -43,15 +44,34 @@ _UNDER_SPOOFING: Final = (
     Status.MAP_OFFSET,
 )  # fmt: skip
 _UNDER_JAMMING: Final = (Status.OK,)
+#: Interference is looked for once so long; tags may be so much before the whole second.
+_SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
 
 
 @dataclass(frozen=True, kw_only=True)
 class InterferenceState:
-    """State of the signs after a chunk."""
+    """State of the signs after a chunk.
+
+    Attributes
+    ----------
+    power : PowerState
+    motion : MotionSignState
+    held : HeldState
+    second : int
+        GPS second of the last epoch that was looked at.
+    broken, alarm : bool, int
+        Break and the receiver's alarms since then.
+    latest : Interference or None
+        Of that epoch.
+    """
 
     power: PowerState = field(default_factory=PowerState)
     motion: MotionSignState = field(default_factory=MotionSignState)
     held: HeldState = field(default_factory=HeldState)
+    second: int = -1
+    broken: bool = False
+    alarm: int = 0
+    latest: Interference | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +150,7 @@ def find_interference(
     hold, release = _times(limits)
     _, stays, held_state = held(corrected.time, signs, state.held, hold_s=hold, release_s=release)
     causes = (stays * np.array([int(cause) for cause in CAUSES])).sum(axis=1, dtype=np.int64)
-    after = InterferenceState(power=power_state, motion=motion_state, held=held_state)
+    after = replace(state, power=power_state, motion=motion_state, held=held_state)
     return Interference(causes=causes, power=power, motion=motion), after
 
 
@@ -172,6 +192,46 @@ def _times(limits: InterferenceLimits) -> tuple[Floats, Floats]:
     )
 
 
+def _once_a_second(
+    corrected: CorrectedRanges,
+    solution: Solution,
+    index: SearchIndex,
+    state: InterferenceState,
+    limits: InterferenceLimits,
+) -> tuple[Interference, InterferenceState]:
+    """Return the interference of the epochs of one antenna: looked for at the first epoch of each second.
+
+    The others have what was found there; a break or an alarm between counts at the next one.
+    """
+    time = corrected.time
+    if not len(time):
+        return find_interference(corrected, solution, index, state, limits)
+    second = (time - GPS_EPOCH + _TAG) // _SECOND
+    due = second != np.concatenate([[state.second], second[:-1]])
+    group = np.cumsum(due)
+    alarm, broken = np.zeros(group[-1] + 2, dtype=np.uint8), np.zeros(group[-1] + 2, dtype=np.bool_)
+    alarm[0], broken[0] = state.alarm, state.broken
+    # what came after a due epoch belongs to the next one
+    np.bitwise_or.at(alarm, group - due, corrected.observations.receiver_alarm)
+    np.logical_or.at(broken, group - due, corrected.break_before)
+    at = np.flatnonzero(due)
+    found, after = [], state
+    if len(at):
+        part, places = rows_of(corrected, at), rows_of(solution, at)
+        observations = changed(part.observations, receiver_alarm=alarm[:-2])
+        part = changed(part, observations=observations, break_before=broken[:-2])
+        own, after = find_interference(part, places, index, state, limits)
+        found = [own]
+    known = found if state.latest is None else [state.latest, *found]
+    every = joined(known)
+    row = group - (state.latest is None)
+    after = replace(
+        after, second=int(second[-1]), alarm=int(alarm[group[-1]]), broken=bool(broken[group[-1]]),
+        latest=rows_of(every, row[-1:]),
+    )  # fmt: skip
+    return rows_of(every, row), after
+
+
 def judge_interference(
     corrected: CorrectedRanges,
     solution: Solution,
@@ -184,7 +244,7 @@ def judge_interference(
         return solution, states
 
     def of_antenna(index: SearchIndex, rows: slice, state: InterferenceState) -> tuple[Interference, InterferenceState]:
-        return find_interference(rows_of(corrected, rows), rows_of(solution, rows), index, state, limits)
+        return _once_a_second(rows_of(corrected, rows), rows_of(solution, rows), index, state, limits)
 
     found, after = antennas.each_with_state(of_antenna, states)
     kind, status = found.suspicion, solution.status

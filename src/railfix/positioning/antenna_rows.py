@@ -146,12 +146,12 @@ def _join(values: Sequence[Any]) -> Any:
     return _make(type(first), members)
 
 
-def rows_of(value: Value, rows: slice) -> Value:
+def rows_of(value: Value, rows: slice | Indices) -> Value:
     """Return some rows of an array, or of the arrays of a dataclass and of those within it."""
     return value if rows is EVERY else cast(Value, _rows_of(value, rows))
 
 
-def _rows_of(value: Any, rows: slice) -> Any:
+def _rows_of(value: Any, rows: slice | Indices) -> Any:
     if isinstance(value, np.ndarray):
         return value[rows]
     if not (names := _members(cast(Hashable, type(value)))):

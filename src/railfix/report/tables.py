@@ -159,7 +159,19 @@ def budget(run: ReportedRun) -> list[Block]:
         alone = {n: (antennas[n].get(only) or {}).get(reason, 0) for n in names}
         ranges.append([f"  {reason}", *cells(counts, alone)])
     caption = "Pseudoranges by the first reason for their rejection, and those with this reason only"
+    signs = [
+        [name, sign, count(seen["epochs"]), str(seen["first"])]
+        for name, facts in antennas.items()
+        for sign, seen in (facts.get("interference") or {}).items()
+    ]
+    suspected = [
+        Table(
+            name="interference", head=["antenna", "sign", "epochs", "first, GPS time"], rows=signs, numeric=[2],
+            caption="Signs of jamming and spoofing",
+        )
+    ] if signs else [Sentence("No sign of jamming or spoofing.")]  # fmt: skip
     return [
+        *suspected,
         Table(name="epochs", head=["", *names], rows=rows, caption="Epochs by status", numeric=range(1, 9)),
         Table(name="pseudoranges", head=head, rows=ranges, caption=caption, numeric=range(1, 9)),
     ]

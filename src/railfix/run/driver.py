@@ -370,6 +370,10 @@ def notes_of(
         if offset is not None and offset.statistic > note_statistic:
             doubt = "contradicts the positions" if antenna.status["map_offset"] else "may be wrong"
             notes.append(f"{name}: the map {doubt}: {offset.text}")
+        notes += [
+            f"{name}: interference: {sign} at {count} epochs from {str(first)[:19]} on"
+            for sign, (count, first) in antenna.interference.items()
+        ]
         if antenna.positioned:
             notes.append(f"{name}: {_describe_detectable(antenna.map_detectable_m)}")
         off = antenna.status["off_map"]

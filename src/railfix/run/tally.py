@@ -11,6 +11,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings
 from railfix.core.reasons import Reason, Status, first_reason, reason_names
+from railfix.integrity.interference import CAUSES
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.filter_result import AlongTrack
@@ -84,6 +85,8 @@ class AntennaTally:
         Epochs without a level because more faults than can be left out are likelier than the risk allows.
     map_offset : MapOffsetFound or None
         Where the 3-D positions contradicted the map most; None before there were enough.
+    interference : dict of str to (int, datetime64[ns])
+        Epochs with each sign of interference, and the first of them.
     left_out, lasting : dict of str to (int, datetime64[ns])
         Epochs at which the filter, and the single epochs, left a satellite's codes out as wrong for long, and the first
         of them.
@@ -113,6 +116,7 @@ class AntennaTally:
     map_offset: MapOffsetFound | None = None
     left_out: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
     lasting: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
+    interference: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
     map_detectable_m: Floats = field(default_factory=lambda: np.full((2, 2), np.nan))
 
     def add(self, result: AntennaResult) -> None:
@@ -140,6 +144,9 @@ class AntennaTally:
         self._add_map_offset(result)
         lasting = (result.reason & int(Reason.LASTING_ERROR)) != 0
         _count_left_out(self.lasting, lasting, result.satellite, result.time)
+        if result.interference is not None:
+            signs = (result.interference.causes[:, None] & np.array([int(cause) for cause in CAUSES])) != 0
+            _count_left_out(self.interference, signs, np.array([str(c.name).lower() for c in CAUSES]), result.time)
         if result.protection is not None:
             levels = np.bincount(result.protection.status, minlength=len(LevelStatus))
             self.level_status.update({s.name.lower(): int(levels[s]) for s in LevelStatus})
@@ -237,6 +244,7 @@ class AntennaTally:
             "observations_rejected_by_one_reason_alone": dict(self.only_reason),
             "satellites_seen": dict(sorted(self.satellites.items())),
             "satellites_without_any_record": self.never_recorded,
+            "interference": {s: {"epochs": n, "first": str(t)[:19]} for s, (n, t) in self.interference.items()},
             "satellites_left_out": {s: n for s, (n, _) in sorted(self.lasting.items())},
             "satellites_left_out_by_the_filter": {s: n for s, (n, _) in sorted(self.left_out.items())},
         }

@@ -1,7 +1,7 @@
 """Receivers' own indicators of jamming and spoofing, and the gain of their front ends.
 
 Sources: u-blox F9 HPG 1.32 interface description (UBX-22008968), 3.14.5 MON-RF, 3.14.2 MON-HW; u-blox X20 HPG 2.00
-(SEC-SIG, versions 1 and 2); Septentrio mosaic-X5 reference guide 4.14, 4.2.14 (RFStatus, ReceiverStatus).
+(SEC-SIG, versions 1 and 2; SEC-SIGLOG); Septentrio mosaic-X5 reference guide 4.14, 4.2.14 (RFStatus, ReceiverStatus).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from railfix.io.receiver.framing import Frames
 MON_RF: Final = 0x0A38
 MON_HW: Final = 0x0A09
 SEC_SIG: Final = 0x2709
+SEC_SIGLOG: Final = 0x2710
 RF_STATUS: Final = 4092
 RECEIVER_STATUS: Final = 4014
 
@@ -34,6 +35,11 @@ _BLOCK: Final = 24
 #: Septentrio: first block of bands or front ends after the time stamp (6 bytes).
 _BANDS, _FRONT_ENDS = 12, 24
 _NO_GAIN: Final = -128
+#: u-blox SEC-SIGLOG: bytes of an event, kinds of detection that count, and how long a single trigger does [s].
+_EVENT: Final = 8
+_SIMULATED: Final = 0
+_LOGGED_JAMMING: Final = frozenset((4, 5))
+_TRIGGERED_S: Final = 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +82,7 @@ def _messages(frames: Frames) -> Iterator[tuple[int, int, int, float]]:
         ("ubx", MON_RF): _mon_rf,
         ("ubx", MON_HW): _mon_hw,
         ("ubx", SEC_SIG): _sec_sig,
+        ("ubx", SEC_SIGLOG): _sec_siglog,
         ("sbf", RF_STATUS): _rf_status,
         ("sbf", RECEIVER_STATUS): _receiver_status,
     }
@@ -112,6 +119,23 @@ def _sec_sig(data: Bytes) -> tuple[int, float] | None:
         return None
     bits = JAMMING * (jamming & 1 == 1 and (jamming >> 1 & 3) >= _CERTAIN)
     return bits | SPOOFING * (spoofing & 1 == 1 and (spoofing >> 1 & 7) >= _CERTAIN), np.nan
+
+
+def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
+    """Jamming and spoofing that the log has begun and not ended, by the newest event of each kind.
+
+    A simulated signal counts as spoofing, broad and narrow bands as jamming. Abnormal signals, contradictions of an
+    inertial unit and abrupt changes do not count: tunnels make them.
+    """
+    if len(data) < 8 or len(data) != 8 + _EVENT * int(data[1]):
+        return None
+    newest: dict[int, tuple[int, int]] = {}
+    for event in data[8:].reshape(-1, _EVENT):
+        elapsed, detection, kind = int(event[:4].view("<u4")[0]), int(event[4]), int(event[5])
+        if elapsed < newest.get(detection, (1 << 32, 0))[0]:
+            newest[detection] = elapsed, kind
+    open_kinds = {d for d, (elapsed, kind) in newest.items() if kind == 0 or (kind == 2 and elapsed <= _TRIGGERED_S)}
+    return JAMMING * bool(open_kinds & _LOGGED_JAMMING) | SPOOFING * (_SIMULATED in open_kinds), np.nan
 
 
 def _rf_status(data: Bytes) -> tuple[int, float] | None:
