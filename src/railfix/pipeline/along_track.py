@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from itertools import pairwise
 from typing import Final
@@ -13,6 +14,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
+from railfix.integrity.interference import WheelSigns, WheelState, wheel_signs
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
@@ -83,6 +85,11 @@ def along_track(
     beside = (tracked.status == TrackStatus.TRACKING) & single.map_offset
     tracked = doubted(tracked, beside, TrackStatus.MAP_OFFSET)
     tracked = doubted(tracked, single.spoofed & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
+    wheel = None
+    if config.interference.use == "on" and any(replay.sensors.wheel_m is not None for replay in replays):
+        wheel, watched = _against_wheel(replays, single, after.wheel, config)
+        after = replace(after, wheel=watched)
+        tracked = doubted(tracked, wheel.parted & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
     inside = on_line_m(tracked, trajectory)
     ecef = trajectory.at_arc(inside)
     latitude, longitude, height = geodetic_from_ecef(ecef)
@@ -100,9 +107,22 @@ def along_track(
         standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS,
         sensed=sensed,
         spacing_error_m=np.full(len(tracked), np.nan),
+        wheel=wheel,
         replay=replays,
     )
     return result, replace(after, line=line)
+
+
+def _against_wheel(
+    replays: Sequence[Replay], single: SingleEpochs, state: WheelState, config: Config
+) -> tuple[WheelSigns, WheelState]:
+    """Compare positions of single epochs with the distance that the wheel has rolled."""
+    parts = [(replay.epochs.time, replay.sensors.wheel_m) for replay in replays]
+    rolled = np.concatenate([np.full(len(time), np.nan) if way is None else way for time, way in parts])
+    return wheel_signs(
+        np.concatenate([time for time, _ in parts]), single.arc_m, single.sigma_m, rolled, state, config.interference,
+        signed=all(replay.sensors.wheel_sign == "measured" for replay in replays if replay.sensors.wheel_m is not None),
+    )  # fmt: skip
 
 
 def checked(

@@ -10,7 +10,7 @@ import numpy as np
 from railfix.core.arrays import Codes, Datetimes, Floats, Masks
 from railfix.core.display import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
-from railfix.integrity.interference import Suspicion
+from railfix.integrity.interference import Suspicion, WheelSigns, WheelState
 from railfix.pipeline.return_gate import ReturnState
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import SensorState
@@ -109,6 +109,8 @@ class FilterState(NotebookTable):
     fixed, anchor : FilterFix or None
         Place of the filter at the last epoch, and at the last one before the present stretch.
     gate : ReturnState
+    wheel : WheelState
+        Of the comparison of distances by satellites and wheel.
     disagreed : datetime64[ns]
         Last epoch at which places or speeds of the two antennas disagreed.
     """
@@ -121,6 +123,7 @@ class FilterState(NotebookTable):
     fixed: FilterFix | None = None
     anchor: FilterFix | None = None
     gate: ReturnState = field(default_factory=ReturnState)
+    wheel: WheelState = field(default_factory=WheelState)
     disagreed: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
 
     def __repr__(self) -> str:
@@ -156,6 +159,8 @@ class AlongTrack(NotebookTable):
         Motion since the epoch before and the line under the body, by wheel and inertial unit.
     spacing_error_m : ndarray, shape (T,) [m]
         Distance from the place of the other antenna less that of the antennas; NaN where it was not looked at.
+    wheel : WheelSigns or None
+        Distances by satellites against those of the wheel; None without a wheel.
     replay : tuple of Replay
         What the filter was given, to smooth it (`railfix.pipeline.smoothing`).
     """
@@ -171,6 +176,7 @@ class AlongTrack(NotebookTable):
     standstill: Masks
     sensed: SensedMotion
     spacing_error_m: Floats
+    wheel: WheelSigns | None = None
     replay: tuple[Replay, ...] = ()
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
@@ -32,6 +33,8 @@ from railfix.positioning.antenna_rows import AntennaRows, joined, rows_of
 
 if TYPE_CHECKING:
     from railfix.pipeline.corrected_ranges import CorrectedRanges
+    from railfix.pipeline.filter_result import AlongTrack
+    from railfix.pipeline.results import AntennaResult
     from railfix.pipeline.solution import Solution
     from railfix.positioning.section_search import SearchIndex
 
@@ -169,6 +172,7 @@ def _signs(alarm: Bytes, power: PowerSigns, motion: MotionSigns, limits: Interfe
         Sign.POSITION_JUMP: (motion.position_jump_m >= limits.position_jump_m)
         & (motion.position_jump_sigmas >= sigmas),
         Sign.CONSTELLATIONS_PART: motion.part_sigmas >= limits.part_sigmas,
+        Sign.WHEEL_PARTS: np.zeros(len(alarm), dtype=np.bool_),  # `with_wheel`, after the filter
         Sign.LEFT_MAP: (motion.off_line_m >= limits.off_map_m) & (motion.off_line_sigmas >= sigmas),
     }
     return np.stack([by_cause[cause] for cause in CAUSES], axis=1)
@@ -232,6 +236,28 @@ def _once_a_second(
     return rows_of(every, row), after
 
 
+def with_statuses(status: Codes, kind: Codes) -> Codes:
+    """Return the statuses of positions with those of interference where they outrank, shape (T,)."""
+    jammed = (kind == Suspicion.JAMMING_SUSPECTED) & np.isin(status, _UNDER_JAMMING)
+    spoofed = (kind == Suspicion.SPOOFING_SUSPECTED) & np.isin(status, _UNDER_SPOOFING)
+    status = np.where(jammed, np.int8(Status.JAMMING_SUSPECTED), status)
+    return np.where(spoofed, np.int8(Status.SPOOFING_SUSPECTED), status)
+
+
+def with_wheel(results: Mapping[str, AntennaResult], fusion: Mapping[str, AlongTrack]) -> dict[str, AntennaResult]:
+    """Return the results of single epochs with the sign of the wheel, which the filter along the track gives."""
+    after = dict(results)
+    for name, tracked in fusion.items():
+        result, wheel = results[name], tracked.wheel
+        found = result.interference
+        if wheel is None or found is None or not wheel.parted.any():
+            continue
+        found = replace(found, causes=np.where(wheel.parted, found.causes | int(Sign.WHEEL_PARTS), found.causes))
+        status = with_statuses(result.status, found.suspicion)
+        after[name] = changed(result, interference=found, status=status)
+    return after
+
+
 def judge_interference(
     corrected: CorrectedRanges,
     solution: Solution,
@@ -247,9 +273,5 @@ def judge_interference(
         return _once_a_second(rows_of(corrected, rows), rows_of(solution, rows), index, state, limits)
 
     found, after = antennas.each_with_state(of_antenna, states)
-    kind, status = found.suspicion, solution.status
-    jammed = (kind == Suspicion.JAMMING_SUSPECTED) & np.isin(status, _UNDER_JAMMING)
-    spoofed = (kind == Suspicion.SPOOFING_SUSPECTED) & np.isin(status, _UNDER_SPOOFING)
-    status = np.where(jammed, np.int8(Status.JAMMING_SUSPECTED), status)
-    status = np.where(spoofed, np.int8(Status.SPOOFING_SUSPECTED), status)
+    status = with_statuses(solution.status, found.suspicion)
     return changed(solution, status=status, interference=found), after

@@ -32,7 +32,7 @@ from railfix.pipeline.config import SCREEN_NAMES, Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, conditions_of, correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
 from railfix.pipeline.filter_result import AlongTrack, FilterState, single_epochs
-from railfix.pipeline.interference_stage import judge_interference
+from railfix.pipeline.interference_stage import judge_interference, with_wheel
 from railfix.pipeline.received import Received, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
 from railfix.pipeline.second_codes import combined
@@ -328,7 +328,8 @@ class EpochProcessor:
             held_s = self.config.antenna_spacing.filter_held_s
             for name, (tracked, own) in found.items():
                 fusion[name], filter_states[name] = checked(tracked, spacing.get(name), own, held_s)
-        result = Result(antennas=solved.results, notes=solved.notes, fusion=fusion)
+        results = with_wheel(solved.results, fusion)
+        result = Result(antennas=results, notes=solved.notes, fusion=fusion)
         return result, replace(state, fusion=filter_states)
 
     def _screened(

@@ -161,6 +161,12 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             lambda r: r.spacing_error_m,
         ),
         Column(
+            "wheel_difference_m",
+            "distance by satellites over the last two minutes less that of the wheel with its circumference; empty for "
+            "the first minute",
+            lambda r: None if r.wheel is None else r.wheel.difference_m,
+        ),
+        Column(
             "innovation_wheel_m",
             "measured less predicted: way since the epoch before",
             lambda r: _innovation(r, Kind.WHEEL),

@@ -11,6 +11,7 @@ from railfix.integrity.interference.limits import (
 from railfix.integrity.interference.motion import MotionSigns, MotionSignState, motion_signs
 from railfix.integrity.interference.power import PowerSigns, PowerState, power_signs
 from railfix.integrity.interference.timing import HeldState, held
+from railfix.integrity.interference.wheel import WheelSigns, WheelState, wheel_signs
 
 __all__ = [
     "CAUSES",
@@ -22,9 +23,12 @@ __all__ = [
     "PowerState",
     "Sign",
     "Suspicion",
+    "WheelSigns",
+    "WheelState",
     "cause_text",
     "held",
     "motion_signs",
     "power_signs",
     "suspicion",
+    "wheel_signs",
 ]

@@ -44,6 +44,8 @@ class Sign(IntFlag):
     CONSTELLATIONS_PART = 1 << 8
     #: Consistent 3-D positions have left the map sideways.
     LEFT_MAP = 1 << 9
+    #: The distance by satellites parts from that of the wheel.
+    WHEEL_PARTS = 1 << 10
 
 
 _JAMMING: Final = Sign.RECEIVER_JAMMING | Sign.CN0_FALL | Sign.GAIN_FALL
@@ -88,6 +90,14 @@ class InterferenceLimits(Settings):
         Velocities and positions with larger standard deviations are not compared.
     hold_s, part_hold_s : float [s]
         How long a fall, equal C/N0 and distance from the map last before they count; and parted constellations.
+    wheel_window_s, wheel_least_s : float [s]
+        Time over which distances by satellites and wheel are compared, and the shortest one.
+    wheel_m, wheel_sigmas : float [m]
+        Least difference, and the same in standard deviations.
+    wheel_scale, wheel_change : float
+        Standard deviation of the wheel's circumference, before positions determine it; and of its change after (creep).
+    wheel_acceleration_mps2 : float
+        A wheel that changes its speed faster has slipped: the comparison begins anew. Adhesion gives 1 to 1.5.
     jamming_release_s, spoofing_release_s : float [s]
         How long a suspicion stays after its last sign: a jump is over in one epoch, what it began is not.
     """
@@ -114,6 +124,13 @@ class InterferenceLimits(Settings):
     largest_sigma_m: float = Field(default=30.0, gt=0)
     hold_s: float = Field(default=3.0, gt=0)
     part_hold_s: float = Field(default=10.0, gt=0)
+    wheel_window_s: float = Field(default=120.0, gt=0)
+    wheel_least_s: float = Field(default=60.0, gt=0)
+    wheel_m: float = Field(default=20.0, gt=0)
+    wheel_sigmas: float = Field(default=6.0, gt=0)
+    wheel_scale: float = Field(default=0.01, gt=0)
+    wheel_change: float = Field(default=0.001, gt=0)
+    wheel_acceleration_mps2: float = Field(default=1.6, gt=0)
     jamming_release_s: float = Field(default=10.0, ge=0)
     spoofing_release_s: float = Field(default=300.0, ge=0)
 

@@ -1,0 +1,213 @@
+"""Distance by satellites against that of a wheel: a pull along the track that nothing else sees.
+
+Over a window of one to two minutes both distances differ by the noise of two positions and by the error of the wheel's
+diameter. That error is taken from the time before the window, as far as positions there determine it: a pull that
+begins later changes the ratio of the two. One that was there from the beginning, or is as slow as the diameter is
+uncertain, is not seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks
+from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
+from railfix.integrity.interference.limits import InterferenceLimits
+from railfix.integrity.interference.timing import HeldState, held
+
+#: Least standard deviation of a position: errors of satellites and atmosphere that change over minutes [m].
+_LEAST_M: Final = 1.0
+#: A tachometer that gives no distance below this speed is taken as standing, to this speed [m/s].
+_SLOW_MPS: Final = 0.5
+#: Positions are taken once so long, as tags may be so much before the whole second.
+_SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WheelSamples:
+    """Positions and distances once a second, shape (N,).
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns]
+    arc_m, sigma_m : ndarray [m]
+        By satellites, single epochs.
+    way_m : ndarray [m]
+        Of the wheel since its beginning.
+    doubt_m : ndarray [m]
+        What it may have rolled at speeds too slow for it.
+    part : ndarray of int
+        The same where the wheel has turned without slip or a gap.
+    """
+
+    time: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
+    arc_m: Floats = field(default_factory=lambda: np.empty(0))
+    sigma_m: Floats = field(default_factory=lambda: np.empty(0))
+    way_m: Floats = field(default_factory=lambda: np.empty(0))
+    doubt_m: Floats = field(default_factory=lambda: np.empty(0))
+    part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    def joined(self, later: WheelSamples) -> WheelSamples:
+        """Return these and later ones."""
+        return WheelSamples(
+            **{name: np.concatenate([getattr(self, name), getattr(later, name)]) for name in vars(self)}
+        )
+
+    def take(self, rows: Masks | Integers) -> WheelSamples:
+        """Return some of them."""
+        return WheelSamples(**{name: values[rows] for name, values in vars(self).items()})
+
+
+@dataclass(frozen=True, kw_only=True)
+class WheelState:
+    """State after a chunk.
+
+    Attributes
+    ----------
+    samples : WheelSamples
+        The first one of the present part, and those of the last window.
+    time : datetime64[ns]
+        Of the last epoch.
+    way_m, doubt_m, speed_mps : float
+        Of the wheel there; the speed NaN where unknown.
+    part, second : int
+    held : HeldState
+    difference_m, beyond : float, bool
+        Of the last sample.
+    """
+
+    samples: WheelSamples = field(default_factory=WheelSamples)
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    way_m: float = 0.0
+    doubt_m: float = 0.0
+    speed_mps: float = float("nan")
+    part: int = 0
+    second: int = -1
+    held: HeldState = field(default_factory=HeldState)
+    difference_m: float = float("nan")
+    beyond: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class WheelSigns:
+    """Comparison of T epochs.
+
+    Attributes
+    ----------
+    difference_m : ndarray, shape (T,) [m]
+        Distance by satellites over the window less that of the wheel with its diameter; NaN where it is not compared.
+    parted : ndarray of bool, shape (T,)
+        It is beyond what noise and diameter allow, or was within the time of release.
+    """
+
+    difference_m: Floats
+    parted: Masks
+
+
+def wheel_signs(
+    time: Datetimes,
+    arc_m: Floats,
+    sigma_m: Floats,
+    wheel_m: Floats,
+    state: WheelState,
+    limits: InterferenceLimits,
+    *,
+    signed: bool,
+) -> tuple[WheelSigns, WheelState]:
+    """Compare distances by satellites and wheel, and return the state to pass on.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    arc_m, sigma_m : ndarray, shape (T,) [m]
+        Positions of single epochs along the line; NaN without one.
+    wheel_m : ndarray, shape (T,) [m]
+        Distance that the wheel has rolled since the epoch before; NaN where it is not known.
+    state : WheelState
+    limits : InterferenceLimits
+    signed : bool
+        Whether the wheel's distance has the sign of the motion along the line.
+    """
+    if not len(time):
+        return WheelSigns(difference_m=np.empty(0), parted=np.empty(0, dtype=np.bool_)), state
+    rolled, after = _rolled(time, wheel_m, state, limits)
+    second = ((time - GPS_EPOCH + _TAG) // _SECOND).astype(np.int64)
+    due = second != np.concatenate([[state.second], second[:-1]])
+    usable = due & np.isfinite(arc_m) & (sigma_m <= limits.largest_sigma_m)
+    every = replace(rolled, arc_m=arc_m, sigma_m=np.hypot(sigma_m, _LEAST_M))
+    before = len(state.samples.time)
+    samples = state.samples.joined(every.take(usable))
+    difference, beyond = _compare(samples, before, limits, signed=signed)
+    latest = np.cumsum(usable)
+    of_epoch = np.concatenate([[state.difference_m], difference])[latest]
+    signs = np.concatenate([[state.beyond], beyond])[latest]
+    hold, release = np.array([limits.hold_s]), np.array([limits.spoofing_release_s])
+    _, stays, held_state = held(time, signs[:, None], state.held, hold_s=hold, release_s=release)
+    window = samples.time >= time[-1] - timedelta(np.array(limits.wheel_window_s + 2.0))
+    own = samples.part == after.part
+    window[np.flatnonzero(own)[:1]] = True
+    after = replace(
+        after, samples=samples.take(window & own), second=int(second[-1]), held=held_state,
+        difference_m=float(of_epoch[-1]), beyond=bool(signs[-1]),
+    )  # fmt: skip
+    return WheelSigns(difference_m=of_epoch, parted=stays[:, 0]), after
+
+
+def _rolled(
+    time: Datetimes, wheel_m: Floats, state: WheelState, limits: InterferenceLimits
+) -> tuple[WheelSamples, WheelState]:
+    """Return the wheel's distance so far at epochs, and the state after them; without positions.
+
+    An unknown distance after slow rolling is none, with a doubt; after another one, and where the speed changes faster
+    than wheels do that hold the rail, a new part begins.
+    """
+    span = seconds(np.diff(np.concatenate([[time[0] if np.isnat(state.time) else state.time], time])))
+    known = np.isfinite(wheel_m) & (span > 0.0)
+    speed = np.where(known, wheel_m / np.where(span > 0.0, span, 1.0), np.nan)
+    row = np.maximum.accumulate(np.where(known, np.arange(1, len(time) + 1), 0))
+    last = np.concatenate([[state.speed_mps], speed])[np.concatenate([[0], row[:-1]])]
+    slow = ~known & (np.abs(np.nan_to_num(last)) <= 2.0 * _SLOW_MPS)
+    held_rail = np.abs(speed - last) <= limits.wheel_acceleration_mps2 * span + _SLOW_MPS
+    new = np.where(known, ~held_rail & np.isfinite(last), ~slow) | (span > limits.longest_gap_s)
+    part = state.part + np.cumsum(new)
+    way = state.way_m + np.cumsum(np.where(known, wheel_m, 0.0))
+    doubt = state.doubt_m + np.cumsum(np.where(slow, _SLOW_MPS * span, 0.0))
+    none = np.full(len(time), np.nan)
+    after = replace(
+        state, time=time[-1], way_m=float(way[-1]), doubt_m=float(doubt[-1]), part=int(part[-1]),
+        speed_mps=float(np.concatenate([[state.speed_mps], speed])[row[-1]]),
+    )  # fmt: skip
+    return WheelSamples(time=time, arc_m=none, sigma_m=none, way_m=way, doubt_m=doubt, part=part), after
+
+
+def _compare(samples: WheelSamples, first: int, limits: InterferenceLimits, *, signed: bool) -> tuple[Floats, Masks]:
+    """Return differences over the window that ends at each sample from `first` on, and which are beyond chance."""
+    time = seconds(samples.time - samples.time[0]) if len(samples.time) else np.empty(0)
+    now = np.arange(first, len(time))
+    begun = np.searchsorted(time, time[now] - limits.wheel_window_s - 0.5)
+    start = np.searchsorted(samples.part, samples.part[now])  # parts rise
+    begun = np.maximum(begun, start)
+    long_enough = time[now] - time[begun] >= limits.wheel_least_s - 0.5
+
+    def apart(a: Integers, b: Integers) -> tuple[Floats, Floats, Floats]:
+        """Distance by satellites less that of the wheel, the wheel's, and the variance of the noise."""
+        arc, way = samples.arc_m[b] - samples.arc_m[a], samples.way_m[b] - samples.way_m[a]
+        if not signed:
+            arc, way = np.abs(arc), np.abs(way)
+        doubt = samples.doubt_m[b] - samples.doubt_m[a]
+        return arc - way, way, samples.sigma_m[a] ** 2 + samples.sigma_m[b] ** 2 + doubt**2
+
+    difference, way, noise = apart(begun, now)
+    earlier, rolled, its_noise = apart(start, begun)
+    prior = limits.wheel_scale**-2.0
+    weight = rolled**2 / its_noise
+    ratio = np.where(rolled != 0.0, earlier / np.where(rolled != 0.0, rolled, 1.0), 0.0)
+    scale = weight * ratio / (prior + weight)
+    variance = 1.0 / (prior + weight) + limits.wheel_change**2
+    left = difference - scale * way
+    sigma = np.sqrt(noise + way**2 * variance)
+    beyond = long_enough & (np.abs(left) >= limits.wheel_m) & (np.abs(left) >= limits.wheel_sigmas * sigma)
+    return np.where(long_enough, left, np.nan), beyond
