@@ -64,7 +64,11 @@ def test_one_sentence_and_nothing_half_written(bench: Bench, change: Change, cod
 
 @pytest.mark.parametrize(
     "options",
-    [{"front": "absent.obs"}, {"track": "brdc.nav"}, {"config": "train.toml"}, {"out": "front.obs"}],
+    [
+        {"front": "absent.obs"},
+        {"out": "front.obs"},
+        *(pytest.param(o, marks=pytest.mark.slow) for o in ({"track": "brdc.nav"}, {"config": "train.toml"})),
+    ],
     ids=lambda o: next(iter(o)),
 )
 def test_the_program_itself_ends_the_same_way(bench: Bench, options: dict[str, Any]) -> None:

@@ -525,6 +525,7 @@ def test_a_campaign_by_configuration(tmp_path: Path):
         found.figure("mean_m", grouping="section")
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_epochs(tmp_path: Path):
     """As many as the source paper evaluated, 145 km at 10 Hz: every epoch counts, the limits are told."""
     time = np.arange(100_240) * 0.1

@@ -164,7 +164,6 @@ def check_integrity(found: Evaluation, expected: tuple[dict, ...]) -> int:
 
 
 @pytest.mark.requirement("C4")
-@pytest.mark.slow
 def test_the_stanford_counts_of_a_run_with_holes(evaluated_worse: tuple[Evaluation, tuple[dict, ...]]):
     found, expected = evaluated_worse
     assert check_integrity(found, expected) > 1000
@@ -174,6 +173,7 @@ def test_the_stanford_counts_of_a_run_with_holes(evaluated_worse: tuple[Evaluati
     assert {usable for _, _, usable in expected[4].values()} == {True, False}
 
 
+@pytest.mark.slow
 @pytest.mark.requirement("C4")
 def test_the_stanford_counts_of_the_demonstration(evaluated: tuple[Evaluation, tuple[dict, ...]]):
     found, expected = evaluated
@@ -182,6 +182,7 @@ def test_the_stanford_counts_of_the_demonstration(evaluated: tuple[Evaluation, t
     assert 0 < whole["kept_60_s"] < whole["kept_15_s"] < whole["windows_15_s"]
 
 
+@pytest.mark.slow
 def test_every_figure_of_the_demonstration(evaluated: tuple[Evaluation, tuple[dict, ...]]):
     assert check(*evaluated) > 2000
 

@@ -32,7 +32,7 @@ FILES = (
 )
 CODE = 22_345_678.9
 #: Every so many records of a file with more than this [pieces].
-MOST = 250
+MOST = 100
 
 
 @cache

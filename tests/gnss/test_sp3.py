@@ -161,7 +161,7 @@ def short_file() -> str:
     return text(epochs=14)
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damage_anywhere_is_an_error_or_an_ephemeris(tmp_path: Path, data: st.DataObject) -> None:
     content = short_file()

@@ -88,7 +88,7 @@ EVENTS = st.lists(
 
 
 @given(EVENTS)
-@settings(max_examples=300)
+@settings(max_examples=100)
 def test_states_follow_the_table(events: list[tuple[str, float, float]]) -> None:
     """Random orders, losses, repeats, clock steps of the train; the table counts sequence and silence on its own."""
     record, now, state, newest, heard = TrainRecord(train=7), 100.0, "unknown", -1, 0.0

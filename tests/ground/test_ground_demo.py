@@ -139,6 +139,7 @@ document.getElementById("phone").addEventListener("load", function () {
 });</script>"""
 
 
+@pytest.mark.slow
 @needs_browser
 def test_nothing_is_wider_than_a_telephone(demo: tuple[dict[str, Any], dict[str, Any]]) -> None:
     app = page_app(lambda: demo[1], {}, sessions=Sessions(password="secret"))
@@ -330,6 +331,7 @@ def test_orders_in_a_browser(demo: tuple[dict[str, Any], dict[str, Any]]) -> Non
     assert note["data-errors"] == ""
 
 
+@pytest.mark.slow
 @needs_browser
 def test_the_page_on_paper(demo: tuple[dict[str, Any], dict[str, Any]], tmp_path: Path) -> None:
     """At most two pages of A4, with the picture, all tables and the log, without the desk for orders."""

@@ -76,7 +76,7 @@ def compare(
     fault=st.floats(-30.0, 30.0),
     least=st.sampled_from([None, 2.0, 20.0]),
 )
-@settings(max_examples=40)
+@settings(max_examples=20)
 def test_every_subset_equals_solving_without_it(seed, system, scale, fault, least):
     systems, ties = system
     ranges = oracle.made(ARC, systems, seed=seed, tie_sigma_m=ties, faults_m={1: fault, len(systems) - 1: 2.0})
@@ -113,7 +113,7 @@ def test_every_subset_equals_solving_without_it(seed, system, scale, fault, leas
     seen=st.sampled_from([(0.0, 0.0), (4.5, -10.0), (-20.0, 37.0), None]),
 )
 @example(seed=193, system=SYSTEMS[3], scale=1.0, seen=None)
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_a_map_left_out_equals_solving_with_what_takes_its_place(seed, system, scale, seen):
     """The offset of the last minutes in place of the map, or nothing; alone and without each satellite."""
     systems, ties = system

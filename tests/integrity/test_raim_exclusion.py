@@ -66,7 +66,7 @@ def check_against_trying(case: oracle.Problem, model: LinearModel, limits: RaimL
     ),
 )
 @example(seed=4147, system=SYSTEMS[5], faults={2: 7.0}, scale=1.0, limits=RaimLimits(mode="fixed"))
-@settings(max_examples=75)
+@settings(max_examples=40)
 def test_line_equals_trying_every_subset(seed, system, faults, scale, limits):
     systems, ties = system
     arc = np.array([731.0])
@@ -82,7 +82,7 @@ def test_line_equals_trying_every_subset(seed, system, faults, scale, limits):
     faults=st.dictionaries(st.integers(0, 3), BIG, max_size=2),
     limits=st.sampled_from([RaimLimits(), RaimLimits(separation_risk=1.0), RaimLimits(mode="fixed")]),
 )
-@settings(max_examples=75)
+@settings(max_examples=40)
 def test_space_equals_trying_every_subset(seed, system, faults, limits):
     systems, ties = system
     ranges = oracle.made(np.array([731.0]), systems, seed=seed, tie_sigma_m=ties, faults_m=faults)

@@ -122,7 +122,7 @@ def worst_pair(case: oracle.Problem, noncentral: float) -> float:
 
 
 @given(seed=st.integers(0, 2**32 - 1), system=st.sampled_from(SYSTEMS), space=st.booleans())
-@settings(max_examples=100)
+@settings(max_examples=40)
 def test_protection_level_is_the_worst_fault_found_by_search(seed, system, space):
     ranges = oracle.made(ARC, system[0], seed=seed, tie_sigma_m=system[1])
     place = oracle.LINE.at_arc(ARC)

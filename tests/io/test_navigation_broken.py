@@ -125,7 +125,7 @@ def test_one_broken_file_of_several_is_named(tmp_path: Path) -> None:
 
 
 @given(data=st.data())
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damage_anywhere_is_an_error_or_a_table(tmp_path: Path, data: st.DataObject) -> None:
     """A changed, lost or added character never ends in anything but a sentence, or numbers that are finite."""
     text = header() + GOOD + record("E03") + record("R05") + record("C03")

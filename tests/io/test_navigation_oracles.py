@@ -150,7 +150,7 @@ def test_ionosphere_against_rtklib(read: tuple[Path, Navigation]) -> None:
 _GEORINEX_FILES = (
     "kinematic/gsdc_pixel5_a/hour1180.21n",
     "kinematic/japan_mosaic_2021265_with_GEONET3034/SEPT2650.21P",
-    "dual/mosaic_x2_99cm/base.nav",
+    pytest.param("dual/mosaic_x2_99cm/base.nav", marks=pytest.mark.slow),
     "static/rtklib_geonet2005/07590920.05n",
 )
 _GEORINEX = {

@@ -295,7 +295,7 @@ def test_options_are_checked(tmp_path: Path, options: dict[str, str]) -> None:
         read_observations([])
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     old=st.booleans(),
     edits=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 3), st.binary(min_size=1, max_size=4)), min_size=1),

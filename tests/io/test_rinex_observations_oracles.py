@@ -103,7 +103,9 @@ def compare_with_georinex(path: Path) -> int:
     return sum(int(np.isfinite(a).sum()) for a in arrays)
 
 
-@pytest.mark.parametrize("name", RECORDINGS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in ("ESBC", "dual base") else n for n in RECORDINGS]
+)
 def test_first_epochs_equal_georinex(recordings: Path, tmp_path: Path, name: str) -> None:
     source = recordings / RECORDINGS[name][0]
     path = source if name in ("geonet 0759", "geonet 3040") else first_epochs(source, tmp_path / "log.rnx", 8)

@@ -239,7 +239,7 @@ TAILS = st.text(st.sampled_from(" 019x"), min_size=2, max_size=2)
 TEXTS = st.tuples(STANDARD | st.text(CHARACTERS, min_size=14, max_size=14), TAILS)
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(st.lists(TEXTS, min_size=1, max_size=12), st.integers(0, 16))
 @example([("             -", "  "), ("         -.500", "  "), ("        - .500", "  "), ("  ,     1.500 ", "  ")], 16)
 @example([("       5  .500", "  "), ("      ,5.500  ", "  "), ("     ,   1.500", "  "), ("     =   1.500", "  ")], 16)
@@ -269,7 +269,7 @@ SATELLITE = st.tuples(st.sampled_from("GRECJSI"), st.integers(1, 99)).map(lambda
 EPOCH = st.dictionaries(SATELLITE, st.lists(st.tuples(VALUES, LOCKS), min_size=4, max_size=4), max_size=15)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(epochs=st.lists(EPOCH, min_size=1, max_size=6), strip=st.booleans(), old=st.booleans())
 def test_what_is_written_is_read(tmp_path: Path, epochs: list[dict], strip: bool, old: bool) -> None:
     systems = "GRECJSI" if not old else "GRECJS"

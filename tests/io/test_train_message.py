@@ -115,7 +115,7 @@ def test_a_key_sent_twice_is_damage() -> None:
 
 
 @given(data=st.binary(max_size=300))
-@settings(max_examples=500)
+@settings(max_examples=200)
 def test_any_bytes_are_a_message_or_an_error(data: bytes) -> None:
     with suppress(MessageError):
         assert isinstance(decode(data), TrainMessage)
@@ -124,7 +124,7 @@ def test_any_bytes_are_a_message_or_an_error(data: bytes) -> None:
 @example(place=54, value=2)
 @example(place=54, value=32)
 @given(place=st.integers(0, 80), value=st.integers(1, 255))
-@settings(max_examples=300)
+@settings(max_examples=100)
 def test_damaged_messages_never_raise_anything_else(place: int, value: int) -> None:
     data = bytearray(encode(PLACED))
     data[place % len(data)] ^= value

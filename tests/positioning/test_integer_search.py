@@ -12,7 +12,7 @@ from railfix.positioning.integer_search import IntegerSearch
 pytestmark = pytest.mark.requirement("E6")
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", [*range(15), *(pytest.param(s, marks=pytest.mark.slow) for s in range(15, 40))])
 def test_nearest_vectors_are_those_of_a_full_search(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 5))

@@ -47,7 +47,13 @@ def arriving(messages: SbasMessages, time: np.ndarray, step: int, limits: SbasLi
     return [np.concatenate(columns) for columns in zip(*parts, strict=True)], most
 
 
-@pytest.mark.parametrize("limits", [SbasLimits(), SbasLimits(mode="en_route", incomplete="inflate"), OFF])
+@pytest.mark.parametrize(
+    "limits",
+    [
+        SbasLimits(),
+        *(pytest.param(v, marks=pytest.mark.slow) for v in (SbasLimits(mode="en_route", incomplete="inflate"), OFF)),
+    ],
+)
 def test_an_hour_in_portions_is_the_whole_hour(recordings: Path, limits: SbasLimits) -> None:
     folder = recordings / "sbas" / "msas_20250215"
     messages = read_sbas(folder / "046r_sbas_prn137.txt")
@@ -79,10 +85,10 @@ def test_forgetting_changes_nothing_over_a_day_of_messages() -> None:
     second = cases.service(0, inside=3, outside=9, regions=[(60, 0, 50, 20, 1)], messages=2, number=2)
     rows += [(6.0, 0, second), (80_000.0, 0, second)]
     messages = cases.message_log(rows)
-    time = cases.START + (np.arange(0, 30 * 3600, 35) * 10**9).astype("timedelta64[ns]")
+    time = cases.START + (np.arange(0, 30 * 3600, 140) * 10**9).astype("timedelta64[ns]")
     for limits in (OFF, SbasLimits()):
         expected = answers(SbasCorrections(messages, prn=137, limits=limits), time)
-        found, most = arriving(messages, time, 97, limits)
+        found, most = arriving(messages, time, 24, limits)
         for ours, theirs in zip(found, expected, strict=True):
             np.testing.assert_array_equal(ours, theirs)
         assert most < len(messages) / 5

@@ -17,11 +17,11 @@ pytestmark = pytest.mark.requirement("D1")
 #: Recording, gap [s]; bounds, a fifth over the table: median, 95th percentile, largest [m], error over its own
 #: standard deviation, and the least share given out.
 BOUNDS = [
-    ("gsdc", 5, 0.02, 0.19, 3.5, 0.95, 0.97),
-    ("gsdc", 20, 0.02, 0.61, 5.0, 1.6, 0.94),
-    ("gsdc", 60, 0.02, 0.90, 5.0, 1.0, 0.75),
+    pytest.param("gsdc", 5, 0.02, 0.19, 3.5, 0.95, 0.97, marks=pytest.mark.slow),
+    pytest.param("gsdc", 20, 0.02, 0.61, 5.0, 1.6, 0.94, marks=pytest.mark.slow),
+    pytest.param("gsdc", 60, 0.02, 0.90, 5.0, 1.0, 0.75, marks=pytest.mark.slow),
     ("urbannav", 10, 0.11, 0.80, 2.1, 1.5, 0.90),
-    ("urbannav", 30, 0.21, 1.2, 2.7, 1.4, 0.75),
+    pytest.param("urbannav", 30, 0.21, 1.2, 2.7, 1.4, 0.75, marks=pytest.mark.slow),
     ("smartloc", 10, 0.11, 1.4, 1.7, 2.3, 0.95),
     ("smartloc", 60, 0.40, 1.7, 2.0, 2.4, 0.90),
 ]

@@ -401,7 +401,7 @@ def test_every_picture_is_drawn(errors: pl.DataFrame, positions: pl.DataFrame, o
         assert axes.get_title()
         assert axes.has_data()
         written = BytesIO()
-        figure.savefig(written, format="png")
+        figure.savefig(written, format="png", dpi=40)
         assert written.getvalue().startswith(b"\x89PNG")
 
 

@@ -140,7 +140,7 @@ WIDE = """
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     first = pl.read_csv(demo_truth(), try_parse_dates=True)["time_gpst"][0]
-    options = RunOptions(observations="write", chunk_epochs=200, end=first + timedelta(seconds=60))
+    options = RunOptions(observations="write", chunk_epochs=70, end=first + timedelta(seconds=20))
     folder = tmp_path_factory.mktemp("browser")
     run_files(demo_inputs(), out=folder / "run", options=options)
     return write_report([folder / "run"], folder / "report.html", references=[demo_truth()])
@@ -201,6 +201,7 @@ def test_charts_zoom_together_and_tables_can_be_downloaded(page: Path, tmp_path:
     assert rows["max"].cast(pl.Float64).min() > 0.0
 
 
+@pytest.mark.slow
 def test_nothing_is_wider_than_a_telephone(page: Path) -> None:
     frame = page.with_name("frame.html")
     frame.write_text(NARROW.replace("PAGE", page.name), encoding="utf-8")
@@ -211,6 +212,7 @@ def test_nothing_is_wider_than_a_telephone(page: Path) -> None:
     assert (said["data-over"], said["data-errors"]) == ("", "")
 
 
+@pytest.mark.slow
 def test_a_dark_page_is_dark(page: Path, tmp_path: Path) -> None:
     """The charts follow the preference of the reader, and print stays light."""
     probe = """<script>

@@ -145,6 +145,7 @@ def test_wrong_decisions_with_phases_are_within_the_risk(half_cycle: bool) -> No
         assert sum(name != own for name, own in given) <= binom.ppf(0.999, len(given), risk)
 
 
+@pytest.mark.slow
 def test_samples_counted_as_independent_decide_wrongly() -> None:
     """The naive method is over its risk by far on the same yards."""
     rows = [decided(k, errors=StandstillErrors(), common_sigma_m=1.0, method="naive") for k in range(18)]

@@ -133,6 +133,7 @@ def test_intervals_are_the_way_between_positions() -> None:
     np.testing.assert_array_equal(intervals_m(passage, found, inside), [4.0])
 
 
+@pytest.mark.slow
 @pytest.mark.requirement("A3")
 @pytest.mark.requirement("A4")
 def test_two_satellites_mistake_the_section_and_three_hardly_do() -> None:
