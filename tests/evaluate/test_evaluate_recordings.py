@@ -17,7 +17,7 @@ pytestmark = pytest.mark.requirement("D2")
 CONFIG = recordings_score.TABLES["all screens, failed checks kept"]
 
 
-@pytest.mark.parametrize("name", ["urbannav_f9p", "japan"])
+@pytest.mark.parametrize("name", [pytest.param("urbannav_f9p", marks=pytest.mark.slow), "japan"])
 def test_a_run_of_a_recording_has_the_figures_of_the_arrays(recordings: Path, tmp_path: Path, name: str):
     """Maps and references go through files of 0.1 mm, so figures agree to millimetres, not to the bit."""
     if name == "urbannav_f9p":

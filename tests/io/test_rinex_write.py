@@ -287,6 +287,7 @@ def test_navigation_reads_back(tmp_path: Path, name: str) -> None:
                 assert (x == y).all(), field
 
 
+@pytest.mark.slow
 @pytest.mark.requirement("A7")
 def test_georinex_reads_the_records(tmp_path: Path) -> None:
     written = navigation().kepler

@@ -37,7 +37,7 @@ from railfix.pipeline.processor import EpochProcessor
 from railfix.run.processor import processor_of
 
 #: Epochs a chunk, and epochs of the log.
-CHUNKS = {1: 120, 7: 350, 1000: 2000}
+CHUNKS = {1: 60, 7: 200, 1000: 1200}
 
 
 def chunked(size: int, length: int) -> list[int]:

@@ -191,7 +191,7 @@ def _keys(navigation: Navigation) -> list[tuple[str, str, str]]:
     return [(str(s), str(t), str(m)) for s, t, m in zip(records.satellite, records.toc, records.message, strict=True)]
 
 
-@pytest.mark.parametrize("name", ["demo", "kinematic/urbannav_tst/hksc137c.nav"])
+@pytest.mark.parametrize("name", ["demo", pytest.param("kinematic/urbannav_tst/hksc137c.nav", marks=pytest.mark.slow)])
 def test_georinex_loads_the_same_navigation(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     if name == "demo":
         path = tmp_path / "nav.rnx"

@@ -196,9 +196,10 @@ def test_a_fault_of_one_station_is_its_own() -> None:
     )
     errors = scenario().errors.replaced(faults=(common,))
     simulation = Simulation(scenario(30.0, stations=stations, errors=errors))
+    without_common = Simulation(scenario(30.0, stations=stations))
     for station in stations:
         piece = next(simulation.pieces(station.name))
-        without = next(Simulation(scenario(30.0, stations=stations)).pieces(station.name))
+        without = next(without_common.pieces(station.name))
         added = dict(zip(piece.observations.satellite.tolist(), (piece.error_m - without.error_m).T, strict=True))
         time = np.arange(30.0)
         assert added[seen[1]] == pytest.approx(np.where(time >= 10.0, 30.0, 0.0), abs=1e-6)

@@ -187,7 +187,9 @@ def test_files_that_are_no_scenarios(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- shipped ones
 
 
-@pytest.mark.parametrize("name", list(shipped_scenarios()))
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if k % 3 else n for k, n in enumerate(shipped_scenarios())]
+)
 def test_every_shipped_run_can_be_set_up(name: str) -> None:
     recipe = load_recipe(name)
     for number in {0, len(recipe.names) - 1}:

@@ -38,6 +38,7 @@ def test_c_n0_falls_by_blockage_more_at_low_elevations(urban: Sample) -> None:
     assert 14.0 < loss[2, 1] < 22.0
 
 
+@pytest.mark.slow
 def test_kinds_differ_as_their_names_say(urban: Sample) -> None:
     none, suburban, canyon = (figures(simulated(kind)) for kind in ("none", "suburban", "canyon"))
     assert none.over_20_m < 0.001

@@ -176,6 +176,7 @@ def test_what_is_refused(tmp_path: Path) -> None:
         read_track([tmp_path / "a.csv", tmp_path / "b.csv"])
 
 
+@pytest.mark.slow
 def test_a_station_on_a_line_in_its_own_frame(recordings: Path, tmp_path: Path) -> None:
     """ESBC (Esbjerg) known in the ITRF: a line in ETRS89 named rightly gives the error of one in WGS 84; named
     wrongly the along-track error changes by the shift."""

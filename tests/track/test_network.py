@@ -210,6 +210,7 @@ def test_infrabel_runs_lie_on_tracks_where_the_positions_are_fixed(
     assert not left_out
 
 
+@pytest.mark.slow
 def test_infrabel_positions_are_on_the_track_that_is_known_of_them(infrabel: Network, recordings: Path) -> None:
     """Also with errors of 2 m. On the last log fixed positions lie metres from the map: no track is known."""
     folder = recordings / "rail" / "infrabel"

@@ -30,7 +30,7 @@ RUNS = {
 
 
 @pytest.mark.requirement("E5")
-@pytest.mark.parametrize("name", list(BOUNDS))
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "pixel" else n for n in BOUNDS])
 def test_errors_of_the_filter_on_a_recording(recordings: Path, name: str) -> None:
     case = filter_score.rinex_case(name, RUNS[name], recordings)
     found = case.run()
@@ -47,7 +47,7 @@ def test_errors_of_the_filter_on_a_recording(recordings: Path, name: str) -> Non
 @pytest.mark.parametrize(
     ("azimuth_deg", "end"),
     [
-        (0.0, "02:30"),
+        pytest.param(0.0, "02:30", marks=pytest.mark.slow),
         pytest.param(0.0, "12:00", marks=pytest.mark.slow),
         pytest.param(90.0, "12:00", marks=pytest.mark.slow),
     ],
