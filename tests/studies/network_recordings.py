@@ -2,7 +2,7 @@
 
 ``python tests/studies/network_recordings.py`` prints them. The logs name no tracks, and even fixed positions
 (NARROW_INT3) lie metres from the centrelines of the map, so that the track is known of some positions only: of fixed
-ones nearer than 1.5 m to one track, with the next at least 2 m farther. Beside the log as it is, the same positions
+ones nearer than 1.5 m to one track, with the next at least 2 m farther, and at a steady distance from it. Beside the log as it is, the same positions
 with errors like those of a single receiver (2 m, lasting 30 s) are matched.
 """
 
@@ -27,6 +27,8 @@ COLUMNS = {"latitude_deg": "latitude", "longitude_deg": "longitude", "time_gpst"
 #: Standard deviation of the added errors of an axis [m], and time over which they last [s].
 SIGMA_M, LASTING_S = 2.0, 30.0
 _NEAREST_M, _FARTHER_M = 1.5, 2.0
+#: Rows of about a second, and change of the distance from the track over them.
+_ROWS, _STEADY_M = 3, 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,11 +63,23 @@ def with_errors(log: PlanLog, rng: np.random.Generator) -> PlanLog:
 
 
 def known_tracks(network: Network, log: PlanLog, fixed: np.ndarray) -> np.ndarray:
-    """Track on which each position is for certain, -1 where there is none."""
+    """Track on which each position is for certain, -1 where there is none.
+
+    A train stays at the same distance from the track on which it is: over a second before and after, as far as that
+    track reaches, that of the positions changes by less than `_STEADY_M`. Where it passes beside a connection between
+    two tracks, which comes nearer and goes away, it does not.
+    """
     near = network.near(log.latitude_deg, log.longitude_deg, within_m=30.0)
     offset = np.abs(near.offset_m)
     certain = fixed & (offset[:, 0] < _NEAREST_M) & (offset[:, 1] > offset[:, 0] + _FARTHER_M)
-    return np.where(certain, near.track[:, 0], -1)
+    rows = np.arange(len(offset))
+    change = np.zeros(len(rows))
+    for step in (-_ROWS, _ROWS):
+        beside = np.clip(rows + step, 0, len(rows) - 1)
+        at, apart = network.place_on(near.track[:, 0], log.latitude_deg[beside], log.longitude_deg[beside])
+        inside = (at > 0.1) & (at < network.length_m[near.track[:, 0]] - 0.1)
+        change = np.fmax(change, np.where(inside, np.abs(apart - offset[:, 0]), 0.0))
+    return np.where(certain & (change < _STEADY_M), near.track[:, 0], -1)
 
 
 def shares(network: Network, path: Path, *, seeds: int = 10) -> Shares:

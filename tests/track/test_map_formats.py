@@ -76,7 +76,7 @@ def test_gpx_and_openstreetmap_have_no_heights_to_use(tmp_path: Path) -> None:
         f'<?xml version="1.0"?><osm version="0.6">{nodes}<way id="7" version="1">{way}<tag k="railway" v="rail"/></way>'
         f'<way id="8" version="1">{way}<tag k="highway" v="path"/></way></osm>'
     )
-    assert [s.metadata["name"] for s in read_segments(osm, MapReading())] == ["7"]
+    assert [s.metadata["name"] for s in read_segments(osm, MapReading())] == ["way/7"]
     with pytest.raises(InputFileError, match="no height"):
         read_track(osm)
 

@@ -18,7 +18,7 @@ from itertools import pairwise
 from typing import Any, ClassVar, Final, NoReturn
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from railfix.core.errors import InputFileError, OutputError, RailfixError, SettingsError
 
@@ -47,7 +47,7 @@ _FULL: Final = (errno.ENOSPC, errno.EIO, errno.EFBIG, errno.EDQUOT)
 
 
 class Command(TyperCommand):
-    """A command that reports options given twice and switches given a value."""
+    """A command that reports options given twice, switches given a value, and all options that are missing at once."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments, after these checks."""
@@ -67,6 +67,13 @@ class Command(TyperCommand):
                 ctx.fail(f"{name} is given twice; give it once")
             if not equals:
                 next(words, None)
+        missing = [
+            param.opts[0]
+            for param in self.params
+            if isinstance(param, TyperOption) and param.required and not any(name in given for name in param.opts)
+        ]
+        if len(missing) > 1 and not {"--help", "-h"} & set(args) and args:
+            ctx.fail(f"Missing options {', '.join(missing)}.")
         return super().parse_args(ctx, args)
 
     @staticmethod

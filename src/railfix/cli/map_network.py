@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import typer
+from pydantic import model_validator
 from rich.table import Table
 
 from railfix.cli.console import console_of_tables, show_notes
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
 from railfix.core.files import write_whole
-from railfix.io.position_log import column_names
+from railfix.core.settings import Settings, option
+from railfix.run.inputs import INPUTS
 from railfix.run.options import ColumnNames, TrackReading
 from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network
@@ -29,9 +31,6 @@ from railfix.track.read import track_of_segments
 _SHOWN = 40
 
 Maps = Annotated[list[Path], typer.Argument(metavar="MAP...", help="Map files; all their tracks form the network.")]
-Tolerance = Annotated[
-    float, typer.Option(metavar="M", help="Ends nearer than this are one point, where the file has no connections.")
-]
 Columns = Annotated[
     list[str] | None,
     typer.Option(metavar="NAME=COLUMN", help=str(ColumnNames.model_fields["column"].description)),
@@ -41,24 +40,63 @@ Columns = Annotated[
 MapReading = Annotated[TrackReading, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")]
 
 
+class RouteChoice(Settings):
+    """The way of a route through a network."""
+
+    tracks: str | None = option("Tracks to pass, in order; others between are found.", None, metavar="NAME,NAME...")
+    via: tuple[str, ...] = option("A point to pass; repeat it in the order of travel.", (), metavar="LAT,LON")
+    positions: Path | None = option("Positions of a run on the route.", None, metavar="LOG", panel=INPUTS)
+    heights: Path | None = option(
+        "Heights of a map without: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV by chainage_m or kilometrage_m, or "
+        "positions of a run.",
+        None,
+        metavar="FILE",
+        panel=INPUTS,
+    )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if sum(bool(way) for way in (self.tracks, self.via, self.positions)) > 1:
+            raise ValueError("give one of --tracks, --via and --positions")
+        return self
+
+
+class Connecting(Settings):
+    """How tracks are connected, and positions put beside them."""
+
+    tolerance: float = option(
+        "Ends nearer than this are one point, where the file has no connections.", TOLERANCE_M, metavar="M", gt=0.0
+    )
+    same_frame: Literal["no", "yes"] = option(
+        "The positions are in the frame of the map (RTK from its base stations), not in that of the satellites.",
+        "no",
+        name="--same-frame",
+    )
+
+
+class MatchOptions(Settings):
+    """How far from a track positions are expected, and what is written of them."""
+
+    sigma: float | None = option(
+        "Sigma of the distance from the track, map included; else that of LOG, or 2 m.", None, metavar="M", gt=0.0
+    )
+    within: float | None = option(
+        "Farthest track considered; else 30 m, farther where LOG states larger sigmas, to 100 m.",
+        None,
+        metavar="M",
+        gt=0.0,
+    )
+    picture: Path | None = option("Picture to write (.png or .svg).", None, metavar="FILE")
+    page: Path | None = option("Page to look at: plan to zoom, switches, faults, tables.", None, metavar="FILE.html")
+
+
 Page = Annotated[
     Path | None, typer.Option(metavar="FILE.html", help="Page to look at: plan to zoom, switches, faults, tables.")
 ]
-SameFrame = Annotated[
-    bool,
-    typer.Option(
-        "--same-frame",
-        help="The positions are in the frame of the map (RTK from its base stations), not in that of the satellites.",
-    ),
-]
 
 
-def _network(maps: list[Path], reading: TrackReading, tolerance: float) -> Network:
-    if not tolerance > 0.0:
-        raise SettingsError("--tolerance must be positive")
-    return read_network(
-        maps, crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid, tolerance_m=tolerance
-    )
+def _network(maps: list[Path], reading: TrackReading, connecting: Connecting) -> Network:
+    return read_network(maps, reading.of_map, tolerance_m=connecting.tolerance)
 
 
 @from_models
@@ -66,7 +104,7 @@ def network(
     maps: Maps,
     *,
     reading: MapReading,
-    tolerance: Tolerance = TOLERANCE_M,
+    connecting: Annotated[Connecting, Without("same_frame")],
     out: Annotated[Path | None, typer.Option(metavar="PICTURE", help="Picture to write (.png or .svg).")] = None,
     page: Page = None,
     overwrite: OverwriteOption = False,
@@ -81,7 +119,7 @@ def network(
     Exit codes as `railfix --help` says; 6 where the network has gaps, kinks, or connections that do not meet.
     """
     check_outputs((out, "picture"), (page, "page"), overwrite=overwrite, inputs=maps)
-    tracks = _network(maps, reading, tolerance)
+    tracks = _network(maps, reading, connecting)
     quality = check_network(tracks)
     console = console_of_tables()
     console.print(
@@ -116,25 +154,10 @@ def route(
     maps: Maps,
     *,
     out: Annotated[Path, typer.Option(metavar="TRACK.csv", help="Track map to write.")],
-    tracks: Annotated[
-        str | None, typer.Option(metavar="NAME,NAME...", help="Tracks to pass, in order; others between are found.")
-    ] = None,
-    via: Annotated[
-        list[str] | None, typer.Option(metavar="LAT,LON", help="A point to pass; repeat it in the order of travel.")
-    ] = None,
-    positions: Annotated[Path | None, typer.Option(metavar="LOG", help="Positions of a run on the route.")] = None,
-    heights: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Heights of a map without: a raster (GeoTIFF, ESRI ASCII grid), CSV by chainage_m or "
-            "kilometrage_m, or positions of a run.",
-        ),
-    ] = None,
-    column: Columns = None,
-    same_frame: SameFrame = False,
+    choice: RouteChoice,
+    columns: ColumnNames,
+    connecting: Connecting,
     reading: Annotated[TrackReading, Without("reference")],
-    tolerance: Tolerance = TOLERANCE_M,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make the track map of one route from a network or any map file.
@@ -145,31 +168,13 @@ def route(
 
     Exit codes as `railfix --help` says; 5 where no route leads from one place to the next.
     """
-    ways = [w for w in (tracks, via, positions) if w]
-    if len(ways) > 1:
-        raise SettingsError("give one of --tracks, --via and --positions")
-    check_outputs((out, "csv"), overwrite=overwrite, inputs=[*maps, positions, heights, reading.jgd_parameters])
-    net = _network(maps, reading, tolerance)
-    notes: list[str] = []
-    if tracks:
-        passed = net.shortest_route([net.index_of(name.strip()) for name in tracks.split(",")])
-    elif via:
-        passed = net.shortest_route([_track_at(net, text) for text in via])
-    elif positions is not None:
-        log, notes = _positions(positions, net, column, reading, same_frame=same_frame)
-        passed, left_out = route_of(net, match(net, log))
-        if not passed:
-            raise MismatchError(f"{positions}: no position lies near a track of the network")
-        if left_out:
-            beside = ", ".join(net.names[k] for k in left_out)
-            notes.append(f"no route joins these tracks to {beside}: the run turned back there, or the map has a gap")
-    elif len(net.tracks) == 1:
-        passed = [0]
-    else:
-        raise SettingsError(f"the map has {len(net.tracks)} tracks; give --tracks, --via or --positions")
+    files = [*maps, choice.positions, choice.heights, reading.jgd_parameters]
+    check_outputs((out, "csv"), overwrite=overwrite, inputs=files)
+    net = _network(maps, reading, connecting)
+    passed, notes = _passed(net, choice, columns, connecting, reading)
     track = track_of_segments(
         [net.tracks[k] for k in passed],
-        heights=heights,
+        heights=choice.heights,
         geoid=reading.geoid,
         height_datum=reading.height_datum,
         sigma_height_m=reading.height_sigma,
@@ -182,12 +187,34 @@ def route(
     console.print(f"track map: {out}", markup=False, soft_wrap=True)
 
 
+def _passed(
+    net: Network, choice: RouteChoice, columns: ColumnNames, connecting: Connecting, reading: TrackReading
+) -> tuple[list[int], list[str]]:
+    """Tracks of the route asked for, and notes on it."""
+    if choice.tracks:
+        return net.shortest_route([net.index_of(name.strip()) for name in choice.tracks.split(",")]), []
+    if choice.via:
+        return net.shortest_route([_track_at(net, text) for text in choice.via]), []
+    if choice.positions is None:
+        if len(net.tracks) == 1:
+            return [0], []
+        raise SettingsError(f"the map has {len(net.tracks)} tracks; give --tracks, --via or --positions")
+    log, notes = _positions(choice.positions, net, columns, connecting, reading)
+    passed, left_out = route_of(net, match(net, log))
+    if not passed:
+        raise MismatchError(f"{choice.positions}: no position lies near a track of the network")
+    if left_out:
+        beside = ", ".join(net.names[k] for k in left_out)
+        notes.append(f"no route joins these tracks to {beside}: the run turned back there, or the map has a gap")
+    return passed, notes
+
+
 def _positions(
-    path: Path, net: Network, column: list[str] | None, reading: TrackReading, *, same_frame: bool
+    path: Path, net: Network, columns: ColumnNames, connecting: Connecting, reading: TrackReading
 ) -> tuple[PlanLog, list[str]]:
     """Positions of a log in the frame of the network, and a note on their shift."""
-    log = read_plan_positions(path, columns=column_names(column or ()))
-    if same_frame:
+    log = read_plan_positions(path, columns=columns.names)
+    if connecting.same_frame == "yes":
         return log, []
     moved, shift = log.in_frame_of(net, **reading.motion)
     size = float(np.hypot(shift.east_m, shift.north_m))
@@ -215,22 +242,10 @@ def match_command(
     *,
     log: Annotated[Path, typer.Option(metavar="LOG", help="Positions: .pos, NMEA, GPX, or CSV with named columns.")],
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="Positions on the network to write.")],
-    picture: Annotated[Path | None, typer.Option(metavar="FILE", help="Picture to write (.png or .svg).")] = None,
-    page: Page = None,
-    sigma: Annotated[
-        float | None,
-        typer.Option(metavar="M", help="Sigma of the distance from the track, map included; else that of LOG, or 2 m."),
-    ] = None,
-    within: Annotated[
-        float | None,
-        typer.Option(
-            metavar="M", help="Farthest track considered; else 30 m, farther where LOG states larger sigmas, to 100 m."
-        ),
-    ] = None,
-    column: Columns = None,
-    same_frame: SameFrame = False,
+    options: MatchOptions,
+    columns: ColumnNames,
+    connecting: Connecting,
     reading: Annotated[TrackReading, Without("reference", "height_sigma")],
-    tolerance: Tolerance = TOLERANCE_M,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Put positions on the tracks of a network: track, chainage on it, probability, and the next best track.
@@ -242,14 +257,11 @@ def match_command(
 
     Exit codes as `railfix --help` says.
     """
-    if sigma is not None and not sigma > 0.0:
-        raise SettingsError("--sigma must be positive")
-    if within is not None and not within > 0.0:
-        raise SettingsError("--within must be positive")
+    picture, page = options.picture, options.page
     check_outputs((out, "csv"), (picture, "picture"), (page, "page"), overwrite=overwrite, inputs=[*maps, log])
-    net = _network(maps, reading, tolerance)
-    positions, notes = _positions(log, net, column, reading, same_frame=same_frame)
-    matched = match(net, positions, sigma_m=sigma, within_m=within)
+    net = _network(maps, reading, connecting)
+    positions, notes = _positions(log, net, columns, connecting, reading)
+    matched = match(net, positions, sigma_m=options.sigma, within_m=options.within)
     if not (matched.track >= 0).any():
         raise MismatchError(f"{log}: no position lies near a track of the network; is it the map of this region?")
     write_whole(out, _matched_csv(net, positions, matched))

@@ -9,11 +9,27 @@ import numpy as np
 import typer
 
 from railfix.cli.console import console_of_tables, show_notes, show_table, show_verdict
-from railfix.cli.options import LenientOption, OverwriteOption, Without, check_outputs, from_models
+from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.cli.settings import Choices, settings_of
+from railfix.core.files import BrokenLines
+from railfix.core.settings import Settings, option
 from railfix.core.tables import Table, count, number
+from railfix.run.inputs import INPUTS
 from railfix.run.options import ColumnNames, LogReading
 from railfix.track.survey.runs import SurveyLimits
+
+
+class SurveyFiles(Settings):
+    """Files beside the runs, and how they are read."""
+
+    nav: tuple[Path, ...] = option(
+        "Navigation file of the logs; repeat it for several days.", (), metavar="NAV", panel=INPUTS
+    )
+    picture: Path | None = option("Picture of map, runs and standard deviations (.png or .svg).", None, metavar="FILE")
+    name: str | None = option("Name of the track; else that of the file.", None, metavar="NAME")
+    broken_lines: BrokenLines = option(
+        "Count broken lines of the input files and continue, instead of stopping.", "stop", name="--lenient"
+    )
 
 
 @from_models
@@ -28,21 +44,11 @@ def survey(
     ],
     *,
     out: Annotated[Path, typer.Option(metavar="TRACK.csv", help="Track map to write.")],
-    nav: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="NAV", help="Navigation file of the logs; repeat it for several days.", show_default=False
-        ),
-    ] = None,
-    picture: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Picture of map, runs and standard deviations (.png or .svg).")
-    ] = None,
-    name: Annotated[str | None, typer.Option(metavar="NAME", help="Name of the track; else that of the file.")] = None,
+    files: SurveyFiles,
     limits: SurveyLimits,
     choices: Annotated[Choices, Without("screens", "without", "filter", "cn0_curve", "error_model", "sbas")],
     reading: LogReading,
     columns: ColumnNames,
-    lenient: LenientOption = False,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make one smoothed 3-D track map of several runs of ordinary receivers, with its standard deviation by point.
@@ -58,12 +64,13 @@ def survey(
     from railfix.run.survey import survey_files
     from railfix.track import write_track_csv
 
-    check_outputs((out, "csv"), (picture, "picture"), overwrite=overwrite, inputs=[*runs, *(nav or ())])
+    picture = files.picture
+    check_outputs((out, "csv"), (picture, "picture"), overwrite=overwrite, inputs=[*runs, *files.nav])
     settings, _ = settings_of(choices)
     surveyed = survey_files(
-        runs, nav or (), settings,
-        limits=limits, name=name or out.stem, reading=reading, columns=columns.names,
-        broken_lines="count" if lenient else "stop",
+        runs, files.nav, settings,
+        limits=limits, name=files.name or out.stem, reading=reading, columns=columns.names,
+        broken_lines=files.broken_lines,
     )  # fmt: skip
     result = surveyed.survey
     track = result.track

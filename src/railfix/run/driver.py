@@ -9,13 +9,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from railfix import __version__
 from railfix.core.arrays import Floats
-from railfix.core.errors import MismatchError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
@@ -40,10 +39,6 @@ from railfix.run.tally import Tally
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
 from railfix.track.quality import error_note
-
-if TYPE_CHECKING:
-    from railfix.run.route import RouteOfLog
-    from railfix.track.network import Network
 
 
 class Progress(Protocol):
@@ -207,15 +202,13 @@ def open_inputs(
             date=options.logs.instant,
         )
 
-    def find(network: Network) -> RouteOfLog:
-        from railfix.run.route import find_route
+    from railfix.run.route import LogPositions
 
-        paths = next(iter(inputs.logs.values()))
-        if at is None:
-            raise MismatchError(f"{inputs.nav[0]}: has no record, so that no route through the network can be found")
-        parts = log_of(paths).parts()
-        return find_route(network, parts, navigation, config, path=str(paths[0]), time=at, reading=options.track)
-
+    paths = next(iter(inputs.logs.values()))
+    positions = LogPositions(
+        path=str(paths[0]), parts=log_of(paths).parts, navigation=navigation, config=config, time=at,
+        reading=options.track,
+    )  # fmt: skip
     line = open_line(
         inputs.track,
         inputs.vehicle,
@@ -223,7 +216,7 @@ def open_inputs(
         reading=options.track,
         heights=inputs.heights,
         at=at,
-        find=find,
+        log=positions,
     )
     logs = {name: log_of(paths) for name, paths in inputs.logs.items()}
     return navigation, line, logs

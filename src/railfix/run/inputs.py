@@ -14,6 +14,8 @@ from railfix.core.settings import Settings, option
 from railfix.io.receiver.recognise import head_of, is_receiver_log
 from railfix.pipeline.config import Config
 
+#: In place of a file: the heights of the log's own positions.
+OF_LOG = Path("log")
 Antenna = Literal["front", "rear"]
 #: Heading of the options that name input files.
 INPUTS = "Inputs"
@@ -36,8 +38,8 @@ def track_option() -> Any:
 def heights_option() -> Any:
     """Return the field for a second source of heights."""
     text = (
-        "Heights of a map without: a raster (GeoTIFF, ESRI ASCII grid), CSV by chainage_m or kilometrage_m, or "
-        "positions of a run."
+        "Heights of a map without: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV by chainage_m or kilometrage_m, "
+        "positions of a run, or the word log for those of the log itself."
     )
     return input_option(text, None)
 
@@ -59,7 +61,7 @@ class InputFiles(Settings):
         for name in type(self).model_fields:
             value = getattr(self, name)
             for path in value if isinstance(value, tuple) else (value,):
-                if path is not None:
+                if path is not None and (name, path) != ("heights", OF_LOG):
                     yield name, path
 
     @property
@@ -94,7 +96,7 @@ class RunInputs(InputFiles):
     track : tuple of Path
         Track map, joined to a route in this order.
     heights : Path or None
-        Heights of a track map without.
+        Heights of a track map without; `OF_LOG`: those of the log's own positions.
     vehicle : Path or None
     tachometer, inertial, radar, ranging : Path or None
         Tables of the sensors on board.

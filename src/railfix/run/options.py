@@ -14,6 +14,7 @@ from railfix.core.settings import Settings, option
 from railfix.io.position_log import column_names
 from railfix.run.output import Overwrite
 from railfix.track.frames import MapMotion
+from railfix.track.segment import MapReading
 from railfix.track.vehicle import Reference
 
 #: Last whole year of times to the nanosecond in 64 bits.
@@ -26,9 +27,16 @@ class TrackReading(Settings):
     crs: str | None = option("CRS of the track where its file does not name one.", None, metavar="EPSG")
     height_datum: str | None = option("Heights of the track: ellipsoidal or orthometric.", None, metavar="DATUM")
     geoid: str | None = option(
-        "Geoid of orthometric heights: japan (JPGEO2024), gsigeo2011, or a grid or CRS known to PROJ.",
+        "Geoid of orthometric heights: egm96 (the world), japan (JPGEO2024), gsigeo2011, or a grid or CRS of PROJ.",
         None,
         metavar="MODEL",
+    )
+    plan_sigma: float | None = option(
+        "Standard deviation of the track in plan, in place of its own (OpenStreetMap: 2 m where the file states none).",
+        None,
+        metavar="M",
+        gt=0,
+        le=1000.0,
     )
     height_sigma: float | None = option(
         "Standard deviation of the track's heights, in place of its own; of a raster needed.",
@@ -51,6 +59,11 @@ class TrackReading(Settings):
         metavar="FILE",
     )
     reference: Reference = option("Point of the vehicle whose chainage is given.", "antenna")
+
+    @property
+    def of_map(self) -> MapReading:
+        """What the readers of maps take."""
+        return MapReading(crs=self.crs, height_datum=self.height_datum, geoid=self.geoid, sigma_plan_m=self.plan_sigma)
 
     @property
     def motion(self) -> MapMotion:

@@ -6,7 +6,7 @@ sequence of tracks is the route on which positions are computed, and every other
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -19,6 +19,7 @@ from railfix.core.errors import MismatchError
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
+from railfix.io.position_log import PositionLog
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.locate import locate
@@ -269,50 +270,80 @@ class RouteOfLog:
         return np.asarray(np.where(nearer, before, after), dtype=np.intp)
 
 
-def find_route(
-    network: Network,
-    parts: Iterable[Observations],
-    navigation: Navigation,
-    config: Config,
-    *,
-    path: str,
-    time: np.datetime64,
-    reading: TrackReading,
-) -> RouteOfLog:
-    """Find the route of a log through a network; `path` names the log in messages, `time` is that of the frame.
+@dataclass(frozen=True, kw_only=True)
+class LogPositions:
+    """Conventional positions of a log once a second, from which a line that is not known yet is found.
 
-    Raises
-    ------
-    MismatchError
-        The log has no position near a track, or no route leads over the tracks that it passes.
+    Attributes
+    ----------
+    path : str
+        Names the log in messages.
+    parts : callable
+        The pieces of the log in order of time.
+    time : datetime64 or None
+        Of the epoch of frames; None without a navigation record.
     """
-    received, book = known_from_start(config, navigation=navigation), ChannelBook(config)
-    located = []
-    for part in parts:
-        seconds = np.diff(part.time) / np.timedelta64(1, "s")
-        step = max(1, round(_INTERVAL_S / float(np.median(seconds)))) if len(seconds) else 1
-        located.append(locate(part[::step], received, config, book))
-    times, ecef, sigma = (
-        np.concatenate([getattr(part, name)[np.isfinite(part.ecef_m[:, 0])] for part in located] or [np.empty(0)])
-        for name in ("time", "ecef_m", "sigma_m")
-    )
-    if not len(times):
-        raise MismatchError(f"{path}: the log has no position, so that no route through the network can be found")
-    positions, _ = plan_log(path, times, ecef, sigma).in_frame_of(network, **reading.motion)
-    matched = match(network, positions)
-    used = np.flatnonzero(np.isfinite(matched.probability))
-    positions, matched = positions.take(used), matched.take(used)
-    tracks, left_out = route_of(network, matched)
-    if not tracks:
-        raise MismatchError(
-            f"{path}: no position lies near a track of the network; is it the map of this region, and its CRS right?"
+
+    path: str
+    parts: Callable[[], Iterable[Observations]]
+    navigation: Navigation
+    config: Config
+    time: np.datetime64 | None
+    reading: TrackReading
+
+    @cached_property
+    def positions(self) -> PositionLog:
+        """Positions of quality 5, single; MismatchError where the log has none."""
+        received, book = known_from_start(self.config, navigation=self.navigation), ChannelBook(self.config)
+        located = []
+        for part in self.parts():
+            seconds = np.diff(part.time) / np.timedelta64(1, "s")
+            step = max(1, round(_INTERVAL_S / float(np.median(seconds)))) if len(seconds) else 1
+            located.append(locate(part[::step], received, self.config, book))
+        times, ecef, sigma = (
+            np.concatenate([getattr(part, name)[np.isfinite(part.ecef_m[:, 0])] for part in located] or [np.empty(0)])
+            for name in ("time", "ecef_m", "sigma_m")
         )
-    return RouteOfLog(
-        network=network,
-        tracks=tuple(tracks),
-        left_out=tuple(left_out),
-        log=positions,
-        matched=matched,
-        time=time,
-        reading=reading,
-    )
+        if not len(times):
+            raise MismatchError(f"{self.path}: the log has no position, so that its line cannot be found")
+        return PositionLog(
+            path=self.path,
+            time=times,
+            ecef_m=ecef,
+            quality=np.full(len(times), 5),
+            sigma_m=sigma,
+            line=np.arange(len(times)),
+        )
+
+    def route(self, network: Network) -> RouteOfLog:
+        """Find the route of the log through a network.
+
+        Raises
+        ------
+        MismatchError
+            The log has no position near a track, or no route leads over the tracks that it passes.
+        """
+        if self.time is None:
+            raise MismatchError("there is no navigation record, so that no route through the network can be found")
+        own = self.positions
+        positions, _ = plan_log(self.path, own.time, own.ecef_m, own.sigma_m).in_frame_of(
+            network, **self.reading.motion
+        )
+        matched = match(network, positions)
+        used = np.flatnonzero(np.isfinite(matched.probability))
+        positions, matched = positions.take(used), matched.take(used)
+        tracks, left_out = route_of(network, matched)
+        if not tracks:
+            raise MismatchError(
+                f"{self.path}: no position lies near a track of the network; is it the map of this region, and its CRS "
+                "right?"
+            )
+        return RouteOfLog(
+            network=network,
+            tracks=tuple(tracks),
+            left_out=tuple(left_out),
+            log=positions,
+            matched=matched,
+            time=self.time,
+            reading=self.reading,
+        )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -15,20 +15,19 @@ from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.files import BrokenLines
 from railfix.gnss.observations import Observations
 from railfix.io.logs import scan_observations
-from railfix.run.inputs import Antenna
+from railfix.run.inputs import OF_LOG, Antenna
 from railfix.run.options import TrackReading
 from railfix.run.prepared import PreparedLines, key_of, track_key
 from railfix.track import Track
 from railfix.track.frames import FrameShift, track_at
-from railfix.track.read import read_segments, track_of_segments
-from railfix.track.segment import MapReading, Segment
+from railfix.track.read import check_heights, read_segments, track_of_segments
+from railfix.track.segment import Segment
 from railfix.track.track import HEIGHTS_M
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import Vehicle, antenna_trajectory, read_vehicle
 
 if TYPE_CHECKING:
-    from railfix.run.route import RouteOfLog
-    from railfix.track.network import Network
+    from railfix.run.route import LogPositions, RouteOfLog
 
 #: Shortest track of a run [m].
 _SHORTEST_M: Final = 1.0
@@ -117,13 +116,13 @@ def open_line(
     reading: TrackReading,
     heights: Path | None = None,
     at: np.datetime64 | None = None,
-    find: Callable[[Network], RouteOfLog] | None = None,
+    log: LogPositions | None = None,
 ) -> OpenedLine:
     """Read the track and the vehicle, and compute the path of each antenna.
 
     With a time `at` the track is moved to the frame of the satellites then (`railfix.track.frames`); without it
     the coordinates stay in the map's own frame. A single file whose tracks do not join to one route is a network:
-    `find` gives the route through it.
+    `log` gives the route through it, and the heights of a map without where `heights` is `OF_LOG`.
 
     Raises
     ------
@@ -131,11 +130,11 @@ def open_line(
         A file is not what it should be, or track and vehicle do not fit.
     """
     prepared = PreparedLines(use=reading.cache == "use")
-    key = key_of("line", *track, heights, reading.crs, reading.height_datum, reading.geoid, reading.height_sigma)
-    centreline, route = prepared.track(key), None
+    key = key_of("line", *track, heights, *vars(reading.of_map).values(), reading.height_sigma)
+    centreline, route = None if heights == OF_LOG else prepared.track(key), None
     if centreline is None:
-        centreline, route = _read_line(track, reading, heights=heights, find=find)
-        if route is None:
+        centreline, route = _read_line(track, reading, heights=heights, log=log)
+        if route is None and heights != OF_LOG:
             prepared.keep_track(key, centreline)
     _check_extent(track, centreline)
     shift, moved = None, centreline
@@ -170,29 +169,31 @@ def _read_line(
     reading: TrackReading,
     *,
     heights: Path | None,
-    find: Callable[[Network], RouteOfLog] | None,
+    log: LogPositions | None,
 ) -> tuple[Track, RouteOfLog | None]:
     """Read the track, and find the route in a network."""
     segments = _segments(track, reading)
+    options = {"geoid": reading.geoid, "height_datum": reading.height_datum, "sigma_height_m": reading.height_sigma}
+    check_heights(segments, heights, **options)
     route = None
     if len(track) == 1 and len(segments) > 1:
         from railfix.track.network_read import is_route, network_of
 
         if not is_route(segments):
-            if find is None:
+            if log is None:
                 raise MismatchError(
                     f"{track[0]}: has {len(segments)} tracks that do not join to one route; make the map of one with "
                     "'railfix map route'"
                 )
-            route = find(network_of(segments, track))
+            route = log.route(network_of(segments, track))
             segments = [route.network.tracks[k] for k in route.tracks]
+    if heights == OF_LOG and log is None:
+        raise SettingsError("--heights log: heights of the log itself are for railfix run; give a file here")
     centreline = track_of_segments(
         segments,
-        heights=heights,
-        geoid=reading.geoid,
+        heights=log.positions if heights == OF_LOG and log is not None else heights,
         name=None if route is None else track[0].stem,
-        height_datum=reading.height_datum,
-        sigma_height_m=reading.height_sigma,
+        **options,
     )
     return centreline, route
 
@@ -200,8 +201,7 @@ def _read_line(
 def _segments(track: tuple[Path, ...], reading: TrackReading) -> list[Segment]:
     if not track:
         raise SettingsError("no track map was given")
-    of_map = MapReading(crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
-    return [segment for path in track for segment in read_segments(path, of_map)]
+    return [segment for path in track for segment in read_segments(path, reading.of_map)]
 
 
 def _paths(

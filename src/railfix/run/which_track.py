@@ -195,9 +195,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
                 standstill_codes(_observations(paths, options), navigation, config, base=base, origin_ecef_m=origin)
             )
     reading = options.reading
-    network = read_network(
-        inputs.map, crs=reading.crs, height_datum=reading.height_datum or "ellipsoidal", geoid=reading.geoid
-    )
+    network = read_network(inputs.map, replace(reading.of_map, height_datum=reading.height_datum or "ellipsoidal"))
     origin, notes = codes[0].origin_ecef_m, list(network.notes)
     if options.same_frame == "no":
         place, shift = in_map_frame(

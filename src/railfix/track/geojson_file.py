@@ -18,8 +18,9 @@ from railfix.core.spelling import misspelt
 from railfix.track.crs import frame_degrees, known_crs, older_datum_note, unit_of_heights, used_crs
 from railfix.track.csv_file import OPTIONAL_COLUMNS, attributes
 from railfix.track.heights import HEIGHT_DATUMS, ellipsoidal_heights, own_height_datum
+from railfix.track.openstreetmap import is_of_openstreetmap, metadata_of, no_track, read_overpass, with_left_out
 from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
-from railfix.track.vector_file import is_of_openstreetmap, left_out_note, name_of, no_track
+from railfix.track.vector_file import name_of, plan_segment
 
 #: RFC 7946, section 4: longitude and latitude on WGS 84 where the file names no CRS.
 RFC_CRS: Final = "OGC:CRS84"
@@ -28,6 +29,8 @@ _DATUM_HELP: Final = (
 )
 #: Property of features that are connections of tracks, no tracks (`railfix.track.network_read`).
 RELATION: Final = "netelementA"
+#: All properties of the feature of a line, and its id.
+_FEATURE: Final = "@feature"
 _MEMBERS: Final = ("height_datum", "geoid", "name", "sigma_plan_m", "sigma_height_m")
 
 
@@ -54,7 +57,8 @@ def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any
         if not isinstance(properties, dict) or not isinstance(geometry, dict):
             raise InputFileError(path, f"{label or 'the feature'} has no geometry")
         stated = {key: value for key, value in properties.items() if value is not None}
-        yield from _lines(path, geometry, label, inherited | own | stated)
+        identity = {} if node.get("id") is None else {"@id": str(node["id"])}
+        yield from _lines(path, geometry, label, inherited | own | stated | {_FEATURE: identity | stated})
     elif kind == "LineString":
         yield _GeojsonLine(path, label, node.get("coordinates"), inherited | own, -1)
     elif kind == "MultiLineString":
@@ -92,6 +96,7 @@ class _GeojsonLine:
     def __init__(self, path: str, label: str, coordinates: Any, properties: dict[str, Any], part: int) -> None:
         self.path = path
         self.source = f"{path} ({label})" if label else path
+        self.feature: dict[str, Any] = properties.pop(_FEATURE, {})
         self.properties = properties
         self.part = part
         self.coordinates = self._coordinates(coordinates)
@@ -176,16 +181,26 @@ def read_geojson_segments(path: str | PathLike[str], reading: MapReading) -> lis
         raise InputFileError(path, "this JSON is nested too deeply for a GeoJSON object") from None
     if not isinstance(document, dict):
         raise InputFileError(path, "this is JSON, but not a GeoJSON object")
+    if "elements" in document and "type" not in document:
+        return _of_overpass(str(path), document, reading)
     used = used_crs(path, reading.crs, _crs_member(str(path), document)) or RFC_CRS
     lines = list(_lines(str(path), document, "", {}))
-    of_openstreetmap = any(is_of_openstreetmap(line.properties) for line in lines)
-    reasons = [no_track(line.properties, of_openstreetmap=of_openstreetmap) for line in lines]
-    notes = left_out_note(path, Counter(why for why in reasons if why))
+    of_openstreetmap = any(is_of_openstreetmap(line.feature) for line in lines)
+    reasons = [no_track(line.feature, of_openstreetmap=of_openstreetmap) for line in lines]
     segments = [_segment(line, used, reading) for line, why in zip(lines, reasons, strict=True) if not why]
-    if not segments:
-        raise InputFileError(path, "there is no track in this file" + "".join(f" ({note})" for note in notes))
-    segments[0] = replace(segments[0], notes=(*segments[0].notes, *notes))
-    return segments
+    return with_left_out(path, segments, Counter(why for why in reasons if why))
+
+
+def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> list[Segment]:
+    """Ways of the JSON of Overpass, which is no GeoJSON."""
+    of_file = replace(reading, crs=used_crs(path, reading.crs, "EPSG:4326"))
+    ways = [(way, no_track(way.row, of_openstreetmap=True)) for way in read_overpass(path, document["elements"])]
+    segments = [
+        plan_segment(way.points_deg, of_file, path=path, name=own["name"], stated=own)
+        for way, why in ways
+        if not why and (own := metadata_of(way.row))
+    ]
+    return with_left_out(path, segments, Counter(why for _, why in ways if why))
 
 
 def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
@@ -213,7 +228,8 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
         height_datum=datum,
         geoid=model,
         notes=older_datum_note(crs),
-        metadata={key: str(line.properties[key]) for key in _MEMBERS if key in line.properties},
+        metadata={key: str(line.properties[key]) for key in _MEMBERS if key in line.properties}
+        | metadata_of(line.feature),
         **attributes(len(latitude), line.array),
     )
 

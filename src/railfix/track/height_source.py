@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from os import PathLike
 from typing import Any, Final
@@ -15,26 +17,55 @@ from railfix.core.files import ending
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.io.nmea import read_any_positions
+from railfix.io.position_log import PositionLog
 from railfix.track.from_positions import SIGMA_OF_QUALITY
-from railfix.track.heights import ellipsoidal_heights
+from railfix.track.heights import GEOIDS, ellipsoidal_heights, own_height_datum
 from railfix.track.polyline import NearestOnPolyline
 from railfix.track.track import SIGMA_HEIGHT_M, Track
 
-#: Endings of rasters, read by GDAL through `rasterio`: GeoTIFF, and ESRI ASCII grid with its .prj file.
-RASTERS: Final = (".tif", ".tiff", ".asc")
+#: Endings of rasters, read by GDAL through `rasterio`: GeoTIFF, ESRI ASCII grid with its .prj file, SRTM, DTED, ...
+RASTERS: Final = (
+    ".tif", ".tiff", ".asc", ".vrt", ".hgt", ".dt0", ".dt1", ".dt2", ".img", ".bil", ".flt", ".jp2", ".grd", ".xyz",
+)  # fmt: skip
+#: A file, or positions in memory.
+HeightSource = str | PathLike[str] | PositionLog
+#: Largest distance of the points that heights are put on [m].
+_SPACING_M: Final = 50.0
 #: Cells of a raster read at a time.
 _WINDOW_CELLS: Final = 4_000_000
 #: Positions further than this from the line in plan are of another line [m].
 _NEAR_M: Final = 15.0
 #: Points further than this from a height along the line have none [m].
 _REACH_M: Final = 200.0
-#: Standard deviation of the weights of positions along the line [m].
+#: Standard deviation of the weights of positions along the line [m]: of fixed ones, and of single ones, whose errors
+#: last for hundreds of metres; a vertical curve of 2 km radius is then off by up to 5 m.
 _KERNEL_M: Final = 15.0
+_LARGEST_KERNEL_M: Final = 150.0
+#: Positions whose heights are this many median deviations off count no more (Cleveland 1979, robust locally weighted
+#: regression, doi:10.1080/01621459.1979.10481038), and how often they are weighed again.
+_ROBUST, _WEIGHED_AGAIN = 6.0, 2
+
+
+def check_raster(
+    path: str | PathLike[str], *, geoid: str | None, height_datum: str | None, sigma_m: float | None
+) -> None:
+    """Raise SettingsError with all options that a raster needs besides; InputFileError where it is none."""
+    with _opened(path) as (_, crs):
+        own = crs.is_compound
+    asked = []
+    if height_datum is None and not own:
+        asked.append("--height-datum (orthometric: above the sea, as most are; or ellipsoidal)")
+    if height_datum != "ellipsoidal" and geoid is None and not own:
+        asked.append(f"--geoid, where they are orthometric ({GEOIDS})")
+    if sigma_m is None:
+        asked.append("--height-sigma (their accuracy in metres)")
+    if asked:
+        raise SettingsError(f"{path}: a raster does not state all that its heights need; give {', '.join(asked)}")
 
 
 def with_heights(
     track: Track,
-    path: str | PathLike[str],
+    source: HeightSource,
     *,
     geoid: str | None = None,
     height_datum: str | None = None,
@@ -44,10 +75,11 @@ def with_heights(
 
     Parameters
     ----------
-    path : path
+    source : path or PositionLog
         Raster (`RASTERS`); CSV with ``chainage_m`` or ``kilometrage_m`` and ``height_m`` (ellipsoidal) or
         ``elevation_m`` (orthometric), its accuracy as the column ``sigma_m`` or the line ``# sigma_m:``; or a log of
-        positions as `railfix.io.nmea.read_any_positions` reads it.
+        positions as `railfix.io.nmea.read_any_positions` reads it. Positions that are given have the heights between
+        and beyond them, too.
     geoid, height_datum : str, optional
         Geoid of orthometric heights; datum of a raster, which needs it.
     sigma_m : float, optional [m]
@@ -60,14 +92,64 @@ def with_heights(
     SettingsError
         A raster without its height datum or its standard deviation.
     """
-    if ending(path) in RASTERS:
-        return _from_raster(track, path, geoid=geoid, height_datum=height_datum, sigma_m=sigma_m)
-    if ending(path) == ".csv":
-        table = read_named_columns(path)
+    track = _dense(track)
+    if isinstance(source, PositionLog):
+        return _from_positions(track, source, sigma_m, reach_m=np.inf)
+    if ending(source) in RASTERS:
+        return _from_raster(track, source, geoid=geoid, height_datum=height_datum, sigma_m=sigma_m)
+    if ending(source) == ".csv":
+        table = read_named_columns(source)
         by_place = {"chainage_m", "kilometrage_m"} & set(table.cells)
         if by_place and not {"latitude_deg", "x_m"} & set(table.cells):
             return _from_profile(track, table, geoid, sigma_m)
-    return _from_positions(track, path, sigma_m)
+    return _from_positions(track, read_any_positions(source), sigma_m, reach_m=_REACH_M)
+
+
+def _dense(track: Track) -> Track:
+    """The track with points at most `_SPACING_M` from each other, so that heights are followed along straights, too."""
+    pieces = np.ceil(np.diff(track.chainage_m) / _SPACING_M).astype(np.intp)
+    if not (pieces > 1).any():
+        return track
+    pieces = np.maximum(pieces, 1)
+    start = np.repeat(np.arange(len(pieces)), pieces)
+    share = (np.arange(len(start)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / np.repeat(pieces, pieces)
+
+    def between(values: Floats) -> Floats:
+        return np.append(values[start] + share * (values[start + 1] - values[start]), values[-1])
+
+    ecef = np.stack([between(column) for column in track.ecef_m.T], axis=-1)
+    latitude, longitude, _ = geodetic_from_ecef(ecef)
+    return Track.from_geodetic(
+        latitude,
+        longitude,
+        between(track.height_m),
+        name=track.name,
+        **{name: between(getattr(track, name)) for name in ("kilometrage_m", "cant_m", "gradient_permille")},
+        radius_m=np.append(track.radius_m[start], track.radius_m[-1]),
+        section=np.append(track.section[start], track.section[-1]),
+        sections=track.sections,
+        sigma_plan_m=track.sigma_plan_m,
+        sigma_height_m=track.sigma_height_m,
+        provenance=track.provenance,
+    )
+
+
+@contextmanager
+def _opened(path: str | PathLike[str]) -> Iterator[tuple[Any, CRS]]:
+    """A raster and its CRS; InputFileError where there is none."""
+    try:
+        import rasterio
+    except ImportError:
+        raise InputFileError(
+            path, "reading a raster needs rasterio; install it with: pip install 'railfix[maps]'"
+        ) from None
+    try:
+        with rasterio.open(path) as raster:
+            if raster.crs is None:
+                raise InputFileError(path, "names no CRS; put a .prj file beside it, or write it as GeoTIFF")
+            yield raster, CRS.from_wkt(raster.crs.to_wkt())
+    except rasterio.errors.RasterioError as error:
+        raise InputFileError(path, f"GDAL cannot read this raster ({str(error).splitlines()[0]})") from None
 
 
 def _from_raster(
@@ -79,31 +161,16 @@ def _from_raster(
     sigma_m: float | None,
 ) -> Track:
     """Heights of a raster at the points of the track, linear between the middles of its cells."""
-    try:
-        import rasterio
-    except ImportError:
-        raise InputFileError(
-            path, "reading a raster needs rasterio; install it with: pip install 'railfix[maps]'"
-        ) from None
-    if height_datum is None:
-        raise SettingsError(f"{path}: the height datum of a raster is not in it; give --height-datum")
-    if sigma_m is None:
-        raise SettingsError(f"{path}: the accuracy of a raster is not in it; give --height-sigma")
-    try:
-        with rasterio.open(path) as raster:
-            if raster.crs is None:
-                raise InputFileError(path, "names no CRS; put a .prj file beside it, or write it as GeoTIFF")
-            to_raster = Transformer.from_crs(
-                CRS.from_user_input(track.provenance.frame).to_2d(),
-                CRS.from_wkt(raster.crs.to_wkt()).to_2d(),
-                always_xy=True,
-            )
-            x, y = (np.asarray(v) for v in to_raster.transform(track.longitude_deg, track.latitude_deg))
-            turn = ~raster.transform
-            column, row = turn.a * x + turn.b * y + turn.c, turn.d * x + turn.e * y + turn.f
-            heights = _sample(raster, np.stack([row, column]) - 0.5)
-    except rasterio.errors.RasterioError as error:
-        raise InputFileError(path, f"GDAL cannot read this raster ({str(error).splitlines()[0]})") from None
+    check_raster(path, geoid=geoid, height_datum=height_datum, sigma_m=sigma_m)
+    with _opened(path) as (raster, crs):
+        height_datum, geoid = own_height_datum(crs.to_wkt(), height_datum, geoid, path=str(path))
+        to_raster = Transformer.from_crs(
+            CRS.from_user_input(track.provenance.frame).to_2d(), crs.to_2d(), always_xy=True
+        )
+        x, y = (np.asarray(v) for v in to_raster.transform(track.longitude_deg, track.latitude_deg))
+        turn = ~raster.transform
+        column, row = turn.a * x + turn.b * y + turn.c, turn.d * x + turn.e * y + turn.f
+        heights = _sample(raster, np.stack([row, column]) - 0.5)
     missing = np.flatnonzero(np.isnan(heights))
     if len(missing):
         raise InputFileError(
@@ -112,13 +179,19 @@ def _from_raster(
             f"{track.chainage_m[missing[0]]:.0f} m; give a raster of the whole line",
         )
     height, model = ellipsoidal_heights(
-        heights, track.latitude_deg, track.longitude_deg, datum=height_datum, geoid=geoid, geoid_m=None, path=str(path)
+        heights,
+        track.latitude_deg,
+        track.longitude_deg,
+        datum=str(height_datum),
+        geoid=geoid,
+        geoid_m=None,
+        path=str(path),
     )
     note = (
-        f"heights of the raster {path}, sigma {sigma_m:.2f} m: those of the ground, which on bridges and in tunnels "
-        "are not the track's"
+        f"heights of the raster {path}, sigma {sigma_m or 0.0:.2f} m: those of the ground, which on bridges and in "
+        "tunnels are not the track's"
     )
-    return _replace(track, height, sigma_m, height_datum, model, note)
+    return _replace(track, height, float(sigma_m or 0.0), str(height_datum), model, note)
 
 
 def _sample(raster: Any, place: Floats) -> Floats:
@@ -176,58 +249,69 @@ def _from_profile(track: Track, table: NamedColumns, geoid: str | None, sigma_m:
     return _replace(track, height, sigma, datum, model, note)
 
 
-def _from_positions(track: Track, path: str | PathLike[str], sigma_m: float | None) -> Track:
-    log = read_any_positions(path)
+def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, reach_m: float) -> Track:
     latitude, longitude, height = geodetic_from_ecef(log.ecef_m)
     plan = NearestOnPolyline(ecef_from_geodetic(track.latitude_deg, track.longitude_deg, np.zeros(len(track))))
     segment, along, offset = plan(ecef_from_geodetic(latitude, longitude, np.zeros(len(log))))
     near = np.isfinite(offset) & (offset < _NEAR_M)
     if near.sum() < 2:
-        raise InputFileError(path, f"{int(near.sum())} of {len(log)} positions lie within {_NEAR_M:g} m of the map")
+        raise InputFileError(log.path, f"{int(near.sum())} of {len(log)} positions lie within {_NEAR_M:g} m of the map")
     by_quality = np.array([SIGMA_OF_QUALITY.get(int(q), SIGMA_OF_QUALITY[5])[1] for q in log.quality])
     sigma = np.where(np.isfinite(log.sigma_m[:, 2]), np.maximum(log.sigma_m[:, 2], by_quality), by_quality)
     place = (track.chainage_m[segment] + along)[near]
     order = np.argsort(place)
     place, height, sigma = place[order], height[near][order], sigma[near][order]
     target = track.chainage_m
-    fitted, spread = _smooth(target, place, height, sigma)
-    spread = spread if sigma_m is None else sigma_m
+    fitted = _smooth(target, place, height, sigma, reach_m=reach_m)
+    # errors of neighbouring positions are common to them: the standard deviation is that of one position
+    spread = float(np.median(sigma)) if sigma_m is None else sigma_m
     if np.isnan(fitted).any():
         first = float(target[np.isnan(fitted)][0])
         raise InputFileError(
-            path,
-            f"{int(np.isnan(fitted).sum())} of {len(track)} points of the map have no position within {_REACH_M:g} m, "
+            log.path,
+            f"{int(np.isnan(fitted).sum())} of {len(track)} points of the map have no position within {reach_m:g} m, "
             f"the first at chainage {first:.0f} m; give positions of the whole line",
         )
-    notes = (
-        f"heights of the antenna positions {path}, sigma {spread:.2f} m: use the map without a vehicle file, or "
+    note = (
+        f"heights of the antenna positions {log.path}, sigma {spread:.2f} m: use the map without a vehicle file, or "
         "lower it by the height of that antenna"
     )
-    return _replace(track, fitted, spread, "ellipsoidal", "", notes)
+    return _replace(track, fitted, spread, "ellipsoidal", "", note)
 
 
-def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats) -> tuple[Floats, float]:
-    """Weighted straight lines through the heights about each target, and their median standard deviation.
-
-    Errors of neighbouring positions are common to them, so the standard deviation is that of one position.
-    """
-    fitted = np.full(len(target), np.nan)
-    for k, at in enumerate(target):
-        low, high = np.searchsorted(place, [at - 3.0 * _KERNEL_M, at + 3.0 * _KERNEL_M])
-        x = place[low:high] - at
-        if high - low >= 3 and x[0] < 0.0 < x[-1]:
-            y, w = height[low:high], np.exp(-0.5 * (x / _KERNEL_M) ** 2) / sigma[low:high] ** 2
-            mean, centre = float(w @ y) / w.sum(), float(w @ x) / w.sum()
-            variance = float(w @ (x - centre) ** 2)
-            slope = float(w @ ((x - centre) * (y - mean))) / variance if variance > 1.0e-9 * w.sum() else 0.0
-            fitted[k] = mean - slope * centre
+def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats, *, reach_m: float) -> Floats:
+    """Weighted straight lines through the heights about each target; NaN farther than a reach from any."""
+    kernel = float(np.clip(_KERNEL_M * np.median(sigma) / SIGMA_HEIGHT_M, _KERNEL_M, _LARGEST_KERNEL_M))
+    weight = 1.0 / sigma**2
+    for _ in range(_WEIGHED_AGAIN if kernel > _KERNEL_M else 0):
+        off = np.abs(height - _local_lines(place, place, height, weight, kernel))
+        off = np.where(np.isnan(off), 0.0, off) / max(_ROBUST * float(np.nanmedian(off)), 1e-6)
+        weight = np.maximum(1.0 - off**2, 1e-3) ** 2 / sigma**2
+    fitted = _local_lines(target, place, height, weight, kernel)
     missing = np.isnan(fitted)
     if missing.any():
         nearest = np.clip(np.searchsorted(place, target), 1, len(place) - 1)
         gap = np.minimum(np.abs(target - place[nearest - 1]), np.abs(place[nearest] - target))
-        fill = missing & (gap <= _REACH_M)
+        fill = missing & (gap <= reach_m)
+        if reach_m == np.inf and not missing.all():  # single positions: the smoothed heights on either side
+            place, height = target[~missing], fitted[~missing]
         fitted[fill] = np.interp(target[fill], place, height)
-    return fitted, float(np.median(sigma))
+    return fitted
+
+
+def _local_lines(target: Floats, place: Floats, height: Floats, weight: Floats, kernel_m: float) -> Floats:
+    """Heights of weighted straight lines about each target; NaN beside all positions."""
+    fitted = np.full(len(target), np.nan)
+    bounds = np.searchsorted(place, [target - 3.0 * kernel_m, target + 3.0 * kernel_m]).T
+    for k, (low, high) in enumerate(bounds.tolist()):
+        x = place[low:high] - target[k]
+        if high - low >= 3 and x[0] < 0.0 < x[-1]:
+            y, w = height[low:high], np.exp(-0.5 * (x / kernel_m) ** 2) * weight[low:high]
+            mean, centre = float(w @ y) / w.sum(), float(w @ x) / w.sum()
+            variance = float(w @ (x - centre) ** 2)
+            slope = float(w @ ((x - centre) * (y - mean))) / variance if variance > 1.0e-9 * w.sum() else 0.0
+            fitted[k] = mean - slope * centre
+    return fitted
 
 
 def _replace(track: Track, height: Floats, sigma: float, datum: str, geoid: str, note: str) -> Track:

@@ -6,6 +6,8 @@ Maps have heights from levelling, satellite positions refer to the ellipsoid (P1
 
 from __future__ import annotations
 
+import os
+import warnings
 from pathlib import Path
 from typing import Final
 
@@ -13,7 +15,9 @@ import japan_geoid
 import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.crs import CompoundCRS
+from pyproj.datadir import get_data_dir, get_user_data_dir
 from pyproj.exceptions import CRSError, ProjError
+from pyproj.transformer import TransformerGroup
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
@@ -33,11 +37,13 @@ _LOADERS: Final = {
     "JPGEO2024+Hrefconv2024": japan_geoid.load_embedded_jpgeo2024_hrefconv2024,
     "GSIGEO2011": japan_geoid.load_embedded_gsigeo2011,
 }
+#: Geoids by name.
+GEOIDS: Final = "egm96 of the world, japan, a grid file, or a vertical CRS such as EPSG:3855"
 #: Advice for orthometric heights without a geoid.
-GEOID_HELP: Final = (
-    "give geoid='japan' (JPGEO2024), 'gsigeo2011', a pyproj grid file or vertical CRS such as 'EPSG:5773', "
-    "or a column geoid_m"
-)
+GEOID_HELP: Final = f"give one (--geoid): {GEOIDS}; or a column geoid_m"
+#: EGM96: the grid of 15' that PROJ knows of, and the error of the one of 1 degree that sidereon ships [m].
+_EGM96: Final = "us_nga_egm96_15.tif"
+_EGM96_NAMES: Final = ("egm96", "epsg:5773")
 HEIGHT_DATUMS: Final = ("ellipsoidal", "orthometric")
 
 
@@ -50,7 +56,8 @@ def check_height_datum(height_datum: str | None) -> None:
 def geoid_heights(geoid: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> tuple[Floats, str]:
     """Height of a geoid above the WGS 84 ellipsoid, shape (n,) [m], and the model used.
 
-    The geoid is a key of `JAPAN_MODELS`; a file or name of a pyproj grid (``.tif``, ``.gtx``); or a vertical or
+    The geoid is a key of `JAPAN_MODELS`; ``egm96``, the grid of 15' where PROJ has it, else of 1 degree (0.4 m RMS from
+    the other) by `sidereon`; a file or name of a pyproj grid (``.tif``, ``.gtx``); or a vertical or
     compound CRS (``EPSG:5773``). SettingsError: when the model is unknown or its grid is not installed. InputFileError:
     when points of the map lie outside the area of the model.
     """
@@ -58,8 +65,10 @@ def geoid_heights(geoid: str, latitude_deg: Floats, longitude_deg: Floats, *, pa
     if key in JAPAN_MODELS:
         name = JAPAN_MODELS[key]
         heights = np.asarray(_LOADERS[name]().get_heights(np.array(longitude_deg), np.array(latitude_deg)), np.float64)
+    elif key in _EGM96_NAMES and not _has_grid(_EGM96):
+        name, heights = _egm96(latitude_deg, longitude_deg)
     else:
-        name, transformer = _proj_transformer(geoid)
+        name, transformer = _proj_transformer(_EGM96 if key == "egm96" else geoid)
         zeros = np.zeros_like(latitude_deg)
         heights = np.asarray(transformer.transform(longitude_deg, latitude_deg, zeros)[2], np.float64)
     outside = ~np.isfinite(heights)
@@ -74,9 +83,38 @@ def geoid_heights(geoid: str, latitude_deg: Floats, longitude_deg: Floats, *, pa
     return heights, name
 
 
+def _has_grid(name: str) -> bool:
+    """Whether PROJ has a grid."""
+    return any((Path(folder) / name).is_file() for folder in (*get_data_dir().split(os.pathsep), get_user_data_dir()))
+
+
+def _egm96(latitude_deg: Floats, longitude_deg: Floats) -> tuple[str, Floats]:
+    """EGM96 by sidereon's grid of 1 degree."""
+    try:
+        import sidereon
+    except ImportError:
+        raise SettingsError(
+            f"geoid egm96: neither PROJ's grid nor a package with it is installed; projsync --file {_EGM96}, or "
+            "pip install 'railfix[maps]'"
+        ) from None
+    east = (longitude_deg + 180.0) % 360.0 - 180.0
+    heights = sidereon.egm96_undulations_deg(np.ascontiguousarray(np.stack([latitude_deg, east], axis=-1)))
+    return "EGM96, 1 degree grid (0.4 m)", np.asarray(heights, dtype=np.float64)
+
+
+def _missing_grids(source: CRS) -> str:
+    """Names of the grids that PROJ would need for heights of a compound CRS."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        group = TransformerGroup(source, "EPSG:4979", always_xy=True, allow_ballpark=False)
+    names = {grid.short_name for operation in group.unavailable_operations for grid in operation.grids}
+    return " or ".join(sorted(names)) or "NAME"
+
+
 def _proj_transformer(geoid: str) -> tuple[str, Transformer]:
     """Create a pyproj transformation from geoid to ellipsoidal heights; ballpark results are not allowed."""
     grid = geoid.lower().endswith((".tif", ".tiff", ".gtx")) or Path(geoid).is_file()
+    name = Path(geoid).name
     try:
         if grid:
             steps = f"+proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=vgridshift +grids={geoid} +multiplier=1"
@@ -90,13 +128,14 @@ def _proj_transformer(geoid: str) -> tuple[str, Transformer]:
             geodetic, vertical = crs.sub_crs_list[0].geodetic_crs, crs.sub_crs_list[1]
             plan = plan if geodetic is None else geodetic.to_2d()
         source = CompoundCRS(vertical.name, [plan, vertical])
+        name = _missing_grids(source)
         transformer = Transformer.from_crs(source, "EPSG:4979", always_xy=True, allow_ballpark=False, only_best=True)
         return crs.name, transformer
     except CRSError:
         raise SettingsError(f"geoid {geoid!r} is unknown; {GEOID_HELP}") from None
     except ProjError:
         raise SettingsError(
-            f"geoid {geoid!r}: the grid is not installed in pyproj; install it (projsync --file NAME) or give its path"
+            f"geoid {geoid!r}: the grid is not installed in PROJ; install it (projsync --file {name}), or give its path"
         ) from None
 
 

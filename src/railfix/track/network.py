@@ -20,9 +20,9 @@ from railfix.core.arrays import Floats, Indices, read_only
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.polyline import NearestOnPolyline, project_on_segments
-from railfix.track.route import one_frame
+from railfix.track.route import one_frame, stated_sigma
 from railfix.track.segment import Segment
-from railfix.track.track import UNNAMED, interpolate_kilometrage
+from railfix.track.track import SIGMA_PLAN_M, UNNAMED, interpolate_kilometrage
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -172,6 +172,11 @@ class Network:
     def frame(self) -> str:
         """Geographic CRS of the coordinates; MismatchError when the tracks are in different ones."""
         return one_frame(self.tracks)
+
+    @cached_property
+    def sigma_plan_m(self) -> float:
+        """Standard deviation of the tracks in plan: the worst that the files state, else that of a surveyed map."""
+        return stated_sigma(self.tracks, "sigma_plan_m", None, SIGMA_PLAN_M)
 
     @property
     def named(self) -> bool:

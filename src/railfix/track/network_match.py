@@ -25,7 +25,7 @@ from railfix.track.crs import kind_of_frame
 from railfix.track.frames import FrameShift, MapMotion, in_map_frame
 from railfix.track.network import Candidates, Network
 from railfix.track.network_decode import Residuals, Transitions, decode
-from railfix.track.track import ANOTHER_PLACE_M, SIGMA_PLAN_M
+from railfix.track.track import ANOTHER_PLACE_M
 
 #: Standard deviation of the distance of a position from its track where its log states none [m].
 SIGMA_M: Final = 2.0
@@ -211,7 +211,7 @@ def match(
         In the order of travel, in the frame of the network.
     sigma_m : float, optional [m]
         Standard deviation of the distance between position and track, map included; by default that of the log
-        with `SIGMA_PLAN_M` of the map, and `SIGMA_M` where the log has none.
+        with that of the map, and `SIGMA_M` where the log has none.
     within_m : float, optional [m]
         Farthest track considered; by default 30 m, or five standard deviations of nine positions of ten up to 100 m.
     correlation_s : float [s]
@@ -225,7 +225,7 @@ def match(
     given = np.flatnonzero(np.isfinite(log.latitude_deg))
     if not len(given):
         raise MismatchError(f"{log.path}: has no position")
-    sigma = np.full(len(given), sigma_m) if sigma_m is not None else np.hypot(log.sigma_m[given], SIGMA_PLAN_M)
+    sigma = np.full(len(given), sigma_m) if sigma_m is not None else np.hypot(log.sigma_m[given], network.sigma_plan_m)
     sigma = np.where(np.isfinite(sigma), sigma, SIGMA_M)
     if within_m is None:
         within_m = float(np.clip(_WITHIN_SIGMAS * np.quantile(sigma, 1.0 - _BEST), _WITHIN_M, _FARTHEST_M))

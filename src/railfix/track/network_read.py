@@ -30,19 +30,17 @@ _LARGEST_TURN_RAD: Final = np.radians(60.0)
 
 def read_network(
     paths: Sequence[str | PathLike[str]],
+    reading: MapReading | None = None,
     *,
-    crs: str | None = None,
-    height_datum: str | None = None,
-    geoid: str | None = None,
     tolerance_m: float = TOLERANCE_M,
 ) -> Network:
-    """Read a network of tracks from map files, as `railfix.track.read_track` reads them.
+    """Read a network of tracks from map files, as `railfix.track.read_track` reads them; repeated points are kept.
 
     Where the files state no connections, ends nearer than the tolerance are one point, and a track on which the end of
     another lies is divided there. InputFileError, SettingsError.
     """
-    reading = MapReading(crs=crs, height_datum=height_datum, geoid=geoid, duplicates="keep")
-    tracks = [track for path in paths for track in read_segments(path, reading)]
+    of_file = replace(reading or MapReading(), duplicates="keep")
+    tracks = [track for path in paths for track in read_segments(path, of_file)]
     return network_of(tracks, paths, tolerance_m=tolerance_m)
 
 

@@ -12,7 +12,9 @@ from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import ending
 from railfix.track.csv_file import read_csv_segment
 from railfix.track.geojson_file import read_geojson_segments
-from railfix.track.heights import check_height_datum
+from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
+from railfix.track.heights import GEOIDS, check_height_datum
+from railfix.track.openstreetmap import SIGMA_M as OSM_SIGMA_M
 from railfix.track.route import MAX_GAP_M, join
 from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
 from railfix.track.track import Track
@@ -78,7 +80,9 @@ def read_track(
         if value is not None and not value > 0.0:
             raise SettingsError(f"{key} is {value:g}; a positive number of metres was expected")
     files = [paths] if isinstance(paths, str | PathLike) else list(paths)
-    reading = MapReading(crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates)
+    reading = MapReading(
+        crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates, sigma_plan_m=sigma_plan_m
+    )
     if not files:
         raise SettingsError("no track map was given")
     return track_of_segments(
@@ -88,7 +92,6 @@ def read_track(
         name=name,
         height_datum=height_datum,
         max_gap_m=max_gap_m,
-        sigma_plan_m=sigma_plan_m,
         sigma_height_m=sigma_height_m,
     )
 
@@ -96,44 +99,78 @@ def read_track(
 def track_of_segments(
     segments: Sequence[Segment],
     *,
-    heights: str | PathLike[str] | None = None,
+    heights: HeightSource | None = None,
     geoid: str | None = None,
     name: str | None = None,
     height_datum: str | None = None,
     max_gap_m: float = MAX_GAP_M,
-    sigma_plan_m: float | None = None,
     sigma_height_m: float | None = None,
 ) -> Track:
     """Join segments to a track, with heights from a second source where they have none; see `read_track`."""
-    flat = [s for s in segments if s.height_datum == NO_HEIGHTS]
-    if flat and heights is None:
-        raise InputFileError(
-            flat[0].source,
-            "the coordinates have no height; give --heights FILE (railfix run, railfix map route): a raster, a "
-            "profile by chainage or a log of 3-D positions",
-        )
-    if heights is not None and len(flat) < len(segments):
-        raise SettingsError(f"{segments[0].source} has heights itself; --heights is for maps without")
+    check_heights(segments, heights, geoid=geoid, height_datum=height_datum, sigma_height_m=sigma_height_m)
     track = join(
         [replace(s, height_m=np.zeros(len(s.height_m))) if s.height_datum == NO_HEIGHTS else s for s in segments],
         name=name,
         height_datum_asked=height_datum,
         max_gap_m=max_gap_m,
-        sigma_plan_m=sigma_plan_m,
         sigma_height_m=sigma_height_m,
     )
     if heights is None:
         return track
-    from railfix.track.height_source import with_heights
-
     return with_heights(track, heights, geoid=geoid, height_datum=height_datum, sigma_m=sigma_height_m)
+
+
+def check_heights(
+    segments: Sequence[Segment],
+    heights: HeightSource | None,
+    *,
+    geoid: str | None,
+    height_datum: str | None,
+    sigma_height_m: float | None,
+) -> None:
+    """Check that segments have heights, or a second source of them with all that it needs.
+
+    Raises
+    ------
+    InputFileError, SettingsError
+        They have none, or both; the message names every option that is missing.
+    """
+    flat = [s for s in segments if s.height_datum == NO_HEIGHTS]
+    if flat and heights is None:
+        raise InputFileError(
+            flat[0].source,
+            "the coordinates have no height; give --heights log (railfix run: those of the log's own positions), or "
+            "--heights FILE: a raster with --height-datum, --height-sigma and, of orthometric heights, --geoid "
+            f"({GEOIDS}); a profile by chainage; or a log of 3-D positions",
+        )
+    if heights is not None and len(flat) < len(segments):
+        raise SettingsError(f"{segments[0].source} has heights itself; --heights is for maps without")
+    if isinstance(heights, str | PathLike) and ending(heights) in RASTERS:
+        check_raster(heights, geoid=geoid, height_datum=height_datum, sigma_m=sigma_height_m)
 
 
 def read_segments(file: str | PathLike[str], reading: MapReading) -> list[Segment]:
     """Read the lines of one map file in their order; a file without heights gives segments without.
 
+    Their accuracy in plan is the one asked for, else the file's own, else that of `openstreetmap.SIGMA_M`.
     InputFileError: when the file is not a map.
     """
+    segments = _segments_of(file, reading)
+    if (given := reading.sigma_plan_m) is not None:
+        return [_with_accuracy(segment, given) for segment in segments]
+    note = f"map: OpenStreetMap states no accuracy, {OSM_SIGMA_M:g} m in plan is taken (--plan-sigma)"
+    return [
+        _with_accuracy(s, OSM_SIGMA_M, note) if "origin" in s.metadata and "sigma_plan_m" not in s.metadata else s
+        for s in segments
+    ]
+
+
+def _with_accuracy(segment: Segment, sigma_m: float, *notes: str) -> Segment:
+    metadata = segment.metadata | {"sigma_plan_m": f"{sigma_m:g}"}
+    return replace(segment, metadata=metadata, notes=(*segment.notes, *notes))
+
+
+def _segments_of(file: str | PathLike[str], reading: MapReading) -> list[Segment]:
     kind = ending(file)
     if kind == ".csv":
         return [read_csv_segment(file, reading)]

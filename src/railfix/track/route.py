@@ -73,7 +73,6 @@ def join(
     name: str | None = None,
     height_datum_asked: str | None = None,
     max_gap_m: float = MAX_GAP_M,
-    sigma_plan_m: float | None = None,
     sigma_height_m: float | None = None,
 ) -> Track:
     """Join segments in the order of the route to one track; a shared point is kept once.
@@ -101,8 +100,8 @@ def join(
         **{key: joined[key] for key in ATTRIBUTES},
         section=np.repeat(np.arange(len(pieces)), [len(columns["height_m"]) for columns in kept]),
         sections=tuple(piece.source for piece in pieces),
-        sigma_plan_m=_sigma(pieces, "sigma_plan_m", sigma_plan_m, SIGMA_PLAN_M),
-        sigma_height_m=_sigma(pieces, "sigma_height_m", sigma_height_m, SIGMA_HEIGHT_M),
+        sigma_plan_m=stated_sigma(pieces, "sigma_plan_m", None, SIGMA_PLAN_M),
+        sigma_height_m=stated_sigma(pieces, "sigma_height_m", sigma_height_m, SIGMA_HEIGHT_M),
         provenance=Provenance(
             files=_unique(piece.file for piece in pieces),
             crs=", ".join(_unique(piece.crs for piece in pieces)),
@@ -128,7 +127,7 @@ def _unique(values: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(values))
 
 
-def _sigma(pieces: Sequence[Segment], key: str, given: float | None, default: float) -> float:
+def stated_sigma(pieces: Sequence[Segment], key: str, given: float | None, default: float) -> float:
     """Return the accuracy given, else the worst of the files, else the default of P1 4.1(3)."""
     if given is not None:
         return given

@@ -20,6 +20,7 @@ class MapReading:
     height_datum: str | None = None
     geoid: str | None = None
     duplicates: str = "reject"
+    sigma_plan_m: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +41,7 @@ class Segment:
     frame : str
         Geographic CRS of the coordinates here.
     metadata : dict of str
-        Name and accuracy, where the file has them.
+        Name, accuracy and origin, where the file has them.
     notes : tuple of str
     """
 

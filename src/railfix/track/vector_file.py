@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from os import PathLike
 from typing import Any, Final
@@ -21,6 +21,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import ending, open_stream
 from railfix.track.crs import frame_degrees, older_datum_note, unit_of_heights, used_crs
 from railfix.track.heights import check_height_datum, stated_heights
+from railfix.track.openstreetmap import is_of_openstreetmap, metadata_of, no_track, read_osm_xml, with_left_out
 from railfix.track.segment import ATTRIBUTES, NO_HEIGHTS, MapReading, Segment
 from railfix.track.track import UNNAMED
 
@@ -31,14 +32,6 @@ INSTALL: Final = "install it with: pip install 'railfix[maps]'"
 _LOOKED_AT: Final = 1 << 20
 #: Columns that name a line, in this order.
 _NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")
-#: Values of OpenStreetMap's tag railway that are tracks on which trains run.
-_OSM_RAILWAYS: Final = ("rail", "light_rail", "subway", "tram", "narrow_gauge", "preserved", "monorail")
-#: Values of that tag that are no such tracks, by which a feature of OpenStreetMap is known.
-_OSM_OTHERS: Final = (
-    "abandoned", "construction", "disused", "dismantled", "demolished", "funicular", "historic", "loading_ramp",
-    "miniature", "planned", "platform", "platform_edge", "proposed", "razed", "removed", "station", "traverser",
-    "turntable", "yard",
-)  # fmt: skip
 
 
 def read_layers(path: str | PathLike[str], *, geometry: str) -> list[tuple[str | None, list[dict[str, Any]], Any]]:
@@ -80,7 +73,7 @@ def read_layers(path: str | PathLike[str], *, geometry: str) -> list[tuple[str |
 def _check_text(path: str | PathLike[str]) -> None:
     """Reject coordinates that GDAL reads as others: decimal commas, heights above the ground."""
     kind = ending(path)
-    if kind not in (".osm", ".gpx", ".kml"):
+    if kind not in (".gpx", ".kml"):
         return
     with open_stream(path, content="bytes") as stream:
         text = stream.read(_LOOKED_AT)
@@ -101,22 +94,31 @@ def read_vector_segments(path: str | PathLike[str], reading: MapReading) -> list
     check_height_datum(reading.height_datum)
     segments: list[Segment] = []
     left_out: Counter[str] = Counter()
-    for named, rows, shapes in read_layers(path, geometry="LineString"):
+    for named, rows, parts in _features(path):
         of_layer = replace(reading, crs=used_crs(path, reading.crs, named))
-        for row, shape in zip(rows, shapes, strict=True):
+        for row, lines in zip(rows, parts, strict=True):
             if why := no_track(row, of_openstreetmap=is_of_openstreetmap(row)):
                 left_out[why] += 1
                 continue
-            for k, part in enumerate(shape.geoms if shape.geom_type.startswith("Multi") else [shape]):
-                name = name_of(row, fallback=f"line {len(segments) + 1}") + (f", part {k + 1}" if k else "")
-                points = np.array(part.coords, dtype=np.float64)
-                segments.append(plan_segment(points, of_layer, path=str(path), name=name, stated=_accuracy(row)))
-    notes = left_out_note(path, left_out)
-    segments[:1] = [replace(s, notes=(*s.notes, *notes)) for s in segments[:1]]
-    if not segments:
-        why = "".join(f" ({note})" for note in notes)
-        raise InputFileError(path, f"there is no line in this file; a track map needs LineStrings{why}")
-    return segments
+            stated = metadata_of(row) | _accuracy(row)
+            own = stated.get("name") or name_of(row, fallback=f"line {len(segments) + 1}")
+            for k, points in enumerate(lines):
+                name = own + (f", part {k + 1}" if k else "")
+                segments.append(plan_segment(points, of_layer, path=str(path), name=name, stated=stated))
+    return with_left_out(path, segments, left_out)
+
+
+def _features(
+    path: str | PathLike[str],
+) -> Iterator[tuple[str | None, list[dict[str, Any]], list[list[Floats]]]]:
+    """CRS, columns and lines of the features of each layer; of OSM XML without GDAL, which needs sorted nodes."""
+    if ending(path) == ".osm":
+        ways = read_osm_xml(path)
+        yield "EPSG:4326", [way.row for way in ways], [[way.points_deg] for way in ways]
+        return
+    for named, rows, shapes in read_layers(path, geometry="LineString"):
+        lines = [s.geoms if s.geom_type.startswith("Multi") else [s] for s in shapes]
+        yield named, rows, [[np.array(part.coords, dtype=np.float64) for part in own] for own in lines]
 
 
 def _accuracy(row: Mapping[str, Any]) -> dict[str, str]:
@@ -166,7 +168,7 @@ def plan_segment(
         frame=frame if crs else "EPSG:4979",
         height_datum=datum,
         geoid=model,
-        metadata={"name": name, **(stated or {})},
+        metadata={**(stated or {}), "name": name},
         notes=older_datum_note(crs),
         **dict.fromkeys(ATTRIBUTES, np.full(len(values), np.nan)),
     )
@@ -180,33 +182,3 @@ def name_of(row: Mapping[str, Any], *, fallback: str) -> str:
         if value is not None and value == value and str(value) not in ("", "nan"):
             return str(value)
     return fallback
-
-
-def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
-    """Why a feature is no track: of OpenStreetMap those not tagged as railways that run; empty for tracks."""
-    railway = _railway(row)
-    if railway in _OSM_RAILWAYS or not (of_openstreetmap or railway in _OSM_OTHERS):
-        return ""
-    return f"railway={railway}" if railway else "no railway"
-
-
-def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
-    """Whether a feature is one of OpenStreetMap, as GDAL, osmtogeojson and Overpass write them."""
-    names = (str(row.get(key) or "") for key in ("@id", "id"))
-    return "osm_id" in row or any(re.fullmatch(r"(way|relation|node)/\d+", name) for name in names)
-
-
-def _railway(row: Mapping[str, Any]) -> str | None:
-    tags, railway = row.get("other_tags"), row.get("railway")
-    if railway is None and isinstance(row.get("tags"), dict):
-        railway = row["tags"].get("railway")
-    if railway is None and isinstance(tags, str) and '"railway"=>"' in tags:
-        railway = tags.split('"railway"=>"', 1)[1].split('"', 1)[0]
-    return railway if isinstance(railway, str) and railway else None
-
-
-def left_out_note(path: str | PathLike[str], reasons: Counter[str]) -> tuple[str, ...]:
-    """A note on the lines of a file that are no tracks."""
-    if not reasons:
-        return ()
-    return (f"{path}: lines left out that are no tracks: " + ", ".join(f"{n} {why}" for why, n in reasons.items()),)
