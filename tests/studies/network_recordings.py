@@ -2,8 +2,8 @@
 
 ``python tests/studies/network_recordings.py`` prints them. The logs name no tracks, and even fixed positions
 (NARROW_INT3) lie metres from the centrelines of the map, so that the track is known of some positions only: of fixed
-ones nearer than 1.5 m to one track, with the next at least 2 m farther, and at a steady distance from it. Beside the log as it is, the same positions
-with errors like those of a single receiver (2 m, lasting 30 s) are matched.
+ones nearer than 1.5 m to one track, with the next at least 2 m farther, and at a steady distance from it. Beside the
+log as it is, the same positions with errors like those of a single receiver (2 m, lasting 30 s) are matched.
 """
 
 from __future__ import annotations

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import networkx as nx
 import numpy as np
 import pytest
 
 from network_made import made_network
+from network_recordings import COLUMNS
 from railfix.track.network import Candidates, Network
 from railfix.track.network_fill import fill_gaps
-from railfix.track.network_match import Matched
+from railfix.track.network_match import Matched, match, read_plan_positions
+from railfix.track.network_read import read_network
 
 pytestmark = pytest.mark.requirement("A10")
 
@@ -73,3 +76,25 @@ def test_no_route_or_positions_off_the_map_leave_the_gap() -> None:
     assert (filled.track[1], filled.chainage_m[1], filled.bound_m[1]) == (0, 150.0, 50.0)
     off_map = replace(matched, probability=np.array([1.0, 0.0, 1.0]))
     assert not fill_gaps(net, off_map, time).filled.any()
+    assert fill_gaps(net, off_map, time, rows_to_fill="off-map").filled.tolist() == [False, True, False]
+
+
+def test_the_tunnel_of_the_measuring_train_is_filled_as_networkx_finds_it(recordings: Path) -> None:
+    """In the tunnel of the airport positions drift by up to 300 m; before and after it the track is known."""
+    folder = recordings / "rail" / "infrabel"
+    net = read_network([folder / "network_airport.geojson"])
+    log = read_plan_positions(folder / "log_28573_L36-A_to_L36C-A_to_L25N-B.csv", columns=COLUMNS)
+    matched = match(net, log)
+    assert (matched.track < 0).mean() > 0.5
+    filled = fill_gaps(net, matched, log.time, rows_to_fill="off-map")
+    assert (filled.track >= 0).all()
+    first, *_, last = np.flatnonzero(filled.filled)
+    before, after = first - 1, last + 1
+    places = (
+        int(matched.track[before]),
+        matched.chainage_m[before],
+        int(matched.track[after]),
+        matched.chainage_m[after],
+    )
+    way = np.linalg.norm(np.diff(net.course_on(filled.track, filled.chainage_m)[0][before : after + 1], axis=0), axis=1)
+    assert way.sum() == pytest.approx(_shortest_m(net, *places), rel=0.01)

@@ -20,7 +20,7 @@ from railfix.run.options import ColumnNames, TrackReading
 from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network
 from railfix.track.network_check import check_network
-from railfix.track.network_fill import fill_gaps
+from railfix.track.network_fill import Filled, Rows, fill_gaps
 from railfix.track.network_match import Matched, PlanLog, match, read_plan_positions
 from railfix.track.network_read import TOLERANCE_M, read_network
 from railfix.track.network_route import route_of
@@ -85,6 +85,11 @@ class MatchOptions(Settings):
         None,
         metavar="M",
         gt=0.0,
+    )
+    fill: Rows = option(
+        "Rows between known places that are put on the shortest route: gaps, those without position; or off-map, also "
+        "those whose positions lie off the map, as in a tunnel.",
+        "gaps",
     )
     picture: Path | None = option("Picture to write (.png or .svg).", None, metavar="FILE")
     page: Path | None = option("Page to look at: plan to zoom, switches, faults, tables.", None, metavar="FILE.html")
@@ -264,7 +269,9 @@ def match_command(
     matched = match(net, positions, sigma_m=options.sigma, within_m=options.within)
     if not (matched.track >= 0).any():
         raise MismatchError(f"{log}: no position lies near a track of the network; is it the map of this region?")
-    write_whole(out, _matched_csv(net, positions, matched))
+    write_whole(
+        out, _matched_csv(net, positions, matched, fill_gaps(net, matched, positions.time, rows_to_fill=options.fill))
+    )
     console = console_of_tables()
     on = matched.track >= 0
     console.print(
@@ -285,9 +292,8 @@ def match_command(
     console.print(f"positions: {out}", markup=False, soft_wrap=True)
 
 
-def _matched_csv(net: Network, log: PlanLog, matched: Matched) -> str:
+def _matched_csv(net: Network, log: PlanLog, matched: Matched, filled: Filled) -> str:
     names = (*net.names, "")
-    filled = fill_gaps(net, matched, log.time)
     kilometrage = net.kilometrage_on(filled.track, filled.chainage_m)
     other = np.where(matched.candidates.track == matched.track[:, None], -1.0, matched.probabilities)
     second = np.argmax(other, axis=1)

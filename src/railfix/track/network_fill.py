@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.track.network import Network
 from railfix.track.network_match import Matched
+
+#: Rows between known places that are filled: those without position, or also those whose positions lie off the map.
+Rows = Literal["gaps", "off-map"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,17 +39,18 @@ class Filled:
         return np.isfinite(self.bound_m)
 
 
-def fill_gaps(network: Network, matched: Matched, time: Datetimes) -> Filled:
+def fill_gaps(network: Network, matched: Matched, time: Datetimes, *, rows_to_fill: Rows = "gaps") -> Filled:
     """Fill rows without usable position between known places: shortest route, even speed (by rows without times).
 
-    A gap with positions that lie off the map is left as it is: the train may have left the map there.
+    A gap with positions that lie off the map is left as it is, as the train may have left the map there; unless
+    `rows_to_fill` is "off-map", as in a tunnel, where positions drift.
     """
     track, chainage = matched.track.copy(), matched.chainage_m.copy()
     bound = np.full(len(track), np.nan)
     known = np.flatnonzero(track >= 0)
     for i in np.flatnonzero(np.diff(known) > 1):
         first, last = known[i], known[i + 1]
-        if not np.isnan(matched.probability[first + 1 : last]).all():
+        if rows_to_fill == "gaps" and not np.isnan(matched.probability[first + 1 : last]).all():
             continue
         legs = _legs(network, int(track[first]), chainage[first], int(track[last]), chainage[last])
         if legs is None:
