@@ -22,6 +22,7 @@ from railfix.evaluate.run_folder import read_run
 from railfix.pipeline.config import Config
 from railfix.run import RunInputs, RunOptions, RunSummary, TrackReading, run_files
 from railfix.run.driver import open_inputs
+from railfix.run.inputs import OF_LOG
 from railfix.run.sources import open_line
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from railfix.track import read_track
@@ -182,7 +183,7 @@ def test_without_a_log_a_network_is_a_sentence(tmp_path: Path) -> None:
 
 def test_a_network_elsewhere_is_a_sentence(tmp_path: Path, recordings: Path) -> None:
     folder = recordings / "rail" / "infrabel"
-    inputs = demo_inputs().replaced(track=(folder / "network_airport.geojson",))
+    inputs = demo_inputs().replaced(track=(folder / "network_airport.geojson",), heights=OF_LOG)
     with pytest.raises(MismatchError, match=r"the map lies \d+ km from where the log was recorded"):
         run_files(inputs, Config(filter="off"), out=tmp_path / "results")
 

@@ -17,6 +17,8 @@ from railfix.core.files import ending, read_text
 from railfix.track.geojson_file import RELATION
 from railfix.track.network import Link, Network, end_points
 from railfix.track.read import read_segments
+from railfix.track.rinf_file import FORMATS as RDF_FORMATS
+from railfix.track.rinf_file import read_rinf_relations
 from railfix.track.route import first_gap, orient
 from railfix.track.segment import MapReading, Segment
 from railfix.track.vector_file import read_layers
@@ -60,6 +62,8 @@ def _relations(path: str | PathLike[str]) -> list[Relation]:
     """Connections that a file states, empty where it states none."""
     if ending(path) in (".xml", ".railml"):
         return read_railml_relations(path)
+    if ending(path) in RDF_FORMATS:
+        return read_rinf_relations(path)
     if ending(path) not in (".geojson", ".json", ".gpkg", ".fgb"):
         return []
     if "json" in ending(path) and RELATION not in read_text(path):

@@ -15,6 +15,8 @@ from railfix.track.geojson_file import read_geojson_segments
 from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
 from railfix.track.heights import GEOIDS, check_height_datum
 from railfix.track.openstreetmap import SIGMA_M as OSM_SIGMA_M
+from railfix.track.rinf_file import FORMATS as RDF_FORMATS
+from railfix.track.rinf_file import read_rinf_segments
 from railfix.track.route import MAX_GAP_M, join
 from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
 from railfix.track.track import Track
@@ -173,7 +175,11 @@ def _with_accuracy(segment: Segment, sigma_m: float, *notes: str) -> Segment:
 def _segments_of(file: str | PathLike[str], reading: MapReading) -> list[Segment]:
     kind = ending(file)
     if kind == ".csv":
-        return [read_csv_segment(file, reading)]
+        from railfix.track.mate_file import is_mate, read_mate_segments
+
+        return read_mate_segments(file, reading) if is_mate(file) else [read_csv_segment(file, reading)]
+    if kind in RDF_FORMATS:
+        return read_rinf_segments(file, reading)
     if kind in (".geojson", ".json"):
         return read_geojson_segments(file, reading)
     if kind in VECTOR_ENDINGS:
@@ -188,5 +194,6 @@ def _segments_of(file: str | PathLike[str], reading: MapReading) -> list[Segment
         return read_xml_segments(file, reading)
     raise InputFileError(
         file,
-        "a track map ends in .csv, .geojson or .json, .ifc, .xml, .landxml, .railml, " + ", ".join(VECTOR_ENDINGS),
+        "a track map ends in .csv, .geojson or .json, .ifc, .xml, .landxml, .railml, "
+        + ", ".join((*VECTOR_ENDINGS, *RDF_FORMATS)),
     )

@@ -1,0 +1,224 @@
+"""Track tables of EGNSS MATE: edges of lines, circles and clothoids, with gradients and cant.
+
+`S_DM_TRACK_SEGMENT_POSITION` as CSV, and beside it, where they are, `S_DM_TRACK_SEGMENT_GRADIENT` and
+`S_DM_TRACK_SEGMENT_CANT` (https://github.com/EGNSS-MATE/egnss-mate-schematics). A line begins at a point with an
+azimuth; a circle is given by its centre and the arc from its north pole, a clothoid by its point without curvature,
+the azimuth there and the arc from it. The tables do not say which side is positive, nor whether the constant of a
+clothoid is its parameter A, radius times length, or the change of curvature: the form is taken in which a segment
+meets those before and after it on its edge.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise, product
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from railfix.core.errors import InputFileError
+from railfix.core.files import text_lines
+from railfix.io.named_columns import read_named_columns
+from railfix.track.crs import used_crs
+from railfix.track.design import segment_of_design
+from railfix.track.elements import CantElement, PlanElement, ProfileElement
+from railfix.track.segment import MapReading, Segment
+
+_POSITION: Final = "S_DM_TRACK_SEGMENT_POSITION"
+_GRADIENT: Final = "S_DM_TRACK_SEGMENT_GRADIENT"
+_CANT: Final = "S_DM_TRACK_SEGMENT_CANT"
+#: Segments of an edge that are further apart than this do not meet [m].
+_MEETS_M: Final = 0.5
+Row = dict[str, str]
+
+
+def is_mate(path: str | PathLike[str]) -> bool:
+    """Whether a CSV is a table of positions of track segments, by its header."""
+    head = next(iter(text_lines(path)), "").upper()
+    return "TRACK_EDGE_ID" in head and "TRACK_SEGMENT_TYPE" in head
+
+
+def read_mate_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
+    """Read the edges of the tables as segments, in the order of the file.
+
+    InputFileError: when a row lacks what its type needs, or the segments of an edge do not meet.
+    """
+    gradients, cants = (_rows(path, name) for name in (_GRADIENT, _CANT))
+    found = []
+    for edge, rows in _rows(path, None).items():
+        cell = rows[0].get("UTM_CELL", "")
+        of_edge = replace(reading, crs=used_crs(path, reading.crs, _crs_of(cell)), height_datum="ellipsoidal")
+        plan = _plan(str(path), edge, rows)
+        profile = [_profile(str(path), row) for row in gradients.get(edge, [])]
+        cant = [_cant(str(path), row, plan) for row in cants.get(edge, [])]
+        found.append(
+            segment_of_design(path=str(path), name=edge, plan=plan, profile=profile, cant=cant, reading=of_edge)
+        )
+    return found
+
+
+def _rows(path: str | PathLike[str], table: str | None) -> dict[str, list[Row]]:
+    """Rows of each edge by their distance from its start; of another table beside the file where it is there."""
+    file = Path(path)
+    if table is not None:
+        names = {entry.name.upper(): entry for entry in file.parent.iterdir()}
+        wanted = file.name.upper().replace(_POSITION, table)
+        if _POSITION not in file.name.upper() or wanted not in names:
+            return {}
+        file = names[wanted]
+    columns = read_named_columns(file)
+    names_of = {name.upper(): name for name in columns.cells}
+    edges: dict[str, list[Row]] = {}
+    for values in zip(*(columns.cells[name] for name in names_of.values()), strict=True):
+        row = {name: str(v).strip() for name, v in zip(names_of, values, strict=True) if v is not None}
+        edges.setdefault(row.get("TRACK_EDGE_ID", ""), []).append(row)
+    return {
+        edge: sorted(rows, key=lambda row: _number(str(file), row, "TRACK_SEGMENT_REFERENCE_POSITION"))
+        for edge, rows in edges.items()
+    }
+
+
+def _number(path: str, row: Row, name: str) -> float:
+    try:
+        return float(row.get(name, ""))
+    except ValueError:
+        edge, kind = row.get("TRACK_EDGE_ID", ""), row.get("TRACK_SEGMENT_TYPE", "")
+        raise InputFileError(
+            path, f"edge {edge!r}: a {kind} has {name} {row.get(name, '')!r}; a number was expected"
+        ) from None
+
+
+def _crs_of(cell: str) -> str | None:
+    """CRS of a UTM cell ("32T"), or of the Swiss grid."""
+    if cell.strip().upper() == "LV95":
+        return "EPSG:2056"
+    zone = re.fullmatch(r"\s*(\d{1,2})\s*([C-X])?\s*", cell.upper())
+    if zone is None:
+        return None
+    return f"EPSG:{(327 if (zone[2] or 'N') < 'N' else 326)}{int(zone[1]):02d}"
+
+
+def _plan(path: str, edge: str, rows: Sequence[Row]) -> list[PlanElement]:
+    """Elements of an edge, of each row the form that meets its neighbours best."""
+    forms = [_forms(path, row) for row in rows]
+    # the cheapest sequence of forms, by the gaps at their joints
+    cost, back = np.zeros(len(forms[0])), []
+    for before, after in pairwise(forms):
+        gaps = np.array([[_gap(a, b) for a in before] for b in after])
+        total = gaps + cost
+        back.append(np.argmin(total, axis=1))
+        cost = total.min(axis=1)
+    chosen = [int(np.argmin(cost))]
+    for column in reversed(back):
+        chosen.append(int(column[chosen[-1]]))
+    plan = [options[k] for options, k in zip(forms, reversed(chosen), strict=True)]
+    for number, (before, after) in enumerate(pairwise(plan), start=2):
+        if (gap := _gap(before, after)) > _MEETS_M:
+            raise InputFileError(path, f"edge {edge!r}: segment {number} begins {gap:.2f} m from the one before it")
+    return plan
+
+
+def _end(element: PlanElement) -> tuple[np.ndarray, float]:
+    way = np.array([element.length_m])
+    return element.place_at(way)[0], float(element.direction_at(way)[0])
+
+
+def _gap(before: PlanElement, after: PlanElement) -> float:
+    """Distance between the end of an element and the start of the next, and of their directions over 10 m."""
+    place, direction = _end(before)
+    turn = np.angle(np.exp(1j * (direction - after.direction_rad)))
+    return float(np.hypot(*(place - (after.x_m, after.y_m))) + 10.0 * abs(turn))
+
+
+def _forms(path: str, row: Row) -> list[PlanElement]:
+    """Elements that a row may mean, the likeliest first."""
+    kind = row.get("TRACK_SEGMENT_TYPE", "").lower()
+    east, north, length = (_number(path, row, name) for name in ("EAST", "NORTH", "TRACK_SEGMENT_LENGTH"))
+    if kind == "line":
+        azimuth = _number(path, row, "AZIMUTH")
+        forms = [_element(east, north, azimuth, 0.0, 0.0, length)]
+    elif kind == "circle":
+        radius, arc = _number(path, row, "RADIUS"), _number(path, row, "INITIAL_ARC_LENGTH")
+        forms = []
+        for side, turned in product((np.sign(radius), -np.sign(radius)), (0.0, np.pi)):
+            angle = side * arc / abs(radius) + turned
+            x, y = east + abs(radius) * np.sin(angle), north + abs(radius) * np.cos(angle)
+            bend = side / abs(radius)
+            forms.append(_element(x, y, angle + side * np.pi / 2.0, bend, bend, length))
+    elif kind == "clothoid":
+        azimuth, arc, constant = (
+            _number(path, row, name) for name in ("AZIMUTH", "INITIAL_ARC_LENGTH", "CLOTHOID_CONSTANT")
+        )
+        size, side = abs(constant), np.sign(constant)
+        sizes = (size**-2, 1.0 / size, size) if size >= 1.0 else (size, size**-2, 1.0 / size)
+        rates = [s * rate for rate, s in product(sizes, (side, -side)) if rate * (abs(arc) + length) < 0.1]
+        forms = [_clothoid(east, north, azimuth, rate, arc, length) for rate in rates]
+    else:
+        raise InputFileError(path, f"a segment is a {kind!r}; line, circle and clothoid are read")
+    if not forms:
+        raise InputFileError(path, f"edge {row.get('TRACK_EDGE_ID')!r}: its clothoid has a radius below 10 m")
+    return [_turned(form) for form in forms] if _number(path, row, "TRACK_SEGMENT_DIRECTION") < 0.0 else forms
+
+
+def _element(x: float, y: float, azimuth: float, first: float, last: float, length: float) -> PlanElement:
+    """An element by azimuth and curvature clockwise, as a design has them counter-clockwise from the easting."""
+    direction = np.pi / 2.0 - azimuth
+    return PlanElement(x_m=x, y_m=y, direction_rad=direction, first=-first, last=-last, length_m=length)
+
+
+def _clothoid(east: float, north: float, azimuth: float, rate: float, arc: float, length: float) -> PlanElement:
+    """The part of a clothoid from an arc from its point without curvature on."""
+    if arc == 0.0:
+        return _element(east, north, azimuth, 0.0, rate * length, length)
+    # back from the origin a clothoid has the same curvature to the other side, and runs the other way
+    way = _element(east, north, azimuth if arc > 0.0 else azimuth + np.pi, 0.0, rate * abs(arc), abs(arc))
+    (x, y), _ = _end(way)
+    return _element(x, y, azimuth + rate * arc**2 / 2.0, rate * arc, rate * (arc + length), length)
+
+
+def _turned(element: PlanElement) -> PlanElement:
+    """An element from its end to its start."""
+    (x, y), direction = _end(element)
+    return replace(
+        element, x_m=float(x), y_m=float(y), direction_rad=direction + np.pi, first=-element.last, last=-element.first
+    )
+
+
+def _profile(path: str, row: Row) -> ProfileElement:
+    start, length, height, gradient = (
+        _number(path, row, name)
+        for name in ("TRACK_SEGMENT_REFERENCE_POSITION", "TRACK_SEGMENT_LENGTH", "INITIAL_HEIGHT", "GRADIENT")
+    )
+    first = last = gradient * 1e-3
+    if row.get("TRACK_SEGMENT_TYPE", "").lower() == "circle":
+        sine = np.sin(np.arctan(first)) + length / _number(path, row, "RADIUS")
+        last = float(np.tan(np.arcsin(sine)))
+    element = ProfileElement(start_m=start, length_m=length, height_m=height, first=first, last=last, arc="circle")
+    if _number(path, row, "TRACK_SEGMENT_DIRECTION") < 0.0:
+        end = float(element.height_at(np.array([start + length]))[0])
+        element = replace(element, height_m=end, first=-last, last=-first)
+    return element
+
+
+def _cant(path: str, row: Row, plan: Sequence[PlanElement]) -> CantElement:
+    """The outer rail above the inner one, about the middle, on the side of the sharpest curve within the element."""
+    start, length, first, last = (
+        _number(path, row, name)
+        for name in ("TRACK_SEGMENT_REFERENCE_POSITION", "TRACK_SEGMENT_LENGTH", "INITIAL_CANT", "END_CANT")
+    )
+    if _number(path, row, "TRACK_SEGMENT_DIRECTION") < 0.0:
+        first, last = last, first
+    starts = np.cumsum([0.0, *(element.length_m for element in plan)])
+    bends = [
+        bend
+        for element, low in zip(plan, starts, strict=False)
+        if low < start + length and low + element.length_m > start
+        for bend in (element.first, element.last)
+    ]
+    side = 0.5 * float(np.sign(max(bends, key=abs, default=0.0)))
+    ends = (abs(first) * side, abs(last) * side)
+    return CantElement(start_m=start, length_m=length, left_m=(-ends[0], -ends[1]), right_m=ends)
