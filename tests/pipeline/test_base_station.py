@@ -7,12 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+import base_score
 import recordings_truth
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
+from railfix.core.timescale import GPS_EPOCH
 from railfix.evaluate import along_track_error, interpolate_reference
 from railfix.gnss.observations import Observations
 from railfix.io.rinex import read_navigation, read_observations
+from railfix.live.engine import LiveEngine
+from railfix.live.settings import LiveSettings
+from railfix.live.stream import single_epochs
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import AntennaResult, EpochProcessor
 from railfix.pipeline.results import State
@@ -100,6 +105,46 @@ def test_a_position_of_the_stream_is_taken_from_its_headers(drive: Drive) -> Non
     errors = base_errors(state)
     assert errors is not None
     assert len(errors) == 1  # the one before was of another place
+
+
+@pytest.mark.requirement("A12")
+def test_integers_of_two_antennas_on_a_roof_are_right(recordings: Path) -> None:
+    """Also where the first places are off by decimetres, as codes are; the map is stated as 0.05 m and right."""
+    case = next(case for case in base_score.cases(recordings) if case.name.startswith("roof"))
+    processor = EpochProcessor(
+        parse_config({
+            "filter": "off", "carrier": "fixed", "elevation": {"mask_deg": 15.0}, "map_plan_sigma_m": 0.05,
+            "map_height_sigma_m": 0.05,
+        }),
+        {"front": case.trajectory}, navigation=case.navigation, base_ecef_m=case.base_ecef_m,
+    )  # fmt: skip
+    result, _ = processor.process({"front": case.train[:40]}, base=case.base[:40])
+    phase = result.antennas["front"].phase
+    assert phase is not None
+    fixed = phase.n_fixed > 0
+    assert fixed.sum() >= 20
+    error = along_track_error(phase.arc_m, case.reference[:40], case.trajectory)
+    assert np.abs(error[fixed]).max() < 0.02
+
+
+@pytest.mark.slow
+def test_a_live_engine_gives_the_same(drive: Drive) -> None:
+    (whole,) = drive.run(base=True, protection="off", carrier="smoothed")
+    config = parse_config(
+        {"filter": "off", "elevation": {"mask_deg": 15.0}, "protection": "off", "carrier": "smoothed"}
+    )
+    processor = EpochProcessor(config, {"front": drive.trajectory}, navigation=drive.navigation, base_ecef_m=PLACE)
+    engine, found = LiveEngine(processor, LiveSettings(period_s=1.0, no_input="skip")), []
+    for k in range(12):
+        for part in single_epochs(drive.base[k : k + 1]):
+            engine.add_base(part)
+            engine.add_base(part)  # repeated by the caster
+        (epoch,) = single_epochs(drive.train[k : k + 1])
+        tag_ns = int((epoch.time[0] - GPS_EPOCH).astype(np.int64))
+        engine.push("front", epoch, now_ns=tag_ns)
+        found += [output.result.antennas["front"].arc_m[-1] for output in engine.poll(now_ns=tag_ns) if output.result]
+    np.testing.assert_allclose(found, whole.arc_m[:12], atol=1e-6)
+    assert engine.counts["base station out of order"] == 12
 
 
 def base_errors(state: State) -> BaseErrors | None:

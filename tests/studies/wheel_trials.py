@@ -34,7 +34,9 @@ _PULLS: Final = 10
 #: The attack begins within these epochs.
 _FIRST, _LAST = 60, 80
 #: Seeds of the clean rides with drawn slips and slides.
-_RIDES: Final = (1, 2)
+_RIDES: Final = (1,)
+#: A tachometer on a wheel whose diameter is wrong by 0.2 %.
+_WHEEL: Final = {"tachometer": {"diameter_error_m": 0.002, "jitter_s": 2e-6}, "inertial": None, "radar": None}
 
 
 def scene_of(ride: Ride) -> Scene:
@@ -53,7 +55,7 @@ def exceeded(ride: Ride, found: AlongTrack) -> int:
 def pulls() -> str:
     rng, delays, errors, early, over, unseen = np.random.default_rng(7), [], [], 0, 0, 0
     for seed in _SEEDS:
-        ride = sensed_ride.made(load_recipe("demo").scenario().replaced(seed=seed, rate_hz=1.0))
+        ride = sensed_ride.made(load_recipe("demo").scenario().replaced(seed=seed, rate_hz=1.0, sensors=_WHEEL))
         scene = scene_of(ride)
         for at in rng.integers(_FIRST, _LAST, _PULLS).tolist():
             attacked = signal_attacks.pulled(scene, at, rng.choice([-0.5, 0.5]), rng=rng)
@@ -113,7 +115,7 @@ def smartloc() -> str:
 def main() -> int:
     print(f"{'without an attack':34} {'epochs':>6} {'compared':>9} {'alarms':>7} {'largest [m]':>12}", flush=True)
     for seed in _SEEDS:
-        demo = load_recipe("demo").scenario().replaced(seed=seed, rate_hz=1.0)
+        demo = load_recipe("demo").scenario().replaced(seed=seed, rate_hz=1.0, sensors=_WHEEL)
         print(clean(demo, f"demonstration, seed {seed}"), flush=True)
     if paths.DATA.is_dir():
         print(smartloc(), flush=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -13,6 +13,7 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Strings
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 
+Values = TypeVar("Values", Floats, Integers)
 #: An epoch of the base station counts for those of the train up to this time before it [s]: clocks of receivers differ.
 _SAME_S: Final = 0.05
 
@@ -162,7 +163,7 @@ class BaseErrors:
         )
 
 
-def _on(values: Floats, own: Sequence[tuple[str, str]], keys: Sequence[tuple[str, str]], blank: float) -> Floats:
+def _on(values: Values, own: Sequence[tuple[str, str]], keys: Sequence[tuple[str, str]], blank: float) -> Values:
     """Return values of channels on those of another list."""
     place = {key: k for k, key in enumerate(keys)}
     columns: Indices = np.array([place[key] for key in own], dtype=np.intp)

@@ -192,7 +192,7 @@ def _segment(
     floats = (np.zeros((count, count)), np.zeros(count))
     if len(value):
         floats = covariance[-1, :count, :count].copy(), value[-1, :count, 0].copy()
-    fixes = _fix_epochs(value, covariance, index, phases, trajectory, limits)
+    fixes = _fix_epochs((base, value, covariance), index, phases, trajectory, limits)
     among = covariance[row[:, None], index[:, :, None], index[:, None, :]]
     before = np.asarray([memory.time], dtype="datetime64[ns]")
     repeats = repeats_of(np.concatenate([before, inputs.time]), limits)[1:]
@@ -220,9 +220,13 @@ def _segment(
 
 
 def _fix_epochs(
-    value: Floats, covariance: Floats, index: Indices, phases: Phases, trajectory: Trajectory, limits: PhaseLimits
+    floats: tuple[Floats, Floats, Floats], index: Indices, phases: Phases, trajectory: Trajectory, limits: PhaseLimits
 ) -> tuple[Integers, Floats]:
-    """Fix ambiguities in place, epoch by epoch; return how many differences, and the risk."""
+    """Fix ambiguities in place, epoch by epoch; return how many differences, and the risk.
+
+    `floats`: first values of the ambiguities, corrections to them with their responses to the map, and covariances.
+    """
+    first, value, covariance = floats
     count, risk = np.zeros(len(index), dtype=np.int64), np.full(len(index), np.nan)
     integers = phases.integers
     if integers is None:
@@ -230,13 +234,16 @@ def _fix_epochs(
     for k, arcs in enumerate(index):
         used = np.flatnonzero(phases.weight[k] > 0)
         at = arcs[used]
+        whole = value[k, at]
+        whole[:, 0] += first[at]
         fixed = fix_integers(
-            value[k, at], covariance[k][np.ix_(at, at)], phases.weight[k, used],
+            whole, covariance[k][np.ix_(at, at)], phases.weight[k, used],
             IntegerChannels(wavelength_m=integers.wavelength_m[used], group=integers.group[used]),
             (trajectory.sigma_plan_m, trajectory.sigma_height_m),
             largest_risk=limits.integer_risk, no_integer_prior=limits.no_integer_prior,
         )  # fmt: skip
         value[k, at], covariance[k][np.ix_(at, at)] = fixed.value_m, fixed.covariance_m2
+        value[k, at, 0] -= first[at]
         count[k], risk[k] = fixed.count, fixed.risk
     return count, risk
 
