@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from functools import cached_property
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -59,6 +60,25 @@ class Provenance:
     height_datum_used: str = "ellipsoidal"
     geoid: str = ""
     notes: tuple[str, ...] = ()
+
+
+class TrackFields(TypedDict, total=False):
+    """Fields of `Track` beside its coordinates.
+
+    Attributes of points (array_like of shape (V,)), sections, accuracy, which is that of a survey unless given, and
+    where it is from.
+    """
+
+    name: str
+    kilometrage_m: ArrayLike | None
+    cant_m: ArrayLike | None
+    radius_m: ArrayLike | None
+    gradient_permille: ArrayLike | None
+    section: ArrayLike | None
+    sections: tuple[str, ...]
+    sigma_plan_m: float
+    sigma_height_m: float
+    provenance: Provenance | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,17 +145,7 @@ class Track(NotebookTable):
         latitude_deg: ArrayLike,
         longitude_deg: ArrayLike,
         height_m: ArrayLike,
-        *,
-        name: str = "track",
-        kilometrage_m: ArrayLike | None = None,
-        cant_m: ArrayLike | None = None,
-        radius_m: ArrayLike | None = None,
-        gradient_permille: ArrayLike | None = None,
-        section: ArrayLike | None = None,
-        sections: tuple[str, ...] = ("track",),
-        sigma_plan_m: float = SIGMA_PLAN_M,
-        sigma_height_m: float = SIGMA_HEIGHT_M,
-        provenance: Provenance | None = None,
+        **attributes: Unpack[TrackFields],
     ) -> Track:
         """Create a track from geodetic coordinates; attributes not given are NaN.
 
@@ -143,59 +153,41 @@ class Track(NotebookTable):
         ----------
         latitude_deg, longitude_deg, height_m : array_like, shape (V,)
             WGS 84, ellipsoidal height.
+        **attributes
+            See `TrackFields`.
 
         Returns
         -------
         Track
         """
+        if unknown := attributes.keys() - TrackFields.__annotations__.keys():
+            raise TypeError(f"a track has no {', '.join(sorted(unknown))}")
         latitude = np.array(latitude_deg, dtype=np.float64)
 
         def floats(values: ArrayLike | None) -> Floats:
             return np.full(latitude.shape, np.nan) if values is None else np.array(values, dtype=np.float64)
 
+        section = attributes.get("section")
         return cls(
-            name=name,
+            name=attributes.get("name", "track"),
             latitude_deg=latitude,
             longitude_deg=floats(longitude_deg),
             height_m=floats(height_m),
-            kilometrage_m=floats(kilometrage_m),
-            cant_m=floats(cant_m),
-            radius_m=floats(radius_m),
-            gradient_permille=floats(gradient_permille),
+            kilometrage_m=floats(attributes.get("kilometrage_m")),
+            cant_m=floats(attributes.get("cant_m")),
+            radius_m=floats(attributes.get("radius_m")),
+            gradient_permille=floats(attributes.get("gradient_permille")),
             section=np.array(np.zeros(latitude.shape) if section is None else section, dtype=np.int64),
-            sections=sections,
-            sigma_plan_m=sigma_plan_m,
-            sigma_height_m=sigma_height_m,
-            provenance=provenance or Provenance(),
+            sections=attributes.get("sections", ("track",)),
+            sigma_plan_m=attributes.get("sigma_plan_m", SIGMA_PLAN_M),
+            sigma_height_m=attributes.get("sigma_height_m", SIGMA_HEIGHT_M),
+            provenance=attributes.get("provenance") or Provenance(),
         )
 
     @classmethod
-    def from_ecef(
-        cls,
-        ecef_m: ArrayLike,
-        *,
-        name: str = "track",
-        kilometrage_m: ArrayLike | None = None,
-        cant_m: ArrayLike | None = None,
-        radius_m: ArrayLike | None = None,
-        sigma_plan_m: float = SIGMA_PLAN_M,
-        sigma_height_m: float = SIGMA_HEIGHT_M,
-        provenance: Provenance | None = None,
-    ) -> Track:
+    def from_ecef(cls, ecef_m: ArrayLike, **attributes: Unpack[TrackFields]) -> Track:
         """Create a track from ECEF points, shape (V, 3) [m]; attributes not given are NaN."""
-        latitude, longitude, height = geodetic_from_ecef(ecef_m)
-        return cls.from_geodetic(
-            latitude,
-            longitude,
-            height,
-            name=name,
-            kilometrage_m=kilometrage_m,
-            cant_m=cant_m,
-            radius_m=radius_m,
-            sigma_plan_m=sigma_plan_m,
-            sigma_height_m=sigma_height_m,
-            provenance=provenance,
-        )
+        return cls.from_geodetic(*geodetic_from_ecef(ecef_m), **attributes)
 
     def __len__(self) -> int:
         return len(self.latitude_deg)

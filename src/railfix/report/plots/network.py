@@ -19,6 +19,8 @@ from railfix.track.network_match import Matched, PlanLog
 _DRAWN: Final = 200_000
 #: Tracks that are named in the plan at most.
 _NAMED: Final = 400
+#: Margin of the view about a run, of its larger extent and at least [m]; names from a track, of the view's extent.
+_MARGIN, _LEAST_VIEW_M, _BESIDE = 0.08, 100.0, 0.03
 _KINDS: Final = {"gap": RED, "joint": RED, "kink": "#e08e0b", "too near": "#7b3294", "dead end": GREY}
 #: Positions by the probability of their track: at least this, and the colour.
 _CLASSES: Final = ((0.99, ORDERED[0]), (0.9, ORDERED[1]), (0.5, ORDERED[3]), (0.0, ORDERED[4]))
@@ -57,7 +59,10 @@ def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[Pl
             layers.append(Points(label=kind, colour=colour, x=place[0], y=place[1], shape="cross", size=7.0))
     if run is not None:
         layers += _positions(at, *run)
-    if len(network.tracks) <= _NAMED:
+    view = None if run is None else _view(at, run[0])
+    if run is not None and view is not None:
+        layers.append(_names_beside(network, at, run[1], view))
+    elif len(network.tracks) <= _NAMED:
         middle = (network.first_point[:-1] + network.first_point[1:]) // 2
         east, north = _local(at, latitude[middle], longitude[middle])
         layers.append(Marks(label="names", colour=BLACK, x=east, y=north, words=network.names, place="on"))
@@ -66,8 +71,38 @@ def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[Pl
         caption += f" Every {nth}th point of a track and its ends are drawn."
     return Chart(
         name="network", title="Tracks", caption=caption, x_label="east [m]", y_label="north [m]", layers=tuple(layers),
-        equal=True,
+        equal=True, x_range=view and view[0], y_range=view and view[1],
     )  # fmt: skip
+
+
+def _view(at: tuple[float, float], log: PlanLog) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """Ranges east and north of the positions with a margin; None without positions."""
+    known = np.isfinite(log.latitude_deg)
+    if not known.any():
+        return None
+    place = np.stack(_local(at, log.latitude_deg[known], log.longitude_deg[known]))
+    low, high = place.min(axis=1), place.max(axis=1)
+    margin = max(_MARGIN * float((high - low).max()), _LEAST_VIEW_M)
+    ranges = [(float(a - margin), float(b + margin)) for a, b in zip(low, high, strict=True)]
+    return ranges[0], ranges[1]
+
+
+def _names_beside(
+    network: Network, at: tuple[float, float], matched: Matched, view: tuple[tuple[float, float], tuple[float, float]]
+) -> Marks:
+    """Names of the tracks that a run has passed, beside the middle of its positions there, on alternating sides."""
+    passed = dict.fromkeys(matched.track[matched.track >= 0].tolist())
+    places = [np.flatnonzero(matched.track == track) for track in passed][:_NAMED]
+    rows = np.array([own[len(own) // 2] for own in places], dtype=np.intp)
+    track = matched.track[rows]
+    points, ahead, _ = network.course_on(track, matched.chainage_m[rows])
+    axes = enu_axes(*at)[:2]
+    (x, y), (dx, dy) = ((values @ axes.T).T for values in (points - ecef_from_geodetic(*at, 0.0), ahead))
+    span = max(high - low for low, high in view)
+    # words are wider than high: farther from a line that runs north
+    away = np.where(np.arange(len(rows)) % 2, -1.0, 1.0) * span * (_BESIDE * np.abs(dx) + 2.0 * _BESIDE * np.abs(dy))
+    words = tuple(network.names[t] for t in track)
+    return Marks(label="names", colour=BLACK, x=x + away * dy, y=y - away * dx, words=words, place="on")
 
 
 def _local(at: tuple[float, float], latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
