@@ -99,7 +99,7 @@ def _tables(folder: Path, side: float, constant: str, *, turned: bool) -> Path:
 
     def clothoid(length: float) -> float:
         product = RADIUS * length
-        return side * {"A": np.sqrt(product), "RL": product, "rate": 1.0 / product}[constant]
+        return side * float({"A": np.sqrt(product), "RL": product, "rate": 1.0 / product}[constant])
 
     # the second clothoid runs to its point without curvature: 80 m before it, or from it back
     back = [4, 0.0, (azimuth[at[4]] + np.pi) % (2.0 * np.pi), -clothoid(80.0), -1]

@@ -14,8 +14,7 @@ from railfix.cli.console import console_of_tables, show_notes
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
 from railfix.core.files import write_whole
-from railfix.core.settings import Settings, option
-from railfix.run.inputs import INPUTS
+from railfix.core.settings import INPUTS, Settings, option
 from railfix.run.options import ColumnNames, TrackReading
 from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network

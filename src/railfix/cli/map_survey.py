@@ -12,9 +12,8 @@ from railfix.cli.console import console_of_tables, show_notes, show_table, show_
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.cli.settings import Choices, settings_of
 from railfix.core.files import BrokenLines
-from railfix.core.settings import Settings, option
+from railfix.core.settings import INPUTS, Settings, option
 from railfix.core.tables import Table, count, number
-from railfix.run.inputs import INPUTS
 from railfix.run.options import ColumnNames, LogReading
 from railfix.track.survey.runs import SurveyLimits
 

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from railfix.core.errors import SettingsError
-from railfix.core.settings import Settings, option, read_toml
+from railfix.core.settings import INPUTS, Settings, option, read_toml
 from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, parse_config
-from railfix.run.inputs import INPUTS
 from railfix.run.processor import with_measured_priors
 
 

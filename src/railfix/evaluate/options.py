@@ -8,9 +8,8 @@ from typing import Annotated, Final, Literal, TypeVar
 
 from pydantic import AfterValidator, Field
 
-from railfix.core.settings import Settings, option
+from railfix.core.settings import INPUTS, Settings, option
 from railfix.evaluate.bracket import LARGEST_GAP_S
-from railfix.run.inputs import INPUTS
 from railfix.run.options import ColumnNames
 
 Method = Literal["chainage", "trajectory"]

@@ -13,11 +13,10 @@ from pydantic import Field
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, RailfixError
-from railfix.core.settings import Settings, option
+from railfix.core.settings import INPUTS, Settings, option
 from railfix.evaluate.along_track import along_track_error, short_way_m, straight_distance
 from railfix.evaluate.options import Method
 from railfix.evaluate.run_folder import RunFolder
-from railfix.run.inputs import INPUTS
 from railfix.run.options import TrackReading
 from railfix.track import Track, read_track
 from railfix.track.track import ANOTHER_PLACE_M

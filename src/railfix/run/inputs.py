@@ -10,15 +10,13 @@ from typing import Any, Literal, Self
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import fingerprint
-from railfix.core.settings import Settings, option
+from railfix.core.settings import INPUTS, Settings, option
 from railfix.io.receiver.recognise import head_of, is_receiver_log
 from railfix.pipeline.config import Config
 
 #: In place of a file: the heights of the log's own positions.
 OF_LOG = Path("log")
 Antenna = Literal["front", "rear"]
-#: Heading of the options that name input files.
-INPUTS = "Inputs"
 
 
 def input_option(text: str, default: Any = ..., *, metavar: str = "FILE") -> Any:

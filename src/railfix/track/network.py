@@ -11,7 +11,7 @@ import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -35,6 +35,8 @@ _NEAR_WAY_M: Final = 5_000.0
 _SAMPLE_M: Final = 50.0
 #: Nearest samples examined for each position at first; more where these do not reach as far as asked.
 _SAMPLES: Final = 32
+#: Positions that are looked up together: of each every sample near it is in memory.
+_TOGETHER: Final = 256
 #: Properties that the connections do not change.
 _OF_POINTS: Final = ("first_point", "points_m", "chainage_m", "length_m", "height_m", "_way", "_index")
 #: Tracks that a message names one by one.
@@ -215,6 +217,19 @@ class Network:
 
     def near(self, latitude_deg: Floats, longitude_deg: Floats, *, within_m: float = 30.0, most: int = 8) -> Candidates:
         """Tracks within a distance in plan of positions, shapes (n,), by a spatial index of all tracks."""
+        parts = [
+            self._near(latitude_deg[k : k + _TOGETHER], longitude_deg[k : k + _TOGETHER], within_m, most)
+            for k in range(0, max(len(latitude_deg), 1), _TOGETHER)
+        ]
+        return Candidates(
+            **{
+                name: np.concatenate([_padded(getattr(part, name), parts, empty) for part in parts])
+                for name, empty in (("track", -1), ("chainage_m", np.nan), ("offset_m", np.inf))
+            }
+        )
+
+    def _near(self, latitude_deg: Floats, longitude_deg: Floats, within_m: float, most: int) -> Candidates:
+        """Some of `near`: arrays have every sample near each position."""
         points = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg)))
         _, segment, of_track, _ = self._index
         usable = ~np.isnan(points[:, 0])
@@ -318,6 +333,12 @@ class Network:
                 return None
             best = reached
         return min(best.values(), key=lambda item: item[0])[1]
+
+
+def _padded(values: Any, parts: Sequence[Candidates], empty: float) -> Any:
+    """Columns of candidates, with empty ones to the most that a part has."""
+    width = max(part.track.shape[1] for part in parts)
+    return np.pad(values, ((0, 0), (0, width - values.shape[1])), constant_values=empty)
 
 
 def end_points(network: Network) -> tuple[Floats, Floats]:

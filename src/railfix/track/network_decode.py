@@ -47,7 +47,7 @@ COMMON_S: Final = 600.0
 _BALLS: Final = 12
 _BALLS_UP: Final = 8
 #: Positions whose probabilities are in memory at a time, where heights do not count.
-_BLOCK: Final = 4096
+_BLOCK: Final = 1024
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ Its ontology (http://data.europa.eu/949/, version 3) has each `LinearElement` wi
 from __future__ import annotations
 
 import re
+import warnings
 from functools import lru_cache
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Final
@@ -102,7 +103,9 @@ def _parsed(path: str, _: str) -> Graph:
     with open_stream(path, content="bytes") as stream:
         data = stream.read()
     try:
-        return Graph().parse(data=data, format=FORMATS[ending(path)])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of rdflib's own classes
+            return Graph().parse(data=data, format=FORMATS[ending(path)])
     except Exception as error:  # noqa: BLE001 - each of rdflib's parsers has its own
         raise InputFileError(path, f"this is no {FORMATS[ending(path)]} ({str(error).splitlines()[0]})") from None
 
