@@ -1,6 +1,5 @@
 """Report on runs: one HTML page with its tables and charts, readable without a network."""
 
-from railfix.report.page import report_page, write_page, write_report
-from railfix.report.runs import ReportedRun, read_runs
+import lazy_loader
 
-__all__ = ["ReportedRun", "read_runs", "report_page", "write_page", "write_report"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -18,9 +18,9 @@ from railfix.core.files import write_whole
 from railfix.core.tables import Column, Table, count, listing, number, percent, signed
 from railfix.evaluate import RunAndReference, evaluate_runs
 from railfix.evaluate.run_folder import POSITIONS_TABLE, floats, read_table, tables_of
+from railfix.report.charts_page import charts_page
 from railfix.report.content import Block, Notes, Sentence
 from railfix.report.explain import explain_epoch, time_text, write_explanation
-from railfix.report.page import charts_page
 from railfix.report.plots.campaign import campaign_bars, campaign_plan
 from railfix.report.plots.chart import Chart
 

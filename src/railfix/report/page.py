@@ -4,26 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib.resources import files
 from itertools import count
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
-
-from railfix import __version__
 from railfix.core.arrays import Floats
 from railfix.core.files import write_whole
 from railfix.evaluate import Evaluation, EvaluationOptions
 from railfix.report import tables
 from railfix.report.background import read_background
+from railfix.report.charts_page import PagePart, figure, render
 from railfix.report.content import Absent, Block, Folded
-from railfix.report.encode import chart_values, script_json, sky_values
 from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, Group, antenna_groups, overview, run_group
 from railfix.report.headline import Headline, headline
-from railfix.report.plots.chart import Chart, Points, SkyEpochs
 from railfix.report.plots.errors import error_ranges
 from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.protection import protection
@@ -31,34 +24,6 @@ from railfix.report.runs import ReportedRun, read_runs
 
 #: Fewest epochs of the sky plot of an antenna.
 _LEAST_SKY: Final = 200
-#: Content security policy of the page: it loads nothing.
-_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Figure:
-    """A chart or sky plot in the page."""
-
-    number: int
-    chart: Chart | SkyEpochs
-    json: Markup
-    width: str
-    sky: str
-    zoomed_with: str
-
-    @property
-    def is_sky(self) -> bool:
-        """Whether it is a sky plot."""
-        return isinstance(self.chart, SkyEpochs)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _PagePart:
-    """Figures under a heading."""
-
-    title: str
-    figures: Sequence[_Figure]
-    absent: Sequence[str] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +32,7 @@ class _AntennaPart:
 
     name: str
     anchor: str
-    parts: Sequence[_PagePart]
+    parts: Sequence[PagePart]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,9 +43,9 @@ class _RunPart:
     anchor: str
     antenna: str
     headline: Headline
-    overview: _PagePart
+    overview: PagePart
     tables: Sequence[Folded]
-    timing: _PagePart
+    timing: PagePart
     antennas: Sequence[_AntennaPart]
 
 
@@ -151,7 +116,7 @@ def report_page(
     antennas = max(sum(len(run.folder.antennas) for run in runs), 1)
     # many antennas share the size that two have
     epochs = max(_LEAST_SKY, min(SKY_EPOCHS, 2 * SKY_EPOCHS // antennas))
-    return _render(
+    return render(
         "page.html.j2",
         title or f"railfix report: {', '.join(run.name for run in runs)}",
         runs=[
@@ -160,36 +125,6 @@ def report_page(
         summary=_summary(runs, evaluation),
         ranges=_ranges(runs, evaluation, numbers),
     )
-
-
-def charts_page(title: str, charts: Sequence[Chart], tables: Sequence[Block], *, lead: Sequence[Block] = ()) -> str:
-    """HTML of a page of sentences, charts, and tables under them."""
-    numbers = count()
-    figures = _PagePart(title="", figures=[_figure(chart, numbers) for chart in charts])
-    return _render("charts.html.j2", title, charts=figures, tables=tables, lead=lead)
-
-
-def _render(template: str, title: str, **content: Any) -> str:
-    environment = Environment(
-        loader=PackageLoader("railfix.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template(template).render(
-        title=title,
-        created=datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        version=__version__,
-        policy=_POLICY,
-        style=_resource("page.css"),
-        scripts=(_resource("errors.js"), _resource("page.js")),
-        **content,
-    )
-
-
-def _resource(name: str) -> Markup:
-    return Markup(files("railfix.report").joinpath("templates", name).read_text(encoding="utf-8"))
 
 
 def _summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> list[Block]:
@@ -203,10 +138,10 @@ def _summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> list
     return blocks
 
 
-def _ranges(runs: Sequence[ReportedRun], evaluation: Evaluation | None, numbers: Iterator[int]) -> _PagePart:
+def _ranges(runs: Sequence[ReportedRun], evaluation: Evaluation | None, numbers: Iterator[int]) -> PagePart:
     """Range of the errors of all runs."""
     if evaluation is None:
-        return _PagePart(title="", figures=())
+        return PagePart(title="", figures=())
     series = {
         f"{run.name}, {antenna}": errors
         for run in runs
@@ -214,7 +149,7 @@ def _ranges(runs: Sequence[ReportedRun], evaluation: Evaluation | None, numbers:
         if (errors := run.errors_of(antenna)) is not None
     }
     chart = error_ranges(series)
-    return _PagePart(title="", figures=() if chart.empty else (_figure(chart, numbers),))
+    return PagePart(title="", figures=() if chart.empty else (figure(chart, numbers),))
 
 
 def _run(
@@ -263,34 +198,6 @@ def _run(
     )
 
 
-def _part(group: Group, numbers: Iterator[int], sky: str, anchor: str, *, width: str = "") -> _PagePart:
-    figures = [_figure(chart, numbers, group=group, sky=sky, anchor=anchor, width=width) for chart in group.charts]
-    return _PagePart(title=group.title, figures=figures, absent=group.absent)
-
-
-def _figure(
-    chart: Chart | SkyEpochs,
-    numbers: Iterator[int],
-    *,
-    group: Group | None = None,
-    sky: str = "",
-    anchor: str = "",
-    width: str = "",
-) -> _Figure:
-    values: dict[str, Any]
-    if isinstance(chart, SkyEpochs):
-        values, linked, axis, width = sky_values(chart), sky, "", "wide"
-    else:
-        clickable = any(isinstance(layer, Points) and layer.epoch_s is not None for layer in chart.layers)
-        values = chart_values(chart, group.start if group is not None and clickable else None)
-        linked = sky if clickable else ""
-        axis = f"{anchor}-{chart.shared_axis}" if chart.shared_axis else ""
-        width = width or chart.width
-    return _Figure(
-        number=next(numbers),
-        chart=chart,
-        json=Markup(script_json(values)),
-        width=width,
-        sky=linked,
-        zoomed_with=axis,
-    )
+def _part(group: Group, numbers: Iterator[int], sky: str, anchor: str, *, width: str = "") -> PagePart:
+    figures = [figure(chart, numbers, group=group, sky=sky, anchor=anchor, width=width) for chart in group.charts]
+    return PagePart(title=group.title, figures=figures, absent=group.absent)
