@@ -132,7 +132,7 @@ def _scales(chart: Chart, axes: Axes) -> None:
     if chart.y_range is not None:
         axes.set_ylim(*chart.y_range)
     if chart.equal:
-        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_aspect("equal", adjustable="datalim" if chart.x_range is None else "box")
         axes.annotate(
             "N",
             xy=(0.97, 0.97),

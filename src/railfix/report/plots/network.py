@@ -20,7 +20,7 @@ _DRAWN: Final = 200_000
 #: Tracks that are named in the plan at most.
 _NAMED: Final = 400
 #: Margin of the view about a run, of its larger extent and at least [m]; names from a track, of the view's extent.
-_MARGIN, _LEAST_VIEW_M, _BESIDE = 0.08, 100.0, 0.03
+_MARGIN, _LEAST_VIEW_M, _BESIDE = 0.12, 100.0, 0.03
 _KINDS: Final = {"gap": RED, "joint": RED, "kink": "#e08e0b", "too near": "#7b3294", "dead end": GREY}
 #: Positions by the probability of their track: at least this, and the colour.
 _CLASSES: Final = ((0.99, ORDERED[0]), (0.9, ORDERED[1]), (0.5, ORDERED[3]), (0.0, ORDERED[4]))
