@@ -14,12 +14,12 @@ import numpy as np
 from railfix.core.settings import write_toml
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
-from railfix.motion.samples import GroundUnits, SensorSamples
+from railfix.motion.samples import GroundUnits, ListedBalises, SensorSamples
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import State
 from railfix.run.processor import processor_of
-from railfix.run.sensors import read_sensors, read_units
+from railfix.run.sensors import read_listed_balises, read_sensors, read_units
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario_file import load_recipe
@@ -38,6 +38,10 @@ UNIT: dict[str, Any] = {
 }
 
 
+#: Tables of the simulator that are no samples.
+_NO_SAMPLES = ("wheel_slips", "balise_truth", "balise_list")
+
+
 @dataclass(frozen=True)
 class Ride:
     """One antenna's log with the samples of the sensors and the ground truth.
@@ -49,6 +53,7 @@ class Ride:
     observations: Observations
     samples: SensorSamples
     units: GroundUnits | None
+    balises: ListedBalises | None
     chainage_m: np.ndarray
     speed_mps: np.ndarray
     along: np.ndarray
@@ -65,6 +70,7 @@ class Ride:
         samples: SensorSamples | None = None,
         cuts: Sequence[int] = (),
         track: Track | None = None,
+        balises: ListedBalises | None = None,
         **settings: object,
     ) -> AlongTrack:
         """Through the filter on a map (of the whole line without one), in chunks that end at `cuts`."""
@@ -74,7 +80,14 @@ class Ride:
             write_toml(path, vehicle_table(self.simulation.scenario.vehicle))
             trajectories = {"front": antenna_trajectory(track, read_vehicle(path), "front")}
         config = parse_config({"filter": "track", "protection": "off", **settings})
-        processor = processor_of(config, self.simulation.navigation, trajectories, track=track, units=self.units)
+        processor = processor_of(
+            config,
+            self.simulation.navigation,
+            trajectories,
+            track=track,
+            units=self.units,
+            balises=balises or self.balises,
+        )
         whole = self.observations if observations is None else observations
         samples = self.samples if samples is None else samples
         state, received = State(), np.datetime64("NaT", "ns")
@@ -85,7 +98,7 @@ class Ride:
             result, state = processor.process({"front": chunk}, state, sensors=samples.between(received, end))
             received = end
             parts.append(result.fusion["front"])
-        return joined(parts)
+        return replace(joined(parts), passings=tuple(p for part in parts for p in part.passings))
 
     def jumped(self, begin_s: float, end_s: float, metres: float) -> Observations:
         """The observations with codes as of a place further along the line for some time."""
@@ -120,11 +133,22 @@ def sensors_of(simulation: Simulation) -> tuple[SensorSamples, GroundUnits | Non
     """Samples of the sensors of a run, and its ground units."""
     tables = sensor_tables(simulation)
     with tempfile.TemporaryDirectory() as folder:
-        paths = {n: Path(folder) / f"{n}.parquet" for n in tables if n != "wheel_slips"}
+        paths = {n: Path(folder) / f"{n}.parquet" for n in tables if n not in _NO_SAMPLES}
         for n, path in paths.items():
             tables[n].write_parquet(path)
         units = read_units(paths.pop("ranging_units")) if "ranging_units" in paths else None
         return read_sensors(**paths), units
+
+
+def balises_of(simulation: Simulation) -> ListedBalises | None:
+    """The list of balises of a run."""
+    table = sensor_tables(simulation).get("balise_list")
+    if table is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "list.csv"
+        table.write_csv(path)
+        return read_listed_balises(path, simulation.line.track())
 
 
 def made(scenario: Scenario) -> Ride:
@@ -139,6 +163,7 @@ def made(scenario: Scenario) -> Ride:
         observations=pieces[0].observations,
         samples=samples,
         units=units,
+        balises=balises_of(simulation),
         chainage_m=np.interp(geometry.chainage_m, line.sampled_chainage_m(), line.track().chainage_m),
         speed_mps=geometry.speed_mps,
         along=np.cos(np.radians(geometry.elevation_deg))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 import threading
 from collections.abc import Iterator
@@ -21,11 +22,12 @@ from railfix.core.timescale import GPS_EPOCH
 from railfix.io.train_message import MessageStatus, Source
 from railfix.live import sensor_watch
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
+from railfix.live.forms import passing_rows
 from railfix.live.sensor_lines import FOREVER, Sensed, SensorLines
 from railfix.live.sensor_watch import SensorWatch
 from railfix.live.settings import LiveSettings
 from railfix.live.state import SavedSession, load_state, write_state
-from railfix.motion.samples import SENSORS, RadarSpeeds, SensorSamples, StationRanges
+from railfix.motion.samples import SENSORS, BaliseReadings, RadarSpeeds, SensorSamples, StationRanges
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.results import State
@@ -47,6 +49,7 @@ RIDE = """{
             "noise_sigma_m": 0.19,
             "units": [{"name": "A", "chainage_m": 480.0}, {"name": "07", "chainage_m": 500.0, "lateral_m": -3.0}],
         },
+        "balises": {"spacing_m": 90.0, "wrong": {"B004": "B007"}, "missed": ["B003"]},
     },
 }"""
 #: Place of the vehicle's ranging unit.
@@ -57,9 +60,10 @@ HEADERS = {
     "yaw_rate_radps",
     "radar": "time_gpst,speed_mps",
     "ranging": "time_gpst,unit,range_m,sigma_m",
+    "balises": "time_gpst,balise,sigma_m",
 }
 #: Rows that say that nothing was measured until then.
-BEATS = {"tachometer": ",{},\n", "ranging": "{},,,\n"}
+BEATS = {"tachometer": ",{},\n", "ranging": "{},,,\n", "balises": "{},,\n"}
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +86,9 @@ def lines_of(samples: SensorSamples) -> dict[str, list[tuple[np.datetime64, byte
             (t, f"{t},{name},{metres!r},\n".encode())
             for t, name, metres in zip(ranges.time, ranges.station, ranges.range_m.tolist(), strict=True)
         ],
+        "balises": [
+            (t, f"{t},{name},\n".encode()) for t, name in zip(samples.balises.time, samples.balises.balise, strict=True)
+        ],
     }
 
 
@@ -92,7 +99,9 @@ def engine_of(case: Ride, folder: Path, **settings: float) -> LiveEngine:
     track = case.simulation.line.track()
     paths = {"front": antenna_trajectory(track, read_vehicle(path), "front")}
     config = parse_config({"filter": "track", "protection": "off", "sensors": PLACE})
-    processor = processor_of(config, case.simulation.navigation, paths, track=track, units=case.units)
+    processor = processor_of(
+        config, case.simulation.navigation, paths, track=track, units=case.units, balises=case.balises
+    )
     return LiveEngine(processor, LiveSettings(period_s=0.5, no_input="skip", **settings), SENSORS)
 
 
@@ -148,6 +157,11 @@ def test_a_live_session_with_sensors_gives_what_the_log_gives(case: Ride, tmp_pa
     np.testing.assert_array_equal(found.sensed.state, whole.sensed.state)
     np.testing.assert_allclose(found.sensed.curvature_1pm, whole.sensed.curvature_1pm, atol=1e-9)
     np.testing.assert_array_equal(found.tracked.used, whole.tracked.used)
+    passed = [json.loads(row) for output in outputs for row in passing_rows(output).splitlines()]
+    assert [row["balise"] for row in passed] == [passing.balise for passing in whole.passings]
+    assert {(row["balise"], row["verdict"]) for row in passed if row["verdict"] != "read"} == {
+        ("B003", "missing"), ("B004", "missing"), ("B007", "contradicts"),
+    }  # fmt: skip
     assert not any("silent" in what for what in engine.counts)
     inside = ~np.isfinite(case.observations.code_m).any(axis=1) & (case.time_s > 50.0)
     assert inside.sum() > 10
@@ -165,7 +179,8 @@ def test_a_live_session_with_sensors_gives_what_the_log_gives(case: Ride, tmp_pa
 def test_a_sensor_that_is_late_is_left_out_and_no_way_is_made_up(case: Ride, tmp_path: Path) -> None:
     """Rows 0.3 s late, a wait of 0.1 s: no epoch has the way since the one before, and none a way that is too short."""
     engine = engine_of(case, tmp_path, sensor_wait_s=0.1)
-    no_ranges = replace(case, samples=replace(case.samples, ranging=StationRanges()))  # these are places, not ways
+    # ranges and balises are places, not ways
+    no_ranges = replace(case, samples=replace(case.samples, ranging=StationRanges(), balises=BaliseReadings()))
     found = places(live(no_ranges, engine, latency_s=0.3, beat=False))
     assert {engine.counts[f"{sensor} silent"] for sensor in SENSORS} == {len(case.observations)}
     assert not (found.tracked.used[:, 3:] > 0).any()

@@ -136,6 +136,13 @@ def test_a_column_of_the_filter_is_the_quantity_that_it_names(result: Result, co
     np.testing.assert_array_equal(train_table(result)[column].to_numpy(), expected)
 
 
+@pytest.mark.requirement("E7")
+def test_the_innovation_of_a_balise_is_that_of_either_turn(result: Result) -> None:
+    sensed = result.fusion["front"].tracked.sensed
+    expected = np.fmax(sensed[:, Kind.BALISE - 3], sensed[:, Kind.NEXT_BALISE - 3])
+    np.testing.assert_array_equal(train_table(result)["innovation_balise_m"].to_numpy(), expected)
+
+
 @pytest.mark.requirement("B7")
 def test_a_column_of_observations_is_the_quantity_that_it_names(result: Result) -> None:
     front, tracked = result.antennas["front"], result.fusion["front"].tracked

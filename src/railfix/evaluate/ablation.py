@@ -30,6 +30,7 @@ from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import RunProvenance, package_versions, run_record
+from railfix.run.sensors import balises_of
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS, ScreenSetup
 from railfix.track.trajectory import Trajectory
@@ -43,6 +44,7 @@ _SENSORS: Final[Mapping[FilterSource, tuple[str, ...]]] = {
     "radar": ("radar",),
     "force": ("inertial",),
     "feature": ("inertial", "tachometer"),
+    "balise": ("balises",),
     "range": ("ranging",),
 }
 
@@ -191,8 +193,9 @@ def ablate_files(
                 for name, chosen in filter_choices(inputs, config.filter_sources).items()
             }
         sensors, units = sensors_of(inputs)
+        balises = balises_of(inputs.balises, inputs.balise_list, None, line.track, config)
         processors = {
-            name: processor_of(chosen, navigation, line.trajectories, track=line.track, units=units)
+            name: processor_of(chosen, navigation, line.trajectories, track=line.track, units=units, balises=balises)
             for name, chosen in settings.items()
         }
         received = np.datetime64("NaT", "ns")

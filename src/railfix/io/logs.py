@@ -17,6 +17,7 @@ import numpy as np
 
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import BrokenLines, Paths, listed
+from railfix.core.mate import mate_table
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io import rinex
@@ -122,6 +123,8 @@ def scan_observations(
 ) -> Iterator[Observations]:
     """Observations of one receiver in pieces of `epochs` epochs; see `read_observations`."""
     paths = listed(path)
+    if any(mate_table(p) == "S_GNSS_SAT" for p in paths):
+        return _mate_pieces(paths, systems, (_instant(start), _instant(end)), epochs)
     receiver = [is_receiver_log(head_of(p)) for p in paths]
     if not any(receiver):
         return rinex.scan_observations(
@@ -134,6 +137,25 @@ def scan_observations(
         )
     limits = (_instant(start), _instant(end), _instant(date))
     return in_pieces(_receiver_runs(paths, systems, limits, progress), epochs)
+
+
+def _mate_pieces(
+    paths: list[str],
+    systems: Iterable[str] | None,
+    limits: tuple[np.datetime64 | None, np.datetime64 | None],
+    epochs: int,
+) -> Iterator[Observations]:
+    """Tables S_GNSS_SAT of EGNSS MATE in pieces."""
+    from railfix.io.mate import scan_mate
+
+    if others := [path for path in paths if mate_table(path) != "S_GNSS_SAT"]:
+        raise MismatchError(f"{others[0]} is no table S_GNSS_SAT as the others; give files of one kind for one antenna")
+    letters = None if systems is None else list(systems)
+    parts = (part if letters is None else _of_systems(part, letters) for part in scan_mate(paths, *limits))
+    pieces = list(in_pieces(parts, epochs))
+    if not any(len(piece) for piece in pieces):
+        raise MismatchError(f"{', '.join(paths)}: no epoch lies in the time span asked for")
+    return iter(pieces)
 
 
 def _instant(time: Time) -> np.datetime64 | None:

@@ -57,6 +57,7 @@ class Source(IntFlag):
     RANGING = 128
     FEATURES = 256
     SBAS = 512
+    BALISES = 1024
 
 
 class SuspectedInterference(IntEnum):

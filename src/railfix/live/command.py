@@ -34,13 +34,14 @@ from railfix.live.sources import check_source, is_file
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
 from railfix.live.warm_up import prepare_kernels
 from railfix.motion.samples import SensorSamples
+from railfix.pipeline.passing_table import balise_notes
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
 from railfix.run.base_station import place_of
 from railfix.run.driver import time_of
 from railfix.run.output import check_not_input
 from railfix.run.processor import processor_of
-from railfix.run.sensors import check_filter, read_sensors, units_of_ranges
+from railfix.run.sensors import balises_of, check_filter, read_sensors, units_of_ranges
 from railfix.run.sources import OpenedLine, open_line
 
 #: Longest distance from the reference location that a position report of ETCS can say, doubts apart [m].
@@ -157,6 +158,15 @@ def _hooks(
 ) -> tuple[Hooks, Mapping[str, Any]]:
     """Tables of results, state file, status line and watch of sensors; and streams' states where the file is used."""
     observers: list[Callable[[LiveOutput], None]] = [PlaceWatch(log.say).take]
+
+    def say_balises(output: LiveOutput) -> None:
+        if output.result is not None and output.part != "message":
+            for name, own in output.result.fusion.items():
+                for note in balise_notes(name, own.passings):
+                    log.say(note)
+
+    if engine.processor.balises is not None:
+        observers.append(say_balises)
     sensed, save, streams = None, None, {}
     if inputs.out is not None:
         tables = held.enter_context(ResultTables(inputs.out, overwrite=inputs.overwrite, inputs=_files_read(inputs)))
@@ -219,10 +229,13 @@ def _prepare(inputs: LiveInputs, tables: SensorSamples) -> tuple[OpenedLine, Epo
     if at is None:
         at = np.datetime64("now", "ns") if inputs.logs.instant is None else inputs.logs.instant
     line = open_line(inputs.track, inputs.vehicle, antennas=inputs.antennas, reading=inputs.reading, at=at)
+    balises = balises_of(inputs.sensors.get("balises"), inputs.balise_list, inputs.virtual_balises, line.track, config)
     base: Floats | Literal["stream"] | None = None
     if inputs.base is not None:
         base = "stream" if inputs.base_place is None else place_of(inputs.base_place, "--base-place")
-    return line, processor_of(config, navigation, line.trajectories, track=line.track, units=units, base_ecef_m=base)
+    return line, processor_of(
+        config, navigation, line.trajectories, track=line.track, units=units, balises=balises, base_ecef_m=base
+    )
 
 
 def _check_reference(line: OpenedLine, live: LiveSettings) -> None:

@@ -2,8 +2,8 @@
 
 ``json`` (a line a message), ``cbor`` (`railfix.io.train_message`; in files and streams each message comes after its
 length in two bytes, most significant first), ``nmea`` (GGA, RMC, GST), ``tpv`` (TPV of gpsd), ``etcs`` (position
-report of SUBSET-026, packet 0, a line of JSON), ``positions`` and ``train`` (rows of the tables of results, a line of
-JSON each).
+report of SUBSET-026, packet 0, a line of JSON), ``positions``, ``train`` and ``passings`` (rows of the tables of
+results, a line of JSON each).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from railfix.io.train_message import MessageStatus, TrainMessage, encode, etcs_r
 from railfix.live.engine import LiveOutput
 from railfix.live.message import antenna_of
 from railfix.live.settings import LiveSettings
+from railfix.pipeline.passing_table import passing_table
 from railfix.pipeline.tables import positions_table
 from railfix.pipeline.train_table import train_table
 
@@ -113,6 +114,14 @@ def train_rows(output: LiveOutput) -> bytes:
     return b"" if output.result is None or not output.result.fusion else _json_rows(train_table(output.result))
 
 
+def passing_rows(output: LiveOutput) -> bytes:
+    """Rows of ``passings.parquet``: balises and virtual ones whose passing has ended, and wrong readings."""
+    result = output.result
+    if result is None or not any(own.passings for own in result.fusion.values()):
+        return b""
+    return _json_rows(passing_table(result))
+
+
 def _json_rows(table: pl.DataFrame) -> bytes:
     """Rows as lines of JSON, all digits; null where there is no number, infinities as words."""
     texts = table.with_columns(pl.col(pl.Datetime).dt.strftime("%Y-%m-%dT%H:%M:%S%.9f"))
@@ -136,6 +145,7 @@ def forms(settings: LiveSettings) -> dict[str, Form]:
         "etcs": etcs_form(settings),
         "positions": positions_rows,
         "train": train_rows,
+        "passings": passing_rows,
     }
 
 
@@ -175,7 +185,7 @@ def _sentence(body: str) -> bytes:
 
 def wants(form: Form, output: LiveOutput) -> bool:
     """Whether a form takes an output: rows of tables those with rows, all others those with a message."""
-    return output.part != ("message" if form in (positions_rows, train_rows) else "rows")
+    return output.part != ("message" if form in (positions_rows, train_rows, passing_rows) else "rows")
 
 
 def whole_message(form: Form, output: LiveOutput) -> bytes:

@@ -10,13 +10,13 @@ from pydantic import Field
 from railfix.core.settings import Settings, option
 from railfix.live.settings import LiveSettings
 from railfix.pipeline.config import Config
-from railfix.run.inputs import input_option
+from railfix.run.inputs import balise_list_option, input_option, virtual_balises_option
 from railfix.run.options import LogReading, TrackReading
 from railfix.run.output import Overwrite
 
 #: Sensors on board.
-Sensor = Literal["tachometer", "inertial", "radar", "ranging"]
-SENSORS: tuple[Sensor, ...] = ("tachometer", "inertial", "radar", "ranging")
+Sensor = Literal["tachometer", "inertial", "radar", "ranging", "balises"]
+SENSORS: tuple[Sensor, ...] = ("tachometer", "inertial", "radar", "ranging", "balises")
 
 
 class LiveInputs(Settings):
@@ -49,8 +49,11 @@ class LiveInputs(Settings):
     radar: str | None = input_option("The same of the speeds of a Doppler radar.", None, metavar="SOURCE")
     ranging: str | None = input_option("The same of two-way ranges to ground units.", None, metavar="SOURCE")
     ranging_units: Path | None = input_option("Surveyed ground units: unit, x_m, y_m, z_m (ECEF).", None, metavar="CSV")
+    balises: str | None = input_option("The same of balises that are read.", None, metavar="SOURCE")
+    balise_list: Path | None = balise_list_option()
+    virtual_balises: Path | None = virtual_balises_option()
     send: tuple[str, ...] = option(
-        "Where messages go: json, cbor, nmea, tpv, etcs, positions or train at -, a file, udp://HOST:PORT, "
+        "Where messages go: json, cbor, nmea, tpv, etcs, positions, train or passings at -, a file, udp://HOST:PORT, "
         "tcp-server://HOST:PORT or mqtt://[USER:PASSWORD@]HOST:PORT/TOPIC. Default: json@-.",
         ("json@-",),
         metavar="FORM@TARGET",
@@ -92,7 +95,8 @@ class LiveInputs(Settings):
         """Files that the positions depend on, by their role."""
         named = {f"track {k}": path for k, path in enumerate(self.track)}
         given = {
-            "vehicle": self.vehicle, "ranging units": self.ranging_units, "cn0 curve": self.config.cn0_curve,
+            "vehicle": self.vehicle, "ranging units": self.ranging_units, "balise list": self.balise_list,
+            "virtual balises": self.virtual_balises, "cn0 curve": self.config.cn0_curve,
             "error model": self.config.error_model, "integrity support": self.config.integrity_support,
         }  # fmt: skip
         return named | {name: path for name, path in given.items() if path is not None}

@@ -23,6 +23,7 @@ _BOUNDS = ("over_cm", "under_cm", "protection_level_cm")
 _SOURCE_OF_KIND = {
     Kind.PHASE: Source.CARRIER_PHASE, Kind.DOPPLER: Source.DOPPLER, Kind.WHEEL: Source.TACHOMETER,
     Kind.RADAR: Source.RADAR, Kind.FORCE: Source.INERTIAL, Kind.PLACE: Source.FEATURES, Kind.RANGE: Source.RANGING,
+    Kind.BALISE: Source.BALISES, Kind.NEXT_BALISE: Source.BALISES,
 }  # fmt: skip
 _SOURCE_OF_ANTENNA = {"front": Source.FRONT_RECEIVER, "rear": Source.REAR_RECEIVER}
 

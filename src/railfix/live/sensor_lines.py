@@ -15,6 +15,7 @@ import numpy as np
 
 from railfix.core.errors import InputFileError
 from railfix.motion.samples import (
+    BaliseReadings,
     GroundUnits,
     InertialSamples,
     RadarSpeeds,
@@ -28,6 +29,8 @@ from railfix.run.sensors import COLUMNS
 FOREVER: Final = np.datetime64("2200-01-01", "ns")
 #: Columns without which a row says nothing but its time.
 _NEEDED: Final = ("pulse", "range_m")
+#: Columns of names.
+_NAMES: Final = ("unit", "balise")
 #: Longest line; a longer one is no row.
 _LINE_BYTES: Final = 4096
 
@@ -130,7 +133,7 @@ class SensorLines:
             texts = {name.strip("[]"): given.get(name.strip("[]"), "") for name in COLUMNS[self.sensor]}
             if not any(texts.values()):
                 return None if np.isnat(time) else (time, {})
-            unit = {"unit": texts.pop("unit")} if "unit" in texts else {}
+            unit: dict[str, float | str] = {name: texts.pop(name) for name in _NAMES if name in texts}
             values = {name: float(text) if text else np.nan for name, text in texts.items()}
         except ValueError:
             return None
@@ -149,6 +152,8 @@ class SensorLines:
             return SensorSamples(tachometer=TachometerPulses(time=time, **whole))
         if self.sensor == "radar":
             return SensorSamples(radar=RadarSpeeds(time=time, **columns))
+        if self.sensor == "balises":
+            return SensorSamples(balises=BaliseReadings(time=time, **columns))
         if self.sensor == "ranging":
             return SensorSamples(ranging=StationRanges(time=time, station=columns.pop("unit"), **columns))
         six = np.stack([columns[name] for name in COLUMNS["inertial"]], axis=1)

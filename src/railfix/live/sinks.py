@@ -31,8 +31,8 @@ _ANSWER_S: Final = 10.0
 #: Longest wait for messages that a broker has not taken at the end [s].
 _LEFT_S: Final = 2.0
 _HELP: Final = (
-    "expected FORM@TARGET, FORM one of json, cbor, nmea, tpv, etcs, positions, train, TARGET -, a file, udp://, "
-    "tcp-server:// or mqtt://"
+    "expected FORM@TARGET, FORM one of json, cbor, nmea, tpv, etcs, positions, train, passings, TARGET -, a file, "
+    "udp://, tcp-server:// or mqtt://"
 )
 
 

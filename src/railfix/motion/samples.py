@@ -11,10 +11,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Strings, read_only
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, read_only
 
 #: Sensors on board by the names of their samples.
-SENSORS: Final = ("tachometer", "inertial", "radar", "ranging")
+SENSORS: Final = ("tachometer", "inertial", "radar", "ranging", "balises")
 
 
 def _times() -> Datetimes:
@@ -144,6 +144,59 @@ class GroundUnits:
 
 
 @dataclass(frozen=True, kw_only=True)
+class BaliseReadings:
+    """Balises that the train's reader has passed, N of them; of a group the reading that the list places.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (N,)
+        At which the reader was over the balise.
+    balise : ndarray of str, shape (N,)
+        Identity.
+    sigma_m : ndarray, shape (N,) [m]
+        Standard deviation along the line that the reader reports; NaN where it reports none.
+    """
+
+    time: Datetimes = field(default_factory=_times)
+    balise: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))
+    sigma_m: Floats = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListedBalises:
+    """Balises, or places without one, along a line, M of them.
+
+    Attributes
+    ----------
+    name : ndarray of str, shape (M,)
+    chainage_m : ndarray, shape (M,) [m]
+    sigma_m : ndarray, shape (M,) [m]
+        Standard deviation of the chainage.
+    virtual : ndarray of bool, shape (M,)
+        Places whose passing is reported; there is no balise.
+    """
+
+    name: Strings
+    chainage_m: Floats
+    sigma_m: Floats
+    virtual: Masks
+
+    def __len__(self) -> int:
+        return len(self.name)
+
+    def index_of(self, names: Strings) -> Indices:
+        """Return the rows of the balises of these names, -1 for one that is not listed."""
+        rows = {str(self.name[k]): k for k in np.flatnonzero(~self.virtual)}
+        return np.array([rows.get(str(name), -1) for name in names], dtype=np.intp)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SensorSamples:
     """Samples of all sensors on board received since the chunk before.
 
@@ -153,6 +206,7 @@ class SensorSamples:
     inertial : InertialSamples
     radar : RadarSpeeds
     ranging : StationRanges
+    balises : BaliseReadings
         Each without rows where the sensor is absent or has sent nothing.
     silent : frozenset of str
         Sensors not yet heard up to the epoch that the samples are given with (live): what they say since the epoch
@@ -163,10 +217,11 @@ class SensorSamples:
     inertial: InertialSamples = field(default_factory=InertialSamples)
     radar: RadarSpeeds = field(default_factory=RadarSpeeds)
     ranging: StationRanges = field(default_factory=StationRanges)
+    balises: BaliseReadings = field(default_factory=BaliseReadings)
     silent: frozenset[str] = frozenset()
 
     @property
-    def tables(self) -> dict[str, TachometerPulses | InertialSamples | RadarSpeeds | StationRanges]:
+    def tables(self) -> dict[str, TachometerPulses | InertialSamples | RadarSpeeds | StationRanges | BaliseReadings]:
         """Samples by sensor."""
         return {name: getattr(self, name) for name in SENSORS}
 

@@ -15,10 +15,12 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import WheelSigns, WheelState, wheel_signs
-from railfix.motion.samples import SensorSamples
+from railfix.motion.samples import BaliseReadings, ListedBalises, SensorSamples
+from railfix.pipeline.balise_stage import BaliseLimits
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.filter_result import AlongTrack, FilterFix, FilterState, SingleEpochs
+from railfix.pipeline.passings import find_passings
 from railfix.pipeline.return_gate import ReturnState, gated_codes
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import LineReferences, sensor_epochs
@@ -73,7 +75,7 @@ def along_track(
     samples : SensorSamples, optional
         Of the sensors on board since the chunk before.
     surroundings : LineReferences, optional
-        Features of the line and ground units that the sensors meet.
+        Features of the line, ground units and balises that the sensors meet.
     """
     epochs, slips = gnss_epochs(ranges, single.noise_scale, config, state.slips)
     epochs = replace(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m)
@@ -142,6 +144,22 @@ def checked(
     if held.any():
         tracked = doubted(tracked, held & is_bounded(tracked.status), TrackStatus.ANTENNAS_DISAGREE)
     return replace(result, tracked=tracked, spacing_error_m=error), replace(state, disagreed=disagreed[-1])
+
+
+def with_passings(
+    result: AlongTrack,
+    state: FilterState,
+    listed: ListedBalises | None,
+    trajectory: Trajectory,
+    samples: SensorSamples | None,
+    limits: BaliseLimits,
+) -> tuple[AlongTrack, FilterState]:
+    """Return the positions with the balises that were passed, and the state; after the last verdict on the places."""
+    if listed is None:
+        return result, state
+    readings = samples.balises if samples else BaliseReadings()
+    found, after = find_passings(result.tracked, listed, trajectory, readings, state.passings, limits)
+    return replace(result, passings=found), replace(state, passings=after)
 
 
 def doubted(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:

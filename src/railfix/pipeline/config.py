@@ -53,9 +53,9 @@ if TYPE_CHECKING:
 
 
 #: Measurements that the filter along the track can use, as its column `sources` names them.
-FilterSource = Literal["code", "phase", "doppler", "wheel", "radar", "force", "feature", "range"]
+FilterSource = Literal["code", "phase", "doppler", "wheel", "radar", "force", "feature", "balise", "range"]
 FILTER_SOURCES: Final[tuple[FilterSource, ...]] = (
-    "code", "phase", "doppler", "wheel", "radar", "force", "feature", "range",
+    "code", "phase", "doppler", "wheel", "radar", "force", "feature", "balise", "range",
 )  # fmt: skip
 
 #: Names of the screens, in the order in which they judge.
@@ -207,7 +207,8 @@ class Config(ScreenSettings):
         sensors, from this and earlier epochs. `railfix run` and `railfix demo` ask for it.
     filter_sources : tuple of str
         Measurements that the filter uses, where they are there: `code`, `phase` and `doppler` of the satellites, and
-        `wheel`, `radar`, `force`, `feature` (of the line, by inertial unit and wheel), `range` of the sensors on board.
+        `wheel`, `radar`, `force`, `feature` (of the line, by inertial unit and wheel), `balise`, `range` of the sensors
+        on board.
     tracking : TrackingLimits
         Noise of motion and measurements of that filter.
     sensors : SensorLimits

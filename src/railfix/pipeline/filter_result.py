@@ -11,6 +11,7 @@ from railfix.core.arrays import Codes, Datetimes, Floats, Masks
 from railfix.core.display import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import Suspicion, WheelSigns, WheelState
+from railfix.pipeline.passings import Passing, PassingState
 from railfix.pipeline.return_gate import ReturnState
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import SensorState
@@ -113,6 +114,8 @@ class FilterState(NotebookTable):
         Of the comparison of distances by satellites and wheel.
     disagreed : datetime64[ns]
         Last epoch at which places or speeds of the two antennas disagreed.
+    passings : PassingState or None
+        Of balises and virtual ones.
     """
 
     line: Line | None = None
@@ -125,6 +128,7 @@ class FilterState(NotebookTable):
     gate: ReturnState = field(default_factory=ReturnState)
     wheel: WheelState = field(default_factory=WheelState)
     disagreed: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    passings: PassingState | None = None
 
     def __repr__(self) -> str:
         if self.track is None or not self.track.hypotheses:
@@ -163,6 +167,8 @@ class AlongTrack(NotebookTable):
         Distances by satellites against those of the wheel; None without a wheel.
     replay : tuple of Replay
         What the filter was given, to smooth it (`railfix.pipeline.smoothing`).
+    passings : tuple of Passing
+        Balises and virtual ones that were passed, and readings that are wrong.
     """
 
     tracked: Tracked
@@ -178,6 +184,7 @@ class AlongTrack(NotebookTable):
     spacing_error_m: Floats
     wheel: WheelSigns | None = None
     replay: tuple[Replay, ...] = ()
+    passings: tuple[Passing, ...] = ()
 
     @property
     def time(self) -> Datetimes:

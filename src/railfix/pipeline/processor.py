@@ -19,8 +19,8 @@ from railfix.core.arrays import Floats, Masks, changed
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.integrity.protection.support import IntegritySupport
-from railfix.motion.samples import GroundUnits, SensorSamples
-from railfix.pipeline.along_track import along_track, checked
+from railfix.motion.samples import GroundUnits, ListedBalises, SensorSamples
+from railfix.pipeline.along_track import along_track, checked, with_passings
 from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.araim_stage import with_araim
 from railfix.pipeline.assemble import antenna_results, with_coordinates
@@ -96,8 +96,8 @@ class EpochProcessor:
         Mean C/N0 over elevation, for the screen "cn0".
     track : Track, optional
         The line itself, for places by its changes of gradient and curvature in the filter along the track.
-    units : GroundUnits, optional
-        Surveyed stations of two-way ranges, for the filter along the track.
+    units, balises : GroundUnits, ListedBalises, optional
+        Of the filter along the track: surveyed stations of two-way ranges; places of balises and virtual ones.
     support : IntegritySupport, optional
         Integrity support message, for ARAIM levels.
     base_ecef_m : ndarray, shape (3,) [m], or "stream", optional
@@ -110,7 +110,7 @@ class EpochProcessor:
     ----------
     received : Received
         Navigation records and SBAS corrections known from the start.
-    units : GroundUnits or None
+    units, balises : GroundUnits or None, ListedBalises or None
     indices : dict of str to SearchIndex
         Of the trajectories.
     screens : tuple
@@ -136,6 +136,7 @@ class EpochProcessor:
         cn0_curve: Cn0Curve | None = None,
         track: Track | None = None,
         units: GroundUnits | None = None,
+        balises: ListedBalises | None = None,
         support: IntegritySupport | None = None,
         base_ecef_m: Floats | Literal["stream"] | None = None,
         screens: Sequence[Screen[Any]] = (),
@@ -168,10 +169,9 @@ class EpochProcessor:
             spacing_known=all(t.body_chainage_m is not None for t in self.trajectories.values()),
             cn0_curve=cn0_curve,
         )
-        self._track, self.units = track, units
+        self._track, self.units, self.balises = track, units, balises
         self._features: dict[str, LineFeatures] = {}
-        self._before_filter = FilterState()
-        self._lacking = self._inactive_notes()
+        self._before_filter, self._lacking = FilterState(), self._inactive_notes()
         self._threads = _threads(len(trajectories))
 
     def __getstate__(self) -> dict[str, Any]:
@@ -325,11 +325,12 @@ class EpochProcessor:
             found = self._filtered(solved, state)
             motions = {name: tracked.motion for name, (tracked, _) in found.items()}
             spacing = filter_verdicts(self.screens, solved.pair, motions)
-            held_s = self.config.antenna_spacing.filter_held_s
+            held_s, limits = self.config.antenna_spacing.filter_held_s, self.config.sensors.balise
             for name, (tracked, own) in found.items():
-                fusion[name], filter_states[name] = checked(tracked, spacing.get(name), own, held_s)
-        results = with_wheel(solved.results, fusion)
-        result = Result(antennas=results, notes=solved.notes, fusion=fusion)
+                tracked, own = checked(tracked, spacing.get(name), own, held_s)
+                path = self.trajectories[name]
+                fusion[name], filter_states[name] = with_passings(tracked, own, self.balises, path, sensors, limits)
+        result = Result(antennas=with_wheel(solved.results, fusion), notes=solved.notes, fusion=fusion)
         return result, replace(state, fusion=filter_states)
 
     def _screened(
@@ -403,12 +404,12 @@ class EpochProcessor:
                 yield from (f"{name}: {note}" for note in curve.notes_for(own.header))
 
     def _line_references(self, name: str, sensors: SensorSamples | None) -> LineReferences:
-        """Ground units, and the features of the line: made when there is an inertial unit."""
+        """Ground units, balises, and the features of the line: made when there is an inertial unit."""
         wanted = "feature" in self.config.filter_sources and sensors is not None and len(sensors.inertial) > 0
         if wanted and self._track is not None and name not in self._features:
             limits = self.config.sensors.feature
             self._features[name] = LineFeatures.of(self._track, self.trajectories[name], limits)
-        return LineReferences(features=self._features.get(name), units=self.units)
+        return LineReferences(features=self._features.get(name), units=self.units, balises=self.balises)
 
     def _pair(self, ranges: Mapping[str, AntennaRanges]) -> PairedEpochs | None:
         """Return the common epochs of two antennas of one vehicle; None where there are no such antennas."""

@@ -15,8 +15,10 @@ from railfix.core.timescale import seconds, timedelta
 from railfix.motion.features import FeatureLimits
 from railfix.motion.ranging import EchoLimits
 from railfix.motion.samples import (
+    BaliseReadings,
     GroundUnits,
     InertialSamples,
+    ListedBalises,
     RadarSpeeds,
     SensorSamples,
     StationRanges,
@@ -24,6 +26,7 @@ from railfix.motion.samples import (
 )
 from railfix.motion.slip import MotionState, SlipLimits
 from railfix.motion.tachometer import TachometerLimits, faults_until, way_m, window_start
+from railfix.pipeline.balise_stage import BaliseLimits, BaliseState, balise_epochs
 from railfix.pipeline.feature_stage import FeatureFix, FeatureState, LineFeatures, RateSeries, ahead_m, feature_fixes
 from railfix.pipeline.sensed_motion import CARRIED, REACH, SensedMotion, SensedState, nothing_sensed, sensed_motion
 from railfix.track.trajectory import Trajectory
@@ -34,7 +37,7 @@ _LONGEST_S: Final = 5.0
 #: Share of the samples of an interval that must be there for its mean.
 _COMPLETE: Final = 0.9
 
-Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, StationRanges)
+Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, StationRanges, BaliseReadings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,10 +48,12 @@ class LineReferences:
     ----------
     features : LineFeatures or None
     units : GroundUnits or None
+    balises : ListedBalises or None
     """
 
     features: LineFeatures | None = None
     units: GroundUnits | None = None
+    balises: ListedBalises | None = None
 
 
 class SensorLimits(Settings):
@@ -78,6 +83,7 @@ class SensorLimits(Settings):
     range_ahead_m, range_right_m, range_above_m : float
         Place of the vehicle's ranging unit: ahead of the vehicle's middle (without a vehicle file: of the antenna),
         to the right of the antenna's path and above the antenna.
+    balise : BaliseLimits
     return_sigmas, return_s : float
         After an outage codes count again when three positions in a row are within so many sigmas of the carried place,
         or so late.
@@ -103,6 +109,7 @@ class SensorLimits(Settings):
     range_ahead_m: float = 0.0
     range_right_m: float = 0.0
     range_above_m: float = 0.0
+    balise: BaliseLimits = Field(default_factory=BaliseLimits)
     return_sigmas: float = Field(default=4.0, gt=0)
     return_s: float = Field(default=60.0, ge=0)
     wheel_sigma_m: float = Field(default=0.01, gt=0)
@@ -122,12 +129,14 @@ class SensorState:
     samples : SensorSamples
     motion : SensedState
     features : FeatureState
+    balises : BaliseState
     """
 
     time: np.datetime64
     samples: SensorSamples
     motion: SensedState = field(default_factory=SensedState)
     features: FeatureState = field(default_factory=FeatureState)
+    balises: BaliseState = field(default_factory=BaliseState)
 
     @classmethod
     def empty(cls) -> SensorState:
@@ -156,7 +165,7 @@ def sensor_epochs(
     *,
     limits: SensorLimits,
     sine_at: Callable[[Floats], Floats] | None = None,
-    sources: Container[str] = ("wheel", "radar", "force", "feature", "range"),
+    sources: Container[str] = ("wheel", "radar", "force", "feature", "balise", "range"),
     surroundings: LineReferences | None = None,
 ) -> tuple[SensorEpochs, SensedMotion, SensorState]:
     """Return ways and forces between the epochs, the motion that wheel and inertia agree on, and the state to keep.
@@ -174,9 +183,9 @@ def sensor_epochs(
     sine_at : callable, optional
         Sine of the gradient at arc lengths; the line is unknown without.
     sources : container of str
-        Which of `wheel`, `radar`, `force`, `feature` and `range` are wanted.
+        Which of `wheel`, `radar`, `force`, `feature`, `balise` and `range` are wanted.
     surroundings : LineReferences, optional
-        Features of the line and ground units.
+        Features of the line, ground units and listed balises.
     """
     if not (samples or state.samples):
         last = time[-1] if len(time) else state.time
@@ -185,7 +194,7 @@ def sensor_epochs(
     if not len(time):
         return SensorEpochs(), nothing_sensed(0), state
     pulses, inertial = state.samples.tachometer, state.samples.inertial
-    radar, ranging = state.samples.radar, state.samples.ranging
+    radar, ranging, balises = state.samples.radar, state.samples.ranging, state.balises
     first = time[0] if np.isnat(state.time) else state.time
     edges = np.concatenate([[first], time])
     facing = trajectory.front_sign
@@ -249,13 +258,19 @@ def sensor_epochs(
         }
     if len(ranging) and "range" in sources and surroundings is not None and surroundings.units is not None:
         values["ranges"] = _ranges(ranging, edges, surroundings.units, ranging_lever_m(trajectory, limits), limits)
+    if len(state.samples.balises) and "balise" in sources and surroundings is not None and surroundings.balises:
+        values["balises"], balises = balise_epochs(
+            state.samples.balises, edges, surroundings.balises, trajectory, balises, limits.balise
+        )
     kept = SensorSamples(
         tachometer=_latest(pulses, _find_first_needed(pulses, edges[-1] - REACH, limits)),
         inertial=_latest(inertial, np.searchsorted(inertial.time, edges[-1] - REACH, side="right") - 1),
         radar=_latest(radar, np.searchsorted(radar.time, edges[-1], side="right") - 1),
         ranging=_latest(ranging, np.searchsorted(ranging.time, edges[-1], side="right")),
+        balises=_latest(state.samples.balises, np.searchsorted(state.samples.balises.time, edges[-1], side="right")),
     )
-    return SensorEpochs(**values), sensed, SensorState(time=time[-1], samples=kept, motion=motion, features=passing)
+    state = SensorState(time=time[-1], samples=kept, motion=motion, features=passing, balises=balises)
+    return SensorEpochs(**values), sensed, state
 
 
 def _with_map(limits: SensorLimits, trajectory: Trajectory) -> tuple[float, float]:

@@ -29,6 +29,8 @@ def _sources(result: AlongTrack) -> Strings:
     carried = (used[:, Kind.WHEEL] > 0) & np.isin(result.sensed.state, CARRIED)
     has = np.column_stack([used > 0, carried])
     has[:, Kind.WHEEL] &= ~carried
+    has[:, Kind.BALISE] |= has[:, Kind.NEXT_BALISE]
+    has[:, Kind.NEXT_BALISE] = False
     combinations, which = np.unique(has, axis=0, return_inverse=True)
     return np.array(["+".join(kinds[row]) for row in combinations], dtype=np.str_)[which.reshape(-1)]
 
@@ -93,11 +95,14 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "over_reading_m",
-            "how far the train may be behind: the level, at least 2 % of the way since codes were used",
+            "how far the train may be behind: the level, at least 2 % of the way since codes were used; "
+            "`L_DOUBTOVER` is it and the reference's `Q_LOCACC`",
             lambda r: r.tracked.amount_m,
         ),
         Column(
-            "under_reading_m", "how far the train may be ahead; counted as the other one", lambda r: r.tracked.amount_m
+            "under_reading_m",
+            "how far the train may be ahead, for `L_DOUBTUNDER`; counted as the other one",
+            lambda r: r.tracked.amount_m,
         ),
         Column(
             "motion",
@@ -108,7 +113,8 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column(
             "sources",
             "measurements used with a weight of more than a half: `code` (once a second), `phase`, `doppler`, `wheel`"
-            " (`carry` where inertia takes its place), `radar`, `force`, `place` (by a feature of the line), `range`",
+            " (`carry` where inertia takes its place), `radar`, `force`, `place` (by a feature of the line), `balise`, "
+            "`range`",
             _sources,
             dtype=pl.String(),
         ),
@@ -185,6 +191,11 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             "innovation_place_m",
             "measured less predicted: place by a feature of the line",
             lambda r: _innovation(r, Kind.PLACE),
+        ),
+        Column(
+            "innovation_balise_m",
+            "measured less predicted: place of a balise",
+            lambda r: np.fmax(_innovation(r, Kind.BALISE), _innovation(r, Kind.NEXT_BALISE)),
         ),
         Column(
             "innovation_range_m",

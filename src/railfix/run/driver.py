@@ -23,17 +23,19 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import basis_of, level_facts, prior_basis_text, risk_of
 from railfix.pipeline.processor import EpochProcessor, SolvedChunk, State
 from railfix.run.base_station import Beside, base_log
+from railfix.run.batch_check import BatchCheck, add_batch
 from railfix.run.beside import without_beside
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.chunks import aligned, read_ahead
 from railfix.run.inputs import Antenna, RunInputs
+from railfix.run.mate import add_mate_results
 from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Figures, Filtered, Levels, RunProvenance, package_versions, run_record
-from railfix.run.result_rows import Replays, ResultRows, add_smoothed
+from railfix.run.result_rows import Replays, ResultRows, add_smoothed, shortened
 from railfix.run.sensor_checks import SensorChecks
-from railfix.run.sensors import check_filter, read_sensors, units_of_ranges
+from railfix.run.sensors import balises_of, check_filter, read_sensors, units_of_ranges
 from railfix.run.sources import TRACK_FILE, Log, OpenedLine, open_line
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS
@@ -118,7 +120,7 @@ def run_files(
     options = options or RunOptions()
     inputs, config = inputs.checked(config or Config())
     needing = [name for name in SENSORS if getattr(inputs, name) is not None]
-    check_filter(config, [*needing, *(["smooth"] if options.smooth == "on" else [])])
+    check_filter(config, [*needing, *options.of_filter])
     with (
         OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths) as folder,
         ThreadPoolExecutor(max_workers=1) as hashing,
@@ -127,9 +129,10 @@ def run_files(
         entries, packages = inputs.entries(hashing, out), beside.submit(package_versions)
         navigation, line, logs = open_inputs(inputs, options, config)
         sensors, units = sensors_of(inputs)
+        balises = balises_of(inputs.balises, inputs.balise_list, inputs.virtual_balises, line.track, config)
         base = base_log(inputs.base, options)
         processor = processor_of(
-            config, navigation, line.trajectories, track=line.track, units=units,
+            config, navigation, line.trajectories, track=line.track, units=units, balises=balises,
             base_ecef_m=None if base is None else base.ecef_m,
         )  # fmt: skip
         rows = ResultRows(
@@ -137,6 +140,8 @@ def run_files(
             line=line,
             observations=options.observations == "write",
             checks=SensorChecks() if sensors else None,
+            batches={name: BatchCheck(trajectory=line.trajectories[name]) for name in logs if options.check == "batch"},
+            passings=balises is not None,
             replays={name: Replays() for name in logs} if options.smooth == "on" else {},
         )
         tally = _position(logs, Beside(sensors, base), processor, rows, beside, progress)
@@ -148,9 +153,12 @@ def run_files(
             *notes_of(line, navigation, tally, logs, causes, note_statistic=config.map_offset.note_threshold),
             *_notes_of_levels(config, tally),
             *_notes_of_sensors(rows.checks, sensors, units, line, config),
+            *shortened(rows.balise_notes),
+            *add_batch(rows.batches, folder),
         )
         sources = [entry.result() for entry in entries]
         folder.end_parquet(_footer(sources, notes))
+        add_mate_results(folder, line.track, inputs.logs["front"][0])
         figures = Figures.of(folder, tally, config)
         wall = clock.perf_counter() - began
         made_from = RunProvenance(
@@ -239,8 +247,9 @@ def sensors_of(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
         A table is not what it should be; ranges to a unit without a surveyed position.
     """
     samples = read_sensors(
-        tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar, ranging=inputs.ranging
-    )
+        tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar, ranging=inputs.ranging,
+        balises=inputs.balises,
+    )  # fmt: skip
     return samples, units_of_ranges(samples, inputs.ranging_units, ranging=inputs.ranging)
 
 

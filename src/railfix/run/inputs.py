@@ -8,6 +8,8 @@ from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any, Literal, Self
 
+from pydantic import model_validator
+
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import fingerprint
 from railfix.core.settings import INPUTS, Settings, option
@@ -24,13 +26,13 @@ def input_option(text: str, default: Any = ..., *, metavar: str = "FILE") -> Any
     return option(text, default, metavar=metavar, panel=INPUTS)
 
 
-def track_option() -> Any:
+def track_option(default: Any = ...) -> Any:
     """Return the field for the files of the track."""
     text = (
         "Track map; several are joined to a route in the order given. Of one file with a network of tracks the route "
         "is found from the log."
     )
-    return input_option(text, metavar="TRACK")
+    return input_option(text, default, metavar="TRACK")
 
 
 def heights_option() -> Any:
@@ -49,6 +51,21 @@ def vehicle_option() -> Any:
         "own path."
     )
     return input_option(text, None, metavar="TOML")
+
+
+def balise_list_option() -> Any:
+    """Return the field for the list of balises."""
+    text = (
+        "Places of the balises: CSV with balise, chainage_m and, where there are such, track (chainage_m then counts "
+        "from the beginning of that track) and sigma_m."
+    )
+    return input_option(text, None, metavar="CSV")
+
+
+def virtual_balises_option() -> Any:
+    """Return the field for virtual balises."""
+    text = "Places whose passing is reported with its interval: a list as of --balise-list. Needs levels."
+    return input_option(text, None, metavar="CSV")
 
 
 class InputFiles(Settings):
@@ -93,6 +110,8 @@ class RunInputs(InputFiles):
         Navigation files; precise orbits, which may be empty.
     track : tuple of Path
         Track map, joined to a route in this order.
+    mate : None
+        Folder of tables of EGNSS MATE, replaced by those in it.
     heights : Path or None
         Heights of a track map without; `OF_LOG`: those of the log's own positions.
     vehicle : Path or None
@@ -100,6 +119,10 @@ class RunInputs(InputFiles):
         Tables of the sensors on board.
     ranging_units : Path or None
         Surveyed positions of the ground units that `ranging` names.
+    balises, balise_list : Path or None
+        Readings of balises, and their places along the line.
+    virtual_balises : Path or None
+        Places along the line whose passing is reported.
     truth : Path or None
         Reference positions, for `ablate` alone.
     config : Path or None
@@ -109,10 +132,18 @@ class RunInputs(InputFiles):
     """
 
     front: tuple[Path, ...] = input_option(
-        "RINEX observation file of the front (or only) antenna; repeat it for a log in several files.", metavar="OBS"
+        "RINEX observation file of the front (or only) antenna; repeat it for a log in several files.",
+        (),
+        metavar="OBS",
     )
     nav: tuple[Path, ...] = input_option("RINEX navigation file; repeat it for several.")
-    track: tuple[Path, ...] = track_option()
+    track: tuple[Path, ...] = track_option(())
+    mate: Path | None = input_option(
+        "Folder with tables of EGNSS MATE, in place of --front, --track and the sensors; an option beside it goes "
+        "before its table.",
+        None,
+        metavar="FOLDER",
+    )
     rear: tuple[Path, ...] = input_option(
         "Observation file of the rear antenna, where there is one.", (), metavar="OBS"
     )
@@ -136,6 +167,11 @@ class RunInputs(InputFiles):
         None,
     )
     ranging_units: Path | None = input_option("Surveyed ground units: CSV with unit, x_m, y_m, z_m (ECEF).", None)
+    balises: Path | None = input_option(
+        "Balises that the train has read: CSV or Parquet with time_gpst, balise and, where it is known, sigma_m.", None
+    )
+    balise_list: Path | None = balise_list_option()
+    virtual_balises: Path | None = virtual_balises_option()
     config: Path | None = None
     cn0_curve: Path | None = None
     error_model: Path | None = None
@@ -147,6 +183,24 @@ class RunInputs(InputFiles):
         None,
         metavar="POSITIONS",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_mate(cls, values: Any) -> Any:
+        """Inputs that a folder of tables gives, beside those that are given themselves."""
+        if not isinstance(values, dict) or values.get("mate") is None:
+            return values
+        from railfix.run.mate import inputs_of
+
+        given = {name: value for name, value in values.items() if name != "mate" and value not in (None, ())}
+        return {**inputs_of(Path(values["mate"])), **given}
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        missing = [name for name in ("front", "track") if not getattr(self, name)]
+        if missing:
+            raise ValueError(f"--{missing[0]} is missing; name its file, or a folder with --mate")
+        return self
 
     def checked(self, config: Config) -> tuple[Self, Config]:
         """Return the inputs with the files that settings name, all checked, and the settings with the logs as files.

@@ -9,7 +9,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import SettingsError
 from railfix.gnss.navigation import Navigation
 from railfix.integrity.protection.support import read_integrity_support
-from railfix.motion.samples import GroundUnits
+from railfix.motion.samples import GroundUnits, ListedBalises
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.ranges.cn0_curve import read_cn0_curve
@@ -40,11 +40,13 @@ def processor_of(
     *,
     track: Track | None = None,
     units: GroundUnits | None = None,
+    balises: ListedBalises | None = None,
     base_ecef_m: Floats | Literal["stream"] | None = None,
 ) -> EpochProcessor:
     """Return a processor with all navigation records and the contents of the files that the settings name.
 
-    `track` is the line itself, for places by its features; `units` are the surveyed stations of two-way ranges.
+    `track` is the line itself, for places by its features; `units` are the surveyed stations of two-way ranges,
+    `balises` the places of those that the train reads.
     `base_ecef_m`: position of a base station; "stream": that of the headers of its observations.
 
     Raises
@@ -70,6 +72,7 @@ def processor_of(
         cn0_curve=None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve),
         track=track,
         units=units,
+        balises=balises,
         base_ecef_m=base_ecef_m,
         support=None if config.integrity_support is None else read_integrity_support(config.integrity_support),
     )

@@ -5,14 +5,16 @@ from __future__ import annotations
 import pickle
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
 
+from railfix.pipeline.passing_table import balise_notes, passing_table
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import Result
 from railfix.pipeline.smoothing import Replay, smooth
 from railfix.pipeline.tables import antenna_positions, observations_table, positions_table, rounded
 from railfix.pipeline.train_table import antenna_train, smoothed_table, train_table, with_smoothed
+from railfix.run.batch_check import BatchCheck
 from railfix.run.output import OutputFolder
 from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sources import OpenedLine
@@ -36,6 +38,12 @@ class ResultRows:
         Takes those of the first antenna, where there are sensors.
     replays : mapping of str to Replays
         Keeps what the filter was given, by antenna; empty where nothing is smoothed.
+    batches : mapping of str to BatchCheck
+        The same, of the epochs that a batch is compared with.
+    passings : bool
+        Whether rows of balises and virtual ones are wanted.
+    balise_notes : list of str
+        Balises so far that were missed, or read where they are not.
     """
 
     folder: OutputFolder
@@ -43,6 +51,9 @@ class ResultRows:
     observations: bool
     checks: SensorChecks | None
     replays: Mapping[str, Replays]
+    batches: Mapping[str, BatchCheck] = field(default_factory=dict)
+    passings: bool = False
+    balise_notes: list[str] = field(default_factory=list)
 
     def write(self, result: Result) -> None:
         """Write the rows of a chunk, with their tracks on a route of a network."""
@@ -54,6 +65,13 @@ class ResultRows:
         if self.checks is not None and result.fusion:
             name = next(iter(result.fusion))
             self.checks.take(antenna_positions(name, result.antennas[name]), antenna_train(name, result.fusion[name]))
+        for name, own in result.fusion.items():
+            self.balise_notes.extend(balise_notes(name, own.passings))
+        if self.passings:
+            tables["passings"] = passing_table(result)
+        for name, check in self.batches.items():
+            if name in result.fusion:
+                check.take(result.fusion[name])
         for name, kept in self.replays.items():
             if name in result.fusion:
                 kept.keep(result.fusion[name].replay)
@@ -65,6 +83,16 @@ class ResultRows:
             self.folder.append_parquet(f"{name}.parquet", table)
             if name != "observations":
                 self.folder.append_csv(f"{name}.csv", rounded(table))
+
+
+#: Notes on balises that a run gives.
+_MOST_NOTES: Final = 20
+
+
+def shortened(notes: list[str]) -> list[str]:
+    """Return the first notes, and how many there are beside."""
+    more = len(notes) - _MOST_NOTES
+    return notes if more <= 0 else [*notes[:_MOST_NOTES], f"{more} more notes on balises; see the table of passings"]
 
 
 class Replays:

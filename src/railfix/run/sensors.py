@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,16 +11,23 @@ import numpy as np
 import polars as pl
 from polars.exceptions import PolarsError
 
+from railfix.core.arrays import Floats, Strings
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.mate import mate_table
 from railfix.motion.samples import (
+    BaliseReadings,
     GroundUnits,
     InertialSamples,
+    ListedBalises,
     RadarSpeeds,
     SensorSamples,
     StationRanges,
     TachometerPulses,
 )
 from railfix.pipeline.config import Config
+from railfix.run.mate import sensor_table
+from railfix.track import Track
+from railfix.track.track import section_spans
 
 #: Columns of each table beside ``time_gpst``, as `railfix simulate` writes them; those in brackets may be absent.
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -31,11 +39,16 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "radar": ("speed_mps",),
     "ranging": ("unit", "range_m", "[sigma_m]"),
     "ranging_units": ("unit", "x_m", "y_m", "z_m"),
+    "balises": ("balise", "[sigma_m]"),
+    "list of balises": ("balise", "chainage_m", "[track]", "[sigma_m]"),
 }  # fmt: skip
 
 
 #: Sensors that may have nothing to say for a while, and say so by rows with the time alone.
-_SILENT: Final = ("tachometer", "ranging")
+_SILENT: Final = ("tachometer", "ranging", "balises")
+#: Tables without a time, and columns of names.
+_TIMELESS: Final = ("ranging_units", "list of balises")
+_NAMES: Final = ("unit", "balise", "track")
 
 
 def read_sensors(
@@ -44,6 +57,7 @@ def read_sensors(
     inertial: Path | None = None,
     radar: Path | None = None,
     ranging: Path | None = None,
+    balises: Path | None = None,
 ) -> SensorSamples:
     """Read the tables of the sensors, CSV (also .gz) or Parquet; a sensor without a file has no samples.
 
@@ -72,12 +86,16 @@ def read_sensors(
         values["radar"] = RadarSpeeds(time=_times(table), speed_mps=speed)
     if ranging is not None:
         table = _table(ranging, "ranging")
-        sigma = table["sigma_m"] if "sigma_m" in table.columns else pl.Series([None]).new_from_index(0, len(table))
         values["ranging"] = StationRanges(
             time=_times(table),
             station=table["unit"].cast(pl.String).to_numpy().astype(np.str_),
             range_m=table["range_m"].cast(pl.Float64).fill_null(float("nan")).to_numpy(),
-            sigma_m=sigma.cast(pl.Float64).fill_null(float("nan")).to_numpy(),
+            sigma_m=_sigmas(table, float("nan")),
+        )
+    if balises is not None:
+        table = _table(balises, "balises")
+        values["balises"] = BaliseReadings(
+            time=_times(table), balise=_names(balises, table, "balise"), sigma_m=_sigmas(table, float("nan"))
         )
     return SensorSamples(**values)
 
@@ -114,6 +132,73 @@ def read_units(path: Path) -> GroundUnits:
     )
 
 
+def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> ListedBalises:
+    """Read balises, or virtual ones, along a line: ``balise,chainage_m`` and, where there are such, ``track,sigma_m``.
+
+    A chainage beside the name of a track counts from the beginning of that track; balises of tracks that are not
+    part of the line, or beyond its ends, are left out.
+
+    InputFileError: no such table, a name twice, or none on the line.
+    """
+    table = _columns(path, "list of balises")
+    names = _names(path, table, "balise")
+    if len(twice := table["balise"].filter(table["balise"].is_duplicated())):
+        raise InputFileError(path, f"lists balise {twice[0]} twice; give each once")
+    chainage = table["chainage_m"].to_numpy()
+    if "track" in table.columns:
+        spans = _spans(track)
+        begin, end = np.array([spans.get(name, (np.nan, np.nan)) for name in table["track"]]).T
+        inside = chainage <= np.abs(end - begin)
+        chainage = np.where(inside, begin + np.sign(end - begin) * chainage, np.nan)
+    inside = (chainage >= 0.0) & (chainage <= track.chainage_m[-1])
+    if not inside.any():
+        raise InputFileError(
+            path, f"lists no balise on the line (0 to {track.chainage_m[-1]:.0f} m); give chainages of this line"
+        )
+    return ListedBalises(
+        name=names[inside],
+        chainage_m=chainage[inside],
+        sigma_m=_sigmas(table, 0.0)[inside],
+        virtual=np.full(int(inside.sum()), virtual),
+    )
+
+
+def _spans(track: Track) -> dict[str | None, tuple[float, float]]:
+    """Chainages of the beginning and end of tracks of a line, by file, file and name, or name; None is the line."""
+    spans: dict[str | None, tuple[float, float]] = {None: (0.0, float(track.chainage_m[-1]))}
+    for source, (begin, end) in zip(track.sections, section_spans(track), strict=True):
+        file, _, name = source.removesuffix(")").partition(" (")
+        spans |= dict.fromkeys([source, name or Path(file).stem], (begin, end))
+    return spans
+
+
+def balises_of(
+    readings: Path | str | None, places: Path | None, virtual: Path | None, track: Track, config: Config
+) -> ListedBalises | None:
+    """Read the places of the balises that the train reads, a table or a stream, and of virtual ones; None without.
+
+    InputFileError: see `read_listed_balises`. SettingsError: readings without a list, or a list without; virtual
+    balises without levels of the filter.
+    """
+    if virtual is not None and (config.filter == "off" or config.tracking.level == "off"):
+        raise SettingsError(
+            "--virtual-balises needs the levels of the filter; leave out --filter off, tracking.level=off"
+        )
+    if (readings is None) != (places is None):
+        given, lacking = ("--balises", "--balise-list") if places is None else ("--balise-list", "--balises")
+        raise SettingsError(f"{given} is given without {lacking}; give both, or leave it out")
+    lists = [
+        read_listed_balises(path, track, virtual=is_virtual)
+        for path, is_virtual in ((places, False), (virtual, True))
+        if path is not None
+    ]
+    if not lists:
+        return None
+    return ListedBalises(
+        **{f.name: np.concatenate([getattr(each, f.name) for each in lists]) for f in fields(ListedBalises)}
+    )
+
+
 def check_filter(config: Config, options: Iterable[str]) -> None:
     """Raise SettingsError where an option is given that only the filter along the track uses, and that is off."""
     for name in options:
@@ -123,6 +208,20 @@ def check_filter(config: Config, options: Iterable[str]) -> None:
 
 def _times(table: pl.DataFrame) -> np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]:
     return table["time_gpst"].to_numpy().astype("datetime64[ns]")
+
+
+def _names(path: Path, table: pl.DataFrame, name: str) -> Strings:
+    """A column of names, none of them empty."""
+    if (empty := table[name].is_null()).any():
+        raise InputFileError(path, f"row {int(empty.arg_max() or 0) + 2}: {name} is empty; name it")
+    return table[name].cast(pl.String).to_numpy().astype(np.str_)
+
+
+def _sigmas(table: pl.DataFrame, absent: float) -> Floats:
+    """Standard deviations of rows, where they are given."""
+    if "sigma_m" not in table.columns:
+        return np.full(len(table), absent)
+    return table["sigma_m"].cast(pl.Float64).fill_null(absent).to_numpy()
 
 
 def _table(path: Path, kind: str) -> pl.DataFrame:
@@ -149,19 +248,21 @@ def _columns_of(table: pl.DataFrame, kind: str) -> pl.Expr:
 
 def _columns(path: Path, kind: str) -> pl.DataFrame:
     try:
-        if path.suffix == ".parquet":
+        if mate_table(path):
+            table = sensor_table(path, kind)
+        elif path.suffix == ".parquet":
             table = pl.read_parquet(path)
         else:
             table = pl.read_csv(
                 path,
-                schema_overrides={"time_gpst": pl.Datetime("ns"), "unit": pl.String},
+                schema_overrides={"time_gpst": pl.Datetime("ns"), **dict.fromkeys(_NAMES, pl.String())},
                 infer_schema_length=None,
                 comment_prefix="#",
             )
     except (PolarsError, OSError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputFileError(path, f"cannot be read as a table of the {kind} ({reason})") from error
-    stamp = () if kind == "ranging_units" else ("time_gpst",)
+    stamp = () if kind in _TIMELESS else ("time_gpst",)
     needed = (*stamp, *(name for name in COLUMNS[kind] if not name.startswith("[")))
     missing = [name for name in needed if name not in table.columns]
     if missing:
@@ -170,9 +271,9 @@ def _columns(path: Path, kind: str) -> pl.DataFrame:
         raise InputFileError(path, f"has no rows; expected those of the {kind}, or leave the file out")
     empty = table.select(pl.all_horizontal(_columns_of(table, kind).is_null())).to_series()
     return table.with_columns(
-        _numbers(path, table[name], may_be_empty=empty if name == "pulse" else pl.Series([True]))
+        _numbers(path, table[name], may_be_empty=empty if name == "pulse" else pl.Series([name != "chainage_m"]))
         for name in (column.strip("[]") for column in COLUMNS[kind])
-        if name != "unit" and name in table.columns
+        if name not in _NAMES and name in table.columns
     )
 
 

@@ -103,6 +103,9 @@ def _list_effects(scenario: Scenario) -> str:
         place = {"ahead": ranging.along_m, "right": right, "above": above}
         given = " ".join(f"--set sensors.range_{name}_m={metres:g}" for name, metres in place.items() if metres)
         parts.append(f"The place of the vehicle's ranging unit, for `railfix run`: `{given}`.")
+    balises = None if scenario.sensors is None else scenario.sensors.balises
+    if balises is not None and balises.along_m:
+        parts.append(f"The balises' reader, for `railfix run`: `--set sensors.balise.ahead_m={balises.along_m:g}`.")
     if scenario.multipath:
         parts.append("Disturbances from Python, which no setting below describes.")
     return " ".join(parts)

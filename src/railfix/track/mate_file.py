@@ -19,9 +19,11 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import polars as pl
 
 from railfix.core.errors import InputFileError
 from railfix.core.files import text_lines
+from railfix.core.mate import read_mate
 from railfix.io.named_columns import read_named_columns
 from railfix.track.crs import used_crs
 from railfix.track.design import segment_of_design
@@ -70,10 +72,13 @@ def _rows(path: str | PathLike[str], table: str | None) -> dict[str, list[Row]]:
         if _POSITION not in file.name.upper() or wanted not in names:
             return {}
         file = names[wanted]
-    columns = read_named_columns(file)
-    names_of = {name.upper(): name for name in columns.cells}
+    if file.suffix.lower() == ".parquet":
+        cells = read_mate(file, ("TRACK_EDGE_ID", "TRACK_SEGMENT_TYPE")).cast(pl.String).to_dict()
+    else:
+        cells = read_named_columns(file).cells
+    names_of = {name.upper(): name for name in cells}
     edges: dict[str, list[Row]] = {}
-    for values in zip(*(columns.cells[name] for name in names_of.values()), strict=True):
+    for values in zip(*(cells[name] for name in names_of.values()), strict=True):
         row = {name: str(v).strip() for name, v in zip(names_of, values, strict=True) if v is not None}
         edges.setdefault(row.get("TRACK_EDGE_ID", ""), []).append(row)
     return {

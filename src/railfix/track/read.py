@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
+from pathlib import Path
 
 import numpy as np
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import ending
+from railfix.core.mate import mate_table
 from railfix.track.csv_file import read_csv_segment
 from railfix.track.geojson_file import read_geojson_segments
 from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
@@ -41,7 +43,7 @@ def read_track(
 
     CSV (``.csv``) and GeoJSON (``.geojson``, ``.json``), plain or packed; GeoPackage, Shapefile, FlatGeobuf, GML, GPX,
     KML, DXF and OpenStreetMap through GDAL; alignments of IFC 4.3 (``.ifc``) and LandXML, and railML 3 (``.xml``,
-    ``.railml``).
+    ``.railml``); tables of EGNSS MATE.
 
     Parameters
     ----------
@@ -173,6 +175,10 @@ def _with_accuracy(segment: Segment, sigma_m: float, *notes: str) -> Segment:
 
 
 def _segments_of(file: str | PathLike[str], reading: MapReading) -> list[Segment]:
+    if mate_table(file) and (mate_table(file) == "S_DM_TRACKPOINT" or ending(file) == ".parquet"):
+        from railfix.track.mate_points import read_edges
+
+        return read_edges(Path(file), reading)
     kind = ending(file)
     if kind == ".csv":
         from railfix.track.mate_file import is_mate, read_mate_segments

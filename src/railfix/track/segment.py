@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from railfix.core.arrays import Floats
+from railfix.track.track import BACKWARDS
 
 #: `Segment.height_datum` of a segment without heights; they are NaN, or come from a second source.
 NO_HEIGHTS = "none"
@@ -70,5 +71,5 @@ class Segment:
         return replace(
             self,
             **turned,
-            notes=(*self.notes, f"{self.source} is used against the order of its points"),
+            notes=(*self.notes, f"{self.source} {BACKWARDS}"),
         )

@@ -23,6 +23,8 @@ from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 SIGMA_PLAN_M = 0.30
 #: Standard deviation of its height [m]: about twice the plan's (P1 4.1(3)).
 SIGMA_HEIGHT_M = 0.60
+#: Note on a section that is joined against the order of its points, after its name.
+BACKWARDS = "is used against the order of its points"
 #: Name of the reference system of a map that names none.
 UNNAMED = "not named (WGS 84 assumed)"
 #: Kilometrage that differs from the length of a segment by more than this, plus a twentieth of
@@ -211,6 +213,14 @@ class Track(NotebookTable):
     def kilometrage_at(self, chainage_m: ArrayLike) -> Floats:
         """Interpolate the kilometrage at chainages; see `interpolate_kilometrage`."""
         return interpolate_kilometrage(chainage_m, self.chainage_m, self.kilometrage_m)
+
+
+def section_spans(track: Track) -> list[tuple[float, float]]:
+    """Return the chainages of the beginning and the end of each section; falling where a section is run backwards."""
+    ends = [0.0, *track.chainage_m[np.flatnonzero(np.diff(track.section, append=len(track.sections)))].tolist()]
+    backwards = [f"{source} {BACKWARDS}" in track.provenance.notes for source in track.sections]
+    spans = zip(ends[:-1], ends[1:], backwards, strict=True)
+    return [(end, begin) if back else (begin, end) for begin, end, back in spans]
 
 
 def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:

@@ -1,6 +1,6 @@
 # The names of `railfix.tracking`, imported at their first use (lazy-loader).
 
-from .epochs import GnssEpochs, Kind, RangeEpochs, SensorEpochs
+from .epochs import BaliseEpochs, GnssEpochs, Kind, RangeEpochs, SensorEpochs
 from .filter import track
 from .limits import TrackingLimits
 from .line import Line
@@ -10,6 +10,7 @@ from .state import TrackState
 
 __all__ = [
     "BackwardInformation",
+    "BaliseEpochs",
     "GnssEpochs",
     "Kind",
     "Line",

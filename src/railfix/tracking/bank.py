@@ -36,6 +36,7 @@ class SourceKind(IntEnum):
     SENSOR = 2
     MOTION = 3
     MAP = 4
+    BALISE = 5
 
 
 #: Sources beside satellites, constellations and sensors: all Dopplers, all phases, the map.
@@ -84,6 +85,7 @@ def budget(limits: TrackingLimits) -> Budget:
         min(local * limits.level_sensor_prior, 1.0),
         min(local * limits.level_motion_prior, 1.0),
         min(local * limits.level_map_prior, 1.0),
+        min(local * limits.level_balise_prior, 1.0),
     ]
     kept = [prior if MOST_SOURCES * prior > SPARED * risk else 0.0 for prior in exposed]
     risk -= MOST_SOURCES * sum(prior for prior, monitored in zip(exposed, kept, strict=True) if not monitored)
@@ -108,6 +110,8 @@ def kind_of(name: str) -> SourceKind:
         return SourceKind.CONSTELLATION
     if name in OTHERS:
         return SourceKind.MAP if name == "map" else SourceKind.MOTION
+    if name in (SENSORS[Kind.BALISE], SENSORS[Kind.NEXT_BALISE]):
+        return SourceKind.BALISE
     return SourceKind.SENSOR if name in SENSORS.values() else SourceKind.SATELLITE
 
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from typing import Literal
 
+import numpy as np
+
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 
 
@@ -19,7 +21,9 @@ class Kind(IntEnum):
     RADAR = 4
     FORCE = 5
     PLACE = 6  # by a feature of the line
-    RANGE = 7  # to a ground unit
+    BALISE = 7  # and the one read after it: balises take turns, so that the level can do without either
+    NEXT_BALISE = 8
+    RANGE = 9  # to a ground unit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +104,41 @@ class RangeEpochs:
 
 
 @dataclass(frozen=True, kw_only=True)
+class BaliseEpochs:
+    """Balises read since the epoch before, by turns: NaN, and any time, where there is none.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (T, 2)
+        At which each was passed.
+    place_m, sigma_m : ndarray, shape (T, 2) [m]
+        Arc length of the trajectory's point then.
+    """
+
+    time: Datetimes
+    place_m: Floats
+    sigma_m: Floats
+
+    @classmethod
+    def none(cls, epochs: int) -> BaliseEpochs:
+        """Epochs without a balise."""
+        place_m, sigma_m = np.full((2, epochs, 2), np.nan)
+        return cls(time=np.zeros((epochs, 2), dtype="datetime64[ns]"), place_m=place_m, sigma_m=sigma_m)
+
+    def latest_of(self, interval: Indices, intervals: int) -> BaliseEpochs:
+        """Return the last balise of each turn in each interval; `interval` has that of each epoch, shape (T,)."""
+        row = np.full((intervals, 2), -1, dtype=np.intp)
+        epoch, turn = np.nonzero(np.isfinite(self.place_m))
+        np.maximum.at(row, (interval[epoch], turn), epoch)
+        turns = np.arange(2)
+        return BaliseEpochs(
+            time=self.time[row, turns],
+            place_m=np.where(row >= 0, self.place_m[row, turns], np.nan),
+            sigma_m=self.sigma_m[row, turns],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class SensorEpochs:
     """Sensor measurements at the same epochs, shape (T,) each, NaN where there is none; None without the sensor.
 
@@ -115,6 +154,7 @@ class SensorEpochs:
         Mean specific force along rising chainage since the epoch before, gravity on the gradient included.
     place_m, place_sigma_m : ndarray or None [m]
         Arc length, by a feature of the line.
+    balises : BaliseEpochs or None
     ranges : RangeEpochs or None
         Two-way ranges to ground units.
     """
@@ -128,6 +168,7 @@ class SensorEpochs:
     force_sigma_mps2: Floats | None = None
     place_m: Floats | None = None
     place_sigma_m: Floats | None = None
+    balises: BaliseEpochs | None = None
     ranges: RangeEpochs | None = None
 
 

@@ -111,6 +111,9 @@ class TrackingLimits(Settings):
         Probability that a fault is common to a constellation: 1e-4, that of the ARAIM milestone 3 report for Galileo.
     level_sensor_prior : float
         Probability that a sensor on board is faulty at such a sample. An assumption.
+    level_balise_prior : float
+        Probability that a balise read is not where the list has it (a wrong identity, list or reading). An assumption;
+        two wrong ones together are not bounded, so that it must be small.
     level_motion_prior : float
         Probability that all Dopplers, or all phases, are wrong together at such a sample. An assumption.
     level_map_prior, level_map_m : float, float
@@ -187,6 +190,7 @@ class TrackingLimits(Settings):
     level_fault_prior: float = Field(default=1e-3, ge=0, lt=1)
     level_constellation_prior: float = Field(default=1e-4, ge=0, lt=1)
     level_sensor_prior: float = Field(default=1e-3, ge=0, lt=1)
+    level_balise_prior: float = Field(default=1e-6, ge=0, le=3e-6)
     level_motion_prior: float = Field(default=1e-5, ge=0, lt=1)
     level_map_prior: float = Field(default=1e-3, ge=0, lt=1)
     level_map_m: float = Field(default=30.0, gt=0)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Datetimes, Floats
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking import layout
 from railfix.tracking import bank
@@ -64,7 +64,7 @@ class Recursion:
         self.levels = levels
         interval, singers = np.unique(chunk.interval_s, return_inverse=True)
         matrices = [singer(float(dt), limits.acceleration_mps2, limits.acceleration_s) for dt in interval]
-        values: dict[str, Any] = _columns(sensors, len(chunk.time))
+        values: dict[str, Any] = _columns(sensors, chunk.time)
         self.sensed = np.isfinite(values["sensor"]).any(axis=0)
         values |= {
             "time_s": seconds(chunk.time - chunk.time[0]),
@@ -158,9 +158,9 @@ def _kernel() -> Callable[..., int]:
     return advance
 
 
-def _columns(sensors: SensorEpochs, epochs: int) -> dict[str, Floats]:
-    """Measurements of the wheel, radar, force, place and ranges and their standard deviations by column."""
-    ranges = sensors.ranges
+def _columns(sensors: SensorEpochs, time: Datetimes) -> dict[str, Floats]:
+    """Measurements of the wheel, radar, force, place, balises and ranges and their standard deviations by column."""
+    ranges, epochs = sensors.ranges, len(time)
     units = 0 if ranges is None else ranges.range_m.shape[1]
     value, sigma = np.full((epochs, layout.RANGE_ROW + units), np.nan), np.ones((epochs, layout.RANGE_ROW + units))
     for column, (values, sigmas) in enumerate(
@@ -173,12 +173,16 @@ def _columns(sensors: SensorEpochs, epochs: int) -> dict[str, Floats]:
     ):
         if values is not None and sigmas is not None:
             value[:, column], sigma[:, column] = values, sigmas
-    unit, age, lever = np.zeros((epochs, units, 3)), np.zeros((epochs, units)), np.zeros(3)
+    unit, age, lever = np.zeros((epochs, units, 3)), np.zeros((epochs, 3 + units)), np.zeros(3)
+    if sensors.balises is not None:
+        own = slice(layout.PLACE_ROW + 1, layout.RANGE_ROW)
+        value[:, own], sigma[:, own] = sensors.balises.place_m, sensors.balises.sigma_m
+        age[:, 1:3] = np.where(np.isfinite(value[:, own]), seconds(time[:, None] - sensors.balises.time), 0.0)
     if ranges is not None:
         value[:, layout.RANGE_ROW :], sigma[:, layout.RANGE_ROW :] = ranges.range_m, ranges.sigma_m
-        unit, age, lever = ranges.unit_ecef_m, ranges.age_s, ranges.lever_m
+        unit, age[:, 3:], lever = ranges.unit_ecef_m, ranges.age_s, ranges.lever_m
     return {
-        "sensor": value, "sensor_sigma": sigma, "range_unit_ecef_m": unit, "range_age_s": age, "lever_m": lever
+        "sensor": value, "sensor_sigma": sigma, "range_unit_ecef_m": unit, "sensor_age_s": age, "lever_m": lever
     }  # fmt: skip
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Final
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.timescale import seconds
-from railfix.tracking.epochs import GnssEpochs, SensorEpochs
+from railfix.tracking.epochs import BaliseEpochs, GnssEpochs, SensorEpochs
 
 #: Sensors whose values between two epochs are added, and the one of which the mean is taken.
 _SUMMED: Final = (("wheel_m", "wheel_sigma_m"), ("radar_m", "radar_sigma_m"), ("force_mps2", "force_sigma_mps2"))
@@ -32,6 +32,8 @@ class AccumulatedIncrement:
         Satellites whose carrier phase went on at all of them; None where there was no epoch.
     total, variance : ndarray, shape (3,)
         Sums over them of the ways by wheel and radar [m] and of the force [m/s2], and of the variances.
+    balises : BaliseEpochs or None
+        Read since then, as one epoch.
     """
 
     start: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
@@ -40,6 +42,7 @@ class AccumulatedIncrement:
     unbroken: frozenset[str] | None = None
     total: Floats = field(default_factory=lambda: np.zeros(3))
     variance: Floats = field(default_factory=lambda: np.zeros(3))
+    balises: BaliseEpochs | None = None
 
 
 def thinned(
@@ -48,7 +51,7 @@ def thinned(
     """Return which epochs are taken, these with what was measured since the one before, and what to go on with.
 
     A carrier phase goes on where it did so at all epochs between. Ways between epochs are added, the force is their
-    mean; places by features and ranges to ground units count at the epochs that are taken.
+    mean; balises at the next epoch taken; places by features and ranges to ground units at the epochs that are taken.
 
     Parameters
     ----------
@@ -70,6 +73,7 @@ def thinned(
     goes_on = np.concatenate([_unbroken(epochs, since)[None], joined])
     total = np.concatenate([since.total[None], value])
     square = np.concatenate([since.variance[None], variance])
+    balises, left_balises = _balises(sensors, since, np.searchsorted(taken, np.arange(len(epochs))), len(taken))
     # Rows of the intervals: that left by the epochs before is the first; those after the last epoch taken are left.
     edges = np.concatenate([[0], taken + 2])
     size = np.diff(edges)
@@ -83,6 +87,7 @@ def thinned(
         unbroken=_names(epochs, np.asarray(goes_on[rest].all(axis=0)), anew=len(taken) > 0 and not len(total[rest])),
         total=total[rest].sum(axis=0),
         variance=square[rest].sum(axis=0),
+        balises=left_balises,
     )
     if not len(taken):
         return taken, epochs.take(taken), SensorEpochs(), left
@@ -92,7 +97,8 @@ def thinned(
     )
     share = np.where(_MEAN, 1.0 / np.maximum(size, 1)[:, None], 1.0)
     total, square = (np.add.reduceat(values[:end], first, axis=0) * share for values in (total, square))
-    return taken, some, _sensors(sensors, taken, total, np.sqrt(square)), left
+    sensed = _sensors(sensors, taken, total, np.sqrt(square))
+    return taken, some, replace(sensed, balises=balises), left
 
 
 def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
@@ -102,6 +108,25 @@ def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
         if getattr(sensors, name) is not None:
             value[:, column], variance[:, column] = getattr(sensors, name), getattr(sensors, sigma) ** 2
     return value, variance
+
+
+def _balises(
+    sensors: SensorEpochs, since: AccumulatedIncrement, interval: Indices, taken: int
+) -> tuple[BaliseEpochs | None, BaliseEpochs | None]:
+    """Balises at the epochs that are taken, and those read after them, with what was left before."""
+    if sensors.balises is None and since.balises is None:
+        return None, None
+    before = since.balises or BaliseEpochs.none(1)
+    own = sensors.balises or BaliseEpochs.none(len(interval))
+    rows = BaliseEpochs(**{
+        f.name: np.concatenate([getattr(before, f.name), getattr(own, f.name)]) for f in fields(BaliseEpochs)
+    })  # fmt: skip
+    parts = rows.latest_of(np.concatenate([[0], interval]), taken + 1)
+    found, left = (
+        BaliseEpochs(**{f.name: getattr(parts, f.name)[part] for f in fields(BaliseEpochs)})
+        for part in (slice(taken), slice(taken, None))
+    )
+    return found, left
 
 
 def _unbroken(epochs: GnssEpochs, since: AccumulatedIncrement) -> Masks:
@@ -117,7 +142,7 @@ def _names(epochs: GnssEpochs, unbroken: Masks, *, anew: bool) -> frozenset[str]
 
 def _sensors(sensors: SensorEpochs, taken: Indices, total: Floats, sigma: Floats) -> SensorEpochs:
     """Sensors at the epochs that are taken."""
-    values: dict[str, Floats] = {}
+    values: dict[str, Any] = {}
     for column, names in enumerate(_SUMMED):
         if getattr(sensors, names[0]) is not None:
             values |= {names[0]: total[:, column], names[1]: sigma[:, column]}

@@ -6,7 +6,7 @@ With u the unit vector from receiver to satellite, e the tangent, c and h the ax
     Doppler r = A + slope (v + w) - u.(c q_c + h q_h) / dt + d + noise
     phase   change L = range_k(s) - range_{k-1}(s') - u.(g q_a + c q_c + h q_h) + B + noise
     wheel   W (1 + k) = s - s', radar alike;  force f = (v - v') / dt + g sin(gradient) + beta;  place = s
-    range   R = |unit - antenna(s - age v, m_c, m_h)|
+    balise  place = s - age v + age^2 a / 2;  range R = |unit - antenna(s - age v, m_c, m_h)|
 
 s' and v' are those of the epoch before, x_i the satellite's correlated error in units of its sigma, o_g the offset
 of its constellation's code clock, w the time-correlated error of Dopplers, z that of
@@ -33,6 +33,7 @@ from railfix.kernels.tracking.constants import (
 )
 from railfix.kernels.tracking.course import find_ends, gradient_at, nearest_to, on_course, point_at
 from railfix.kernels.tracking.layout import (
+    ACCELERATION,
     ARC,
     C_CLOCK,
     C_DRIFT,
@@ -83,8 +84,8 @@ def write_equations(
 
     `design` has three coefficients on the axes for each code, four for each phase (way, clock, right, up) and Doppler
     (right, up, speed, drift). `sensed` has for each sensor the coefficients of the place and the place before, the
-    speed and the speed before, of its own unknown and of the displacement along the map; of a range the second and
-    the fourth are of the error of the map to the right and up.
+    speed and the speed before, of its own unknown (of a place the acceleration) and of the displacement along the map;
+    of a range the second and the fourth are of the error of the map to the right and up.
     """
     mean, seen, design, value, sensed = work.mean, work.sight, work.design, work.value, work.sensed
     codes, phases, dopplers, sensors, point, axes = (
@@ -180,10 +181,11 @@ def write_equations(
             value[h, i] = (
                 measured - (mean[h, SPEED] - mean[h, n + PREVIOUS_SPEED]) / dt - gravity - mean[h, active.force]
             )
-        elif kind == PLACE_ROW:
-            sensed[h, j, 0] = 1.0
+        elif kind < RANGE_ROW:
+            age = epochs.sensor_age_s[t, kind - PLACE_ROW]
+            sensed[h, j, 0], sensed[h, j, 2], sensed[h, j, 4] = 1.0, -age, 0.5 * age**2
             there = nearest_to(line, on_course(line, measured), mean[h, ARC])
-            value[h, i] = there - mean[h, ARC]
+            value[h, i] = there - mean[h, ARC] + age * mean[h, SPEED] - 0.5 * age**2 * mean[h, ACCELERATION]
         else:
             value[h, i] = measured - _write_range(epochs, t, line, kind - RANGE_ROW, work, h, j)
 
@@ -192,7 +194,7 @@ def write_equations(
 def _write_range(epochs: Epochs, t: int, line: LineArrays, unit: int, work: Work, h: int, j: int) -> float:
     """Write the coefficients of a range to a ground unit; return the range at the mean."""
     mean, sensed, point, axes, lever = work.mean, work.sensed, work.point, work.axes, epochs.lever_m
-    age = epochs.range_age_s[t, unit]
+    age = epochs.sensor_age_s[t, RANGE_ROW - PLACE_ROW + unit]
     point_at(line, mean[h, ARC] - age * mean[h, SPEED] + lever[0], point, axes, 0)
     across, above, square = mean[h, RIGHT] + lever[1], mean[h, UP] + lever[2], 0.0
     along = right = up = 0.0
@@ -228,6 +230,8 @@ def move_sensor_equations(active: Active, rows: Rows, best: int, work: Work, h: 
             own = mean[h, active.radar] - mean[best, active.radar]
         elif kind == FORCE_ROW:
             own = mean[h, active.force] - mean[best, active.force]
+        elif PLACE_ROW <= kind < RANGE_ROW:
+            own = mean[h, ACCELERATION] - mean[best, ACCELERATION]
         for c in range(6):
             sensed[h, j, c] = sensed[best, j, c]
         work.value[h, i] = work.value[best, i] - (
@@ -285,6 +289,8 @@ def combine(epochs: Epochs, t: int, active: Active, rows: Rows, work: Work, h: i
             unknown[i, 4] = active.radar
         elif rows.sensors[j] == FORCE_ROW:
             unknown[i, 4] = active.force
+        elif PLACE_ROW <= rows.sensors[j] < RANGE_ROW:
+            unknown[i, 4] = ACCELERATION
         share[i, 4] = sensed[h, j, 4]
         unknown[i, 5], share[i, 5] = n + MAP_LENGTH_ERROR, sensed[h, j, 5]
     for i in range(size):

@@ -16,11 +16,11 @@ OF_EPOCH = 7
 #: Combinations of phases and Dopplers after the clock of the codes.
 C_WAY, C_CLOCK, C_RIGHT, C_UP, C_SPEED, C_DRIFT = 1, 2, 3, 4, 5, 6
 COMBINED = 7
-#: Kinds of sensors, and their columns: wheel, radar, force, place, and one for each range to a ground unit.
-SENSORS = 5
+#: Kinds of sensors, and their columns: wheel, radar, force, place, balises in turn, and one for each range to a unit.
+SENSORS = 7
 #: Sources of sub-filters after the sensors: all Dopplers, all phases, the map.
 OTHERS = 3
-WHEEL_ROW, RADAR_ROW, FORCE_ROW, PLACE_ROW, RANGE_ROW = 0, 1, 2, 3, 4
+WHEEL_ROW, RADAR_ROW, FORCE_ROW, PLACE_ROW, RANGE_ROW = 0, 1, 2, 3, 6
 #: Parts of an epoch: all of it; the prediction alone; what follows a prediction that is in the work space already,
 #: places sought in between; the same where the track was lost.
 WHOLE, PREDICTION, REST, REST_LOST = 0, 1, 2, 3
@@ -30,9 +30,9 @@ class Epochs(NamedTuple):
     """T prepared epochs of K channels (`railfix.tracking.chunk.Chunk`) and sensors.
 
     `begins` marks epochs before which the state begins anew; `singer` is the row of `step` and `noise` of each
-    interval; columns of `sensor` and `sensor_sigma`: wheel, radar, force, place, and R ranges to ground units, which
-    were measured `range_age_s` before, by a unit at `lever_m` along the line, to the right and up; NaN without a
-    measurement.
+    interval; columns of `sensor` and `sensor_sigma`: wheel, radar, force, place, two of balises, and R ranges to ground
+    units by a unit at `lever_m` along the line, to the right and up; NaN without a measurement. Those from the place on
+    were measured `sensor_age_s` before, shape (T, 3 + R).
     """
 
     time_s: Floats
@@ -59,7 +59,7 @@ class Epochs(NamedTuple):
     sensor: Floats
     sensor_sigma: Floats
     range_unit_ecef_m: Floats
-    range_age_s: Floats
+    sensor_age_s: Floats
     lever_m: Floats
     unsigned: bool
 

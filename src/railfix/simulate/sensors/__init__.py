@@ -1,6 +1,8 @@
-"""Vehicle sensors besides the satellite receivers: tachometer, inertial sensor, radar, ranging."""
+"""Vehicle sensors besides the satellite receivers: tachometer, inertial sensor, radar, ranging, balises."""
 
 from railfix.simulate.sensors.settings import (
+    Balise,
+    BaliseSettings,
     DrawnSlips,
     Dropout,
     GroundUnit,
@@ -13,6 +15,8 @@ from railfix.simulate.sensors.settings import (
 )
 
 __all__ = [
+    "Balise",
+    "BaliseSettings",
     "DrawnSlips",
     "Dropout",
     "GroundUnit",

@@ -263,6 +263,50 @@ class RangingSettings(ScenarioSettings):
         return units
 
 
+class Balise(ScenarioSettings):
+    """Balise in the track.
+
+    Attributes
+    ----------
+    name : str
+        Identity.
+    chainage_m : float
+    """
+
+    name: str = Field(min_length=1)
+    chainage_m: Finite
+
+
+class BaliseSettings(ScenarioSettings):
+    """Balises and their reader on the vehicle.
+
+    Attributes
+    ----------
+    balises : tuple of Balise
+    spacing_m : float
+        Others are so far apart from each other and the beginning of the line, named B001 and on; 0 for none.
+    along_m : float
+        Place of the reader along the body, as the antennas'.
+    noise_sigma_m : float
+        Error of a reading along the line.
+    missed : tuple of str
+        Balises that are not read.
+    wrong : mapping of str to str
+        Balises that are read with another identity.
+    missed_chance, wrong_chance : float
+        The same by chance, the identity being that of another balise.
+    """
+
+    balises: tuple[Balise, ...] = ()
+    spacing_m: NotNegative = 0.0
+    along_m: Finite = 0.0
+    noise_sigma_m: NotNegative = 0.0
+    missed: tuple[str, ...] = ()
+    wrong: dict[str, str] = Field(default_factory=dict)
+    missed_chance: Share = 0.0
+    wrong_chance: Share = 0.0
+
+
 class SensorSettings(ScenarioSettings):
     """Sensors of the vehicle; None: no sensor of that kind.
 
@@ -272,9 +316,11 @@ class SensorSettings(ScenarioSettings):
     inertial : InertialSettings or None
     radar : RadarSettings or None
     ranging : RangingSettings or None
+    balises : BaliseSettings or None
     """
 
     tachometer: TachometerSettings | None = TachometerSettings()
     inertial: InertialSettings | None = InertialSettings()
     radar: RadarSettings | None = RadarSettings()
     ranging: RangingSettings | None = None
+    balises: BaliseSettings | None = None

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import polars as pl
 
+from railfix.simulate.sensors.balises import balise_list_table, balise_tables
 from railfix.simulate.sensors.inertial import inertial_table
 from railfix.simulate.sensors.radar import radar_table
 from railfix.simulate.sensors.ranging import ranging_table, unit_table
@@ -52,6 +53,13 @@ COLUMNS: Final[dict[str, dict[str, str]]] = {
         "y_m": "surveyed position, ECEF [m]",
         "z_m": "surveyed position, ECEF [m]",
     },
+    "balises": {"time_gpst": "instant at which the reader was over a balise, GPS time", "balise": "identity read"},
+    "balise_list": {"balise": "identity", "chainage_m": "surveyed chainage [m]"},
+    "balise_truth": {
+        "time_gpst": "ground truth: instant at which the reader was over a balise, GPS time",
+        "balise": "ground truth: the balise there",
+        "read": "identity that was read; empty where none was",
+    },
 }
 
 
@@ -59,7 +67,8 @@ def sensor_tables(simulation: Simulation) -> dict[str, pl.DataFrame]:
     """Tables of the sensors that `Scenario.sensors` names; none where it is None.
 
     ``tachometer`` and ``wheel_slips`` (ground truth of its wheel), ``inertial``, ``radar``, ``ranging``
-    and ``ranging_units``; the columns are those of `COLUMNS`, all rows in order of `time_gpst`.
+    and ``ranging_units``, ``balises``, ``balise_list`` and ``balise_truth`` (ground truth); the columns are those of
+    `COLUMNS`, all rows in order of `time_gpst`.
     """
     settings = simulation.scenario.sensors
     tables: dict[str, pl.DataFrame] = {}
@@ -75,4 +84,7 @@ def sensor_tables(simulation: Simulation) -> dict[str, pl.DataFrame]:
     if settings.ranging is not None:
         tables["ranging"] = ranging_table(simulation, settings.ranging)
         tables["ranging_units"] = unit_table(simulation, settings.ranging)
+    if settings.balises is not None:
+        tables["balises"], tables["balise_truth"] = balise_tables(simulation, settings.balises)
+        tables["balise_list"] = balise_list_table(simulation, settings.balises)
     return tables

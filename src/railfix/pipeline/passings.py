@@ -1,0 +1,266 @@
+"""Passing of balises and of virtual balises: when the train was over them, within which interval, and what was read.
+
+The train was over a place at arc length m some time while ``|m - s| <= L``, s the place of the filter and L its level
+along the line. The interval ends where the place is certainly behind. A passing takes the train from one side to the
+other, also where it backs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Integers
+from railfix.core.timescale import seconds, timedelta
+from railfix.motion.samples import BaliseReadings, ListedBalises
+from railfix.pipeline.balise_stage import BaliseLimits, arcs_of_balises
+from railfix.track.trajectory import Trajectory
+from railfix.tracking import Tracked
+
+#: Verdicts on a place or a reading.
+VIRTUAL, READ, MISSING, CONTRADICTS, NOT_LISTED = range(5)
+VERDICTS: Final = ("virtual", "read", "missing", "contradicts", "not_listed")
+#: Confidence of an odometer by SUBSET-041 5.2.1.1: so much, and a share of the way since the last balise read.
+ODOMETER_M, ODOMETER_SHARE = 5.0, 0.05
+#: Epochs further apart have nothing between them [s]; a reading may be so far outside of the interval of its passing.
+_APART_S: Final = 2.0
+_NEVER: Final = np.datetime64("NaT", "ns")
+#: Of the filter, at each epoch.
+_VALUES: Final = ("arc_m", "speed_mps", "sigma_m", "level_m", "amount_m")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Passing:
+    """A place that was passed, or a balise that was read where the filter is not.
+
+    Attributes
+    ----------
+    balise : str
+    verdict : int
+        Number of one of `VERDICTS`: a place without a balise; a balise that was read, or was not though it was passed;
+        a reading that contradicts the filter, or of a balise that is not listed.
+    chainage_m : float [m]
+        As listed; NaN where it is not.
+    time, earliest, latest : datetime64[ns]
+        Of the passing, by the filter, with its interval; of a contradicting reading the instant of the reading, NaT.
+    read : datetime64[ns]
+        Time of the reading; NaT without one.
+    read_error_m : float [m]
+        Listed place less that of the filter at the reading.
+    here : str
+        For a reading that contradicts: the balise that is listed nearest to the place of the filter.
+    speed_mps, sigma_m, level_m, amount_m, odometer_m : float
+        At the passing, or reading: speed, standard deviation, level and over- and under-reading amount of the place,
+        and what an odometer that meets SUBSET-041 is allowed since the balise read before.
+    """
+
+    balise: str
+    verdict: int
+    chainage_m: float
+    time: np.datetime64
+    earliest: np.datetime64 = _NEVER
+    latest: np.datetime64 = _NEVER
+    read: np.datetime64 = _NEVER
+    read_error_m: float = float("nan")
+    here: str = ""
+    speed_mps: float = float("nan")
+    sigma_m: float = float("nan")
+    level_m: float = float("nan")
+    amount_m: float = float("nan")
+    odometer_m: float = float("nan")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PassingState:
+    """What one chunk leaves to the next; M places.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (1,) or (0,)
+    values : ndarray, shape (1, 5) or (0, 5)
+        Of the last epoch with a place, as `_VALUES`.
+    side : ndarray of int, shape (M,)
+        On which side of each place the train was last for certain: -1 before it, 1 beyond, 0 not known.
+    since, over : ndarray of datetime64[ns], shape (M,)
+        When that ended, and when the place of the filter was last over it.
+    over_values : ndarray, shape (M, 6)
+        `_VALUES` then, and the odometer's confidence.
+    read : ndarray of datetime64[ns], shape (M,)
+        Last reading.
+    waiting : BaliseReadings
+        Not yet compared, as the epoch after them is to come.
+    right : tuple of (datetime64[ns], float)
+        Readings that were right, the last before the chunk first, with the place of the filter [m].
+    """
+
+    time: Datetimes
+    values: Floats
+    side: Integers
+    since: Datetimes
+    over: Datetimes
+    over_values: Floats
+    read: Datetimes
+    waiting: BaliseReadings = field(default_factory=BaliseReadings)
+    right: tuple[tuple[np.datetime64, float], ...] = ()
+
+    @classmethod
+    def empty(cls, places: int) -> PassingState:
+        """State before the first epoch."""
+        since, over, read = np.full((3, places), _NEVER)
+        return cls(
+            time=np.empty(0, dtype="datetime64[ns]"), values=np.empty((0, len(_VALUES))),
+            side=np.zeros(places, dtype=np.int64), since=since, over=over,
+            over_values=np.full((places, len(_VALUES) + 1), np.nan), read=read,
+        )  # fmt: skip
+
+
+def find_passings(
+    tracked: Tracked,
+    listed: ListedBalises,
+    trajectory: Trajectory,
+    readings: BaliseReadings,
+    state: PassingState | None,
+    limits: BaliseLimits,
+) -> tuple[tuple[Passing, ...], PassingState]:
+    """Return the passings that ended in a chunk and the readings in it that are wrong, and the state to pass on.
+
+    Parameters
+    ----------
+    tracked : Tracked
+        Places of the filter, with levels.
+    listed : ListedBalises
+        Balises and virtual ones.
+    trajectory : Trajectory
+        Of the antenna.
+    readings : BaliseReadings
+        Since the chunk before.
+    state : PassingState or None
+    limits : BaliseLimits
+    """
+    state = state or PassingState.empty(len(listed))
+    own = trajectory.arc_at_chainage(listed.chainage_m)
+    arcs = np.where(listed.virtual, own, arcs_of_balises(listed, trajectory, limits))
+    rows = np.flatnonzero(np.isfinite(tracked.arc_m))
+    values = np.stack([getattr(tracked, name)[rows] for name in _VALUES], axis=1)
+    time, values = np.concatenate([state.time, tracked.time[rows]]), np.concatenate([state.values, values])
+    if not len(time):
+        return (), replace(state, waiting=_joined(state.waiting, readings))
+    state, wrong = _judge(
+        _joined(state.waiting, readings), listed, arcs, trajectory.turn_m, time, values, state, limits
+    )
+    passed, state = _pass(listed, arcs, trajectory.turn_m, time, values, state)
+    found = sorted([*wrong, *passed], key=lambda passing: passing.time)
+    return tuple(found), replace(state, time=time[-1:], values=values[-1:], right=state.right[-1:])
+
+
+def _nearest(difference_m: Floats, turn_m: float) -> Floats:
+    """Differences of arc lengths; once round a closed line is none."""
+    return difference_m - turn_m * np.round(difference_m / turn_m) if np.isfinite(turn_m) else difference_m
+
+
+def _joined(before: BaliseReadings, after: BaliseReadings) -> BaliseReadings:
+    names = [f.name for f in fields(BaliseReadings)]
+    return BaliseReadings(**{n: np.concatenate([getattr(before, n), getattr(after, n)]) for n in names})
+
+
+def _judge(
+    readings: BaliseReadings,
+    listed: ListedBalises,
+    arcs_m: Floats,
+    turn_m: float,
+    time: Datetimes,
+    values: Floats,
+    state: PassingState,
+    limits: BaliseLimits,
+) -> tuple[PassingState, list[Passing]]:
+    """Return the state with the readings that are right, and those that are wrong."""
+    wrong: list[Passing] = []
+    read, right = state.read.copy(), list(state.right)
+    heard = readings.time <= time[-1]
+    index = listed.index_of(readings.balise)
+    for k in np.flatnonzero(heard):  # a few balises
+        at, mark, balise = readings.time[k], int(index[k]), str(readings.balise[k])
+        row = min(int(np.searchsorted(time, at)), len(time) - 1)
+        arc, speed, sigma, level, amount = values[row]
+        place = arc - speed * float(seconds(time[row] - at))
+        near = abs(float(seconds(time[row] - at))) <= _APART_S
+        own = Passing(
+            balise=balise, verdict=NOT_LISTED, chainage_m=float("nan"), time=at, read=at, speed_mps=speed,
+            sigma_m=sigma, level_m=level, amount_m=amount, odometer_m=_odometer(place, at, right),
+        )  # fmt: skip
+        if mark < 0:
+            wrong.append(own)
+        elif near:
+            error = float(_nearest(arcs_m[mark] - place, turn_m))
+            spread = np.sqrt(sigma**2 + np.fmax(readings.sigma_m[k], limits.sigma_m) ** 2 + listed.sigma_m[mark] ** 2)
+            if abs(error) <= limits.contradiction_sigmas * spread:
+                read[mark] = at
+                right.append((at, place))
+                continue
+            real = np.where(listed.virtual, np.nan, np.abs(_nearest(arcs_m - place, turn_m)))
+            here = "" if np.isnan(real).all() else str(listed.name[np.nanargmin(real)])
+            chainage = float(listed.chainage_m[mark])
+            wrong.append(replace(own, verdict=CONTRADICTS, chainage_m=chainage, read_error_m=error, here=here))
+    waiting = BaliseReadings(**{f.name: getattr(readings, f.name)[~heard] for f in fields(BaliseReadings)})
+    return replace(state, read=read, waiting=waiting, right=tuple(right)), wrong
+
+
+def _odometer(place_m: float, time: np.datetime64, right: Sequence[tuple[np.datetime64, float]]) -> float:
+    """Confidence of an odometer at a place since the balise before it that was read [m]; NaN without one."""
+    before = [place for at, place in right if seconds(time - at) > _APART_S]
+    return ODOMETER_M + ODOMETER_SHARE * abs(place_m - before[-1]) if before else float("nan")
+
+
+def _pass(
+    listed: ListedBalises, arcs_m: Floats, turn_m: float, time: Datetimes, values: Floats, state: PassingState
+) -> tuple[list[Passing], PassingState]:
+    """Return the passings that ended, and the state after."""
+    level = np.where(np.isfinite(values[:, 3]), values[:, 3], np.inf)[:, None]
+    ahead = _nearest(arcs_m - values[:, :1], turn_m)
+    far = np.abs(ahead) > 0.25 * turn_m
+    side = np.where(far, 0, np.where(ahead > level, -1, np.where(ahead < -level, 1, 0)))
+    crossed = np.zeros(ahead.shape, dtype=np.bool_)
+    crossed[1:] = ((ahead[1:] < 0.0) != (ahead[:-1] < 0.0)) & ~far[1:]
+    changed = np.zeros(ahead.shape, dtype=np.bool_)
+    changed[1:] = (side[1:] != side[:-1]) | crossed[1:] | (far[1:] != far[:-1])
+    sure, since, over, over_values = state.side.copy(), state.since.copy(), state.over.copy(), state.over_values.copy()
+    if not len(state.time):
+        sure[:] = side[0]
+    found: list[Passing] = []
+    for row, mark in np.argwhere(changed):  # a few a passing
+        before, after = ahead[row - 1, mark], ahead[row, mark]
+        if far[row, mark]:
+            sure[mark] = 0
+            continue
+
+        def instant(first: float, last: float, k: int = int(row)) -> np.datetime64:
+            """When a value that changes its sign between the epochs is zero; the first epoch where that is unknown."""
+            span = float(seconds(time[k] - time[k - 1]))
+            known = np.isfinite(first - last) and first != last and span <= _APART_S
+            return np.datetime64(time[k - 1] + timedelta(span * first / (first - last) if known else 0.0))
+
+        if crossed[row, mark]:
+            over[mark] = instant(before, after)
+            nearer = values[row if abs(after) < abs(before) else row - 1]
+            over_values[mark] = [*nearer, _odometer(nearer[0], over[mark], state.right)]
+        left, entered = side[row - 1, mark], side[row, mark]
+        if left and left != entered:
+            since[mark] = instant(-left * before - level[row - 1, 0], -left * after - level[row, 0])
+        if entered and sure[mark] == -entered and not np.isnat(over[mark]):
+            first, last = entered * before + level[row - 1, 0], entered * after + level[row, 0]
+            known = np.isfinite(first) and seconds(time[row] - time[row - 1]) <= _APART_S
+            latest = instant(first, last) if known else time[row]
+            read = READ if seconds(state.read[mark] - since[mark]) >= -_APART_S else MISSING
+            _, speed, sigma, bound, amount, odometer = over_values[mark].tolist()
+            found.append(Passing(
+                balise=str(listed.name[mark]), verdict=VIRTUAL if listed.virtual[mark] else read,
+                chainage_m=float(listed.chainage_m[mark]), time=over[mark], earliest=since[mark], latest=latest,
+                read=state.read[mark] if read == READ else _NEVER, speed_mps=speed, sigma_m=sigma, level_m=bound,
+                amount_m=amount, odometer_m=odometer,
+            ))  # fmt: skip
+        if entered:
+            sure[mark], over[mark] = entered, _NEVER
+    return found, replace(state, side=sure, since=since, over=over, over_values=over_values)
