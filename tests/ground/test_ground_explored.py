@@ -33,7 +33,8 @@ def running(name: str) -> World:
     [
         ("following", 2, 300),
         pytest.param("following", 3, 7_000, marks=pytest.mark.slow),
-        ("meeting", 3, 3_000),
+        ("meeting", 2, 150),
+        pytest.param("meeting", 3, 3_000, marks=pytest.mark.slow),
         ("three", 2, 500),
         pytest.param("following", 4, 100_000, marks=pytest.mark.slow),
         pytest.param("meeting", 4, 30_000, marks=pytest.mark.slow),

@@ -239,8 +239,8 @@ def violations(seeds: range, steps: int) -> tuple[Counter[str], int]:
 
 @pytest.mark.parametrize(
     ("seeds", "steps"),
-    [(range(12), 250), pytest.param(range(1000), 600, marks=pytest.mark.slow)],
-    ids=["12 runs", "1000 runs"],
+    [(range(4), 250), pytest.param(range(1000), 600, marks=pytest.mark.slow)],
+    ids=["4 runs", "1000 runs"],
 )
 def test_no_overlap_in_traffic_of_eight_trains(seeds: range, steps: int) -> None:
     """Loss 30 %, delays to 8 s, outages, stops of the centre, sensor failures."""
@@ -378,11 +378,11 @@ def test_a_route_over_the_layout_of_a_network() -> None:
 
 
 def test_trains_nearby_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step that looks at the trains nearby ends as one that looks at every train, over 400 s of disturbed traffic."""
+    """A step that looks at the trains nearby ends as one that looks at every train, over 200 s of disturbed traffic."""
 
     def course() -> list[Interlocking]:
         run, states = traffic(3, trains=10, layout=line_with_loops(8)), []
-        for _ in range(400):
+        for _ in range(200):
             run.step()
             states.append(run.centre.state)
         return states
@@ -449,7 +449,7 @@ def test_no_authority_is_extended_into_a_closed_section(monkeypatch: pytest.Monk
     assert [into for into, _ in courses] == [0, 0, 0, 0]
     assert sum(stopped for _, stopped in courses) > 5
     take_out(monkeypatch, "closed")
-    assert sum(closed_course(seed)[0] for seed in range(4)) > 0
+    assert any(closed_course(seed)[0] for seed in range(4))
 
 
 def test_a_closed_section_stops_its_trains_until_it_is_open() -> None:
