@@ -17,12 +17,14 @@ from typer.testing import CliRunner
 
 from railfix.cli import app
 from railfix.core.tables import number, share
+from railfix.evaluate import Evaluation
 from railfix.evaluate.tables import error_tables, evaluation_of, group_tables, level_tables
 from railfix.pipeline.config import parse_config
 from railfix.report import read_runs, report_page, write_report
 from railfix.report.encode import packed, script_json
 from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, NO_TIMES
 from railfix.report.protection import NO_LEVELS
+from railfix.report.runs import ReportedRun
 from railfix.run import RunOptions, RunSummary, run_files
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from report_page import Page, fetched
@@ -35,10 +37,10 @@ STRANGE = "a<b>&'run'"
 
 @pytest.fixture(scope="module")
 def summary(tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
-    """The first minute of the demonstration, in a folder whose name is no HTML."""
+    """The first 20 s of the demonstration, in a folder whose name is no HTML."""
     first = pl.read_csv(demo_truth(), try_parse_dates=True)["time_gpst"][0]
     asked = {"preset": "p1", "raim": {"false_alarm": 0.01}, "antenna_pair": {"clocks": "median"}}
-    options = RunOptions(observations="write", chunk_epochs=200, end=first + timedelta(seconds=60))
+    options = RunOptions(observations="write", chunk_epochs=70, end=first + timedelta(seconds=20))
     out = tmp_path_factory.mktemp("run") / STRANGE
     return run_files(demo_inputs(), parse_config({"filter": "off", **asked}), out=out, options=options, asked=asked)
 
@@ -49,8 +51,27 @@ def folder(summary: RunSummary) -> Path:
 
 
 @pytest.fixture(scope="module")
-def document(folder: Path) -> str:
+def judged(folder: Path) -> tuple[tuple[ReportedRun, ...], Evaluation]:
     runs, evaluation = read_runs([folder], [demo_truth()])
+    assert evaluation is not None
+    return runs, evaluation
+
+
+@pytest.fixture(scope="module")
+def evaluation(judged: tuple[tuple[ReportedRun, ...], Evaluation]) -> Evaluation:
+    return judged[1]
+
+
+@pytest.fixture(scope="module")
+def document(judged: tuple[tuple[ReportedRun, ...], Evaluation]) -> str:
+    return report_page(*judged)
+
+
+@pytest.fixture(scope="module")
+def unjudged(folder: Path) -> str:
+    """The page without a reference."""
+    runs, evaluation = read_runs([folder])
+    assert evaluation is None
     return report_page(runs, evaluation)
 
 
@@ -150,9 +171,7 @@ def test_the_head_tells_what_was_run(document: str, folder: Path) -> None:
         assert note in document
 
 
-def test_figures_of_merit_are_the_evaluations(document: str, folder: Path) -> None:
-    _, evaluation = read_runs([folder], [demo_truth()])
-    assert evaluation is not None
+def test_figures_of_merit_are_the_evaluations(document: str, evaluation: Evaluation) -> None:
     for antenna in ("front", "rear"):
         largest = evaluation.figure("max_m", antenna=antenna)
         conventional = evaluation.figure("p95_m", antenna=antenna, position="conventional")
@@ -161,12 +180,10 @@ def test_figures_of_merit_are_the_evaluations(document: str, folder: Path) -> No
     assert NO_REFERENCE not in document
 
 
-def test_the_terminal_and_the_page_show_the_same_tables(document: str, folder: Path) -> None:
+def test_the_terminal_and_the_page_show_the_same_tables(document: str, evaluation: Evaluation, folder: Path) -> None:
     """Every cell of the evaluation of single epochs: in the page, and what `railfix evaluate` prints."""
     words = ["evaluate", str(folder), "--reference", str(demo_truth()), "--table", "positions"]
     printed = RUNNER.invoke(app, words, env={"COLUMNS": "500"}).output
-    _, evaluation = read_runs([folder], [demo_truth()])
-    assert evaluation is not None
     part = evaluation_of(evaluation, folder.name)
     tables = [*error_tables(part), *group_tables(part), *level_tables(part, worst=20)]
     names = ["figures-of-merit", "intervals", "stanford-separation", "above-level-separation"]
@@ -191,12 +208,10 @@ def test_nothing_is_fetched_and_nothing_unescaped(document: str, page: Page) -> 
 
 
 @pytest.mark.requirement("C4")
-def test_the_protection_level_has_its_section(document: str, page: Page, folder: Path) -> None:
+def test_the_protection_level_has_its_section(document: str, page: Page, evaluation: Evaluation, folder: Path) -> None:
     names = [figure["data-name"] for figure in page.figures]
     assert names.count("stanford") == 4  # usable and all, of two antennas
     assert names.count("levels") == names.count("levels-chainage") == 2
-    _, evaluation = read_runs([folder], [demo_truth()])
-    assert evaluation is not None
     table = evaluation.integrity["separation"].stanford.filter(grouping="all", own_limit=True)
     regions = ("nominal", "misleading", "hazardously_misleading", "unavailable", "unavailable_misleading")
     order = [(antenna, levels_of) for antenna in ("front", "rear") for levels_of in ("usable", "all")]
@@ -244,10 +259,8 @@ def test_errors_over_their_level_are_listed(folder: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.requirement("C4")
-def test_levels_without_a_reference_and_runs_without_levels(folder: Path, tmp_path: Path) -> None:
-    runs, _ = read_runs([folder])
-    document = report_page(runs, None)
-    names = [figure["data-name"] for figure in Page(document).figures]
+def test_levels_without_a_reference_and_runs_without_levels(folder: Path, unjudged: str, tmp_path: Path) -> None:
+    names = [figure["data-name"] for figure in Page(unjudged).figures]
     assert (names.count("levels"), names.count("levels-chainage")) == (2, 3)
     assert "stanford" not in names
     positions = pl.read_parquet(folder / "positions.parquet").filter(pl.col("antenna").cast(pl.String) == "front")
@@ -256,7 +269,7 @@ def test_levels_without_a_reference_and_runs_without_levels(folder: Path, tmp_pa
         pl.col("protection_status").cast(pl.String) != "alarm",
         pl.col("protection_level_m") <= 20.0,
     )
-    section = document.split("<summary>Protection level</summary>")[1].split("</details>")[0]
+    section = unjudged.split("<summary>Protection level</summary>")[1].split("</details>")[0]
     row = next(line for line in section.split("<tr>") if "front" in line and "usable" in line and ">20<" in line)
     assert f"{100 * len(within) / len(positions):.2f} %" in row
     shutil.copy(folder / "run.json", tmp_path)
@@ -271,10 +284,10 @@ def test_levels_without_a_reference_and_runs_without_levels(folder: Path, tmp_pa
     assert not {"levels", "stanford"} & {figure["data-name"] for figure in Page(bare).figures}
 
 
-def test_the_top_of_the_page_compares_like_with_like(folder: Path, tmp_path: Path) -> None:
+def test_the_top_of_the_page_compares_like_with_like(document: str, folder: Path, tmp_path: Path) -> None:
     """Both kinds of position at the same epochs, the conventional ones of unscreened ranges."""
     first = pl.read_csv(demo_truth(), try_parse_dates=True)["time_gpst"][0]
-    options = RunOptions(end=first + timedelta(seconds=60))
+    options = RunOptions(end=first + timedelta(seconds=20))
     run_files(
         demo_inputs(),
         parse_config({"filter": "off", "screens": ["elevation"]}),
@@ -299,9 +312,8 @@ def test_the_top_of_the_page_compares_like_with_like(folder: Path, tmp_path: Pat
         size = (both[column] - both["true_m"]).abs()
         assert f"{size.max():.2f} m" in top
         assert f"{size.quantile(0.95, 'linear'):.2f} m" in top
-    plain = report_page(*read_runs([folder], [demo_truth()]))
-    assert "unscreened" not in plain
-    assert "the same screened ranges" in plain
+    assert "unscreened" not in document
+    assert "the same screened ranges" in document
 
 
 def test_a_larger_error_on_the_map_is_explained(folder: Path, tmp_path: Path) -> None:
@@ -325,7 +337,8 @@ def test_a_larger_error_on_the_map_is_explained(folder: Path, tmp_path: Path) ->
 
 def test_a_background_is_drawn_below_the_plan(folder: Path, tmp_path: Path) -> None:
     streets = tmp_path / "streets.geojson"
-    line = {"type": "LineString", "coordinates": [[135.44, 35.04], [135.452, 35.0523], [135.46, 35.06]]}
+    positions = pl.read_parquet(folder / "positions.parquet", columns=["longitude_deg", "latitude_deg"])
+    line = {"type": "LineString", "coordinates": [[135.44, 35.04], positions.drop_nulls().row(0), [135.46, 35.06]]}
     streets.write_text(json.dumps({"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": line}]}))
     arguments = ["report", str(folder), "--background", str(streets), "--out", str(tmp_path / "page.html")]
     assert RUNNER.invoke(app, arguments).exit_code == 0
@@ -355,10 +368,10 @@ def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tm
     train = pl.read_parquet(mine / "positions.parquet").select(columns).with_columns(status=pl.lit("tracking"))
     train.write_parquet(mine / "train.parquet")
     runs, evaluation = read_runs([mine], [demo_truth()])
-    values = chart(Page(report_page(runs, evaluation)), "error-chainage")
+    document = report_page(runs, evaluation)
+    values = chart(Page(document), "error-chainage")
     on_map, filtered = (unpacked(layer_of(values, name)["y"]) for name in ("on the map", "filtered along the track"))
     np.testing.assert_allclose(filtered, on_map, atol=1e-6)
-    document = report_page(runs, evaluation)
     assert evaluation is not None
     largest = evaluation.figure("max_m", run="run (train)", antenna="front")
     assert "of all epochs, those without satellites included, by the filter along the track" in document
@@ -375,7 +388,7 @@ def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tm
     assert "filter-stanford-train" in document
 
 
-def test_hostile_words_stay_words(folder: Path, tmp_path: Path) -> None:
+def test_hostile_words_stay_words(folder: Path, unjudged: str, tmp_path: Path) -> None:
     attack = "</script><script>alert(1)</script><!--"
     mine = tmp_path / "run"
     shutil.copytree(folder, mine)
@@ -391,8 +404,7 @@ def test_hostile_words_stay_words(folder: Path, tmp_path: Path) -> None:
     document = report_page(runs, None, title=attack)
     assert "alert(1)</script>" not in document
     assert "<!--" not in document
-    clean = report_page(read_runs([folder])[0], None)
-    assert document.count("<script") == clean.count("<script") - 2 * _signals_lost(folder)
+    assert document.count("<script") == unjudged.count("<script") - 2 * _signals_lost(folder)
     assert document.count("&lt;script&gt;alert(1)") >= 5
 
 
@@ -403,15 +415,12 @@ def _signals_lost(folder: Path) -> int:
     return kinds.select("kind", "signal").unique().height - kinds["kind"].n_unique()
 
 
-def test_without_a_reference_the_page_says_so(folder: Path) -> None:
-    runs, evaluation = read_runs([folder])
-    assert evaluation is None
-    document = report_page(runs, evaluation)
-    names = {figure["data-name"] for figure in Page(document).figures}
-    assert NO_REFERENCE in document
+def test_without_a_reference_the_page_says_so(unjudged: str) -> None:
+    names = {figure["data-name"] for figure in Page(unjudged).figures}
+    assert NO_REFERENCE in unjudged
     assert not {"error-time", "error-chainage", "error-ranges", "stanford"} & names
     assert {"plan", "interval-chainage", "sky"} <= names
-    assert "Figures of merit" not in document
+    assert "Figures of merit" not in unjudged
 
 
 def test_without_observations_and_times_the_page_says_so(folder: Path, tmp_path: Path) -> None:
@@ -448,7 +457,7 @@ def test_several_runs_have_a_summary_and_a_part_each(folder: Path, tmp_path: Pat
 def test_the_run_tells_how_long_its_chunks_took(summary: RunSummary, page: Page) -> None:
     record = json.loads(summary.files["run.json"].read_text(encoding="utf-8"))
     chunks = record["chunks"]
-    assert sum(chunks["epochs"]) == summary.tally.epochs == 1200
+    assert sum(chunks["epochs"]) == summary.tally.epochs == 400
     assert len(chunks["epochs"]) == len(chunks["positioning_s"]) == 3
     assert chunks["first_epoch_gpst"][0] == record["antennas"]["front"]["first_epoch_gpst"]
     assert 0.0 < sum(chunks["positioning_s"]) < record["wall_s"]

@@ -28,6 +28,8 @@ from railfix.simulate.demonstration import demo_inputs
 pytestmark = [pytest.mark.requirement("B7"), pytest.mark.requirement("D2")]
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
+#: 70 s; the tunnel begins after 60 s.
+PART = RunOptions.model_validate({"end": "2024-03-05T03:11:10"})
 SCREENS = ("elevation", "doppler", "antenna_pair", "raim", "antenna_spacing")
 
 
@@ -48,7 +50,7 @@ def inputs_with(truth: Path | None) -> RunInputs:
 
 @pytest.fixture(scope="module")
 def ablation(truth: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Ablation, list[int]]:
-    """All choices on the whole made-up run, and how often its logs were read."""
+    """All choices on a part of the made-up run, and how often its logs were read."""
     readings: list[int] = []
 
     def counted(*arguments: Any, **options: Any) -> Iterator[Observations]:
@@ -57,9 +59,8 @@ def ablation(truth: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Abl
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run_sources, "scan_observations", counted)
-        made = ablate_files(
-            inputs_with(truth), parse_config({"filter": "off"}), out=tmp_path_factory.mktemp("ablation") / "out"
-        )
+        out = tmp_path_factory.mktemp("ablation") / "out"
+        made = ablate_files(inputs_with(truth), parse_config({"filter": "off"}), out=out, options=PART)
     return made, readings
 
 
@@ -93,7 +94,8 @@ def test_a_choice_is_the_run_with_these_screens(
     ablation: tuple[Ablation, list[int]], truth: Path, tmp_path: Path, choice: str
 ) -> None:
     screens = choices(SCREENS)[choice]
-    summary = run_files(demo_inputs(), parse_config({"filter": "off", "screens": list(screens)}), out=tmp_path / "out")
+    config = parse_config({"filter": "off", "screens": list(screens)})
+    summary = run_files(demo_inputs(), config, out=tmp_path / "out", options=PART)
     rows = pl.read_parquet(summary.files["positions.parquet"])
     true = pl.read_csv(truth, schema_overrides={"time_gpst": pl.Datetime("ns")})
     joined = rows.join(true, on=["time_gpst", "antenna"], suffix="_true", maintain_order="left")
