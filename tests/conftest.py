@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from bad_inputs import Desk, desk_in
 from railfix.live.warm_up import prepare_kernels
 
 # A busy machine is no failure: examples have no deadline, and slow drawing of data is no error.
@@ -23,6 +26,23 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     options = session.config.option
     if getattr(options, "numprocesses", None) and not options.collectonly:
         prepare_kernels()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Tests and modules stay until the end: the collector of garbage need not look at them again and again."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
+@pytest.fixture(scope="session")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Desk:
+    """One good input of every kind, and results of them; a test that changes them does so in a copy."""
+    return desk_in(tmp_path_factory.mktemp("desk"))
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from bad_inputs import CASES, COMMANDS, FAULTS, MISTAKES, Desk, desk_in
+from bad_inputs import CASES, COMMANDS, FAULTS, MISTAKES, Desk
 from more_mistakes import MORE, Edit, feet
 from railfix.cli import app
 
@@ -22,11 +22,6 @@ HARMLESS = {(kind, "empty") for kind in COMMANDS if kind.endswith(".toml")} | {
 }
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
-
-
-@pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Desk:
-    return desk_in(tmp_path_factory.mktemp("desk"))
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from typing import Final
 import pytest
 from typer.testing import CliRunner
 
-from bad_inputs import Desk, desk_in
+from bad_inputs import Desk
 from railfix.cli import app
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
@@ -21,8 +21,8 @@ NARROW: Final = {**os.environ, "COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"}
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Desk:
-    return desk_in(tmp_path_factory.mktemp("desk"))
+def desk(good: Desk) -> Desk:
+    return good
 
 
 def text_of(output: str) -> str:
@@ -160,7 +160,14 @@ def test_a_reader_that_stops_reading_is_no_defect(desk: Desk) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no full device here")
-@pytest.mark.parametrize("words", ["--help", "--version", "simulate --list", "map check line.csv"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--help",
+        "map check line.csv",
+        *(pytest.param(w, marks=pytest.mark.slow) for w in ("--version", "simulate --list")),
+    ],
+)
 def test_a_full_device_is_one_sentence(desk: Desk, words: str) -> None:
     with open("/dev/full", "w") as full:  # noqa: PTH123
         done = subprocess.run(

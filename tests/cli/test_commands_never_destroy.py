@@ -17,7 +17,7 @@ from typing import Final
 import pytest
 from typer.testing import CliRunner
 
-from bad_inputs import Desk, desk_in
+from bad_inputs import Desk
 from railfix.cli import app
 from railfix.core.errors import OutputError
 from railfix.run import read_record
@@ -46,11 +46,6 @@ TO_FOLDER: Final = {
     "simulate {desk}/scenario.toml --out {out}": "README.md",
     "map check {desk}/line.csv --out {out}": "map_check.png",
 }
-
-
-@pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Desk:
-    return desk_in(tmp_path_factory.mktemp("desk"))
 
 
 @pytest.fixture
@@ -280,7 +275,9 @@ def test_a_signal_while_the_results_folder_is_made_leaves_nothing(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda n: n.name)
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)], ids=lambda n: n.name
+)
 def test_a_terminated_run_leaves_nothing(desk: Desk, number: signal.Signals) -> None:
     words = [word.format(desk=desk.folder, out="out") for word in KILLED["run"].split()]
     process = subprocess.Popen([sys.executable, "-m", "railfix", *words, "--chunk", "1"], cwd=desk.folder)

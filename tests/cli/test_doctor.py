@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from bad_inputs import desk_in
+from bad_inputs import Desk
 from railfix.cli import app
 from railfix.run.doctor import examine_files
 
@@ -16,8 +16,8 @@ pytestmark = pytest.mark.requirement("G4")
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return desk_in(tmp_path_factory.mktemp("desk")).folder
+def desk(good: Desk) -> Path:
+    return good.folder
 
 
 def test_each_file_is_known_by_its_content(desk: Path) -> None:

@@ -19,7 +19,7 @@ import polars as pl
 import pytest
 from typer.testing import CliRunner
 
-from bad_inputs import desk_in
+from bad_inputs import Desk
 from railfix.cli import app
 from railfix.core.errors import InputFileError, OutputError, SettingsError
 from railfix.run.campaign import read_campaign, run_campaign
@@ -39,10 +39,10 @@ chunk_epochs = 50
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(good: Desk, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two trains on two days; one log is broken, one day has no rear antenna."""
     folder = tmp_path_factory.mktemp("campaign")
-    desk = desk_in(tmp_path_factory.mktemp("desk")).folder
+    desk = good.folder
     for name in ("line.csv", "train.toml"):
         shutil.copy(desk / name, folder / name)
     (folder / "nav").mkdir()
