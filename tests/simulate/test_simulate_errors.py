@@ -49,10 +49,17 @@ def whole(scenario: Scenario, antenna: str = "front") -> Piece:
     return piece
 
 
+#: Runs without errors by scenario and antenna, which many tests compare with.
+WITHOUT: dict[tuple[str, str], Piece] = {}
+
+
 def on_and_off(errors: ErrorSettings, antenna: str = "front", **settings: object) -> tuple[Piece, Piece]:
     """The same run with the errors and without."""
     scenario = Scenario(**settings)  # type: ignore[arg-type]
-    return whole(scenario.replaced(errors=errors), antenna), whole(scenario, antenna)
+    key = (repr(scenario), antenna)
+    if key not in WITHOUT:
+        WITHOUT[key] = whole(scenario, antenna)
+    return whole(scenario.replaced(errors=errors), antenna), WITHOUT[key]
 
 
 def added_m(on: Piece, off: Piece) -> tuple[np.ndarray, np.ndarray]:
@@ -135,7 +142,14 @@ def test_satellite_clocks_give_their_sigma_and_correlation_time_back() -> None:
     assert np.abs(apart).max() < 4.0 / np.sqrt(450.0)
 
 
-@pytest.mark.parametrize(("axis", "name"), list(enumerate(("radial_sigma_m", "along_sigma_m", "cross_sigma_m"))))
+@pytest.mark.parametrize(
+    ("axis", "name"),
+    [
+        pytest.param(0, "radial_sigma_m", marks=pytest.mark.slow),
+        (1, "along_sigma_m"),
+        pytest.param(2, "cross_sigma_m", marks=pytest.mark.slow),
+    ],
+)
 def test_orbit_errors_act_through_the_line_of_sight(axis: int, name: str) -> None:
     table = SatelliteErrorSettings(**{name: 2.0}, orbit_time_s=20.0)
     errors = ErrorSettings(satellites=dict.fromkeys("GJE", table))
@@ -253,7 +267,7 @@ def full(time_s: float = 60.0) -> ErrorSettings:
     )
 
 
-@pytest.mark.parametrize("size", [1, 7, 64])
+@pytest.mark.parametrize("size", [pytest.param(1, marks=pytest.mark.slow), 7, 64])
 def test_any_cutting_gives_the_same_numbers_with_all_errors(size: int) -> None:
     scenario = Scenario(duration_s=7.0, errors=full())
     simulation = Simulation(scenario)
