@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from railfix.ground.keys import write_keys
-from railfix.ground.links import BEARERS, CentreLinks, TrainLinks
+from railfix.ground.links import BEARERS, CentreLinks, TrainLinks, bearers_of
 from railfix.ground.relay import LinkDisturbance, RelaySettings
 
 #: Namespaces, and addresses of both bearers in each.
@@ -181,7 +181,10 @@ async def send(transport: str, folder: Path, rate: float, seconds: float) -> lis
         stop: Callable[[], Any] = endpoint.close
     elif transport.startswith("links"):
         links = TrainLinks(
-            1, folder, {b: (HOSTS["c"][b], PORTS[b]) for b in BEARERS}, HOSTS["t"], mode=transport.split(", ")[1]
+            1,
+            folder,
+            bearers_of({b: (HOSTS["c"][b], PORTS[b]) for b in BEARERS}, HOSTS["t"]),
+            mode=transport.split(", ")[1],
         )  # type: ignore[arg-type]
         await links.start()
         while len(links.protocols) < 2:

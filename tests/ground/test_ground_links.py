@@ -20,7 +20,7 @@ from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, Receive
 from railfix.ground.keys import write_keys
 from railfix.ground.link_figure import coverage, round_trips
 from railfix.ground.link_quality import LinkChoice, LinkLimits, LinkMeter
-from railfix.ground.links import BEARERS, CentreLinks, TrainLinks
+from railfix.ground.links import BEARERS, CentreLinks, TrainLinks, bearers_of
 from railfix.ground.quic import LinkProtocol, configuration, connected
 from railfix.ground.relay import LinkDisturbance, Relay, RelaySettings
 
@@ -254,7 +254,9 @@ def test_two_lossy_bearers_carry_each_message_once(keys: Path) -> None:
             )
             relays[name] = Relay(centre.addresses[name], settings)
             await relays[name].open(HOSTS[name])
-        train = TrainLinks(7, keys, {n: r.address for n, r in relays.items()}, LOCAL, received=orders.append)
+        train = TrainLinks(
+            7, keys, bearers_of({n: r.address for n, r in relays.items()}, LOCAL), received=orders.append
+        )
         await train.start()
         await _until(lambda: len(train.protocols) == 2, 8.0)
         assert {p.peer for p in train.protocols.values()} == {"centre"}
@@ -317,7 +319,8 @@ def test_each_threat_on_the_wire(tmp_path: Path) -> None:
                 relay.disturbance = LinkDisturbance(settings.replaced(seed=settings.seed + 10 * k))
                 relay.disturbance.settings = RelaySettings()  # until it is connected
             local = {"A": f"127.0.1.{40 + number}", "B": f"127.0.2.{40 + number}"}
-            trains[number] = TrainLinks(number, tmp_path, {n: relays[number, n].address for n in BEARERS}, local)
+            given = bearers_of({n: relays[number, n].address for n in BEARERS}, local)
+            trains[number] = TrainLinks(number, tmp_path, given)
             await trains[number].start()
         await _until(lambda: all(len(train.protocols) == 2 for train in trains.values()), 10.0)
         for (number, _), relay in relays.items():
@@ -392,7 +395,7 @@ def test_a_wrong_certificate_is_rejected(keys: Path, tmp_path: Path, kind: str) 
         name = "train-8" if kind == "other train" else "train-7"
         (folder / "train-7.pem").write_bytes((source / f"{name}.pem").read_bytes())
         (folder / "train-7.key").write_bytes((source / f"{name}.key").read_bytes())
-        train = TrainLinks(7, folder, centre.addresses, LOCAL)
+        train = TrainLinks(7, folder, bearers_of(centre.addresses, LOCAL))
         if kind == "no certificate":
             import railfix.ground.links as links
 
@@ -429,7 +432,7 @@ def test_a_certificate_ends_while_connected(tmp_path: Path, how: str) -> None:
         got: Counter[int] = Counter()
         centre = CentreLinks(keys, HOSTS, received=lambda train, _: got.update([train]))
         await centre.start()
-        trains = {n: TrainLinks(n, keys, centre.addresses, LOCAL) for n in (7, 8)}
+        trains = {n: TrainLinks(n, keys, bearers_of(centre.addresses, LOCAL)) for n in (7, 8)}
         for train in trains.values():
             await train.start()
 
@@ -476,7 +479,7 @@ def test_the_next_report_arrives_at_once_when_both_links_were_gone(keys: Path, o
         for name in BEARERS:
             await relays[name].open(HOSTS[name])
         limits = LinkLimits(answer_s=0.1)
-        train = TrainLinks(7, keys, {n: r.address for n, r in relays.items()}, LOCAL, limits=limits)
+        train = TrainLinks(7, keys, bearers_of({n: r.address for n, r in relays.items()}, LOCAL), limits=limits)
         await train.start()
         await _until(lambda: len(train.protocols) == 2, 5.0)
         train.send(b"0")
@@ -511,7 +514,9 @@ def test_spare_mode_switches_and_returns(keys: Path) -> None:
         for name in BEARERS:
             await relays[name].open(HOSTS[name])
         limits = LinkLimits(answer_s=0.1, misses=3, good=5, good_s=0.3)
-        train = TrainLinks(7, keys, {n: r.address for n, r in relays.items()}, LOCAL, mode="spare", limits=limits)
+        train = TrainLinks(
+            7, keys, bearers_of({n: r.address for n, r in relays.items()}, LOCAL), mode="spare", limits=limits
+        )
         await train.start()
         await _until(lambda: len(train.protocols) == 2, 5.0)
         for k in range(100):
@@ -544,7 +549,7 @@ def test_a_frame_and_its_answer_are_a_packet_each(keys: Path, monkeypatch: pytes
         got: list[bytes] = []
         centre = CentreLinks(keys, HOSTS, received=lambda train, _: centre.send(train, b"x"))
         await centre.start()
-        train = TrainLinks(7, keys, centre.addresses, LOCAL, received=got.append)
+        train = TrainLinks(7, keys, bearers_of(centre.addresses, LOCAL), received=got.append)
         await train.start()
         assert await _until(lambda: len(train.protocols) == 2, 5.0) < 5.0
         await asyncio.sleep(0.3)

@@ -27,7 +27,7 @@ from railfix.ground.interlocking import Interlocking, TrainInterval
 from railfix.ground.interlocking_text import HEAD, from_documents
 from railfix.ground.keys import write_keys
 from railfix.ground.link_quality import LinkLimits
-from railfix.ground.links import BEARERS, TrainLinks, first_sequence
+from railfix.ground.links import BEARERS, TrainLinks, bearers_of, first_sequence
 from railfix.ground.monitor import MonitorLimits
 from railfix.ground.on_board import OnBoard, OnBoardLimits
 from railfix.ground.serve import run_centre
@@ -112,7 +112,7 @@ def test_a_killed_centre_keeps_what_its_trains_know(folder: Path, tmp_path: Path
             newest.append(authority)
 
         limits = LinkLimits(idle_s=2.0)
-        links = TrainLinks(1, folder / "keys", addresses(folder), LOCAL, received=received, limits=limits)
+        links = TrainLinks(1, folder / "keys", bearers_of(addresses(folder), LOCAL), received=received, limits=limits)
         await links.start()
         process = await asyncio.to_thread(started, tmp_path)
         running.append(process)
@@ -187,8 +187,8 @@ def test_positions_go_to_the_centre_and_authorities_come_back(folder: Path, tmp_
         await begun.wait()
         train = asyncio.create_task(
             run_train(
-                1, folder / "keys", addresses(folder), LOCAL, lines=positions(), limits=OnBoardLimits(fresh_s=4.0),
-                write=lambda line: lines.append(json.loads(line)),
+                1, folder / "keys", bearers_of(addresses(folder), LOCAL), lines=positions(),
+                limits=OnBoardLimits(fresh_s=4.0), write=lambda line: lines.append(json.loads(line)),
             )
         )  # fmt: skip
         for task, done in (

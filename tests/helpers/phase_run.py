@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -85,10 +85,9 @@ def phase_run(
             break
     total = base + value[:, 0]
     arcs = ArcAmbiguities(arc_id=walk.arc_id, ambiguity_m=total[:count], covariance_m2=covariance[:count, :count])
-    return assembled(
-        arc, started, own, lin, total[index], np.diagonal(covariance)[index], arcs,
-        iterations=iteration, limits=limits,
-    )  # fmt: skip
+    fixes = np.zeros(len(arc), dtype=np.int64), np.full(len(arc), np.nan)
+    ambiguity = (total[index], np.diagonal(covariance)[index])
+    return replace(assembled(arc, started, own, lin, ambiguity, arcs, fixes, limits), iterations=iteration)
 
 
 @dataclass(frozen=True)

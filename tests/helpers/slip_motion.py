@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from railfix.core.constants import GRAVITY_MPS2
-from railfix.motion.slip import MotionState, SlipLimits, SlipResult, find_slips
+from railfix.motion.slip import MotionSamples, MotionState, SlipLimits, SlipResult, find_slips
 
 RATE_HZ = 50.0
 SLIPPING = (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE)
@@ -32,7 +32,7 @@ class Motion:
             body[:, 1] = np.gradient(np.arcsin(self.sine), self.time_s) + gyro_bias_radps
         sine = self.sine if line else np.full(len(self.time_s), np.nan)
         return find_slips(
-            self.time_s, self.wheel, acceleration, self.force, sine, body=body,
+            MotionSamples(self.time_s, self.wheel, acceleration, self.force, sine, body),
             limits=SlipLimits.model_validate(limits),
         )[0]  # fmt: skip
 

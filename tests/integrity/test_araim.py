@@ -19,7 +19,7 @@ from railfix.integrity.protection.araim import AraimBudget, AraimGeometry, Araim
 from railfix.integrity.protection.support import read_integrity_support
 from railfix.pipeline.araim_stage import with_map
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor import EpochProcessor, Models
 
 MESSAGE = """
 format = "railfix integrity support 1"
@@ -222,7 +222,7 @@ def test_positions_of_a_run_have_levels_along_the_track_and_in_space_whatever_th
         parse_config(given),
         {"front": pipeline_cases.clean_trajectories()["front"]},
         navigation=pipeline_cases.clean_navigation(),
-        support=read_integrity_support(path),
+        models=Models(support=read_integrity_support(path)),
     )
     log = pipeline_cases.clean_observations()["front"][::100]
     found = processor.process({"front": log})[0]["front"]

@@ -107,11 +107,11 @@ def test_open_places_are_those_that_solving_every_subset_leaves_open(
     systems = [name[0] for name in result.satellite[result.columns].tolist()]
     model = constrained_model(ranges, line, arc, section=section)
     scale = np.maximum(result.noise_scale[rows], 1.0)
-    index, every = SearchIndex(line), np.arange(len(rows))
+    index = SearchIndex(line)
     elevation, azimuth = elevation_azimuth(ranges.sat_ecef_m, line.at_arc(arc))
     right = np.sin(np.radians(azimuth - line.heading_deg[section][:, None])) > 0
     sides = np.stack([(elevation < 45.0) & ~right, (elevation < 45.0) & right], axis=1)
-    found = places_beyond_the_level(AntennaRows.of(index), arc, model, level, scale, systems, risk, sides, every)
+    found = places_beyond_the_level(AntennaRows.of(index), arc, model, level, scale, systems, risk, sides)
     points = line.at_arc(np.arange(0.0, line.arc_m[-1], 0.5))
     open_ones = 0
     for t in range(len(rows)):
@@ -167,12 +167,12 @@ def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(open_places, "_risk_of_block", counted)
     bounded = places_beyond_the_level(
-        AntennaRows.of(SearchIndex(path)), arc, model, level, scale, systems, RiskBudget(), sides, rows
+        AntennaRows.of(SearchIndex(path)), arc, model, level, scale, systems, RiskBudget(), sides
     )
     assert 0 < sum(looked_at) < 0.3 * len(rows)
     monkeypatch.setattr(kernels.off_tangent, "risk_off_tangent", lambda _, scale, *__: np.full(len(scale), 1.0))
     every = places_beyond_the_level(
-        AntennaRows.of(SearchIndex(path)), arc, model, level, scale, systems, RiskBudget(), sides, rows
+        AntennaRows.of(SearchIndex(path)), arc, model, level, scale, systems, RiskBudget(), sides
     )
     np.testing.assert_array_equal(bounded, every)
     assert every.any() == (share < 1.0)

@@ -22,6 +22,7 @@ from railfix.integrity.protection import (
     along_track_level,
     availability,
 )
+from railfix.integrity.protection.level import MapError, RangeBounds
 from railfix.integrity.raim import LinearModel, constrained_model
 from railfix.positioning.normal_equations import UNTIED_M
 from raim_oracle import point_model
@@ -147,7 +148,7 @@ def test_level_equals_solving_every_subset_again(seed, system, scale, biased, sh
     )
     if expected.sigma_m > 100.0:
         return  # at the edge of what the ranges determine
-    got = along_track_level(model, list(systems), risk=budget, scale=scale, bias_m=bias)
+    got = along_track_level(model, list(systems), risk=budget, scale=scale, overbound=RangeBounds(bias_m=bias))
     assert got.sigma_m[0] == pytest.approx(expected.sigma_m, rel=1e-7)
     for mine, theirs in (
         (got.fault_free_m, expected.fault_free_m),
@@ -215,12 +216,13 @@ def kinds_of_faults(systems: str) -> tuple[LinearModel, dict[str, Any]]:
             risk_per_hour=1e-3, local_prior=1e-3, side_prior=1e-3, constellation_prior={"E": 1e-7, "C": 1e-6}
         ),
         "scale": np.linspace(0.6, 2.0, 12),
-        "least_sigma_m": rng.uniform(0.0, 4.0, (12, n)),
-        "bias_m": rng.uniform(0.0, 1.0, (12, n)),
-        "map_bias_m": rng.normal(size=(12, 2)),
-        "map_seen": (
+        "overbound": RangeBounds(rng.uniform(0.0, 4.0, (12, n)), rng.uniform(0.0, 1.0, (12, n))),
+        "map_error": MapError(
             rng.normal(size=(12, 2)),
-            np.tile(np.diag([0.1, 0.01]), (12, 1, 1)) * (rng.random(12) > 0.3)[:, None, None],
+            (
+                rng.normal(size=(12, 2)),
+                np.tile(np.diag([0.1, 0.01]), (12, 1, 1)) * (rng.random(12) > 0.3)[:, None, None],
+            ),
         ),
         "sides": sides,
         "n_excluded": np.arange(12) % 3,
@@ -231,8 +233,14 @@ def kinds_of_faults(systems: str) -> tuple[LinearModel, dict[str, Any]]:
 def at(options: dict[str, Any], t: int) -> dict[str, Any]:
     """Options of one epoch."""
     one = {name: value[t : t + 1] for name, value in options.items() if isinstance(value, np.ndarray)}
-    seen, known = options["map_seen"]
-    return {**options, **one, "map_seen": (seen[t : t + 1], known[t : t + 1])}
+    bias, seen = options["map_error"]
+    error = MapError(bias[t : t + 1], tuple(values[t : t + 1] for values in seen))
+    return {
+        **options,
+        **one,
+        "overbound": RangeBounds(*(v[t : t + 1] for v in options["overbound"])),
+        "map_error": error,
+    }
 
 
 @pytest.mark.parametrize("systems", ["GGGGEEEECCCR", "GGGGGGGEEEEEECCCC"])
@@ -265,12 +273,14 @@ def test_levels_have_the_unit_of_the_sigmas(systems, factor):
         covariance_m2=model.covariance_m2 * factor**2,
         prior=model.prior / factor**2,
     )
-    seen, known = options["map_seen"]
-    metres = {name: factor * options[name] for name in ("least_sigma_m", "bias_m", "map_bias_m")}
+    error = options["map_error"]
+    assert error.seen is not None
+    metres = {
+        "overbound": RangeBounds(*(factor * values for values in options["overbound"])),
+        "map_error": MapError(factor * error.bias_m, (factor * error.seen[0], error.seen[1] / factor**2)),
+    }
     one = along_track_level(model, list(systems), **options)
-    two = along_track_level(
-        other, list(systems), **{**options, **metres, "map_seen": (factor * seen, known / factor**2)}
-    )
+    two = along_track_level(other, list(systems), **{**options, **metres})
     for name in ("level_m", "fault_free_m", "one_fault_m", "two_fault_m", "sigma_m"):
         np.testing.assert_allclose(getattr(two, name), factor * getattr(one, name), rtol=1e-6, err_msg=name)
     np.testing.assert_allclose(two.separation, one.separation, rtol=1e-6)
@@ -347,14 +357,20 @@ def test_constellation_fault_that_nothing_checks():
     # Without the map six satellites of one constellation are enough, five less one are not: a map and a satellite.
     known = (np.zeros((1, 2)), np.zeros((1, 2, 2)))
     few = constrained_model(oracle.made(ARC, "GGGGG", seed=5), oracle.LINE, ARC)
-    free = along_track_level(few, list("GGGGG"), risk=RiskBudget(map_prior=1e-2, local_prior=1e-4), map_seen=known)
+    free = along_track_level(
+        few, list("GGGGG"), risk=RiskBudget(map_prior=1e-2, local_prior=1e-4), map_error=MapError(seen=known)
+    )
     assert free.cause[0] == Cause.UNCHECKED_MAP
     wide = constrained_model(oracle.made(ARC, "GGGGGEEEEE", seed=5), oracle.LINE, ARC)
     priors = RiskBudget(map_prior=1e-2, constellation_prior={"G": 1e-5}, unchecked_share=1e-3)
     four = oracle.only(oracle.made(ARC, "GGGGGEEEEE", seed=5), [0, 1, 2, 3, 4, 5, 6, 7])
-    both = along_track_level(constrained_model(four, oracle.LINE, ARC), list("GGGGGEEEEE"), risk=priors, map_seen=known)
+    both = along_track_level(
+        constrained_model(four, oracle.LINE, ARC), list("GGGGGEEEEE"), risk=priors, map_error=MapError(seen=known)
+    )
     assert both.cause[0] == Cause.UNCHECKED_TOGETHER
-    assert np.isfinite(along_track_level(wide, list("GGGGGEEEEE"), risk=priors, map_seen=known).level_m[0])
+    assert np.isfinite(
+        along_track_level(wide, list("GGGGGEEEEE"), risk=priors, map_error=MapError(seen=known)).level_m[0]
+    )
     both = constrained_model(oracle.made(ARC, "GGGGGGEEEEE", seed=5), oracle.LINE, ARC)
     ok = along_track_level(both, list("GGGGGGEEEEE"), risk=RiskBudget(constellation_prior={"G": 1e-8}))
     assert np.isfinite(ok.level_m[0])

@@ -160,7 +160,7 @@ def test_a_piece_may_have_fewer_channels(tmp_path: Path) -> None:
 def test_packed_files_hold_the_plain_text_and_no_date(tmp_path: Path) -> None:
     written = log()
     for name in ("a.rnx", "a.rnx.gz", "a.crx", "a.crx.gz"):
-        write_observations(written, tmp_path / name, run_by="TEST")
+        write_observations(written, tmp_path / name)
     plain = (tmp_path / "a.rnx").read_bytes()
     assert gzip.decompress((tmp_path / "a.rnx.gz").read_bytes()) == plain
     crx = (tmp_path / "a.crx").read_bytes()

@@ -22,6 +22,7 @@ import separation_oracle
 from plain_kernels import plain
 from railfix import kernels
 from railfix.integrity.protection import RiskBudget, along_track_level
+from railfix.integrity.protection.level import MapError, RangeBounds
 from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.kernels import compiling
@@ -193,13 +194,12 @@ def test_levels_of_every_kind_of_hypothesis_are_those_of_all_sets_side_by_side(
             constellation_prior={"E": 1e-7, "C": 1e-6},
         ),
         "scale": np.linspace(0.6, 2.0, 12),
-        "map_bias_m": rng.normal(size=(12, 2)),
-        "map_seen": (rng.normal(size=(12, 2)), known),
+        "map_error": MapError(rng.normal(size=(12, 2)), (rng.normal(size=(12, 2)), known)),
         "sides": rng.random((12, 2, n)) > 0.6,
         "n_excluded": np.arange(12) % 3,
     }
     if by_range:
-        options |= {"least_sigma_m": rng.uniform(0.0, 5.0, (12, n)), "bias_m": rng.uniform(0.0, 1.0, (12, n))}
+        options["overbound"] = RangeBounds(rng.uniform(0.0, 5.0, (12, n)), rng.uniform(0.0, 1.0, (12, n)))
     both = []
     for function in (separation_oracle.tails_of_hypotheses, kernels.hypotheses.tails_of_hypotheses):
         with pytest.MonkeyPatch.context() as patch:

@@ -242,8 +242,7 @@ def test_a_broken_connection_is_opened_again(
                 {"front": f"tcp://127.0.0.1:{port}"},
                 [],
                 speed=None,
-                metrics=metrics,
-                hooks=Hooks(observe=outputs.append),
+                hooks=Hooks(observe=outputs.append, metrics=metrics),
             )
         )
         while sum(o.result is not None for o in outputs) < EPOCHS and not task.done():

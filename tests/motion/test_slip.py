@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from railfix.core.constants import GRAVITY_MPS2
-from railfix.motion.slip import MotionState, find_slips
+from railfix.motion.slip import MotionSamples, MotionState, find_slips
 from slip_motion import RATE_HZ, SLIPPING, Motion, even_motion, motion
 
 SLIPS = [(70.0 + 40.0 * k, 1.0 + 0.4 * (k % 5), (0.3, -0.3, 0.15, -0.5, 0.8)[k % 5]) for k in range(12)]
@@ -76,7 +76,7 @@ def test_rolling_away_on_a_gradient_is_found_below_walking_speed(permille: float
     free = t > 6.0
     force = np.where(free, 0.0, GRAVITY_MPS2 * sine)
     wheel = np.where(t < 0.5, 0.0, np.nan)
-    found, _ = find_slips(t, wheel, np.zeros(len(t)), force, np.full(len(t), sine))
+    found, _ = find_slips(MotionSamples(t, wheel, np.zeros(len(t)), force, np.full(len(t), sine)))
     rolling = np.flatnonzero(found.state == MotionState.ROLLING)
     assert (found.state[(t > 2.0) & (t < 6.0)] == MotionState.STANDING).all()
     assert len(rolling)
@@ -93,7 +93,7 @@ def test_a_body_that_comes_to_rest_after_braking_does_not_roll_away(permille: fl
     swing = permille / 1e3 * np.exp(-np.maximum(t - 1.0, 0.0) / 0.8)
     wheel = np.where(t < 0.7, 1.0 - t, np.nan)
     force = np.where(t < 1.0, -1.0, 0.0) + GRAVITY_MPS2 * swing
-    found, _ = find_slips(t, wheel, np.where(t < 0.7, -1.0, np.nan), force, np.zeros(len(t)))
+    found, _ = find_slips(MotionSamples(t, wheel, np.where(t < 0.7, -1.0, np.nan), force, np.zeros(len(t))))
     assert (found.state[t > 3.0] == MotionState.STANDING).all()
     assert found.way_m[-1] == pytest.approx(found.way_m[np.searchsorted(t, 1.1)], abs=0.2)
 
@@ -102,7 +102,9 @@ def test_a_body_that_comes_to_rest_after_braking_does_not_roll_away(permille: fl
 def test_rolling_without_a_pulse_expires_as_other_carries_do() -> None:
     t = np.arange(0.0, 60.0, 1.0 / RATE_HZ)
     force = np.where(t < 10.0, 0.05, 0.0)
-    found, _ = find_slips(t, np.where(t < 0.5, 0.0, np.nan), np.zeros(len(t)), force, np.full(len(t), np.nan))
+    found, _ = find_slips(
+        MotionSamples(t, np.where(t < 0.5, 0.0, np.nan), np.zeros(len(t)), force, np.full(len(t), np.nan))
+    )
     rolling = t[found.state == MotionState.ROLLING]
     assert rolling[0] < 12.0
     assert rolling[-1] - rolling[0] == pytest.approx(30.0, abs=0.1)

@@ -18,7 +18,7 @@ from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline import processor as processing
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import correct_ranges
-from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor import EpochProcessor, Models
 from railfix.pipeline.results import AntennaResult, State
 from railfix.positioning.antenna_rows import EVERY, AntennaRows, joined, rows_of, stack_observations
 from railfix.positioning.section_search import SearchIndex
@@ -96,7 +96,7 @@ def _run(
 ) -> dict[str, list[AntennaResult]]:
     """Process the logs in chunks that end before some times."""
     navigation, paths = _inputs()[1:]
-    processor, state = EpochProcessor(config, paths, navigation=navigation, error_model=model), State()
+    processor, state = EpochProcessor(config, paths, navigation=navigation, models=Models(error_model=model)), State()
     found: dict[str, list[AntennaResult]] = {name: [] for name in logs}
     cuts = {name: [0, *np.searchsorted(log.time, ends).tolist()] for name, log in logs.items()}
     for k in range(len(ends)):

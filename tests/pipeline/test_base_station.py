@@ -18,6 +18,7 @@ from railfix.io.rinex import read_navigation, read_observations
 from railfix.live.engine import LiveEngine
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import single_epochs
+from railfix.pipeline.base_station import Stations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import AntennaResult, EpochProcessor
 from railfix.pipeline.results import State
@@ -43,7 +44,10 @@ class Drive:
     def run(self, *, base: bool, cuts: tuple[int, ...] = (), **settings: Any) -> list[AntennaResult]:
         config = parse_config({"filter": "off", "elevation": {"mask_deg": 15.0}, **settings})
         processor = EpochProcessor(
-            config, {"front": self.trajectory}, navigation=self.navigation, base_ecef_m=PLACE if base else None
+            config,
+            {"front": self.trajectory},
+            navigation=self.navigation,
+            stations=Stations(base_ecef_m=PLACE if base else None),
         )
         state, results, read = State(), [], 0
         for part in np.split(np.arange(len(self.train)), cuts):
@@ -91,7 +95,7 @@ def test_a_position_of_the_stream_is_taken_from_its_headers(drive: Drive) -> Non
         parse_config({"filter": "off", "protection": "off"}),
         {"front": drive.trajectory},
         navigation=drive.navigation,
-        base_ecef_m="stream",
+        stations=Stations(base_ecef_m="stream"),
     )
     nowhere, known = (with_place(drive.base[:1], place) for place in (np.full(3, np.nan), PLACE))
     first, state = processor.process({"front": drive.train[:1]}, base=nowhere)
@@ -116,7 +120,7 @@ def test_integers_of_two_antennas_on_a_roof_are_right(recordings: Path) -> None:
             "filter": "off", "carrier": "fixed", "elevation": {"mask_deg": 15.0}, "map_plan_sigma_m": 0.05,
             "map_height_sigma_m": 0.05,
         }),
-        {"front": case.trajectory}, navigation=case.navigation, base_ecef_m=case.base_ecef_m,
+        {"front": case.trajectory}, navigation=case.navigation, stations=Stations(base_ecef_m=case.base_ecef_m),
     )  # fmt: skip
     result, _ = processor.process({"front": case.train[:40]}, base=case.base[:40])
     phase = result.antennas["front"].phase
@@ -133,7 +137,9 @@ def test_a_live_engine_gives_the_same(drive: Drive) -> None:
     config = parse_config(
         {"filter": "off", "elevation": {"mask_deg": 15.0}, "protection": "off", "carrier": "smoothed"}
     )
-    processor = EpochProcessor(config, {"front": drive.trajectory}, navigation=drive.navigation, base_ecef_m=PLACE)
+    processor = EpochProcessor(
+        config, {"front": drive.trajectory}, navigation=drive.navigation, stations=Stations(base_ecef_m=PLACE)
+    )
     engine, found = LiveEngine(processor, LiveSettings(period_s=1.0, no_input="skip")), []
     for k in range(12):
         for part in single_epochs(drive.base[k : k + 1]):
@@ -160,7 +166,11 @@ def test_integers_without_a_base_station_and_two_kinds_of_corrections_are_refuse
     with pytest.raises(SettingsError, match="need a base station"):
         EpochProcessor(parse_config({"carrier": "fixed"}), {"front": line_trajectory})
     with pytest.raises(SettingsError, match="give one of the two"):
-        EpochProcessor(parse_config({"sbas": "stream", "sbas_prn": 137}), {"front": line_trajectory}, base_ecef_m=PLACE)
+        EpochProcessor(
+            parse_config({"sbas": "stream", "sbas_prn": 137}),
+            {"front": line_trajectory},
+            stations=Stations(base_ecef_m=PLACE),
+        )
 
 
 @pytest.fixture

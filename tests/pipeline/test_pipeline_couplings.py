@@ -19,7 +19,7 @@ from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
 from railfix.pipeline import level_stage, solution, solve
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor import EpochProcessor, Models
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.robust_fit import RobustFit
@@ -91,7 +91,7 @@ def test_the_bias_of_the_error_model_is_in_the_level() -> None:
     def level(bias_m: float) -> AntennaResult:
         model = error_model(bias_m)
         path = {"front": clean_trajectories()["front"]}
-        processor = EpochProcessor(config, path, navigation=clean_navigation(), error_model=model)
+        processor = EpochProcessor(config, path, navigation=clean_navigation(), models=Models(error_model=model))
         return processor.process({"front": front()})[0].antennas["front"]
 
     without, three, six = (level(bias).protection for bias in (0.0, 3.0, 6.0))
@@ -166,7 +166,7 @@ def test_sigmas_of_the_level_are_the_larger_of_model_and_receiver() -> None:
             config,
             {"front": clean_trajectories()["front"]},
             navigation=clean_navigation(),
-            error_model=replace(model, after=wide),
+            models=Models(error_model=replace(model, after=wide)),
         )
         protection = processor.process({"front": front()})[0].antennas["front"].protection
         assert protection is not None

@@ -7,7 +7,7 @@ import pytest
 
 import carrier_cases
 import synthetic
-from railfix.positioning.carrier import ContinuityLimits, ContinuityState, track_jumps
+from railfix.positioning.carrier import ContinuityLimits, ContinuityState, TrackedPhases, track_jumps
 from railfix.positioning.carrier.continuity import TrackJumps
 
 LINE = synthetic.line()
@@ -28,7 +28,8 @@ def drive(
 
 def judged(time, near, phase, sats, state=None, slip=None, **limits) -> tuple[TrackJumps, ContinuityState]:
     none = np.zeros(phase.shape, dtype=bool) if slip is None else slip
-    return track_jumps(time, NAMES, SIGNAL, phase, sats, none, LINE, near, state, limits=ContinuityLimits(**limits))
+    phases = TrackedPhases(phase, sats, none)
+    return track_jumps(time, NAMES, SIGNAL, phases, LINE, near, state, limits=ContinuityLimits(**limits))
 
 
 @pytest.mark.requirement("A5")

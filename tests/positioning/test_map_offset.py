@@ -14,9 +14,11 @@ import synthetic
 from railfix.core.timescale import seconds, timedelta
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.map_offset import (
+    LinePositions,
     MapOffset,
     MapOffsetLimits,
     MapOffsetState,
+    RangeErrors,
     beyond_threshold,
     map_offset,
 )
@@ -57,7 +59,9 @@ def case() -> tuple[np.ndarray, Ranges, SinglePoint, np.ndarray, np.ndarray, np.
 def of_case(limits: MapOffsetLimits = LIMITS) -> tuple[MapOffset, MapOffsetState]:
     time, ranges, point, nominal, variance, arc = case()
     start = [MapOffsetState()]
-    result, (end,) = map_offset(time, ranges, point, nominal, variance, ALONE, arc, AWAY, start, limits=limits)
+    result, (end,) = map_offset(
+        time, ranges, point, RangeErrors(nominal, variance), ALONE, LinePositions(arc, AWAY), start, limits=limits
+    )
     return result, end
 
 
@@ -158,11 +162,9 @@ def test_chunks_give_the_same(cut: int) -> None:
             time[part],
             some,
             point.take(part),
-            nominal[part],
-            variance[part],
+            RangeErrors(nominal[part], variance[part]),
             ALONE,
-            arc[part],
-            AWAY[part],
+            LinePositions(arc[part], AWAY[part]),
             [state],
             limits=LIMITS,
         )

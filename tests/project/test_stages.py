@@ -51,7 +51,7 @@ def test_a_range_that_is_nan_is_not_used_and_a_faulty_one_is_excluded() -> None:
     given = (ranges.sat_ecef_m, faulty, sigma, clock)
     section = positioning.find_section(*given, line)
     place = positioning.position_on_line(*given, line, section.vertex)
-    found = integrity.exclude_faults(*given, line, place.arc_m)
+    found = integrity.exclude_faults(positioning.weighted_ranges(*given), line, place.arc_m)
     assert found.excluded[::2, 2].all()
     assert found.excluded.sum() == 10
     clean = (ranges.sat_ecef_m, np.where(found.excluded, np.nan, faulty), sigma, clock)
@@ -61,7 +61,7 @@ def test_a_range_that_is_nan_is_not_used_and_a_faulty_one_is_excluded() -> None:
     assert np.abs(place.arc_m - arc).max() < 3.0
     names = np.array([f"{letter}{k + 1:02d}" for k, letter in enumerate(clock)])
     level = integrity.protection_level(
-        *clean, line, place.arc_m, satellite=names, n_excluded=found.excluded.sum(axis=1)
+        positioning.weighted_ranges(*clean), line, place.arc_m, satellite=names, n_excluded=found.excluded.sum(axis=1)
     )
     assert (level.level_m > np.abs(place.arc_m - arc)).all()
     space = positioning.point_position(*clean, line.ecef_m[0])

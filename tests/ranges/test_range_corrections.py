@@ -19,7 +19,7 @@ from railfix.gnss.orbits import SatelliteStates
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline import carrier_stage
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor import EpochProcessor, Models
 from railfix.positioning.normal_equations import Ranges
 from railfix.ranges.atmospheric_delays import SeenFrom, modelled_delays
 from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel, FaultRate
@@ -282,7 +282,7 @@ def test_a_model_of_local_errors_is_widened_by_the_nominal_errors_and_another_is
             parse_config({"filter": "off", "error_model": "line.toml", "screens": []}),
             cases.clean_trajectories(),
             navigation=cases.clean_navigation(),
-            error_model=replace(model, covers=cast("Any", covers)),
+            models=Models(error_model=replace(model, covers=cast("Any", covers))),
         )
         result = processor.process(observations)[0].antennas["front"]
         used = result.reason == 0
@@ -305,7 +305,7 @@ def test_sigmas_of_the_error_model_are_by_the_direction_from_the_front_of_the_ca
         parse_config({"filter": "off", "error_model": "line.toml", "screens": []}),
         cases.clean_trajectories(),
         navigation=cases.clean_navigation(),
-        error_model=model,
+        models=Models(error_model=model),
     )
     result = processor.process({"front": cases.clean_observations()["front"][::100]})[0].antennas["front"]
     vertex = np.clip(np.searchsorted(trajectory.arc_m, result.arc_m), 1, len(trajectory.arc_m) - 1)
@@ -388,7 +388,7 @@ def test_a_model_of_an_earlier_version_is_noted() -> None:
         faults = FaultRate.model_validate({**measured, "upper": 0.3, "together": 0.0, **more})
         model = replace(uniform_model(3.0, 0.0), faults=faults)
         config = parse_config({"filter": "off", "error_model": "line.toml", "screens": []})
-        notes[name] = EpochProcessor(config, cases.clean_trajectories(), error_model=model).notes
+        notes[name] = EpochProcessor(config, cases.clean_trajectories(), models=Models(error_model=model)).notes
     assert [note for note in notes["old"] if note not in notes["new"]] == [
         "error model: it does not state how often low satellites of one side are faulty together (faults.side_upper), "
         "as one of an earlier version; railfix error-model measures it"
@@ -406,7 +406,7 @@ def test_a_bias_of_the_error_model_widens_the_protection_level() -> None:
             config,
             cases.clean_trajectories(),
             navigation=cases.clean_navigation(),
-            error_model=uniform_model(3.0, bias),
+            models=Models(error_model=uniform_model(3.0, bias)),
         )
         results.append(processor.process(observations)[0].antennas["front"])
     plain, biased = (result.protection.level.level_m for result in results if result.protection is not None)

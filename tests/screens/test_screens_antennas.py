@@ -32,6 +32,7 @@ from railfix.screens import (
     pair_epochs,
     spacing_direction,
 )
+from railfix.screens.antenna_pair import Spacing, TagDifference
 from railfix.screens.antenna_spacing import SCREEN
 from railfix.screens.base import FilteredMotion, PairedEpochs
 from railfix.screens.pairs import on_pairs
@@ -163,7 +164,8 @@ def two_antennas(
 def paired(front: np.ndarray, rear: np.ndarray, told: dict[str, np.ndarray], **more: object) -> AntennaPairScreened:
     for array in (front, rear, *told.values()):
         array.flags.writeable = False
-    return antenna_pair_screen(front, rear, satellite=SATELLITES, **told, **more)
+    sight, spacing = [told[n] for n in ("elevation_deg", "azimuth_deg")], [told[n] for n in Spacing._fields]
+    return antenna_pair_screen(front, rear, *sight, satellite=SATELLITES, spacing=Spacing(*spacing), **more)
 
 
 #: Error of the front code, of the rear code -> refused on both.
@@ -189,7 +191,11 @@ def test_truth_table(front_m: float, rear_m: float, refused: bool, clocks: str) 
     rear[2, 1] += rear_m
     satellite_rates = np.zeros(front.shape)
     result = paired(
-        front, rear, told, limits=AntennaPairLimits(clocks=clocks, least_satellites=3), range_rate_mps=satellite_rates
+        front,
+        rear,
+        told,
+        limits=AntennaPairLimits(clocks=clocks, least_satellites=3),
+        tags=TagDifference(np.zeros(len(front), "m8[ns]"), satellite_rates),
     )
     expected = np.zeros(front.shape, dtype=bool)
     expected[2, 1] = refused
@@ -234,7 +240,7 @@ def test_exactly_at_the_limit_is_used() -> None:
     rear = front + np.array([5.0, 5.0 + 2.0**-20, -5.0, 0.0, 0.0])
     told = {"elevation_deg": np.full((1, 5), 90.0), "azimuth_deg": np.zeros((1, 5))}
     result = antenna_pair_screen(
-        front, rear, satellite=SATELLITES, heading_deg=0.0, gradient_permille=0.0, spacing_m=np.zeros(1),
+        front, rear, satellite=SATELLITES, spacing=Spacing(0.0, 0.0, np.zeros(1)),
         limits=AntennaPairLimits(clocks="common"), **told,
     )  # fmt: skip
     assert result.reject.tolist() == [[False, True, False, False, False]]
@@ -259,7 +265,7 @@ def test_instants_of_separate_clocks() -> None:
         rear += rate * (tag_s - clock_s)
         tags = timedelta(np.full(6, tag_s))
         limits = AntennaPairLimits(least_satellites=4)
-        result = paired(front, rear, told, limits=limits, tag_difference=tags, range_rate_mps=rate)
+        result = paired(front, rear, told, limits=limits, tags=TagDifference(tags, rate))
         np.testing.assert_allclose(result.metric[:, :4], 0.0, atol=2e-3)
         np.testing.assert_allclose(result.clock_m[:, 0], SPEED_OF_LIGHT * clock_s, atol=2e-3)
 
@@ -278,8 +284,8 @@ def test_order_and_cutting_do_not_matter(seed: int) -> None:
     np.testing.assert_array_equal(whole.metric, np.concatenate([r.metric for r in single]))
     order = rng.permutation(5)
     other = antenna_pair_screen(
-        front[:, order], rear[:, order], satellite=SATELLITES[order], limits=limits,
-        **{k: v[:, order] if v.ndim == 2 else v for k, v in told.items()},
+        front[:, order], rear[:, order], told["elevation_deg"][:, order], told["azimuth_deg"][:, order],
+        satellite=SATELLITES[order], spacing=Spacing(*(told[name] for name in Spacing._fields)), limits=limits,
     )  # fmt: skip
     np.testing.assert_array_equal(whole.metric[:, order], other.metric)
 
@@ -316,8 +322,8 @@ def _two_logs(
     rate = -SPEED_OF_LIGHT / carrier_frequency_hz(satellite, signal) * front.doppler_hz[np.ix_(epochs[0], a)]
     return antenna_pair_screen(
         np.where(elevation > 15, code[0], np.nan), code[1], elevation, azimuth, satellite=satellite,
-        heading_deg=heading[0], gradient_permille=heading[1], spacing_m=np.broadcast_to(heading[2], len(place)),
-        tag_difference=rear.time[epochs[1]] - front.time[epochs[0]], range_rate_mps=rate,
+        spacing=Spacing(heading[0], heading[1], np.broadcast_to(heading[2], len(place))),
+        tags=TagDifference(rear.time[epochs[1]] - front.time[epochs[0]], rate),
         limits=AntennaPairLimits(**limits),  # type: ignore[arg-type]
     )  # fmt: skip
 

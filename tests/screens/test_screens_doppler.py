@@ -16,6 +16,7 @@ from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.io.rinex import read_observations
 from railfix.screens import DopplerLimits, DopplerScreened, DopplerState, doppler_limit_m, doppler_screen
+from railfix.screens.doppler import DopplerChannels
 
 pytestmark = pytest.mark.requirement("B2")
 
@@ -50,8 +51,8 @@ def screened(
     for array in (time, code, doppler):
         array.flags.writeable = False
     return doppler_screen(
-        time, code, doppler, satellite=satellite, signal=np.array(["1C"] * len(satellite)),
-        frequency_hz=np.full(len(satellite), L1), limits=limits or DopplerLimits(mode="fixed"), state=state, **more,
+        time, code, doppler, limits=limits or DopplerLimits(mode="fixed"), state=state, **more,
+        channels=DopplerChannels(satellite, np.array(["1C"] * len(satellite)), np.full(len(satellite), L1)),
     )  # fmt: skip
 
 
@@ -150,8 +151,8 @@ def test_two_signals_of_a_satellite_are_one_satellite() -> None:
     time = START + timedelta(np.arange(3) * 0.1)
     code = np.full((3, 3), 2.2e7)
     result, _ = doppler_screen(
-        time, code, np.zeros((3, 3)), satellite=satellite, signal=np.array(["1C", "5Q", "1C"]),
-        frequency_hz=np.full(3, L1),
+        time, code, np.zeros((3, 3)),
+        channels=DopplerChannels(satellite, np.array(["1C", "5Q", "1C"]), np.full(3, L1)),
     )  # fmt: skip
     assert np.isnan(result.metric).all()
 
@@ -173,7 +174,7 @@ def test_what_it_cannot_judge_is_nan_and_used() -> None:
     assert np.isnan(result.metric[1:3, 2]).all()
     assert not np.isnan(result.metric[3, 2])
     frequency = np.array([L1, np.nan, L1, L1, L1])
-    result, _ = doppler_screen(time, code, doppler, satellite=SATELLITES, signal=SIGNALS, frequency_hz=frequency)
+    result, _ = doppler_screen(time, code, doppler, channels=DopplerChannels(SATELLITES, SIGNALS, frequency))
     assert np.isnan(result.metric[:, 1]).all()
 
 
@@ -306,8 +307,10 @@ def rates(log: Observations, limits: DopplerLimits) -> tuple[float, DopplerScree
     """Share of the judged first-band codes that is refused."""
     first = np.flatnonzero(np.isin(log.signal, ("1C", "2I", "1X")) & np.isin(log.system, list("GJEC")))
     result, _ = doppler_screen(
-        log.time, log.code_m[:, first], log.doppler_hz[:, first], satellite=log.satellite[first],
-        signal=log.signal[first], frequency_hz=carrier_frequency_hz(log.satellite[first], log.signal[first]),
+        log.time, log.code_m[:, first], log.doppler_hz[:, first],
+        channels=DopplerChannels(
+            log.satellite[first], log.signal[first], carrier_frequency_hz(log.satellite[first], log.signal[first])
+        ),
         break_before=log.break_before, limits=limits,
     )  # fmt: skip
     return float(result.reject.sum() / np.isfinite(result.metric).sum()), result

@@ -21,6 +21,7 @@ from railfix.evaluate import along_track_error, interpolate_reference
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
+from railfix.pipeline.base_station import Stations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.track.trajectory import Trajectory
@@ -75,7 +76,9 @@ def rows(case: Case) -> Iterator[str]:
             "filter": "off", "protection": "off", "elevation": {"mask_deg": 15.0}, "carrier": carrier,
             "map_plan_sigma_m": case.map_m, "map_height_sigma_m": case.map_m,
         })  # fmt: skip
-        processor = EpochProcessor(config, {"front": case.trajectory}, navigation=case.navigation, base_ecef_m=place)
+        processor = EpochProcessor(
+            config, {"front": case.trajectory}, navigation=case.navigation, stations=Stations(base_ecef_m=place)
+        )
         result, _ = processor.process({"front": case.train}, base=None if place is None else case.base)
         found = result.antennas["front"]
         error = np.abs(along_track_error(found.arc_m, case.reference, case.trajectory))

@@ -34,6 +34,7 @@ from railfix.positioning.carrier import (
     SlipReason,
     Slips,
     SmoothedCodes,
+    TrackedPhases,
     TrackJumps,
     corrected_phase_m,
     find_slips,
@@ -137,8 +138,8 @@ def on_track(case: Case, result: AntennaResult, slips: Slips, used: np.ndarray) 
     phase = corrected_phase_m(slips.phase_m[:, columns], result.satellites.clock_m, ionosphere, troposphere)
     phase = np.where(used, phase, np.nan)
     jumps, _ = track_jumps(
-        obs.time, obs.satellite[columns], obs.signal[columns], phase, result.satellites.position_ecef_m,
-        slips.slip[:, columns], case.trajectory, result.arc_m,
+        obs.time, obs.satellite[columns], obs.signal[columns],
+        TrackedPhases(phase, result.satellites.position_ecef_m, slips.slip[:, columns]), case.trajectory, result.arc_m,
     )  # fmt: skip
     return phase, jumps
 

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ground_load import CENTRE, LOCAL, centre_file
+from ground_load import BEARERS_OF, centre_file
 from railfix.ground.authority import Authority
 from railfix.ground.interlocking import Interlocking
 from railfix.ground.interlocking_text import HEAD, from_documents
@@ -84,7 +84,7 @@ class KilledCentre:
         """Report once a second."""
         train = self.trains[number]
         link = TrainLinks(
-            number, self.folder / "keys", CENTRE, LOCAL, received=lambda payload: self.received(number, payload)
+            number, self.folder / "keys", BEARERS_OF, received=lambda payload: self.received(number, payload)
         )
         await link.start()
         try:

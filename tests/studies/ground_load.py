@@ -28,7 +28,7 @@ from railfix.ground.authority import Authority
 from railfix.ground.control import ControlCentre
 from railfix.ground.keys import write_keys
 from railfix.ground.layout import Layout
-from railfix.ground.links import TrainLinks, first_sequence
+from railfix.ground.links import TrainLinks, bearers_of, first_sequence
 from railfix.ground.on_board import OnBoard
 from railfix.ground.serve import COLLECTION, STEP_S
 from railfix.ground.store import Store
@@ -37,7 +37,7 @@ from railfix.ground.traffic import SimulatedTrain, line_with_loops
 from railfix.io.train_message import encode
 
 CENTRE = {"A": ("127.0.1.1", 4433), "B": ("127.0.2.1", 4433)}
-LOCAL = {"A": "127.0.1.41", "B": "127.0.2.41"}
+BEARERS_OF = bearers_of(CENTRE, {"A": "127.0.1.41", "B": "127.0.2.41"})
 
 
 def line(trains: int) -> tuple[Layout, dict[int, SimulatedTrain]]:
@@ -126,7 +126,7 @@ async def drive(
 
     async def run(number: int) -> None:
         nonlocal counted
-        link = TrainLinks(number, folder / "keys", CENTRE, LOCAL, received=lambda payload: received(number, payload))
+        link = TrainLinks(number, folder / "keys", BEARERS_OF, received=lambda payload: received(number, payload))
         due = time.perf_counter()
         await link.start()
         while due < begin + seconds:

@@ -23,7 +23,7 @@ from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.settings import write_toml
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import InertialSamples, SensorSamples, TachometerPulses
-from railfix.motion.slip import MotionState, SlipLimits, SlipResult, find_slips
+from railfix.motion.slip import MotionSamples, MotionState, SlipLimits, SlipResult, find_slips
 from railfix.motion.tachometer import TachometerLimits, pulse_speeds, way_m
 from railfix.pipeline import sensed_motion as stage
 from railfix.run.measured_features import measured_features
@@ -84,8 +84,8 @@ def sense(
         slope = course.gradient_at(arc_m) if line else np.full(len(arc_m), np.nan)
         return slope / np.sqrt(1.0 + slope**2)
 
-    def keeping(*args: object, **words: object) -> object:
-        result = find_slips(*args, **(words if gyro else words | {"body": None}))  # type: ignore[arg-type]
+    def keeping(samples: MotionSamples, **words: object) -> object:
+        result = find_slips(samples if gyro else samples._replace(body=None), **words)  # type: ignore[arg-type]
         kept.append(result[0])
         return result
 
@@ -214,7 +214,7 @@ def rolling_lines() -> Iterator[str]:
         force = np.where(free, 0.0, -GRAVITY_MPS2 * permille / 1e3)
         force = force + 0.005 * np.random.default_rng(3).normal(size=len(t))
         wheel = np.where(t < 0.5, 0.0, np.nan)
-        found, _ = find_slips(t, wheel, np.zeros(len(t)), force, np.full(len(t), np.nan))
+        found, _ = find_slips(MotionSamples(t, wheel, np.zeros(len(t)), force, np.full(len(t), np.nan)))
         rolling = found.state == MotionState.ROLLING
         true = GRAVITY_MPS2 * permille / 1e3 * (t - 6.0)
         first = int(np.argmax(rolling))

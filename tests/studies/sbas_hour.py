@@ -22,6 +22,7 @@ import paths
 from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.gnss.orbits import satellite_states
 from railfix.integrity.protection import along_track_level
+from railfix.integrity.protection.level import RangeBounds
 from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
@@ -178,7 +179,7 @@ def _at_point(
     ranges = ranges_at(above, place, np.sqrt((sigmas**2).sum(axis=-1)), used)
     model = constrained_model(ranges, line, np.where(enough, arc, np.nan), section=np.full(len(used), section))
     systems = [name[0] for name in above.satellite.tolist()]
-    level = along_track_level(model, systems, risk=risk, bias_m=np.where(used, bias, 0.0))
+    level = along_track_level(model, systems, risk=risk, overbound=RangeBounds(bias_m=np.where(used, bias, 0.0)))
     gain = np.einsum("tkj,tj->tk", model.design, model.covariance_m2[:, 0]) * model.root_weight
     parts = (gain[..., None] ** 2 * np.where(used[..., None], sigmas, 0.0) ** 2).sum(axis=1)
     rest = model.covariance_m2[:, 0, 0] - parts.sum(axis=1)

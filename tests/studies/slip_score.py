@@ -20,7 +20,7 @@ import numpy as np
 
 import paths  # noqa: F401
 from railfix.core.timescale import seconds, timedelta
-from railfix.motion.slip import MotionState, SlipLimits, SlipResult, find_slips
+from railfix.motion.slip import MotionSamples, MotionState, SlipLimits, SlipResult, find_slips
 from railfix.motion.tachometer import way_m
 from railfix.pipeline import sensed_motion as stage
 from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, sensor_epochs
@@ -96,8 +96,10 @@ def scored(simulation: Simulation, scores: dict[str, Score]) -> None:
         limits = SlipLimits.model_validate({"rule": rule})
         kept: list[SlipResult] = []
 
-        def keeping(*args: object, gyro: bool = gyro, kept: list[SlipResult] = kept, **words: object) -> object:
-            found = find_slips(*args, **(words if gyro else words | {"body": None}))  # type: ignore[arg-type]
+        def keeping(
+            samples: MotionSamples, gyro: bool = gyro, kept: list[SlipResult] = kept, **words: object
+        ) -> object:
+            found = find_slips(samples if gyro else samples._replace(body=None), **words)  # type: ignore[arg-type]
             kept.append(found[0])
             return found
 

@@ -17,6 +17,7 @@ from railfix.core.timescale import timedelta
 from railfix.evaluate import evaluate_run
 from railfix.io.reference_log import AntennaReference
 from railfix.pipeline.return_gate import ReturnState, gated_codes
+from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.pipeline.smoothing import Replay, smooth
 from railfix.positioning.constrained import constrained_position
 from railfix.positioning.section_search import SearchIndex, SectionLimits, search
@@ -148,7 +149,7 @@ def test_codes_that_come_back_beyond_the_join_count() -> None:
     state = ReturnState(time=time[0], place_m=length - 20.0, sigma_m=1.0)
     place = np.mod(length - 20.0 + 10.0 * np.arange(1, 9), length)
     refused, _ = gated_codes(
-        time, observed, np.full(8, 10.0), place, np.ones(8), state, line, sigmas=4.0, longest_s=60.0
+        time, observed, np.full(8, 10.0), place, np.ones(8), state, line, SensorLimits(return_sigmas=4.0, return_s=60.0)
     )
     np.testing.assert_array_equal(np.flatnonzero(refused), [3, 4])
 

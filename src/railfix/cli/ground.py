@@ -389,7 +389,7 @@ def train(
     """
     import asyncio
 
-    from railfix.ground.links import BEARERS
+    from railfix.ground.links import BEARERS, bearers_of
     from railfix.ground.serve import parse_address
     from railfix.ground.train import run_train
 
@@ -403,8 +403,7 @@ def train(
     work = run_train(
         number,
         choices.keys,
-        addresses,
-        dict(zip(BEARERS, hosts, strict=True)),
+        bearers_of(addresses, dict(zip(BEARERS, hosts, strict=True))),
         write=lambda line: print(line, flush=True),
         limits=limits,
         integrity=choices.integrity,

@@ -21,7 +21,7 @@ from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.keys import write_keys
 from railfix.ground.link_figure import draw_coverage
 from railfix.ground.link_quality import LinkLimits, LinkName
-from railfix.ground.links import BEARERS, CentreLinks, TrainLinks
+from railfix.ground.links import BEARERS, CentreLinks, TrainLinks, bearers_of
 from railfix.ground.monitor import MonitorState
 from railfix.ground.on_board import OnBoard
 from railfix.ground.reference_curve import ReferenceCurve
@@ -166,8 +166,10 @@ async def run_demo(
             links = trains[number] = TrainLinks(
                 number,
                 folder / "keys",
-                {bearer: relays[number, bearer].address for bearer in BEARERS},
-                {"A": f"127.0.1.{10 + number}", "B": f"127.0.2.{10 + number}"},
+                bearers_of(
+                    {bearer: relays[number, bearer].address for bearer in BEARERS},
+                    {"A": f"127.0.1.{10 + number}", "B": f"127.0.2.{10 + number}"},
+                ),
                 received=lambda payload: traffic.authority(Authority.decode(payload)),
                 limits=LinkLimits(idle_s=10.0),  # its outages are short in real time
             )

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import AsyncExitStack
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from railfix.core.errors import InputFileError
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
@@ -29,8 +29,20 @@ def first_sequence() -> int:
     return int(time.time() * 10)
 
 
+class Bearer(NamedTuple):
+    """A bearer of the links: the centre's address on it, and the train's own."""
+
+    centre: tuple[str, int]
+    local: str
+
+
+def bearers_of(addresses: dict[LinkName, tuple[str, int]], local: dict[LinkName, str]) -> dict[LinkName, Bearer]:
+    """Return the bearers by the centre's addresses and the train's own."""
+    return {name: Bearer(addresses[name], local[name]) for name in BEARERS}
+
+
 class TrainLinks:
-    """The train's end: two connections, each from its own local address, that of a bearer.
+    """The train's end: two connections, one on each bearer.
 
     With the keys of `railfix.ground.keys.write_keys`; `received` is called with the payload of each new frame of the
     centre.
@@ -40,8 +52,7 @@ class TrainLinks:
         self,
         train: int,
         keys: Path,
-        addresses: dict[LinkName, tuple[str, int]],
-        local: dict[LinkName, str],
+        bearers: dict[LinkName, Bearer],
         *,
         mode: Literal["spare", "both"] = "both",
         received: Callable[[bytes], None] = lambda _: None,
@@ -52,7 +63,7 @@ class TrainLinks:
         self.choice = LinkChoice()
         self.receiver = FrameReceiver(sender=CENTRE)
         self.protocols: dict[LinkName, LinkProtocol] = {}
-        self._keys, self._addresses, self._local = keys, addresses, local
+        self._keys, self._bearers = keys, bearers
         self._received, self._sequence = received, first_sequence()
         self._newest: bytes | None = None
         self._tasks: list[asyncio.Task[None]] = []
@@ -73,9 +84,9 @@ class TrainLinks:
         while True:
             try:
                 async with connected(
-                    self._addresses[name],
+                    self._bearers[name].centre,
                     settings,
-                    local=self._local[name],
+                    local=self._bearers[name].local,
                     received=lambda _, data: self._frame(name, data),
                     timeout_s=3.0,
                 ) as protocol:

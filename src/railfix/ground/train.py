@@ -15,7 +15,7 @@ from typing import Any
 from railfix.ground.authority import Authority
 from railfix.ground.keys import check_keys
 from railfix.ground.link_quality import LinkName
-from railfix.ground.links import TrainLinks, first_sequence
+from railfix.ground.links import Bearer, TrainLinks, first_sequence
 from railfix.ground.on_board import OnBoard, OnBoardLimits
 from railfix.io.train_message import MessageError, TrainMessage, encode, from_json
 
@@ -30,8 +30,7 @@ LONGEST_LINE = 100_000
 async def run_train(
     train: int,
     keys: Path,
-    addresses: dict[LinkName, tuple[str, int]],
-    local: dict[LinkName, str],
+    bearers: dict[LinkName, Bearer],
     *,
     lines: AsyncIterator[str] | None = None,
     write: Callable[[str], None],
@@ -41,14 +40,14 @@ async def run_train(
 ) -> None:
     """Send the newest position every second, and write authorities and braking as lines of JSON.
 
-    With the train's own two files and ``authority.pem`` of the folder `keys`, to the centre's address on each bearer
-    from its local address. The positions are messages as `railfix.io.train_message.to_json` writes them, from the
-    standard input by default. With `integrity`, a file of the train's integrity device, `is_complete` of it takes the
-    place of what the messages say. InputFileError: when a key is not there, or a line is no position message.
+    With the train's own two files and ``authority.pem`` of the folder `keys`. The positions are messages as
+    `railfix.io.train_message.to_json` writes them, from the standard input by default. With `integrity`, a file of the
+    train's integrity device, `is_complete` of it takes the place of what the messages say. InputFileError: when a key
+    is not there, or a line is no position message.
     """
     check_keys(keys, f"train-{train}")
     desk = _Desk(train=train, write=write, limits=limits or OnBoardLimits(), integrity=integrity)
-    links = TrainLinks(train, keys, addresses, local, received=desk.received)
+    links = TrainLinks(train, keys, bearers, received=desk.received)
     await links.start()
     reading = asyncio.create_task(desk.read(_standard_input() if lines is None else lines))
     sending = asyncio.create_task(desk.work(links))

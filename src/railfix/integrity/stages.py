@@ -10,22 +10,13 @@ from railfix.integrity.protection.level import ProtectionLevel, along_track_leve
 from railfix.integrity.protection.risk import RiskBudget
 from railfix.integrity.raim.detection import RaimLimits
 from railfix.integrity.raim.exclusion import Exclusion, exclude
-from railfix.integrity.raim.model import LinearModel, constrained_model
-from railfix.positioning.stages import weighted_ranges
+from railfix.integrity.raim.model import constrained_model
+from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
 
 
-def _model(
-    satellite_ecef_m: Floats, code_m: Floats, sigma_m: Floats, clock: Strings, trajectory: Trajectory, arc_m: Floats
-) -> LinearModel:
-    return constrained_model(weighted_ranges(satellite_ecef_m, code_m, sigma_m, clock), trajectory, arc_m)
-
-
 def exclude_faults(
-    satellite_ecef_m: Floats,
-    code_m: Floats,
-    sigma_m: Floats,
-    clock: Strings,
+    ranges: Ranges,
     trajectory: Trajectory,
     arc_m: Floats,
     *,
@@ -36,8 +27,8 @@ def exclude_faults(
 
     Parameters
     ----------
-    satellite_ecef_m, code_m, sigma_m, clock
-        As for `railfix.positioning.weighted_ranges`.
+    ranges : Ranges
+        Of `railfix.positioning.weighted_ranges`.
     trajectory : Trajectory
     arc_m : ndarray, shape (T,) [m]
         Positions (`Constrained.arc_m` of `railfix.positioning.position_on_line`).
@@ -50,15 +41,11 @@ def exclude_faults(
     Exclusion
         Positions without the excluded satellites are those of `position_on_line` with NaN in their codes.
     """
-    model = _model(satellite_ecef_m, code_m, sigma_m, clock, trajectory, arc_m)
-    return exclude(model, limits=limits, scale=scale)
+    return exclude(constrained_model(ranges, trajectory, arc_m), limits=limits, scale=scale)
 
 
 def protection_level(
-    satellite_ecef_m: Floats,
-    code_m: Floats,
-    sigma_m: Floats,
-    clock: Strings,
+    ranges: Ranges,
     trajectory: Trajectory,
     arc_m: Floats,
     *,
@@ -71,7 +58,7 @@ def protection_level(
 
     Parameters
     ----------
-    satellite_ecef_m, code_m, sigma_m, clock, trajectory, arc_m, scale
+    ranges, trajectory, arc_m, scale
         As for `exclude_faults`, after the exclusions.
     satellite : ndarray of str, shape (M,)
         Names, for the priors of their constellations.
@@ -79,6 +66,6 @@ def protection_level(
     n_excluded : array_like of int, shape (T,) or ()
         Satellites that `exclude_faults` took out.
     """
-    model = _model(satellite_ecef_m, code_m, sigma_m, clock, trajectory, arc_m)
+    model = constrained_model(ranges, trajectory, arc_m)
     systems = [name[0] for name in np.asarray(satellite).tolist()]
     return along_track_level(model, systems, risk=risk, scale=scale, n_excluded=n_excluded)

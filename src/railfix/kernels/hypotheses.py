@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,14 +17,35 @@ _NO_EFFECT = 1e-6
 _SAME = 1e-9
 
 
+class _RangeErrors(NamedTuple):
+    """Errors of single ranges beyond the noise, where there are `any`: `bias`, and variance `beyond` it.
+
+    `gain` is that of the ranges before any is left out, `own` work space for others.
+    """
+
+    any: bool
+    gain: Floats
+    bias: Floats
+    beyond: Floats
+    own: Floats
+
+
+class _Sets(NamedTuple):
+    """Offset, sigma and separation over its threshold of sets of channels left out, written one after the other."""
+
+    offset: Floats
+    sigma: Floats
+    ratio: Floats
+
+
 @inner
-def _of_ranges(left: Floats, gain: Floats, range_bias: Floats, beyond: Floats) -> tuple[float, float, float]:
+def _of_ranges(left: Floats, ranges: _RangeErrors) -> tuple[float, float, float]:
     """Return what the gains of single ranges add to bias, variance of the distance, and variance."""
     bias, apart, total = 0.0, 0.0, 0.0
     for m in range(len(left)):
-        bias += abs(left[m]) * range_bias[m]
-        apart += (left[m] - gain[m]) ** 2 * beyond[m]
-        total += left[m] ** 2 * beyond[m]
+        bias += abs(left[m]) * ranges.bias[m]
+        apart += (left[m] - ranges.gain[m]) ** 2 * ranges.beyond[m]
+        total += left[m] ** 2 * ranges.beyond[m]
     return bias, apart, total
 
 
@@ -78,21 +99,15 @@ def _with_each_later(
     blind: bool,
     limit: float,
     common: Floats,
-    by_range: bool,
-    gain: Floats,
-    left: Floats,
-    own: Floats,
-    range_bias: Floats,
-    beyond: Floats,
-    offset: Floats,
-    sigma: Floats,
-    ratio: Floats,
+    ranges: _RangeErrors,
+    sets: _Sets,
 ) -> None:
-    """Write offset, sigma and separation of the channels after i, left out with it from the system `rows`.
+    """Write the sets of channel i and one after it, left out together from the system `rows`.
 
-    `gone` and `blind` are of what has been left out of it before, `left` the gains of the ranges then.
-    """  # fmt: skip
-    n = rows.shape[1]
+    `gone` and `blind` are of what has been left out of it before.
+    """
+    n, own = rows.shape[1], ranges.own
+    offset, sigma, ratio = sets.offset, sets.sigma, sets.ratio
     share, of_first = rows[i, i], rows[n, i]
     inverse = 1.0 / share if share > LEAST_REDUNDANCY else 0.0
     weight = inverse * of_first
@@ -120,7 +135,7 @@ def _with_each_later(
             (0.0, 0.0, 0.0),
             common,
         )
-    if not (by_range or blind or lost):
+    if not (ranges.any or blind or lost):
         return
     for at in range(n - 1 - i):
         j = i + 1 + at
@@ -128,15 +143,15 @@ def _with_each_later(
         of_gain = rows[n, j] - coupling * of_first
         rest = rows[j, j] - coupling * rows[i, j]
         last = of_gain / rest if rest > LEAST_REDUNDANCY else 0.0
-        if by_range:
+        if ranges.any:
             for m in range(n):
-                own[m] = left[m] - weight * rows[i, m] - last * (rows[j, m] - coupling * rows[i, m])
+                own[m] = rows[n, m] - weight * rows[i, m] - last * (rows[j, m] - coupling * rows[i, m])
             offset[at], sigma[at], ratio[at] = _separate(
                 square + last * of_gain,
                 distance + last * (rows[n + 1, j] - coupling * residual),
                 across + last * (rows[n + 2, j] - coupling * map_across),
                 up + last * (rows[n + 3, j] - coupling * map_up),
-                _of_ranges(own, gain, range_bias, beyond),
+                _of_ranges(own, ranges),
                 common,
             )
         if blind or (not rest > LEAST_REDUNDANCY and abs(of_gain) > limit):
@@ -233,7 +248,7 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
         common[2], common[3] = -q[0, 1] * root_across, -q[0, 2] * root_up
         common[4], common[5] = errors.map_bias_m[t, 0] * root_across, errors.map_bias_m[t, 1] * root_up
         common[6] = asked.k_false_alarm[t]
-        more = _of_ranges(rows[n], rows[n], range_bias, beyond)
+        more = _of_ranges(rows[n], _RangeErrors(by_range, rows[n], range_bias, beyond, own))
         common[7] = common[6] * _SAME * _separate(0.0, 0.0, 0.0, 0.0, more, common)[1]
 
         # The place without the map: its distance counts whole, and nothing is tested.
@@ -273,7 +288,7 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
                 continue
             mapped, of_base = asked.wrong_map[base], asked.shared_prior[t, base]
             system, known, nil = (free_rows, free, lost) if mapped else (rows, common, limit)
-            gain, some = system[n], False
+            ranges, some = _RangeErrors(by_range, system[n], range_bias, beyond, own), False
             for i in range(n):
                 member[i] = i < count and asked.members[t, base, used[i]]
                 others[i] = 0.0 if member[i] else likely[i]
@@ -284,7 +299,7 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
                 blind |= _leave_out(system, member, by_range or order > 0, nil, work, gone)
                 system = work
             left = system[n]
-            more = _of_ranges(left, gain, range_bias, beyond) if by_range else (0.0, 0.0, 0.0)
+            more = _of_ranges(left, ranges) if by_range else (0.0, 0.0, 0.0)
             at = first[0]
             offset[t, at], sigma[t, at], ratio[at] = _separate(gone[0], gone[1], gone[2], gone[3], more, known)
             if blind:
@@ -298,7 +313,7 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
                 if by_range:
                     for m in range(n):
                         own[m] = left[m] - w * system[i, m]
-                    more = _of_ranges(own, gain, range_bias, beyond)
+                    more = _of_ranges(own, ranges)
                 offset[t, at], sigma[t, at], ratio[at] = _separate(
                     gone[0] + w * system[n, i], gone[1] + w * system[n + 1, i],
                     gone[2] + w * system[n + 2, i], gone[3] + w * system[n + 3, i], more, known,
@@ -318,10 +333,8 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
                 start[depth] += 1
                 rest = system if depth == 0 else reduced[depth - 1]
                 begin, end = place[depth], place[depth] + n - 1 - i
-                _with_each_later(
-                    rest, i, taken[depth], blinds[depth], nil, known, by_range, gain, rest[n], own, range_bias, beyond,
-                    offset[t, begin:end], sigma[t, begin:end], ratio[begin:end],
-                )  # fmt: skip
+                sets = _Sets(offset[t, begin:end], sigma[t, begin:end], ratio[begin:end])
+                _with_each_later(rest, i, taken[depth], blinds[depth], nil, known, ranges, sets)
                 with_first = product[depth] * others[i]
                 for j in range(i + 1, n):
                     weight[t, begin + j - i - 1] = with_first * others[j]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -100,21 +100,27 @@ def _tail_of(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, s
     return 0.5 * math.erfc(math.sqrt(0.5 * excess)) if excess > 0.0 else 1.0
 
 
+class _Residuals(NamedTuple):
+    """Residuals of the channels in use, their projector, and their change with the place."""
+
+    projector: Floats
+    residual: Floats
+    rows: Floats
+
+
 @inner
 def _of_sides(
     used: Indices,
-    n: int,
     sides: Masks,
     side_prior: float,
-    projector: Floats,
-    residual: Floats,
-    rows: Floats,
+    residuals: _Residuals,
     slope: Floats,
     matrix: Floats,
     clear_m: float,
 ) -> float:
     """Return the sum of the tails with the channels of each side left out, one after the other."""
-    total = 0.0
+    projector, residual, rows = residuals
+    total, n = 0.0, len(used)
     member = np.empty(n, dtype=np.intp)
     for c in range(len(sides)):
         count = 0
@@ -156,8 +162,7 @@ def risk_off_tangent(
     sides: Masks,
     side_prior: float,
     clear_m: Floats,
-    sigma_plan_m: float,
-    sigma_height_m: float,
+    sigma_m: tuple[float, float],
     enough: float,
 ) -> Floats:
     """Return an upper bound of the probability that the true place lies off the tangent beyond a distance.
@@ -181,7 +186,8 @@ def risk_off_tangent(
         Probability of that.
     clear_m : ndarray, shape (T,) [m]
         Distance within which no place is off the tangent.
-    sigma_plan_m, sigma_height_m : float [m]
+    sigma_m : tuple of float [m]
+        Of the map in plan and height.
     enough : float
         Probability up to which a loose bound will do.
 
@@ -205,8 +211,8 @@ def risk_off_tangent(
                 n += 1
         # The map error alike in all horizontal directions, and the place that the residuals ask for then.
         normal = _inverse(covariance_m2[t]) - map_prior
-        of_map[0] = of_map[1] = (noise / sigma_plan_m) ** 2
-        of_map[2] = (noise / sigma_height_m) ** 2
+        of_map[0] = of_map[1] = (noise / sigma_m[0]) ** 2
+        of_map[2] = (noise / sigma_m[1]) ** 2
         covariance = _inverse(normal + np.diag(of_map))
         asked[:] = 0.0
         pull[:] = 0.0
@@ -277,8 +283,8 @@ def risk_off_tangent(
                 tau = (c * leverage[i] + a * leverage[j] - 2.0 * b * effect[i, j]) / det
                 regular = det > LEAST_REDUNDANCY * a * c and min(a, c) > LEAST_REDUNDANCY
                 two = max(two, tau if regular else 0.0)
-        root = math.sqrt(max(constant, 0.0))
-        of_sides = _of_sides(used, n, sides[t], side_prior, projector, residual, rows, slope, matrix, clear_m[t])
+        root, residuals = math.sqrt(max(constant, 0.0)), _Residuals(projector, residual, rows)
+        of_sides = _of_sides(used[:n], sides[t], side_prior, residuals, slope, matrix, clear_m[t])
         total[t] = of_sides + 2.0 * _tail(clear_m[t], spread, start, root, 0.0)
         total[t] += singles * _tail(clear_m[t], spread, start, root, one)
         total[t] += 0.5 * (singles * singles - squares) * _tail(clear_m[t], spread, start, root, two)

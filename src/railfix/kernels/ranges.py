@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,21 +12,31 @@ from railfix.kernels.compiling import inner, kernel
 from railfix.kernels.sight import sight
 
 
+class _Epoch(NamedTuple):
+    """One epoch of `RangeArrays`; `offset_m` of length 0 without ties."""
+
+    sat_ecef_m: Floats
+    code_m: Floats
+    weight: Floats
+    starts: Indices
+    offset_m: Floats
+    sigma_m: Floats
+
+
+class _Equations(NamedTuple):
+    """One epoch of what `reduced_equations` returns, and the weights of the groups."""
+
+    system: Floats
+    means: Floats
+    rows: Floats
+    totals: Floats
+
+
 @inner
-def reduce_epoch(
-    sat_ecef_m: Floats,
-    code_m: Floats,
-    weight: Floats,
-    place_ecef_m: Floats,
-    starts: Indices,
-    offset_m: Floats,
-    sigma_m: Floats,
-    system: Floats,
-    means: Floats,
-    rows: Floats,
-    totals: Floats,
-) -> None:
-    """Compute the normal equations of one epoch; `offset_m` of length 0 without ties."""
+def reduce_epoch(epoch: _Epoch, place_ecef_m: Floats, equations: _Equations) -> None:
+    """Compute the normal equations of one epoch."""
+    sat_ecef_m, code_m, weight, starts, offset_m, _ = epoch
+    system, means, rows, totals = equations
     channels, groups = len(weight), len(starts)
     x, y, z = place_ecef_m[0], place_ecef_m[1], place_ecef_m[2]
     system[:] = 0.0
@@ -63,24 +73,17 @@ def reduce_epoch(
                 for j in range(i, 4):
                     system[i, j] += wi * rows[j, m]
     if len(offset_m):
-        _tie(weight, starts, offset_m, sigma_m, system, means, rows, totals)
+        _tie(epoch, equations)
     for i in range(4):
         for j in range(i):
             system[i, j] = system[j, i]
 
 
 @inner
-def _tie(
-    weight: Floats,
-    starts: Indices,
-    offset_m: Floats,
-    sigma_m: Floats,
-    system: Floats,
-    means: Floats,
-    rows: Floats,
-    totals: Floats,
-) -> None:
-    """Add what the known offsets between the clocks of one epoch say."""
+def _tie(epoch: _Epoch, equations: _Equations) -> None:
+    """Add the known offsets between the clocks of one epoch."""
+    weight, starts, offset_m, sigma_m = epoch.weight, epoch.starts, epoch.offset_m, epoch.sigma_m
+    system, means, rows, totals = equations
     channels, groups = len(weight), len(starts)
     mass, apart, common = np.zeros(groups), np.empty((4, groups)), np.zeros(4)
     all_mass = 0.0
@@ -141,10 +144,8 @@ def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats
     rows, totals = np.empty((epochs, 4, channels)), np.empty((epochs, groups))
     for t in range(epochs):
         offset, spread = (offset_m[t], sigma_m[t]) if tied else (no, no)
-        reduce_epoch(
-            sat_ecef_m[t], code_m[t], weight[t], place_ecef_m[t], starts, offset, spread,
-            system[t], means[t], rows[t], totals[t],
-        )  # fmt: skip
+        epoch = _Epoch(sat_ecef_m[t], code_m[t], weight[t], starts, offset, spread)
+        reduce_epoch(epoch, place_ecef_m[t], _Equations(system[t], means[t], rows[t], totals[t]))
     return system, means, rows, totals > 0.0
 
 
@@ -247,16 +248,16 @@ def iterated_points(
     wsse, residual = np.full(epochs, np.nan), np.full((epochs, channels), np.nan)
     system, means = np.empty((4, 4)), np.empty((4, groups))
     rows, totals = np.empty((4, channels)), np.empty(groups)
+    equations = _Equations(system, means, rows, totals)
     current, step, inverse = np.empty(3), np.empty(3), np.empty((3, 3))
     for t in range(epochs):
         if not enough[t]:
             continue
         current[:] = start_ecef_m[t]
         offset, spread = (offset_m[t], sigma_m[t]) if tied else (no, no)
+        epoch = _Epoch(sat_ecef_m[t], code_m[t], weight[t], starts, offset, spread)
         for _ in range(most):
-            reduce_epoch(
-                sat_ecef_m[t], code_m[t], weight[t], current, starts, offset, spread, system, means, rows, totals
-            )  # fmt: skip
+            reduce_epoch(epoch, current, equations)
             invert(system, inverse)
             gain = 0.0
             for i in range(3):
@@ -349,6 +350,7 @@ def iterated_along(
     clock, residual = np.full((epochs, groups), np.nan), np.full((epochs, channels), np.nan)
     system, means = np.empty((4, 4)), np.empty((4, groups))
     rows, totals = np.empty((4, channels)), np.empty(groups)
+    equations = _Equations(system, means, rows, totals)
     place, jump, unit = np.empty(3), np.empty(3), np.empty(channels)
     for t in range(epochs):
         solved[4, t] = 0.0
@@ -357,12 +359,11 @@ def iterated_along(
         section = min(vertex[t], last)
         along, entered = (length_m[section] if vertex[t] > last else 0.0), 0
         offset, spread = (offset_m[t], sigma_m[t]) if tied else (no, no)
+        epoch = _Epoch(sat_ecef_m[t], code_m[t], weight[t], starts, offset, spread)
         for _ in range(most):
             for i in range(3):
                 place[i] = start_ecef_m[section, i] + along * tangent[section, i]
-            reduce_epoch(
-                sat_ecef_m[t], code_m[t], weight[t], place, starts, offset, spread, system, means, rows, totals
-            )
+            reduce_epoch(epoch, place, equations)
             step, sigma, exact, least = _along(system, tangent[section], across[section], up[section], plan_m, height_m)
             target, length = along + step, length_m[section]
             below, above = target < 0.0, target > length
@@ -382,9 +383,7 @@ def iterated_along(
                     chosen[t] = section
                     for m in range(channels):
                         unit[m] = 1.0 if weight[t, m] > 0.0 else 0.0
-                    reduce_epoch(
-                        sat_ecef_m[t], code_m[t], unit, place, starts, offset, spread, system, means, rows, totals
-                    )
+                    reduce_epoch(_Epoch(sat_ecef_m[t], code_m[t], unit, starts, offset, spread), place, equations)
                     information = 0.0
                     for i in range(3):
                         for j in range(3):

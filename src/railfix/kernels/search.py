@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -70,9 +71,7 @@ def radii_of_balls(
 @kernel
 def points_in_balls(
     points_m: Floats,
-    middle: Indices,
-    reach_m: Floats,
-    first: Indices,
+    stretches: tuple[Indices, Floats, Indices],
     centre_m: Floats,
     radius_m: Floats,
     matrix: Floats,
@@ -84,8 +83,8 @@ def points_in_balls(
     Parameters
     ----------
     points_m : ndarray, shape (V, 3) [m]
-    middle, reach_m, first
-        Of `SearchIndex.stretches`.
+    stretches
+        `SearchIndex.stretches`.
     centre_m, radius_m : ndarray, shapes (n, 3), (n,) [m]
     matrix, least : ndarray, shapes (n, 3, 3), (n,)
         The quadratic form: normal matrix, and q at the centre.
@@ -101,6 +100,7 @@ def points_in_balls(
     unsure : ndarray of bool, shape (p,)
         The error of the quadratic form leaves open which point of the epoch is the best, and this may be it.
     """
+    middle, reach_m, first = stretches
     epochs, top = len(radius_m), len(first) - 2
     count, found = np.zeros(epochs, dtype=np.intp), 0
     vertex, values, unsure = np.empty(1024, dtype=np.intp), np.empty((1024, 6)), np.empty(1024, dtype=np.bool_)
@@ -172,16 +172,9 @@ def _floor(vertex: int, q: float, slope: Floats, matrix: Floats, tangent: Floats
 
 @kernel
 def best_points(
-    count: Indices,
-    vertex: Indices,
-    q: Floats,
-    half_gradient: Floats,
-    matrix: Floats,
-    matrix_of: Indices,
+    candidates: Any,
     freedom: Integers,
-    arc_m: Floats,
-    tangent: Floats,
-    length_m: Floats,
+    line: tuple[Floats, Floats, Floats],
     separation_m: float,
     turn_m: float,
 ) -> tuple[Indices, Floats, Floats, Indices]:
@@ -189,11 +182,10 @@ def best_points(
 
     Parameters
     ----------
-    count, vertex, q, half_gradient, matrix, matrix_of
-        Of `_Candidates`.
+    candidates : SectionCandidates
     freedom : ndarray of int, shape (n,)
-    arc_m, tangent, length_m
-        Of the trajectory.
+    line : tuple of ndarray
+        `arc_m`, `tangent` and `length_m` of the trajectory.
     separation_m : float
         Places nearer than this along the line are one.
     turn_m : float
@@ -204,6 +196,8 @@ def best_points(
     vertex, q, excess, other_vertex : ndarray, shape (n,)
         As in `Section`.
     """
+    _, count, vertex, q, half_gradient, matrix, matrix_of = candidates
+    arc_m, tangent, length_m = line
     epochs, begin = len(count), 0
     chosen, other = np.empty(epochs, dtype=np.intp), np.full(epochs, -1, dtype=np.intp)
     least, excess = np.empty(epochs), np.full(epochs, np.inf)

@@ -21,7 +21,7 @@ from railfix.live.channels import TwoChannels
 from railfix.live.console import SessionLog, check_log_file
 from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.inputs import LiveInputs
-from railfix.live.metrics import Metrics, serve_metrics
+from railfix.live.metrics import serve_metrics
 from railfix.live.outlets import Outlet
 from railfix.live.place_watch import PlaceWatch
 from railfix.live.record import ResultTables
@@ -103,10 +103,10 @@ async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
         if inputs.channels == "2":
             engine = TwoChannels(processor, live, tuple(inputs.sensors))
             held.callback(engine.close)
-        metrics = Metrics()
+        hooks, streams = _hooks(inputs, live, engine, log, held, full="wait" if replay else "drop")
+        metrics = hooks.metrics
         if inputs.metrics is not None:
             held.callback((await serve_metrics(metrics, inputs.metrics)).close)
-        hooks, streams = _hooks(inputs, live, engine, log, held, full="wait" if replay else "drop")
         for name in set(inputs.sensors) - set(listened):
             samples = SensorSamples(**{str(name): getattr(tables, name)})
             table = Sensed(sensor=name, samples=samples, until=FOREVER)
@@ -121,7 +121,6 @@ async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
                 sinks,
                 speed=inputs.speed,
                 sensors=listened,
-                metrics=metrics,
                 hooks=hooks,
                 date=inputs.logs.instant,
                 streams=streams,

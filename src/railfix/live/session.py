@@ -53,12 +53,15 @@ class Hooks:
         Called every `LiveSettings.state_every_s`, in idle time, with what a restart needs.
     show : callable or None
         Called with a text for the status line, twice a second.
+    metrics : Metrics
+        Counted in, and returned.
     """
 
     observe: Callable[[LiveOutput], None] | None = None
     sensed: Callable[[Sensed], None] | None = None
     save: Callable[[SavedSession], None] | None = None
     show: Callable[[str], None] | None = None
+    metrics: Metrics = field(default_factory=Metrics)
 
 
 async def run_session(
@@ -68,7 +71,6 @@ async def run_session(
     *,
     speed: float | None,
     sensors: Mapping[str, str] | None = None,
-    metrics: Metrics | None = None,
     hooks: Hooks | None = None,
     date: np.datetime64 | None = None,
     streams: Mapping[str, ReceiverState] | None = None,
@@ -99,7 +101,8 @@ async def run_session(
     ChannelsDisagreeError
         Two channels differ.
     """
-    session = _Session(engine=engine, sinks=sinks, metrics=metrics or Metrics(), hooks=hooks or Hooks())
+    hooks = hooks or Hooks()
+    session = _Session(engine=engine, sinks=sinks, metrics=hooks.metrics, hooks=hooks)
     session.metrics.epochs, session.metrics.sinks = engine.counts, sinks
     replay = speed is None and not sensors and all(is_file(source) for source in sources.values())
     session.streams = {name: (streams or {}).get(name) or fresh_state(source, date) for name, source in sources.items()}

@@ -24,7 +24,7 @@ from copy import copy
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -196,24 +196,13 @@ def roll_sine(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floa
     return np.clip((speed_mps * rate_radps[:, 2] - force_mps2[:, 1]) / GRAVITY_MPS2, -0.5, 0.5)
 
 
-def find_slips(
-    time_s: Floats,
-    wheel_mps: Floats,
-    wheel_mps2: Floats,
-    force_mps2: Floats,
-    line_sine: Floats,
-    *,
-    body: Floats | None = None,
-    since_pulse_s: Floats | None = None,
-    limits: SlipLimits | None = None,
-    state: SlipState | None = None,
-) -> tuple[SlipResult, SlipState | None]:
-    """Return the state of the motion, its speed and way, each sample from itself and earlier ones.
+class MotionSamples(NamedTuple):
+    """N samples of wheel and body, 10 to 100 a second.
 
-    Parameters
+    Attributes
     ----------
     time_s : ndarray, shape (N,) [s]
-        Rising, 10 to 100 samples a second.
+        Rising.
     wheel_mps, wheel_mps2 : ndarray, shape (N,) [m/s], [m/s2]
         Speed of the wheel at the samples, and its acceleration; NaN where pulses say nothing.
     force_mps2 : ndarray, shape (N,) [m/s2]
@@ -226,6 +215,25 @@ def find_slips(
         there is none.
     since_pulse_s : ndarray, shape (N,), optional [s]
         Time since the last pulse: a vehicle that creeps has pulses without a speed. Without it that of the last speed.
+    """
+
+    time_s: Floats
+    wheel_mps: Floats
+    wheel_mps2: Floats
+    force_mps2: Floats
+    line_sine: Floats
+    body: Floats | None = None
+    since_pulse_s: Floats | None = None
+
+
+def find_slips(
+    samples: MotionSamples, *, limits: SlipLimits | None = None, state: SlipState | None = None
+) -> tuple[SlipResult, SlipState | None]:
+    """Return the state of the motion, its speed and way, each sample from itself and earlier ones.
+
+    Parameters
+    ----------
+    samples : MotionSamples
     limits : SlipLimits, optional
     state : SlipState, optional
         Left by the samples before.
@@ -236,13 +244,13 @@ def find_slips(
     SlipState or None
         To pass on with the next samples; None where there is no sample so far.
     """
-    limits = limits or SlipLimits()
+    limits, (time_s, *given, body, since_pulse_s) = limits or SlipLimits(), samples
     size = len(time_s)
     automaton = _Automaton(limits) if state is None else state.automaton.copied(limits)
     steps = np.diff(time_s, prepend=time_s[:1] if state is None else state.time_s).tolist()
     turning = np.full((size, 3), np.nan) if body is None else body
     since = np.full(size, np.nan) if since_pulse_s is None else since_pulse_s
-    columns = (wheel_mps, wheel_mps2, force_mps2, line_sine, turning, since)
+    columns = (*given, turning, since)
     rows = np.empty((size, 8))
     for k, (dt, *values) in enumerate(zip(steps, *(column.tolist() for column in columns), strict=True)):
         automaton.step(dt, *values)

@@ -1,6 +1,8 @@
 # The names of `railfix.pipeline`, imported at their first use (lazy-loader).
 
+from .base_station import Stations
 from .config import Config, load_config
+from .corrected_ranges import Models
 from .processor import EpochProcessor
 from .results import AntennaResult, AntennaState, Result, State
 from .tables import observations_table, positions_table, to_xarray
@@ -11,8 +13,10 @@ __all__ = [
     "AntennaState",
     "Config",
     "EpochProcessor",
+    "Models",
     "Result",
     "State",
+    "Stations",
     "load_config",
     "observations_table",
     "positions_table",

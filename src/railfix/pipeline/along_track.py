@@ -240,10 +240,7 @@ def _gate(
         if other is not None and (other is not sensors.wheel_m or sensors.wheel_sign == "measured"):
             way = np.where(np.isfinite(other), other, way)
     observed = np.asarray(np.isfinite(epochs.code_m).any(axis=1))
-    refused, gate = gated_codes(
-        epochs.time, observed, way, place_m, sigma_m, state.gate, line,
-        sigmas=config.sensors.return_sigmas, longest_s=config.sensors.return_s,
-    )  # fmt: skip
+    refused, gate = gated_codes(epochs.time, observed, way, place_m, sigma_m, state.gate, line, config.sensors)
     return (
         replace(epochs, code_m=np.where(refused[:, None], np.nan, epochs.code_m)) if refused.any() else epochs
     ), gate

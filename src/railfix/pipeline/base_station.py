@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef, range_w
 from railfix.core.reasons import Reason
 from railfix.core.timescale import timedelta
 from railfix.gnss.observations import Observations
+from railfix.motion.samples import GroundUnits, ListedBalises
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
@@ -31,6 +32,14 @@ _HALF_LINE_DEG: Final = 0.0005
 _NO_EPOCH: Final = "base station: no epoch of known position so far, nothing subtracted"
 #: Positions of a station that differ by no more are the same [m].
 _SAME_PLACE_M: Final = 0.01
+
+
+class Stations(NamedTuple):
+    """Surveyed places: units of two-way ranges, a base station ("stream": its position is in its headers), balises."""
+
+    units: GroundUnits | None = None
+    base_ecef_m: Floats | Literal["stream"] | None = None
+    balises: ListedBalises | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,6 +21,7 @@ from railfix.positioning.carrier import (
     Phases,
     PhaseState,
     SmoothingState,
+    TrackedPhases,
     corrected_phase_m,
     find_slips,
     last_arcs,
@@ -134,7 +135,7 @@ def code_and_phase(
             integers = _integer_channels(corrected)
     phase = np.where(used, phase, np.nan)
     jumps, continuity = track_jumps(
-        time, satellite, signal, phase, satellites.position_ecef_m, slip,
+        time, satellite, signal, TrackedPhases(phase, satellites.position_ecef_m, slip),
         trajectory, arc_m, state.continuity, limits=config.continuity,
     )  # fmt: skip
     has = np.isfinite(slips.phase_m[:, columns])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, changed
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states
+from railfix.integrity.protection.support import IntegritySupport
 from railfix.pipeline.channels import Channels
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received
@@ -25,6 +26,7 @@ from railfix.positioning.single_point import SinglePointLimits, single_point
 from railfix.positioning.two_frequencies import Combined, SecondCodes
 from railfix.ranges.atmospheric_delays import SeenFrom, modelled_delays
 from railfix.ranges.base_station import BaseDifferences
+from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.ranges.error_model import Conditions, ErrorModel
 from railfix.ranges.sbas_delays import SBAS_SIGNAL, corrected_satellites, sbas_delays
 from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m, first_available
@@ -38,6 +40,14 @@ ANCHOR_TOLERANCE_M: Final = 1000.0
 BESIDE_THE_LINE_M: Final = 1e5
 #: Satellite position of ranges without weight: any finite value will do [m].
 SOMEWHERE_ABOVE_M: Final = (2.6e7, 0.0, 0.0)
+
+
+class Models(NamedTuple):
+    """Measured models: weights of the ranges in place of `Config.noise`, the screen "cn0", ARAIM levels."""
+
+    error_model: ErrorModel | None = None
+    cn0_curve: Cn0Curve | None = None
+    support: IntegritySupport | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -229,11 +229,20 @@ def feature_fixes(
                 continue
             tick = begin + 1 + int(np.argmax(sense * (behind - feature.arc_m) >= 0.0))
             shift = float(body[tick - begin - 1] - ways[tick + 1])  # from ways to places of the body's middle
-            until_tick = sense * (metre - ways[tick + 1]) <= 0.0
-            located = _compare(
-                metre[until_tick], headings[until_tick], pitches[until_tick], shift, feature, line, facing, sense,
-                sigma_m, last, noise, limits,
-            )  # fmt: skip
+            # In rising arc length: a vehicle that backs or faces the other way turns the signs of pitch, heading stays.
+            passed_by = np.flatnonzero(sense * (metre - ways[tick + 1]) <= 0.0)[:: int(sense)]
+            profile = (
+                np.asarray(metre[passed_by] + shift, dtype=np.float64),
+                headings[passed_by],
+                facing * pitches[passed_by],
+            )
+            before = None
+            if last is not None:
+                covered = feature.arc_m - shift - last[2]
+                # on a closed line the last feature may lie before the join
+                nearest = line.line.nearest_m(np.array(last[0]), np.array(feature.arc_m - covered))
+                before = (float(nearest), last[1], covered)
+            located = _compare(profile, feature, line, sigma_m, before, noise, limits)
             if located is None:
                 continue
             fixes.append(FeatureFix(tick=tick, feature=feature, located=located))
@@ -258,37 +267,26 @@ def _whole_metres(way_m: Floats) -> Integers:
 
 
 def _compare(
-    metre: Integers,
-    heading_rad: Floats,
-    pitch_rad: Floats,
-    shift_m: float,
+    profile: tuple[Floats, Floats, Floats],
     feature: Feature,
     line: LineFeatures,
-    facing: float,
-    sense: float,
     sigma_m: float,
     last: tuple[float, float, float] | None,
     noise: tuple[float, float],
     limits: FeatureLimits,
 ) -> LocatedFeature | None:
-    """Verdict on one feature; None where the way about it was not passed without a break."""
-    order = slice(None) if sense > 0 else slice(None, None, -1)
-    about = metre[order] + shift_m - feature.arc_m
+    """Verdict on one feature by arc lengths, headings and pitches; None where it was not passed without a break."""
+    arc_m, heading_rad, pitch_rad = profile
+    about = arc_m - feature.arc_m
     near = np.flatnonzero(np.abs(about) <= limits.half_length_m)
     if len(near) < 1.8 * limits.half_length_m or len(near) < 3:
         return None
-    # In rising arc length: a vehicle that backs or faces the other way turns the signs of pitch, heading stays.
-    heading, pitch = heading_rad[order][near], facing * pitch_rad[order][near]
+    heading, pitch = heading_rad[near], pitch_rad[near]
     measured = LineSeries(
         arc_m=np.asarray(about[near][1:-1], dtype=np.float64),
         gradient=np.tan(pitch[1:-1]),
         curvature_1pm=0.5 * (heading[2:] - heading[:-2]),
     )
-    since = None
-    if last is not None:
-        way = feature.arc_m - shift_m - last[2]
-        # on a closed line the last feature may lie before the join
-        since = (float(line.line.nearest_m(np.array(last[0]), np.array(feature.arc_m - way))), last[1], way)
     return locate(
-        measured, line.series, feature.arc_m, sigma_m, quantity=feature.quantity, noise=noise, last=since, limits=limits
+        measured, line.series, feature.arc_m, sigma_m, quantity=feature.quantity, noise=noise, last=last, limits=limits
     )

@@ -18,6 +18,7 @@ from railfix.integrity.protection import (
     along_track_level,
     availability,
 )
+from railfix.integrity.protection.level import MapError, RangeBounds
 from railfix.integrity.protection.open_places import places_beyond_the_level
 from railfix.integrity.protection.risk import SUPPORTED_SIDE_PRIOR
 from railfix.integrity.raim import LinearModel
@@ -148,10 +149,8 @@ def protection_levels(
         [name[0] for name in corrected.satellite.tolist()],
         risk=risk_of(config),
         scale=level_scale(scale, config),
-        least_sigma_m=None if config.error_model is None else corrected.bound_sigma_m,
-        bias_m=None if config.error_model is None else corrected.bias_m,
-        map_bias_m=np.stack(offset.beyond_m, axis=1),
-        map_seen=offset.seen,
+        overbound=None if config.error_model is None else RangeBounds(corrected.bound_sigma_m, corrected.bias_m),
+        map_error=MapError(np.stack(offset.beyond_m, axis=1), offset.seen),
         sides=sides,
         n_excluded=raim.excluded.sum(axis=1),
     )
@@ -159,14 +158,21 @@ def protection_levels(
     return ProtectionResult(level=level, status=status, kind=kind_of(config), basis=basis_of(config))
 
 
+def bounding_model(
+    corrected: CorrectedRanges, ranges: Ranges, antennas: AntennaRows, place: Place, scale: Floats
+) -> tuple[LinearModel, Floats]:
+    """Return the model of positions whose sigmas bound the errors of the ranges by an error model, and its scale."""
+    sigma = np.maximum(corrected.bound_sigma_m, scale[:, None] * corrected.sigma_m)
+    weight = np.where(ranges.weight > 0, 1.0 / sigma**2, 0.0)
+    return line_model(replace(ranges, weight=weight), antennas, place.constrained), np.ones(len(ranges))
+
+
 def unresolved_alternatives(
     corrected: CorrectedRanges,
-    ranges: Ranges,
     antennas: AntennaRows,
     place: Place,
-    model: LinearModel,
+    bounding: tuple[LinearModel, Floats],
     protection: ProtectionResult,
-    scale: Floats,
     sides: Masks,
     config: Config,
 ) -> Masks:
@@ -174,31 +180,24 @@ def unresolved_alternatives(
 
     Parameters
     ----------
-    corrected, model, scale, sides, config
+    corrected, sides, config
         As for `protection_levels`.
-    ranges : Ranges
-        That `place` was found from.
     antennas : AntennaRows
     place : Place
         Epochs that are ambiguous already are not looked at.
+    bounding : tuple of LinearModel and ndarray, shape (T,)
+        Of the positions, and the noise scale; `bounding_model` where there is an error model.
     protection : ProtectionResult
     """
-    constrained = place.constrained
-    if config.error_model is not None:
-        sigma = np.maximum(corrected.bound_sigma_m, scale[:, None] * corrected.sigma_m)
-        weight = np.where(ranges.weight > 0, 1.0 / sigma**2, 0.0)
-        model = line_model(replace(ranges, weight=weight), antennas, constrained)
-        scale = np.ones(len(ranges))
     return places_beyond_the_level(
         antennas,
-        constrained.arc_m,
-        model,
-        protection.level.level_m,
-        scale,
+        place.constrained.arc_m,
+        bounding[0],
+        np.where(place.section.excess > config.section.threshold, protection.level.level_m, np.nan),
+        bounding[1],
         [name[0] for name in corrected.satellite.tolist()],
         risk_of(config),
         sides,
-        np.flatnonzero(place.section.excess > config.section.threshold),
     )
 
 

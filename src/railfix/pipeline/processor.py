@@ -11,25 +11,24 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Masks, changed
+from railfix.core.arrays import Masks, changed
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.integrity.protection.support import IntegritySupport
-from railfix.motion.samples import GroundUnits, ListedBalises, SensorSamples
+from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import along_track, checked, with_passings
 from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.araim_stage import with_araim
 from railfix.pipeline.assemble import antenna_results, with_coordinates
-from railfix.pipeline.base_station import BaseStation, check_base
+from railfix.pipeline.base_station import BaseStation, Stations, check_base
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.compared import filter_verdicts, judge_pairs, position_verdicts, with_screens
 from railfix.pipeline.config import SCREEN_NAMES, Config
-from railfix.pipeline.corrected_ranges import CorrectedRanges, conditions_of, correct_ranges
+from railfix.pipeline.corrected_ranges import CorrectedRanges, Models, conditions_of, correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
 from railfix.pipeline.filter_result import AlongTrack, FilterState, single_epochs
 from railfix.pipeline.interference_stage import judge_interference, with_wheel
@@ -40,8 +39,7 @@ from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples
 from railfix.pipeline.solution import Solution, solve
 from railfix.positioning.antenna_rows import AntennaRows, rows_of, stack_observations
 from railfix.positioning.section_search import SearchIndex
-from railfix.ranges.cn0_curve import Cn0Curve
-from railfix.ranges.error_model import ErrorModel, condition_differences
+from railfix.ranges.error_model import condition_differences
 from railfix.ranges.sbas import SbasMessages
 from railfix.screens import SCREENS, AntennaRanges, ObservationScreen, PairedEpochs, Screen, ScreenSetup, in_order
 from railfix.screens.pairs import pair_antennas
@@ -90,18 +88,10 @@ class EpochProcessor:
         Navigation records known from the start; others may come with each chunk.
     messages : SbasMessages, optional
         SBAS messages known from the start. SBAS corrections are used once messages are given, here or with a chunk.
-    error_model : ErrorModel, optional
-        Gives the weights of the ranges in place of ``config.noise``.
-    cn0_curve : Cn0Curve, optional
-        Mean C/N0 over elevation, for the screen "cn0".
+    models : Models, optional
     track : Track, optional
         The line itself, for places by its changes of gradient and curvature in the filter along the track.
-    units, balises : GroundUnits, ListedBalises, optional
-        Of the filter along the track: surveyed stations of two-way ranges; places of balises and virtual ones.
-    support : IntegritySupport, optional
-        Integrity support message, for ARAIM levels.
-    base_ecef_m : ndarray, shape (3,) [m], or "stream", optional
-        Position of a base station, in the frame of the satellites; "stream": that of its observations' headers.
+    stations : Stations, optional
     screens : sequence of Screen, optional
         Screens of one's own, used with their limits beside those of `config`; their verdicts are in
         `AntennaResult.screens`, without columns of the tables (those of installed packages have them).
@@ -132,13 +122,9 @@ class EpochProcessor:
         *,
         navigation: Navigation | None = None,
         messages: SbasMessages | None = None,
-        error_model: ErrorModel | None = None,
-        cn0_curve: Cn0Curve | None = None,
+        models: Models | None = None,
         track: Track | None = None,
-        units: GroundUnits | None = None,
-        balises: ListedBalises | None = None,
-        support: IntegritySupport | None = None,
-        base_ecef_m: Floats | Literal["stream"] | None = None,
+        stations: Stations | None = None,
         screens: Sequence[Screen[Any]] = (),
     ) -> None:
         if not trajectories:
@@ -158,8 +144,9 @@ class EpochProcessor:
         self.received = known_from_start(config, navigation=navigation, messages=messages)
         self._channels = ChannelBook(config)
         self.indices = {name: SearchIndex(t) for name, t in self.trajectories.items()}
-        self._error_model, self._support = error_model, support
-        self._base = None if base_ecef_m is None else BaseStation(config, base_ecef_m)
+        models, stations = models or Models(), stations or Stations()
+        self._error_model, self._support = models.error_model, models.support
+        self._base = None if stations.base_ecef_m is None else BaseStation(config, stations.base_ecef_m)
         if taken := [s.name for s in screens if s.name in SCREEN_NAMES]:
             raise ValueError(f"there is a screen {taken[0]} already; give it another name")
         chosen = (*(s for s in SCREENS if s.name in config.screens), *screens)
@@ -167,9 +154,9 @@ class EpochProcessor:
         self.setup = ScreenSetup(
             antennas=len(self.trajectories),
             spacing_known=all(t.body_chainage_m is not None for t in self.trajectories.values()),
-            cn0_curve=cn0_curve,
+            cn0_curve=models.cn0_curve,
         )
-        self._track, self.units, self.balises = track, units, balises
+        self._track, self.units, self.balises = track, stations.units, stations.balises
         self._features: dict[str, LineFeatures] = {}
         self._before_filter, self._lacking = FilterState(), self._inactive_notes()
         self._threads = _threads(len(trajectories))

@@ -9,6 +9,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.timescale import seconds
+from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.tracking import Line
 
 #: Without codes for so long the place is that of the sensors [s].
@@ -56,15 +57,13 @@ def gated_codes(
     sigma_m: Floats,
     state: ReturnState,
     line: Line,
-    *,
-    sigmas: float,
-    longest_s: float,
+    limits: SensorLimits,
 ) -> tuple[Masks, ReturnState]:
     """Return the epochs whose codes do not count yet, shape (T,), and the state to pass on.
 
     After an outage the position of each epoch by itself is compared with the place coasted on the sensors: codes count
-    again with the third in a row that lies within `sigmas` of both standard deviations together, and after `longest_s`
-    in any case. Where no sensor gives a way nothing is refused.
+    again with the third in a row that lies within `SensorLimits.return_sigmas` of both standard deviations together,
+    and after `SensorLimits.return_s` in any case. Where no sensor gives a way nothing is refused.
 
     Parameters
     ----------
@@ -78,13 +77,13 @@ def gated_codes(
     state : ReturnState
         With the place of the filter at the epoch before the first.
     line : Line
-    sigmas, longest_s : float
+    limits : SensorLimits
     """
     refused = np.zeros(len(time), dtype=np.bool_)
     ways = state.way_m + np.cumsum(way_m)
     coasted = state.place_m + np.cumsum(way_m)
     spread = np.sqrt(state.sigma_m**2 + (_WAY_SHARE * ways) ** 2 + np.maximum(sigma_m, _LEAST_SIGMA_M) ** 2)
-    fits = np.abs(line.nearest_m(place_m, coasted) - coasted) <= sigmas * spread
+    fits = np.abs(line.nearest_m(place_m, coasted) - coasted) <= limits.return_sigmas * spread
     last, returned, agreeing = state.time, state.returned, state.agreeing
     steps = seconds(np.diff(time, prepend=last if not np.isnat(last) else time[:1]))
     if np.isnat(returned) and observed.all() and steps.max(initial=0.0) < _OUTAGE_S:
@@ -94,7 +93,7 @@ def gated_codes(
         if out and np.isfinite(coasted[k]):
             returned = time[k] if np.isnat(returned) else returned
             agreeing = agreeing + 1 if fits[k] else 0
-            refused[k] = agreeing < _AGREEING and float(seconds(time[k] - returned)) <= longest_s
+            refused[k] = agreeing < _AGREEING and float(seconds(time[k] - returned)) <= limits.return_s
         if not refused[k]:
             last, returned, agreeing = time[k], _NEVER, 0
     if not len(time):

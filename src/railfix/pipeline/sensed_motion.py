@@ -13,6 +13,7 @@ from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.timescale import seconds
 from railfix.motion.samples import InertialSamples, TachometerPulses
 from railfix.motion.slip import (
+    MotionSamples,
     MotionState,
     SlipLimits,
     SlipState,
@@ -183,13 +184,15 @@ def sensed_motion(
     # the speed by pulses is that of the middle of their time: 0.065 s ago, 0.2 m after a slip of 3 s begun at 1 m/s2
     ago = seconds(when - speed.time)
     found, slip = find_slips(
-        np.asarray(1e-9 * _TICK_NS * ticks, dtype=np.float64),
-        speed.speed_mps + np.nan_to_num(acceleration * ago),
-        acceleration,
-        force[:, 0],
-        line_sine,
-        body=np.stack([force[:, 1], rates[:, 1], rates[:, 2]], axis=1),
-        since_pulse_s=since,
+        MotionSamples(
+            time_s=np.asarray(1e-9 * _TICK_NS * ticks, dtype=np.float64),
+            wheel_mps=speed.speed_mps + np.nan_to_num(acceleration * ago),
+            wheel_mps2=acceleration,
+            force_mps2=force[:, 0],
+            line_sine=line_sine,
+            body=np.stack([force[:, 1], rates[:, 1], rates[:, 2]], axis=1),
+            since_pulse_s=since,
+        ),
         limits=limits,
         state=state.slip,
     )

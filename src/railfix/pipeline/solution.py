@@ -21,7 +21,7 @@ from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
 from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.lasting_errors import lasting_errors
-from railfix.pipeline.level_stage import low_sides, protection_levels, unresolved_alternatives
+from railfix.pipeline.level_stage import bounding_model, low_sides, protection_levels, unresolved_alternatives
 from railfix.pipeline.off_map import OffMapState, off_map_epochs
 from railfix.pipeline.reason_table import alone_on_their_clocks
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
@@ -30,7 +30,7 @@ from railfix.positioning.antenna_rows import AntennaRows, rows_of
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.constrained import constrained_position
 from railfix.positioning.intersystem_bias import tie_clocks
-from railfix.positioning.map_offset import MapOffset, beyond_threshold, map_offset
+from railfix.positioning.map_offset import LinePositions, MapOffset, RangeErrors, beyond_threshold, map_offset
 from railfix.positioning.noise_scale import (
     NoiseState,
     epoch_variance,
@@ -156,8 +156,8 @@ def solve(
 
     away, off_map_states = antennas.each_with_state(own_absence, states)
     offset, map_states = map_offset(
-        time, agreeing, free, corrected.nominal_m, np.maximum(scale, 1.0) ** 2, antennas,
-        constrained.arc_m, away, [state.map_offset for state in states], limits=config.map_offset,
+        time, agreeing, free, RangeErrors(corrected.nominal_m, np.maximum(scale, 1.0) ** 2), antennas,
+        LinePositions(constrained.arc_m, away), [state.map_offset for state in states], limits=config.map_offset,
     )  # fmt: skip
     model = line_model(ranges, antennas, constrained)
     if "raim" in config.screens and config.raim_protection == "on":
@@ -169,7 +169,10 @@ def solve(
         heading = antennas.each(lambda index, rows: index.trajectory.heading_deg[section[rows]])
         sides = low_sides(corrected, heading, config.risk.side_elevation_deg)
         level = protection_levels(corrected, model, offset, raim, scale, sides, config)
-        open_elsewhere = unresolved_alternatives(corrected, ranges, antennas, place, model, level, scale, sides, config)
+        bounding = (model, scale)
+        if config.error_model is not None:
+            bounding = bounding_model(corrected, ranges, antennas, place, scale)
+        open_elsewhere = unresolved_alternatives(corrected, antennas, place, bounding, level, sides, config)
     own_sigma = own_sigma_m(redundancy, constrained.wsse, constrained.exact_map_sigma_m, scale)
     arc, exact, total = constrained.arc_m, constrained.exact_map_sigma_m, constrained.sigma_m
     variance = epoch_variance(scale, constrained.wsse, redundancy, limits=config.noise_scale)

@@ -8,13 +8,13 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.arrays import Datetimes, Floats, Indices
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.locate import UncorrectedRanges, locate_ranges, uncorrected_ranges
+from railfix.pipeline.locate import locate_ranges, uncorrected_ranges
 from railfix.pipeline.received import Received
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, thinned_rows
@@ -96,23 +96,7 @@ def survey_epochs(
     rate = -SPEED_OF_LIGHT / seen.channels.frequency_hz * obs.doppler_hz[:, columns]
     broken = np.cumsum(slips.slip[:, columns] | obs.break_before[:, None], axis=0, dtype=np.intp)
     rows = thinned_rows(obs.time, limits.interval_s)
-    signals = _signals(
-        seen, obs.time[rows], rows, usable, phase, rate, broken, obs.cn0_dbhz[:, columns], limits, config
-    )
-    epochs = SurveyEpochs(
-        time=obs.time[rows],
-        ecef_m=located.ecef_m[rows],
-        sigma_m=np.nan_to_num(located.sigma_m[rows][:, [1, 0, 2]], nan=1.0),
-        n_used=located.n_used[rows],
-        signals=signals,
-    )
-    return epochs, after
-
-
-def _signals(
-    seen: UncorrectedRanges, time: Datetimes, rows: Indices, usable: Masks, phase: Floats, rate: Floats,
-    broken: Indices, cn0_dbhz: Floats, limits: SurveyLimits, config: Config,
-) -> RunSignals:  # fmt: skip
+    time, cn0_dbhz = obs.time[rows], obs.cn0_dbhz[:, columns]
     weak = 10.0 ** ((45.0 - np.where(np.isnan(cn0_dbhz), 45.0, np.minimum(cn0_dbhz, 50.0))) / 10.0)
     used, position, weak = usable[rows], seen.states.position_ecef_m[rows], weak[rows]
     step_s = seconds(np.diff(time))[:, None]
@@ -133,7 +117,7 @@ def _signals(
         clock[group] = number
     row, channel = np.nonzero(used)
     step, of_step = np.nonzero(joined | doppler)
-    return RunSignals(
+    signals = RunSignals(
         row=row,
         sat_ecef_m=position[row, channel],
         code_m=seen.ranges.code_m[rows][row, channel],
@@ -145,3 +129,11 @@ def _signals(
         change_m=np.where(joined, by_phase, by_doppler)[step, of_step],
         change_sigma_m=np.where(joined, phase_m, doppler_m)[step, of_step],
     )
+    epochs = SurveyEpochs(
+        time=time,
+        ecef_m=located.ecef_m[rows],
+        sigma_m=np.nan_to_num(located.sigma_m[rows][:, [1, 0, 2]], nan=1.0),
+        n_used=located.n_used[rows],
+        signals=signals,
+    )
+    return epochs, after

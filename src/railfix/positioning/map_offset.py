@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -140,15 +140,44 @@ class MapOffset:
         return np.where(known, across, 0.0), np.where(known, up, 0.0)
 
 
+class RangeErrors(NamedTuple):
+    """Errors of the ranges of T epochs.
+
+    Attributes
+    ----------
+    nominal_m : ndarray, shape (T, M) [m]
+        Standard deviations of satellites and atmosphere.
+    variance : ndarray, shape (T,)
+        Of the ranges against their weights.
+    """
+
+    nominal_m: Floats
+    variance: Floats
+
+
+class LinePositions(NamedTuple):
+    """Positions on the line at T epochs.
+
+    Attributes
+    ----------
+    arc_m : ndarray, shape (T,) [m]
+        NaN where there is none.
+    off_map : ndarray of bool, shape (T,)
+        The train is away from the line. These epochs have a window of their own: what a train was beside while it was
+        away says nothing of the map once it is on it.
+    """
+
+    arc_m: Floats
+    off_map: Masks
+
+
 def map_offset(
     time: Datetimes,
     ranges: Ranges,
     point: SinglePoint,
-    nominal_m: Floats,
-    variance: Floats,
+    errors: RangeErrors,
     antennas: AntennaRows,
-    arc_m: Floats,
-    off_map: Masks,
+    positions: LinePositions,
     states: Sequence[MapOffsetState],
     *,
     limits: MapOffsetLimits | None = None,
@@ -162,16 +191,9 @@ def map_offset(
         What the 3-D positions were solved with: ranges that agree with each other.
     point : SinglePoint
         3-D positions.
-    nominal_m : ndarray, shape (T, M) [m]
-        Standard deviations of satellites and atmosphere in the ranges.
-    variance : ndarray, shape (T,)
-        Of the ranges against their weights.
+    errors : RangeErrors
     antennas : AntennaRows
-    arc_m : ndarray, shape (T,) [m]
-        Positions on the line; NaN where there is none.
-    off_map : ndarray of bool, shape (T,)
-        The train is away from the line. These epochs have a window of their own: what a train was beside while it was
-        away says nothing of the map once it is on it.
+    positions : LinePositions
     states : sequence of MapOffsetState
         By antenna.
     limits : MapOffsetLimits, optional
@@ -181,13 +203,15 @@ def map_offset(
     MapOffset
     list of MapOffsetState
     """
-    limits = limits or MapOffsetLimits()
+    limits, (arc_m, off_map) = limits or MapOffsetLimits(), positions
     usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.n_used - ranges.n_clocks > 3)
     arc = np.where(usable, arc_m, 0.0)
     axes, place = antennas.each(lambda index, rows: _across_and_up(index.trajectory, arc[rows]))
     at = np.where(usable[:, None], point.ecef_m, place)
     covariance = np.where(usable[:, None, None], point.covariance_m2, np.eye(3))
-    terms = terms_of_epochs(ranges.arrays, at, covariance, place, axes, np.ascontiguousarray(nominal_m), variance)
+    terms = terms_of_epochs(
+        ranges.arrays, at, covariance, place, axes, np.ascontiguousarray(errors.nominal_m), errors.variance
+    )
     sample = np.zeros((len(time), 2, _SUMS))
     rows = np.flatnonzero(usable)
     sample[rows, off_map[rows].astype(np.intp)] = terms[rows]
@@ -242,8 +266,10 @@ def terms_of_epochs(
 
     Parameters
     ----------
-    ranges, nominal_m, variance
-        As for `map_offset`; `nominal_m` in C order.
+    ranges
+        As for `map_offset`.
+    nominal_m, variance
+        Of `RangeErrors`; `nominal_m` in C order.
     ecef_m, covariance_m2 : ndarray, shapes (T, 3) [m], (T, 3, 3) [m^2]
         3-D positions.
     place_ecef_m : ndarray, shape (T, 3) [m]

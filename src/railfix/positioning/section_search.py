@@ -20,6 +20,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -162,13 +163,12 @@ class SearchIndex:
         return np.asarray(self._clear_m[section])
 
 
-@dataclass
-class _SectionCandidates:
+class SectionCandidates(NamedTuple):
     """Points looked at, sorted by epoch and point, with q and its slope there; n epochs, p points.
 
     Attributes
     ----------
-    at, count : ndarray of int, shape (n,)
+    at, points : ndarray of int, shape (n,)
         The epochs, and how many points each has (at least one).
     vertex, q, half_gradient : ndarray, shapes (p,), (p,), (p, 3)
     matrix : ndarray, shape (m, 3, 3)
@@ -178,7 +178,7 @@ class _SectionCandidates:
     """
 
     at: Indices
-    count: Indices
+    points: Indices
     vertex: Indices
     q: Floats
     half_gradient: Floats
@@ -216,7 +216,7 @@ def search(
     epochs = len(ranges)
     weight_norm = np.sqrt(ranges.weight.sum(axis=1))
     freedom = np.maximum(ranges.n_used - ranges.n_clocks - 1, 1)
-    candidates: list[_SectionCandidates] = []
+    candidates: list[SectionCandidates] = []
     evaluations = np.zeros(epochs, dtype=np.int64)
 
     radius = _ball(index, point, weight_norm, freedom, limits)
@@ -230,7 +230,7 @@ def search(
         evaluations[coarse] += tried
         candidates.append(part)
     for part in candidates:
-        evaluations[part.at] += part.count
+        evaluations[part.at] += part.points
     return _decide(epochs, candidates, index.trajectory, freedom, limits, evaluations)
 
 
@@ -264,11 +264,11 @@ def _in_ball(
     weight_norm: Floats,
     epochs: Indices,
     radius: Floats,
-) -> _SectionCandidates:
+) -> SectionCandidates:
     """Points in the ball of each epoch with q from the quadratic form; exact where that leaves a choice."""
     count, vertex, q, half_gradient, unsure = kernels.search.points_in_balls(
         index.trajectory.ecef_m,
-        *index.stretches,
+        index.stretches,
         point.ecef_m[epochs],
         radius,
         point.matrix[epochs],
@@ -279,7 +279,8 @@ def _in_ball(
         raise AssertionError(f"an empty ball at epochs {epochs[count == 0]}: the radius is below the nearest point")
     if unsure.any():
         q[unsure] = fit(ranges, index.trajectory.ecef_m[vertex[unsure]], np.repeat(epochs, count)[unsure])
-    return _SectionCandidates(epochs, count, vertex, q, half_gradient, point.matrix, np.repeat(epochs, count))
+    matrix = np.ascontiguousarray(point.matrix)
+    return SectionCandidates(epochs, count, vertex, q, half_gradient, matrix, np.repeat(epochs, count))
 
 
 def _coarse_to_fine(
@@ -289,7 +290,7 @@ def _coarse_to_fine(
     freedom: Integers,
     limits: SectionLimits,
     epochs: Indices,
-) -> tuple[_SectionCandidates, Integers]:
+) -> tuple[SectionCandidates, Integers]:
     """Return the points that fit as well as noise allows, by dropping stretches of line that fit too badly."""
     points = index.trajectory.ecef_m
     upper = np.full(len(ranges), np.inf)
@@ -317,14 +318,14 @@ def _coarse_to_fine(
     equations = normal_equations(ranges.take(epoch), points[node])
     count = np.bincount(epoch, minlength=len(ranges))[epochs]
     found, every = count > 0, np.arange(len(epoch))
-    return _SectionCandidates(epochs[found], count[found], node, q, -equations.vector, equations.matrix, every), tried[
+    return SectionCandidates(epochs[found], count[found], node, q, -equations.vector, equations.matrix, every), tried[
         epochs
     ]
 
 
 def _decide(
     epochs: int,
-    parts: list[_SectionCandidates],
+    parts: list[SectionCandidates],
     trajectory: Trajectory,
     freedom: Integers,
     limits: SectionLimits,
@@ -334,20 +335,10 @@ def _decide(
     vertex = np.full(epochs, -1, dtype=np.intp)
     other = np.full(epochs, -1, dtype=np.intp)
     q, excess = np.full(epochs, np.nan), np.full(epochs, np.inf)
+    line = (trajectory.arc_m, trajectory.tangent, trajectory.length_m)
     for part in parts:
         at = part.at
         vertex[at], q[at], excess[at], other[at] = kernels.search.best_points(
-            part.count,
-            part.vertex,
-            part.q,
-            part.half_gradient,
-            np.ascontiguousarray(part.matrix),
-            part.matrix_of,
-            freedom[at],
-            trajectory.arc_m,
-            trajectory.tangent,
-            trajectory.length_m,
-            limits.separation_m,
-            trajectory.turn_m,
+            part, freedom[at], line, limits.separation_m, trajectory.turn_m
         )
     return Section(vertex=vertex, q=q, excess=excess, other_vertex=other, evaluations=evaluations)

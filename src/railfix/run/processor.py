@@ -10,7 +10,9 @@ from railfix.core.errors import SettingsError
 from railfix.gnss.navigation import Navigation
 from railfix.integrity.protection.support import read_integrity_support
 from railfix.motion.samples import GroundUnits, ListedBalises
+from railfix.pipeline.base_station import Stations
 from railfix.pipeline.config import Config
+from railfix.pipeline.corrected_ranges import Models
 from railfix.pipeline.processor import EpochProcessor
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.ranges.error_model import read_error_model
@@ -68,11 +70,11 @@ def processor_of(
         trajectories,
         navigation=navigation,
         messages=messages,
-        error_model=None if config.error_model is None else read_error_model(config.error_model),
-        cn0_curve=None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve),
+        models=Models(
+            error_model=None if config.error_model is None else read_error_model(config.error_model),
+            cn0_curve=None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve),
+            support=None if config.integrity_support is None else read_integrity_support(config.integrity_support),
+        ),
         track=track,
-        units=units,
-        balises=balises,
-        base_ecef_m=base_ecef_m,
-        support=None if config.integrity_support is None else read_integrity_support(config.integrity_support),
+        stations=Stations(units, base_ecef_m, balises),
     )

@@ -21,7 +21,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -106,7 +106,30 @@ class AntennaPairScreened(Screened):
     clocks: str
 
 
-def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
+class Spacing(NamedTuple):
+    """Line from the rear to the front antenna, shape (P,) or scalar each; NaN where unknown: not judged."""
+
+    heading_deg: ArrayLike
+    gradient_permille: ArrayLike
+    spacing_m: ArrayLike
+
+
+class TagDifference(NamedTuple):
+    """Instants of the two receivers.
+
+    Attributes
+    ----------
+    later : array_like of timedelta64[ns], shape (P,)
+        Time tags of the rear receiver less those of the front one.
+    range_rate_mps : array_like, shape (P, C) [m/s]
+        ``-lambda D``, NaN where unknown: then left out.
+    """
+
+    later: ArrayLike
+    range_rate_mps: ArrayLike
+
+
+def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> Spacing:
     """Heading, gradient and length of the line from the rear to the front antenna.
 
     Parameters
@@ -117,7 +140,7 @@ def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> tuple[
 
     Returns
     -------
-    heading_deg, gradient_permille, spacing_m : ndarray, shape (P,)
+    Spacing
     """
     front, rear = np.asarray(front_ecef_m, dtype=np.float64), np.asarray(rear_ecef_m, dtype=np.float64)
     latitude, longitude, _ = geodetic_from_ecef((front + rear) / 2.0)
@@ -126,7 +149,7 @@ def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> tuple[
     with np.errstate(divide="ignore", invalid="ignore"):
         gradient = 1e3 * enu[:, 2] / level
     heading = np.degrees(np.arctan2(enu[:, 0], enu[:, 1])) % 360.0
-    return heading, gradient, np.hypot(level, enu[:, 2])
+    return Spacing(heading, gradient, np.hypot(level, enu[:, 2]))
 
 
 def expected_difference_m(
@@ -206,11 +229,8 @@ def antenna_pair_screen(
     azimuth_deg: ArrayLike,
     *,
     satellite: Strings,
-    heading_deg: ArrayLike,
-    gradient_permille: ArrayLike,
-    spacing_m: ArrayLike,
-    tag_difference: ArrayLike | None = None,
-    range_rate_mps: ArrayLike | None = None,
+    spacing: Spacing,
+    tags: TagDifference | None = None,
     limits: AntennaPairLimits | None = None,
 ) -> AntennaPairScreened:
     """Reject satellites whose two pseudoranges do not differ as the places of the antennas require.
@@ -222,12 +242,10 @@ def antenna_pair_screen(
         corrected alike; NaN where absent.
     elevation_deg, azimuth_deg : array_like, shape (P, C) [deg]
     satellite : ndarray of str, shape (C,)
-    heading_deg, gradient_permille, spacing_m : array_like, shape (P,) or scalar
-        From the rear to the front antenna (`spacing_direction`); NaN where unknown: not judged.
-    tag_difference : array_like of timedelta64[ns], shape (P,), optional
-        Time tags of the rear receiver less those of the front one.
-    range_rate_mps : array_like, shape (P, C) [m/s], optional
-        ``-lambda D``, NaN where unknown: then left out. Without them the instants count as one.
+    spacing : Spacing
+        Of `spacing_direction`.
+    tags : TagDifference, optional
+        Without it the instants count as one.
     limits : AntennaPairLimits, optional
 
     Returns
@@ -238,11 +256,9 @@ def antenna_pair_screen(
     """
     limits = limits or AntennaPairLimits()
     front, rear = np.asarray(code_front_m, dtype=np.float64), np.asarray(code_rear_m, dtype=np.float64)
-    expected = expected_difference_m(
-        elevation_deg, azimuth_deg, heading_deg=heading_deg, gradient_permille=gradient_permille, spacing_m=spacing_m
-    )
-    rate = np.zeros(front.shape) if range_rate_mps is None else np.nan_to_num(np.asarray(range_rate_mps))
-    later = np.zeros(len(front)) if tag_difference is None else seconds(tag_difference)
+    expected = expected_difference_m(elevation_deg, azimuth_deg, **spacing._asdict())
+    rate = np.zeros(front.shape) if tags is None else np.nan_to_num(np.asarray(tags.range_rate_mps))
+    later = np.zeros(len(front)) if tags is None else seconds(tags.later)
     raw = rear - front - expected - rate * later[:, None]
     if limits.clocks == "median":
         clock = _clock_difference(raw, rate, satellite, least=limits.least_satellites)
@@ -251,11 +267,11 @@ def antenna_pair_screen(
         separate = np.abs(row_median(raw)) > SEPARATE_CLOCKS_M
         clock = np.broadcast_to(np.where(separate, np.nan, 0.0), raw.shape)
     metric = raw - clock
-    relative = np.asarray(azimuth_deg) - np.asarray(heading_deg, dtype=np.float64)[..., None]
+    relative = np.asarray(azimuth_deg) - np.asarray(spacing.heading_deg, dtype=np.float64)[..., None]
     zone = ambiguity_m(
         elevation_deg,
         relative,
-        np.asarray(spacing_m, dtype=np.float64)[..., None],
+        np.asarray(spacing.spacing_m, dtype=np.float64)[..., None],
         elevation_error_deg=limits.elevation_error_deg,
         azimuth_error_deg=limits.azimuth_error_deg,
     )
@@ -298,7 +314,6 @@ class AntennaPairScreen(PairScreen[AntennaPairLimits]):
         """Return the verdict on a chunk, the same for both antennas."""
         at_front, at_rear = pair.front_epoch, pair.rear_epoch
         ours, theirs = pair_channels(front.satellite, front.signal, rear.satellite, rear.signal)
-        heading, gradient, length = spacing_direction(pair.front_ecef_m, pair.rear_ecef_m)
         here = np.ix_(at_front, ours)
         screened = antenna_pair_screen(
             front.corrected_code_m[here],
@@ -306,11 +321,11 @@ class AntennaPairScreen(PairScreen[AntennaPairLimits]):
             front.elevation_deg[here],
             front.azimuth_deg[here],
             satellite=front.satellite[ours],
-            heading_deg=heading,
-            gradient_permille=gradient,
-            spacing_m=length,
-            tag_difference=rear.time[at_rear] - front.time[at_front],
-            range_rate_mps=-SPEED_OF_LIGHT / front.frequency_hz[ours] * front.doppler_hz[here],
+            spacing=spacing_direction(pair.front_ecef_m, pair.rear_ecef_m),
+            tags=TagDifference(
+                rear.time[at_rear] - front.time[at_front],
+                -SPEED_OF_LIGHT / front.frequency_hz[ours] * front.doppler_hz[here],
+            ),
             limits=limits,
         )
         verdicts = {}

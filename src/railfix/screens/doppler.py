@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -96,14 +96,20 @@ class DopplerState:
         freeze_arrays(self)
 
 
+class DopplerChannels(NamedTuple):
+    """Channels, shape (M,) each; the carrier [Hz] is NaN where unknown: not judged."""
+
+    satellite: Strings
+    signal: Strings
+    frequency_hz: ArrayLike
+
+
 def doppler_screen(
     time: ArrayLike,
     code_m: ArrayLike,
     doppler_hz: ArrayLike,
     *,
-    satellite: Strings,
-    signal: Strings,
-    frequency_hz: ArrayLike,
+    channels: DopplerChannels,
     break_before: ArrayLike | None = None,
     code_sigma_m: ArrayLike | None = None,
     limits: DopplerLimits | None = None,
@@ -125,9 +131,7 @@ def doppler_screen(
     time : array_like of datetime64[ns], shape (T,)
     code_m, doppler_hz : array_like, shape (T, M) [m], [Hz]
         NaN where absent. Implausible codes (0, 1e9) must be left out by the caller.
-    satellite, signal : ndarray of str, shape (M,)
-    frequency_hz : array_like, shape (M,) [Hz]
-        Carrier; NaN where unknown: not judged.
+    channels : DopplerChannels
     break_before : array_like of bool, shape (T,), optional
         Nothing is differenced across the step into these epochs.
     code_sigma_m : array_like, shape (T, M) [m], optional
@@ -150,7 +154,7 @@ def doppler_screen(
     ValueError
         Mode "sigma" without `code_sigma_m`.
     """
-    limits = limits or DopplerLimits()
+    limits, (satellite, signal, frequency_hz) = limits or DopplerLimits(), channels
     when = np.asarray(time, dtype="datetime64[ns]")
     code, doppler = np.asarray(code_m, dtype=np.float64), np.asarray(doppler_hz, dtype=np.float64)
     if code_sigma_m is None and limits.mode == "sigma":
@@ -334,9 +338,7 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
             antenna.time,
             np.where((antenna.reason & Reason.IMPLAUSIBLE_CODE) == 0, antenna.code_m, np.nan),
             antenna.doppler_hz,
-            satellite=antenna.satellite,
-            signal=antenna.signal,
-            frequency_hz=antenna.frequency_hz,
+            channels=DopplerChannels(antenna.satellite, antenna.signal, antenna.frequency_hz),
             break_before=antenna.break_before,
             code_sigma_m=antenna.sigma_m,
             limits=limits,

@@ -114,8 +114,8 @@ class Handover:
         given = self.recursion
         return int(
             given.kernel(
-                given.epochs, given.course, given.parameters, self.active, self.memory, self.subfilters,
-                given.answers, self.rows, self.work, self.first, self.last, part,
+                layout.Inputs(given.epochs, given.course, given.parameters, self.active), self.memory,
+                self.subfilters, given.answers, self.rows, self.work, (self.first, self.last), part,
             )
         )  # fmt: skip
 

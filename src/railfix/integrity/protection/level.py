@@ -122,16 +122,37 @@ class ProtectionLevel:
     cause: Codes
 
 
+class RangeBounds(NamedTuple):
+    """Paired overbound of each range, shapes (T, M) or (M,) [m]: least standard deviation, and largest nominal bias."""
+
+    sigma_m: ArrayLike | None = None
+    bias_m: ArrayLike | None = None
+
+
+class MapError(NamedTuple):
+    """What is known of the map's error across and up besides its sigmas.
+
+    Attributes
+    ----------
+    bias_m : array_like, shape (T, 2) or (2,) [m]
+        Offset that is not within its sigma.
+    seen : tuple of ndarray, shapes (T, 2) [m] and (T, 2, 2) [1/m^2], optional
+        Place of the antenna without the map, and its inverse covariance (0: unknown). With it a wrong map is a
+        hypothesis of prior `RiskBudget.map_prior`.
+    """
+
+    bias_m: ArrayLike = 0.0
+    seen: tuple[Floats, Floats] | None = None
+
+
 def along_track_level(
     model: LinearModel,
     systems: Sequence[str],
     *,
     risk: RiskBudget | None = None,
     scale: ArrayLike = 1.0,
-    least_sigma_m: ArrayLike | None = None,
-    bias_m: ArrayLike | None = None,
-    map_bias_m: ArrayLike | None = None,
-    map_seen: tuple[Floats, Floats] | None = None,
+    overbound: RangeBounds | None = None,
+    map_error: MapError | None = None,
     sides: Masks | None = None,
     n_excluded: ArrayLike = 0,
 ) -> ProtectionLevel:
@@ -146,15 +167,9 @@ def along_track_level(
     risk : RiskBudget, optional
     scale : array_like, shape (T,) or ()
         Noise scale: multiplies the sigmas of the ranges, not the map error.
-    least_sigma_m : array_like, shape (T, M) or (M,) [m], optional
-        Least standard deviation of each range, as an overbound gives it; none: that of its weight times the scale.
-    bias_m : array_like, shape (T, M) or (M,) [m], optional
-        Largest nominal bias of each range, as a paired overbound gives it; none: 0.
-    map_bias_m : array_like, shape (T, 2) or (2,) [m], optional
-        Offset of the map across and up that is not within its sigma; none: 0.
-    map_seen : tuple of ndarray, shapes (T, 2) [m] and (T, 2, 2) [1/m^2], optional
-        Place of the antenna across and above the line without the map, and its inverse covariance (0: unknown). With it
-        a wrong map is a hypothesis of prior `RiskBudget.map_prior`.
+    overbound : RangeBounds, optional
+        By default the sigma of each range is that of its weight times the scale, without bias.
+    map_error : MapError, optional
     sides : ndarray of bool, shape (T, S, M), optional
         Sets of satellites that one reflection can make faulty together, each a hypothesis of `RiskBudget.side_prior`.
     n_excluded : array_like of int, shape (T,) or ()
@@ -172,7 +187,7 @@ def along_track_level(
     """
     if model.interest != 1:
         raise ValueError("a level along the track asks for a model on the line (constrained_model)")
-    risk = risk or RiskBudget()
+    risk, overbound, map_error = risk or RiskBudget(), overbound or RangeBounds(), map_error or MapError()
     epochs, channels = model.root_weight.shape
     if len(systems) != channels:
         raise ValueError(f"systems names each channel: {channels} channels, got {len(systems)}")
@@ -181,14 +196,13 @@ def along_track_level(
         raise ValueError("the noise scale must be positive")
     out = np.broadcast_to(np.asarray(n_excluded, dtype=np.int64), (epochs,))
     groups = np.zeros((epochs, 0, channels), dtype=bool) if sides is None else sides
-    plan = allocate(model, systems, risk, out, groups, wrong_map=map_seen is not None)
+    plan = allocate(model, systems, risk, out, groups, wrong_map=map_error.seen is not None)
     given = Errors(
         scale,
-        _by_epoch(least_sigma_m, epochs, channels),
-        _by_epoch(bias_m, epochs, channels),
-        _by_epoch(0.0 if map_bias_m is None else map_bias_m, epochs, 2),
-        np.zeros((epochs, 2)) if map_seen is None else map_seen[0],
-        np.zeros((epochs, 2, 2)) if map_seen is None else map_seen[1],
+        _by_epoch(overbound.sigma_m, epochs, channels),
+        _by_epoch(overbound.bias_m, epochs, channels),
+        _by_epoch(map_error.bias_m, epochs, 2),
+        *((np.zeros((epochs, 2)), np.zeros((epochs, 2, 2))) if map_error.seen is None else map_error.seen),
     )
     located = np.isfinite(model.covariance_m2).all(axis=(1, 2)) & np.isfinite(scale)
     if 0 < epochs <= FEW and located.all():
@@ -236,7 +250,7 @@ def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Ind
 
 
 class Errors(NamedTuple):
-    """Parameters of `along_track_level` of the same names; of shape (T, 0) for none."""
+    """Errors of ranges and map that `along_track_level` is given; of shape (T, 0) for none."""
 
     scale: Floats
     least_sigma_m: Floats

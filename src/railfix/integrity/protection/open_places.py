@@ -67,7 +67,6 @@ def places_beyond_the_level(
     systems: Sequence[str],
     risk: RiskBudget,
     sides: Masks,
-    rows: Indices,
 ) -> Masks:
     """Return the epochs with places of the line that are open beyond the level, shape (T,).
 
@@ -84,6 +83,7 @@ def places_beyond_the_level(
     model : LinearModel
         Of the positions.
     level_m : ndarray, shape (T,) [m]
+        Epochs without a finite level are not looked at.
     scale : ndarray, shape (T,)
         Noise scale, taken as 1 at least.
     systems : sequence of str
@@ -91,11 +91,9 @@ def places_beyond_the_level(
     risk : RiskBudget
     sides : ndarray of bool, shape (T, S, M)
         Low satellites of each side of the track.
-    rows : ndarray of int
-        Epochs to look at; those without a finite level are left out.
     """
     result = np.zeros(len(arc_m), dtype=bool)
-    rows = rows[np.isfinite(level_m[rows]) & np.isfinite(arc_m[rows]) & np.isfinite(model.wsse[rows])]
+    rows = np.flatnonzero(np.isfinite(level_m) & np.isfinite(arc_m) & np.isfinite(model.wsse))
     if not len(rows):
         return result
     channels = int(np.count_nonzero(model.used[rows], axis=1).max())
@@ -114,7 +112,7 @@ def places_beyond_the_level(
             np.ascontiguousarray(sides[block]),
             risk.side_prior,
             clear[block],
-            *sigmas,
+            sigmas,
             risk.risk_per_sample,
         )
         near = block[bound > risk.risk_per_sample]
@@ -122,28 +120,19 @@ def places_beyond_the_level(
             for some in np.array_split(own, 1 + 9 * len(own) // size):
                 parts, design, none = whitened(model.take(some), *sigmas, np.maximum(scale[some], 1.0))
                 prior = np.where(parts.used, likely[parts.channel], 0.0)
-                of_sides = without_sides(parts, design, none, sides[some], risk.side_prior)
-                spent = _risk_of_block(index, arc_m[some], level_m[some], parts, design, none, prior, of_sides, risk)
+                forms = [
+                    _without_one(parts, design, none, prior),
+                    without_sides(parts, design, none, sides[some], risk.side_prior),
+                ]
+                if parts.channel.shape[1] > 1:
+                    forms.append(_without_two(parts, design, none, prior))
+                spent = _risk_of_block(index, arc_m[some], level_m[some], none.beside(*forms), risk)
                 result[some] = spent > risk.risk_per_sample
     return result
 
 
-def _risk_of_block(
-    index: SearchIndex,
-    arc_m: Floats,
-    level_m: Floats,
-    parts: Compact,
-    design: Floats,
-    none: Forms,
-    prior: Floats,
-    of_sides: Forms,
-    risk: RiskBudget,
-) -> Floats:
+def _risk_of_block(index: SearchIndex, arc_m: Floats, level_m: Floats, forms: Forms, risk: RiskBudget) -> Floats:
     """Return the probability that the true place lies beyond the level off the tangent, shape (T,)."""
-    without = [_without_one(parts, design, none, prior), of_sides]
-    if parts.channel.shape[1] > 1:
-        without.append(_without_two(parts, design, none, prior))
-    forms = none.beside(*without)
     return _risk_beyond(forms, _around(index, arc_m, level_m, forms.radius_m(risk.risk_per_sample)))
 
 

@@ -14,11 +14,11 @@ def header_line(text: str, label: str) -> str:
     return f"{text:<60}{label:<20}\n"
 
 
-def program_line(run_by: str, created: np.datetime64 | None) -> str:
+def program_line(created: np.datetime64 | None) -> str:
     """Format PGM / RUN BY / DATE; the date, in UTC, is blank without `created`."""
     date = ""
     if created is not None:
         date = (
             str(np.datetime_as_string(created, unit="s")).replace("-", "").replace(":", "").replace("T", " ") + " UTC"
         )
-    return header_line(f"{PROGRAM:<20}{run_by:<20}{date:<20}", "PGM / RUN BY / DATE")
+    return header_line(f"{PROGRAM:<20}{'':20}{date:<20}", "PGM / RUN BY / DATE")

@@ -45,7 +45,6 @@ def write_observations(
     observables: Mapping[str, Sequence[str]] | None = None,
     header: ObservationHeader | None = None,
     comments: Sequence[str] = (),
-    run_by: str = "",
     created: np.datetime64 | None = None,
 ) -> None:
     """Write a RINEX observation file; a failed write leaves no file.
@@ -66,7 +65,6 @@ def write_observations(
         By default that of the first piece.
     comments : sequence of str
         Each at most 60 characters.
-    run_by : str
     created : datetime64, optional
         UTC; blank by default.
 
@@ -84,7 +82,7 @@ def write_observations(
     header = header or first.header
     columns = _columns(first, observables)
     with open_target(path, packing=packing) as target:
-        target.write(_observation_header(first, header, columns, version, program_line(run_by, created), comments))
+        target.write(_observation_header(first, header, columns, version, program_line(created), comments))
         for piece in chain([first], pieces):
             for block in _text_blocks(piece, columns):
                 target.write(block)

@@ -38,7 +38,6 @@ def write_navigation(
     packing: Packing | None = None,
     version: RinexVersion = "3.04",
     comments: Sequence[str] = (),
-    run_by: str = "",
     created: np.datetime64 | None = None,
 ) -> None:
     """Write a RINEX navigation file; a failed write leaves no file.
@@ -57,7 +56,6 @@ def write_navigation(
         Version 4 names the message of each record, and has the ionosphere as records.
     comments : sequence of str
         Each at most 60 characters.
-    run_by : str
     created : datetime64, optional
         UTC; blank by default.
 
@@ -75,7 +73,7 @@ def write_navigation(
     kind = letters[0] if len(letters) == 1 else "M"
     head = [
         header_line(f"{version:>9}{'':11}{'N: GNSS NAV DATA':<20}{kind:<20}", "RINEX VERSION / TYPE"),
-        program_line(run_by, created),
+        program_line(created),
         *(header_line(comment, "COMMENT") for comment in comments),
     ]
     for letter, values in sorted(navigation.klobuchar.items()) if version == "3.04" else ():

@@ -151,6 +151,15 @@ class Active(NamedTuple):
     satellite: Indices
 
 
+class Inputs(NamedTuple):
+    """What the recursion is given and leaves as it is."""
+
+    epochs: Epochs
+    line: LineArrays
+    parameters: Parameters
+    active: Active
+
+
 class KernelState(NamedTuple):
     """State that is read and written: compact means and covariances, and `scalars` (`HYPOTHESES` and following)."""
 

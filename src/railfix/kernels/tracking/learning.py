@@ -31,10 +31,9 @@ from railfix.kernels.tracking.layout import (
     SCALE_PHASE,
     WEAK_CODE,
     WEAK_MOTION,
-    Epochs,
+    Inputs,
     KernelState,
     Outputs,
-    Parameters,
     Rows,
     Work,
 )
@@ -44,22 +43,13 @@ from railfix.kernels.tracking.update import mean_weights
 
 @borrowing
 def learn(
-    epochs: Epochs,
-    parameters: Parameters,
-    state: KernelState,
-    rows: Rows,
-    work: Work,
-    t: int,
-    best: int,
-    shift: float,
-    dt: float,
-    code_s: float,
+    inputs: Inputs, t: int, state: KernelState, rows: Rows, work: Work, best: int, shift: float, code_s: float
 ) -> bool:
     """Learn the noise of phases and Dopplers, doubt, the error of the map, and wrong codes.
 
     Returns whether another satellite's codes are left out from here on.
     """
-    found = False
+    epochs, parameters, dt, found = inputs.epochs, inputs.parameters, inputs.epochs.interval_s[t], False
     scalars, weight, innovation = state.scalars, work.weight, work.innovation
     nc, nph, nd = rows.counts[0], rows.counts[1], rows.counts[2]
     gnss = nc + nph + nd

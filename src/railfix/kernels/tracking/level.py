@@ -40,8 +40,8 @@ from railfix.kernels.tracking.layout import (
     SENSORS,
     SPEED,
     UP,
-    Active,
     Epochs,
+    Inputs,
     KernelState,
     LineArrays,
     Outputs,
@@ -104,18 +104,9 @@ def _begin(bank: Subfilters, b: int, copied: bool, best: int, parameters: Parame
 
 
 @borrowing
-def _update(
-    epochs: Epochs,
-    t: int,
-    line: LineArrays,
-    parameters: Parameters,
-    active: Active,
-    rows: Rows,
-    best: int,
-    work: Work,
-    h: int,
-) -> None:
+def _update(inputs: Inputs, t: int, rows: Rows, best: int, work: Work, h: int) -> None:
     """Update row `h` of the work space without the measurements whose `masked` variance is infinite."""
+    epochs, line, parameters, active = inputs.epochs, inputs.line, inputs.parameters, inputs.active
     mean, spread, n = work.mean, work.spread, work.mean.shape[1] - OF_EPOCH
     for kind in range(3):
         if work.anew[best, kind]:
@@ -146,11 +137,8 @@ def _is_contradicted(rows: Rows, parameters: Parameters, work: Work, h: int) -> 
 
 @borrowing
 def advance_subfilters(
-    epochs: Epochs,
+    inputs: Inputs,
     t: int,
-    line: LineArrays,
-    parameters: Parameters,
-    active: Active,
     bank: Subfilters,
     rows: Rows,
     best: int,
@@ -164,6 +152,7 @@ def advance_subfilters(
     of it. One that its own measurements contradict has settled somewhere else and begins anew. The filter itself is
     one without a source that it has not met.
     """
+    epochs, line, parameters, active = inputs.epochs, inputs.line, inputs.parameters, inputs.active
     mean, spread = work.mean, work.spread
     n, dt = mean.shape[1] - OF_EPOCH, epochs.interval_s[t]
     nc, nph = rows.counts[0], rows.counts[1]
@@ -185,9 +174,7 @@ def advance_subfilters(
             bank.running[b], met[b] = False, True
         if bank.running[b]:
             wrong_m = parameters.level_map_m if b == len(bank.running) - 1 else 0.0
-            predict(
-                epochs, t, line, parameters, active, bank.mean, bank.covariance, b, map_log_variance, wrong_m, work, h
-            )
+            predict(inputs, t, bank.mean[b], bank.covariance[b], map_log_variance, wrong_m, work, h)
             find_ends(line, mean[h, ARC], mean[h, n + PREVIOUS_ARC], work)
             add_bend(parameters, work, h)
             sigma = math.sqrt(spread[h, ARC, ARC])
@@ -209,7 +196,7 @@ def advance_subfilters(
         for j in range(rows.counts[3]):
             own = slots + clocks + min(rows.sensors[j], RANGE_ROW)
             work.masked[gnss + j] = math.inf if own == b else work.variance[gnss + j]
-        _update(epochs, t, line, parameters, active, rows, best, work, h)
+        _update(inputs, t, rows, best, work, h)
         if _is_contradicted(rows, parameters, work, h):
             bank.weak_s[b] += dt
         elif nc > 0:
@@ -276,11 +263,11 @@ def write_level(
     outputs.level_m[t] = outputs.ground_level_m[t] = math.inf
     if math.isnan(apart) or contradicted:
         return
-    outputs.ground_level_m[t] = _solve(state, count, bank, parameters, work, 1, start, place, sigma)
+    outputs.ground_level_m[t] = _solve(state, count, bank, parameters, work, 1, start)
     if count == 1:
         outputs.level_m[t] = outputs.ground_level_m[t]
     elif far <= parameters.level_risk:
-        outputs.level_m[t] = _solve(state, count, bank, parameters, work, 0, start, place, sigma)
+        outputs.level_m[t] = _solve(state, count, bank, parameters, work, 0, start)
     wrong = len(bank.running) - 1
     if bank.running[wrong]:
         aside = abs(bank.mean[wrong, RIGHT]) - 2.0 * math.sqrt(bank.covariance[wrong, RIGHT, RIGHT])
@@ -296,15 +283,13 @@ def _solve(
     work: Work,
     which: int,
     start: float,
-    place: float,
-    sigma: float,
 ) -> float:
     """Level at which all hypotheses together have the risk; `which` is the column of the branches' distances.
 
     Newton's steps of its logarithm within a bracket, from the largest that one hypothesis alone asks for: they must
     not begin where a branch makes it flat.
     """
-    level = start
+    place, sigma, level = state.mean[0, ARC], math.sqrt(state.covariance[0, ARC, ARC]), start
     for h in range(1, count):
         excess = math.exp(state.log_probability[h]) / (2.0 * parameters.level_risk)
         k = math.sqrt(2.0 * math.log(excess)) if excess > 1.0 else 0.0

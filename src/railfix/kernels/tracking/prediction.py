@@ -29,9 +29,7 @@ from railfix.kernels.tracking.layout import (
     STEP_RIGHT,
     STEP_UP,
     UP,
-    Active,
-    Epochs,
-    LineArrays,
+    Inputs,
     Parameters,
     Work,
 )
@@ -39,24 +37,21 @@ from railfix.kernels.tracking.layout import (
 
 @borrowing
 def predict(
-    epochs: Epochs,
+    inputs: Inputs,
     t: int,
-    line: LineArrays,
-    parameters: Parameters,
-    active: Active,
     mean: Floats,
     covariance: Floats,
-    h: int,
     map_log_variance: float,
     map_sigma_m: float,
     work: Work,
     to: int,
 ) -> None:
-    """Predict row `h` of the compact unknowns to epoch `t`: row `to` of `work.mean` and `work.spread`."""
+    """Predict the compact unknowns of a hypothesis to epoch `t`: row `to` of `work.mean` and `work.spread`."""
+    epochs, line, parameters, active = inputs.epochs, inputs.line, inputs.parameters, inputs.active
     after, spread, rows, kept = work.mean, work.spread, work.stepped, work.faded
     dt, step, noise = epochs.interval_s[t], epochs.step[epochs.singer[t]], epochs.noise[epochs.singer[t]]
-    n = mean.shape[1]
-    speed = abs(mean[h, SPEED])
+    n = len(mean)
+    speed = abs(mean[SPEED])
     travel = speed * dt
     map_kept = math.exp(-travel / parameters.map_absolute_m)
     code_kept = math.exp(-dt / parameters.code_correlation_s - travel / parameters.code_correlation_m)
@@ -71,16 +66,14 @@ def predict(
             kept[i] = code_kept
     for i in range(3, n):
         for j in range(n):
-            rows[i, j] = kept[i] * covariance[h, i, j]
+            rows[i, j] = kept[i] * covariance[i, j]
     for i in range(3):
         for j in range(n):
-            rows[i, j] = (
-                step[i, 0] * covariance[h, 0, j] + step[i, 1] * covariance[h, 1, j] + step[i, 2] * covariance[h, 2, j]
-            )
+            rows[i, j] = step[i, 0] * covariance[0, j] + step[i, 1] * covariance[1, j] + step[i, 2] * covariance[2, j]
     for j in range(n):
-        rows[n + PREVIOUS_ARC, j] = covariance[h, ARC, j]
-        rows[n + PREVIOUS_SPEED, j] = covariance[h, SPEED, j]
-        rows[n + PHASE_CLOCK, j] = dt * covariance[h, DRIFT, j]
+        rows[n + PREVIOUS_ARC, j] = covariance[ARC, j]
+        rows[n + PREVIOUS_SPEED, j] = covariance[SPEED, j]
+        rows[n + PHASE_CLOCK, j] = dt * covariance[DRIFT, j]
     for i in range(n + 3):
         for j in range(3, n):
             spread[to, i, j] = kept[j] * rows[i, j]
@@ -123,13 +116,13 @@ def predict(
         if i >= 0:
             spread[to, i, i] += 1.0 - code_kept**2
     for i in range(3, n):
-        after[to, i] = kept[i] * mean[h, i]
+        after[to, i] = kept[i] * mean[i]
     for i in range(3):
-        after[to, i] = step[i, 0] * mean[h, 0] + step[i, 1] * mean[h, 1] + step[i, 2] * mean[h, 2]
+        after[to, i] = step[i, 0] * mean[0] + step[i, 1] * mean[1] + step[i, 2] * mean[2]
     after[to, n + PREVIOUS_ARC], after[to, n + PREVIOUS_SPEED], after[to, n + PHASE_CLOCK] = (
-        mean[h, ARC],
-        mean[h, SPEED],
-        dt * mean[h, DRIFT],
+        mean[ARC],
+        mean[SPEED],
+        dt * mean[DRIFT],
     )
     for i in range(n + 3, n + OF_EPOCH):
         after[to, i] = 0.0

@@ -64,6 +64,7 @@ from railfix.kernels.tracking.layout import (
     WITHHELD,
     Active,
     Epochs,
+    Inputs,
     KernelState,
     LineArrays,
     Outputs,
@@ -137,56 +138,33 @@ def _take(mean: Floats, covariance: Floats, to: int, new_mean: Floats, new_covar
 
 
 @borrowing
-def _predict_all(
-    epochs: Epochs, t: int, line: LineArrays, parameters: Parameters, active: Active, state: KernelState, work: Work
-) -> None:
+def _predict_all(inputs: Inputs, t: int, state: KernelState, work: Work) -> None:
     """Predict all hypotheses."""
     scale = state.scalars[MAP_LOG_VARIANCE]
     for h in range(int(state.scalars[HYPOTHESES])):
-        predict(epochs, t, line, parameters, active, state.mean, state.covariance, h, scale, 0.0, work, h)
+        predict(inputs, t, state.mean[h], state.covariance[h], scale, 0.0, work, h)
 
 
 @borrowing
-def _coast(
-    epochs: Epochs,
-    t: int,
-    line: LineArrays,
-    parameters: Parameters,
-    active: Active,
-    state: KernelState,
-    bank: Subfilters,
-    work: Work,
-    h: int,
-) -> None:
+def _coast(inputs: Inputs, t: int, state: KernelState, bank: Subfilters, work: Work, h: int) -> None:
     """Take over the prediction of all hypotheses and sub-filters where nothing is measured; row `h` is free."""
     for k in range(int(state.scalars[HYPOTHESES])):
         _take(state.mean, state.covariance, k, work.mean, work.spread, k)
     for b in range(len(bank.running)):
         if bank.running[b]:
             scale = state.scalars[MAP_LOG_VARIANCE]
-            wrong_m = parameters.level_map_m if b == len(bank.running) - 1 else 0.0
-            predict(epochs, t, line, parameters, active, bank.mean, bank.covariance, b, scale, wrong_m, work, h)
+            wrong_m = inputs.parameters.level_map_m if b == len(bank.running) - 1 else 0.0
+            predict(inputs, t, bank.mean[b], bank.covariance[b], scale, wrong_m, work, h)
             _take(bank.mean, bank.covariance, b, work.mean, work.spread, h)
 
 
 @borrowing
 def _measure(
-    epochs: Epochs,
-    t: int,
-    line: LineArrays,
-    parameters: Parameters,
-    active: Active,
-    state: KernelState,
-    bank: Subfilters,
-    outputs: Outputs,
-    rows: Rows,
-    work: Work,
-    shift: float,
-    map_log_variance: float,
-    code_s: float,
+    inputs: Inputs, t: int, state: KernelState, bank: Subfilters, rows: Rows, work: Work, shift: float, code_s: float
 ) -> int:
     """Take over what an epoch's measurements have given, and learn from it; return the hypothesis to go by."""
-    scalars, dt, count = state.scalars, epochs.interval_s[t], int(state.scalars[HYPOTHESES])
+    epochs, scalars, count = inputs.epochs, state.scalars, int(state.scalars[HYPOTHESES])
+    map_log_variance = scalars[MAP_LOG_VARIANCE]
     for h in range(count):
         _take(state.mean, state.covariance, h, work.new_mean, work.new_covariance, h)
     scalars[MEASURED] = epochs.time_s[t]
@@ -195,33 +173,23 @@ def _measure(
     for i in range(rows.counts[0]):
         state.offset_known[epochs.offset[rows.codes[i]]] = True
     best = leading(state, count)
-    found = learn(epochs, parameters, state, rows, work, t, best, shift, dt, code_s)
-    write_rows(outputs, rows, work, t, best, 1.0)
+    found = learn(inputs, t, state, rows, work, best, shift, code_s)
     if len(bank.running):
-        room = len(work.now) - 1
-        advance_subfilters(epochs, t, line, parameters, active, bank, rows, best, map_log_variance, work, room)
+        advance_subfilters(inputs, t, bank, rows, best, map_log_variance, work, len(work.now) - 1)
     if found and abs(shift) < FREED_SIGMAS:
         for h in range(count):
             state.covariance[h, ARC, ARC] += FREED_M**2
         for b in range(len(bank.running)):
             bank.covariance[b, ARC, ARC] += FREED_M**2
-    square = contradiction(epochs, t, line, state, work, best)
-    watch(parameters, state, bank, square, 0.0 if best else shift, work.pushed[best], dt, code_s)
+    square, dt = contradiction(epochs, t, inputs.line, state, work, best), epochs.interval_s[t]
+    watch(inputs.parameters, state, bank, square, 0.0 if best else shift, work.pushed[best], dt, code_s)
     return best
 
 
 @borrowing
-def _update(
-    epochs: Epochs,
-    t: int,
-    line: LineArrays,
-    parameters: Parameters,
-    active: Active,
-    state: KernelState,
-    rows: Rows,
-    work: Work,
-) -> float:
+def _update(inputs: Inputs, t: int, state: KernelState, rows: Rows, work: Work) -> float:
     """Write all hypotheses after an epoch's measurements; return the shift that codes ask of the one in the lead."""
+    epochs, line, parameters, active = inputs.epochs, inputs.line, inputs.parameters, inputs.active
     mean, new_mean = work.mean, work.new_mean
     n, room = mean.shape[1] - OF_EPOCH, mean.shape[0] - 1
     count, nc = int(state.scalars[HYPOTHESES]), rows.counts[0]
@@ -266,27 +234,25 @@ def _update(
 
 @borrowing
 def _finish(
+    inputs: Inputs,
     t: int,
     best: int,
-    aided: bool,
-    measured: bool,
-    lost: bool,
-    dt: float,
-    line: LineArrays,
-    parameters: Parameters,
-    active: Active,
+    status: int,
     state: KernelState,
     bank: Subfilters,
     outputs: Outputs,
     work: Work,
 ) -> None:
-    """End an epoch: direction, way without codes, hypotheses to go on with; write its answer."""
+    """End an epoch: direction, distance on the branches, hypotheses to go on with; write its answer.
+
+    `status` is that of an epoch without doubt and without other branches.
+    """
+    line, parameters, active, dt = inputs.line, inputs.parameters, inputs.active, inputs.epochs.interval_s[t]
     scalars = state.scalars
     count = int(scalars[HYPOTHESES])
     speed = state.mean[best, SPEED]
     if abs(speed) > DIRECTION_MPS:
         scalars[DIRECTION] = math.copysign(1.0, speed)
-    scalars[DISTANCE_SINCE_CODE] = 0.0 if aided else scalars[DISTANCE_SINCE_CODE] + abs(speed) * dt
     scalars[BRANCH_S] += dt
     scalars[BRANCH_M] += abs(speed) * dt
     for h in range(count):
@@ -327,71 +293,66 @@ def _finish(
             outputs.level_m[t] = math.inf
         outputs.amount_m[t] = max(outputs.level_m[t], SCALE_BOUND * scalars[DISTANCE_SINCE_CODE])
         outputs.level_speed_mps[t] = speed_bound(state.mean[0, SPEED], outputs.speed_sigma_mps[t], bank, parameters)
-    if lost:
-        outputs.status[t] = LOST
-    elif scalars[OPEN] > 0.0:
+    if status != LOST and scalars[OPEN] > 0.0:
         outputs.status[t] = SEVERAL_BRANCHES
-    elif scalars[WITHHELD] > 0.0:
+    elif status != LOST and scalars[WITHHELD] > 0.0:
         outputs.status[t] = DOUBTFUL
     else:
-        outputs.status[t] = TRACKING if measured else COASTING
+        outputs.status[t] = status
 
 
 @kernel
 def advance(
-    epochs: Epochs,
-    line: LineArrays,
-    parameters: Parameters,
-    active: Active,
+    inputs: Inputs,
     state: KernelState,
     bank: Subfilters,
     outputs: Outputs,
     rows: Rows,
     work: Work,
-    first: int,
-    last: int,
+    span: tuple[int, int],
     part: int,
 ) -> int:
-    """Do epochs from `first` on; return the first before which places have to be sought, or `last`.
+    """Do the epochs of a span; return the first before which places have to be sought, or the end of the span.
 
     `part` says what of an epoch is done: `layout.WHOLE`, or of the first alone the `PREDICTION`, or the `REST`.
     """
+    epochs, line, parameters, active = inputs.epochs, inputs.line, inputs.parameters, inputs.active
     scalars, room = state.scalars, len(work.now) - 1
-    for t in range(first, last):
+    for t in range(span[0], span[1]):
         if part < REST:
             if epochs.begins[t] or (part == WHOLE and _needs_search(epochs, t, parameters, state)):
                 return t
             _forget(epochs, t, active, state, bank)
             _go_round(line, state, bank)
-            _predict_all(epochs, t, line, parameters, active, state, work)
+            _predict_all(inputs, t, state, work)
             if part == PREDICTION:
                 return t
         code_s = code_interval_s(epochs, t, parameters, state, outputs)
         choose_rows(epochs, t, rows)
         choose_sensors(epochs, t, state, rows, work)
         measured = rows.counts[0] + rows.counts[1] + rows.counts[2] + rows.counts[3] > 0
-        dt, map_scale, shift = epochs.interval_s[t], scalars[MAP_LOG_VARIANCE], 0.0
+        dt, shift = epochs.interval_s[t], 0.0
         if measured:
             write_variances(epochs, t, state, rows, work.variance)
-            shift = _update(epochs, t, line, parameters, active, state, rows, work)
+            shift = _update(inputs, t, state, rows, work)
         if not possible(parameters, state, rows, work, dt, measured):
             # What no train can do is not believed: the prediction goes on, made anew as the clocks in it were moved.
             measured = False
             scalars[WEAK_MOTION] += dt
             write_rows(outputs, rows, work, t, 0, 0.0)
             if part == WHOLE:
-                _predict_all(epochs, t, line, parameters, active, state, work)
+                _predict_all(inputs, t, state, work)
         if measured:
-            best = _measure(
-                epochs, t, line, parameters, active, state, bank, outputs, rows, work, shift, map_scale, code_s
-            )
+            best = _measure(inputs, t, state, bank, rows, work, shift, code_s)
+            write_rows(outputs, rows, work, t, best, 1.0)
         else:
-            _coast(epochs, t, line, parameters, active, state, bank, work, room)
+            _coast(inputs, t, state, bank, work, room)
             best = leading(state, int(scalars[HYPOTHESES]))
             scalars[WITHHELD] = max(scalars[WITHHELD] - dt, 0.0)
-        aided = measured and rows.counts[0] > 0
-        lost = part == REST_LOST
-        _finish(t, best, aided, measured, lost, dt, line, parameters, active, state, bank, outputs, work)
+        travel = scalars[DISTANCE_SINCE_CODE] + abs(state.mean[best, SPEED]) * dt
+        scalars[DISTANCE_SINCE_CODE] = 0.0 if measured and rows.counts[0] > 0 else travel
+        status = LOST if part == REST_LOST else (TRACKING if measured else COASTING)
+        _finish(inputs, t, best, status, state, bank, outputs, work)
         if not math.isfinite(state.mean[0, ARC]):
             return t + 1
-    return last
+    return span[1]

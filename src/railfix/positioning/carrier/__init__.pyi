@@ -2,7 +2,7 @@
 
 from .ambiguities import ArcAmbiguities, PhaseLimits, PhasePositions, repeats_of
 from .arcs import ArcState, last_arcs, number_arcs
-from .continuity import ContinuityLimits, ContinuityState, TrackJumps, track_jumps
+from .continuity import ContinuityLimits, ContinuityState, TrackedPhases, TrackJumps, track_jumps
 from .filtered import PhaseState, phase_positions
 from .integers import Fixed, IntegerChannels, fix_integers
 from .observation_model import Phases, corrected_phase_m
@@ -28,6 +28,7 @@ __all__ = [
     "SmoothingLimits",
     "SmoothingState",
     "TrackJumps",
+    "TrackedPhases",
     "corrected_phase_m",
     "find_slips",
     "fix_integers",

@@ -204,15 +204,13 @@ def assembled(
     started: Masks,
     own: OwnUnknowns,
     lin: Linearised,
-    ambiguity_m: Floats,
-    variance_m2: Floats,
+    ambiguity: tuple[Floats, Floats],
     arcs: ArcAmbiguities,
     fixes: tuple[Integers, Floats],
-    *,
     limits: PhaseLimits,
 ) -> PhasePositions:
-    """Return the positions of a run, NaN where there is none."""
-    has = started & (own.noise_sigma_m <= limits.largest_sigma_m)
+    """Return the positions of a run, NaN where there is none; `ambiguity` is value [m] and variance [m^2]."""
+    (ambiguity_m, variance_m2), has = ambiguity, started & (own.noise_sigma_m <= limits.largest_sigma_m)
     code, phase = lin.code_weight > 0, lin.phase_weight > 0
     return PhasePositions(
         arc_m=np.where(has, arc_m, np.nan),

@@ -9,6 +9,7 @@ channels that then fit are accepted again.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -96,13 +97,29 @@ class TrackJumps:
     moved_sigma_m: Floats
 
 
+class TrackedPhases(NamedTuple):
+    """Phases of T epochs by M channels.
+
+    Attributes
+    ----------
+    phase_m : ndarray, shape (T, M) [m]
+        Corrected phases (`observation_model.corrected_phase_m`), NaN where not used.
+    sat_ecef_m : ndarray, shape (T, M, 3) [m]
+        Satellites where there is a phase.
+    slip : ndarray of bool, shape (T, M)
+        Slips already known: not judged again.
+    """
+
+    phase_m: Floats
+    sat_ecef_m: Floats
+    slip: Masks
+
+
 def track_jumps(
     time: Datetimes,
     satellite: Strings,
     signal: Strings,
-    phase_m: Floats,
-    sat_ecef_m: Floats,
-    slip: Masks,
+    phases: TrackedPhases,
     trajectory: Trajectory,
     arc_m: Floats,
     state: ContinuityState | None = None,
@@ -115,12 +132,7 @@ def track_jumps(
     ----------
     time : ndarray of datetime64[ns], shape (T,)
     satellite, signal : ndarray of str, shape (M,)
-    phase_m : ndarray, shape (T, M) [m]
-        Corrected phases (`observation_model.corrected_phase_m`), NaN where not used.
-    sat_ecef_m : ndarray, shape (T, M, 3) [m]
-        Satellites where there is a phase.
-    slip : ndarray of bool, shape (T, M)
-        Slips already known: not judged again.
+    phases : TrackedPhases
     trajectory : Trajectory
     arc_m : ndarray, shape (T,) [m]
         Positions of codes alone, good to some metres; NaN: the epoch cannot judge nor be judged.
@@ -132,7 +144,7 @@ def track_jumps(
     TrackJumps
     ContinuityState
     """
-    limits, state = limits or ContinuityLimits(), state or ContinuityState()
+    limits, state, (phase_m, sat_ecef_m, slip) = limits or ContinuityLimits(), state or ContinuityState(), phases
     channels = channel_keys(satellite, signal)
     rows = rows_before(state.channels, channels)
     last_phase = np.append(state.phase_m, np.nan)[rows]

@@ -212,10 +212,8 @@ def _segment(
         ambiguity_m=(memory.first_m + end)[running],
         covariance_m2=last[np.ix_(running, running)],
     )
-    piece = assembled(
-        arc, inputs.started, own, lin,
-        base[index] + value[row, index, 0], covariance[row, index, index], arcs, fixes, limits=limits,
-    )  # fmt: skip
+    ambiguity = (base[index] + value[row, index, 0], covariance[row, index, index])
+    piece = assembled(arc, inputs.started, own, lin, ambiguity, arcs, fixes, limits)
     return piece, arc, left
 
 
