@@ -1,7 +1,8 @@
 """P4's experiment on recorded stations: a reference station played as a train on a straight line.
 
 Run ``python tests/studies/p4_experiment.py [folder]`` with the recordings beside the checkout: prints the
-tables of docs/p4-experiment.md, and writes the picture p4-experiment.png into the folder where one is given.
+tables of tests/references/results/p4-experiment.txt, and writes the picture p4-experiment.png into the folder where
+one is given.
 """
 
 from __future__ import annotations

@@ -119,7 +119,7 @@ def _seeds() -> str:
 
 
 def _p4() -> str:
-    text = (paths.ROOT / "docs" / "p4-experiment.md").read_text(encoding="utf-8")
+    text = (paths.ROOT / "tests" / "references" / "results" / "p4-experiment.txt").read_text(encoding="utf-8")
     cells = next(line for line in text.splitlines() if line.startswith("ESBC, GPS       0.0")).split()
     return f"p95 {cells[9]} and {cells[12]} m, least squares {cells[-2]} and {cells[-1]} m"
 

@@ -17,9 +17,9 @@ pytestmark = pytest.mark.requirement("B6")
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 
-def shown(document: str) -> list[str]:
-    (block,) = re.findall(r"^```text\n(.*?)^```$", (ROOT / "docs" / document).read_text(), re.MULTILINE | re.DOTALL)
-    return block.rstrip().splitlines()
+def shown() -> list[str]:
+    kept = ROOT / "tests" / "references" / "results" / "p4-experiment.txt"
+    return kept.read_text(encoding="utf-8").rstrip().splitlines()
 
 
 def assert_same(printed: list[str], document: list[str]) -> None:
@@ -55,8 +55,8 @@ def test_the_station_is_where_p4_has_it() -> None:
     assert np.degrees(np.arctan2(east, north)) % 360.0 == pytest.approx(219.47, abs=0.1)
 
 
-def test_the_document_shows_what_is_measured(recordings: Path, tmp_path: Path) -> None:
-    station, document = p4_experiment.STATIONS[0], shown("p4-experiment.md")
+def test_the_kept_output_is_what_is_measured(recordings: Path, tmp_path: Path) -> None:
+    station, document = p4_experiment.STATIONS[0], shown()
     day = p4_experiment.play(recordings, station, *p4_experiment.LINES[0])
     assert_same([f"{station.name:12s} {0.0:6.1f} {0.3:7.1f} {p4_experiment.row(day)}"], document[2:3])
     p4_experiment.draw(day, tmp_path / "p4.png")
@@ -64,8 +64,8 @@ def test_the_document_shows_what_is_measured(recordings: Path, tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_the_whole_document_shows_what_is_measured(recordings: Path) -> None:
-    assert_same(list(p4_experiment.report(recordings)), shown("p4-experiment.md"))
+def test_the_whole_kept_output_is_what_is_measured(recordings: Path) -> None:
+    assert_same(list(p4_experiment.report(recordings)), shown())
 
 
 @pytest.mark.slow
