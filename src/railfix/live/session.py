@@ -162,7 +162,7 @@ class _Session:
         self.reserved_from = self.engine.saved().sequence
         self.save(reserved=self.reserved)
         try:
-            while read_to_ns:
+            while read_to_ns.keys() - {BASE}:  # a base station's stream alone has no end
                 for pump in pumps:
                     if pump.done() and queue.empty():
                         pump.result()  # an error of a source ends the session, after what came before it

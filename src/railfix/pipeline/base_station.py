@@ -11,7 +11,6 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef, range_with_rotation
 from railfix.core.reasons import Reason
-from railfix.core.timescale import timedelta
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, ListedBalises
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
@@ -96,7 +95,7 @@ class BaseStation:
             state = BaseState(errors=new if errors is None else errors.joined(new), carrier=carrier)
         if np.isnat(began) or state.errors is None:
             return state
-        kept = timedelta(np.array(2.0 * self._config.base.longest_age_s))
+        kept = np.timedelta64(round(2e9 * self._config.base.longest_age_s), "ns")
         return replace(state, errors=state.errors.kept_from(began - kept))
 
     def _rows(self, ecef_m: Floats) -> AntennaRows:
