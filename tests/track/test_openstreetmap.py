@@ -17,6 +17,7 @@ from railfix.io.position_log import PositionLog
 from railfix.track import Track
 from railfix.track.height_source import with_heights
 from railfix.track.heights import geoid_heights
+from railfix.track.network import Network
 from railfix.track.network_read import read_network
 from railfix.track.read import read_segments, track_of_segments
 from railfix.track.segment import MapReading
@@ -122,6 +123,15 @@ def test_every_exporter_gives_the_same_tracks_with_id_name_and_accuracy(tmp_path
     assert network.sigma_plan_m == 0.5
     # the siding divides the line where it leaves it
     assert set(network.names) == {'way/11 Ligne "36"/1', 'way/11 Ligne "36"/2', "way/12"}
+
+
+def test_a_way_is_known_by_its_id_alone(tmp_path: Path) -> None:
+    path = tmp_path / "area.osm"
+    path.write_text(_xml())
+    network = Network(tracks=tuple(read_segments(path, MapReading())), links=())
+    assert (network.index_of("way/11"), network.index_of("way/12")) == (0, 1)
+    with pytest.raises(SettingsError, match=r"no track 'way/1'"):
+        network.index_of("way/1")
 
 
 def test_a_shapefile_of_classes_is_read_as_its_geojson(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import japan_geoid
 import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.crs import CompoundCRS
-from pyproj.datadir import get_data_dir, get_user_data_dir
+from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 

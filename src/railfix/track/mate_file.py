@@ -121,8 +121,8 @@ def _plan(path: str, edge: str, rows: Sequence[Row]) -> list[PlanElement]:
     for column in reversed(back):
         chosen.append(int(column[chosen[-1]]))
     plan = [options[k] for options, k in zip(forms, reversed(chosen), strict=True)]
-    for number, (before, after) in enumerate(pairwise(plan), start=2):
-        if (gap := _gap(before, after)) > _MEETS_M:
+    for number, (first, second) in enumerate(pairwise(plan), start=2):
+        if (gap := _gap(first, second)) > _MEETS_M:
             raise InputFileError(path, f"edge {edge!r}: segment {number} begins {gap:.2f} m from the one before it")
     return plan
 

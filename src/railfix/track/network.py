@@ -279,7 +279,14 @@ class Network:
         return kilometrage
 
     def index_of(self, name: str) -> int:
-        """Number of the track of a name; SettingsError when there is none."""
+        """Number of the track of a name, of a way of OpenStreetMap also by its id alone; SettingsError without one."""
+        by_id = [
+            k
+            for k, track in enumerate(self.tracks)
+            if "origin" in track.metadata and track.metadata.get("name", "").startswith(f"{name} ")
+        ]
+        if name not in self.names and len(by_id) == 1:
+            return by_id[0]
         if name not in self.names:
             close = [n for n in self.names if name.lower() in n.lower()] or difflib.get_close_matches(name, self.names)
             few = len(self.names) <= _NAMED
