@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate import RunSettings, Scenario, Simulation
 from railfix.simulate.sensors import (
+    BaliseSettings,
     DrawnSlips,
     Dropout,
     GroundUnit,
@@ -64,10 +65,11 @@ def inertial(settings: InertialSettings, duration_s: float = 100.0, run: RunSett
 
 def test_the_tables_have_the_columns_that_are_described() -> None:
     assert sensor_tables(Simulation(Scenario(duration_s=1.0))) == {}
-    sensors = SensorSettings(ranging=RangingSettings(units=(GroundUnit(name="A", chainage_m=60.0),)))
+    units = RangingSettings(units=(GroundUnit(name="A", chainage_m=60.0),))
+    sensors = SensorSettings(ranging=units, balises=BaliseSettings(spacing_m=50.0))
     made = sensor_tables(Simulation(Scenario(duration_s=30.0, sensors=sensors)))
     assert {name: list(frame.columns) for name, frame in made.items()} == {n: list(c) for n, c in COLUMNS.items()}
-    for name in made.keys() - {"ranging_units"}:
+    for name in made.keys() - {"ranging_units", "balise_list"}:
         assert made[name]["time_gpst"].dtype == pl.Datetime("ns")
         assert made[name]["time_gpst"].is_sorted()
     again = sensor_tables(Simulation(Scenario(duration_s=30.0, sensors=sensors)))
