@@ -249,9 +249,8 @@ class RunInputs(InputFiles):
             A file is missing, a folder, or cannot be opened; or the same log is given twice.
         """
         self.check_files()
-        logs: dict[str, tuple[Path, ...]] = {"base": self.base}
-        logs.update(self.logs)
-        check_given_once((f"--{name}", path) for name, paths in logs.items() for path in paths)
+        logs = [("base", self.base), *self.logs.items()]
+        check_given_once((f"--{name}", path) for name, paths in logs for path in paths)
         check_given_once(("--track", path) for path in self.track)
 
 

@@ -173,7 +173,9 @@ def _read_line(
 ) -> tuple[Track, RouteOfLog | None]:
     """Read the track, and find the route in a network."""
     segments = _segments(track, reading)
-    options = {"geoid": reading.geoid, "height_datum": reading.height_datum, "sigma_height_m": reading.height_sigma}
+    options: dict[str, Any] = {
+        "geoid": reading.geoid, "height_datum": reading.height_datum, "sigma_height_m": reading.height_sigma
+    }  # fmt: skip
     check_heights(segments, heights, **options)
     route = None
     if len(track) == 1 and len(segments) > 1:
