@@ -217,8 +217,9 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
     height, model, datum = np.full(len(latitude), np.nan), "", NO_HEIGHTS
     if line.coordinates.shape[1] > 2:
         height, model, datum = _heights(line, crs, latitude, longitude, reading)
+    of_way = metadata_of(line.feature)
     return Segment(
-        source=line.source,
+        source=f"{line.path} ({of_way['name']})" if "name" in of_way else line.source,
         file=line.path,
         latitude_deg=latitude,
         longitude_deg=longitude,
@@ -228,8 +229,7 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
         height_datum=datum,
         geoid=model,
         notes=older_datum_note(crs),
-        metadata={key: str(line.properties[key]) for key in _MEMBERS if key in line.properties}
-        | metadata_of(line.feature),
+        metadata={key: str(line.properties[key]) for key in _MEMBERS if key in line.properties} | of_way,
         **attributes(len(latitude), line.array),
     )
 
