@@ -32,8 +32,8 @@ from typing import Any
 
 import numpy as np
 
-from railfix.ground.keys import write_keys
 from railfix.ground.links import BEARERS, CentreLinks, TrainLinks, bearers_of
+from railfix.ground.quic import write_keys
 from railfix.ground.relay import LinkDisturbance, RelaySettings
 
 #: Namespaces, and addresses of both bearers in each.

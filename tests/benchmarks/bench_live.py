@@ -31,7 +31,7 @@ from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.run.processor import processor_of
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 

@@ -31,7 +31,7 @@ import numpy as np
 import railfix
 from railfix.gnss.observations import Observations
 from railfix.io.train_message import MessageStatus, decode
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 from ubx_made import rawx

@@ -32,12 +32,11 @@ from railfix.evaluate import (
     evaluate_run,
     evaluate_runs,
 )
-from railfix.evaluate.blocks import block_limits
-from railfix.evaluate.branches import BRANCH_COLUMNS
 from railfix.evaluate.epochs import travelled, with_missing
-from railfix.evaluate.outages import OUTAGE_COLUMNS
+from railfix.evaluate.intervals import BRANCH_COLUMNS, OUTAGE_COLUMNS
+from railfix.evaluate.options import read_sections
 from railfix.evaluate.run_folder import tables_of
-from railfix.evaluate.sections import read_sections
+from railfix.evaluate.scores import block_limits
 from railfix.io.reference_log import AntennaReference
 from railfix.run import run_files
 from railfix.simulate.demonstration import demo_inputs

@@ -11,7 +11,7 @@ import pytest
 from railfix.core.errors import MismatchError
 from railfix.evaluate import service
 from railfix.evaluate.run_folder import RunFolder
-from railfix.report.plots.service import plot_service
+from railfix.report.plots.campaign import plot_service
 
 pytestmark = pytest.mark.requirement("G4")
 

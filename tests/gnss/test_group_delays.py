@@ -13,7 +13,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits import satellite_states
 from railfix.gnss.orbits.kepler import Orbits, kepler_state
-from railfix.gnss.orbits.signal_health import group_delay_s, group_delay_sigma_m, unhealthy
+from railfix.gnss.orbits.prepared_records import group_delay_s, group_delay_sigma_m, unhealthy
 from railfix.io.rinex import read_navigation
 
 pytestmark = pytest.mark.requirement("A11")

@@ -14,14 +14,13 @@ import pytest
 from attacked_line import run_sequence
 from railfix.core.errors import InputFileError
 from railfix.core.settings import load_settings
-from railfix.ground import plausibility, reports, shortening
-from railfix.ground.authority import Authority
+from railfix.ground import plausibility, stops
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import Interlocking, InterlockingLimits, extended, stopped_trains
 from railfix.ground.interlocking_text import from_documents
 from railfix.ground.layout import Layout, LoopStation
-from railfix.ground.on_board import OnBoard, OnBoardLimits
-from railfix.ground.reports import report_received
+from railfix.ground.on_board import Authority, OnBoard, OnBoardLimits
+from railfix.ground.plausibility import report_received
 from railfix.ground.serve import CentreFile, _check_line
 from railfix.ground.stops import overlaps_stopped, release_train
 from railfix.ground.store import Store
@@ -40,10 +39,14 @@ LENGTH_M = 200.0
 RULES["integrity"] = {plausibility.confirms_rear: {"message.complete and ": ""}}
 RULES["length"] = {
     plausibility.confirms_rear: {"abs(message.length_cm / 100.0 - known.length_m) <= LENGTH_ROUNDING_M": "True"},
-    reports.report_received: {"(over_cm / 100.0 + before.length_m)": "(over_cm / 100.0 + message.length_cm / 100.0)"},
+    plausibility.report_received: {
+        "(over_cm / 100.0 + before.length_m)": "(over_cm / 100.0 + message.length_cm / 100.0)"
+    },
     plausibility.compute_contradiction: {"message.length_cm == 0": "False"},
 }
-RULES["two reports"] = {reports.report_received: {"min(facing * rear, facing * before.claimed_m)": "facing * rear"}}
+RULES["two reports"] = {
+    plausibility.report_received: {"min(facing * rear, facing * before.claimed_m)": "facing * rear"}
+}
 RULES["way"] = {
     plausibility.compute_contradiction: {
         "way > _longest_way_m(known.speed_mps, speed, elapsed, limits)": "False",
@@ -55,7 +58,7 @@ RULES["roll-back"] = {
     }
 }
 RULES["agreed"] = {
-    shortening.answer_received: {
+    stops.answer_received: {
         "message.authority < known.asked_number": "False",
         "further - direction * known.asked_m > ROUNDING_M": "False",
     }

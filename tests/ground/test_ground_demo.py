@@ -26,7 +26,7 @@ from starlette.routing import Route
 
 from railfix.ground import web
 from railfix.ground.demo import FAULT_S, run_demo
-from railfix.ground.keys import write_keys
+from railfix.ground.quic import write_keys
 from railfix.ground.web import MOST_WRONG, SESSION_S, PageServer, Sessions, page_app
 from report_page import _OPTIONS, Page, browser, fetched
 

@@ -15,7 +15,6 @@ import pytest
 from disturbed_traffic import Conditions, DisturbedTraffic, traffic
 from network_made import made_network
 from railfix.core.errors import MismatchError
-from railfix.ground.authority import Authority
 from railfix.ground.interlocking import (
     Interlocking,
     InterlockingLimits,
@@ -30,11 +29,9 @@ from railfix.ground.interlocking import (
     stopped_trains,
 )
 from railfix.ground.interlocking_text import from_documents, to_documents
-from railfix.ground.layout import Layout, LoopStation, overlap
-from railfix.ground.layout_network import layout_of
-from railfix.ground.on_board import OnBoard, OnBoardLimits
-from railfix.ground.plausibility import compute_contradiction
-from railfix.ground.reports import report_received
+from railfix.ground.layout import Layout, LoopStation, layout_of, overlap
+from railfix.ground.on_board import Authority, OnBoard, OnBoardLimits
+from railfix.ground.plausibility import compute_contradiction, report_received
 from railfix.ground.stops import close_section, open_section, release_train, stop_trains
 from railfix.ground.supervision import Supervision
 from railfix.ground.traffic import SimulatedTrain, line_with_loops

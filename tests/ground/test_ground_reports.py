@@ -7,12 +7,11 @@ from typing import Any
 
 import pytest
 
-from railfix.ground import plausibility, reports, stops
-from railfix.ground.authority import Authority
+from railfix.ground import plausibility, stops
 from railfix.ground.interlocking import Interlocking, PointState, TrainInterval, extended, route_requested
 from railfix.ground.layout import Layout, LoopStation
-from railfix.ground.on_board import OnBoard
-from railfix.ground.reports import report_received
+from railfix.ground.on_board import Authority, OnBoard
+from railfix.ground.plausibility import report_received
 from railfix.ground.stops import release_train
 from railfix.ground.supervision import Supervision, at_start, standing_train
 from test_ground_attacks import LENGTH_M, LIMITS, after, report
@@ -33,7 +32,7 @@ RULES["creep"] = {
         )
     }
 }
-RULES["tracks kept"] = {reports._turned: {"if station in under": "if station == known.station"}}
+RULES["tracks kept"] = {plausibility._turned: {"if station in under": "if station == known.station"}}
 RULES["end of the place"] = {OnBoard.receive: {"if not self._granted:": "if False:"}}
 RULES["two places"] = {OnBoard.moved: {"self.direction * before)": "-1e9)"}}
 RULES["unknown before"] = {OnBoard.receive: {"authority.shortens and not (agrees or self._granted)": "False"}}

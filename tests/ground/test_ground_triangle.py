@@ -18,11 +18,9 @@ import static_monitors
 from railfix.cli.ground import app
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.observations import Observations
-from railfix.ground.monitor import MonitorLimits, MonitorState, Order, advance, release
-from railfix.ground.monitor_log import monitor_log
-from railfix.ground.simulated_triangle import PLAN_M, TIME, points_ecef_m, simulated_fixes
-from railfix.ground.station_fixes import station_fixes
-from railfix.ground.station_streams import StationStreams
+from railfix.ground.demo import PLAN_M, TIME, points_ecef_m, simulated_fixes
+from railfix.ground.monitor import MonitorLimits, MonitorState, Order, advance, monitor_log, release
+from railfix.ground.station_fixes import StationStreams, station_fixes
 from railfix.ground.triangle import (
     SIDES,
     STOPPING,

@@ -121,7 +121,7 @@ def epoch_starts(text: str) -> list[int]:
 def bench_in(folder: Path) -> Bench:
     """The shipped run, cut short and unpacked."""
     from railfix.core.files import read_bytes
-    from railfix.simulate.demo_data import demo_files
+    from railfix.simulate.demonstration import demo_files
 
     demo = demo_files()
     for name, what in (("front.obs", "front"), ("rear.obs", "rear"), ("brdc.nav", "nav")):

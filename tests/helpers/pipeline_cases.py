@@ -20,7 +20,7 @@ from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
 from railfix.simulate import Scenario, write_run
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle

@@ -16,8 +16,8 @@ from railfix import kernels
 from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits
 from railfix.tracking.bank import SENSORS, budget, kind_of
+from railfix.tracking.filter import _parameters
 from railfix.tracking.handover import _work_space
-from railfix.tracking.recursion import _parameters
 
 
 def _compiled_modules() -> list[str]:

@@ -22,7 +22,7 @@ from railfix.integrity.protection import (
     along_track_level,
     availability,
 )
-from railfix.integrity.protection.level import MapError, RangeBounds
+from railfix.integrity.protection.level import MapDeviation, RangeBounds
 from railfix.integrity.raim import LinearModel, constrained_model
 from railfix.positioning.normal_equations import UNTIED_M
 from raim_oracle import point_model
@@ -217,7 +217,7 @@ def kinds_of_faults(systems: str) -> tuple[LinearModel, dict[str, Any]]:
         ),
         "scale": np.linspace(0.6, 2.0, 12),
         "overbound": RangeBounds(rng.uniform(0.0, 4.0, (12, n)), rng.uniform(0.0, 1.0, (12, n))),
-        "map_error": MapError(
+        "map_error": MapDeviation(
             rng.normal(size=(12, 2)),
             (
                 rng.normal(size=(12, 2)),
@@ -234,7 +234,7 @@ def at(options: dict[str, Any], t: int) -> dict[str, Any]:
     """Options of one epoch."""
     one = {name: value[t : t + 1] for name, value in options.items() if isinstance(value, np.ndarray)}
     bias, seen = options["map_error"]
-    error = MapError(bias[t : t + 1], tuple(values[t : t + 1] for values in seen))
+    error = MapDeviation(bias[t : t + 1], tuple(values[t : t + 1] for values in seen))
     return {
         **options,
         **one,
@@ -277,7 +277,7 @@ def test_levels_have_the_unit_of_the_sigmas(systems, factor):
     assert error.seen is not None
     metres = {
         "overbound": RangeBounds(*(factor * values for values in options["overbound"])),
-        "map_error": MapError(factor * error.bias_m, (factor * error.seen[0], error.seen[1] / factor**2)),
+        "map_error": MapDeviation(factor * error.bias_m, (factor * error.seen[0], error.seen[1] / factor**2)),
     }
     one = along_track_level(model, list(systems), **options)
     two = along_track_level(other, list(systems), **{**options, **metres})
@@ -358,18 +358,18 @@ def test_constellation_fault_that_nothing_checks():
     known = (np.zeros((1, 2)), np.zeros((1, 2, 2)))
     few = constrained_model(oracle.made(ARC, "GGGGG", seed=5), oracle.LINE, ARC)
     free = along_track_level(
-        few, list("GGGGG"), risk=RiskBudget(map_prior=1e-2, local_prior=1e-4), map_error=MapError(seen=known)
+        few, list("GGGGG"), risk=RiskBudget(map_prior=1e-2, local_prior=1e-4), map_error=MapDeviation(seen=known)
     )
     assert free.cause[0] == Cause.UNCHECKED_MAP
     wide = constrained_model(oracle.made(ARC, "GGGGGEEEEE", seed=5), oracle.LINE, ARC)
     priors = RiskBudget(map_prior=1e-2, constellation_prior={"G": 1e-5}, unchecked_share=1e-3)
     four = oracle.only(oracle.made(ARC, "GGGGGEEEEE", seed=5), [0, 1, 2, 3, 4, 5, 6, 7])
     both = along_track_level(
-        constrained_model(four, oracle.LINE, ARC), list("GGGGGEEEEE"), risk=priors, map_error=MapError(seen=known)
+        constrained_model(four, oracle.LINE, ARC), list("GGGGGEEEEE"), risk=priors, map_error=MapDeviation(seen=known)
     )
     assert both.cause[0] == Cause.UNCHECKED_TOGETHER
     assert np.isfinite(
-        along_track_level(wide, list("GGGGGEEEEE"), risk=priors, map_error=MapError(seen=known)).level_m[0]
+        along_track_level(wide, list("GGGGGEEEEE"), risk=priors, map_error=MapDeviation(seen=known)).level_m[0]
     )
     both = constrained_model(oracle.made(ARC, "GGGGGGEEEEE", seed=5), oracle.LINE, ARC)
     ok = along_track_level(both, list("GGGGGGEEEEE"), risk=RiskBudget(constellation_prior={"G": 1e-8}))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import protection_oracle
 import raim_oracle as oracle
 from railfix.integrity.protection import Cause, RiskBudget, along_track_level
-from railfix.integrity.protection.level import MapError, RangeBounds
+from railfix.integrity.protection.level import MapDeviation, RangeBounds
 from railfix.integrity.raim import constrained_model
 
 pytestmark = pytest.mark.requirement("C2")
@@ -69,7 +69,7 @@ def test_tails_of_all_hypotheses_use_up_the_risk(seed, side_prior, of_constellat
         risk=risk,
         scale=scale,
         overbound=RangeBounds(bias_m=bias),
-        map_error=MapError(
+        map_error=MapDeviation(
             seen=(np.array([seen or (0.0, 0.0)]), np.diag(MAP_SIGMA_M**-2.0)[None] * (seen is not None))
         ),
         sides=members,

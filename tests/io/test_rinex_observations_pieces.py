@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from railfix.core import files
 from railfix.core.errors import InputFileError
 from railfix.gnss.observations import Observations, concatenate
-from railfix.io.rinex import observations_blocks, observations_fields, read_observations, scan_observations
+from railfix.io.rinex import observations_blocks, observations_decode, read_observations, scan_observations
 from rinex_observations_text import epoch_2, epoch_3, event_2, field, header_2, header_3, record, text_of, write
 
 pytestmark = pytest.mark.requirement("A7")
@@ -247,9 +247,9 @@ TEXTS = st.tuples(STANDARD | st.text(CHARACTERS, min_size=14, max_size=14), TAIL
 def test_fields_equal_float_of_their_text(texts: list[tuple[str, str]], cut: int) -> None:
     line = "".join(number + tail for number, tail in texts)
     line = line[: len(line) - 16 + cut]
-    data = np.frombuffer(line.encode() + b"\n9" + b" " * observations_fields.PADDING, dtype=np.uint8)
+    data = np.frombuffer(line.encode() + b"\n9" + b" " * observations_decode.PADDING, dtype=np.uint8)
     arguments = (data, np.zeros(1, dtype=np.int64), np.array([len(line)]), np.arange(len(texts)), np.ones(len(texts)))
-    fields = observations_fields.read_fields(*arguments)
+    fields = observations_decode.read_fields(*arguments)
     for k in range(len(texts)):
         text = f"{line[16 * k : 16 * k + 16]:<16}"
         good = (not text[:14].strip() or NUMBER.fullmatch(text[:14])) and re.fullmatch("[ 0-9]{2}", text[14:])

@@ -22,7 +22,7 @@ import separation_oracle
 from plain_kernels import plain
 from railfix import kernels
 from railfix.integrity.protection import RiskBudget, along_track_level
-from railfix.integrity.protection.level import MapError, RangeBounds
+from railfix.integrity.protection.level import MapDeviation, RangeBounds
 from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.kernels import compiling
@@ -194,7 +194,7 @@ def test_levels_of_every_kind_of_hypothesis_are_those_of_all_sets_side_by_side(
             constellation_prior={"E": 1e-7, "C": 1e-6},
         ),
         "scale": np.linspace(0.6, 2.0, 12),
-        "map_error": MapError(rng.normal(size=(12, 2)), (rng.normal(size=(12, 2)), known)),
+        "map_error": MapDeviation(rng.normal(size=(12, 2)), (rng.normal(size=(12, 2)), known)),
         "sides": rng.random((12, 2, n)) > 0.6,
         "n_excluded": np.arange(12) % 3,
     }

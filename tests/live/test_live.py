@@ -32,7 +32,7 @@ from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
 from railfix.live.sources import _Chunks, check_source
 from railfix.live.stream import ReceiverState, receive_bytes, single_epochs
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 
 pytestmark = pytest.mark.requirement("A8")
 RUNNER = CliRunner(env={"COLUMNS": "100", "TERM": "dumb", "NO_COLOR": "1"})

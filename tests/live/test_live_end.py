@@ -17,7 +17,7 @@ import pytest
 import railfix
 from railfix.live.arrivals import next_arrival
 from railfix.live.sinks import MqttTarget
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 from test_live_sinks import broker as broker
 from test_live_sinks import log_of, output, program
 

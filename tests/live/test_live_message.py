@@ -23,7 +23,7 @@ from railfix.motion.samples import SensorSamples, TachometerPulses
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import Result
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 from railfix.tracking import TrackStatus
 
 

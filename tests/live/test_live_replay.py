@@ -21,7 +21,7 @@ from railfix.live import engine, session
 from railfix.live.forms import nmea_bytes
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import single_epochs
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 from ubx_made import log_of, rawx
 
 pytestmark = pytest.mark.requirement("A8")

@@ -34,7 +34,7 @@ from railfix.live.forms import etcs_form
 from railfix.live.outlets import Outlet
 from railfix.live.settings import LiveSettings
 from railfix.live.sinks import open_sink
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 from ubx_made import log_of
 
 pytestmark = pytest.mark.requirement("A8")

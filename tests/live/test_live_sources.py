@@ -33,7 +33,7 @@ from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
 from railfix.live.sources import Connected, Lost, read_source
 from railfix.live.stream import ReceiverState, receive_bytes, single_epochs
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 from ubx_made import log_of
 
 pytestmark = pytest.mark.requirement("A8")

@@ -21,7 +21,7 @@ from railfix.io.train_message import from_json
 from railfix.live.engine import EngineState
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
 from railfix.pipeline.results import State
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 from ubx_made import log_of
 
 pytestmark = pytest.mark.requirement("A8")

@@ -23,7 +23,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.integrity.protection.level import Asked, Errors
-from railfix.integrity.protection.off_tangent import one_after_the_other
+from railfix.integrity.protection.open_places import one_after_the_other
 from railfix.integrity.raim.model import LinearModel, ModelArrays, compact, regular_inverse
 from railfix.kernels.layout import LEAST_REDUNDANCY
 

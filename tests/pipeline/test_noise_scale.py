@@ -16,10 +16,9 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.forgetting import ages, decayed_sums
-from railfix.positioning.noise_scale import NoiseScaleLimits, epoch_variance
+from railfix.positioning.noise_scale import NoiseScaleLimits, epoch_variance, robust_fit
 from railfix.positioning.normal_equations import Ranges
-from railfix.positioning.robust_fit import robust_fit
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 
 
 def with_fault(satellite: str, size_m: float, *, since: int = 0) -> AntennaResult:

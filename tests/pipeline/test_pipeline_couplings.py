@@ -21,8 +21,8 @@ from railfix.pipeline import level_stage, solution, solve
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor, Models
 from railfix.pipeline.results import AntennaResult
+from railfix.positioning.noise_scale import RobustFit
 from railfix.positioning.normal_equations import Ranges
-from railfix.positioning.robust_fit import RobustFit
 from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel
 
 BASE = {"screens": ["elevation", "raim"]}

@@ -34,8 +34,8 @@ from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.single_point import single_point
 from railfix.ranges.atmosphere import saastamoinen_delay_m
+from railfix.ranges.corrected import REASONS
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, read_sbas
-from railfix.ranges.sbas_delays import REASONS
 from railfix.run.processor import processor_of
 from railfix.simulate import demo_files
 from railfix.track import Track, write_track_csv

@@ -18,7 +18,7 @@ from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
 from railfix.run.driver import run_files
 from railfix.run.inputs import RunInputs
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 from railfix.track import Track, read_track, write_track_csv
 from railfix.track.trajectory import Trajectory
 

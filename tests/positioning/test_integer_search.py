@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from railfix.positioning.integer_search import IntegerSearch
+from railfix.positioning.standstill_phase import IntegerSearch
 
 pytestmark = pytest.mark.requirement("E6")
 

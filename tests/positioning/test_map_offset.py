@@ -18,7 +18,7 @@ from railfix.positioning.map_offset import (
     MapOffset,
     MapOffsetLimits,
     MapOffsetState,
-    RangeErrors,
+    OffsetErrors,
     beyond_threshold,
     map_offset,
 )
@@ -60,7 +60,7 @@ def of_case(limits: MapOffsetLimits = LIMITS) -> tuple[MapOffset, MapOffsetState
     time, ranges, point, nominal, variance, arc = case()
     start = [MapOffsetState()]
     result, (end,) = map_offset(
-        time, ranges, point, RangeErrors(nominal, variance), ALONE, LinePositions(arc, AWAY), start, limits=limits
+        time, ranges, point, OffsetErrors(nominal, variance), ALONE, LinePositions(arc, AWAY), start, limits=limits
     )
     return result, end
 
@@ -162,7 +162,7 @@ def test_chunks_give_the_same(cut: int) -> None:
             time[part],
             some,
             point.take(part),
-            RangeErrors(nominal[part], variance[part]),
+            OffsetErrors(nominal[part], variance[part]),
             ALONE,
             LinePositions(arc[part], AWAY[part]),
             [state],

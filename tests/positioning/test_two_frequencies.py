@@ -13,7 +13,7 @@ from railfix.core.arrays import Floats
 from railfix.core.reasons import Reason
 from railfix.core.timescale import timedelta
 from railfix.evaluate import interpolate_reference
-from railfix.gnss.orbits.signal_health import group_delay_s
+from railfix.gnss.orbits.prepared_records import group_delay_s
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import AntennaResult

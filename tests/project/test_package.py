@@ -17,7 +17,7 @@ import railfix.motion
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 
 georinex = pytest.importorskip("georinex")
 #: georinex merges datasets by a default of xarray that will change.

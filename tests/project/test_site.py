@@ -82,7 +82,7 @@ def commands() -> Iterator[str]:
     """Yield the commands of the command line, those of groups with the name of the group."""
     program = typer.main.get_command(app)
     for name in program.list_commands(program.make_context("railfix", [], resilient_parsing=True)):
-        inner = getattr(loaded(name), "commands", None)
+        inner = getattr(loaded(name, program.modules.get(name)), "commands", None)
         yield from (f"{name} {sub}" for sub in inner) if inner else (name,)
 
 

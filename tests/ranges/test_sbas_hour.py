@@ -12,9 +12,9 @@ from railfix.core.constants import FREQUENCY_L1
 from railfix.core.geodesy import elevation_azimuth, enu_axes, geodetic_from_ecef
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.level_stage import risk_of
-from railfix.ranges.atmospheric_delays import SeenFrom
+from railfix.ranges.atmosphere import SeenFrom
+from railfix.ranges.corrected import sbas_delays
 from railfix.ranges.sbas import SatelliteState
-from railfix.ranges.sbas_delays import sbas_delays
 from railfix.track.trajectory import Trajectory
 
 pytestmark = pytest.mark.requirement("C2")

@@ -25,8 +25,7 @@ from railfix.reference import (
     build_references,
 )
 from railfix.simulate import AntennaTruth, antenna_truth
-from railfix.simulate.kinematics import Motion
-from railfix.simulate.motion import shuttle
+from railfix.simulate.motion import Motion, shuttle
 from railfix.simulate.scenario import LineSettings, ReceiverSettings, RunSettings, Scenario
 from railfix.simulate.signals import Simulation
 from railfix.track import Track

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from railfix.cli import app
 from railfix.pipeline.config import parse_config
-from railfix.report.plots import run_screens
+from railfix.report.plots import screens
 from railfix.run import RunOptions, RunSummary, run_files
 from railfix.screens import ScreenPicture
 from railfix.simulate.demonstration import demo_inputs
@@ -52,8 +52,8 @@ def drawn(monkeypatch: pytest.MonkeyPatch, folder: Path, out: Path) -> dict[str,
         seen[path.stem] = (picture, chainage_m)
         return path
 
-    monkeypatch.setattr(run_screens, "draw_screen", keep)
-    run_screens.draw_run_screens(folder, out)
+    monkeypatch.setattr(screens, "draw_screen", keep)
+    screens.draw_run_screens(folder, out)
     return seen
 
 

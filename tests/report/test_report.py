@@ -22,8 +22,7 @@ from railfix.evaluate.tables import error_tables, evaluation_of, group_tables, l
 from railfix.pipeline.config import parse_config
 from railfix.report import read_runs, report_page, write_report
 from railfix.report.encode import packed, script_json
-from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, NO_TIMES
-from railfix.report.protection import NO_LEVELS
+from railfix.report.figures import NO_LEVELS, NO_OBSERVATIONS, NO_REFERENCE, NO_TIMES
 from railfix.report.runs import ReportedRun
 from railfix.run import RunOptions, RunSummary, run_files
 from railfix.simulate.demonstration import demo_inputs, demo_truth

@@ -18,9 +18,8 @@ from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.positioning.which_track import StandstillErrors, StandstillFix, TrackPosterior, track_posterior
 from railfix.run.standstill import StandstillBase, StandstillCodes, standstill_codes
-from railfix.run.track_prior import prior_of_interlocking, prior_of_last_place, write_last_place
-from railfix.run.which_track import decide_track
-from railfix.simulate.demo_data import demo_files
+from railfix.run.which_track import decide_track, prior_of_interlocking, prior_of_last_place, write_last_place
+from railfix.simulate.demonstration import demo_files
 from yard_made import RISKS, SPACING_M, decided, made_tracks, to_geojson
 
 pytestmark = pytest.mark.requirement("E6")

@@ -11,8 +11,7 @@ from railfix.core.arrays import Floats
 from railfix.gnss.observations import concatenate
 from railfix.simulate import ReceiverSettings, Scenario, Simulation, SkySettings
 from railfix.simulate.environment import Environment, EnvironmentSettings
-from railfix.simulate.environment.antenna import circular_reflection, received_amplitude
-from railfix.simulate.environment.second_reflections import second_reflection
+from railfix.simulate.environment.diffraction import circular_reflection, received_amplitude
 from railfix.simulate.environment.settings import (
     AntennaSettings,
     NeighbourSettings,
@@ -20,11 +19,16 @@ from railfix.simulate.environment.settings import (
     SideStreetSettings,
     TreeSettings,
 )
-from railfix.simulate.environment.side_streets import SideStreets, street_reflections
+from railfix.simulate.environment.side_streets import (
+    SideStreets,
+    equipment_amplitude,
+    foliage,
+    neighbour_clearance,
+    neighbour_reflection,
+    street_reflections,
+)
 from railfix.simulate.environment.structures import build_structures, tree_rows
-from railfix.simulate.environment.trees import foliage
-from railfix.simulate.environment.vehicles import equipment_amplitude, neighbour_clearance, neighbour_reflection
-from railfix.simulate.environment.walls import Rays
+from railfix.simulate.environment.walls import Rays, second_reflection
 from railfix.simulate.errors.settings import TrackingSettings
 from railfix.simulate.noise import CodeSmoothing, TrackingNoise
 from railfix.simulate.scenario_file import load_scenario

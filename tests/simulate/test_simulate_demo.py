@@ -14,7 +14,7 @@ from conftest import ROOT
 from railfix.cli import app
 from railfix.core.errors import InputFileError
 from railfix.io.rinex import read_navigation, read_observations
-from railfix.simulate import DEMO_FILES, Scenario, demo_data, demo_files, demo_folder, write_run
+from railfix.simulate import DEMO_FILES, Scenario, demo_files, demo_folder, demonstration, write_run
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
@@ -87,7 +87,7 @@ def test_the_truth_lies_on_the_trajectory_of_the_map() -> None:
 
 
 def test_a_missing_demonstration_is_one_clear_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demo_data, "__file__", str(tmp_path / "src" / "railfix" / "simulate" / "demo_data.py"))
+    monkeypatch.setattr(demonstration, "__file__", str(tmp_path / "src" / "railfix" / "simulate" / "demonstration.py"))
     with pytest.raises(InputFileError, match="install railfix again"):
         demo_folder()
     installed = tmp_path / "src" / "railfix" / "_demo"

@@ -30,8 +30,8 @@ from railfix.simulate import (
     run_curve,
     shuttle,
 )
-from railfix.simulate.body_motion import BodyMotion
-from railfix.simulate.kinematics import limit_jerk
+from railfix.simulate.body import BodyMotion
+from railfix.simulate.motion import limit_jerk
 from railfix.simulate.run import vehicle_table
 from railfix.track import read_track, write_track_csv
 from railfix.track.vehicle import antenna_trajectory, read_vehicle

@@ -12,9 +12,9 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.io.rinex import read_observations
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, SbasLimits, SbasMessages, read_sbas
 from railfix.simulate import Scenario, Simulation, write_run
-from railfix.simulate.delays import ionosphere_m
 from railfix.simulate.errors import SatelliteFault
-from railfix.simulate.sbas import SbasSettings, encode
+from railfix.simulate.noise import ionosphere_m
+from railfix.simulate.sbas import SbasSettings, service
 from railfix.simulate.sbas.service import sbas_messages, write_sbas
 from railfix.simulate.scenario import ReferenceStation
 from railfix.simulate.scenario_file import load_recipe
@@ -145,9 +145,9 @@ def test_messages_are_lost_and_come_back_from_their_file(simulation: Simulation,
 
 def test_a_value_that_does_not_fit_its_field_is_an_error() -> None:
     with pytest.raises(ValueError, match="type 2: 4800 does not fit 12 bits"):
-        encode.fast(0, [600.0], [5])
+        service.fast(0, [600.0], [5])
     with pytest.raises(ValueError, match="no field brr"):
-        encode.parameters(0, brr=1)
+        service.parameters(0, brr=1)
 
 
 # Reference station ------------------------------------------------------------------------------------------------

@@ -27,8 +27,7 @@ from railfix.simulate.sensors import (
     TachometerSettings,
 )
 from railfix.simulate.sensors.inertial import gravity_mps2
-from railfix.simulate.sensors.radar import dropouts
-from railfix.simulate.sensors.tables import COLUMNS, sensor_tables
+from railfix.simulate.sensors.tables import COLUMNS, dropouts, sensor_tables
 from railfix.simulate.sensors.wheel import wheel_slips
 
 pytestmark = pytest.mark.requirement("D4")

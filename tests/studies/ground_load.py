@@ -24,12 +24,11 @@ from pathlib import Path
 import numpy as np
 
 import paths  # noqa: F401
-from railfix.ground.authority import Authority
 from railfix.ground.control import ControlCentre
-from railfix.ground.keys import write_keys
 from railfix.ground.layout import Layout
 from railfix.ground.links import TrainLinks, bearers_of, first_sequence
-from railfix.ground.on_board import OnBoard
+from railfix.ground.on_board import Authority, OnBoard
+from railfix.ground.quic import write_keys
 from railfix.ground.serve import COLLECTION, STEP_S
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start

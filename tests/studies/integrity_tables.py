@@ -36,14 +36,14 @@ from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
+from railfix.positioning.noise_scale import map_information
 from railfix.positioning.normal_equations import Ranges, inverse_3x3, normal_equations
-from railfix.positioning.robust_fit import map_information
 from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR, klobuchar_delay_m
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
-from railfix.tracking.student_t import Tails
+from railfix.tracking.limits import Tails
 from recordings_score import smartloc, trajectory_of
 
 DATA: Final = paths.ROOT.parent / "shared" / "data" / "kinematic"

@@ -19,9 +19,9 @@ from railfix.core.settings import write_toml
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.conventional import PointStatus
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
+from railfix.pipeline.solve import PointStatus
 from railfix.ranges.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
 from railfix.run.processor import processor_of
 from railfix.run.sensors import read_sensors

@@ -67,18 +67,16 @@ def document() -> str:
     lines = [
         "# The five papers, item by item",
         "",
-        "Written by `python tests/studies/papers.py` from `tests/references/papers.toml` and kept outputs. An item",
-        "without a test is open.",
-        "",
-        "| item | asked | reached | function, test |",
-        "|---|---|---|---|",
+        "Written by `python tests/studies/papers.py` from `tests/references/papers.toml` and kept outputs: each item,",
+        "what the paper asks, what is reached, function and test. An item without a test is open.",
     ]
     for paper, title in DATA["papers"].items():
-        lines.append(f"| **{paper}** {title} | | | |")
+        lines += ["", f"## {paper}: {title}", ""]
         for item in (item for item in DATA["item"] if item["paper"] == paper):
+            asked = f"; asked: {item['asked']}" if "asked" in item else ""
+            found = f"; reached: {reached(item)}" if reached(item) else ""
             test = f"`{item['test']}`" if "test" in item else "**open**"
-            cells = (item["what"], item.get("asked", ""), reached(item), f"`{item['where']}`<br>{test}")
-            lines.append(f"| {' | '.join(cells)} |".replace("|  |", "| |").replace("|  |", "| |"))
+            lines.append(f"- {item['what']}{asked}{found}. `{item['where']}`, {test}")
     lines += ["", "## Where we read the papers differently", ""]
     for found in DATA["difference"]:
         why = f" Why: {found['why']}." if found["why"] else ""

@@ -27,9 +27,15 @@ from railfix.pipeline.corrected_ranges import without
 from railfix.pipeline.processor import AntennaResult
 from railfix.positioning.constrained import Constrained, constrained_position
 from railfix.positioning.intersystem_bias import OffsetState, tie_clocks
-from railfix.positioning.noise_scale import NoiseState, noise_age, own_sigma_m, robust_scale
+from railfix.positioning.noise_scale import (
+    NoiseState,
+    map_information,
+    noise_age,
+    own_sigma_m,
+    robust_fit,
+    robust_scale,
+)
 from railfix.positioning.normal_equations import Ranges, clock_groups
-from railfix.positioning.robust_fit import map_information, robust_fit
 from railfix.positioning.section_search import SearchIndex, search
 from railfix.positioning.single_point import single_point
 from railfix.ranges.weights import code_sigma_m

@@ -26,8 +26,7 @@ from railfix.evaluate import (
     LEVEL_COLUMNS,
     STANFORD_COLUMNS,
 )
-from railfix.evaluate.branches import BRANCH_COLUMNS
-from railfix.evaluate.outages import OUTAGE_COLUMNS
+from railfix.evaluate.intervals import BRANCH_COLUMNS, OUTAGE_COLUMNS
 from railfix.pipeline.columns import UNITS, Column
 from railfix.pipeline.config import Config
 from railfix.pipeline.passing_table import PASSING_COLUMNS

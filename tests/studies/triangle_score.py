@@ -15,7 +15,7 @@ import numpy as np
 
 import paths  # noqa: F401
 from railfix.core.arrays import Floats
-from railfix.ground.simulated_triangle import PLAN_M
+from railfix.ground.demo import PLAN_M
 from railfix.ground.triangle import STOPPING, YEAR_S, TriangleLimits, compare_triangle, limits_for_false_stops
 
 #: Name, standard deviation of a fix and of the part of its own, an axis [m].

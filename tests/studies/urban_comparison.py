@@ -1,7 +1,7 @@
 """Simulated surroundings beside recorded cities: errors of the codes and C/N0 by elevation, printed.
 
 Run ``python tests/studies/urban_comparison.py`` with the recordings beside the checkout; without them only the
-simulated columns are printed. The kinds of `railfix.simulate.environment.section_kinds` are not fitted; the
+simulated columns are printed. The kinds of `railfix.simulate.environment.structures` are not fitted; the
 scenario `city` is calibrated on the Hong Kong recordings with some seeds, Berlin and the Pixel and other seeds are for
 validation: ``python tests/studies/urban_comparison.py calibration`` prints them side by side.
 ``python tests/studies/urban_comparison.py speed`` prints the processor time.

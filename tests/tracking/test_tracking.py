@@ -9,7 +9,7 @@ import pytest
 
 from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.state import TrackState
-from railfix.tracking.transition import singer_step
+from railfix.tracking.velocity import singer_step
 from tracking_cases import Ride, bent_line, corner_line, part, reflected, ride, wheel, with_codes_behind, without_epochs
 
 

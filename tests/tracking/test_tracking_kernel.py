@@ -12,8 +12,8 @@ from plain_kernels import plain
 from railfix.kernels.tracking import layout
 from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.chunk import prepare_chunk
+from railfix.tracking.filter import Recursion
 from railfix.tracking.handover import Handover
-from railfix.tracking.recursion import Recursion
 from tracking_cases import Ride, bent_line, part, reflected, ride, without_epochs
 
 
@@ -92,7 +92,7 @@ def test_as_plain_python_the_recursion_gives_the_same(name: str, first: int, mon
     _, state = track(part(epochs, before), line, sensors=_sensors_of(sensors, before), levels=True)
     own = _sensors_of(sensors, cut)
     compiled, _ = track(part(epochs, cut), line, state, sensors=own, levels=True)
-    monkeypatch.setattr("railfix.tracking.recursion._kernel", lambda: plain("tracking.recursion").advance)
+    monkeypatch.setattr("railfix.tracking.filter._kernel", lambda: plain("tracking.recursion").advance)
     found, _ = track(part(epochs, cut), line, state, sensors=own, levels=True)
     for field in fields(Tracked):
         one, other = getattr(found, field.name), getattr(compiled, field.name)

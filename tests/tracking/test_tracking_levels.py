@@ -12,11 +12,10 @@ import pytest
 from typer.testing import CliRunner
 
 from railfix.cli import app
-from railfix.simulate.demo_data import demo_files
+from railfix.simulate.demonstration import demo_files
 from railfix.tracking import GnssEpochs, SensorEpochs, Tracked, TrackingLimits, TrackState, TrackStatus, track
 from railfix.tracking import levels as levels_of
-from railfix.tracking.levels import LevelState, carried_levels, track_with_levels
-from railfix.tracking.thinned import AccumulatedIncrement, thinned
+from railfix.tracking.levels import AccumulatedIncrement, LevelState, carried_levels, thinned, track_with_levels
 from tracking_cases import Ride, part, ride, wheel
 
 LIMITS = TrackingLimits()

@@ -7,7 +7,7 @@ import pytest
 
 from railfix.tracking import BackwardInformation, Step, TrackingLimits, TrackState, smoothed, track
 from railfix.tracking.state import StateIndex
-from railfix.tracking.transition import transition
+from railfix.tracking.velocity import transition
 from tracking_cases import Ride, bent_line, part, ride, without_epochs
 
 LIMITS = TrackingLimits()

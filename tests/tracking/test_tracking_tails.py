@@ -10,7 +10,7 @@ from scipy.differentiate import derivative
 from scipy.stats import t as student
 
 from railfix.tracking import TrackingLimits, track
-from railfix.tracking.student_t import Tails
+from railfix.tracking.limits import Tails
 from tracking_cases import ride
 
 RESIDUAL = np.linspace(-6.0, 6.0, 25)[None]

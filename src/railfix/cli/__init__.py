@@ -40,6 +40,17 @@ class _Program(LazyCommands):
         "ground": "Monitor satellites by a reference triangle, demonstrate the ground side.",
         "map": "Check a track map, make one, or put positions on a network.",
     }
+    modules: ClassVar[Mapping[str, str]] = {
+        "doctor": "convert",
+        "export": "convert",
+        "explain": "report",
+        "plot-screens": "report",
+        "benchmark": "campaign",
+        "ablate": "campaign",
+        "reference": "evaluate",
+        "which-track": "locate",
+        "cn0-curve": "error_model",
+    }
 
 
 app = typer.Typer(

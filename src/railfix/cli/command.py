@@ -111,6 +111,8 @@ class LazyCommands(Commands):
     """The commands of the program, each imported from its module when it is called; `summaries` are for their list."""
 
     summaries: ClassVar[Mapping[str, str]] = {}
+    #: Modules of the commands that share one.
+    modules: ClassVar[Mapping[str, str]] = {}
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the names of the commands."""
@@ -130,15 +132,15 @@ class LazyCommands(Commands):
         if near:
             ctx.fail(f"there is no command {word!r}; is {near[0]!r} meant?")
         name, command, rest = super().resolve_command(ctx, args)
-        return name, loaded(str(name)) if name in self.summaries else command, rest
+        return name, loaded(str(name), self.modules.get(str(name))) if name in self.summaries else command, rest
 
 
-def loaded(name: str) -> Any:
-    """Return a command, imported from its module in `railfix.cli`."""
+def loaded(name: str, module_name: str | None = None) -> Any:
+    """Return a command, imported from its module in `railfix.cli`: by default that of its name."""
     word = name.replace("-", "_")
     gc.disable()  # nothing of what an import makes is garbage: looking for it takes a tenth of the start
     try:
-        module = import_module(f"railfix.cli.{word}")
+        module = import_module(f"railfix.cli.{module_name or word}")
     finally:
         gc.freeze()
         gc.enable()

@@ -89,7 +89,7 @@ def monitor(
 
     Exit codes as `railfix --help` says; 5 where the logs have no satellite or no epoch in common.
     """
-    from railfix.ground.monitor_log import draw_triangle, monitor_log
+    from railfix.ground.monitor import draw_triangle, monitor_log
     from railfix.ground.station_fixes import station_fixes
     from railfix.ground.triangle import TriangleVerdict
     from railfix.io import read_navigation, read_observations
@@ -147,8 +147,8 @@ def _monitor_live(
     import asyncio
     import time
 
-    from railfix.ground.monitor_log import LiveMonitor
-    from railfix.ground.station_streams import stream_fixes
+    from railfix.ground.monitor import LiveMonitor
+    from railfix.ground.station_fixes import stream_fixes
     from railfix.ground.triangle import TriangleVerdict
     from railfix.io import read_navigation
     from railfix.live.sources import check_source, is_file
@@ -233,7 +233,7 @@ def keys(
 
     Exit codes as `railfix --help` says; 8 where a file is there already.
     """
-    from railfix.ground.keys import write_keys
+    from railfix.ground.quic import write_keys
 
     if not all(0 < number < 1 << 32 for number in choices.train):
         raise SettingsError("--train: a number from 1 to 4294967295 was expected")

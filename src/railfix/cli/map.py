@@ -94,7 +94,7 @@ def check(
     )
     quality = check_track(track, limits=MapLimits(mid_chord_m=mid_chord))
     if picture is not None:
-        from railfix.report.plots.track import plot_track_quality
+        from railfix.report.plots.network import plot_track_quality
 
         _make_folder(picture.parent)
         plot_track_quality(quality, picture)

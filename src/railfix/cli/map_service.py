@@ -59,7 +59,7 @@ def service(
     if out is not None:
         write_whole(out, found.write_csv(float_precision=3))
     if picture is not None:
-        from railfix.report.plots.service import plot_service
+        from railfix.report.plots.campaign import plot_service
 
         plot_service(found, picture, title=", ".join(path.name for path in runs), limit_m=limit)
     served = found.filter(pl.col("within_limit_share") >= _SERVED)

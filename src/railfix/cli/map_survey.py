@@ -75,7 +75,7 @@ def survey(
     track = result.track
     write_track_csv(track, out, sigma_m=np.stack([result.sigma_plan_m, result.sigma_height_m], axis=1))
     if picture is not None:
-        from railfix.report.plots.survey import plot_survey
+        from railfix.report.plots.network import plot_survey
 
         plot_survey(surveyed, picture)
     console = console_of_tables()

@@ -1,4 +1,4 @@
-"""``railfix report``: runs as one page for the browser."""
+"""Commands on finished runs: report, one epoch explained, pictures of screens."""
 
 from __future__ import annotations
 
@@ -8,12 +8,17 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
+from rich.table import Table
 
-from railfix.cli.options import OverwriteOption, check_outputs, from_models
+from railfix.cli.console import console_of_tables
+from railfix.cli.options import OverwriteOption, check_outputs, from_models, overwriting
 from railfix.evaluate import EvaluationOptions
 from railfix.report import write_report
+from railfix.report.explain import explain_epoch, time_text, write_explanation
+from railfix.report.plots.screens import draw_run_screens
 from railfix.run.folder import reading_table
 from railfix.run.options import ColumnNames
+from railfix.run.output import OutputFolder
 
 #: ``M_MMAP_THRESHOLD`` of ``malloc.h``, and the size from which on an array has pages of its own [bytes].
 _THRESHOLD: Final = (-3, 1 << 17)
@@ -96,3 +101,75 @@ def _free_arrays_at_once() -> None:
     """
     if sys.platform == "linux" and hasattr(library := ctypes.CDLL(None), "mallopt"):
         library.mallopt(*_THRESHOLD)
+
+
+def explain(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `railfix run --observations` wrote.")],
+    *,
+    at: Annotated[str, typer.Option(metavar="TIME", help="GPS time: hh:mm:ss, or 'yyyy-mm-dd hh:mm:ss'.")],
+    antenna: Annotated[str | None, typer.Option(metavar="NAME", help="The run's first antenna unless given.")] = None,
+    html: Annotated[Path | None, typer.Option(metavar="HTML", help="Write a page with the sky as well.")] = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Explain one epoch: its place, every satellite and its fate, what set sigma, level and status.
+
+    Of each satellite that was used it says how far the position of the single epoch would move along the line without
+    it. The epoch nearest to the time is taken, a minute away at most.
+
+    Example: `railfix explain results --at 06:34:12 --html epoch.html`
+
+    Exit codes: 0 done; 3 RUN is not what it should be; 4 no such time or antenna; 5 no epoch near the time; 8 the page
+    cannot be written.
+    """
+    inputs = sorted(run.iterdir()) if run.is_dir() else []
+    check_outputs((html, "page"), overwrite=overwrite, inputs=[path for path in inputs if path.suffix != ".html"])
+    found = explain_epoch(run, at, antenna=antenna)
+    console = console_of_tables()
+    console.print(f"{found.antenna} antenna, {time_text(found.time)} GPS time (asked: {at})", markup=False)
+    for sentence in found.sentences:
+        console.print(sentence, markup=False, soft_wrap=True)
+    table = Table(title="Satellites")
+    columns = {
+        "satellite": ("satellite", None), "signal": ("signal", None), "elevation_deg": ("elevation", 1),
+        "cn0_dbhz": ("C/N0", 1), "sigma_m": ("sigma m", 2), "residual_m": ("residual m", 2),
+        "without_shift_m": ("without it m", 2), "without_sigma_m": ("sigma then m", 2), "reason_text": ("fate", None),
+    }  # fmt: skip
+    for heading, digits in columns.values():
+        table.add_column(heading, justify="left" if digits is None else "right")
+    for row in found.satellites.iter_rows(named=True):
+        values = ((row[name], digits) for name, (_, digits) in columns.items())
+        table.add_row(*("" if v is None else str(v) if digits is None else f"{v:.{digits}f}" for v, digits in values))
+    console.print(table)
+    if html is not None:
+        console.print(f"wrote {write_explanation(found, html)}", markup=False, soft_wrap=True)
+
+
+def plot_screens(
+    run: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `railfix run --observations` wrote.")],
+    *,
+    out: Annotated[Path, typer.Option("--out", metavar="PICS", help="Folder for the pictures; made where absent.")],
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Plot each screen's metric against its limit, over time and over chainage.
+
+    One PNG per screen and antenna: `front_doppler.png`, `rear_antenna_pair.png`, `front_raim.png`, ...;
+    none for screens that were off or inactive. Rejected observations have another colour, and their share is
+    in the title.
+
+    Example:
+
+        railfix plot-screens results --out results/screens
+
+    Exit codes: 0 done; 2 the command line was misused; 3 DIR is not the folder of a run with observations;
+    8 the pictures cannot be written; 1 a defect of railfix.
+    """
+    with OutputFolder(out, overwrite=overwriting(overwrite)) as folder:
+        with reading_table(run / "observations.parquet"):
+            pictures = draw_run_screens(run, folder.staging)
+        for picture in pictures:
+            folder.staged(picture.name)
+        drawn = folder.commit()
+    for path in drawn.values():
+        typer.echo(f"wrote {path}")
+    if not drawn:
+        typer.echo("no screen of this run was active")

@@ -6,8 +6,9 @@ Every set of limits is a `Settings` model beside the function it belongs to. `Co
 
 from __future__ import annotations
 
+import difflib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import NoneType
 from typing import Any, Final, Self, TypeVar, get_args, get_origin
@@ -17,7 +18,23 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationIn
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, write_whole
-from railfix.core.spelling import misspelt
+
+
+def misspelt(names: Iterable[str], known: Iterable[str]) -> dict[str, str]:
+    """Names that are close to a known one but not it, with that one.
+
+    Examples
+    --------
+    >>> misspelt(["lattitude_deg", "remark"], ["latitude_deg", "height_m"])
+    {'lattitude_deg': 'latitude_deg'}
+    """
+    known = list(known)
+    close = {
+        name: difflib.get_close_matches(name.lower().replace(" ", "_"), known, n=1, cutoff=0.75)
+        for name in names
+        if name not in known
+    }
+    return {name: matches[0] for name, matches in close.items() if matches}
 
 
 class Settings(BaseModel):

@@ -9,8 +9,7 @@ from railfix.evaluate.epochs import EPOCH_COLUMNS
 from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_run, evaluate_runs
 from railfix.evaluate.figures import FIGURE_COLUMNS
 from railfix.evaluate.integrity import BEYOND_COLUMNS, STANFORD_COLUMNS, Integrity
-from railfix.evaluate.intervals import INTERVAL_COLUMNS
-from railfix.evaluate.levels import LEVEL_COLUMNS
+from railfix.evaluate.intervals import INTERVAL_COLUMNS, LEVEL_COLUMNS
 from railfix.evaluate.options import EvaluationOptions
 from railfix.evaluate.output import write_evaluation
 from railfix.evaluate.place import TrackFiles

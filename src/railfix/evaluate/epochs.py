@@ -14,10 +14,9 @@ from railfix.core.errors import MismatchError
 from railfix.core.timescale import seconds
 from railfix.evaluate.bracket import bracket
 from railfix.evaluate.integrity import PARTS, STATED
-from railfix.evaluate.options import EvaluationOptions
+from railfix.evaluate.options import EvaluationOptions, Sections
 from railfix.evaluate.place import Answers, PlaceErrors, TrackFiles, errors_of
 from railfix.evaluate.run_folder import RunFolder, floats
-from railfix.evaluate.sections import Sections
 from railfix.io.reference_log import AntennaReference
 
 #: Status of an epoch missing in the log.

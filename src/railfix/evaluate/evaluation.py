@@ -13,17 +13,13 @@ import polars.selectors as cs
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import fingerprint
-from railfix.evaluate.branches import branch_table
 from railfix.evaluate.epochs import antenna_epochs, below
 from railfix.evaluate.figures import ALL, KEYS, USED, figures_by
 from railfix.evaluate.integrity import Integrity, LevelledRun, integrity_of
-from railfix.evaluate.intervals import interval_table
-from railfix.evaluate.levels import level_table
-from railfix.evaluate.options import EvaluationOptions
-from railfix.evaluate.outages import outage_table
+from railfix.evaluate.intervals import branch_table, interval_table, level_table, outage_table
+from railfix.evaluate.options import EvaluationOptions, read_sections
 from railfix.evaluate.place import TrackFiles
 from railfix.evaluate.run_folder import NO_MORE, POSITIONS_TABLE, TABLES, UNKNOWN_KIND, RunFolder, read_run
-from railfix.evaluate.sections import read_sections
 from railfix.io.reference_log import AntennaReference, read_reference
 
 #: Names of a reference that is looked for beside the log of a run.
@@ -120,7 +116,7 @@ class Evaluation:
     integrity : mapping of str to Integrity
         Levels against errors, by what the levels rest on; empty where no run has a level.
     outages, branches : polars.DataFrame or None
-        `railfix.evaluate.outages.OUTAGE_COLUMNS`, `railfix.evaluate.branches.BRANCH_COLUMNS`; None where no table of
+        `railfix.evaluate.intervals.OUTAGE_COLUMNS`, `railfix.evaluate.intervals.BRANCH_COLUMNS`; None where no table of
         the filter along the track is among the runs.
     options : EvaluationOptions
     inputs : tuple of mapping

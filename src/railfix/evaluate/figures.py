@@ -10,10 +10,9 @@ import numpy as np
 import polars as pl
 
 from railfix.core.reasons import Status
-from railfix.evaluate.blocks import LIMIT_COLUMNS, block_limits
 from railfix.evaluate.options import EvaluationOptions
 from railfix.evaluate.run_folder import floats
-from railfix.evaluate.scores import WRONG_PLACE_M
+from railfix.evaluate.scores import LIMIT_COLUMNS, WRONG_PLACE_M, block_limits
 
 #: Which positions: on the map, those of status ok alone, the 3-D ones at their nearest point.
 POSITIONS: Final = ("constrained", "constrained_ok", "conventional")

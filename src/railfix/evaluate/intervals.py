@@ -1,12 +1,15 @@
-"""How far the train runs, and how long it takes, from one position to the next (P1 5, figure 12)."""
+"""What a run shows beside its errors: steps between positions, outages, branches, widths of protection levels."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Final
 
 import polars as pl
 
-from railfix.evaluate.figures import POSITIONS, at_largest, positioned
+from railfix.evaluate.epochs import OF_FILTER, level_columns
+from railfix.evaluate.figures import AIDED, ALL, KEYS, POSITIONS, at_largest, positioned
+from railfix.evaluate.scores import WRONG_PLACE_M
 
 #: Columns of the table of intervals beside its keys, with their unit and meaning.
 INTERVAL_COLUMNS: Final[dict[str, str]] = {
@@ -88,3 +91,180 @@ def _of_position(epochs: pl.LazyFrame, position: str, by: list[str]) -> pl.DataF
 
 def _seconds(duration: pl.Expr) -> pl.Expr:
     return duration.dt.total_nanoseconds() / 1e9
+
+
+#: Shorter losses of all satellites are no stretch [s].
+LEAST_S: Final = 2.0
+
+#: Columns of the table of stretches without satellites beside its keys, with their unit and meaning.
+OUTAGE_COLUMNS: Final[dict[str, str]] = {
+    "begin_gpst": "first epoch at which the single-epoch solution used no satellite, GPS time",
+    "duration_s": "from the last epoch with a satellite to the last without",
+    "travelled_m": "distance travelled meanwhile, by the reference",
+    "environment": "of the reference or of the sections, at its middle",
+    "carried_by": "measurements that the filter used within it",
+    "epochs": "epochs without satellites, those missing in the log included",
+    "positions": "those with a position",
+    "outage_p50_m": "size of error",
+    "outage_p95_m": "size of error",
+    "outage_max_m": "size of error",
+    "end_error_m": "error at the last position, + toward the end of the line",
+    "end_sigma_m": "stated standard deviation there",
+    "largest_normalised": "largest size of error / along_sigma_m",
+}
+_OUTAGE_COLUMNS: Final = (
+    "time_gpst", "observed", "n_used", "in_reference", "reference_good", "positioned", "moved_m", "environment",
+    "sources", "error_m", "along_sigma_m", "branch_probability",
+)  # fmt: skip
+
+
+def outage_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
+    """Stretches without satellites with the filter's errors, in order of time; None without a table of the filter.
+
+    Single epochs have no position in these stretches and are left out.
+    """
+    filtered = epochs.select(*KEYS, *_OUTAGE_COLUMNS).filter(OF_FILTER)
+    if not len(filtered):
+        return None
+    keys = list(KEYS)
+    before = pl.col("time_gpst").shift().over(keys)
+    marked = (
+        filtered.filter("in_reference")
+        .with_columns(without=~AIDED, before=before, moved_before=pl.col("moved_m").shift().over(keys))
+        .with_columns(stretch=pl.col("without").rle_id().over(keys))
+        .filter("without")
+    )
+    size = pl.col("error_m").abs()
+    judged = pl.col("positioned") & pl.col("reference_good")
+    first = pl.coalesce(pl.col("before").first(), pl.col("time_gpst").first())
+    start = pl.coalesce(pl.col("moved_before").first(), pl.col("moved_m").first())
+    words = pl.col("sources").str.split("+").list.explode(keep_nulls=False, empty_as_null=False)
+    table = marked.group_by([*keys, "stretch"], maintain_order=True).agg(
+        begin_gpst=pl.col("time_gpst").first(),
+        duration_s=(pl.col("time_gpst").last() - first).dt.total_nanoseconds() / 1e9,
+        travelled_m=pl.col("moved_m").last() - start,
+        environment=pl.col("environment").get(pl.len() // 2),
+        carried_by=words.filter(words != "").unique(maintain_order=True).str.join("+"),
+        epochs=pl.len().cast(pl.Int64),
+        positions=pl.col("positioned").sum().cast(pl.Int64),
+        outage_p50_m=size.filter(judged).quantile(0.5, "linear"),
+        outage_p95_m=size.filter(judged).quantile(0.95, "linear"),
+        outage_max_m=size.filter(judged).max(),
+        end_error_m=pl.col("error_m").filter(judged).last(),
+        end_sigma_m=pl.col("along_sigma_m").filter(judged).last(),
+        largest_normalised=(size / pl.col("along_sigma_m")).filter(judged).max(),
+    )
+    return table.filter(pl.col("duration_s") >= LEAST_S).select(*keys, *OUTAGE_COLUMNS)
+
+
+#: Limits of the classes of probability.
+_EDGES: Final = (0.0, 0.5, 0.9, 0.99, 0.999, 1.0)
+
+_BRANCH_COLUMNS: Final = ("in_reference", "reference_good", "positioned", "branch_probability", "distance_m", "block")
+
+#: Columns of the table of probabilities beside its keys, with their unit and meaning.
+BRANCH_COLUMNS: Final[dict[str, str]] = {
+    "probability": "class of the stated probability of the place; `all` for every epoch",
+    "judged": "positions of the class with an error",
+    "probability_mean": "mean of the stated probabilities",
+    "right_share": "share of the places within 50 m of the reference, straight distance",
+    "wrong_places": "places further away",
+    "blocks": "blocks of time with such an epoch: about the number of independent ones",
+    "wrong_blocks": "blocks with a wrong place",
+}
+
+
+def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
+    """Stated probability against the share of right places, by class; None without a table of the filter.
+
+    Of `railfix.evaluate.epochs.EPOCH_COLUMNS` of all runs. Calibrated probabilities have a `right_share` of at least
+    `probability_mean`: a hypothesis rejected can be near.
+    """
+    filtered = epochs.select(*KEYS, *_BRANCH_COLUMNS).filter(OF_FILTER)
+    if not len(filtered):
+        return None
+    judged = filtered.filter("in_reference", "reference_good", "positioned")
+    names = [f"{low:g} to {high:g}" for low, high in pairwise(_EDGES)]
+    rank = pl.sum_horizontal((pl.col("branch_probability") >= edge).cast(pl.Int64) for edge in _EDGES[1:-1])
+    wrong = pl.col("distance_m") > WRONG_PLACE_M
+    figures = [
+        pl.len().cast(pl.Int64).alias("judged"),
+        pl.col("branch_probability").mean().alias("probability_mean"),
+        (1.0 - wrong.mean()).alias("right_share"),
+        wrong.sum().cast(pl.Int64).alias("wrong_places"),
+        pl.col("block").n_unique().cast(pl.Int64).alias("blocks"),
+        pl.col("block").filter(wrong).n_unique().cast(pl.Int64).alias("wrong_blocks"),
+    ]
+    ranked = judged.with_columns(rank=rank)
+    tables = [
+        ranked.group_by([*KEYS, "rank"], maintain_order=True).agg(figures),
+        ranked.with_columns(rank=pl.lit(len(names), pl.Int64))
+        .group_by([*KEYS, "rank"], maintain_order=True)
+        .agg(figures),
+    ]
+    table = pl.concat(tables).with_columns(probability=pl.col("rank").replace_strict(dict(enumerate([*names, ALL]))))
+    return table.sort(*KEYS, "rank", maintain_order=True).select(*KEYS, *BRANCH_COLUMNS)
+
+
+#: Columns of the table of levels beside its keys, with their unit and meaning.
+LEVEL_COLUMNS: Final[dict[str, str]] = {
+    "level": "column of the level",
+    "position": "`constrained` or `constrained_ok`",
+    "observed": "epochs with observations and reference",
+    "positions": "epochs with a position",
+    "infinite": "positions with an infinite level",
+    "with_level": "positions with a finite level",
+    "level_share": "share of `observed` with a finite level",
+    "level_p50_m": "finite levels",
+    "level_p95_m": "finite levels",
+    "errors": "finite levels with an error",
+    "over_level": "errors above their level",
+    "over_level_share": "over_level / errors",
+}
+
+
+def level_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame | None:
+    """Counts of every protection level of the epochs, by the values of some columns; None where a run has none."""
+    tables = []
+    for level in level_columns(epochs):
+        if epochs[level].null_count() == len(epochs):
+            continue
+        # runs without this level, such as the filter along the track, have no row
+        columns = ("run", *by, "status", "observed", "in_reference", "reference_good", "positioned", "error_m", level)
+        spanned = epochs.select(*dict.fromkeys(columns)).filter(
+            "in_reference", pl.col(level).is_not_null().any().over("run")
+        )
+        for position in ("constrained", "constrained_ok"):
+            has = positioned(position)
+            tables.append(
+                spanned.with_columns(has=has, finite=has & pl.col(level).is_finite().fill_null(value=False))
+                .group_by(by, maintain_order=True)
+                .agg(_counts(level))
+                .with_columns(
+                    level=pl.lit(level),
+                    position=pl.lit(position),
+                    level_share=pl.when(pl.col("observed") > 0).then(pl.col("observed_level") / pl.col("observed")),
+                    over_level_share=pl.when(pl.col("errors") > 0).then(pl.col("over_level") / pl.col("errors")),
+                )
+                .select(*by, *LEVEL_COLUMNS)
+            )
+    return pl.concat(tables) if tables else None
+
+
+def _counts(level: str) -> list[pl.Expr]:
+    value, has, finite = pl.col(level), pl.col("has"), pl.col("finite")
+    judged = finite & pl.col("reference_good")
+    counts = {
+        "observed": pl.col("observed"),
+        "positions": has,
+        "infinite": has & value.is_infinite(),
+        "with_level": finite,
+        "observed_level": finite & pl.col("observed"),
+        "errors": judged,
+        "over_level": judged & (pl.col("error_m").abs() > value),
+    }
+    return [
+        *(expression.sum().cast(pl.Int64).alias(name) for name, expression in counts.items()),
+        value.filter(finite).median().alias("level_p50_m"),
+        value.filter(finite).quantile(0.95, "linear").alias("level_p95_m"),
+    ]

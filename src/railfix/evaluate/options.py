@@ -1,15 +1,20 @@
-"""Settings of an evaluation."""
+"""Settings of an evaluation, and sections of the line by chainage with what surrounds the train there."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Final, Literal, TypeVar
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
+from railfix.core.arrays import Floats, Strings
+from railfix.core.errors import InputFileError
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.evaluate.bracket import LARGEST_GAP_S
+from railfix.io.named_columns import read_named_columns
 from railfix.run.options import ColumnNames
 
 Method = Literal["chainage", "trajectory"]
@@ -122,3 +127,65 @@ class EvaluationOptions(Settings):
     replicates: int = Field(default=1000, ge=1)
     seed: int = option("Seed of the random numbers of the confidence limits.", 0, metavar="N", ge=0)
     confidence: float = Field(default=0.95, gt=0.0, lt=1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sections:
+    """S stretches of the line, rising, none over another.
+
+    Attributes
+    ----------
+    path : Path
+    from_m, to_m : ndarray, shape (S,) [m]
+        Chainage; the end belongs to the next one.
+    environment : tuple of str
+    """
+
+    path: Path
+    from_m: Floats
+    to_m: Floats
+    environment: tuple[str, ...]
+
+    def at(self, chainage_m: Floats) -> Strings:
+        """Environment at chainages, shape (T,); blank outside every section and for NaN."""
+        words = np.array([*self.environment, ""])
+        index = np.searchsorted(self.from_m, chainage_m, side="right") - 1
+        safe = np.maximum(index, 0)
+        last = (safe == len(self.to_m) - 1) & (chainage_m == self.to_m[-1])
+        inside = (index >= 0) & ((chainage_m < self.to_m[safe]) | last)
+        return np.asarray(words[np.where(inside, safe, len(words) - 1)])
+
+
+def read_sections(path: Path) -> Sections:
+    """Read ``from_m,to_m,environment``.
+
+    Raises
+    ------
+    InputFileError
+        No such table, a section without length or name, or one that overlaps another.
+    """
+    table = read_named_columns(path)
+    for name in ("from_m", "to_m", "environment"):
+        if name not in table:
+            raise InputFileError(
+                path, f"has no column {name}; from_m, to_m and environment are needed", line=table.header_line
+            )
+    if not len(table):
+        raise InputFileError(path, "has no section below the header")
+    first, last = table.numbers("from_m"), table.numbers("to_m")
+    for row, name in enumerate(table.cells["environment"]):
+        if not name:
+            raise table.error(row, "the environment is empty; expected a word such as open or tunnel")
+        if not first[row] < last[row]:
+            raise table.error(row, f"from_m {first[row]:g} is not below to_m {last[row]:g}; mend the section")
+    order = np.argsort(first, kind="stable")
+    over = np.flatnonzero(first[order][1:] < last[order][:-1] - 1e-6)
+    if len(over):
+        row = int(order[over[0] + 1])
+        raise table.error(row, f"the section from {first[row]:g} m begins inside another one; make them disjoint")
+    return Sections(
+        path=path,
+        from_m=first[order],
+        to_m=last[order],
+        environment=tuple(table.cells["environment"].gather(order)),
+    )

@@ -11,14 +11,11 @@ from typing import Any, Final
 import polars as pl
 
 from railfix import __version__
-from railfix.evaluate.branches import BRANCH_COLUMNS
 from railfix.evaluate.epochs import EPOCH_COLUMNS
 from railfix.evaluate.evaluation import Evaluation
 from railfix.evaluate.figures import FIGURE_COLUMNS
 from railfix.evaluate.integrity import BEYOND_COLUMNS, STANFORD_COLUMNS
-from railfix.evaluate.intervals import INTERVAL_COLUMNS
-from railfix.evaluate.levels import LEVEL_COLUMNS
-from railfix.evaluate.outages import OUTAGE_COLUMNS
+from railfix.evaluate.intervals import BRANCH_COLUMNS, INTERVAL_COLUMNS, LEVEL_COLUMNS, OUTAGE_COLUMNS
 from railfix.run.output import OutputFolder
 
 #: What P1 found (3.3, table 4; 5, figures 10 to 12), for comparison where it is asked for.

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Strings, freeze_arrays
-from railfix.core.display import NotebookTable, plural, time_span_text
+from railfix.core.tables import NotebookTable, plural, time_span_text
 
 
 def _records_text(satellite: Strings, toe: Datetimes) -> str:

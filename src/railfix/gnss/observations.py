@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, freeze_arrays
-from railfix.core.display import NotebookTable, plural, time_span_text
+from railfix.core.tables import NotebookTable, plural, time_span_text
 
 #: Largest number of messages about single faults; further faults are only counted.
 MAX_PROBLEMS: Final = 50

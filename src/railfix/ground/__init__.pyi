@@ -1,6 +1,5 @@
 # The names of `railfix.ground`, imported at their first use (lazy-loader).
 
-from .authority import Authority
 from .centre import CentreLimits, TrainRecord, TrainState, report_received, time_passed
 from .interlocking import (
     Interlocking,
@@ -13,7 +12,7 @@ from .interlocking import (
 )
 from .layout import Layout, LoopStation
 from .monitor import MonitorLimits, MonitorState, advance, release
-from .on_board import OnBoard, OnBoardLimits
+from .on_board import Authority, OnBoard, OnBoardLimits
 from .reference_curve import ReferenceCurve
 from .station_fixes import StationFixes, station_fixes
 from .supervision import Supervision

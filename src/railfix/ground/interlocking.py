@@ -2,8 +2,8 @@
 
 A pure state machine. Occupied by a train is the interval from its last safe rear end to the end of its authority.
 Authorities are extended up to the nearest of: another train's interval, points that are not locked and detected for
-the train, the end of its route; less a margin. They are shortened by agreement alone (`railfix.ground.shortening`);
-reports move the intervals (`railfix.ground.reports`).
+the train, the end of its route; less a margin. They are shortened by agreement alone (`railfix.ground.stops`);
+reports move the intervals (`railfix.ground.plausibility`).
 It is not a national rule book: no shunting, no overlaps behind signals, no level crossings, no degraded working by
 hand.
 """

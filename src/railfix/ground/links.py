@@ -13,9 +13,8 @@ from typing import Literal, NamedTuple
 
 from railfix.core.errors import InputFileError
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
-from railfix.ground.keys import read_revoked
 from railfix.ground.link_quality import LinkChoice, LinkLimits, LinkMeter, LinkName
-from railfix.ground.quic import WAIT_S, LinkProtocol, configuration, connected, listen
+from railfix.ground.quic import WAIT_S, LinkProtocol, configuration, connected, listen, read_revoked
 
 #: Identity of the centre as a sender of frames.
 CENTRE = 0
@@ -44,7 +43,7 @@ def bearers_of(addresses: dict[LinkName, tuple[str, int]], local: dict[LinkName,
 class TrainLinks:
     """The train's end: two connections, one on each bearer.
 
-    With the keys of `railfix.ground.keys.write_keys`; `received` is called with the payload of each new frame of the
+    With the keys of `railfix.ground.quic.write_keys`; `received` is called with the payload of each new frame of the
     centre.
     """
 

@@ -26,14 +26,13 @@ from railfix.ground.centre import CentreLimits
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import InterlockingLimits, TrainInterval
 from railfix.ground.interlocking_text import HEAD
-from railfix.ground.keys import check_keys
-from railfix.ground.layout import Layout, LoopStation, PointName
-from railfix.ground.layout_network import layout_of
+from railfix.ground.layout import Layout, LoopStation, PointName, layout_of
 from railfix.ground.link_quality import LinkName
 from railfix.ground.links import BEARERS, CentreLinks
 from railfix.ground.monitor import MonitorLimits
+from railfix.ground.quic import check_keys
 from railfix.ground.reference_curve import ReferenceCurve
-from railfix.ground.station_streams import stream_fixes
+from railfix.ground.station_fixes import stream_fixes
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.ground.triangle import TriangleLimits, TriangleVerdict, compare_triangle
@@ -124,7 +123,7 @@ class CentreFile(Settings):
     stations : tuple of LoopStation
         The line; or else
     network : tuple of Path
-        Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout_network`).
+        Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout`).
     drive : {"left", "right"}
         Side on which trains pass a station of the network.
     trains : tuple of TrainPlace

@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from railfix.ground.authority import Authority
 from railfix.ground.centre import CentreLimits, Rejection, TrainRecord
 from railfix.ground.centre import report_received as record_received
 from railfix.ground.interlocking import (
@@ -28,9 +27,9 @@ from railfix.ground.interlocking import (
     stopped_trains,
 )
 from railfix.ground.layout import Layout, PointName
-from railfix.ground.reports import report_received
-from railfix.ground.shortening import answer_received, ask_route_back
-from railfix.ground.stops import overlaps_stopped
+from railfix.ground.on_board import Authority
+from railfix.ground.plausibility import report_received
+from railfix.ground.stops import answer_received, ask_route_back, overlaps_stopped
 from railfix.io.train_message import TrainMessage
 
 #: A train within this distance of the end of its track asks for the next route [m].

@@ -7,10 +7,9 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from railfix.ground.authority import Authority
 from railfix.ground.interlocking import TrainInterval
 from railfix.ground.layout import Layout, LoopStation, PointName, overlap
-from railfix.ground.on_board import OnBoard
+from railfix.ground.on_board import Authority, OnBoard
 from railfix.ground.supervision import Supervision, standing_train
 from railfix.io.train_message import MessageStatus, TrainMessage
 

@@ -12,11 +12,10 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
-from railfix.ground.authority import Authority
-from railfix.ground.keys import check_keys
 from railfix.ground.link_quality import LinkName
 from railfix.ground.links import Bearer, TrainLinks, first_sequence
-from railfix.ground.on_board import OnBoard, OnBoardLimits
+from railfix.ground.on_board import Authority, OnBoard, OnBoardLimits
+from railfix.ground.quic import check_keys
 from railfix.io.train_message import MessageError, TrainMessage, encode, from_json
 
 #: Time between two reports, and between two looks at the age of the authority [s].

@@ -21,7 +21,7 @@ from railfix.core.mate import mate_table
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io import rinex
-from railfix.io.receiver.recognise import head_of, is_receiver_log
+from railfix.io.receiver.framing import head_of, is_receiver_log
 from railfix.io.rinex.observations import (
     DEFAULT_EPOCHS,
     in_pieces,

@@ -14,7 +14,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import ending, read_text
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.core.spelling import misspelt
+from railfix.core.settings import misspelt
 from railfix.core.timescale import from_week, timedelta, utc_to_gpst
 from railfix.io.named_columns import NamedColumns, read_named_columns
 

@@ -10,7 +10,7 @@ from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import inner, kernel
 
 _U = np.uint64
-#: As in `railfix.io.rinex.observations_fields`.
+#: As in `railfix.io.rinex.observations_decode`.
 _WIDTH, _TAIL_WRONG, _BLANK, _ZERO = 16, np.uint8(255), np.uint8(32), np.uint8(48)
 _BLANKS, _ZEROS, _ZEROS_POINT = _U(0x2020202020202020), _U(0x3030303030303030), _U(0x30303030302E3030)
 _NOT_A_DIGIT, _MINUS, _BYTE, _ONE, _NONE = _U(0x1010101010101010), _U(0x0D0D0D0D0D0D0D0D), _U(0xFF), _U(1), _U(0)

@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from railfix.io.receiver.framing import head_of, is_receiver_log
 from railfix.io.receiver.log import StreamState
-from railfix.io.receiver.recognise import head_of, is_receiver_log
 from railfix.io.rinex import scan_observations
 from railfix.live.settings import LiveSettings
 from railfix.live.sources import Connected, Lost, Place, is_file, read_source

@@ -11,11 +11,11 @@ from railfix.core.arrays import Bytes, Indices
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.receiver import rtcm, sbf, ubx
+from railfix.io.receiver.bits import SbasFrames
 from railfix.io.receiver.ephemerides import navigation_of
 from railfix.io.receiver.framing import find_frames
 from railfix.io.receiver.log import StreamState, at_station, decode
 from railfix.io.receiver.measurements import Tracking, observations_of
-from railfix.io.receiver.subframes import SbasFrames
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -201,18 +201,15 @@ class MotionSamples(NamedTuple):
 
     Attributes
     ----------
-    time_s : ndarray, shape (N,) [s]
-        Rising.
+    time_s, force_mps2 : ndarray, shape (N,) [s], [m/s2]
+        Rising; specific force along the vehicle.
     wheel_mps, wheel_mps2 : ndarray, shape (N,) [m/s], [m/s2]
         Speed of the wheel at the samples, and its acceleration; NaN where pulses say nothing.
-    force_mps2 : ndarray, shape (N,) [m/s2]
-        Specific force along the vehicle.
     line_sine : ndarray, shape (N,)
         Sine of the line's gradient at the vehicle, + up forward; NaN where it is not known.
     body : ndarray, shape (N, 3), optional [m/s2, rad/s, rad/s]
         Specific force to the right, pitch rate and yaw rate of the body, for the rate of the pitch
-        (`pitch_rate_radps`) at the speed carried through a slip: that of the wheel would lean the body. NaN where
-        there is none.
+        (`pitch_rate_radps`) at the speed carried through a slip: that of the wheel would lean the body; NaN for none.
     since_pulse_s : ndarray, shape (N,), optional [s]
         Time since the last pulse: a vehicle that creeps has pulses without a speed. Without it that of the last speed.
     """

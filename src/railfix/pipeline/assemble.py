@@ -13,9 +13,8 @@ from railfix.core.reasons import CHECK_FAILED, POSITIONED, Status
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.level_stage import judged
-from railfix.pipeline.reason_table import reason_of_all_channels, satellites_rejected
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.solution import Solution
+from railfix.pipeline.solution import Solution, reason_of_all_channels, satellites_rejected
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.track.track import interpolate_kilometrage
 from railfix.track.trajectory import Trajectory

@@ -33,11 +33,10 @@ from railfix.integrity.protection.araim import AraimBudget
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.positioning.carrier import ContinuityLimits, CycleSlipLimits, PhaseLimits, SmoothingLimits
 from railfix.positioning.constrained import ConstrainedLimits
+from railfix.positioning.forgetting import LastingErrorLimits
 from railfix.positioning.intersystem_bias import ClockOffsetLimits
 from railfix.positioning.map_offset import MapOffsetLimits
-from railfix.positioning.noise_scale import NoiseScaleLimits
-from railfix.positioning.residual_means import LastingErrorLimits
-from railfix.positioning.robust_fit import RobustFitLimits
+from railfix.positioning.noise_scale import NoiseScaleLimits, RobustFitLimits
 from railfix.positioning.section_search import SectionLimits
 from railfix.positioning.single_point import SinglePointLimits
 from railfix.positioning.two_frequencies import TwoFrequencyLimits

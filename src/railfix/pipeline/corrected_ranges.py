@@ -13,7 +13,7 @@ from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, changed
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states
-from railfix.integrity.protection.support import IntegritySupport
+from railfix.integrity.protection.araim import IntegritySupport
 from railfix.pipeline.channels import Channels
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received
@@ -24,11 +24,11 @@ from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.section_search import SearchIndex, search
 from railfix.positioning.single_point import SinglePointLimits, single_point
 from railfix.positioning.two_frequencies import Combined, SecondCodes
-from railfix.ranges.atmospheric_delays import SeenFrom, modelled_delays
+from railfix.ranges.atmosphere import SeenFrom, modelled_delays
 from railfix.ranges.base_station import BaseDifferences
 from railfix.ranges.cn0_curve import Cn0Curve
+from railfix.ranges.corrected import SBAS_SIGNAL, corrected_satellites, sbas_delays
 from railfix.ranges.error_model import Conditions, ErrorModel
-from railfix.ranges.sbas_delays import SBAS_SIGNAL, corrected_satellites, sbas_delays
 from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m, first_available
 from railfix.screens import AntennaRanges, Screened, Verdict, suspicion_sigma_m
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Masks
-from railfix.core.display import NotebookTable, median_text, plural, time_span_text
+from railfix.core.tables import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import Suspicion, WheelSigns, WheelState
 from railfix.pipeline.passings import Passing, PassingState
@@ -62,7 +62,7 @@ class SingleEpochs:
     near_ecef_m : ndarray, shape (T, 3) [m]
         3-D position without the line.
     off_map : ndarray of bool
-        The train is away from the line: `railfix.pipeline.off_map`.
+        The train is away from the line: `railfix.pipeline.return_gate`.
     map_offset : ndarray of bool
         3-D positions of the last minutes lie beside or above the line.
     spoofed : ndarray of bool

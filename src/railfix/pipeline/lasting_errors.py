@@ -20,9 +20,8 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.solve import Place, line_model, redundancy_of, solved_again
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.forgetting import ages, decayed_sums, steps_s
+from railfix.positioning.forgetting import LastingErrorState, ages, decayed_sums, steps_s
 from railfix.positioning.normal_equations import Ranges
-from railfix.positioning.residual_means import LastingErrorState
 from railfix.positioning.section_search import SearchIndex
 
 #: Below this share of its own error in its residual a range tells nothing of it.

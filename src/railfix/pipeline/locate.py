@@ -15,10 +15,10 @@ from railfix.pipeline.channels import ChannelBook, Channels
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import ANCHOR_SIGMA_M, usable_ranges, without
 from railfix.pipeline.received import Received
+from railfix.positioning.noise_scale import robust_fit
 from railfix.positioning.normal_equations import Ranges
-from railfix.positioning.robust_fit import robust_fit
 from railfix.positioning.single_point import single_point
-from railfix.ranges.atmospheric_delays import SeenFrom, modelled_delays
+from railfix.ranges.atmosphere import SeenFrom, modelled_delays
 from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m, first_available
 
 _EARTH_RADIUS_M: Final = 6.371e6

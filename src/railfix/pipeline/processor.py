@@ -20,18 +20,17 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import along_track, checked, with_passings
-from railfix.pipeline.antenna_order import AntennaOrder
-from railfix.pipeline.araim_stage import with_araim
 from railfix.pipeline.assemble import antenna_results, with_coordinates
 from railfix.pipeline.base_station import BaseStation, Stations, check_base
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
-from railfix.pipeline.compared import filter_verdicts, judge_pairs, position_verdicts, with_screens
+from railfix.pipeline.compared import AntennaOrder, filter_verdicts, judge_pairs, position_verdicts, with_screens
 from railfix.pipeline.config import SCREEN_NAMES, Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, Models, conditions_of, correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
 from railfix.pipeline.filter_result import AlongTrack, FilterState, single_epochs
 from railfix.pipeline.interference_stage import judge_interference, with_wheel
+from railfix.pipeline.level_stage import with_araim
 from railfix.pipeline.received import Received, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
 from railfix.pipeline.second_codes import combined

@@ -17,10 +17,10 @@ from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
 from railfix.pipeline.along_track import innovations
 from railfix.pipeline.columns import Column, by_name
-from railfix.pipeline.conventional import PointStatus
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.level_stage import BASES, KINDS
 from railfix.pipeline.results import AntennaResult
+from railfix.pipeline.solve import PointStatus
 from railfix.positioning.two_frequencies import Combined, SecondCodes
 from railfix.screens import SCREENS, ScreenColumn
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Masks, Strings
-from railfix.core.display import NotebookTable, html_list, html_table, median_text, plural, time_span_text
 from railfix.core.reasons import Status
+from railfix.core.tables import NotebookTable, html_list, html_table, median_text, plural, time_span_text
 from railfix.gnss.orbits import SatelliteStates
 from railfix.integrity.protection import ProtectionLevel
 from railfix.integrity.protection.araim import AraimResult
@@ -19,14 +19,14 @@ from railfix.pipeline.base_station import BaseState
 from railfix.pipeline.carrier_stage import CarrierState
 from railfix.pipeline.filter_result import AlongTrack, FilterState
 from railfix.pipeline.interference_stage import Interference, InterferenceState
-from railfix.pipeline.off_map import OffMapState
 from railfix.pipeline.received import Received
+from railfix.pipeline.return_gate import OffMapState
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.constrained import Constrained
+from railfix.positioning.forgetting import LastingErrorState
 from railfix.positioning.intersystem_bias import OffsetState
 from railfix.positioning.map_offset import MapOffset, MapOffsetState
 from railfix.positioning.noise_scale import NoiseState
-from railfix.positioning.residual_means import LastingErrorState
 from railfix.positioning.section_search import Section
 from railfix.positioning.single_point import SinglePoint
 from railfix.positioning.two_frequencies import Combined, SecondCodes, TwoFrequencyState
@@ -190,7 +190,7 @@ class AntennaResult(NotebookTable):
     n_used, n_rejected : ndarray of int, shape (T,)
         Satellites used; satellites with a code that were not used.
     conventional_status : ndarray of int8, shape (T,)
-        `railfix.pipeline.conventional.PointStatus` of the conventional position, which is kept as it is.
+        `railfix.pipeline.solve.PointStatus` of the conventional position, which is kept as it is.
     conventional_ecef_m : ndarray, shape (T, 3) [m]
         3-D single point from the same ranges.
     conventional_arc_m, conventional_chainage_m, conventional_offset_m : ndarray, shape (T,) [m]

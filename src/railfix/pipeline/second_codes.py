@@ -14,7 +14,7 @@ from railfix.core.reasons import Reason
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates
-from railfix.gnss.orbits.signal_health import group_delay_s, group_delay_sigma_m, unhealthy
+from railfix.gnss.orbits.prepared_records import group_delay_s, group_delay_sigma_m, unhealthy
 from railfix.positioning.two_frequencies import SecondCodes, TwoFrequencyState, combine_codes
 from railfix.ranges.atmosphere import thin_shell_obliquity
 from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m

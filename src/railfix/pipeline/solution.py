@@ -9,40 +9,77 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import chdtri, expit
 
-from railfix.core.arrays import Codes, Floats, Masks, changed
+from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, changed
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
 from railfix.integrity.protection.araim import AraimResult
 from railfix.integrity.raim import LinearModel
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
-from railfix.pipeline.conventional import validate_point
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
 from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.lasting_errors import lasting_errors
 from railfix.pipeline.level_stage import bounding_model, low_sides, protection_levels, unresolved_alternatives
-from railfix.pipeline.off_map import OffMapState, off_map_epochs
-from railfix.pipeline.reason_table import alone_on_their_clocks
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
-from railfix.pipeline.solve import Place, line_model, place_on_line, redundancy_of
+from railfix.pipeline.return_gate import OffMapState, off_map_epochs
+from railfix.pipeline.solve import Place, line_model, place_on_line, redundancy_of, validate_point
 from railfix.positioning.antenna_rows import AntennaRows, rows_of
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.constrained import constrained_position
 from railfix.positioning.intersystem_bias import tie_clocks
-from railfix.positioning.map_offset import LinePositions, MapOffset, RangeErrors, beyond_threshold, map_offset
+from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
 from railfix.positioning.noise_scale import (
     NoiseState,
+    RobustFit,
     epoch_variance,
+    map_information,
     noise_age,
     own_sigma_m,
+    robust_fit,
     robust_scale,
     stated_scale,
 )
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, fit
-from railfix.positioning.robust_fit import RobustFit, map_information, robust_fit
 from railfix.positioning.section_search import SearchIndex
 from railfix.positioning.single_point import SinglePoint, single_point
+
+
+def reason_of_all_channels(corrected: CorrectedRanges) -> Bits:
+    """Return the reasons of all channels of the observations, shape (T, M)."""
+    not_observed = ~np.isfinite(corrected.observations.code_m) * np.int64(Reason.NOT_OBSERVED)
+    reason = np.asarray(not_observed | corrected.channels.left_out)
+    reason[:, corrected.columns] = corrected.reason
+    second, found = corrected.second, corrected.combined
+    if second is not None and found is not None:
+        epoch, channel = np.nonzero(np.isfinite(found.share))
+        reason[epoch, second.column[epoch, channel]] = corrected.reason[epoch, channel]
+    return reason
+
+
+def alone_on_their_clocks(corrected: CorrectedRanges, ties: ClockTies) -> Masks:
+    """Return the satellites that are the only ones of a clock without a known bias, shape (T, K)."""
+    alone = np.zeros(corrected.reason.shape, dtype=bool)
+    for g, group in enumerate(corrected.groups):
+        used = corrected.reason[:, group] == 0
+        lone = (np.count_nonzero(used, axis=1) == 1) & (ties.sigma_m[:, g] >= UNTIED_M)
+        alone[:, group] = used & lone[:, None]
+    return alone
+
+
+def satellites_rejected(member: Integers, reason: Bits) -> Integers:
+    """Return the number of satellites with a code of which no signal was used, shape (T,).
+
+    Parameters
+    ----------
+    member : ndarray of int64, shape (M, S)
+        `Channels.member`.
+    reason : ndarray of int64, shape (T, M)
+    """
+    of_satellite = member.astype(np.float32)  # small counts are exact, and floats are multiplied in blocks
+    seen = ((reason & Reason.NOT_OBSERVED) == 0).astype(np.float32) @ of_satellite > 0
+    used = (reason == 0).astype(np.float32) @ of_satellite > 0
+    return np.asarray(np.count_nonzero(seen & ~used, axis=1), dtype=np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +91,7 @@ class Solution:
     point : SinglePoint
         Conventional position: every constellation with a clock of its own.
     point_status : ndarray of int8, shape (T,)
-        `railfix.pipeline.conventional.PointStatus`.
+        `railfix.pipeline.solve.PointStatus`.
     place : Place
         Positions from the codes, after exclusions.
     ties : ClockTies
@@ -69,11 +106,11 @@ class Solution:
     protection : ProtectionResult or None
     map_offset : MapOffset
     off_map : ndarray of bool, shape (T,)
-        The train is away from the line: `railfix.pipeline.off_map`.
+        The train is away from the line: `railfix.pipeline.return_gate`.
     interference : Interference or None
         Of `railfix.pipeline.interference_stage`, which comes after; None where it is off.
     araim : AraimResult or None
-        Of `railfix.pipeline.araim_stage`, which comes after; None without an integrity support message.
+        Of `railfix.pipeline.level_stage`, which comes after; None without an integrity support message.
     """
 
     point: SinglePoint
@@ -156,7 +193,7 @@ def solve(
 
     away, off_map_states = antennas.each_with_state(own_absence, states)
     offset, map_states = map_offset(
-        time, agreeing, free, RangeErrors(corrected.nominal_m, np.maximum(scale, 1.0) ** 2), antennas,
+        time, agreeing, free, OffsetErrors(corrected.nominal_m, np.maximum(scale, 1.0) ** 2), antennas,
         LinePositions(constrained.arc_m, away), [state.map_offset for state in states], limits=config.map_offset,
     )  # fmt: skip
     model = line_model(ranges, antennas, constrained)

@@ -140,7 +140,7 @@ class MapOffset:
         return np.where(known, across, 0.0), np.where(known, up, 0.0)
 
 
-class RangeErrors(NamedTuple):
+class OffsetErrors(NamedTuple):
     """Errors of the ranges of T epochs.
 
     Attributes
@@ -175,7 +175,7 @@ def map_offset(
     time: Datetimes,
     ranges: Ranges,
     point: SinglePoint,
-    errors: RangeErrors,
+    errors: OffsetErrors,
     antennas: AntennaRows,
     positions: LinePositions,
     states: Sequence[MapOffsetState],
@@ -191,7 +191,7 @@ def map_offset(
         What the 3-D positions were solved with: ranges that agree with each other.
     point : SinglePoint
         3-D positions.
-    errors : RangeErrors
+    errors : OffsetErrors
     antennas : AntennaRows
     positions : LinePositions
     states : sequence of MapOffsetState
@@ -269,7 +269,7 @@ def terms_of_epochs(
     ranges
         As for `map_offset`.
     nominal_m, variance
-        Of `RangeErrors`; `nominal_m` in C order.
+        Of `OffsetErrors`; `nominal_m` in C order.
     ecef_m, covariance_m2 : ndarray, shapes (T, 3) [m], (T, 3, 3) [m^2]
         3-D positions.
     place_ecef_m : ndarray, shape (T, 3) [m]

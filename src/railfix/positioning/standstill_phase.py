@@ -4,6 +4,9 @@ Double differences of the phases have integer ambiguities that stay the same whi
 the place is known across but for the error of the map, so that the phases of all satellites together have few
 unknowns, and integers that fit them exist near the true place alone (P1 2.5: carrier phase gives centimetres, at
 rest time may be taken). Each satellite's phase has a constant error, which does not average out.
+
+LAMBDA: decorrelation by integer transformations and a search in a shrinking ellipsoid (Teunissen 1995,
+doi:10.1007/BF00863419; Chang, Yang & Zhou 2005, doi:10.1007/s00190-005-0004-x).
 """
 
 from __future__ import annotations
@@ -16,8 +19,129 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import logsumexp
 
-from railfix.core.arrays import Floats
-from railfix.positioning.integer_search import IntegerSearch
+from railfix.core.arrays import Floats, Integers
+
+#: Vectors whose square exceeds the least by more are not looked for: exp(-20) of its likelihood.
+_WITHIN: Final = 40.0
+#: Exchange of two unknowns must shrink the conditional variance by more than rounding.
+_ROUNDING: Final = 1e-9
+
+
+class IntegerSearch:
+    """Search for integer vectors near real ones that have the same covariance.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (n, n) [cycle^2]
+        Positive definite.
+    """
+
+    def __init__(self, covariance: Floats) -> None:
+        lower, variance = _lower_factor(covariance)
+        #: Transformed unknowns are `transform.T @ N`; their covariance is `lower.T @ diag(variance) @ lower`.
+        self._transform, self._lower, self._variance = _decorrelate(lower, variance)
+        self._back = np.round(np.linalg.inv(self._transform)).astype(np.int64)
+
+    def nearest(self, cycles: Floats, count: int, *, below: float = np.inf) -> tuple[Integers, Floats]:
+        """The nearest integer vectors, nearest first.
+
+        Parameters
+        ----------
+        cycles : ndarray, shape (n,)
+        count : int
+        below : float
+            Vectors of larger squares are left out.
+
+        Returns
+        -------
+        integers : ndarray of int, shape (m, n)
+            At most `count`, of squares near the least; none where all squares are larger.
+        squares : ndarray, shape (m,)
+            ``(N - cycles)' inv(covariance) (N - cycles)``.
+        """
+        integers, squares = _search(cycles @ self._transform, self._lower, self._variance, count, below)
+        return integers @ self._back, squares
+
+
+def _lower_factor(covariance: Floats) -> tuple[Floats, Floats]:
+    """Unit lower triangular L and variances d with covariance = L' diag(d) L."""
+    upper = np.linalg.cholesky(covariance[::-1, ::-1])[::-1, ::-1].T
+    diagonal = np.diag(upper)
+    return np.asarray(upper / diagonal[:, None]), np.asarray(diagonal**2)
+
+
+def _decorrelate(lower: Floats, variance: Floats) -> tuple[Integers, Floats, Floats]:
+    """Integer transformation that makes the unknowns nearly uncorrelated, ordered by falling precision."""
+    n = len(variance)
+    lower, variance, transform = lower.copy(), variance.copy(), np.eye(n, dtype=np.int64)
+    rounded_to = n - 2
+    k = n - 2
+    while k >= 0:
+        if k <= rounded_to:
+            for i in range(k + 1, n):
+                step = round(float(lower[i, k]))
+                if step:
+                    lower[i:, k] -= step * lower[i:, i]
+                    transform[:, k] -= step * transform[:, i]
+        new = variance[k] + lower[k + 1, k] ** 2 * variance[k + 1]
+        if new < variance[k + 1] * (1.0 - _ROUNDING):
+            _exchange(lower, variance, transform, k, float(new))
+            rounded_to, k = k, n - 2
+        else:
+            k -= 1
+    return transform, lower, variance
+
+
+def _exchange(lower: Floats, variance: Floats, transform: Integers, k: int, new: float) -> None:
+    """Exchange unknowns k and k + 1 in place; `new` is the conditional variance of the latter then."""
+    share, slope = variance[k] / new, variance[k + 1] * lower[k + 1, k] / new
+    variance[k], variance[k + 1] = share * variance[k + 1], new
+    above, below = lower[k, :k].copy(), lower[k + 1, :k].copy()
+    lower[k, :k] = below - lower[k + 1, k] * above
+    lower[k + 1, :k] = share * above + slope * below
+    lower[k + 1, k] = slope
+    lower[k + 2 :, [k, k + 1]] = lower[k + 2 :, [k + 1, k]]
+    transform[:, [k, k + 1]] = transform[:, [k + 1, k]]
+
+
+def _search(cycles: Floats, lower: Floats, variance: Floats, count: int, below: float) -> tuple[Integers, Floats]:
+    """Nearest integer vectors of decorrelated unknowns, depth first from the last one."""
+    n = len(variance)
+    # plain floats: the search goes one unknown at a time
+    start, weight = cycles.tolist(), (1.0 / variance).tolist()
+    conditional, chosen, steps, sums = [0.0] * n, [0.0] * n, [0.0] * n, [0.0] * (n + 1)
+    shifts = np.zeros((n + 1, n))
+    found: list[tuple[float, list[float]]] = []
+    limit, k, descending = below, n - 1, True
+    while True:
+        if descending:
+            conditional[k] = start[k] + float(shifts[k + 1, k])
+            chosen[k] = float(round(conditional[k]))
+            steps[k] = 1.0 if conditional[k] >= chosen[k] else -1.0
+        miss = conditional[k] - chosen[k]
+        square = sums[k + 1] + miss * miss * weight[k]
+        if square < limit and k > 0:
+            sums[k] = square
+            np.subtract(shifts[k + 1, :k], miss * lower[k, :k], out=shifts[k, :k])
+            k, descending = k - 1, True
+            continue
+        if square < limit:
+            found.append((square, chosen.copy()))
+            found.sort()
+            del found[count:]
+            limit = min(found[-1][0] if len(found) == count else below, found[0][0] + _WITHIN)
+        else:
+            k += 1
+            if k == n:
+                break
+        # the next nearest integer of this unknown
+        chosen[k] += steps[k]
+        steps[k] = -steps[k] - (1.0 if steps[k] > 0.0 else -1.0)
+        descending = False
+    kept = [item for item in found if item[0] <= limit]
+    integers = np.array([vector for _, vector in kept]).reshape(-1, n).astype(np.int64)
+    return integers, np.array([square for square, _ in kept])
+
 
 #: Integer vectors summed over at most; those that add less than this (logarithm) to uniform phases are left out.
 _VECTORS: Final = 20

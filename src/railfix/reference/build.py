@@ -25,6 +25,7 @@ from railfix.motion.wheel import Wheel, wheel_of
 from railfix.positioning.doppler_speed import Dopplers, DopplerSpeed, doppler_speed
 from railfix.reference.assemble import Built, assembled
 from railfix.reference.fixes import Fixes, judge_alone, judge_pair, judge_place, judge_travel
+from railfix.reference.matching import LONGEST_STEP_S, Speeds, fused, instants, nearest
 from railfix.reference.settings import ReferenceSettings
 from railfix.reference.smoother import (
     WINDOWS,
@@ -36,7 +37,6 @@ from railfix.reference.smoother import (
     slip_m,
     smooth,
 )
-from railfix.reference.ways import LONGEST_STEP_S, Speeds, fused, instants, nearest
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
 #: Rounds of Dopplers and smoother; the first starts from an even run between the fixes.

@@ -12,17 +12,16 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
-from railfix.core.display import plural
 from railfix.core.errors import RailfixError
 from railfix.core.files import write_whole
-from railfix.core.tables import Column, Table, count, listing, number, percent, signed
+from railfix.core.tables import Column, Table, count, listing, number, percent, plural, signed
 from railfix.evaluate import RunAndReference, evaluate_runs
 from railfix.evaluate.run_folder import POSITIONS_TABLE, floats, read_table, tables_of
 from railfix.report.charts_page import charts_page
-from railfix.report.content import Block, Notes, Sentence
 from railfix.report.explain import explain_epoch, time_text, write_explanation
 from railfix.report.plots.campaign import campaign_bars, campaign_plan
 from railfix.report.plots.chart import Chart
+from railfix.report.tables import Block, Notes, Sentence
 
 #: Epochs that are listed, one at most in so many seconds of a run [s]; pieces of the line that each run is drawn in.
 _WORST: Final = 10

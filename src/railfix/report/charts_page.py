@@ -13,9 +13,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from railfix import __version__
-from railfix.report.content import Block
 from railfix.report.encode import chart_values, script_json, sky_values
 from railfix.report.plots.chart import Chart, Points, SkyEpochs
+from railfix.report.tables import Block
 
 if TYPE_CHECKING:
     from railfix.report.figures import Group

@@ -11,8 +11,8 @@ import numpy as np
 from railfix.core.files import write_whole
 from railfix.core.tables import Table, number, share
 from railfix.report.charts_page import charts_page
-from railfix.report.content import Block, Notes, Sentence
 from railfix.report.plots.network import network_plan
+from railfix.report.tables import Block, Notes, Sentence
 from railfix.track.network import Network
 from railfix.track.network_check import NetworkQuality
 from railfix.track.network_match import Matched, PlanLog

@@ -12,15 +12,14 @@ from railfix.core.arrays import Floats
 from railfix.core.files import write_whole
 from railfix.evaluate import Evaluation, EvaluationOptions
 from railfix.report import tables
-from railfix.report.background import read_background
 from railfix.report.charts_page import PagePart, figure, render
-from railfix.report.content import Absent, Block, Folded
-from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, Group, antenna_groups, overview, run_group
+from railfix.report.encode import read_background
+from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, Group, antenna_groups, overview, protection, run_group
 from railfix.report.headline import Headline, headline
 from railfix.report.plots.errors import error_ranges
 from railfix.report.plots.signals import SKY_EPOCHS
-from railfix.report.protection import protection
 from railfix.report.runs import ReportedRun, read_runs
+from railfix.report.tables import Absent, Block, Folded
 
 #: Fewest epochs of the sky plot of an antenna.
 _LEAST_SKY: Final = 200
@@ -70,7 +69,7 @@ def write_report(
     references, conventional : sequence of Path
         See `railfix.report.read_runs`.
     background : Path, optional
-        GeoJSON file with lines to draw below the plan (`railfix.report.background`).
+        GeoJSON file with lines to draw below the plan (`railfix.report.encode`).
     title : str
     options : EvaluationOptions, optional
 

@@ -4,16 +4,60 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, ClassVar
 
 from railfix.core.tables import Table, count, number, share
 from railfix.evaluate import Evaluation
 from railfix.evaluate.run_folder import flattened
 from railfix.evaluate.tables import error_tables, evaluation_of, group_tables
-from railfix.report.content import Absent, Block, Folded, Notes, ReportedCommand, Sentence
 from railfix.report.runs import ReportedRun
+
+
+@dataclass(frozen=True)
+class Sentence:
+    """A paragraph of text."""
+
+    kind: ClassVar[str] = "sentence"
+    text: str
+
+
+@dataclass(frozen=True)
+class Absent:
+    """A sentence on content that the page does not have, with the reason."""
+
+    kind: ClassVar[str] = "absent"
+    text: str
+
+
+@dataclass(frozen=True)
+class ReportedCommand:
+    """A command line."""
+
+    kind: ClassVar[str] = "command"
+    text: str
+
+
+@dataclass(frozen=True)
+class Notes:
+    """A list of sentences under a heading."""
+
+    kind: ClassVar[str] = "notes"
+    title: str
+    lines: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Folded:
+    """A part that the reader opens."""
+
+    kind: ClassVar[str] = "folded"
+    title: str
+    blocks: Sequence[Block]
+
+
+Block = Table | Sentence | Absent | ReportedCommand | Notes | Folded
 
 
 def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table:

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Final, TypeVar
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes
+from railfix.core.reasons import Status
 from railfix.gnss.observations import Observations, concatenate
+from railfix.pipeline.along_track import doubted
+from railfix.pipeline.config import Config
+from railfix.pipeline.level_stage import judged
+from railfix.pipeline.results import Result
+from railfix.run.route import RouteOfLog
+from railfix.tracking.result import TrackStatus, is_bounded
 
 Item = TypeVar("Item")
 #: Tags of two receivers that differ by no more than this belong to one instant [ns].
@@ -74,3 +82,22 @@ def read_ahead(items: Iterator[Item]) -> Iterator[Item]:
         while (item := coming.result()) is not None:
             coming = reader.submit(next, items, None)
             yield item
+
+
+def without_beside(result: Result, route: RouteOfLog, config: Config) -> Result:
+    """Results whose statuses and levels know where another track is more probable than `Config.track_risk`."""
+    antennas, fusion = dict(result.antennas), dict(result.fusion)
+    for name, single in antennas.items():
+        beside = route.is_uncertain(single.time, risk=config.track_risk)
+        status = np.where(beside & (single.status == Status.OK), np.int8(Status.MAP_OFFSET), single.status)
+        protection = single.protection
+        if protection is not None:
+            has = np.isfinite(single.chainage_m)
+            level = replace(protection.level, level_m=np.where(beside & has, np.inf, protection.level.level_m))
+            protection = judged(replace(protection, level=level), status, has, single.chainage_m, config)
+        antennas[name] = replace(single, status=status, protection=protection)
+    for name, filtered in fusion.items():
+        tracked = filtered.tracked
+        beside = route.is_uncertain(tracked.time, risk=config.track_risk) & is_bounded(tracked.status)
+        fusion[name] = replace(filtered, tracked=doubted(tracked, beside, TrackStatus.MAP_OFFSET))
+    return replace(result, antennas=antennas, fusion=fusion)

@@ -24,9 +24,8 @@ from railfix.pipeline.level_stage import basis_of, level_facts, prior_basis_text
 from railfix.pipeline.processor import EpochProcessor, SolvedChunk, State
 from railfix.run.base_station import Beside, base_log
 from railfix.run.batch_check import BatchCheck, add_batch
-from railfix.run.beside import without_beside
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
-from railfix.run.chunks import aligned, read_ahead
+from railfix.run.chunks import aligned, read_ahead, without_beside
 from railfix.run.inputs import Antenna, RunInputs
 from railfix.run.mate import add_mate_results
 from railfix.run.options import RunOptions
@@ -311,7 +310,7 @@ def _causes(
     for name in logs:
         antenna = tally.antennas[name]
         if antenna.observed and antenna.status["off_map"] == antenna.positioned:
-            from railfix.run.mismatch import likely_cause
+            from railfix.run.locate import likely_cause
 
             again = replace(logs[name], problems=[], skipped=Counter())
             part = next(again.parts())

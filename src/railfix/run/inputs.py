@@ -13,7 +13,7 @@ from pydantic import model_validator
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import fingerprint
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.io.receiver.recognise import head_of, is_receiver_log
+from railfix.io.receiver.framing import head_of, is_receiver_log
 from railfix.pipeline.config import Config
 
 #: In place of a file: the heights of the log's own positions.

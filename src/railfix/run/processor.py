@@ -8,7 +8,7 @@ from typing import Literal
 from railfix.core.arrays import Floats
 from railfix.core.errors import SettingsError
 from railfix.gnss.navigation import Navigation
-from railfix.integrity.protection.support import read_integrity_support
+from railfix.integrity.protection.araim import read_integrity_support
 from railfix.motion.samples import GroundUnits, ListedBalises
 from railfix.pipeline.base_station import Stations
 from railfix.pipeline.config import Config

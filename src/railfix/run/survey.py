@@ -16,7 +16,7 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.navigation import Navigation
 from railfix.io.logs import read_navigation
 from railfix.io.nmea import read_any_positions
-from railfix.io.receiver.recognise import head_of, is_receiver_log
+from railfix.io.receiver.framing import head_of, is_receiver_log
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import known_from_start
 from railfix.pipeline.survey_signals import survey_run

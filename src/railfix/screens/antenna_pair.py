@@ -43,8 +43,7 @@ from railfix.screens.base import (
     ScreenPicture,
     Verdict,
 )
-from railfix.screens.medians import clock_medians, row_median
-from railfix.screens.pairs import on_pairs, pair_channels
+from railfix.screens.pairs import clock_medians, on_pairs, pair_channels, row_median
 
 #: Treatments of the receiver clocks, as named in the output.
 CLOCKS: Final = {

@@ -35,7 +35,7 @@ from railfix.screens.base import (
     Verdict,
 )
 from railfix.screens.doppler_limits import DopplerLimits, doppler_limit_m, expected_limit_m, receiver_limit_m
-from railfix.screens.medians import clock_medians
+from railfix.screens.pairs import clock_medians
 
 _NS: Final = 1e9
 

@@ -37,7 +37,7 @@ from pydantic import Field
 
 from railfix.core.arrays import Floats
 from railfix.core.settings import Settings
-from railfix.screens.medians import row_median
+from railfix.screens.pairs import row_median
 
 #: Median of the absolute value of a unit normal variable.
 _MEDIAN_NORMAL: Final = 0.674_489_750_196_081_7

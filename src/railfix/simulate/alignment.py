@@ -19,10 +19,9 @@ from scipy.interpolate import CubicHermiteSpline
 
 from railfix.core.arrays import Floats, read_only
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
-from railfix.simulate.line_elements import Knots, generated_knots, knots_of_elements
-from railfix.simulate.line_file import FileLine, line_of_file
+from railfix.simulate.errors.processes import RandomFunction
+from railfix.simulate.line_file import FileLine, Knots, generated_knots, knots_of_elements, line_of_file
 from railfix.simulate.line_settings import PATTERN_LENGTH_M, LineSettings
-from railfix.simulate.random_functions import RandomFunction
 from railfix.track import Track, interpolate_kilometrage
 
 _SEMI_MAJOR_M: Final = 6_378_137.0

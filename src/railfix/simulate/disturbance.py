@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 from railfix.core.arrays import Datetimes, Floats, Strings
 
@@ -62,3 +63,8 @@ class Disturbance:
 
 #: A source of disturbances: a function of the geometry alone, so that results do not depend on the chunks.
 Disturbances = Callable[[SightGeometry], Disturbance]
+
+
+CN0_HORIZON_DBHZ: Final = 34.0
+CN0_RISE_DB: Final = 16.0
+CN0_SECOND_DB: Final = -3.0

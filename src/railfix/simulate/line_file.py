@@ -9,18 +9,164 @@ curvature of the line: a file with a curve tighter than 30 m is an error.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from railfix.core.arrays import Floats, Masks
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
-from railfix.simulate.line_elements import Knots
-from railfix.simulate.line_settings import LineFile
+from railfix.simulate.line_settings import Element, GeneratedLine, Gradient, LineFile, LineSettings, Terrain
 from railfix.track import Track, read_track
+
+_GRAVITY: Final = 9.806_65
+#: Distance between the wheels' contact points of the generated lines [m], for the equilibrium cant.
+_CONTACT_M: Final = 1.137
+#: A generated line turns back when its direction differs from the first by this [rad],
+_FAR_RAD: Final = np.radians(50.0)
+#: and when it has climbed or fallen by this [m].
+_HIGH_M: Final = 150.0
+#: Cant comes in steps [m]; transitions in whole metres.
+_CANT_STEP_M: Final = 0.005
+
+
+@dataclass(frozen=True, kw_only=True)
+class Knots:
+    """Curvature, lean and gradient, linear between knots.
+
+    Attributes
+    ----------
+    knot_m, curvature, lean_m : ndarray, shape (K,)
+        Chainage of the elements' ends from 0 [m]; in plan, right positive [1/m]; cant, positive where the vehicle
+        leans right [m].
+    grade_knot_m, grade : ndarray, shape (G,)
+        Chainage [m] and gradient [m/m, climb over plan length].
+    """
+
+    knot_m: Floats
+    curvature: Floats
+    lean_m: Floats
+    grade_knot_m: Floats
+    grade: Floats
+
+
+def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]) -> Knots:
+    """Knots of a line of given elements.
+
+    SettingsError: when a curve meets a straight or another curve without a transition, two transitions follow each
+    other, or vertical curves overlap or lie beyond the ends.
+    """
+    for k, (element, following) in enumerate(pairwise(elements)):
+        both = {element.kind, following.kind}
+        if both == {"transition"}:
+            raise SettingsError(f"line.elements {k + 1} and {k + 2} are both transitions; make them one")
+        if "transition" not in both and (element.radius_m, element.cant_m) != (
+            following.radius_m,
+            following.cant_m,
+        ):
+            raise SettingsError(
+                f"line.elements {k + 1} ({element.kind}) and {k + 2} ({following.kind}) meet without a transition"
+            )
+    knot = np.concatenate([[0.0], np.cumsum([item.length_m for item in elements])])
+    ends = np.zeros((2, len(knot)))
+    for k, item in enumerate(elements):
+        if item.kind != "transition":
+            bend, lean = 1.0 / item.radius_m, np.sign(item.radius_m) * item.cant_m
+            ends[:, k], ends[:, k + 1] = (bend, lean), (bend, lean)
+    grade_knot, grade = _vertical(gradients, float(knot[-1]))
+    return Knots(knot_m=knot, curvature=ends[0], lean_m=ends[1], grade_knot_m=grade_knot, grade=grade)
+
+
+def _vertical(gradients: Sequence[Gradient], length_m: float) -> tuple[Floats, Floats]:
+    """Gradients joined by vertical curves in which the gradient changes evenly."""
+    places, values, reached, current = [0.0], [0.0], 0.0, 0.0
+    for k, item in enumerate(gradients):
+        value = 1e-3 * item.permille
+        half = item.vertical_radius_m * abs(value - current) / 2.0
+        if item.from_m == 0.0 and k == 0:
+            values[0] = current = value
+            continue
+        if item.from_m - half < reached - 1e-9 or item.from_m + half > length_m:
+            raise SettingsError(
+                f"line.gradients {k + 1} at {item.from_m} m: its vertical curve of {2.0 * half:.1f} m "
+                "overlaps the one before or an end of the line"
+            )
+        if half > 0.0:
+            places += [item.from_m - half, item.from_m + half]
+            values += [current, value]
+        current, reached = value, item.from_m + half
+    return np.array([*places, length_m]), np.array([*values, current])
+
+
+def generated_knots(settings: LineSettings) -> Knots:
+    """Knots of a generated line, straights and curves in turn."""
+    rng = np.random.default_rng([settings.generated.seed, 11])
+    return knots_of_elements(_plan(settings, rng), _profile(settings, rng))
+
+
+def _terrain(generated: GeneratedLine, chainage_m: float) -> Terrain:
+    return [part for part in generated.terrain if part.from_m <= chainage_m][-1]
+
+
+def _plan(settings: LineSettings, rng: np.random.Generator) -> list[Element]:
+    limits = settings.generated
+    elements: list[Element] = []
+    place, heading = 0.0, 0.0
+    while place < settings.length_m:
+        here = _terrain(limits, place)
+        radius = float(np.round(rng.uniform(*here.radius_m), -1))
+        straight, curve = (float(np.round(rng.uniform(*r))) for r in (here.straight_m, here.curve_m))
+        to_right = rng.random() < 0.5 if abs(heading) < _FAR_RAD else heading < 0.0
+        side = 1.0 if to_right else -1.0
+        # Equilibrium cant; transition of 400 times the cant and of 8 times cant and speed in km/h, m each.
+        cant = min(limits.speed_mps**2 / (_GRAVITY * radius) * _CONTACT_M, limits.largest_cant_m)
+        cant = float(np.round(np.round(cant / _CANT_STEP_M) * _CANT_STEP_M, 3))
+        speed_kmh = 3.6 * min(limits.speed_mps, np.sqrt(_GRAVITY * radius * (cant + 0.06) / _CONTACT_M))
+        ramp = float(np.ceil(max(20.0, 400.0 * cant, 8.0 * cant * speed_kmh)))
+        turn = (curve + ramp) / radius
+        if turn > 2.0 * _FAR_RAD:
+            curve = max(10.0, float(np.floor(2.0 * _FAR_RAD * radius - ramp)))
+            turn = (curve + ramp) / radius
+        heading += side * turn
+        bend = Element(kind="curve", length_m=curve, radius_m=side * radius, cant_m=cant)
+        elements += [Element(kind="straight", length_m=straight), Element(kind="transition", length_m=ramp)]
+        elements += [bend, Element(kind="transition", length_m=ramp)]
+        place += straight + curve + 2.0 * ramp
+    return _cut(elements, settings.length_m)
+
+
+def _cut(elements: list[Element], length_m: float) -> list[Element]:
+    """The elements up to the length: the last curve that does not fit gives way to a straight."""
+    while elements and sum(item.length_m for item in elements) > length_m:
+        # Straight, transition, curve, transition: all four go.
+        del elements[-4:]
+    rest = length_m - sum(item.length_m for item in elements)
+    return [*elements, Element(kind="straight", length_m=rest)] if rest > 0.0 else elements
+
+
+def _profile(settings: LineSettings, rng: np.random.Generator) -> list[Gradient]:
+    limits = settings.generated
+    changes: list[Gradient] = []
+    place, height, before, behind = 0.0, 0.0, 0.0, np.inf
+    while True:
+        here = _terrain(limits, place)
+        step = float(np.round(rng.uniform(*here.gradient_m)))
+        permille = float(np.round(rng.uniform(-here.permille, here.permille) * 2.0) / 2.0)
+        if abs(height) > _HIGH_M:
+            permille = -float(np.sign(height)) * abs(permille)
+        # Half of the vertical curve ahead and half of the one behind have to fit.
+        fits = 0.9 * min(step, behind) / limits.vertical_radius_m * 1e3
+        permille = float(np.clip(permille, before - fits, before + fits))
+        if place + 2.0 * step > settings.length_m:
+            break
+        changes.append(Gradient(from_m=place, permille=permille, vertical_radius_m=limits.vertical_radius_m))
+        height, before, place, behind = height + 1e-3 * permille * step, permille, place + step, step
+    return changes
+
 
 #: Spacing of the points by which the spline is turned into one of arc length [m].
 _STEP_M: Final = 0.5

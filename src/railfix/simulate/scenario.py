@@ -15,8 +15,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from railfix.core.errors import SettingsError
-from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DB
-from railfix.simulate.disturbance import Disturbances
+from railfix.simulate.disturbance import CN0_HORIZON_DBHZ, CN0_RISE_DB, Disturbances
 from railfix.simulate.environment.settings import EnvironmentSettings
 from railfix.simulate.errors.settings import ErrorSettings, SatelliteFault
 from railfix.simulate.line_settings import LineSettings

@@ -11,7 +11,7 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import write_whole
-from railfix.core.spelling import misspelt
+from railfix.core.settings import misspelt
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.track.crs import frame_degrees, known_crs, older_datum_note, used_crs
 from railfix.track.heights import check_height_datum, ellipsoidal_heights

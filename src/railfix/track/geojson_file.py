@@ -14,7 +14,7 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import read_text
-from railfix.core.spelling import misspelt
+from railfix.core.settings import misspelt
 from railfix.track.crs import frame_degrees, known_crs, older_datum_note, unit_of_heights, used_crs
 from railfix.track.csv_file import OPTIONAL_COLUMNS, attributes
 from railfix.track.heights import HEIGHT_DATUMS, ellipsoidal_heights, own_height_datum

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Floats, Integers, Masks, freeze_arrays, read_only
-from railfix.core.display import NotebookTable, plural
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from railfix.core.tables import NotebookTable, plural
 
 #: Standard deviation of an aerial survey's centreline in plan [m] (P1 4.1(3)).
 SIGMA_PLAN_M = 0.30

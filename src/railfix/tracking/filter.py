@@ -1,19 +1,204 @@
-"""The filter along the track: epochs in, places along the trajectory and the state for the next epochs out."""
+"""The filter along the track: epochs in, places along the trajectory and the state for the next epochs out.
+
+`railfix.kernels.tracking.layout` has the arrays, `railfix.kernels.tracking.recursion` the recursion over them. It works
+on the unknowns that are in use; the state has all of them.
+"""
 
 from __future__ import annotations
 
 from copy import copy
+from dataclasses import fields
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.tracking.chunk import finish_chunk, prepare_chunk
+from railfix.core.arrays import Datetimes, Floats
+from railfix.core.timescale import seconds
+from railfix.kernels.tracking import layout
+from railfix.tracking import bank
+from railfix.tracking.chunk import Chunk, finish_chunk, prepare_chunk
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
+from railfix.tracking.handover import Handover, row_major
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
-from railfix.tracking.recursion import Recursion
 from railfix.tracking.result import Tracked, TrackStatus
+from railfix.tracking.search import Sought, seek
 from railfix.tracking.smoother import Step
-from railfix.tracking.state import StateIndex, TrackState
+from railfix.tracking.state import SATELLITES, StateIndex, TrackState
+from railfix.tracking.velocity import singer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+#: Satellites come and go: the unknowns in use are chosen again after so many epochs.
+_EPOCHS: Final = 512
+
+
+class Recursion:
+    """A chunk as the kernel takes it.
+
+    Parameters
+    ----------
+    chunk : Chunk
+    line : Line
+    sensors : SensorEpochs
+    limits : TrackingLimits
+    result : Tracked
+        Written to.
+    levels : bool
+        Whether there are sub-filters.
+    """
+
+    def __init__(
+        self,
+        chunk: Chunk,
+        line: Line,
+        sensors: SensorEpochs,
+        limits: TrackingLimits,
+        result: Tracked,
+        *,
+        levels: bool,
+    ) -> None:
+        self.kernel = _kernel()
+        self.chunk, self.line, self.limits, self.result = chunk, line, limits, result
+        self.levels = levels
+        interval, singers = np.unique(chunk.interval_s, return_inverse=True)
+        matrices = [singer(float(dt), limits.acceleration_mps2, limits.acceleration_s) for dt in interval]
+        values: dict[str, Any] = _columns(sensors, chunk.time)
+        self.sensed = np.isfinite(values["sensor"]).any(axis=0)
+        values |= {
+            "time_s": seconds(chunk.time - chunk.time[0]),
+            "begins": chunk.apart | chunk.off_map,
+            "singer": singers.reshape(-1).astype(np.intp),
+            "step": np.stack([step for step, _ in matrices]),
+            "noise": np.stack([noise for _, noise in matrices]),
+        }
+        for name in layout.Epochs._fields:
+            if name not in values and name != "unsigned":
+                values[name] = getattr(chunk, name)
+        arrays = {name: row_major(array) for name, array in values.items()}
+        self.epochs = layout.Epochs(**arrays, unsigned=sensors.wheel_sign == "unknown")
+        self.course = layout.LineArrays(**line.written)
+        self.parameters = _parameters(limits)
+        written = {field.name: getattr(result, field.name) for field in fields(result)}
+        self.answers = layout.Outputs(**{name: written[name] for name in layout.Outputs._fields})
+
+    def advance(self, state: TrackState, first: int, trace: list[Step] | None) -> int:
+        """Do epochs from `first` on, change the state, and return the first before which places have to be sought.
+
+        One at a time where the smoother needs something of each.
+        """
+        if trace is not None:
+            return self._advance_traced(state, first, trace)
+        last = min(first + _EPOCHS, len(self.chunk.time))
+        handed = Handover(self, state, first, last)
+        done = handed.run(layout.WHOLE)
+        if done > first:
+            handed.take_back(state, first, done)
+        return done
+
+    def _advance_traced(self, state: TrackState, epoch: int, trace: list[Step]) -> int:
+        handed = Handover(self, state, epoch, epoch + 1, every=True)
+        if handed.run(layout.WHOLE) == epoch:
+            return epoch
+        parents = Sought(lost=False, parent=np.arange(state.hypotheses), splits=None)
+        self._take_back_traced(state, epoch, handed, parents, trace)
+        return epoch + 1
+
+    def search(self, state: TrackState, epoch: int, trace: list[Step] | None) -> None:
+        """Do an epoch before which places have to be sought."""
+        chunk, every = self.chunk, trace is not None
+        if state.hypotheses:
+            handed = Handover(self, state, epoch, epoch + 1, every=every)
+            handed.run(layout.PREDICTION)
+            handed.take_back_prediction(state, epoch)
+        else:
+            state.code_bias = np.where(chunk.fresh[epoch], 0.0, state.code_bias)
+        found = seek(state, chunk, epoch, self.line, self.limits)
+        state.time = chunk.time[epoch]
+        if not state.hypotheses:
+            if trace is not None:
+                trace.append(Step.without_place(state, float(chunk.interval_s[epoch])))
+            return
+        if found.lost:
+            state.bank = None
+        handed = Handover(self, state, epoch, epoch + 1, every=every, predicted=True)
+        handed.run(layout.REST_LOST if found.lost else layout.REST)
+        if trace is None:
+            handed.take_back(state, epoch, epoch + 1)
+        else:
+            self._take_back_traced(state, epoch, handed, found, trace)
+
+    def _take_back_traced(
+        self, state: TrackState, epoch: int, handed: Handover, found: Sought, trace: list[Step]
+    ) -> None:
+        """Take an epoch back, and add what the smoother needs of it."""
+        hypotheses = state.hypotheses
+        updated, cut = handed.updated(state, epoch)
+        cut[:, SATELLITES + np.flatnonzero(self.chunk.fresh[epoch])] = True
+        handed.take_back(state, epoch, epoch + 1)
+        step = Step(
+            dt=float(self.chunk.interval_s[epoch]),
+            cut=cut,
+            satellite=state.satellite,
+            parent=found.parent,
+            splits=found.splits,
+            updated=updated,
+        )
+        if hypotheses > 1:
+            step.choose(handed.work.kept[: state.hypotheses])
+        step.mean, step.covariance = state.mean, state.covariance
+        trace.append(step)
+
+
+def _kernel() -> Callable[..., int]:
+    """The compiled recursion; numba is imported here, for what runs no filter does without."""
+    from railfix.kernels.tracking.recursion import advance
+
+    return advance
+
+
+def _columns(sensors: SensorEpochs, time: Datetimes) -> dict[str, Floats]:
+    """Measurements of the wheel, radar, force, place, balises and ranges and their standard deviations by column."""
+    ranges, epochs = sensors.ranges, len(time)
+    units = 0 if ranges is None else ranges.range_m.shape[1]
+    value, sigma = np.full((epochs, layout.RANGE_ROW + units), np.nan), np.ones((epochs, layout.RANGE_ROW + units))
+    for column, (values, sigmas) in enumerate(
+        (
+            (sensors.wheel_m, sensors.wheel_sigma_m),
+            (sensors.radar_m, sensors.radar_sigma_m),
+            (sensors.force_mps2, sensors.force_sigma_mps2),
+            (sensors.place_m, sensors.place_sigma_m),
+        )
+    ):
+        if values is not None and sigmas is not None:
+            value[:, column], sigma[:, column] = values, sigmas
+    unit, age, lever = np.zeros((epochs, units, 3)), np.zeros((epochs, 3 + units)), np.zeros(3)
+    if sensors.balises is not None:
+        own = slice(layout.PLACE_ROW + 1, layout.RANGE_ROW)
+        value[:, own], sigma[:, own] = sensors.balises.place_m, sensors.balises.sigma_m
+        age[:, 1:3] = np.where(np.isfinite(value[:, own]), seconds(time[:, None] - sensors.balises.time), 0.0)
+    if ranges is not None:
+        value[:, layout.RANGE_ROW :], sigma[:, layout.RANGE_ROW :] = ranges.range_m, ranges.sigma_m
+        unit, age[:, 3:], lever = ranges.unit_ecef_m, ranges.age_s, ranges.lever_m
+    return {
+        "sensor": value, "sensor_sigma": sigma, "range_unit_ecef_m": unit, "sensor_age_s": age, "lever_m": lever
+    }  # fmt: skip
+
+
+@lru_cache(maxsize=8)
+def _parameters(limits: TrackingLimits) -> layout.Parameters:
+    """Settings as the kernel takes them."""
+    budget = bank.budget(limits)
+    given: dict[str, Any] = {
+        "degrees": tuple(limits.tails),
+        "level_risk": budget.risk,
+        "level_k": budget.k,
+        "level_k_speed": budget.k_speed,
+    }
+    names = layout.Parameters._fields
+    return layout.Parameters(**{name: given[name] if name in given else getattr(limits, name) for name in names})
 
 
 def track(

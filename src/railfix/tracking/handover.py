@@ -11,15 +11,15 @@ from railfix.core.timescale import seconds, timedelta
 from railfix.kernels.tracking import layout
 from railfix.kernels.tracking.constants import FORCE_WALK_MPS2, RADAR_WALK, WHEEL_WALK
 from railfix.tracking import bank
-from railfix.tracking.branches import begin
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
+from railfix.tracking.search import begin
 from railfix.tracking.smoother import Updated
 from railfix.tracking.state import CLOCKS, OFFSETS, SATELLITES, Bank, StateIndex, TrackState
 
 if TYPE_CHECKING:
-    from railfix.tracking.recursion import Recursion
+    from railfix.tracking.filter import Recursion
 
 #: Unknowns that are always in use, in the order of the kernel.
 _ALWAYS: Final = np.array([

@@ -20,7 +20,7 @@ from railfix.core.arrays import Floats, Indices, Masks, Strings
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.search import SplitHypothesis
 from railfix.tracking.state import SATELLITES, StateIndex, TrackState
-from railfix.tracking.transition import transition
+from railfix.tracking.velocity import transition
 
 
 @dataclass(frozen=True, kw_only=True)

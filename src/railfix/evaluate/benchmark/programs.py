@@ -22,7 +22,7 @@ from railfix.core.timescale import seconds
 from railfix.evaluate.place import Answers, TrackFiles, find_trajectory
 from railfix.evaluate.run_folder import CONVENTIONAL, RunFolder, floats, read_run
 from railfix.io.position_log import PositionLog
-from railfix.io.receiver.recognise import head_of, is_receiver_log
+from railfix.io.receiver.framing import head_of, is_receiver_log
 from railfix.pipeline.config import Config
 from railfix.run.inputs import Antenna, RunInputs
 from railfix.run.output import OutputFolder

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Final, Literal
@@ -11,12 +11,159 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings
+from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1
 from railfix.core.timescale import seconds, timedelta
-from railfix.gnss.navigation import Navigation
-from railfix.gnss.orbits.glonass import GlonassStates
-from railfix.gnss.orbits.kepler import Orbits
+from railfix.gnss.navigation import KeplerRecords, Navigation
+from railfix.gnss.orbits.kepler import GlonassStates, Orbits
 from railfix.gnss.orbits.record_selection import VALIDITY_S, make_lookup, validity_s
-from railfix.gnss.orbits.signal_health import group_delay_s, unhealthy
+
+#: Galileo: data validity and signal health by band, E1-B, E5a, E5b (RINEX 3.05, table A8; OS SIS ICD 5.1.9.3).
+GALILEO_HEALTH: Final[Mapping[str, int]] = {"1": 0b111, "5": 0b111_000, "7": 0b111_000_000}
+#: QZSS: bits of the health word that concern a signal (IS-QZSS-PNT-006, 4.1.2.3(4)): L1, L1C/A, L2C, L5, L1C, L1C/B
+#: from the most significant one. 1 (no L1C/B) is broadcast by satellites with L1C/A since 2022.
+QZSS_HEALTH: Final[Mapping[str, int]] = {
+    "1C": 0b110_000, "1E": 0b100_001, "1S": 0b10, "1L": 0b10, "1X": 0b10,
+    "2S": 0b1000, "2L": 0b1000, "2X": 0b1000, "5I": 0b100, "5Q": 0b100, "5X": 0b100,
+}  # fmt: skip
+#: A record that states an accuracy beyond this (GPS and QZSS: URA index 8 and more, 15 is no prediction at all;
+#: IS-GPS-200, 20.3.3.3.1.3) is of no use [m]; the performance standard of GPS calls such a signal marginal.
+LARGEST_ACCURACY_M: Final = 48.0
+#: Columns of `KeplerRecords.inter_signal_s` by signal of GPS and QZSS; their mean where data and pilot are one code.
+_ISC: Final[Mapping[str, list[int]]] = {
+    "1C": [0], "1E": [0], "2S": [1], "2L": [1], "2X": [1], "5I": [2], "5Q": [3], "5X": [2, 3],
+    "1S": [4], "1L": [5], "1X": [4, 5],
+}  # fmt: skip
+#: Standard deviation of the delay on L2 and L5 without ISC [m]: over the satellites of GPS whose CNAV has it, on
+#: 2025-02-15, TGD - ISC less what stands for it has 0.24 m on L2C and 0.55 m on L5Q
+#: (`tests/gnss/test_group_delays.py`).
+_WITHOUT_ISC_M: Final[Mapping[str, float]] = {"2": 0.3, "5": 0.6}
+#: Signals of the P code, to which TGD refers.
+_P_CODES: Final = ("2P", "2W", "2Y", "2D", "2N", "2M")
+#: Bits of the health word of CNAV by band.
+_CNAV_HEALTH: Final[Mapping[str, int]] = {"1": 0b100, "2": 0b010, "5": 0b001}
+#: All bits.
+_ANY: Final = -1
+
+
+def unhealthy(records: KeplerRecords, signal: str) -> Masks:
+    """Flag the records in which a signal is unhealthy, shape (n,).
+
+    GPS: any of the six bits. QZSS and Galileo: the bits of the signal; Galileo also where no
+    accuracy is predicted (SISA "NAPA", written as -1; OS SDD 1.3, 2.3.1.4 calls that marginal).
+    CNAV and CNAV-2: the bit of the band. BeiDou: SatH1 or HS. All: an accuracy beyond `LARGEST_ACCURACY_M`.
+    """
+    system = records.satellite.astype("<U1")
+    bits = np.full(len(records), _ANY, dtype=np.int64)
+    bits[system == "J"] = QZSS_HEALTH.get(signal, _ANY)
+    cnav = np.isin(system, ["G", "J"]) & (records.message == "CNAV")
+    bits[cnav] = _CNAV_HEALTH.get(signal[:1], _ANY)
+    bits[system == "E"] = GALILEO_HEALTH.get(signal[:1], _ANY)
+    no_accuracy = ((system == "E") & (records.accuracy_m < 0.0)) | (records.accuracy_m > LARGEST_ACCURACY_M)
+    return np.asarray(((records.health & bits) != 0) | no_accuracy)
+
+
+def group_delay_s(
+    records: KeplerRecords, signal: str, *, clock: Literal["broadcast", "ionosphere_free"] = "broadcast"
+) -> Floats:
+    """Compute the group delay of a signal relative to the satellite clock, shape (n,) [s].
+
+    ======== =====================================================================================
+    GPS,     TGD on L1, (f1/f2)^2 TGD on L2 (IS-GPS-200, 20.3.3.3.3.2). CNAV and CNAV-2: TGD - ISC on
+    QZSS     L1 C/A, L2C, L5 and L1C (IS-GPS-200, 30.3.3.3.1.1; IS-GPS-705, 20.3.3.3.1.2; IS-GPS-800,
+             3.5.3.9). LNAV has no ISC: TGD on L5 (`group_delay_sigma_m`).
+    Galileo  OS SIS ICD 5.1.5. Clocks of I/NAV refer to E1 and E5b, of F/NAV to E1 and E5a. E1 uses
+             the BGD of its clock; E5a and E5b follow from both BGDs. F/NAV has no BGD E5b/E1:
+             BGD E5a/E1 is used in its place. NaN on E6, whose delay is not broadcast.
+    BeiDou   The clock is that of B3I (B1I ICD 3.0, 5.2.4.10), 0 on B3I. D1 and D2: TGD1 on B1I, TGD2 on B2I.
+             CNV1, CNV2 (B1C ICD 1.0, 7.6; B2a ICD 1.0, 7.6): TGD_B1Cp and TGD_B2ap on the pilots, with ISC on
+             the data signals. CNV3: TGD_B2bI on B2b. NaN on signals whose delay the message does not contain.
+    ======== =====================================================================================
+
+    Parameters
+    ----------
+    records : KeplerRecords
+    signal : str
+        RINEX 3 code without its type letter: "1C".
+    clock : {"broadcast", "ionosphere_free"}
+        Clock of the record, or of SP3 files, which refers to the ionosphere-free pair L1/L2 of GPS and QZSS (the
+        same as broadcast), E1/E5a of Galileo, B1I/B3I of BeiDou.
+    """
+    delay = np.full(len(records), np.nan)
+    system = records.satellite.astype("<U1")
+    band = signal[:1]
+    here = np.isin(system, ["G", "J"])
+    delay[here] = _navstar(records, signal)[here]
+    here = system == "E"
+    delay[here] = _galileo(records, band, always_fnav=clock == "ionosphere_free")[here]
+    here = system == "C"
+    delay[here] = _beidou(records, signal, ionosphere_free=clock == "ionosphere_free")[here]
+    return delay
+
+
+def group_delay_sigma_m(records: KeplerRecords, signal: str) -> Floats:
+    """Return the standard deviation of a group delay that the record lacks a part of, shape (n,) [m]; 0 for the others.
+
+    L2C and L5 by LNAV, without their ISC.
+    """
+    lacking = np.isin(records.satellite.astype("<U1"), ["G", "J"]) & (records.message == "LNAV")
+    return np.where(lacking, _WITHOUT_ISC_M.get(signal[:1], 0.0) * (signal not in _P_CODES), 0.0)
+
+
+def _navstar(records: KeplerRecords, signal: str) -> Floats:
+    tgd = records.group_delay_1_s
+    frequency = CARRIER_FREQUENCY["G"].get(signal[:1], np.nan)
+    scale = (FREQUENCY_L1 / frequency) ** 2
+    legacy = tgd * (1.0 if signal[:1] == "5" else scale)
+    columns = _ISC.get(signal)
+    if columns is None:
+        return legacy
+    corrected = tgd - records.inter_signal_s[:, columns].mean(axis=1)
+    return np.where(records.message == "LNAV", legacy, corrected)
+
+
+def _galileo(records: KeplerRecords, band: str, *, always_fnav: bool) -> Floats:
+    inav = records.message == "INAV"
+    e5a = records.group_delay_1_s
+    e5b = np.where(inav, records.group_delay_2_s, e5a)
+    on_e1 = e5a if always_fnav else np.where(inav, e5b, e5a)
+    # BGD(E1, x) = (delay on E1 - delay on x) / (1 - (f1/fx)^2)
+    frequency = CARRIER_FREQUENCY["E"]
+    on_e5a = on_e1 - e5a * (1.0 - (FREQUENCY_L1 / frequency["5"]) ** 2)
+    on_e5b = on_e1 - e5b * (1.0 - (FREQUENCY_L1 / frequency["7"]) ** 2)
+    by_band = {"1": on_e1, "5": on_e5a, "7": on_e5b, "8": 0.5 * (on_e5a + on_e5b)}
+    return by_band.get(band, np.full(len(records), np.nan))
+
+
+def _beidou(records: KeplerRecords, signal: str, *, ionosphere_free: bool) -> Floats:
+    unknown = np.full(len(records), np.nan)
+    first, second = records.group_delay_1_s, records.group_delay_2_s
+    if signal[:1] == "6":
+        delay = np.zeros(len(records))
+    elif signal[:1] == "2":
+        delay = np.where(_is_of(records, "D1", "D2"), first, unknown)
+    elif signal in ("7I", "7Q", "7X"):  # B2I; 7D, 7P and 7Z are B2b
+        delay = np.where(_is_of(records, "D1", "D2"), second, unknown)
+    elif signal in ("7D", "7Z"):
+        delay = np.where(_is_of(records, "CNV3"), first, unknown)
+    elif signal in ("1P", "1X"):
+        delay = np.where(_is_of(records, "CNV1", "CNV2"), first, unknown)
+    elif signal in ("5P", "5X"):
+        delay = np.where(_is_of(records, "CNV1", "CNV2"), second, unknown)
+    elif signal == "1D":
+        delay = np.where(_is_of(records, "CNV1"), first + records.inter_signal_s[:, 0], unknown)
+    elif signal == "5D":
+        delay = np.where(_is_of(records, "CNV2"), second + records.inter_signal_s[:, 1], unknown)
+    else:
+        delay = unknown
+    if not ionosphere_free:
+        return delay
+    f1, f3 = CARRIER_FREQUENCY["C"]["2"] ** 2, CARRIER_FREQUENCY["C"]["6"] ** 2
+    return np.where(_is_of(records, "D1", "D2"), delay - f1 / (f1 - f3) * first, unknown)
+
+
+def _is_of(records: KeplerRecords, *messages: str) -> Masks:
+    return np.isin(records.message, messages)
+
 
 #: Number of channel sets cached per navigation.
 _CACHED_SETS: Final = 64

@@ -129,7 +129,7 @@ class RangeBounds(NamedTuple):
     bias_m: ArrayLike | None = None
 
 
-class MapError(NamedTuple):
+class MapDeviation(NamedTuple):
     """What is known of the map's error across and up besides its sigmas.
 
     Attributes
@@ -152,7 +152,7 @@ def along_track_level(
     risk: RiskBudget | None = None,
     scale: ArrayLike = 1.0,
     overbound: RangeBounds | None = None,
-    map_error: MapError | None = None,
+    map_error: MapDeviation | None = None,
     sides: Masks | None = None,
     n_excluded: ArrayLike = 0,
 ) -> ProtectionLevel:
@@ -169,7 +169,7 @@ def along_track_level(
         Noise scale: multiplies the sigmas of the ranges, not the map error.
     overbound : RangeBounds, optional
         By default the sigma of each range is that of its weight times the scale, without bias.
-    map_error : MapError, optional
+    map_error : MapDeviation, optional
     sides : ndarray of bool, shape (T, S, M), optional
         Sets of satellites that one reflection can make faulty together, each a hypothesis of `RiskBudget.side_prior`.
     n_excluded : array_like of int, shape (T,) or ()
@@ -187,7 +187,7 @@ def along_track_level(
     """
     if model.interest != 1:
         raise ValueError("a level along the track asks for a model on the line (constrained_model)")
-    risk, overbound, map_error = risk or RiskBudget(), overbound or RangeBounds(), map_error or MapError()
+    risk, overbound, map_error = risk or RiskBudget(), overbound or RangeBounds(), map_error or MapDeviation()
     epochs, channels = model.root_weight.shape
     if len(systems) != channels:
         raise ValueError(f"systems names each channel: {channels} channels, got {len(systems)}")

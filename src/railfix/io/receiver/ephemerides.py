@@ -18,7 +18,7 @@ from railfix.core.arrays import Bytes, Datetimes
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.io.receiver import nav_messages
-from railfix.io.receiver.bits import Field, fields, unsigned
+from railfix.io.receiver.bits import Field, Subframes, fields, packed_words, unsigned
 from railfix.io.receiver.records import (
     Record,
     Values,
@@ -29,7 +29,6 @@ from railfix.io.receiver.records import (
     glonass_record,
     gps_record,
 )
-from railfix.io.receiver.subframes import Subframes, packed_words
 from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_records, kepler_records
 
 #: Galileo data source: I/NAV with clock and group delay E5b/E1, received on E1-B or on E5b-I.

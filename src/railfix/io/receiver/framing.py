@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Bytes, Indices, Integers, Masks, Strings
+from railfix.core.files import FilePath, open_stream
 
 #: Bytes of the longest frame: RTCM 3 has 1029, UBX and SBF up to 65 543; receivers stay below 16 KiB.
 LONGEST_FRAME: Final = 16_384
@@ -268,3 +269,19 @@ def _hex(digit: Bytes) -> Integers:
     value[np.frombuffer(b"ABCDEF", np.uint8)] = np.arange(10, 16)
     value[np.frombuffer(b"abcdef", np.uint8)] = np.arange(10, 16)
     return value[digit]
+
+
+#: Bytes in which a log must show a frame with a valid checksum to be taken for one.
+_HEAD_BYTES: Final = 1 << 16
+
+
+def is_receiver_log(head: bytes) -> bool:
+    """Whether bytes from the beginning of a file hold a UBX, RTCM 3 or SBF frame with a valid checksum."""
+    frames = find_frames(np.frombuffer(head, dtype=np.uint8))
+    return bool(np.isin(frames.protocol, ["ubx", "rtcm3", "sbf"]).any())
+
+
+def head_of(path: FilePath) -> bytes:
+    """First bytes of a file, unpacked."""
+    with open_stream(path, content="bytes") as stream:
+        return stream.read(_HEAD_BYTES)

@@ -16,9 +16,9 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week
 from railfix.gnss.signals import named_frequency_hz
+from railfix.io.receiver.bits import Subframes
 from railfix.io.receiver.framing import Frames
 from railfix.io.receiver.measurements import Measurements
-from railfix.io.receiver.subframes import Subframes
 from railfix.io.receiver.ubx import gathered
 
 Words = np.ndarray[tuple[int, int], np.dtype[np.uint32]]

@@ -13,11 +13,16 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, ByteStream, FilePath, open_stream
 from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
 from railfix.gnss.observations import Observations
-from railfix.io.rinex.fault_log import CYCLE_SLIPS, DUPLICATES, EXTERNAL_EVENTS, FaultLog
 from railfix.io.rinex.header import RinexHeader, apply_records, parse_header, read_header_bytes
-from railfix.io.rinex.observations_decode import decode, lines_per_satellite
-from railfix.io.rinex.observations_epochs import EpochHeads, find_epochs
-from railfix.io.rinex.observations_fields import PADDING
+from railfix.io.rinex.observations_decode import PADDING, decode, lines_per_satellite
+from railfix.io.rinex.observations_epochs import (
+    CYCLE_SLIPS,
+    DUPLICATES,
+    EXTERNAL_EVENTS,
+    EpochHeads,
+    FaultLog,
+    find_epochs,
+)
 from railfix.io.rinex.observations_lines import Lines, split_lines
 
 #: Bytes of text read at a time: large enough for array operations, small enough for the processor's cache.

@@ -1,4 +1,4 @@
-"""Writing of files: plain, gzip, Hatanaka (CRX).
+"""How a written RINEX file is packed, and its header records.
 
 Packed bytes depend on the content only: gzip is given no name and no time, and the date that
 ``rnx2crx`` writes into its header is blanked.
@@ -17,6 +17,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, Final, Literal, cast, get_args
+
+import numpy as np
 
 from railfix.core.errors import OutputError
 from railfix.core.files import FilePath, staged_file
@@ -90,3 +92,23 @@ def _without_date(head: bytes) -> bytes:
     lines = head.split(b"\n")
     lines[1] = lines[1][:40] + b" " * 20 + lines[1][60:]
     return b"\n".join(lines)
+
+
+PROGRAM = "railfix"
+
+
+def header_line(text: str, label: str) -> str:
+    """Format one header record of 80 columns with its line end; ValueError for more than 60 characters or no ASCII."""
+    if len(text) > 60 or not text.isascii():
+        raise ValueError(f"{label}: {text!r} is not ASCII of at most 60 characters")
+    return f"{text:<60}{label:<20}\n"
+
+
+def program_line(created: np.datetime64 | None) -> str:
+    """Format PGM / RUN BY / DATE; the date, in UTC, is blank without `created`."""
+    date = ""
+    if created is not None:
+        date = (
+            str(np.datetime_as_string(created, unit="s")).replace("-", "").replace(":", "").replace("T", " ") + " UTC"
+        )
+    return header_line(f"{PROGRAM:<20}{'':20}{date:<20}", "PGM / RUN BY / DATE")

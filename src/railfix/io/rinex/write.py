@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
 from railfix.gnss.observations import ObservationHeader, Observations
-from railfix.io.rinex.header_text import header_line, program_line
-from railfix.io.rinex.packing import Packing, open_target
+from railfix.io.rinex.packing import Packing, header_line, open_target, program_line
 from railfix.io.rinex.write_navigation import RinexVersion
 
 #: Array of each kind of observable, by the letter before the signal.

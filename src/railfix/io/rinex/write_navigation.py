@@ -15,8 +15,7 @@ from railfix.core.arrays import Datetimes, Floats, Masks, Strings
 from railfix.core.constants import BDT_MINUS_GPST_S
 from railfix.core.timescale import BDT_EPOCH, GPS_EPOCH, SECONDS_PER_WEEK, gpst_minus_utc, seconds, timedelta, to_week
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
-from railfix.io.rinex.header_text import header_line, program_line
-from railfix.io.rinex.packing import Packing, open_target
+from railfix.io.rinex.packing import Packing, header_line, open_target, program_line
 
 #: Written for an unknown transmission time.
 UNKNOWN_TRANSMISSION_S: Final = 0.9999e9

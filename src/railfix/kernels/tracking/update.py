@@ -16,7 +16,7 @@ from railfix.kernels.tracking.layout import C_RIGHT, C_SPEED, C_WAY, COMBINED, P
 
 @borrowing
 def weight_of(square: float, late: bool, degrees: tuple[float, float]) -> float:
-    """Weight of a measurement by its square over its variance: `railfix.tracking.student_t.Tails`."""
+    """Weight of a measurement by its square over its variance: `railfix.tracking.limits.Tails`."""
     own = degrees[1] if late else degrees[0]
     return (degrees[0] + 1.0) / degrees[0] * own / (own + square)
 

@@ -4,7 +4,7 @@ Beside a base station the differences of ambiguities of one signal are whole cyc
 and the error of the map, so that phases of two or three satellites tell integers apart where a place in space takes
 five. Which integers are right is decided by Bayes' rule: each vector with the density of the float ambiguities around
 it, against all other vectors and against phases that are no whole cycles (multipath, half cycles), of which the prior
-probability is `PhaseLimits.no_integer_prior` and the density uniform. LAMBDA (`railfix.positioning.integer_search`)
+probability is `PhaseLimits.no_integer_prior` and the density uniform. LAMBDA (`railfix.positioning.standstill_phase`)
 finds the vectors.
 """
 
@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers
-from railfix.positioning.integer_search import IntegerSearch
+from railfix.positioning.standstill_phase import IntegerSearch
 
 #: Vectors compared.
 _VECTORS: Final = 12

@@ -34,8 +34,15 @@ from pydantic import Field
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
 from railfix.core.settings import Settings, write_toml
-from railfix.ranges.error_model.conditions import Conditions
-from railfix.ranges.error_model.model import POOLED, BinStatistics, ErrorBins, ErrorModel, ErrorModelSource, FaultRate
+from railfix.ranges.error_model.model import (
+    POOLED,
+    BinStatistics,
+    Conditions,
+    ErrorBins,
+    ErrorModel,
+    ErrorModelSource,
+    FaultRate,
+)
 from railfix.ranges.model_file import read_model_file
 
 FORMAT: Final = "railfix error model 2"

@@ -1,16 +1,81 @@
-"""Error model from samples: bins, pooling where they are thin, statistics."""
+"""Error model from samples: bins, pooling where they are thin, statistics.
+
+A normal distribution shifted by +b bounds the upper half of the errors, one shifted by -b the lower
+half: whatever probability one asks for, the bound's quantile lies further out than the sample's
+(CDF overbounding, B. DeCleene, Defining pseudorange integrity: overbounding, ION GPS 2000). Sums of
+independent errors stay bounded by the summed biases and the root of the summed squared sigmas as long
+as the distribution after the shift is symmetric and has one peak (the two-step method of J. Blanch, T.
+Walter, P. Enge, Gaussian bounds of sample distributions for integrity analysis, IEEE Trans. Aerospace
+and Electronic Systems 55(4), 2019, doi:10.1109/TAES.2018.2876583). Neither can be proven from samples.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from pydantic import Field
+from scipy.special import ndtri
 
 from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.settings import Settings, option
-from railfix.ranges.error_model.model import POOLED, BinStatistics, ErrorBins
-from railfix.ranges.error_model.overbound import gaussian_overbound
+from railfix.ranges.error_model.model import POOLED, BinStatistics, ErrorBins, ErrorModel
+
+#: Standard scores from which on a sample belongs to the tail, which alone sets sigma.
+TAIL_SCORE: Final = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overbound:
+    """Pair of normal distributions that bound a sample, one for each half.
+
+    Attributes
+    ----------
+    bias_m : float [m]
+        Distance of their means from zero, to either side.
+    sigma_m : float [m]
+    """
+
+    bias_m: float
+    sigma_m: float
+
+
+def gaussian_overbound(error_m: Floats) -> Overbound:
+    """The pair that bounds a sample, sigma from the tails and the bias from the middle.
+
+    The k-th of n samples counts as the quantile of probability ``k / (n + 1)``, from either end. Sigma is
+    the least that bounds both tails (beyond one standard score) about the median's distance from zero;
+    the bias is then the least that bounds the rest. Beyond the largest sample the bound is an
+    extrapolation by the normal distribution and nothing else.
+
+    Parameters
+    ----------
+    error_m : ndarray, shape (n,) [m]
+        At least three, finite.
+
+    Returns
+    -------
+    Overbound
+
+    Raises
+    ------
+    ValueError
+        Fewer than three samples, or one that is not finite.
+    """
+    if len(error_m) < 3 or not np.isfinite(error_m).all():
+        raise ValueError("an overbound needs at least three samples, all finite")
+    ordered = np.sort(error_m)
+    score = ndtri(np.arange(1, len(ordered) + 1) / (len(ordered) + 1.0))
+    half = score >= 0.0
+    # Both halves as distances from zero outward: the upper as it is, the lower mirrored.
+    score, sizes = score[half], (ordered[half], -ordered[::-1][half])
+    center = abs(float(np.median(ordered)))
+    tail = score >= min(TAIL_SCORE, float(score[-1]))
+    sigma = max(0.0, *(float(np.max((size[tail] - center) / score[tail])) for size in sizes))
+    bias = max(center, *(float(np.max(size - sigma * score)) for size in sizes))
+    return Overbound(bias_m=bias, sigma_m=sigma)
 
 
 class ErrorModelFit(Settings):
@@ -138,3 +203,47 @@ def _figures(error: Floats) -> tuple[float, float, float, float]:
         return (float("nan"),) * 4
     bound = gaussian_overbound(error)
     return float(error.mean()), float(error.std(ddof=1)), bound.bias_m, bound.sigma_m
+
+
+_SIDES: Final = {1: ("all round",), 2: ("ahead", "behind"), 4: ("ahead", "right", "behind", "left")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SummaryRow:
+    """One row: its name, and count, bias, sigma, overbound before and after the screens as text."""
+
+    name: str
+    cells: tuple[str, ...]
+
+
+def summary(model: ErrorModel) -> Iterator[SummaryRow]:
+    """Rows by elevation, by sector and by C/N0.
+
+    Bias and sigma are those of all samples of the row, from the bins' own figures; the overbound is the span
+    of the bins' sigmas of bounds.
+    """
+    bins = model.bins
+    width = 360.0 / bins.sectors
+    names = (
+        [f"elevation {a:g}-{b:g}" for a, b in zip(bins.elevation_deg[:-1], bins.elevation_deg[1:], strict=True)],
+        list(_SIDES.get(bins.sectors, tuple(f"azimuth {k * width:g} deg" for k in range(bins.sectors)))),
+        [f"C/N0 {a:g}-{b:g}" for a, b in zip(bins.cn0_dbhz[:-1], bins.cn0_dbhz[1:], strict=True)],
+    )
+    for axis, labels in enumerate(names):
+        for k, name in enumerate(labels):
+            cells = (*_cells(model.before, axis, k), *_cells(model.after, axis, k))
+            yield SummaryRow(name=name, cells=cells)
+
+
+def _cells(statistics: BinStatistics, axis: int, k: int) -> tuple[str, str, str, str]:
+    count = np.take(statistics.count, k, axis=axis)
+    total, has = int(count.sum()), count > 0
+    if total == 0:
+        return "0", "-", "-", "-"
+    bias, sigma, bound = (
+        np.take(getattr(statistics, name), k, axis=axis)[has] for name in ("bias_m", "sigma_m", "bound_sigma_m")
+    )
+    share = count[has] / total
+    mean = float(np.nansum(share * bias))
+    spread = float(np.sqrt(np.nansum(share * (sigma**2 + (bias - mean) ** 2))))
+    return f"{total:,}", f"{mean:+.2f}", f"{spread:.2f}", f"{np.nanmin(bound):.1f}-{np.nanmax(bound):.1f}"

@@ -9,15 +9,27 @@ matplotlib is imported when a picture is drawn, never with the package.
 
 from typing import Final
 
+from railfix.report.plots.campaign import processing_time
 from railfix.report.plots.chart import Chart, SkyEpochs
 from railfix.report.plots.draw import draw_chart, draw_figure, draw_sky, drawn
-from railfix.report.plots.errors import error_over_chainage, error_over_time, error_ranges
-from railfix.report.plots.levels import levels_over_chainage, levels_over_time, stanford
+from railfix.report.plots.errors import (
+    error_over_chainage,
+    error_over_time,
+    error_ranges,
+    levels_over_chainage,
+    levels_over_time,
+    stanford,
+)
 from railfix.report.plots.line import interval_distribution, interval_over_chainage, plan, satellites_over_time
-from railfix.report.plots.run_screens import draw_run_screens, screens_of
-from railfix.report.plots.screens import draw_cn0_curve, draw_screen, screen_over_chainage, screen_over_time
+from railfix.report.plots.screens import (
+    draw_cn0_curve,
+    draw_run_screens,
+    draw_screen,
+    screen_over_chainage,
+    screen_over_time,
+    screens_of,
+)
 from railfix.report.plots.signals import cn0_over_elevation, sky_epochs
-from railfix.report.plots.timing import processing_time
 
 plot_plan: Final = drawn(plan)
 plot_error_over_time: Final = drawn(error_over_time)

@@ -4,7 +4,7 @@ A `Chart` is axes with layers of numbers. The functions of `railfix.report.plots
 arrays; `railfix.report.plots.draw_chart` draws one with matplotlib, and `railfix.report` puts the same one into
 a page, so a notebook and the report show the same numbers.
 
-Long series are thinned when a chart is made (`railfix.report.plots.thinning`); the caption has the counts.
+Long series are thinned when a chart is made (`railfix.report.plots.columns`); the caption has the counts.
 """
 
 from __future__ import annotations

@@ -27,8 +27,17 @@ from railfix.report.plots.chart import (
     Marks,
     Points,
 )
-from railfix.report.plots.columns import floats, nice_step, points, since, start_of, words
-from railfix.report.plots.thinning import counts_sentence, one_per_cell, spread
+from railfix.report.plots.columns import (
+    counts_sentence,
+    floats,
+    nice_step,
+    one_per_cell,
+    points,
+    since,
+    spread,
+    start_of,
+    words,
+)
 from railfix.track import Track
 
 ECEF: Final = ("x_m", "y_m", "z_m")
@@ -68,7 +77,7 @@ def plan(
     tunnels_m : sequence of (float, float) [m]
         Chainages between which the line runs in a tunnel.
     background : sequence of ndarray, shape (P, 2) [deg]
-        Longitude and latitude of lines to draw below, see `railfix.report.background`.
+        Longitude and latitude of lines to draw below, see `railfix.report.encode`.
     title : str
     """
     ecef, conventional = points(positions, *ECEF), points(positions, *(f"conventional_{name}" for name in ECEF))

@@ -5,7 +5,6 @@ of disturbances for `Scenario.multipath`. docs/simulator-multipath.md has the ph
 """
 
 from railfix.simulate.environment.model import Environment
-from railfix.simulate.environment.section_kinds import drawn_sections
 from railfix.simulate.environment.settings import (
     KINDS,
     CorrelatorSettings,
@@ -15,6 +14,7 @@ from railfix.simulate.environment.settings import (
     RowSettings,
     SectionSettings,
 )
+from railfix.simulate.environment.structures import drawn_sections
 
 __all__ = [
     "KINDS",

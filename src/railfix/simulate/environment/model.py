@@ -12,20 +12,26 @@ from railfix.core.arrays import Complexes, Floats, Indices, Masks, Strings
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.gnss.signals import carrier_frequency_hz
-from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DB
-from railfix.simulate.disturbance import Disturbance, SightGeometry
-from railfix.simulate.environment.antenna import cross_polar_gain, received_amplitude
+from railfix.simulate.disturbance import CN0_HORIZON_DBHZ, CN0_RISE_DB, Disturbance, SightGeometry
 from railfix.simulate.environment.correlator import TrackedCode, tracked
-from railfix.simulate.environment.diffraction import edge_amplitude, roughness_loss
+from railfix.simulate.environment.diffraction import (
+    cross_polar_gain,
+    edge_amplitude,
+    received_amplitude,
+    roughness_loss,
+)
 from railfix.simulate.environment.masts import Electrification
-from railfix.simulate.environment.second_reflections import second_reflection
-from railfix.simulate.environment.section_kinds import drawn_sections
 from railfix.simulate.environment.settings import EnvironmentSettings
-from railfix.simulate.environment.side_streets import side_streets, street_reflections
-from railfix.simulate.environment.structures import BEYOND_M, build_structures, tree_rows
-from railfix.simulate.environment.trees import foliage
-from railfix.simulate.environment.vehicles import equipment_amplitude, neighbour_clearance, neighbour_reflection
-from railfix.simulate.environment.walls import FREE_V, Rays, reflections, roof_amplitude, shadow
+from railfix.simulate.environment.side_streets import (
+    equipment_amplitude,
+    foliage,
+    neighbour_clearance,
+    neighbour_reflection,
+    side_streets,
+    street_reflections,
+)
+from railfix.simulate.environment.structures import BEYOND_M, build_structures, drawn_sections, tree_rows
+from railfix.simulate.environment.walls import FREE_V, Rays, reflections, roof_amplitude, second_reflection, shadow
 
 #: Chips over C/A's, by constellation and band; all others are C/A's (BPSK(1), BOC(1,1)).
 CHIP_RATIO: Final = {"C2": 0.5, "C6": 0.1, "E7": 0.1, "E5": 0.1, "E8": 0.1, "G5": 0.1, "J5": 0.1, "C5": 0.1, "C7": 0.1}

@@ -1,15 +1,17 @@
-"""Reflections by walls along side streets, square to the line: far away, ahead of the train or behind it."""
+"""Obstacles beside the line: side streets, trees, vehicles that pass."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.simulate.environment.diffraction import edge_amplitude, per_metre, roughness_loss
-from railfix.simulate.environment.settings import SideStreetSettings
-from railfix.simulate.environment.walls import Rays
+from railfix.simulate.environment.settings import NeighbourSettings, RoofEquipment, SideStreetSettings
+from railfix.simulate.environment.structures import Strips
+from railfix.simulate.environment.walls import FREE_V, Rays, wall_met
 
 #: Least lateral and longitudinal component of a direction that is computed.
 _LEAST: float = 0.02
@@ -98,3 +100,83 @@ def street_reflections(
             growth[rows] = -2.0 * ahead[rows] * along[rows]
         found.append((amplitude, extra, growth, along))
     return found
+
+
+#: Width of the edge of a crown over which the loss rises [m].
+_EDGE_M: float = 0.5
+_LEAST_TREE: float = 1e-3
+
+
+def foliage(row: Strips, rays: Rays) -> tuple[Floats, Floats, Floats]:
+    """Amplitude left by the crowns of a row of trees, and amplitude and extra path [m] of their scatter, shapes (N,).
+
+    The loss is the specific attenuation times the way through the crown, taken as long as the crown is wide, and at
+    most `most_db` (ITU-R P.833-9, 2.1: the loss saturates); what is lost is partly scattered forward.
+    """
+    side = (rays.y > 0.0).astype(np.intp)
+    lateral = np.maximum(np.abs(rays.y), _LEAST_TREE)
+    tree = wall_met(row, side, rays.chainage_m, np.zeros_like(lateral), rays.x, lateral)
+    value = {name: column[tree] for name, column in row.value.items()}
+    far = value["distance_m"] / lateral
+    height = rays.height_m + far * rays.z
+    place = rays.chainage_m + far * rays.x
+    inside = np.minimum(
+        np.minimum(place - row.start_m[tree], row.end_m[tree] - place),
+        np.minimum(value["height_m"] - height, height - value["crown_m"]),
+    )
+    share = np.clip(0.5 + inside / _EDGE_M, 0.0, 1.0)
+    way = (row.end_m[tree] - row.start_m[tree]) / np.sqrt(np.maximum(1.0 - rays.z**2, 0.04))
+    loss_db = np.minimum(value["attenuation_db_per_m"] * way, value["most_db"]) * share
+    left = 10.0 ** (-loss_db / 20.0)
+    return left, value["scatter"] * (1.0 - left), 0.5 * way * (1.0 + rays.x)
+
+
+_LEAST_VEHICLE: float = 1e-3
+#: Sign of the lateral component of rays toward a side.
+_SIDE: Final = {"right": 1.0, "left": -1.0}
+
+
+def neighbour_clearance(settings: NeighbourSettings, rays: Rays, time_s: Floats) -> Floats:
+    """Fresnel parameter of the vehicles on a parallel track, positive where they are in the way, shape (N,).
+
+    They follow each other at a constant headway and speed, so their places are a function of time alone, on any scale
+    that is the same for all calls. Rays to the other side pass.
+    """
+    lateral = np.maximum(np.abs(rays.y), _LEAST_VEHICLE)
+    far = settings.lateral_m / lateral
+    spacing = settings.spacing_m
+    place = np.remainder(rays.chainage_m + far * rays.x - settings.speed_mps * time_s, spacing)
+    # Distance inside of the nearest end of the vehicle, negative in a gap.
+    ends = np.where(
+        place < settings.length_m,
+        np.minimum(place, settings.length_m - place),
+        -np.minimum(place - settings.length_m, spacing - place),
+    )
+    level = lateral / np.sqrt(np.maximum(1.0 - rays.z**2, 1e-9))
+    rise = lateral / np.sqrt(lateral**2 + rays.z**2)
+    top = (settings.height_m - rays.height_m - far * rays.z) * rise
+    v = np.minimum(top, ends * level) * per_metre(far, rays.wavelength_m)
+    return np.where(rays.y * _SIDE[settings.side] > 0.0, v, FREE_V)
+
+
+def neighbour_reflection(settings: NeighbourSettings, rays: Rays, time_s: Floats) -> tuple[Floats, Floats, Floats]:
+    """Amplitude, extra path [m] and growth [m/m] of reflections by the sides of vehicles on a parallel track."""
+    v = neighbour_clearance(settings, replace(rays, y=-rays.y), time_s)
+    amplitude = settings.reflection * np.where(rays.y * _SIDE[settings.side] < 0.0, edge_amplitude(-v), 0.0)
+    return amplitude, 2.0 * settings.lateral_m * np.abs(rays.y), np.zeros(len(rays.x))
+
+
+def equipment_amplitude(equipment: tuple[RoofEquipment, ...], rays: Rays) -> Floats:
+    """Amplitude left of the direct signal by equipment on the vehicle's own roof, shape (N,)."""
+    amplitude = np.ones(len(rays.x))
+    for part in equipment:
+        along = np.maximum(np.abs(rays.x), _LEAST_VEHICLE)
+        far = abs(part.ahead_m) / along
+        rise = along / np.sqrt(along**2 + rays.z**2)
+        aside = along / np.sqrt(np.maximum(1.0 - rays.z**2, 1e-9))
+        margin = np.minimum(
+            (part.above_antenna_m - far * rays.z) * rise, (part.half_width_m - far * np.abs(rays.y)) * aside
+        )
+        v = margin * per_metre(far, rays.wavelength_m)
+        amplitude = amplitude * np.where(rays.x * part.ahead_m > 0.0, edge_amplitude(v), 1.0)
+    return amplitude

@@ -1,6 +1,5 @@
 """Messages of a simulated SBAS that corrects the simulated errors."""
 
-from railfix.simulate.sbas import encode
 from railfix.simulate.sbas.settings import SbasSettings
 
-__all__ = ["SbasSettings", "encode"]
+__all__ = ["SbasSettings"]

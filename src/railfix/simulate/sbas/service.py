@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -15,13 +15,132 @@ from railfix.core.files import write_whole
 from railfix.core.timescale import seconds, timedelta, to_week
 from railfix.ranges.sbas import SbasMessages
 from railfix.ranges.sbas.grid import BANDS, COLUMNS, POINT_OF_BIT
-from railfix.simulate.delays import ionosphere_m
+from railfix.ranges.sbas.messages import DATA_BITS, PREAMBLES, with_parity
+from railfix.simulate.noise import ionosphere_m
 from railfix.simulate.satellites import newest_record
-from railfix.simulate.sbas import encode
 from railfix.simulate.sbas.settings import SbasSettings
 
 if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
+
+Field = tuple[int, int]
+#: Slot, IODE, position [m] and clock [2^-31 s] of a long-term correction without velocity.
+LongTerm = tuple[int, int, tuple[float, float, float], float]
+
+#: Resolution of corrections and delays [m].
+STEP_M: Final = 0.125
+#: UDREI and GIVEI of slots and points that are not monitored.
+NOT_MONITORED: Final = 14
+NO_DELAY: Final = 15
+#: Fields of type 10 in their order, with their lengths.
+DEGRADATION: Final = {
+    "brrc": 10, "cltc_lsb": 10, "cltc_v1": 10, "iltc_v1": 9, "cltc_v0": 10, "iltc_v0": 9, "cgeo_lsb": 10,
+    "cgeo_v": 10, "igeo": 9, "cer": 6, "ciono_step": 10, "iiono": 9, "ciono_ramp": 10, "rss_udre": 1,
+    "rss_iono": 1, "ccovariance": 7,
+}  # fmt: skip
+
+
+def message(kind: int, second: int, *fields: Field) -> Bytes:
+    """Message of a type, with one of the three preambles by its second, and its parity, shape (32,).
+
+    The fields (value, length) lie from bit 14 on, negative values in two's complement. ValueError: when a value does
+    not fit its field, or the fields are longer than a message.
+    """
+    text = f"{PREAMBLES[second % 3]:08b}{kind:06b}"
+    for value, length in fields:
+        if not -(1 << length) < 2 * value + 1 <= (1 << (length + 1)):
+            raise ValueError(f"type {kind}: {value} does not fit {length} bits")
+        text += f"{value & ((1 << length) - 1):0{length}b}"
+    if len(text) > DATA_BITS:
+        raise ValueError(f"type {kind}: {len(text)} bits, expected at most {DATA_BITS}")
+    bits = np.array([int(c) for c in text.ljust(256, "0")], dtype=np.uint8)
+    return np.asarray(with_parity(np.packbits(bits)[None, :])[0])
+
+
+def mask(second: int, numbers: Collection[int], iodp: int = 0) -> Bytes:
+    """Type 1: satellites by their numbers of the PRN mask."""
+    return message(1, second, *((int(i in numbers), 1) for i in range(1, 211)), (iodp, 2))
+
+
+def fast(
+    second: int,
+    prc: Sequence[float],
+    udrei: Sequence[int],
+    *,
+    kind: int = 2,
+    iodf: int = 0,
+    iodp: int = 0,
+) -> Bytes:
+    """Types 0 and 2 to 5; corrections in metres, slots left over are not monitored."""
+    values = [round(v / STEP_M) for v in prc] + [0] * (13 - len(prc))
+    grades = list(udrei) + [NOT_MONITORED] * (13 - len(udrei))
+    return message(kind, second, (iodf, 2), (iodp, 2), *((v, 12) for v in values), *((g, 4) for g in grades))
+
+
+def integrity(second: int, udrei: Sequence[int], iodf: Sequence[int] = (0, 0, 0, 0)) -> Bytes:
+    """Type 6: UDREI of all slots."""
+    grades = list(udrei) + [NOT_MONITORED] * (51 - len(udrei))
+    return message(6, second, *((i, 2) for i in iodf), *((g, 4) for g in grades))
+
+
+def factors(second: int, indicator: Sequence[int], *, latency: int = 0, iodp: int = 0) -> Bytes:
+    """Type 7: degradation indicator of all slots."""
+    values = list(indicator) + [0] * (51 - len(indicator))
+    return message(7, second, (latency, 4), (iodp, 2), (0, 2), *((v, 4) for v in values))
+
+
+def parameters(second: int, **values: int) -> Bytes:
+    """Type 10 with raw numbers by name, those of `DEGRADATION`; 0 where not given."""
+    if unknown := values.keys() - DEGRADATION.keys():
+        raise ValueError(f"type 10 has no field {min(unknown)}")
+    return message(10, second, *((values.get(name, 0), length) for name, length in DEGRADATION.items()))
+
+
+def half(satellites: Sequence[LongTerm], iodp: int) -> list[Field]:
+    """Half of type 25 without velocity: (slot from 1, IODE, position [m], clock [2^-31 s]) of up to two."""
+    fields: list[Field] = [(0, 1)]
+    for i in range(2):
+        slot, iode, position, clock = satellites[i] if i < len(satellites) else (0, 0, (0.0, 0.0, 0.0), 0.0)
+        fields += [(slot, 6), (iode, 8), *((round(v / STEP_M), 9) for v in position), (round(clock), 10)]
+    return [*fields, (iodp, 2), (0, 1)]
+
+
+def long_term(second: int, satellites: Sequence[LongTerm], iodp: int = 0) -> Bytes:
+    """Type 25 of velocity code 0, up to four satellites."""
+    return message(25, second, *half(satellites[:2], iodp), *half(satellites[2:], iodp))
+
+
+def mixed(
+    second: int,
+    prc: Sequence[float],
+    udrei: Sequence[int],
+    satellites: Sequence[LongTerm],
+    *,
+    block: int = 0,
+    iodf: int = 0,
+    iodp: int = 0,
+) -> Bytes:
+    """Type 24: six fast corrections and half a type 25."""
+    values = [round(v / STEP_M) for v in prc] + [0] * (6 - len(prc))
+    grades = list(udrei) + [NOT_MONITORED] * (6 - len(udrei))
+    head = [*((v, 12) for v in values), *((g, 4) for g in grades), (iodp, 2), (block, 2), (iodf, 2), (0, 4)]
+    return message(24, second, *head, *half(satellites, iodp))
+
+
+def grid_mask(second: int, band: int, bits: Collection[int], iodi: int = 0, bands: int = 1) -> Bytes:
+    """Type 18; bits from 0."""
+    return message(18, second, (bands, 4), (band, 4), (iodi, 2), *((int(i in bits), 1) for i in range(201)))
+
+
+def grid_delay(
+    second: int, band: int, block: int, delay: Sequence[float], givei: Sequence[int], iodi: int = 0
+) -> Bytes:
+    """Type 26; delays in metres, 63.875 says do not use; points left over are not monitored."""
+    raw = [round(v / STEP_M) for v in delay] + [0] * (15 - len(delay))
+    grades = list(givei) + [NO_DELAY] * (15 - len(givei))
+    pairs = [field for v, g in zip(raw, grades, strict=True) for field in ((v, 9), (g, 4))]
+    return message(26, second, (band, 4), (block, 4), *pairs, (iodi, 2))
+
 
 #: Slots of one message of types 2 to 5; satellites of one of type 25; points of one of type 26.
 _FAST, _LONG_TERM, _DELAYS = 13, 4, 15
@@ -66,7 +185,7 @@ class _Service:
         fault, _ = self._errors.fault_m(self._instant(second - settings.alert_s + settings.latency_s), self.satellites)
         return [_DO_NOT_USE if abs(f) > settings.alert_m else settings.udrei for f in fault[0].tolist()]
 
-    def orbits(self, second: float) -> list[encode.LongTerm]:
+    def orbits(self, second: float) -> list[LongTerm]:
         """Long-term corrections of `satellites`: positions, to the issue of data in force."""
         at = self._instant(second)
         error = self._errors.orbit_error_m(at)[0]
@@ -124,8 +243,8 @@ class _Service:
                 values, grades = self.fast_m(second)[part].tolist(), self.udrei(second)[part]
                 if first > 0 and count - first <= _MIXED:
                     pair = self.orbits(second)[-2:]
-                    return encode.mixed(second, values, grades, pair, block=block, iodf=issue)
-                return encode.fast(second, values, grades, kind=2 + block, iodf=issue)
+                    return mixed(second, values, grades, pair, block=block, iodf=issue)
+                return fast(second, values, grades, kind=2 + block, iodf=issue)
 
             return made
 
@@ -136,10 +255,10 @@ class _Service:
         numbers = {int(name[1:]) for name in self.satellites}
         count = len(self.satellites)
         messages: list[Callable[[int], Bytes]] = [
-            lambda second: encode.mask(second, numbers),
-            lambda second: encode.factors(second, [0] * count),
-            lambda second: encode.parameters(second, iltc_v0=120, iiono=300),
-            lambda second: encode.integrity(second, self.udrei(second), iodf=(3, 3, 3, 3)),
+            lambda second: mask(second, numbers),
+            lambda second: factors(second, [0] * count),
+            lambda second: parameters(second, iltc_v0=120, iiono=300),
+            lambda second: integrity(second, self.udrei(second), iodf=(3, 3, 3, 3)),
         ]
         messages += [self._long_term(first) for first in range(0, count, _LONG_TERM)]
         for band, points in self.bands.items():
@@ -148,16 +267,16 @@ class _Service:
         return messages
 
     def _long_term(self, first: int) -> Callable[[int], Bytes]:
-        return lambda second: encode.long_term(second, self.orbits(second)[first : first + _LONG_TERM])
+        return lambda second: long_term(second, self.orbits(second)[first : first + _LONG_TERM])
 
     def _grid_mask(self, band: int) -> Callable[[int], Bytes]:
         bits = [point[0] for point in self.bands[band]]
-        return lambda second: encode.grid_mask(second, band, bits, bands=len(self.bands))
+        return lambda second: grid_mask(second, band, bits, bands=len(self.bands))
 
     def _grid_delays(self, band: int, block: int) -> Callable[[int], Bytes]:
         points = self.bands[band][_DELAYS * block : _DELAYS * (block + 1)]
         grades = [self._settings.givei] * len(points)
-        return lambda second: encode.grid_delay(second, band, block, self.delays_m(second, points), grades)
+        return lambda second: grid_delay(second, band, block, self.delays_m(second, points), grades)
 
 
 def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessages:

@@ -17,9 +17,8 @@ from railfix.core.arrays import Floats
 from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.timescale import timedelta
-from railfix.simulate.body_motion import FULL_SPEED_MPS
-from railfix.simulate.errors.processes import GaussMarkov
-from railfix.simulate.random_functions import RandomFunction
+from railfix.simulate.body import FULL_SPEED_MPS
+from railfix.simulate.errors.processes import GaussMarkov, RandomFunction
 from railfix.simulate.sensors.settings import InertialSettings
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from railfix.core.timescale import timedelta
 from railfix.simulate.sensors.settings import DrawnSlips, SlipInterval, TachometerSettings
 
 if TYPE_CHECKING:
-    from railfix.simulate.kinematics import Motion
+    from railfix.simulate.motion import Motion
     from railfix.simulate.signals import Simulation
 
 
