@@ -88,7 +88,7 @@ def without_beside(result: Result, route: RouteOfLog, config: Config) -> Result:
     """Results whose statuses and levels know where another track is more probable than `Config.track_risk`."""
     antennas, fusion = dict(result.antennas), dict(result.fusion)
     for name, single in antennas.items():
-        beside = route.is_uncertain(single.time, risk=config.track_risk)
+        beside = route.is_uncertain(single.time, single.chainage_m, risk=config.track_risk)
         status = np.where(beside & (single.status == Status.OK), np.int8(Status.MAP_OFFSET), single.status)
         protection = single.protection
         if protection is not None:
@@ -98,6 +98,7 @@ def without_beside(result: Result, route: RouteOfLog, config: Config) -> Result:
         antennas[name] = replace(single, status=status, protection=protection)
     for name, filtered in fusion.items():
         tracked = filtered.tracked
-        beside = route.is_uncertain(tracked.time, risk=config.track_risk) & is_bounded(tracked.status)
+        beside = route.is_uncertain(tracked.time, filtered.chainage_m, risk=config.track_risk)
+        beside &= is_bounded(tracked.status)
         fusion[name] = replace(filtered, tracked=doubted(tracked, beside, TrackStatus.MAP_OFFSET))
     return replace(result, antennas=antennas, fusion=fusion)

@@ -33,6 +33,9 @@ from railfix.track.network_route import route_of
 
 #: Interval of the positions that are matched [s].
 _INTERVAL_S: Final = 1.0
+#: Tracks of the route this near count for a place on it [m], and how far lengths in plan and of the line differ.
+_REACH_M: Final = 50.0
+_LENGTHS_DIFFER: Final = 1e-3
 #: Least probability of a track beside the route that is written and named.
 _LEAST_WRITTEN: Final = 1e-4
 _LEAST_NAMED: Final = 0.01
@@ -121,16 +124,28 @@ class RouteOfLog:
         """Probability of the route at each matched position, shape (n,)."""
         return np.asarray((self.matched.probabilities * self._on_route).sum(axis=1))
 
-    def is_uncertain(self, time: Datetimes, *, risk: float) -> Masks:
-        """Whether another track than the route's, or none of the map, is more probable than a risk.
+    def is_uncertain(self, time: Datetimes, chainage_m: Floats, *, risk: float) -> Masks:
+        """Whether the train is, with more than a risk, on another track than where it was placed on the route.
 
-        At the positions matched before and after each time: the track between two that are known may be another.
+        By the tracks of the route within `_REACH_M` of each chainage: a part of the route that lies beside another has
+        its own probability. At the positions matched before and after each time: the track between two that are known
+        may be another.
         """
         after = np.searchsorted(self.log.time, time)
-        least = np.fmin(
-            *(self.probability[np.clip(k, 0, len(self.log.time) - 1)] for k in (np.maximum(after - 1, 0), after))
-        )
-        return np.asarray(least < 1.0 - risk)
+        last = len(self.log.time) - 1
+        shares = (self._share_at(np.clip(k, 0, last), chainage_m) for k in (np.maximum(after - 1, 0), after))
+        return np.asarray(np.fmin(*shares) < 1.0 - risk)
+
+    def _share_at(self, epoch: Indices, chainage_m: Floats) -> Floats:
+        """Probability of the tracks of the route near chainages, at matched positions; of all without a chainage."""
+        lengths = self.network.length_m[list(self.tracks)]
+        end = np.cumsum(lengths)
+        reach = _REACH_M + _LENGTHS_DIFFER * end[-1]
+        along = chainage_m[:, None]
+        near = ((along > end - lengths - reach) & (along < end + reach)) | np.isnan(along)
+        track, share = self.matched.candidates.track[epoch], self.matched.probabilities[epoch]
+        own = [np.where(track == t, share, 0.0).sum(axis=1) for t in self.tracks]
+        return np.asarray((np.stack(own, axis=-1) * near).sum(axis=1))
 
     @cached_property
     def unmapped(self) -> Floats:
