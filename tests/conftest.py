@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from collections import Counter
 from collections.abc import Generator
 from pathlib import Path
 
@@ -43,6 +44,20 @@ def pytest_collection() -> Generator[None, object, object]:
 def good(tmp_path_factory: pytest.TempPathFactory) -> Desk:
     """One good input of every kind, and results of them; a test that changes them does so in a copy."""
     return desk_in(tmp_path_factory.mktemp("desk"))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Make of a test with the mark `every(n)` all cases but each n-th slow ones."""
+    seen: Counter[tuple[str, str]] = Counter()
+    for item in items:
+        mark = item.get_closest_marker("every")
+        if mark is None:
+            continue
+        function = (item.path.as_posix(), item.name.partition("[")[0])
+        if seen[function] % mark.args[0]:
+            item.add_marker(pytest.mark.slow)
+        seen[function] += 1
 
 
 @pytest.fixture(scope="session")

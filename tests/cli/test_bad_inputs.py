@@ -47,6 +47,7 @@ def test_the_good_inputs_are_good(desk: Desk, kind: str) -> None:
 
 
 @pytest.mark.parametrize(("kind", "fault"), CASES, ids=lambda name: name.replace("/", "-"))
+@pytest.mark.every(2)
 def test_one_sentence_and_nothing_destroyed(desk: Desk, kind: str, fault: str) -> None:
     FAULTS[fault](desk.folder / kind)
     before = contents(desk.folder)

@@ -54,6 +54,7 @@ def test_there_are_enough_cases() -> None:
 
 
 @pytest.mark.parametrize(("change", "code", "words"), CASES)
+@pytest.mark.every(2)
 def test_one_sentence_and_nothing_half_written(bench: Bench, change: Change, code: int, words: tuple[str, ...]) -> None:
     options = change(bench)
     before = everything_below(bench.folder)
@@ -71,6 +72,7 @@ def test_one_sentence_and_nothing_half_written(bench: Bench, change: Change, cod
     ],
     ids=lambda o: next(iter(o)),
 )
+@pytest.mark.every(3)
 def test_the_program_itself_ends_the_same_way(bench: Bench, options: dict[str, Any]) -> None:
     command = [sys.executable, "-m", "railfix", *bench.arguments(**options)]
     done = subprocess.run(command, cwd=bench.folder, capture_output=True, text=True, check=False)

@@ -126,6 +126,7 @@ def test_help_reads_like_a_manual() -> None:
         assert len(printed.splitlines()) > 20
 
 
+@pytest.mark.slow
 def test_the_commands_do_not_load_matplotlib() -> None:
     import subprocess
 

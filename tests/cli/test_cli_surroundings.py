@@ -129,6 +129,7 @@ def text_of(output: str) -> str:
         ("report {desk}/results --out {desk}", 8, "is a folder"),
     ],
 )
+@pytest.mark.every(2)
 def test_bad_words_end_with_one_sentence(desk: Desk, tmp_path: Path, words: str, code: int, sentence: str) -> None:
     log = "run --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --out {out}"
     text = words.replace("{log}", log).replace("{desk}", str(desk.folder)).replace("{out}", str(tmp_path / "out"))
@@ -146,6 +147,7 @@ def test_bad_words_end_with_one_sentence(desk: Desk, tmp_path: Path, words: str,
 # -- the surroundings of a process --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_reader_that_stops_reading_is_no_defect(desk: Desk) -> None:
     words = [*PROGRAM, "evaluate", "results", "--reference", "truth.csv"]
     with subprocess.Popen(
@@ -214,6 +216,7 @@ def test_a_name_that_is_not_utf_8_is_one_sentence(tmp_path: Path) -> None:
     ],
     ids=lambda words: words.split()[0],
 )
+@pytest.mark.every(3)
 def test_tables_are_whole_in_a_log_of_80_columns(
     desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str
 ) -> None:

@@ -92,6 +92,7 @@ def test_an_existing_file_is_refused_and_an_input_never_overwritten(desk: Desk, 
 
 
 @pytest.mark.parametrize("command", TO_FOLDER, ids=lambda text: " ".join(text.split()[:2]))
+@pytest.mark.every(3)
 def test_existing_results_are_replaced_only_when_asked(desk: Desk, command: str) -> None:
     out = desk.folder / "out"
     out.mkdir()
@@ -253,6 +254,7 @@ KILLED: Final = {
 
 
 @pytest.mark.parametrize("name", ["run", pytest.param("simulate", marks=pytest.mark.slow)])
+@pytest.mark.every(2)
 def test_the_next_run_works_after_a_kill(desk: Desk, name: str) -> None:
     _check_kills(desk, KILLED[name], 2, signal.SIGKILL, seed=1)
 

@@ -19,6 +19,7 @@ COLD_START = "16dBatt_no_interference_coldstart.ubx.gz"
 
 
 @pytest.mark.parametrize("version", ["3", "4"])
+@pytest.mark.every(3)
 def test_a_log_comes_back_from_rinex(recordings: Path, tmp_path: Path, version: str) -> None:
     log = recordings / "live" / COLD_START
     out, nav = tmp_path / "log.crx.gz", tmp_path / "log.nav.gz"

@@ -670,6 +670,7 @@ def rows_of_document(antenna: str, columns: int) -> list[list[str]]:
     return [[cell.replace(",", "").removesuffix(" %") for cell in row] for row in rows if len(row) == columns]
 
 
+@pytest.mark.slow
 def test_the_document_shows_what_the_demonstration_gives(tmp_path: Path):
     run_files(demo_inputs(), out=tmp_path / "run")
     found = evaluate_run(tmp_path / "run")
@@ -687,6 +688,7 @@ def test_the_document_shows_what_the_demonstration_gives(tmp_path: Path):
 
 
 @pytest.mark.requirement("C4")
+@pytest.mark.slow
 def test_the_document_shows_the_levels_of_the_demonstration(tmp_path: Path):
     run_files(demo_inputs(), out=tmp_path / "run")
     table = evaluate_run(tmp_path / "run").integrity["separation"].stanford.filter(grouping="all", own_limit=True)

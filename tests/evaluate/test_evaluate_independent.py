@@ -164,6 +164,7 @@ def check_integrity(found: Evaluation, expected: tuple[dict, ...]) -> int:
 
 
 @pytest.mark.requirement("C4")
+@pytest.mark.slow
 def test_the_stanford_counts_of_a_run_with_holes(evaluated_worse: tuple[Evaluation, tuple[dict, ...]]):
     found, expected = evaluated_worse
     assert check_integrity(found, expected) > 1000

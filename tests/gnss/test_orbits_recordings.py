@@ -76,6 +76,7 @@ def compare(nav: Navigation, row: int, ephemeris: Any, *, of_glonass: bool) -> t
 
 @pytest.mark.requirement("A7")
 @pytest.mark.parametrize("name", FILES)
+@pytest.mark.every(3)
 def test_positions_and_clocks_of_rtklib(name: str, recordings: Path, tmp_path: Path) -> None:
     """RTKLIB reads the file and computes the states. Required: 1 mm and 1 mm; found: a micrometre."""
     rtk = pytest.importorskip("pyrtklib5")

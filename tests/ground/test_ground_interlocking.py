@@ -441,6 +441,7 @@ def closed_course(seed: int) -> tuple[int, int]:
     return into, len(stopped)
 
 
+@pytest.mark.slow
 def test_no_authority_is_extended_into_a_closed_section(monkeypatch: pytest.MonkeyPatch) -> None:
     courses = [closed_course(seed) for seed in range(4)]
     assert [into for into, _ in courses] == [0, 0, 0, 0]

@@ -422,6 +422,7 @@ def test_a_wrong_certificate_is_rejected(keys: Path, tmp_path: Path, kind: str) 
 
 
 @pytest.mark.parametrize("how", ["revoked", "expired"])
+@pytest.mark.every(2)
 def test_a_certificate_ends_while_connected(tmp_path: Path, how: str) -> None:
     write_keys(tmp_path / "keys", [7, 8])
     keys = tmp_path / "keys"

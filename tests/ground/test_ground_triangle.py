@@ -120,6 +120,7 @@ def test_a_triangle_too_small_for_its_limits_is_rejected() -> None:
 
 
 @pytest.mark.parametrize("per_sample", [1e-2, 1e-3, 1e-4])
+@pytest.mark.slow
 def test_false_stops_stay_below_the_rate_that_was_set(per_sample: float) -> None:
     """A million independent samples; Rayleigh tails of three circles make up half of the rate."""
     stops_per_year = per_sample * 31_557_600.0 / 100.0

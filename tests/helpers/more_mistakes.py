@@ -155,7 +155,7 @@ MORE: Final[dict[str, Mistake]] = {
     ),
     "geometry_missing": ({"s.geojson": _feature("null")}, _NETWORK, 3, "feature 1 has no geometry"),
     "features_none": ({"s.geojson": _feature("")}, _NETWORK, 3, "has no features"),
-    "tolerance_negative": ({}, "map network {desk}/line.geojson --tolerance -1", 4, "--tolerance must be positive"),
+    "tolerance_negative": ({}, "map network {desk}/line.geojson --tolerance -1", 4, "--tolerance: Input should be greater than 0"),
     "page_as_pdf": ({}, "map network {desk}/line.geojson --page {desk}/s.pdf", 8, "an HTML page is written"),
     "track_misnamed": (
         {"s.geojson": _feature('{"type":"LineString","coordinates":[[8,47,4],[8,47.1,4]]}')},
@@ -261,7 +261,7 @@ MORE: Final[dict[str, Mistake]] = {
     "last_place_over_the_log": ({}, _WHICH + " --save-last {desk}/front.obs", 8, "is an input"),
     "base_without_place": ({}, _WHICH + " --base {desk}/rear.obs", 4, "needs both --base and --base-place"),
     "base_without_height": (
-        {}, _WHICH + " --base {desk}/rear.obs --base-place 35,139", 4, "expected LATITUDE,LONGITUDE,HEIGHT",
+        {}, _WHICH + " --base {desk}/rear.obs --base-place 35,139", 4, "expected LAT,LON,HEIGHT",
     ),
     "spacing_negative": ({}, _WHICH + " --spacing -3", 4, "--spacing: Input should be greater than or equal to 0"),
     "spacing_of_one_antenna": ({}, _WHICH + " --spacing 18", 4, "--spacing is given without --rear"),

@@ -194,10 +194,10 @@ def test_bounds_are_the_same_compiled(
     monkeypatch.setattr(kernels.off_tangent, "risk_off_tangent", recorded)
     pixel.solved(integrity_tables.SETTINGS.model_copy(update={"risk": RiskBudget(side_prior=1e-2)}))
     assert calls
-    for *arrays, clear_m, plan, height, _ in calls:
+    for *arrays, clear_m, sigma_m, _ in calls:
         clear_m = np.linspace(20.0, 200.0, len(clear_m))
         one, other = (
-            function(*arrays, clear_m, plan, height, enough)
+            function(*arrays, clear_m, sigma_m, enough)
             for function in (plain("off_tangent").risk_off_tangent, compiled)
         )
         assert 0.1 * len(one) < np.count_nonzero((one > 1e-12) & (one < 1e-2))

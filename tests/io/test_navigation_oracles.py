@@ -161,6 +161,7 @@ _GEORINEX = {
 
 
 @pytest.mark.parametrize("name", _GEORINEX_FILES)
+@pytest.mark.every(3)
 def test_kepler_records_against_georinex(recordings: Path, name: str) -> None:
     """Every record that georinex keeps is one of ours; it keeps one a satellite and clock time, and no D exponents."""
     georinex = pytest.importorskip("georinex", reason="the independent reader is not installed")

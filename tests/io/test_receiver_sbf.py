@@ -297,6 +297,7 @@ def test_sbas_messages_of_pages() -> None:
     assert messages.rejected["parity"] == 1
 
 
+@pytest.mark.slow
 def test_a_stream_of_sbf_cut_anywhere_is_the_log(cold: tuple[Path, Navigation]) -> None:
     """Epochs and records in the order of the stream, in fragments as a receiver sends them."""
     data = cold[0].read_bytes()[:150_000]

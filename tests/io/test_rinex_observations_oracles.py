@@ -106,6 +106,7 @@ def compare_with_georinex(path: Path) -> int:
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.slow) if n in ("ESBC", "dual base") else n for n in RECORDINGS]
 )
+@pytest.mark.every(3)
 def test_first_epochs_equal_georinex(recordings: Path, tmp_path: Path, name: str) -> None:
     source = recordings / RECORDINGS[name][0]
     path = source if name in ("geonet 0759", "geonet 3040") else first_epochs(source, tmp_path / "log.rnx", 8)

@@ -312,6 +312,7 @@ else:
 
 
 @pytest.mark.parametrize("terminal", [True, False])
+@pytest.mark.every(2)
 def test_a_terminal_is_told_of_compilation_once(terminal: bool) -> None:
     program = """
 import numba

@@ -328,6 +328,7 @@ def test_a_stream_through_a_socket_is_the_log(recordings: Path, tmp_path: Path) 
     assert np.array_equal(list(a.values()), list(b.values()), equal_nan=True)
 
 
+@pytest.mark.slow
 def test_ephemerides_count_from_when_they_are_complete(recordings: Path, tmp_path: Path) -> None:
     """A cold start: no position until subframes of enough satellites have been received whole."""
     log = recordings / "live" / "16dBatt_no_interference_coldstart.ubx.gz"

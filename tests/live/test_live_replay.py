@@ -67,6 +67,7 @@ def without_satellites(log: Observations, first: int, last: int) -> Observations
     return replace(log, code_m=code)
 
 
+@pytest.mark.slow
 def test_epochs_without_a_satellite_of_two_antennas(epochs: dict[str, Observations], tmp_path: Path) -> None:
     """RXM-RAWX with no measurement, from both receivers and from one: as in the log."""
     logs = {name: log[:60] for name, log in epochs.items()}
@@ -95,6 +96,7 @@ def test_logs_of_different_rates(
     assert "epochs paired: 60" in assert_live_is_run({"front": log_of(epochs["front"]), "rear": rear}, tmp_path)
 
 
+@pytest.mark.slow
 def test_the_end_of_a_paced_replay_has_its_message(epochs: dict[str, Observations], tmp_path: Path) -> None:
     """Epochs that wait for their pair or period where the logs end: all have rows, the newest has a message."""
     logs = {"front": log_of(epochs["front"][:30]), "rear": log_of(epochs["rear"][:29])}

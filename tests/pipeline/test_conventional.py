@@ -27,6 +27,7 @@ def test_the_dilution_is_that_of_the_whole_design_matrix() -> None:
 
 
 @pytest.mark.parametrize("scale", [1.0, 2.5])
+@pytest.mark.slow
 def test_noise_alone_fails_as_often_as_set(scale: float) -> None:
     arc = np.linspace(50.0, 900.0, 3000)
     ranges = synthetic.ranges(LINE, arc, systems="GGGGGGG", seed=4)

@@ -38,6 +38,7 @@ def clean() -> AntennaResult:
 
 @pytest.mark.requirement("B4")
 @pytest.mark.parametrize(("satellite", "size_m"), [("G06", 10.0), ("G06", 20.0), ("G06", 100.0), ("E05", 20.0)])
+@pytest.mark.every(3)
 def test_a_fault_from_the_first_epoch_on_teaches_nothing(clean: AntennaResult, satellite: str, size_m: float) -> None:
     found = with_fault(satellite, size_m)
     ok = (found.status == Status.OK) & (clean.status == Status.OK)

@@ -72,6 +72,7 @@ def m8t(recordings) -> tuple[EpochProcessor, Observations]:
 
 @pytest.mark.requirement("A8")
 @pytest.mark.parametrize(("size", "epochs"), [(1, 250), (7, 785), (1000, 785)])
+@pytest.mark.every(4)
 def test_chunks_of_a_recording_give_the_whole(m8t, size: int, epochs: int):
     one, observations = m8t
     parts = {"front": observations[:epochs]}

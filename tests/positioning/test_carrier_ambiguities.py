@@ -183,6 +183,7 @@ def test_exact_on_a_curved_line():
 
 @pytest.mark.requirement("A5")
 @pytest.mark.parametrize("tied", [False, True])
+@pytest.mark.every(2)
 def test_without_phases_it_is_the_position_of_the_codes(tied):
     arc, time = moving(40), carrier_cases.times(40)
     ranges, phases = carrier_cases.observed(LINE, arc)

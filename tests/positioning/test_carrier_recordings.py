@@ -68,6 +68,7 @@ def test_a_mosaic_in_the_open(recordings):
     ("name", "p50"),
     [("urbannav F9P", 0.95), pytest.param("urbannav M8T", 0.75, marks=pytest.mark.slow), ("gsdc_pixel5_a", 0.9)],
 )
+@pytest.mark.slow
 def test_in_towns_it_does_no_harm(recordings, name, p50):
     """Arcs of seconds, codes wrong by tens of metres: the median gains, the 95 % little."""
     got = scores(recorded(recordings, name))

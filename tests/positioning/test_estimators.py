@@ -183,6 +183,7 @@ def oracle(ranges: Ranges, t: int, line: Trajectory, arc: float) -> float:
 
 @pytest.mark.requirement("A4")
 @pytest.mark.parametrize("used", [list(range(8)), [0, 1, 2, 3], [0, 1, 2], [0, 1]])
+@pytest.mark.every(2)
 def test_constrained_position_equals_a_general_optimiser(used):
     """On a straight line, where the optimum is smooth: within 1 mm."""
     s = np.arange(0.0, 1001.0, 20.0)
@@ -211,6 +212,7 @@ def test_exact_ranges_of_two_satellites_give_the_place():
 
 
 @pytest.mark.requirement("A4")
+@pytest.mark.slow
 def test_error_over_its_own_sigma_is_one():
     where = arcs(3000)
     ranges = synthetic.ranges(LINE, where, sigma_m=2.0)
@@ -228,6 +230,7 @@ def test_error_over_its_own_sigma_is_one():
 
 
 @pytest.mark.requirement("A4")
+@pytest.mark.slow
 def test_convex_vertex_ends_the_walk():
     """Both neighbours of a sharp point send the step back to it: the point is the answer."""
     s = np.arange(0.0, 201.0, 20.0)

@@ -150,6 +150,7 @@ def test_georinex_loads_the_same_observations(tmp_path: Path) -> None:
 
 
 @pytest.mark.requirement("A7")
+@pytest.mark.slow
 def test_observations_are_read_through_georinex_beside_our_own_reader(tmp_path: Path) -> None:
     whole = railfix.read_observations(demo_files()["front"])
     paths = [tmp_path / "two.rnx", tmp_path / "one.rnx"]
@@ -226,6 +227,7 @@ def test_another_dataset_is_named(demo: dict[str, object], change: object, messa
         railfix.navigation_from_xarray(data)
 
 
+@pytest.mark.slow
 def test_the_help_leads_on() -> None:
     run = subprocess.run(
         [sys.executable, "-c", "import railfix; help(railfix)"], capture_output=True, text=True, check=True

@@ -113,6 +113,7 @@ def check(listed: dict[str, Any]) -> str:
     return str(validators.JsonStrictValidator(schema.V1_6).validate_str(json.dumps(listed)) or "")
 
 
+@pytest.mark.slow
 def test_the_list_of_components_is_valid_and_the_same_each_time() -> None:
     listed = bill_of_materials()
     assert check(listed) == ""

@@ -379,6 +379,7 @@ def test_layers_of_unequal_length_are_refused() -> None:
         Cells(label="a", colour="#000000", x_edges=np.arange(3.0), y_edges=np.arange(3.0), counts=np.zeros((3, 2), int))
 
 
+@pytest.mark.slow
 def test_every_picture_is_drawn(errors: pl.DataFrame, positions: pl.DataFrame, observations: pl.DataFrame) -> None:
     chunks = {"first_epoch_gpst": [str(START)], "epochs": [100], "positioning_s": [0.2]}
     figures: list[Figure] = [

@@ -108,6 +108,7 @@ def result_of(reasons: list[list[int]], satellites: list[str], status: list[Stat
             map_offset=SimpleNamespace(statistic=np.full(epochs, np.nan)),
             screens={},
             protection=None,
+            interference=None,
         ),
     )
 

@@ -168,6 +168,7 @@ def test_without_a_vehicle_the_output_says_so(bench: Bench, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("epochs", [1, 7, 1000])
+@pytest.mark.every(2)
 def test_the_results_do_not_depend_on_the_chunks(
     bench: Bench, tmp_path: Path, epochs: int, request: pytest.FixtureRequest
 ) -> None:
@@ -359,6 +360,7 @@ def test_positions_that_failed_a_check_do_not_count_when_they_are_dropped(tmp_pa
 
 
 @pytest.mark.requirement("C2")
+@pytest.mark.slow
 def test_a_run_says_what_speaks_against_its_levels(whole: RunSummary, tmp_path: Path) -> None:
     """Faults that RAIM excludes are likelier than the level takes them to be; and a budget too small gives none."""
     assert any("RAIM has excluded" in note and "see risk.local_prior" in note for note in whole.notes)

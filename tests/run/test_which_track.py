@@ -191,6 +191,7 @@ def _from(codes: StandstillCodes, first: int, epochs: int) -> StandstillCodes:
 
 
 @pytest.mark.parametrize(("kind", "decisions"), [("base", 0.9), ("alone", 0.0)])
+@pytest.mark.every(3)
 def test_roof_with_invented_yards_is_never_on_a_wrong_track(
     roof: dict[str, StandstillCodes], kind: str, decisions: float
 ) -> None:
@@ -243,6 +244,7 @@ def test_a_slip_ends_the_part_of_a_satellite_that_is_used(roof: dict[str, Stands
     assert np.abs(change - np.round(change)).max() < 0.02
 
 
+@pytest.mark.slow
 def test_roof_between_tracks_of_a_map_that_lacks_its_own_is_on_none(roof: dict[str, StandstillCodes]) -> None:
     for azimuth in range(0, 180, 60):
         yard = [track for k, track in enumerate(made_tracks(5, azimuth, np.zeros(2), 2)) if k != 2]
@@ -331,6 +333,7 @@ def test_last_places_that_cannot_be_used_are_one_sentence(tmp_path: Path) -> Non
         prior_of_interlocking("y=1", net)
 
 
+@pytest.mark.slow
 def test_last_place_decides_what_codes_alone_cannot(recordings: Path, tmp_path: Path) -> None:
     """Switched off beside a base station, switched on again without one."""
     folder = recordings / "dual" / "mosaic_x2_99cm"

@@ -15,7 +15,7 @@ import polars as pl
 import pytest
 
 from railfix.core.reasons import Reason, Status
-from railfix.core.tables import listing
+from railfix.core.tables import Table, listing
 from railfix.evaluate.tables import _ERRORS
 from railfix.io.rinex import read_observations, write_observations
 from railfix.pipeline.config import Config
@@ -221,7 +221,8 @@ def test_the_report_states_both_rates() -> None:
     )
     (row,) = summary([run], None).rows
     assert [str(cell) for cell in row[3:]] == ["200", "90.00 %", "60.00 %", "2.75"]
-    epochs = {str(row[0]).strip(): str(row[1]) for row in budget(run)[0].rows}  # type: ignore[union-attr]
+    tables = [block for block in budget(run) if isinstance(block, Table)]
+    epochs = {str(row[0]).strip(): str(row[1]) for row in tables[0].rows}
     assert epochs["positioning rate"] == "90.00 %"
     assert epochs["rate of ok"] == "60.00 %"
     assert [epochs[name] for name in ("epochs", "with observations", "with position")] == ["200", "100", "90"]

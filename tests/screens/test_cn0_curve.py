@@ -310,6 +310,7 @@ def test_a_day_of_open_sky(recordings: Path, tmp_path: Path) -> None:
 # -- pictures -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_pictures(tmp_path: Path) -> None:
     samples = Cn0Samples()
     samples.add(*sky(500))

@@ -65,6 +65,7 @@ def example(folder: Path) -> Path:
 
 
 @pytest.mark.requirement("B7")
+@pytest.mark.slow
 def test_a_screen_of_ones_own_is_one_module_and_one_entry_point(tmp_path: Path) -> None:
     path = os.pathsep.join([str(example(tmp_path / "site")), *sys.path])
     environment = {**os.environ, "PYTHONPATH": path, "COLUMNS": "120"}
@@ -93,6 +94,7 @@ def test_a_screen_of_ones_own_is_one_module_and_one_entry_point(tmp_path: Path) 
 
 
 @pytest.mark.requirement("B7")
+@pytest.mark.slow
 def test_a_package_with_a_wrong_screen_is_named(tmp_path: Path) -> None:
     site = example(tmp_path / "site")
     entry = site / "my_package-1.0.dist-info" / "entry_points.txt"

@@ -115,6 +115,7 @@ def test_nothing_is_added_by_default() -> None:
     assert (on.error_m == 0.0).all()
 
 
+@pytest.mark.slow
 def test_satellite_clocks_give_their_sigma_and_correlation_time_back() -> None:
     errors = ErrorSettings(
         satellites={

@@ -90,6 +90,7 @@ def test_the_transition_is_a_clothoid() -> None:
     assert heading[2] < 0.0, "the line falls here"
 
 
+@pytest.mark.slow
 def test_heights_follow_the_gradient_and_chainage_is_arc_length() -> None:
     s = np.linspace(0.0, 756.0, 756_001)
     place = LINE.at(s)

@@ -185,6 +185,7 @@ def test_messages_and_station_are_written(tmp_path: Path) -> None:
     assert station.header.approximate_ecef_m == pytest.approx(true, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_fault_of_one_station_is_its_own() -> None:
     """Three stations (P3, 3): a receiver fault shows in one of them, a satellite fault in all."""
     seen = [name for name in Simulation(scenario(5.0)).satellites if name.startswith("G")]

@@ -64,6 +64,7 @@ def test_the_recordings_are_clean(named):
 
 
 @pytest.mark.parametrize("kind", [steps, ramps])
+@pytest.mark.every(3)
 def test_one_fault_is_detected_as_theory_says(named, kind):
     """Every satellite in turn, 2, 10, 50 and 200 m, on the residuals as recorded."""
     name, case = named
@@ -91,6 +92,7 @@ def test_two_faults_over_three_detectable_biases_are_excluded(named):
     assert found.wrong == 0
 
 
+@pytest.mark.every(3)
 def test_detection_in_gaussian_noise_is_the_non_central_chi_square(named):
     """The geometry of the recording with noise of known sigma: within the Monte-Carlo bounds of theory."""
     _, case = named

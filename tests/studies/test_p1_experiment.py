@@ -91,6 +91,7 @@ def test_the_standing_experiments_are_as_they_were(tmp_path: Path) -> None:
 
 
 @pytest.mark.requirement("D2")
+@pytest.mark.slow
 def test_strict_is_what_the_preset_makes_of_it() -> None:
     """The limit of the own sigma put upon the results of "default, drop" is the preset "strict"."""
     scenario = p1_experiment.short_scenario()

@@ -16,6 +16,7 @@ pytestmark = pytest.mark.requirement("A9")
 
 
 @pytest.mark.parametrize("name", FRAMES)
+@pytest.mark.every(2)
 def test_a_frame_is_moved_as_proj_or_its_definition_has_it(name: str) -> None:
     case = moved(name)
     assert case.off_m < 0.05

@@ -129,6 +129,7 @@ def test_check_finds_a_gap_a_kink_and_a_track_twice() -> None:
     assert not [f for f in check_network(net).findings if f.kind != "dead end"]
 
 
+@pytest.mark.slow
 def test_runs_are_on_the_right_track_and_probabilities_are_calibrated() -> None:
     """Of tracks 3.6 m apart: the share on the right one at the probability that is given, over 25 runs."""
     net = made_network(10.0)

@@ -86,6 +86,7 @@ def test_epochs_one_by_one_give_what_the_whole_gives(name: str) -> None:
 
 @pytest.mark.requirement("E5")
 @pytest.mark.parametrize(("name", "first"), [("sensors", 55), ("faults", 67)])
+@pytest.mark.every(2)
 def test_as_plain_python_the_recursion_gives_the_same(name: str, first: int, monkeypatch: pytest.MonkeyPatch) -> None:
     epochs, line, sensors = _case(name)
     before, cut = slice(0, first), slice(first, first + 7)
@@ -179,7 +180,7 @@ def _ranged(case: Ride, *, kept: float) -> SensorEpochs:
 def test_ranges_to_ground_units_give_the_place_to_decimetres() -> None:
     case = ride(60, noise=1.0, seed=5)
     found, state = track(case.epochs, case.line, sensors=_ranged(case, kept=0.6), levels=True)
-    assert found.used[:, 7].sum() > 40
+    assert found.used[:, 3 + layout.RANGE_ROW].sum() > 40
     assert np.abs(found.arc_m - case.arc_m)[10:].max() < 0.4
     assert state.bank is not None
     assert "range" in state.bank.without

@@ -31,6 +31,7 @@ RUNS = {
 
 @pytest.mark.requirement("E5")
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "pixel" else n for n in BOUNDS])
+@pytest.mark.every(2)
 def test_errors_of_the_filter_on_a_recording(recordings: Path, name: str) -> None:
     case = filter_score.rinex_case(name, RUNS[name], recordings)
     found = case.run()

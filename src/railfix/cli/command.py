@@ -68,13 +68,16 @@ class Command(TyperCommand):
             if not equals:
                 next(words, None)
         missing = [
-            param.opts[0]
+            param
             for param in self.params
             if isinstance(param, TyperOption) and param.required and not any(name in given for name in param.opts)
         ]
-        if len(missing) > 1 and not {"--help", "-h"} & set(args) and args:
-            ctx.fail(f"Missing options {', '.join(missing)}.")
-        return super().parse_args(ctx, args)
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            if len(missing) < 2 or error.param not in missing:
+                raise
+            ctx.fail(f"Missing options {', '.join(param.opts[0] for param in missing)}.")
 
     @staticmethod
     def _check_switch(ctx: Any, name: str, args: list[str]) -> None:
