@@ -155,7 +155,9 @@ MORE: Final[dict[str, Mistake]] = {
     ),
     "geometry_missing": ({"s.geojson": _feature("null")}, _NETWORK, 3, "feature 1 has no geometry"),
     "features_none": ({"s.geojson": _feature("")}, _NETWORK, 3, "has no features"),
-    "tolerance_negative": ({}, "map network {desk}/line.geojson --tolerance -1", 4, "--tolerance: Input should be greater than 0"),
+    "tolerance_negative": (
+        {}, "map network {desk}/line.geojson --tolerance -1", 4, "--tolerance: Input should be greater than 0",
+    ),
     "page_as_pdf": ({}, "map network {desk}/line.geojson --page {desk}/s.pdf", 8, "an HTML page is written"),
     "track_misnamed": (
         {"s.geojson": _feature('{"type":"LineString","coordinates":[[8,47,4],[8,47.1,4]]}')},
