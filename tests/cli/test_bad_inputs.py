@@ -71,6 +71,7 @@ def test_one_sentence_and_nothing_destroyed(desk: Desk, kind: str, fault: str) -
 
 @pytest.mark.requirement("G4")
 @pytest.mark.parametrize("name", [*MISTAKES, *MORE])
+@pytest.mark.every(2)
 def test_a_mistake_of_the_user_is_one_sentence_with_its_remedy(good: Desk, name: str) -> None:
     files, command, code, words = {**MISTAKES, **MORE}[name]
     for file, text in files.items():

@@ -170,6 +170,7 @@ def test_a_reader_that_stops_reading_is_no_defect(desk: Desk) -> None:
         *(pytest.param(w, marks=pytest.mark.slow) for w in ("--version", "simulate --list")),
     ],
 )
+@pytest.mark.every(2)
 def test_a_full_device_is_one_sentence(desk: Desk, words: str) -> None:
     with open("/dev/full", "w") as full:  # noqa: PTH123
         done = subprocess.run(

@@ -70,6 +70,7 @@ def contents(folder: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("command", TO_FILE, ids=lambda text: " ".join(text.split()[:2]))
+@pytest.mark.every(2)
 def test_an_existing_file_is_refused_and_an_input_never_overwritten(desk: Desk, command: str) -> None:
     ending = next(end for word, end in ENDINGS.items() if word in command)
     out = desk.folder / f"there{ending}"

@@ -56,6 +56,7 @@ def on_terminal(words: list[str], columns: int, folder: Path) -> str:
 
 @pytest.mark.requirement("G4")
 @pytest.mark.parametrize("columns", [80, 100, 120])
+@pytest.mark.every(3)
 def test_no_digit_is_cut_on_a_terminal(tmp_path: Path, columns: int) -> None:
     shown = on_terminal([sys.executable, "-c", _SCRIPT], columns, tmp_path)
     assert max(len(line) for line in shown.splitlines()) <= columns

@@ -47,6 +47,7 @@ def test_a_run_says_first_where_how_good_and_how_sure(desk: Desk) -> None:
     assert lines[3].endswith(f"railfix report {desk.folder}/new --out report.html")
 
 
+@pytest.mark.slow
 def test_an_evaluation_says_the_worst_first_in_five_lines(desk: Desk) -> None:
     command = "evaluate {desk}/results --reference {desk}/truth.csv"
     lines = first_lines(desk, command)

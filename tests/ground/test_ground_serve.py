@@ -210,6 +210,7 @@ def test_positions_go_to_the_centre_and_authorities_come_back(folder: Path, tmp_
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_a_train_ends_within_a_second(folder: Path, number: signal.Signals) -> None:
     """With its input open and silent, and no centre there."""
     words = [sys.executable, "-m", "railfix", "ground", "train", "1", "--keys", str(folder / "keys")]

@@ -272,6 +272,7 @@ def test_a_satellite_clock_step_in_the_logs(triangle_logs: tuple[list[Path], Pat
     assert done.output.index("suspend") < done.output.index("stop:")
 
 
+@pytest.mark.slow
 def test_streams_are_judged_as_their_logs_are(triangle_logs: tuple[list[Path], Path], tmp_path: Path) -> None:
     """The same verdicts and errors as from the logs; a clock step in the streams stops the trains at once."""
     logs, nav = triangle_logs

@@ -85,6 +85,7 @@ def exceeded(systems: str, members: tuple[int, ...], *, wrong_map: bool) -> floa
 
 
 @pytest.mark.parametrize("kind", CASES)
+@pytest.mark.every(3)
 def test_faults_together_stay_within_the_level(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """And would not, were they neither hypotheses nor taken off the risk: the injected faults can be seen."""
     systems, members, wrong_map, likely = CASES[kind]

@@ -122,6 +122,7 @@ MIXES = [
 
 
 @pytest.mark.parametrize(("systems", "ties"), MIXES)
+@pytest.mark.every(3)
 def test_false_alarm_rate(systems, ties):
     false_alarms_are_as_set(systems, ties, 20_000, [1e-2, 1e-3])
 

@@ -92,6 +92,7 @@ def test_space_equals_trying_every_subset(seed, system, faults, limits):
         check_against_trying(oracle.problem_in_space(ranges, 0, place[0]), model, limits, 1.0)
 
 
+@pytest.mark.slow
 def test_own_errors_about_the_limit_of_noise():
     """A second, small fault on a satellite that the others check little: excluded with the first only when over."""
     limits, scale = RaimLimits(separation_risk=1.0, false_alarm=0.05), 1.0

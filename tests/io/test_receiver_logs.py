@@ -142,6 +142,7 @@ def test_ubx_ephemerides_are_those_of_rtklib(recordings: Path, tmp_path: Path) -
     assert sorted(ours.kepler.satellite.astype("<U1").tolist()) == ["E"] * 19 + ["G"] * 9
 
 
+@pytest.mark.slow
 def test_rtcm_ephemerides_are_those_of_the_rinex_file(recordings: Path) -> None:
     """GPS records of a caster beside those of a station's file of the same hours; Galileo is F/NAV there."""
     ours = railfix.read_navigation(recordings / "live" / RTCM, date="2023-08-17T02:00")
@@ -232,6 +233,7 @@ def observed(observations: Observations) -> set[tuple[object, ...]]:
 
 
 @pytest.mark.parametrize("block", [0, *(pytest.param(b, marks=pytest.mark.slow) for b in range(1, 10))])
+@pytest.mark.slow
 def test_damage_gives_no_false_observation(recordings: Path, block: int) -> None:
     """30 variants a block: no exception, nothing observed that the whole log does not have, counts add up."""
     data = gzip.decompress((recordings / "live" / TWO_BANDS).read_bytes())[:120_000]

@@ -125,6 +125,7 @@ def test_an_hour_of_the_day_log_equals_georinex(recordings: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("name", ["geonet 0759", "crescent", "M8T", "F9P", "mosaic", "dual base", "ESBC"])
+@pytest.mark.every(3)
 def test_first_epochs_equal_rtklib(recordings: Path, tmp_path: Path, name: str) -> None:
     """Every value RTKLIB keeps (it has three bands) stands at the same place here."""
     rtk = pytest.importorskip("pyrtklib5")

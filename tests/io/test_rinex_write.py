@@ -108,6 +108,7 @@ def test_our_reader_gets_back_what_was_written(tmp_path: Path, name: str) -> Non
 
 
 @pytest.mark.requirement("A7")
+@pytest.mark.slow
 def test_georinex_gets_back_what_was_written(tmp_path: Path) -> None:
     written = log()
     write_observations(written, tmp_path / "log.rnx")

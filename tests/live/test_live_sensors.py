@@ -176,6 +176,7 @@ def test_a_live_session_with_sensors_gives_what_the_log_gives(case: Ride, tmp_pa
     assert not any(Source.FEATURES in some for some in sources)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_is_late_is_left_out_and_no_way_is_made_up(case: Ride, tmp_path: Path) -> None:
     """Rows 0.3 s late, a wait of 0.1 s: no epoch has the way since the one before, and none a way that is too short."""
     engine = engine_of(case, tmp_path, sensor_wait_s=0.1)

@@ -473,6 +473,7 @@ def asked(port: int) -> str:
     return data.decode()
 
 
+@pytest.mark.slow
 def test_a_status_line_on_a_terminal_alone(tmp_path: Path) -> None:
     """On a terminal the status is renewed in place; into a file not a word of it goes."""
     log = tmp_path / "log.ubx"

@@ -170,6 +170,7 @@ def _turned(samples: SensorSamples, sensor: str, column: str, factor: object) ->
         ("inertial", "rate_radps", 57.29578, "inertial: its rates are in degrees"),
     ],
 )  # fmt: skip
+@pytest.mark.every(2)
 def test_a_sensor_that_is_turned_or_in_another_unit_is_told(
     sensor: str, column: str, factor: object, said: str, facing: float
 ) -> None:

@@ -138,6 +138,7 @@ def test_the_bias_of_the_gyro_is_learnt_from_the_line() -> None:
 
 @pytest.mark.requirement("E1")
 @pytest.mark.parametrize("rule", ["p2", "map"])
+@pytest.mark.every(2)
 def test_the_bias_of_the_gyro_is_learnt_without_a_line_and_a_slip_is_carried_by_it(rule: str) -> None:
     """P2 2.1(3) and (4): no map; pitch by wheel and accelerometer gives the bias, the corrected gyro carries."""
     case, bias = motion(2000.0, [(1940.0, 8.0, 0.6)]), 5e-4

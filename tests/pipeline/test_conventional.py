@@ -15,6 +15,7 @@ pytestmark = pytest.mark.requirement("A6")
 LINE = synthetic.line()
 
 
+@pytest.mark.slow
 def test_the_dilution_is_that_of_the_whole_design_matrix() -> None:
     arc = np.linspace(50.0, 900.0, 6)
     ranges = synthetic.ranges(LINE, arc)

@@ -75,6 +75,7 @@ def test_smoothed_columns_stand_beside_those_of_the_filter(tracked: RunSummary, 
 
 
 @pytest.mark.requirement("E5")
+@pytest.mark.slow
 def test_samples_of_sensors_count_once_however_the_log_is_cut(tmp_path: Path) -> None:
     truth = pl.read_csv(demo_files()["truth"], schema_overrides={"time_gpst": pl.Datetime("ns")})
     truth = truth.filter(pl.col("antenna") == "front").slice(0, 400)

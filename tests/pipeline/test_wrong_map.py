@@ -56,6 +56,7 @@ def test_the_right_map_is_neither_off_nor_offset(right: AntennaResult) -> None:
 
 @pytest.mark.requirement("C4")
 @pytest.mark.parametrize(("across_m", "least"), [(50.0, 0.97), (200.0, 0.97), (2000.0, 0.97)])
+@pytest.mark.every(3)
 def test_off_the_map_in_the_middle_of_a_line(across_m: float, least: float) -> None:
     """The nearest point is within the line: no end that clamps tells it."""
     result = on_a_map(across_m=across_m)

@@ -230,6 +230,7 @@ def cut(time: np.ndarray, ranges: Ranges, phases: Phases, start: np.ndarray, siz
 
 @pytest.mark.requirement("A5")
 @pytest.mark.parametrize("interval_s", [0.2, 30.0])
+@pytest.mark.every(2)
 def test_chunks_give_the_same(interval_s):
     epochs = 200
     arc, time = moving(epochs, 3.0), carrier_cases.times(epochs, interval_s)

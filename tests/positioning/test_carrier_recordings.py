@@ -51,6 +51,7 @@ def test_slips_put_into_the_simulated_run_are_all_found():
 
 
 @pytest.mark.requirement("A5")
+@pytest.mark.slow
 def test_a_mosaic_in_the_open(recordings):
     """No Dopplers: the line finds every slip of one cycle; the median error falls below half."""
     found = recorded(recordings, "japan_mosaic")
@@ -79,6 +80,7 @@ def test_in_towns_it_does_no_harm(recordings, name, p50):
 
 
 @pytest.mark.requirement("A5")
+@pytest.mark.slow
 def test_a_static_station_every_30_s(recordings):
     """P4's experiment has 30 s: Dopplers absent, ambiguities that walk 0.05 m between epochs."""
     code, live = [], []

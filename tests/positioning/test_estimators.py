@@ -104,6 +104,7 @@ def test_single_point_needs_three_ranges_beyond_the_clocks():
 @pytest.mark.requirement("A3")
 @pytest.mark.parametrize("used", [[0, 1, 2, 3, 4, 5, 6, 7], [0, 1, 2, 3], [0, 1, 2], [0, 1], [0, 5, 6], [1, 2, 5, 6]])
 @pytest.mark.parametrize("sigma_m", [0.3, 8.0])
+@pytest.mark.every(3)
 def test_search_equals_exhaustive_search(used, sigma_m):
     ranges = keep(synthetic.ranges(LINE, arcs(60), sigma_m=sigma_m), used)
     vertex, q = exhaustive_search(ranges, LINE)
@@ -116,6 +117,7 @@ def test_search_equals_exhaustive_search(used, sigma_m):
 @pytest.mark.requirement("A3")
 @given(seed=st.integers(0, 2**32 - 1), outlier=st.floats(-2000, 2000))
 @settings(max_examples=25)
+@pytest.mark.slow
 def test_search_equals_exhaustive_search_under_multipath(seed, outlier):
     ranges = synthetic.ranges(LINE, arcs(8, seed), seed=seed)
     code = ranges.code_m.copy()
@@ -277,6 +279,7 @@ def test_clock_shift_and_order_of_satellites_change_nothing(seed, shift):
     assert again.clock_m == pytest.approx(base.clock_m + shift, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_unused_satellites_do_not_matter():
     ranges = keep(synthetic.ranges(LINE, arcs(10)), [0, 1, 2, 3, 5, 6])
     code = ranges.code_m.copy()

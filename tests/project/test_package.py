@@ -32,6 +32,7 @@ def test_every_name_of_the_package_can_be_imported(package: object) -> None:
 
 
 @pytest.mark.requirement("A7")
+@pytest.mark.slow
 def test_a_run_starts_without_the_large_parts_of_scipy() -> None:
     heavy = ["scipy.stats", "scipy.optimize", "scipy.interpolate", "scipy.signal", "matplotlib", "networkx", "numba"]
     program = f"import sys, railfix.cli.run; print([name for name in {heavy} if name in sys.modules])"
@@ -174,6 +175,7 @@ def test_observations_are_read_through_georinex_beside_our_own_reader(tmp_path: 
         railfix.read_observations(tmp_path / "text", reader="georinex")
 
 
+@pytest.mark.slow
 def test_georinex_loads_the_same_recorded_observations(recordings: Path, tmp_path: Path) -> None:
     path = cut(recordings / "static/ESBC_2020177/ESBC00DNK_R_20201770000_01D_30S_MO.crx.gz", tmp_path / "a.rnx", 400)
     log = railfix.read_observations(path, broken_lines="count")
@@ -193,6 +195,7 @@ def _keys(navigation: Navigation) -> list[tuple[str, str, str]]:
 
 
 @pytest.mark.parametrize("name", ["demo", pytest.param("kinematic/urbannav_tst/hksc137c.nav", marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_georinex_loads_the_same_navigation(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     if name == "demo":
         path = tmp_path / "nav.rnx"

@@ -34,6 +34,7 @@ def recording(name: str, data: Path) -> Recording:
 
 
 @pytest.mark.parametrize(("name", "length", "p50", "p95", "largest", "ratio", "share"), BOUNDS)
+@pytest.mark.every(3)
 def test_bridged_places_of_recordings(
     name: str, length: int, p50: float, p95: float, largest: float, ratio: float, share: float, recordings: Path
 ) -> None:

@@ -187,6 +187,7 @@ def test_pictures_can_be_pointed_at_enlarged_and_clicked(page: Path, tmp_path: P
     assert 2 <= int(said["data-skies"]) <= len(linked)
 
 
+@pytest.mark.slow
 def test_charts_zoom_together_and_tables_can_be_downloaded(page: Path, tmp_path: Path) -> None:
     copy = tmp_path / "together.html"
     copy.write_text(page.read_text(encoding="utf-8").replace("</body>", TOGETHER), encoding="utf-8")
@@ -252,6 +253,7 @@ def test_tables_fit_a_window_of_1300_pixels(tmp_path: Path) -> None:
     assert said["data-window"] == "1300"
 
 
+@pytest.mark.slow
 def test_an_error_of_the_script_would_be_seen(page: Path, tmp_path: Path) -> None:
     copy = tmp_path / "broken.html"
     broken = "<script>console.error('told'); nowhere();</script></body>"

@@ -112,6 +112,7 @@ def test_there_is_no_order_of_one_antenna_or_without_a_vehicle() -> None:
 
 
 @pytest.mark.parametrize("exchanged", [False, True])
+@pytest.mark.every(2)
 def test_the_run_says_unasked_that_its_logs_are_exchanged(tmp_path: Path, exchanged: bool) -> None:
     files = demo_files()
     logs = [files["rear"], files["front"]] if exchanged else [files["front"], files["rear"]]

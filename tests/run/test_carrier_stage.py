@@ -45,6 +45,7 @@ def run(carrier: str, cuts: int, epochs: int = EPOCHS):
 @pytest.mark.requirement("A5")
 @pytest.mark.parametrize("carrier", ["smoothed", "float"])
 @pytest.mark.parametrize(("cuts", "epochs"), [(1, 40), (7, EPOCHS), pytest.param(1, EPOCHS, marks=pytest.mark.slow)])
+@pytest.mark.every(2)
 def test_cutting_changes_nothing(carrier: str, cuts: int, epochs: int):
     (whole,), parts = run(carrier, epochs, epochs), run(carrier, cuts, epochs)
     arc = np.concatenate([part.arc_m for part in parts])

@@ -109,6 +109,7 @@ def test_wrong_decisions_of_2000_yards_are_within_the_risk(common_m: float) -> N
         assert wrong <= binom.ppf(0.999, given, risk)
 
 
+@pytest.mark.slow
 def test_phases_decide_more_and_never_wrongly() -> None:
     """The same yards with and without phases, at a risk that codes seldom reach."""
     looks, risk = (60.0,), 1e-3

@@ -151,6 +151,7 @@ def test_satellite_clocks_give_their_sigma_and_correlation_time_back() -> None:
         pytest.param(2, "cross_sigma_m", marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.slow
 def test_orbit_errors_act_through_the_line_of_sight(axis: int, name: str) -> None:
     table = SatelliteErrorSettings(**{name: 2.0}, orbit_time_s=20.0)
     errors = ErrorSettings(satellites=dict.fromkeys("GJE", table))
@@ -186,6 +187,7 @@ def test_group_delay_errors_are_constants_of_the_codes() -> None:
     assert drawn.std() == pytest.approx(sigma, rel=0.05)
 
 
+@pytest.mark.slow
 def test_residual_ionosphere_is_vertical_delay_times_mapping() -> None:
     """A second apart in correlation: 7200 samples of one process."""
     errors = ErrorSettings(ionosphere=IonosphereErrorSettings(vertical_sigma_m=0.5, vertical_time_s=1.0))
@@ -240,6 +242,7 @@ def test_pierce_points_and_mappings_at_the_zenith_and_the_horizon() -> None:
     assert troposphere_mapping(np.array([90.0, 30.0, 5.0])) == pytest.approx([1.0, 1.994, 10.21], abs=0.01)
 
 
+@pytest.mark.slow
 def test_residual_troposphere_is_zenith_delay_times_mapping() -> None:
     errors = ErrorSettings(troposphere=TroposphereErrorSettings(zenith_sigma_m=0.05, zenith_time_s=1.0))
     on, off = on_and_off(errors, **(LONG | {"duration_s": 7200.0, "sky": SkySettings(systems="G")}))
@@ -414,6 +417,7 @@ def noise_of(noise: NoiseSettings, **settings: object) -> tuple[Piece, np.ndarra
     return piece, (piece.observations.code_m - piece.clean_code_m) / piece.code_sigma_m
 
 
+@pytest.mark.slow
 def test_code_noise_is_correlated_as_it_is_said() -> None:
     """At 10 Hz: share * exp(-lag / time) at lags of 0.1 s and 1 s; the standard deviation stays."""
     noise = NoiseSettings(code_correlated_share=0.7, code_correlation_time_s=1.0)

@@ -318,6 +318,7 @@ def read_track_with_jitter(folder: Path, lat: np.ndarray, lon: np.ndarray, heigh
     return folder / "rough.csv"
 
 
+@pytest.mark.slow
 def test_the_map_is_off_by_the_error_that_was_asked_for() -> None:
     error = MapError(plan_sigma_m=0.3, height_sigma_m=0.6, correlation_m=200.0, seed=3)
     line = build_alignment(LineSettings(length_m=60_000.0, map_error=error))
@@ -443,6 +444,7 @@ def test_random_pitch_has_its_sigma_and_none_at_rest() -> None:
 
 
 @pytest.mark.parametrize("jerk", [0.1, 0.4, 2.0])
+@pytest.mark.every(3)
 def test_the_jerk_stays_within_its_limit_and_the_stops_where_they_are(jerk: float) -> None:
     settings = RunSettings(stations=(Station(at_m=30.0), Station(at_m=400.0), Station(at_m=720.0)), stand_s=25.0)
     plain = run_curve(LINE, settings, 100.0, contact_m=1.137)

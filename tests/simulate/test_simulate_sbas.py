@@ -153,6 +153,7 @@ def test_a_value_that_does_not_fit_its_field_is_an_error() -> None:
 # Reference station ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_station_stands_still_shares_the_errors_and_changes_no_train() -> None:
     plain, with_station = (scenario(60.0, stations=s) for s in ((), (ReferenceStation(chainage_m=200.0),)))
     train, base = Simulation(with_station), Simulation(with_station)

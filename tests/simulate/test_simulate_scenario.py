@@ -354,6 +354,7 @@ def lines(folder: Path) -> dict[str, LineSettings]:
 
 
 @pytest.mark.parametrize("kind", ["elements", "generated", "file"])
+@pytest.mark.every(3)
 def test_rtklib_stands_where_the_antenna_is_on_any_line(tmp_path: Path, kind: str) -> None:
     """Everything switched off but the swaying: an independent single point is the truth within a centimetre."""
     program = shutil.which("rnx2rtkp")
@@ -386,6 +387,7 @@ def test_rtklib_stands_where_the_antenna_is_on_any_line(tmp_path: Path, kind: st
         assert np.linalg.norm(rows[:, 2:] - mine, axis=1).max() < 0.01
 
 
+@pytest.mark.slow
 def test_georinex_reads_the_files(tmp_path: Path) -> None:
     georinex = pytest.importorskip("georinex")
     scenario = Scenario(duration_s=3.0, rate_hz=1.0, sky=SkySettings(systems="GJE"))

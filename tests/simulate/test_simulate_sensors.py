@@ -120,6 +120,7 @@ def test_slips_and_slides_take_the_pulses_that_they_say(ratio: float) -> None:
     assert truth["ratio"].to_list() == [ratio]
 
 
+@pytest.mark.slow
 def test_drawn_slips_come_as_often_as_they_should() -> None:
     """Over 100 hours of a shuttle; slips while it accelerates, slides while it brakes."""
     drawn = DrawnSlips(slip_chance=0.2, slide_chance=0.6, ratio=0.3, duration_s=3.0)

@@ -82,6 +82,7 @@ def test_one_fault_is_detected_as_theory_says(named, kind):
         assert count.right + count.partly + count.wrong <= count.detected
 
 
+@pytest.mark.every(3)
 def test_two_faults_over_three_detectable_biases_are_excluded(named):
     """Every pair in turn: 95 % where theory tells them apart, nobody else blamed."""
     name, case = named
@@ -171,6 +172,7 @@ def test_theory_is_the_one_of_a_single_bias(named):
     np.testing.assert_allclose(both, apart, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_pipeline_excludes_a_step_in_the_middle_of_a_run(recordings):
     """The whole chain, with its section search and running noise scale: each satellite wrong by 20 m for 60 s."""
     recording = japan(recordings)

@@ -70,6 +70,7 @@ def check_whole(got: Weighted) -> None:
     assert got.share(1 + SHRUNK.index(0.8)) > 1.0
 
 
+@pytest.mark.slow
 def test_all_hypotheses_together_keep_within_the_risk():
     check_whole(whole_risk(200, 800, 3, BUDGETS["1e-5, prior 1.7e-3"]))
 
@@ -82,6 +83,7 @@ def test_ten_million_epochs_of_all_hypotheses_keep_within_the_risk(name):
     check_whole(got)
 
 
+@pytest.mark.slow
 def test_exclusion_at_work_keeps_within_the_risk():
     got = excluding(6000, 5, OFTEN)
     assert got.excluded[1] > 1000

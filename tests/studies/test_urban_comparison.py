@@ -48,6 +48,7 @@ def test_kinds_differ_as_their_names_say(urban: Sample) -> None:
     assert canyon.tracked < figures(urban).tracked < suburban.tracked
 
 
+@pytest.mark.slow
 def test_it_is_the_class_of_the_recorded_cities(urban: Sample, recordings: Path) -> None:
     """Share of codes over 20 m: within a factor of two of Hong Kong's, and as one-sided."""
     ours = figures(urban)

@@ -83,6 +83,7 @@ def test_any_cutting_of_the_log_gives_the_same(case: Ride, found: AlongTrack) ->
 @pytest.mark.requirement("E7")
 @pytest.mark.parametrize("wrong", ["B006", "B012", "B013"])
 @pytest.mark.parametrize("shift", [1, -2])
+@pytest.mark.every(3)
 def test_a_wrong_identity_is_named_and_makes_no_level_wrong(case: Ride, wrong: str, shift: int) -> None:
     read = f"B{int(wrong[1:]) + shift:03d}"
     result = with_readings(case, {wrong: read})

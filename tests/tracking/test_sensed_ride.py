@@ -103,6 +103,7 @@ def test_a_curve_of_a_good_map_sharpens_the_place(case: Ride) -> None:
 
 @pytest.mark.requirement("E5")
 @pytest.mark.parametrize("metres", [50.0, -50.0, 20.0])
+@pytest.mark.every(3)
 def test_a_jump_of_the_satellites_at_the_portal_is_refused(case: Ride, metres: float) -> None:
     jumped = case.jumped(68.0, 78.0, metres)
     after = case.time_s > 61.0

@@ -70,6 +70,7 @@ def _sensors_of(sensors: SensorEpochs | None, cut: slice) -> SensorEpochs | None
 
 @pytest.mark.requirement("E5")
 @pytest.mark.parametrize("name", ["sensors", "faults", "branches", "off map", "gap"])
+@pytest.mark.every(3)
 def test_epochs_one_by_one_give_what_the_whole_gives(name: str) -> None:
     epochs, line, sensors = _case(name)
     whole, _ = track(epochs, line, sensors=sensors, levels=True)
