@@ -27,7 +27,7 @@ def place_of(text: str, option: str) -> Floats:
     except ValueError:
         raise SettingsError(f"{option} {text!r}: expected LAT,LON,HEIGHT, for example 35.63,139.74,60") from None
     if not (-90.0 <= latitude <= 90.0 and -180.0 <= longitude <= 360.0 and -1e4 < height < 1e5):
-        raise SettingsError(f"{option} {text!r}: expected a latitude to 90, a longitude, a height in metres")
+        raise SettingsError(f"{option} {text!r}: expected a latitude to 90 degrees, a longitude and a height in metres")
     return ecef_from_geodetic(latitude, longitude, height)
 
 
