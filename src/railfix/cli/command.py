@@ -75,9 +75,9 @@ class Command(TyperCommand):
         try:
             return super().parse_args(ctx, args)
         except typer.BadParameter as error:
-            if len(missing) < 2 or error.param not in missing:
-                raise
-            ctx.fail(f"Missing options {', '.join(param.opts[0] for param in missing)}.")
+            if len(missing) > 1 and error.param in missing:
+                ctx.fail(f"Missing options {', '.join(param.opts[0] for param in missing)}.")
+            raise
 
     @staticmethod
     def _check_switch(ctx: Any, name: str, args: list[str]) -> None:
