@@ -8,9 +8,7 @@ import numpy as np
 
 from railfix.core.arrays import Bytes, Floats
 from railfix.ranges.sbas.dfmc import AUGMENTED, PREAMBLES
-from railfix.ranges.sbas.messages import DATA_BITS, with_parity
-
-Field = tuple[int, int]
+from railfix.simulate.sbas.service import Field, packed
 
 
 def message(kind: int, second: int, *fields: Field) -> Bytes:
@@ -18,15 +16,7 @@ def message(kind: int, second: int, *fields: Field) -> Bytes:
 
     The fields (value, length) lie from bit 10 on, negative values in two's complement. ValueError: one does not fit.
     """
-    text = f"{PREAMBLES[second % 6]:04b}{kind:06b}"
-    for value, length in fields:
-        if not -(1 << length) < 2 * value + 1 <= (1 << (length + 1)):
-            raise ValueError(f"type {kind}: {value} does not fit {length} bits")
-        text += f"{value & ((1 << length) - 1):0{length}b}"
-    if len(text) > DATA_BITS:
-        raise ValueError(f"type {kind}: {len(text)} bits, expected at most {DATA_BITS}")
-    bits = np.array([int(c) for c in text.ljust(256, "0")], dtype=np.uint8)
-    return np.asarray(with_parity(np.packbits(bits)[None, :])[0])
+    return packed(f"{PREAMBLES[second % 6]:04b}{kind:06b}", kind, fields)
 
 
 def mask(second: int, slots: Collection[int], iodm: int = 0) -> Bytes:

@@ -46,7 +46,11 @@ def message(kind: int, second: int, *fields: Field) -> Bytes:
     The fields (value, length) lie from bit 14 on, negative values in two's complement. ValueError: when a value does
     not fit its field, or the fields are longer than a message.
     """
-    text = f"{PREAMBLES[second % 3]:08b}{kind:06b}"
+    return packed(f"{PREAMBLES[second % 3]:08b}{kind:06b}", kind, fields)
+
+
+def packed(text: str, kind: int, fields: Sequence[Field]) -> Bytes:
+    """Message from its first bits as text and its fields, with parity, shape (32,); ValueError: one does not fit."""
     for value, length in fields:
         if not -(1 << length) < 2 * value + 1 <= (1 << (length + 1)):
             raise ValueError(f"type {kind}: {value} does not fit {length} bits")
