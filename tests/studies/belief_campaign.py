@@ -30,6 +30,7 @@ from typing import Any, Final
 
 import numpy as np
 import polars as pl
+from scipy.interpolate import make_interp_spline
 
 import paths
 import recordings_score
@@ -294,6 +295,18 @@ def moved(case: Case, metres: float) -> Case:
     return on_line(case, points + metres * right)
 
 
+def roughened(case: Case, metres: float, length_m: float = 80.0, *, seed: int = 0) -> Case:
+    """A case whose map wanders across and up by so much over such a length, and says so."""
+    at, random = case.trajectory, np.random.default_rng(seed)
+    points, arc = np.asarray(at.ecef_m), np.asarray(at.arc_m)
+    knots = np.arange(0.0, arc[-1] + 2.0 * length_m, length_m)
+    right, up = (make_interp_spline(knots, random.normal(0.0, metres, len(knots)))(arc) for _ in range(2))
+    above = points / np.linalg.norm(points, axis=1, keepdims=True)
+    across = np.cross(np.gradient(points, axis=0), above)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return on_line(case, points + right[:, None] * across + up[:, None] * above, sigma_m=metres)
+
+
 def stretched(case: Case, share: float) -> Case:
     """A case whose map is too long by a share, right where the run begins."""
     points = np.asarray(case.trajectory.ecef_m)
@@ -302,9 +315,10 @@ def stretched(case: Case, share: float) -> Case:
     return on_line(case, centre + (1.0 + share) * (points - centre))
 
 
-def on_line(case: Case, ecef_m: np.ndarray) -> Case:
-    """The case on another line with the same vertices."""
-    other = Trajectory.from_track(Track.from_ecef(ecef_m))
+def on_line(case: Case, ecef_m: np.ndarray, *, sigma_m: float | None = None) -> Case:
+    """The case on another line with the same vertices; with an accuracy of its own, or that of a survey."""
+    stated = {} if sigma_m is None else {"sigma_plan_m": sigma_m, "sigma_height_m": sigma_m}
+    other = Trajectory.from_track(Track.from_ecef(ecef_m, **stated))
     arc = np.interp(case.reference_arc_m, np.asarray(case.trajectory.arc_m), np.asarray(other.arc_m))
     return replace(case, trajectory=other, reference_arc_m=np.where(np.isfinite(case.reference_arc_m), arc, np.nan))
 
@@ -390,6 +404,7 @@ def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterat
     yield "map 20 m aside", moved(case, 20.0)
     yield "map 5 m aside", moved(case, 5.0)
     yield "map 2 % long", stretched(case, 0.02)
+    yield "map wandering by 2 m, stated", roughened(case, 2.0)
 
 
 def sensor_faults(case: Case, sensors: SensorSamples) -> Iterator[tuple[str, Case]]:

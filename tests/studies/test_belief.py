@@ -65,6 +65,17 @@ def test_no_fault_is_over_its_level_without_an_alarm(recordings: Path, fault: st
 
 
 @pytest.mark.requirement("C6")
+def test_map_drawn_to_its_stated_accuracy_is_within_the_level(recordings: Path) -> None:
+    """Bends that are not there tell carriageways 20 m aside apart, unless the map's accuracy counts for its shape."""
+    drawn = belief_campaign.roughened(_start(recordings, "pixel", 640.0, 150.0), 2.0, seed=2)
+    found = run(drawn, {})
+    assert not found.over.any()
+    assert not found.over_chainage.any()
+    unstated = belief_campaign.on_line(drawn, np.asarray(drawn.trajectory.ecef_m))
+    assert run(unstated, {}).over.any()
+
+
+@pytest.mark.requirement("C6")
 def test_the_numbers_of_a_case_folder_are_those_of_its_files(recordings: Path, tmp_path: Path) -> None:
     """Anyone's log, map and reference: a folder with a case.toml."""
     folder = recordings / "kinematic" / "urbannav_tst"

@@ -53,7 +53,8 @@ def exceeded(ride: Ride, found: AlongTrack) -> int:
 
 
 def pulls() -> str:
-    rng, delays, errors, early, over, unseen = np.random.default_rng(7), [], [], 0, 0, 0
+    rng, delays, errors, early, unseen = np.random.default_rng(7), [], [], 0, 0
+    over, covered, levels = 0, 0, []
     for seed in _SEEDS:
         ride = sensed_ride.made(load_recipe("demo").scenario().replaced(seed=seed, rate_hz=1.0, sensors=_WHEEL))
         scene = scene_of(ride)
@@ -64,6 +65,9 @@ def pulls() -> str:
             after = np.flatnonzero(found.wheel.parted)
             early += int((after < at).sum())
             over += exceeded(ride, found) > 0
+            bounded = ride.run(observations=attacked, interference={"wheel_level": "on"})
+            covered += exceeded(ride, bounded) > 0
+            levels.append([np.median(f.tracked.level_m[:at]) for f in (found, bounded)])
             after = after[after >= at]
             unseen += not len(after)
             if len(after):
@@ -74,7 +78,8 @@ def pulls() -> str:
     return (
         f"pull of 0.5 m/s, C/N0 as before: {len(delays)} of {len(delays) + unseen} seen after {times} "
         f"(p50 of the error then {np.median(error) if len(error) else np.nan:.0f} m); early epochs {early}; "
-        f"rides over a level {over}"
+        f"rides over a level {over}; with wheel_level on {covered}, median level before the pull "
+        f"{np.median(levels, axis=0)[0]:.1f} m, then {np.median(levels, axis=0)[1]:.1f} m"
     )
 
 

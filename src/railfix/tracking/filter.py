@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 #: Satellites come and go: the unknowns in use are chosen again after so many epochs.
 _EPOCHS: Final = 512
+#: Least `map_branch_m` in standard deviations of the map across.
+_BRANCH_SIGMAS: Final = 3.0
 
 
 class Recursion:
@@ -80,7 +82,8 @@ class Recursion:
         arrays = {name: row_major(array) for name, array in values.items()}
         self.epochs = layout.Epochs(**arrays, unsigned=sensors.wheel_sign == "unknown")
         self.course = layout.LineArrays(**line.written)
-        self.parameters = _parameters(limits)
+        branch_m = max(limits.map_branch_m, _BRANCH_SIGMAS * line.sigma_plan_m)
+        self.parameters = _parameters(limits)._replace(map_branch_m=branch_m)
         written = {field.name: getattr(result, field.name) for field in fields(result)}
         self.answers = layout.Outputs(**{name: written[name] for name in layout.Outputs._fields})
 

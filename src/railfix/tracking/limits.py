@@ -101,8 +101,8 @@ class TrackingLimits(Settings):
     offset_prior_m : float
         Standard deviation of such an offset before anything is known beside the first epoch's median.
     map_roughness_m, map_correlation_m : float
-        Local error of the map across and up, and the length over which it changes: with it the change of the carrier
-        phase cannot claim more than the shape of the line is known to.
+        Least local error of the map across and up, and the length over which it changes. The map's stated accuracy
+        counts where it is more, of heights the half.
     map_scale_m : float
         Error of a length along the map [m per square root of m]; a larger one is learnt where the codes show it.
     map_misfit_sigmas, map_misfit_s, map_misfit_kept_s : float
@@ -111,7 +111,7 @@ class TrackingLimits(Settings):
     map_absolute_m : float
         Length over which the absolute error of the map changes (sigmas are those of the trajectory).
     map_branch_m : float
-        Distance of two branches at which half of their difference is the map's: three times an error of 2 m.
+        Least distance of two branches at which half of their difference is the map's: three times an error of 2 m.
     code_common_m : float
         Standard deviation of an error that the codes have in common across the line: reflections off one side of a
         street.

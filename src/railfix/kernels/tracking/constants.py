@@ -30,6 +30,9 @@ CODE_CLOCK_SIGMA_M: Final = 1e3
 WHEEL_WALK: Final = 5e-4
 FORCE_WALK_MPS2: Final = 1e-3
 RADAR_WALK: Final = 2e-4
+#: Share of the map's error of height that changes over `map_correlation_m`; across it is the whole: heights of a survey
+#: or a terrain model are wrong over longer ways.
+HEIGHT_ROUGHNESS: Final = 0.5
 #: Least variance of a step of the place [m2], keeps matrices regular.
 LEAST_STEP_M2: Final = 1e-6
 
@@ -132,7 +135,7 @@ BESIDE_AFTER_S: Final = 0.9
 #: The velocity is compared with the line at the place and so many of its standard deviations, or metres, beside it.
 REACH_SIGMAS: Final = 2.0
 REACH_M: Final = 3.0
-#: Errors of the velocity beside its covariance [m/s], and of the line's direction as a share of the speed.
+#: Errors of the velocity beside its covariance [m/s], and least of the line's direction as a share of the speed.
 VELOCITY_FLOOR_MPS: Final = 0.15
 DIRECTION_SHARE: Final = 0.03
 #: A squared contradiction counts up to this, less this a second (cumulative sum, E. S. Page, 1954).

@@ -56,7 +56,9 @@ from railfix.kernels.tracking.layout import (
 
 
 @borrowing
-def contradiction(epochs: Epochs, t: int, line: LineArrays, state: KernelState, work: Work, h: int) -> float:
+def contradiction(
+    epochs: Epochs, t: int, line: LineArrays, parameters: Parameters, state: KernelState, work: Work, h: int
+) -> float:
     """Square of the velocity against that of the place over its variance; NaN without a velocity.
 
     Along the line and across it, at the best of three places that the place's standard deviation allows.
@@ -70,7 +72,8 @@ def contradiction(epochs: Epochs, t: int, line: LineArrays, state: KernelState, 
     floor, least = 0.0, math.inf
     for c in range(3):
         floor += velocity[t, c] * velocity[t, c]
-    floor = VELOCITY_FLOOR_MPS**2 + DIRECTION_SHARE**2 * floor
+    direction = max(DIRECTION_SHARE, math.sqrt(2.0) * line.sigma_plan_m / parameters.map_correlation_m)
+    floor = VELOCITY_FLOOR_MPS**2 + direction**2 * floor
     for turn in range(3):
         point_at(line, state.mean[h, ARC] - age_s * speed + (turn - 1) * reach, work.point, axes, 0)
         total = 0.0

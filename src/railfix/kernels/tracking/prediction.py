@@ -9,6 +9,7 @@ from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.constants import (
     CODE_CLOCK_SIGMA_M,
     FORCE_WALK_MPS2,
+    HEIGHT_ROUGHNESS,
     LEAST_STEP_M2,
     RADAR_WALK,
     WHEEL_WALK,
@@ -126,9 +127,11 @@ def predict(
     )
     for i in range(n + 3, n + OF_EPOCH):
         after[to, i] = 0.0
-    rough = 2.0 * parameters.map_roughness_m**2 * (1.0 - math.exp(-travel / parameters.map_correlation_m)) + 1e-8
-    spread[to, n + STEP_RIGHT, n + STEP_RIGHT] = rough
-    spread[to, n + STEP_UP, n + STEP_UP] = rough
+    changed = 2.0 * (1.0 - math.exp(-travel / parameters.map_correlation_m))
+    across = max(parameters.map_roughness_m, line.sigma_plan_m)
+    above = max(parameters.map_roughness_m, HEIGHT_ROUGHNESS * line.sigma_height_m)
+    spread[to, n + STEP_RIGHT, n + STEP_RIGHT] = across**2 * changed + 1e-8
+    spread[to, n + STEP_UP, n + STEP_UP] = above**2 * changed + 1e-8
     # The way on the map is the way run less the error of the length: what codes see of it, phases do not.
     length = parameters.map_scale_m**2 * math.exp(map_log_variance) * travel + parameters.phase_walk_m**2 * dt
     spread[to, ARC, ARC] += length

@@ -181,7 +181,7 @@ def _measure(
             state.covariance[h, ARC, ARC] += FREED_M**2
         for b in range(len(bank.running)):
             bank.covariance[b, ARC, ARC] += FREED_M**2
-    square, dt = contradiction(epochs, t, inputs.line, state, work, best), epochs.interval_s[t]
+    square, dt = contradiction(epochs, t, inputs.line, inputs.parameters, state, work, best), epochs.interval_s[t]
     watch(inputs.parameters, state, bank, square, 0.0 if best else shift, work.pushed[best], dt, code_s)
     return best
 
