@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
+import sensed_ride
+import signal_attacks
 from railfix.integrity.interference import InterferenceLimits, WheelSigns, WheelState, wheel_signs
+from railfix.simulate.scenario_file import load_recipe
 
 pytestmark = pytest.mark.requirement("B8")
 LIMITS = InterferenceLimits()
@@ -34,7 +37,7 @@ def signs(case: tuple[np.ndarray, ...], cuts: tuple[int, ...] = (), *, signed: b
         part, state = wheel_signs(*(values[rows] for values in case), state, LIMITS, signed=signed)
         parts.append(part)
     return WheelSigns(
-        **{name: np.concatenate([getattr(p, name) for p in parts]) for name in ("difference_m", "parted")}
+        **{name: np.concatenate([getattr(p, name) for p in parts]) for name in ("difference_m", "bound_m", "parted")}
     )
 
 
@@ -65,10 +68,40 @@ def test_a_wheel_without_a_sign_is_compared_by_its_distance() -> None:
     assert not found.parted[:600].any()
 
 
+@pytest.mark.parametrize("pull", [0.2, 0.5, -2.0])
+def test_the_bound_holds_from_the_beginning_of_a_pull_to_its_alarm(pull: float) -> None:
+    for seed in range(10):
+        found, s = signs(ride(pull_mps=pull, sigma_m=0.5, seed=seed)), np.arange(900)
+        error = np.abs(pull) * np.maximum(s - 600, 0)
+        unseen = (s < 600 + 119) & ~found.parted
+        assert (error <= found.bound_m)[unseen].all()
+        assert np.median(found.bound_m[300:600]) < 8.0
+
+
+def test_the_level_of_the_filter_covers_a_pull_where_asked_for() -> None:
+    """On the demonstration's line, 0.5 m/s from the 70th second on, which Dopplers and phases agree with."""
+    wheel = {"tachometer": {"diameter_error_m": 0.002, "jitter_s": 2e-6}, "inertial": None, "radar": None}
+    ride = sensed_ride.made(load_recipe("demo").scenario().replaced(rate_hz=1.0, sensors=wheel))
+    place = ride.simulation.truth("front", ride.time_s)[0].ecef_m
+    scene = signal_attacks.Scene.of(ride.observations, ride.simulation.navigation, place)
+    attacked = signal_attacks.pulled(scene, 70, 0.5, rng=np.random.default_rng(7))
+    over = {}
+    for use in ("on", "off"):
+        found = ride.run(
+            observations=attacked, interference={"wheel_level": use}, cuts=() if use == "off" else (50, 90)
+        )
+        bounded = np.isfinite(found.tracked.level_m)
+        assert bounded[:140].mean() > 0.9
+        over[use] = int((np.abs(ride.error_m(found)) > found.tracked.level_m)[bounded].sum())
+    assert over["on"] == 0
+    assert over["off"] > 20
+
+
 def test_chunks_change_nothing() -> None:
     case = ride(pull_mps=0.5)
     whole, cut = signs(case), signs(case, (1, 2, 300, 601, 640, 641))
     np.testing.assert_allclose(cut.difference_m, whole.difference_m, atol=1e-9)
+    np.testing.assert_allclose(cut.bound_m, whole.bound_m, atol=1e-9)
     np.testing.assert_array_equal(cut.parted, whole.parted)
 
 

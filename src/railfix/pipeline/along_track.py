@@ -89,8 +89,12 @@ def along_track(
     tracked = doubted(tracked, single.spoofed & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
     wheel = None
     if config.interference.use == "on" and any(replay.sensors.wheel_m is not None for replay in replays):
-        wheel, watched = _against_wheel(replays, single, after.wheel, config)
-        after = replace(after, wheel=watched)
+        wheel, alone = _against_wheel(replays, single.arc_m, single.sigma_m, after.wheel, config)
+        after = replace(after, wheel=alone)
+        if config.interference.wheel_level == "on":
+            sure = np.where(is_bounded(tracked.status), tracked.sigma_m, np.nan)
+            pulled, filtered = _against_wheel(replays, tracked.arc_m, sure, after.pulled, config)
+            after, tracked = replace(after, pulled=filtered), _bounded_by_wheel(tracked, pulled.bound_m)
         tracked = doubted(tracked, wheel.parted & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
     inside = on_line_m(tracked, trajectory)
     ecef = trajectory.at_arc(inside)
@@ -115,14 +119,22 @@ def along_track(
     return result, replace(after, line=line)
 
 
+def _bounded_by_wheel(tracked: Tracked, bound_m: Floats) -> Tracked:
+    """Return places whose finite levels are at least what a pull may have got to unseen."""
+    levels = {name: np.asarray(getattr(tracked, name)) for name in ("level_m", "ground_level_m", "amount_m")}
+    return replace(
+        tracked, **{n: np.where(np.isfinite(level), np.fmax(level, bound_m), level) for n, level in levels.items()}
+    )
+
+
 def _against_wheel(
-    replays: Sequence[Replay], single: SingleEpochs, state: WheelState, config: Config
+    replays: Sequence[Replay], arc_m: Floats, sigma_m: Floats, state: WheelState, config: Config
 ) -> tuple[WheelSigns, WheelState]:
-    """Compare positions of single epochs with the distance that the wheel has rolled."""
+    """Compare positions with the distance that the wheel has rolled."""
     parts = [(replay.epochs.time, replay.sensors.wheel_m) for replay in replays]
     rolled = np.concatenate([np.full(len(time), np.nan) if way is None else way for time, way in parts])
     return wheel_signs(
-        np.concatenate([time for time, _ in parts]), single.arc_m, single.sigma_m, rolled, state, config.interference,
+        np.concatenate([time for time, _ in parts]), arc_m, sigma_m, rolled, state, config.interference,
         signed=all(replay.sensors.wheel_sign == "measured" for replay in replays if replay.sensors.wheel_m is not None),
     )  # fmt: skip
 

@@ -110,8 +110,8 @@ class FilterState(NotebookTable):
     fixed, anchor : FilterFix or None
         Place of the filter at the last epoch, and at the last one before the present stretch.
     gate : ReturnState
-    wheel : WheelState
-        Of the comparison of distances by satellites and wheel.
+    wheel, pulled : WheelState
+        Of the comparison of distances by the wheel with those of single epochs, and of the filter.
     disagreed : datetime64[ns]
         Last epoch at which places or speeds of the two antennas disagreed.
     passings : PassingState or None
@@ -127,6 +127,7 @@ class FilterState(NotebookTable):
     anchor: FilterFix | None = None
     gate: ReturnState = field(default_factory=ReturnState)
     wheel: WheelState = field(default_factory=WheelState)
+    pulled: WheelState = field(default_factory=WheelState)
     disagreed: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     passings: PassingState | None = None
 

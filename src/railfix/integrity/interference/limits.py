@@ -94,6 +94,11 @@ class InterferenceLimits(Settings):
         Time over which distances by satellites and wheel are compared, and the shortest one.
     wheel_m, wheel_sigmas : float [m]
         Least difference, and the same in standard deviations.
+    wheel_level : {"on", "off"}
+        Whether the level of the filter covers a pull that the wheel has not shown yet: two to four times as large.
+    wheel_level_sigmas : float
+        Standard deviations of the difference in it: 2.1 for a probability of 1e-7 that a pull has begun within the
+        window, and a risk of 1e-9.
     wheel_scale, wheel_change : float
         Standard deviation of the wheel's circumference, before positions determine it; and of its change after (creep).
     wheel_acceleration_mps2 : float
@@ -128,6 +133,8 @@ class InterferenceLimits(Settings):
     wheel_least_s: float = Field(default=60.0, gt=0)
     wheel_m: float = Field(default=20.0, gt=0)
     wheel_sigmas: float = Field(default=6.0, gt=0)
+    wheel_level: Literal["on", "off"] = "off"
+    wheel_level_sigmas: float = Field(default=2.1, ge=0)
     wheel_scale: float = Field(default=0.01, gt=0)
     wheel_change: float = Field(default=0.001, gt=0)
     wheel_acceleration_mps2: float = Field(default=1.6, gt=0)

@@ -34,7 +34,7 @@ class WheelSamples:
     ----------
     time : ndarray of datetime64[ns]
     arc_m, sigma_m : ndarray [m]
-        By satellites, single epochs.
+        By satellites.
     way_m : ndarray [m]
         Of the wheel since its beginning.
     doubt_m : ndarray [m]
@@ -75,7 +75,7 @@ class WheelState:
         Of the wheel there; the speed NaN where unknown.
     part, second : int
     held : HeldState
-    difference_m, beyond : float, bool
+    difference_m, bound_m, beyond : float, float, bool
         Of the last sample.
     """
 
@@ -88,6 +88,7 @@ class WheelState:
     second: int = -1
     held: HeldState = field(default_factory=HeldState)
     difference_m: float = float("nan")
+    bound_m: float = float("nan")
     beyond: bool = False
 
 
@@ -99,11 +100,15 @@ class WheelSigns:
     ----------
     difference_m : ndarray, shape (T,) [m]
         Distance by satellites over the window less that of the wheel with its diameter; NaN where it is not compared.
+    bound_m : ndarray, shape (T,) [m]
+        Of the error of the position, for a pull that began within the window, be it shorter than `wheel_least_s`: the
+        difference, and `wheel_level_sigmas` of the position at the beginning and of the wheel's distance since.
     parted : ndarray of bool, shape (T,)
         It is beyond what noise and diameter allow, or was within the time of release.
     """
 
     difference_m: Floats
+    bound_m: Floats
     parted: Masks
 
 
@@ -123,7 +128,7 @@ def wheel_signs(
     ----------
     time : ndarray of datetime64[ns], shape (T,)
     arc_m, sigma_m : ndarray, shape (T,) [m]
-        Positions of single epochs along the line; NaN without one.
+        Positions along the line, of single epochs or of the filter; NaN without one.
     wheel_m : ndarray, shape (T,) [m]
         Distance that the wheel has rolled since the epoch before; NaN where it is not known.
     state : WheelState
@@ -132,7 +137,7 @@ def wheel_signs(
         Whether the wheel's distance has the sign of the motion along the line.
     """
     if not len(time):
-        return WheelSigns(difference_m=np.empty(0), parted=np.empty(0, dtype=np.bool_)), state
+        return WheelSigns(difference_m=np.empty(0), bound_m=np.empty(0), parted=np.empty(0, dtype=np.bool_)), state
     rolled, after = _rolled(time, wheel_m, state, limits)
     second = ((time - GPS_EPOCH + _TAG) // _SECOND).astype(np.int64)
     due = second != np.concatenate([[state.second], second[:-1]])
@@ -140,9 +145,10 @@ def wheel_signs(
     every = replace(rolled, arc_m=arc_m, sigma_m=np.hypot(sigma_m, _LEAST_M))
     before = len(state.samples.time)
     samples = state.samples.joined(every.take(usable))
-    difference, beyond = _compare(samples, before, limits, signed=signed)
+    difference, bound, beyond = _compare(samples, before, limits, signed=signed)
     latest = np.cumsum(usable)
     of_epoch = np.concatenate([[state.difference_m], difference])[latest]
+    bounds = np.concatenate([[state.bound_m], bound])[latest]
     signs = np.concatenate([[state.beyond], beyond])[latest]
     hold, release = np.array([limits.hold_s]), np.array([limits.spoofing_release_s])
     _, stays, held_state = held(time, signs[:, None], state.held, hold_s=hold, release_s=release)
@@ -151,9 +157,9 @@ def wheel_signs(
     window[np.flatnonzero(own)[:1]] = True
     after = replace(
         after, samples=samples.take(window & own), second=int(second[-1]), held=held_state,
-        difference_m=float(of_epoch[-1]), beyond=bool(signs[-1]),
+        difference_m=float(of_epoch[-1]), bound_m=float(bounds[-1]), beyond=bool(signs[-1]),
     )  # fmt: skip
-    return WheelSigns(difference_m=of_epoch, parted=stays[:, 0]), after
+    return WheelSigns(difference_m=of_epoch, bound_m=bounds, parted=stays[:, 0]), after
 
 
 def _rolled(
@@ -183,8 +189,10 @@ def _rolled(
     return WheelSamples(time=time, arc_m=none, sigma_m=none, way_m=way, doubt_m=doubt, part=part), after
 
 
-def _compare(samples: WheelSamples, first: int, limits: InterferenceLimits, *, signed: bool) -> tuple[Floats, Masks]:
-    """Return differences over the window that ends at each sample from `first` on, and which are beyond chance."""
+def _compare(
+    samples: WheelSamples, first: int, limits: InterferenceLimits, *, signed: bool
+) -> tuple[Floats, Floats, Masks]:
+    """Return differences over the window that ends at each sample from `first` on, bounds, and which are too large."""
     time = seconds(samples.time - samples.time[0]) if len(samples.time) else np.empty(0)
     now = np.arange(first, len(time))
     begun = np.searchsorted(time, time[now] - limits.wheel_window_s - 0.5)
@@ -193,21 +201,23 @@ def _compare(samples: WheelSamples, first: int, limits: InterferenceLimits, *, s
     long_enough = time[now] - time[begun] >= limits.wheel_least_s - 0.5
 
     def apart(a: Integers, b: Integers) -> tuple[Floats, Floats, Floats]:
-        """Distance by satellites less that of the wheel, the wheel's, and the variance of the noise."""
+        """Distance by satellites less that of the wheel, the wheel's, and the variance without the second position."""
         arc, way = samples.arc_m[b] - samples.arc_m[a], samples.way_m[b] - samples.way_m[a]
         if not signed:
             arc, way = np.abs(arc), np.abs(way)
         doubt = samples.doubt_m[b] - samples.doubt_m[a]
-        return arc - way, way, samples.sigma_m[a] ** 2 + samples.sigma_m[b] ** 2 + doubt**2
+        return arc - way, way, samples.sigma_m[a] ** 2 + doubt**2
 
-    difference, way, noise = apart(begun, now)
-    earlier, rolled, its_noise = apart(start, begun)
+    difference, way, at_beginning = apart(begun, now)
+    earlier, rolled, noise = apart(start, begun)
     prior = limits.wheel_scale**-2.0
-    weight = rolled**2 / its_noise
+    weight = rolled**2 / (noise + samples.sigma_m[begun] ** 2)
     ratio = np.where(rolled != 0.0, earlier / np.where(rolled != 0.0, rolled, 1.0), 0.0)
     scale = weight * ratio / (prior + weight)
     variance = 1.0 / (prior + weight) + limits.wheel_change**2
     left = difference - scale * way
-    sigma = np.sqrt(noise + way**2 * variance)
+    by_wheel = at_beginning + way**2 * variance
+    sigma = np.sqrt(by_wheel + samples.sigma_m[now] ** 2)
     beyond = long_enough & (np.abs(left) >= limits.wheel_m) & (np.abs(left) >= limits.wheel_sigmas * sigma)
-    return np.where(long_enough, left, np.nan), beyond
+    bound = np.abs(left) + limits.wheel_level_sigmas * np.sqrt(by_wheel)
+    return np.where(long_enough, left, np.nan), bound, beyond
