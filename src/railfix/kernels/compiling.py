@@ -74,6 +74,8 @@ class _InnerCompiler(CompilerBase):
 #: Versions of numba whose inner workings `_InnerCompiler` is known to suit; others compile in the usual way.
 _SUITED: Final = ((0, 61), (0, 68))
 _IS_SUITED: Final = _SUITED[0] <= tuple(int(part) for part in numba.__version__.split(".")[:2]) <= _SUITED[1]
+#: The option is one of numba's own; a numba without it counts.
+_UNCOUNTED: Final[dict[str, Any]] = {"_nrt": False} if hasattr(DefaultOptions, "_nrt") else {}
 _INNER: Final[dict[str, Any]] = {
     "no_cpython_wrapper": True,
     **({"pipeline_class": _InnerCompiler} if _IS_SUITED else {}),
@@ -93,10 +95,19 @@ def kernel(function: Function) -> Function:
     SettingsError
         None of these folders can be written.
     """
+    return _kernel(function, {})
+
+
+def borrowing_kernel(function: Function) -> Function:
+    """Compile a kernel that makes no array, without counting references to those that it is given."""
+    return _kernel(function, _UNCOUNTED)
+
+
+def _kernel(function: Function, options: dict[str, Any]) -> Function:
     if numba.config.DISABLE_JIT or _is_left(function):  # type: ignore[attr-defined]
         return function
     try:
-        made = numba.njit(cache=True, **_OPTIONS)(function)
+        made = numba.njit(cache=True, **_OPTIONS, **options)(function)
     except RuntimeError as error:
         raise SettingsError(
             f"compiled kernels cannot be kept on disk ({error}); set NUMBA_CACHE_DIR to a folder that can be "
@@ -144,10 +155,8 @@ def borrowing(function: Function) -> Function:
     """Compile an inner function that makes no array, without counting references to those that it is given.
 
     Each call would count every array of a tuple of work space up and down: a tenth of the time of the recursion.
-    The option is one of numba's own; a numba without it counts.
     """
-    uncounted: dict[str, Any] = {"_nrt": False} if hasattr(DefaultOptions, "_nrt") else {}
-    return cast(Function, numba.njit(**_OPTIONS, **_INNER, **uncounted)(function))
+    return cast(Function, numba.njit(**_OPTIONS, **_INNER, **_UNCOUNTED)(function))
 
 
 class _Announcement(event.Listener):

@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 
 from railfix.core.arrays import Floats
-from railfix.kernels.compiling import borrowing, kernel
+from railfix.kernels.compiling import borrowing, borrowing_kernel
+from railfix.kernels.references import by_reference
 from railfix.kernels.tracking.algebra import invert, restart
 from railfix.kernels.tracking.branches import keep_hypotheses, leading, reweigh
 from railfix.kernels.tracking.clocks import start_clocks
@@ -301,8 +302,8 @@ def _finish(
         outputs.status[t] = status
 
 
-@kernel
-def advance(
+@borrowing
+def _advance(
     inputs: Inputs,
     state: KernelState,
     bank: Subfilters,
@@ -312,10 +313,7 @@ def advance(
     span: tuple[int, int],
     part: int,
 ) -> int:
-    """Do the epochs of a span; return the first before which places have to be sought, or the end of the span.
-
-    `part` says what of an epoch is done: `layout.WHOLE`, or of the first alone the `PREDICTION`, or the `REST`.
-    """
+    """Do the epochs of a span (`advance`)."""
     epochs, line, parameters, active = inputs.epochs, inputs.line, inputs.parameters, inputs.active
     scalars, room = state.scalars, len(work.now) - 1
     for t in range(span[0], span[1]):
@@ -356,3 +354,24 @@ def advance(
         if not math.isfinite(state.mean[0, ARC]):
             return t + 1
     return span[1]
+
+
+@borrowing_kernel
+def advance(
+    inputs: Inputs,
+    state: KernelState,
+    bank: Subfilters,
+    outputs: Outputs,
+    rows: Rows,
+    work: Work,
+    span: tuple[int, int],
+    part: int,
+) -> int:
+    """Do the epochs of a span; return the first before which places have to be sought, or the end of the span.
+
+    `part` says what of an epoch is done: `layout.WHOLE`, or of the first alone the `PREDICTION`, or the `REST`.
+    """
+    return _advance(
+        by_reference(inputs), by_reference(state), by_reference(bank), by_reference(outputs),
+        by_reference(rows), by_reference(work), span, part,
+    )  # fmt: skip

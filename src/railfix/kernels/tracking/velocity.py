@@ -64,8 +64,10 @@ def fitted_velocities(
                 vertical = up[t, a] * up[t, b] / CLIMB_MPS**2 if a < 3 and b < 3 else 0.0
                 prior[a, b] = vertical + (PRIOR_MPS[a] ** -2.0 if a == b else 0.0)
         for _ in range(PASSES):
-            normal[0] = prior
-            right[:] = 0.0
+            for a in range(4):
+                right[a] = 0.0
+                for b in range(4):
+                    normal[0, a, b] = prior[a, b]
             for k in range(count):
                 for a in range(4):
                     scaled = row[k, a] * weight[k] * information[k]
