@@ -8,11 +8,11 @@ import shutil
 import sqlite3
 import struct
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 from xml.etree import ElementTree
 
 import numpy as np
@@ -22,6 +22,8 @@ import pyarrow.parquet
 import pyogrio
 import pytest
 import shapely
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from pyproj import CRS, Transformer
 from typer.testing import CliRunner
 
@@ -173,8 +175,36 @@ def read_geoparquet(path: Path) -> list[Point]:
     return points
 
 
+def messages(path: Path) -> Iterator[tuple[str, int, Any]]:
+    """Topic, time [ns] and content of each message."""
+    with path.open("rb") as file:
+        for _, channel, message, content in make_reader(
+            file, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
+            yield channel.topic, message.log_time, content
+
+
+def read_mcap(path: Path) -> list[Point]:
+    """Rows of the filter or of single epochs, at the place and time of the fix beside each."""
+    fixes = {}
+    points = []
+    for topic, time, message in messages(path):
+        stamp = 10**9 * message.header.stamp.sec + message.header.stamp.nanosec
+        assert topic.startswith(f"/{message.header.frame_id}/")
+        assert time == stamp
+        if topic.endswith("/fix"):
+            fixes[topic.split("/")[1], stamp] = (message.longitude, message.latitude, message.altitude)
+        elif topic.endswith("/row"):
+            values = {name: getattr(message, name) for name in message.__slots__}
+            values["protection_level_m"] = level if math.isfinite(level := message.protection_level_m) else None
+            utc = datetime.fromtimestamp(stamp / 1e9, UTC)
+            points.append(point(values, fixes[message.antenna, stamp], utc))
+    return points
+
+
 READERS: Final[dict[str, Callable[[Path], list[Point]]]] = {
     ".kml": read_kml, ".gpx": read_gpx, ".geojson": read_geojson, ".gpkg": read_geopackage, ".parquet": read_geoparquet,
+    ".mcap": read_mcap,
 }  # fmt: skip
 
 
@@ -206,7 +236,7 @@ def test_positions_read_back_to_a_millimetre(results: Path, tmp_path: Path, endi
     assert [p.level_m for p in points] == expected
 
 
-@pytest.mark.parametrize("ending", [ending for ending in READERS if ending != ".parquet"])
+@pytest.mark.parametrize("ending", [".kml", ".gpx", ".geojson", ".gpkg"])
 def test_gdal_shows_the_positions_as_a_gis_does(results: Path, tmp_path: Path, ending: str) -> None:
     """GDAL opens each file by its content: points with heights, in WGS 84, at the places and times of the run."""
     out = tmp_path / f"run{ending}"
@@ -277,6 +307,45 @@ def test_tracks_of_a_network_are_attributes(results: Path, tmp_path: Path) -> No
     assert texts.count("L36 <B> & 'C'") == sum(f["properties"]["track"] is not None for f in features)
 
 
+def test_messages_of_the_filter_for_ros(results: Path, tmp_path: Path) -> None:
+    """Layout of emate_msgs/FusionResultTrack, every column of a row, and the variance of the place."""
+    run = shutil.copytree(results, tmp_path / "results")
+    rows = pl.read_parquet(run / "train.parquet")
+    on_track = pl.int_range(pl.len()) > 100
+    rows = rows.with_columns(
+        track=pl.when(on_track).then(pl.lit("L36")),
+        track_chainage_m=pl.when(on_track).then(pl.col("chainage_m") - 7.0),
+        under_reading_m=pl.col("protection_level_m"),
+    )
+    rows.write_parquet(run / "train.parquet")
+    export(run, tmp_path / "run.mcap")
+    found: dict[str, list[Any]] = {}
+    for topic, _, message in messages(tmp_path / "run.mcap"):
+        found.setdefault(topic, []).append(message)
+    assert set(found) == {f"/{name}/{topic}" for name in ("front", "rear") for topic in ("fix", "row", "track")}
+    rows = rows.drop_nulls("x_m").filter(antenna="front")
+    tracks, fixes, every = (found[f"/front/{topic}"] for topic in ("track", "fix", "row"))
+    assert [len(tracks), len(fixes), len(every)] == [len(rows)] * 3
+    statuses = {status.text: int(status) for status in TrackStatus}
+    for row, track, fix, copy in zip(rows.iter_rows(named=True), tracks, fixes, every, strict=True):
+        assert track.status == statuses[row["status"]]
+        assert list(track.track_id) == ([row["track"]] if row["track"] else [])
+        place = row["track_chainage_m"] if row["track"] else row["chainage_m"]
+        assert track.relative_dist == pytest.approx(place, abs=1e-4)
+        assert track.movement_direction == (row["direction"] != "falling")
+        assert track.speed == pytest.approx(abs(row["speed_mps"]), abs=1e-4)
+        assert track.dist_ci.overestimation == pytest.approx(row["over_reading_m"], abs=1e-4)
+        assert track.dist_ci.underestimation == pytest.approx(row["under_reading_m"], abs=1e-4)
+        assert fix.position_covariance[0] == pytest.approx(row["along_sigma_m"] ** 2, rel=1e-2, abs=1e-4)
+        assert copy.protection_level_m == pytest.approx(row["protection_level_m"], abs=1e-4)
+        assert set(copy.__slots__) >= set(row)
+    assert math.isinf(max(copy.protection_level_m for copy in every + found["/rear/row"]))
+    assert tracks[-1].travelled_dist == pytest.approx(rows["chainage_m"].diff().abs().sum(), abs=0.01)
+    export(run, tmp_path / "single.mcap", "--single")
+    topics = {topic for topic, _, _ in messages(tmp_path / "single.mcap")}
+    assert topics == {f"/{name}/{topic}" for name in ("front", "rear") for topic in ("fix", "row")}
+
+
 # -- styles ---------------------------------------------------------------------------------------------------
 
 
@@ -317,17 +386,20 @@ def test_formats_share_a_style_and_a_style_of_the_user_is_kept(results: Path, tm
 def test_another_ending_is_refused_with_those_there_are(results: Path, tmp_path: Path) -> None:
     code, said = refused(results, tmp_path / "run.shp")
     assert code == 8
-    assert "name a file that ends in .kml or .gpx or .geojson or .gpkg or .parquet" in said
+    assert "name a file that ends in .kml or .gpx or .geojson or .gpkg or .parquet or .mcap" in said
 
 
-@pytest.mark.parametrize("package", ["pyogrio", "shapely"])
+@pytest.mark.parametrize(
+    ("package", "ending", "extra"),
+    [("pyogrio", "gpkg", "maps"), ("shapely", "gpkg", "maps"), ("mcap_ros2.writer", "mcap", "mcap")],
+)
 def test_a_missing_extra_is_one_sentence(
-    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, ending: str, extra: str
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    code, said = refused(results, tmp_path / "run.gpkg")
+    code, said = refused(results, tmp_path / f"run.{ending}")
     assert (code, list(tmp_path.iterdir())) == (4, [])
-    assert f"this needs {package}, which is not installed; pip install 'railfix[maps]'" in said
+    assert f"this needs {package}, which is not installed; pip install 'railfix[{extra}]'" in said
     export(results, tmp_path / "run.kml")
 
 

@@ -13,8 +13,9 @@ from network_made import made_network
 from network_recordings import COLUMNS
 from railfix.track.network import Candidates, Network
 from railfix.track.network_fill import fill_gaps
-from railfix.track.network_match import Matched, match, read_plan_positions
+from railfix.track.network_match import Matched, PlanLog, match, read_plan_positions
 from railfix.track.network_read import read_network
+from route_matcher import matched_track
 
 pytestmark = pytest.mark.requirement("A10")
 
@@ -31,6 +32,11 @@ def _matched(track: list[int], chainage: list[float]) -> Matched:
         candidates=near,
         probabilities=probability[:, None],
     )
+
+
+def _without_positions(time: np.ndarray) -> PlanLog:
+    none = np.full(len(time), np.nan)
+    return PlanLog(path="made", time=time, latitude_deg=none, longitude_deg=none, sigma_m=none)
 
 
 def _shortest_m(net: Network, first: int, from_m: float, last: int, to_m: float) -> float:
@@ -57,7 +63,7 @@ def test_a_gap_is_filled_by_the_shortest_route(first: int, last: int) -> None:
     count = 2001
     matched = _matched([first, *[-1] * (count - 2), last], [from_m, *[np.nan] * (count - 2), to_m])
     time = np.datetime64("2024-01-01T00:00:00", "ns") + np.arange(count) * np.timedelta64(1, "s")
-    filled = fill_gaps(net, matched, time)
+    filled = fill_gaps(net, matched, _without_positions(time))
     length = _shortest_m(net, first, from_m, last, to_m)
     assert filled.filled.sum() == count - 2
     steps = np.linalg.norm(np.diff(net.course_on(filled.track, filled.chainage_m)[0], axis=0), axis=1)
@@ -69,7 +75,7 @@ def test_a_gap_is_filled_by_the_shortest_route(first: int, last: int) -> None:
 
 def test_no_route_or_positions_off_the_map_leave_the_gap() -> None:
     net = made_network(10.0)
-    time = np.full(3, np.datetime64("NaT"), dtype="datetime64[ns]")
+    time = _without_positions(np.full(3, np.datetime64("NaT"), dtype="datetime64[ns]"))
     assert not fill_gaps(net, _matched([1, -1, 2], [1.0, np.nan, 1.0]), time).filled.any()
     matched = _matched([0, -1, 0], [100.0, np.nan, 200.0])
     filled = fill_gaps(net, matched, time)
@@ -86,7 +92,7 @@ def test_the_tunnel_of_the_measuring_train_is_filled_as_networkx_finds_it(record
     log = read_plan_positions(folder / "log_28573_L36-A_to_L36C-A_to_L25N-B.csv", columns=COLUMNS)
     matched = match(net, log)
     assert (matched.track < 0).mean() > 0.5
-    filled = fill_gaps(net, matched, log.time, rows_to_fill="off-map")
+    filled = fill_gaps(net, matched, log, rows_to_fill="off-map")
     assert (filled.track >= 0).all()
     first, *_, last = np.flatnonzero(filled.filled)
     before, after = first - 1, last + 1
@@ -98,3 +104,44 @@ def test_the_tunnel_of_the_measuring_train_is_filled_as_networkx_finds_it(record
     )
     way = np.linalg.norm(np.diff(net.course_on(filled.track, filled.chainage_m)[0][before : after + 1], axis=0), axis=1)
     assert way.sum() == pytest.approx(_shortest_m(net, *places), rel=0.01)
+
+
+@pytest.mark.parametrize("cut", [900, *(pytest.param(cut, marks=pytest.mark.slow) for cut in (700, 1100, 1300))])
+def test_a_log_that_begins_or_ends_in_the_tunnel(recordings: Path, cut: int) -> None:
+    """Against the log of both sides, and the shortest routes between neighbouring positions that drift."""
+    folder = recordings / "rail" / "infrabel"
+    net = read_network([folder / "network_airport.geojson"])
+    log = read_plan_positions(folder / "log_28573_L36-A_to_L36C-A_to_L25N-B.csv", columns=COLUMNS)
+    matched = match(net, log)
+    both = fill_gaps(net, matched, log, rows_to_fill="off-map")
+    right = routes = 0
+    for rows in (np.arange(cut, len(log.time)), np.arange(cut + 1)):
+        part = log.take(rows)
+        begun = match(net, part)
+        filled = fill_gaps(net, begun, part, rows_to_fill="off-map")
+        assert not fill_gaps(net, begun, part).filled.any()
+        assert (filled.track >= 0).all()
+        inside = (begun.track < 0) & (matched.track[rows] < 0)
+        assert np.isinf(filled.bound_m[inside]).all()
+        seen, true = (net.course_on(f.track, f.chainage_m)[0] for f in (filled, both))
+        assert np.percentile(np.linalg.norm(seen - true[rows], axis=1), 95) < 210.0
+        right += (filled.track == both.track[rows])[inside].sum()
+        routes += (matched_track(net, part)[0] == both.track[rows])[inside].sum()
+    assert right > routes
+
+
+def test_a_route_much_longer_than_the_distance_travelled_is_not_taken() -> None:
+    net = made_network(10.0)
+    matched = _matched([0, -1, 0], [100.0, np.nan, 2100.0])
+    matched = replace(matched, probability=np.array([1.0, 0.0, 1.0]))
+    latitude, longitude, none = net.tracks[0].latitude_deg[0], net.tracks[0].longitude_deg[0], np.full(3, np.nan)
+    still = PlanLog(
+        path="made",
+        time=np.full(3, np.datetime64("NaT"), dtype="datetime64[ns]"),
+        latitude_deg=np.full(3, latitude),
+        longitude_deg=np.full(3, longitude),
+        sigma_m=none,
+    )
+    assert not fill_gaps(net, matched, still, rows_to_fill="off-map").filled.any()
+    near = replace(matched, chainage_m=np.array([100.0, np.nan, 500.0]))
+    assert fill_gaps(net, near, still, rows_to_fill="off-map").filled.tolist() == [False, True, False]

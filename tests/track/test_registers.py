@@ -69,6 +69,23 @@ def test_a_register_without_geometry_is_a_sentence(tmp_path: Path) -> None:
         read_network([path])
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        (
+            "rinf.xml",
+            '<Country><SectionOfLine><SOLOPStart Value="BE1"/><SOLLength Value="5,2"/></SectionOfLine></Country>',
+        ),
+        ("rinf.csv", "SOLLineIdentification,SOLOPStart,SOLOPEnd,SOLLength\n36,BE1,BE2,5.2\n"),
+    ],
+)
+def test_sections_of_line_are_refused_with_the_form_that_is_read(tmp_path: Path, name: str, text: str) -> None:
+    """Elements as programs that read the register's XML name them (SectionOfLine, SOLOPStart, UniqueOPID)."""
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputFileError, match=r"no geometry of tracks; export the register's topology as RDF \(.ttl"):
+        read_segments(tmp_path / name, MapReading())
+
+
 # --- EGNSS MATE --------------------------------------------------------------
 
 #: Lengths of line, clothoid, circle, clothoid and line [m], and place of the start in LV95.

@@ -35,6 +35,7 @@ EXTRAS: Final = {
     "uvicorn": "ground",
     "sqlalchemy": "ground",
     "distributed": "cluster",
+    "mcap_ros2": "mcap",
     "pyogrio": "maps",
     "shapely": "maps",
 }

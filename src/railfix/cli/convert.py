@@ -15,6 +15,7 @@ from railfix.io.positions_export import style_file, write_positions
 from railfix.pipeline.tables import rounded
 from railfix.run.doctor import examine_files
 from railfix.run.inputs import located
+from railfix.run.mcap import write_mcap
 from railfix.run.options import LogReading
 
 
@@ -65,7 +66,7 @@ def export(
     *,
     out: Annotated[
         Path,
-        typer.Option(metavar="FILE", help="File to write; it ends in .kml, .gpx, .geojson, .gpkg or .parquet."),
+        typer.Option(metavar="FILE", help="File to write; it ends in .kml, .gpx, .geojson, .gpkg, .parquet or .mcap."),
     ],
     filtered: Annotated[
         bool | None,
@@ -77,14 +78,14 @@ def export(
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Write the positions of a run for maps: KML, GPX, GeoJSON, GeoPackage or GeoParquet.
+    """Write the positions of a run for maps and ROS 2: KML, GPX, GeoJSON, GeoPackage, GeoParquet or MCAP.
 
     The ending of FILE chooses the format. Each position has its time, antenna, status, chainage, standard deviation,
     protection level, speed and track, as far as the run has them; an infinite level is left empty. Epochs without a
     position are left out. Coordinates are WGS 84, heights above the ellipsoid.
 
     Beside GeoJSON, GeoPackage and GeoParquet comes a style of the same name (`.qml`), by which QGIS colours the
-    positions by status.
+    positions by status. MCAP has every column of the run.
 
     Example: `railfix export results --out positions.gpkg`
 
@@ -106,7 +107,8 @@ def export(
     frame = "WGS 84" + (f" ({used})" if used else "")
     what = "filter along the track" if table == "train" else "single epochs"
     description = f"Antenna positions of railfix, {what}, {folder.line_name}; {frame}, heights above the ellipsoid"
-    written = write_positions(rounded(folder.positions), out, description=description)
+    write = write_mcap if out.suffix.lower() == ".mcap" else write_positions
+    written = write(rounded(folder.positions), out, description=description)
     console = console_of_tables()
     console.print(f"{written:,} positions of {len(folder.positions):,} epochs and antennas, {what}", markup=False)
     console.print(f"{frame}, heights above the ellipsoid", markup=False)

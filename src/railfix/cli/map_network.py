@@ -86,8 +86,8 @@ class MatchOptions(Settings):
         gt=0.0,
     )
     fill: Rows = option(
-        "Rows between known places that are put on the shortest route: gaps, those without position; or off-map, also "
-        "those whose positions lie off the map, as in a tunnel.",
+        "Rows that are put on the shortest route: gaps, those without position between known places; or off-map, also "
+        "those whose positions lie off the map, as in a tunnel, at its start and end too.",
         "gaps",
     )
     picture: Path | None = option("Picture to write (.png or .svg).", None, metavar="FILE")
@@ -269,7 +269,7 @@ def match_command(
     if not (matched.track >= 0).any():
         raise MismatchError(f"{log}: no position lies near a track of the network; is it the map of this region?")
     write_whole(
-        out, _matched_csv(net, positions, matched, fill_gaps(net, matched, positions.time, rows_to_fill=options.fill))
+        out, _matched_csv(net, positions, matched, fill_gaps(net, matched, positions, rows_to_fill=options.fill))
     )
     console = console_of_tables()
     on = matched.track >= 0

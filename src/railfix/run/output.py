@@ -96,7 +96,7 @@ _ENDINGS: Final[Mapping[str, tuple[str, tuple[str, ...], str]]] = {
     "pos": ("RTKLIB's format of positions", (".pos",), ""),
     "picture": ("a picture in PNG or SVG", (".png", ".svg"), ""),
     "png": ("a picture in PNG", (".png",), ""),
-    "map": ("a file for maps", (".kml", ".gpx", ".geojson", ".gpkg", ".parquet"), ""),
+    "map": ("a file for maps", (".kml", ".gpx", ".geojson", ".gpkg", ".parquet", ".mcap"), ""),
 }
 #: How times are written to CSV: ISO 8601, GPS time, to the nanosecond, no time zone.
 CSV_TIME: Final = "%Y-%m-%dT%H:%M:%S%.9f"

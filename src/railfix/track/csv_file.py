@@ -15,7 +15,7 @@ from railfix.core.settings import misspelt
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.track.crs import frame_degrees, known_crs, older_datum_note, used_crs
 from railfix.track.heights import check_height_datum, ellipsoidal_heights
-from railfix.track.segment import MapReading, Segment
+from railfix.track.segment import RINF_NAMES, RINF_SECTIONS, MapReading, Segment
 from railfix.track.track import UNNAMED, Track
 
 #: Attribute of the track, factor, and value of an empty cell, by column of the file.
@@ -108,6 +108,8 @@ def _check_columns(table: NamedColumns) -> tuple[str, ...]:
     for name in ("latitude_deg", "longitude_deg"):
         if name not in table:
             message = f"there is no column {name!r}; the columns are {', '.join(table.cells)}"
+            if any(cell.lower() in RINF_NAMES for cell in table.cells):
+                message += f"; {RINF_SECTIONS}"
             raise InputFileError(table.path, message, line=table.header_line)
     if ("height_m" in table) == ("elevation_m" in table):
         what = "both 'height_m' and 'elevation_m'" if "height_m" in table else "neither 'height_m' nor 'elevation_m'"

@@ -1,18 +1,25 @@
-"""Places on a network between known ones: tunnels and gaps of a log, filled by the shortest connected route."""
+"""Places on a network beside known ones: tunnels and gaps of a log, filled by the shortest connected route."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import median_filter
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.network import Network
-from railfix.track.network_match import Matched
+from railfix.track.network_match import Matched, PlanLog
 
-#: Rows between known places that are filled: those without position, or also those whose positions lie off the map.
+#: Rows that are filled: those without position between known places, or also those whose positions lie off the map.
 Rows = Literal["gaps", "off-map"]
+#: Farthest track looked at from a position that drifts, and largest difference of a route from the distance travelled
+#: [m]; and steps of which the speed is the median.
+_DRIFT_M = 500.0
+_STEPS = 15
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,11 +29,11 @@ class Filled:
     Attributes
     ----------
     track : ndarray of int
-        -1 where no route joins the known places before and after, or one of them is missing.
+        -1 where no place is known and no route was found.
     chainage_m : ndarray
     bound_m : ndarray
-        Farthest that a train on this route, which does not turn back, can be from the filled place [m]; NaN where the
-        place was known.
+        Farthest that a train on this route, which does not turn back, can be from the filled place [m]; infinite before
+        the first known place and after the last, NaN where the place was known.
     """
 
     track: Indices
@@ -36,37 +43,93 @@ class Filled:
     @property
     def filled(self) -> Masks:
         """Rows that were filled."""
-        return np.isfinite(self.bound_m)
+        return ~np.isnan(self.bound_m)
 
 
-def fill_gaps(network: Network, matched: Matched, time: Datetimes, *, rows_to_fill: Rows = "gaps") -> Filled:
-    """Fill rows without usable position between known places: shortest route, even speed (by rows without times).
+def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill: Rows = "gaps") -> Filled:
+    """Fill rows without usable position along the shortest route between known places, at even speed.
 
     A gap with positions that lie off the map is left as it is, as the train may have left the map there; unless
-    `rows_to_fill` is "off-map", as in a tunnel, where positions drift.
+    `rows_to_fill` is "off-map", as in a tunnel, where positions drift but their steps still tell the speed. Then a
+    route counts whose length differs from the distance travelled by at most `_DRIFT_M`, and rows before the first known
+    place and after the last are filled too: from the track near the outermost position of which distance and
+    difference of lengths are together smallest.
     """
-    track, chainage = matched.track.copy(), matched.chainage_m.copy()
-    bound = np.full(len(track), np.nan)
-    known = np.flatnonzero(track >= 0)
-    for i in np.flatnonzero(np.diff(known) > 1):
-        first, last = known[i], known[i + 1]
-        if rows_to_fill == "gaps" and not np.isnan(matched.probability[first + 1 : last]).all():
+    filled = Filled(
+        track=matched.track.copy(), chainage_m=matched.chainage_m.copy(), bound_m=np.full(len(matched.track), np.nan)
+    )
+    travelled = _travelled_m(log)
+    known = np.flatnonzero(matched.track >= 0)
+    for first, last in pairwise(known):
+        drifting = not np.isnan(matched.probability[first + 1 : last]).all()
+        if last == first + 1 or (rows_to_fill == "gaps" and drifting):
             continue
-        legs = _legs(network, int(track[first]), chainage[first], int(track[last]), chainage[last])
-        if legs is None:
-            continue
+        legs = _legs(network, *_place(matched, first), *_place(matched, last))
         rows = np.arange(first, last + 1)
-        at = rows.astype(float) if np.isnat(time[rows]).any() else (time[rows] - time[first]) / np.timedelta64(1, "ns")
-        share = (at[1:-1] - at[0]) / (at[-1] - at[0]) if at[-1] > at[0] else np.full(len(rows) - 2, 0.5)
-        numbers, enter, leave = legs
-        ends = np.cumsum(np.abs(leave - enter))
-        way = share * ends[-1]
-        leg = np.minimum(np.searchsorted(ends, way), len(ends) - 1)
-        inner = rows[1:-1]
-        track[inner] = numbers[leg]
-        chainage[inner] = leave[leg] - np.sign(leave - enter)[leg] * (ends[leg] - way)
-        bound[inner] = np.maximum(way, ends[-1] - way)
-    return Filled(track=track, chainage_m=chainage, bound_m=bound)
+        at = travelled[rows]
+        if not drifting or np.isnan(at).any():
+            no_time = np.isnat(log.time[rows]).any()
+            at = rows.astype(float) if no_time else (log.time[rows] - log.time[first]) / np.timedelta64(1, "ns")
+        elif legs is not None and _excess_m(legs, at) > _DRIFT_M:
+            continue
+        if legs is not None:
+            _put_on(filled, legs, rows[1:-1], at)
+    if rows_to_fill == "off-map" and len(known):
+        _fill_before(network, matched, log, travelled, np.arange(known[0], -1, -1), filled)
+        _fill_before(network, matched, log, travelled, np.arange(known[-1], len(matched.track)), filled)
+    return filled
+
+
+def _fill_before(
+    network: Network, matched: Matched, log: PlanLog, travelled_m: Floats, rows: Indices, filled: Filled
+) -> None:
+    """Fill rows from a known place outward, as far as they have positions."""
+    rows = rows[: np.argmin([*np.isfinite(travelled_m[rows]), False])]
+    if len(rows) < 2:
+        return
+    outer, way = rows[-1:], np.abs(travelled_m[rows] - travelled_m[rows[0]])
+    near = network.near(log.latitude_deg[outer], log.longitude_deg[outer], within_m=_DRIFT_M)
+    best, route = 2.0 * _DRIFT_M, None
+    for track, chainage, offset in zip(near.track[0], near.chainage_m[0], near.offset_m[0], strict=True):
+        legs = None if track < 0 else _legs(network, *_place(matched, rows[0]), int(track), float(chainage))
+        if legs is not None:
+            cost = abs(offset) + _excess_m(legs, way)
+            best, route = (cost, legs) if cost < best else (best, route)
+    if route is not None:
+        _put_on(filled, route, rows[1:], way, ends_known=False)
+
+
+def _excess_m(legs: tuple[Indices, Floats, Floats], way_m: Floats) -> float:
+    """Difference of a route's length from the distance travelled."""
+    return abs(float(np.abs(legs[2] - legs[1]).sum()) - float(way_m[-1] - way_m[0]))
+
+
+def _place(matched: Matched, row: int) -> tuple[int, float]:
+    return int(matched.track[row]), float(matched.chainage_m[row])
+
+
+def _travelled_m(log: PlanLog) -> Floats:
+    """Distance by the steps between positions, each the median of `_STEPS`, as positions jump; NaN without position."""
+    ecef = ecef_from_geodetic(log.latitude_deg, log.longitude_deg, np.zeros(len(log.time)))
+    step = np.linalg.norm(np.diff(ecef, axis=0), axis=1)
+    speed = median_filter(np.nan_to_num(step), _STEPS, mode="nearest")
+    travelled = np.concatenate([[0.0], np.cumsum(speed)])
+    return np.where(np.isfinite(ecef[:, 0]), travelled, np.nan)
+
+
+def _put_on(
+    filled: Filled, legs: tuple[Indices, Floats, Floats], rows: Indices, at: Floats, *, ends_known: bool = True
+) -> None:
+    """Put rows on a route in proportion to `at`, of which the first and, with known ends, the last are its ends."""
+    numbers, enter, leave = legs
+    share = (at - at[0]) / (at[-1] - at[0]) if at[-1] > at[0] else np.full(len(at), 0.5)
+    share = share[1 : len(rows) + 1]
+    ends = np.cumsum(np.abs(leave - enter))
+    way = share * ends[-1]
+    leg = np.minimum(np.searchsorted(ends, way), len(ends) - 1)
+    filled.track[rows] = numbers[leg]
+    filled.chainage_m[rows] = leave[leg] - np.sign(leave - enter)[leg] * (ends[leg] - way)
+    filled.bound_m[rows] = np.maximum(way, ends[-1] - way) if ends_known else np.inf
 
 
 def _legs(network: Network, first: int, from_m: float, last: int, to_m: float) -> tuple[Indices, Floats, Floats] | None:

@@ -2,7 +2,7 @@
 
 Its ontology (http://data.europa.eu/949/, version 3) has each `LinearElement` with its geometry (GeoSPARQL, WKT) and a
 `NetRelation` for each pair of ends that meet, as railML 3 has. Turtle, RDF/XML, N-Triples and JSON-LD are read by
-`rdflib`. The register's older XML has lines between operational points alone, no geometry of tracks.
+`rdflib`. The register's XML and CSV have sections of line between operational points alone, no geometry of tracks.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from railfix.core.errors import InputFileError
 from railfix.core.files import ending, file_sha256, open_stream
 from railfix.track.crs import used_crs
-from railfix.track.segment import MapReading, Segment
+from railfix.track.segment import RINF_SECTIONS, MapReading, Segment
 from railfix.track.vector_file import INSTALL, plan_segment
 from railfix.track.xml_files import Relation
 
@@ -60,8 +60,7 @@ def read_rinf_segments(path: str | PathLike[str], reading: MapReading) -> list[S
     if not segments:
         raise InputFileError(
             path,
-            "no era:LinearElement has a geometry (geosparql:hasGeometry, asWKT LINESTRING); the register's sections of "
-            "line have none, export its topology",
+            f"no era:LinearElement has a geometry (geosparql:hasGeometry, asWKT LINESTRING); {RINF_SECTIONS}",
         )
     return segments
 

@@ -12,6 +12,13 @@ NO_HEIGHTS = "none"
 #: Optional attributes of each point of a map.
 ATTRIBUTES = ("kilometrage_m", "cant_m", "radius_m", "gradient_permille")
 
+#: Names by which files of ERA RINF are known that have no tracks, in small letters, and what is said of them.
+RINF_NAMES = ("sectionofline", "operationalpoint", "solopstart", "uniqueopid", "uopid", "opstart")
+RINF_SECTIONS = (
+    "sections of line and operational points of ERA RINF have no geometry of tracks; export the register's topology as "
+    "RDF (.ttl, .rdf, .nt, .jsonld)"
+)
+
 
 @dataclass(frozen=True, kw_only=True)
 class MapReading:

@@ -14,7 +14,7 @@ from railfix.core.files import read_bytes
 from railfix.track.crs import used_crs
 from railfix.track.design import segment_of_design
 from railfix.track.elements import CantElement, PlanElement, ProfileElement
-from railfix.track.segment import MapReading, Segment
+from railfix.track.segment import RINF_NAMES, RINF_SECTIONS, MapReading, Segment
 from railfix.track.vector_file import INSTALL, plan_segment
 
 _METRIC: Final = (1.0, 1e-3, 1e-2, 1e3)
@@ -78,7 +78,10 @@ def read_xml_segments(path: str | PathLike[str], reading: MapReading) -> list[Se
         return _landxml(str(path), root, reading)
     if kind == "railML":
         return _railml(str(path), root, reading)
-    raise InputFileError(path, f"the root element is {kind!r}; LandXML or railML (3) was expected")
+    message = f"the root element is {kind!r}; LandXML or railML (3) was expected"
+    if any(str(element.tag).rsplit("}", 1)[-1].lower() in RINF_NAMES for element in root.iter()):
+        message += f"; {RINF_SECTIONS}"
+    raise InputFileError(path, message)
 
 
 # --- LandXML -----------------------------------------------------------------
