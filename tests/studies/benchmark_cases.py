@@ -86,14 +86,14 @@ _TEXT: Final = """# Benchmark on recordings
 `{command}` on {date}, commit `{commit}`: cars with a satellite receiver,
 the map made from the ground truth, every setting at its default. [How to](how-to.md#compare-with-other-programs).
 
-- Errors are in metres along the line; *wrong*: errors above 50 m. *Over level*: without an alarm, where railfix had raised
-  an alarm or a doubt, and hazardously misleading.
-- Performance features of EN 16803-1: availability (rate, level in limit), accuracy (errors, wrong, error/sigma), integrity
-  (over level), continuity (15 s), TTFF (first).
-- *RTKLIB* is the single point of `rnx2rtkp` with the same mask and constellations, moved to the nearest point of the line;
-  *3-D* is that of railfix. OUT/benchmark.md has straight distances too.
-- *Held out*: read by no test, no setting was chosen with it (`python tests/studies/public_recording.py CASES/town`); the
-  others were seen while railfix was made.
+- Errors are in metres along the line; *wrong*: errors above 50 m. *Over level*: without an alarm, where railfix had
+  raised an alarm or a doubt, and hazardously misleading.
+- Performance features of EN 16803-1: availability (rate, level in limit), accuracy (errors, wrong, error/sigma),
+  integrity (over level), continuity (15 s), TTFF (first).
+- *RTKLIB* is the single point of `rnx2rtkp` with the same mask and constellations, moved to the nearest point of the
+  line; *3-D* is that of railfix. OUT/benchmark.md has straight distances too.
+- *Held out*: read by no test, no setting was chosen with it (`python tests/studies/public_recording.py CASES/town`);
+  the others were seen while railfix was made.
 
 {table}{notes}"""
 #: Columns of the page: head, and the columns of benchmark.md whose cells it joins.
