@@ -29,7 +29,7 @@ def test_each_hazard_and_condition_has_a_test_that_exists_or_says_that_it_is_not
 
 
 def test_statuses_and_reasons_of_the_tables_exist() -> None:
-    tables = "\n".join(line for line in TEXT.splitlines() if line.startswith("|"))
+    tables = "\n".join(line for line in TEXT.splitlines() if line.startswith(("|", "- ")))
     named = set(re.findall(r"`([a-z_]+)`", tables))
     known = {s.text for s in Status} | {s.text for s in TrackStatus} | {str(r.name).lower() for r in Reason}
     assert named - known - {"no_input"} == set()

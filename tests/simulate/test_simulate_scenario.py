@@ -419,4 +419,4 @@ def test_the_files_of_the_document_are_scenarios(tmp_path: Path) -> None:
         "falling",
     ]
     for name in shipped_scenarios():
-        assert f"| `{name}` |" in text
+        assert f"\n- `{name}`: " in text

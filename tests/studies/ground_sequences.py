@@ -21,6 +21,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--events", type=int, default=4)
     parser.add_argument("--random", type=int, default=100_000)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first random one: goes on after a part")
     parser.add_argument("--seconds", type=float, default=36_000.0, help="end the random ones after this time")
     given = parser.parse_args()
     violated = False
@@ -28,13 +29,17 @@ def main() -> None:
         worlds, sequence = explore(running(name), given.events)
         print(f"{name}: {worlds} worlds of up to {given.events} events, {sequence or 'no violation'}", flush=True)
         violated |= sequence is not None
+    busy = time.process_time()
     violations, seen, end, count = Counter[str](), Counter[str](), time.monotonic() + given.seconds, 0
     while count < given.random and time.monotonic() < end:
-        line = run_sequence(count)
+        line = run_sequence(given.first + count)
         violations += line.violations
         seen += line.seen
         count += 1
-    print(f"{count} random sequences, violations: {dict(violations) or 'none'}; {dict(seen)}")
+    print(
+        f"{count} random sequences from seed {given.first} on, {time.process_time() - busy:.0f} s of the processor, "
+        f"violations: {dict(violations) or 'none'}; {dict(seen)}"
+    )
     raise SystemExit(int(violated or bool(violations)))
 
 

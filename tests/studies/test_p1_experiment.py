@@ -35,7 +35,7 @@ def test_the_page_shows_the_kept_outputs() -> None:
     text = p1_page.PAGE.read_text(encoding="utf-8")
     assert p1_page.page(text) == text, "run python tests/studies/p1_page.py"
     # the row of the preset p1 with GPS, by eye from p1-commercial.txt
-    assert "| | p1 | 90.80 | 2.55 | 2.12 | 47.9 | 56 |" in text
+    assert "| | p1 | 90.80, 2.55 | 2.12, 47.9 | 56 |" in text
 
 
 @pytest.mark.requirement("D2")

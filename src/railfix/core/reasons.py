@@ -35,13 +35,13 @@ class Reason(IntFlag):
     UNHEALTHY = 1 << 6
     #: Below the elevation mask.
     ELEVATION_MASK = 1 << 7
-    #: The only usable satellite of its clock group: it determines that clock and contributes nothing to the position.
+    #: The only usable satellite of its clock group: it determines that clock alone.
     ALONE_ON_ITS_CLOCK = 1 << 8
-    #: A correction is unknown: the group delay of the signal is not broadcast, or the satellite is at the horizon.
+    #: No group delay of the signal is broadcast, or the satellite is at the horizon.
     NO_CORRECTION = 1 << 9
     #: SBAS: the satellite is not in the PRN mask.
     SBAS_NOT_COVERED = 1 << 10
-    #: SBAS: the fast or long-term correction, its degradation, or the record with its issue of data is missing.
+    #: SBAS: fast or long-term correction, degradation, or record with its issue of data is missing.
     SBAS_NO_CORRECTION = 1 << 11
     #: SBAS: the corrections have timed out.
     SBAS_TIMED_OUT = 1 << 12
@@ -59,9 +59,9 @@ class Reason(IntFlag):
     ANTENNA_PAIR = 1 << 18
     #: Excluded by RAIM: its estimated range error exceeds the limit.
     FAULT_EXCLUDED = 1 << 19
-    #: Left out: the residuals have had one sign and size for a minute (`railfix.pipeline.lasting_errors`).
+    #: Left out: residuals of one sign and size for a minute.
     LASTING_ERROR = 1 << 20
-    #: Left out by the setting `exclude`, by its own name or that of its constellation.
+    #: Left out by the setting `exclude`.
     EXCLUDED_BY_SETTING = 1 << 21
 
 
@@ -85,7 +85,7 @@ class Status(IntEnum):
     NO_OBSERVATION = 6
     #: A position, but the ranges are inconsistent and no exclusion restores consistency.
     INCONSISTENT = 7
-    #: A position, but the distance between the two antennas' positions disagrees with the antenna spacing.
+    #: A position, but its distance from the other antenna's disagrees with the antenna spacing.
     ANTENNAS_DISAGREE = 8
     #: A position, but its single-epoch sigma exceeds `Config.largest_sigma_m`.
     UNCERTAIN = 9

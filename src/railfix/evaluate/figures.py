@@ -32,7 +32,7 @@ AIDED: Final = pl.col("observed") & (pl.col("n_used").fill_null(0) > 0)
 #: Columns of the table of figures, with their unit and meaning.
 FIGURE_COLUMNS: Final[dict[str, str]] = {
     "grouping": "`all`, `section`, `environment`, `speed`, `satellites`, `signals` (with or without a satellite "
-    "used), `status`; of several runs also `configuration` and `line`: the runs of one configuration together",
+    "used), `status`; of several runs also `configuration` and `line`",
     "group": "name of the group",
     "run": "name of the run; `all` for several together",
     "configuration": "settings of the run",
@@ -58,7 +58,7 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "highest_m": "error furthest toward the end of the line",
     "max_at_time": "GPS time of the largest error",
     "max_at_chainage_m": "chainage of the reference there",
-    "over_5_m": "share of errors above this size (sizes are an option)",
+    "over_5_m": "share of errors above this size",
     "wrong_places": "errors above 50 m",
     "reference_sigma_p50_m": "median standard deviation of the reference",
     "along_sigma_p50_m": "median standard deviation that the run states",
@@ -67,8 +67,8 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "distance_max_m": "straight distance from the position on the map to the reference",
     "normalised_mean": "error / along_sigma",
     "normalised_rms": "error / along_sigma",
-    "normalised_p68": "size of error / along_sigma; 1.0 and 2.0 for normal errors and a correct sigma",
-    "normalised_p95": "size of error / along_sigma; 1.0 and 2.0 for normal errors and a correct sigma",
+    "normalised_p68": "size of error / along_sigma",
+    "normalised_p95": "size of error / along_sigma",
     "over_1_sigma": "share of errors above so many along_sigma",
     "over_2_sigma": "share of errors above so many along_sigma",
     "over_3_sigma": "share of errors above so many along_sigma",

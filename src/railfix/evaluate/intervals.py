@@ -15,7 +15,7 @@ from railfix.evaluate.scores import WRONG_PLACE_M
 INTERVAL_COLUMNS: Final[dict[str, str]] = {
     "position": "`constrained`, `constrained_ok` or `conventional`",
     "intervals": "pairs of consecutive positions between which the train moved",
-    "standing": "pairs between which it did not move; they count for the time gaps only",
+    "standing": "pairs between which it did not",
     "interval_mean_m": "distance travelled between consecutive positions",
     "interval_p50_m": "distance travelled between consecutive positions",
     "interval_p95_m": "distance travelled between consecutive positions",
@@ -98,17 +98,17 @@ LEAST_S: Final = 2.0
 
 #: Columns of the table of stretches without satellites beside its keys, with their unit and meaning.
 OUTAGE_COLUMNS: Final[dict[str, str]] = {
-    "begin_gpst": "first epoch at which the single-epoch solution used no satellite, GPS time",
+    "begin_gpst": "first epoch without a satellite used, GPS time",
     "duration_s": "from the last epoch with a satellite to the last without",
     "travelled_m": "distance travelled meanwhile, by the reference",
     "environment": "of the reference or of the sections, at its middle",
     "carried_by": "measurements that the filter used within it",
-    "epochs": "epochs without satellites, those missing in the log included",
+    "epochs": "epochs without satellites",
     "positions": "those with a position",
     "outage_p50_m": "size of error",
     "outage_p95_m": "size of error",
     "outage_max_m": "size of error",
-    "end_error_m": "error at the last position, + toward the end of the line",
+    "end_error_m": "error at the last position",
     "end_sigma_m": "stated standard deviation there",
     "largest_normalised": "largest size of error / along_sigma_m",
 }
@@ -167,9 +167,9 @@ BRANCH_COLUMNS: Final[dict[str, str]] = {
     "probability": "class of the stated probability of the place; `all` for every epoch",
     "judged": "positions of the class with an error",
     "probability_mean": "mean of the stated probabilities",
-    "right_share": "share of the places within 50 m of the reference, straight distance",
+    "right_share": "share of the places within 50 m of the reference",
     "wrong_places": "places further away",
-    "blocks": "blocks of time with such an epoch: about the number of independent ones",
+    "blocks": "blocks of time with such an epoch",
     "wrong_blocks": "blocks with a wrong place",
 }
 

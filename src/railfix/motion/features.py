@@ -35,7 +35,7 @@ class FeatureLimits(Settings):
     gradient_change, curvature_change_1pm : float
         Least change: 3 permille, and from straight to a radius of 1000 m.
     half_length_m : float
-        Length of line before and behind a feature that is compared.
+        Line before and behind a feature that is compared.
     likelihood_ratio : float
         Of the place found to any other place of the window.
     gap_sigmas : float

@@ -67,12 +67,12 @@ class SlipLimits(Settings):
     map_limit : float
         Sine of the pitch against the line's: 0.1 m/s2 of wheel against train.
     noise_sigmas, noise_s : float
-        The limit is at least so many standard deviations of that difference while the wheel rolls, over such a time: a
+        The limit is at least so many standard deviations while the wheel rolls, over such a time: a
         body that pitches shakes its accelerometer too, the more the higher it is mounted.
     confirm_s : float
         Time over the limit after which a slip is one.
     latch_mps, latch_share, latch_s : float
-        A slip ends when wheel and inertia agree within a speed or a share of it for so long.
+        A slip ends when wheel and inertia agree so well for so long.
     carry_drift_mps2 : float
         The two may differ by so much more a second of the carry: 1e-3 of gravity, the offset of the accelerometer and
         the error of the pitch together.
@@ -83,16 +83,16 @@ class SlipLimits(Settings):
     smoothing_s : float
         Time constant of the mean of the pitch: of the body's pitching at about 1 Hz and of vibration.
     offset_s : float
-        Time constant with which the accelerometer's offset is learnt while the wheel rolls.
+        Time constant of the accelerometer's offset.
     standing_s : float
         Time without a pulse after which a vehicle at rest stands.
     pitch_s, bias_s : float
-        Time constants with which the gyro's pitch follows the line's, and its bias is learnt. Without a line the pitch
+        Time constants of the gyro's pitch and bias. Without a line the pitch
         by wheel and accelerometer takes its place.
     settling_s : float
-        After a stop the body comes to rest on its suspension for so long; its pitch then is the one of the standstill.
+        Time for which the body swings after a stop; its pitch then is the one of the standstill.
     rolling_limit, rolling_s, rolling_mps : float
-        Change of the apparent pitch at standstill, duration, and carried speed that mean rolling away.
+        Change of the pitch at standstill, duration and speed that mean rolling away.
     """
 
     rule: Literal["map", "p2"] = "map"

@@ -25,11 +25,11 @@ class BaliseLimits(Settings):
     Attributes
     ----------
     ahead_m : float
-        Place of the reader ahead of the vehicle's middle (without a vehicle file: of the antenna).
+        Place of the reader ahead of the vehicle's middle, without a vehicle file of the antenna.
     sigma_m : float
         Least standard deviation of a reading along the line: SUBSET-036 has 1 m for the vital use of a balise's place.
     contradiction_sigmas : float
-        A balise further than this from the place of the filter has a wrong identity or place in the list.
+        A balise further than this from the filter is wrong.
     """
 
     ahead_m: float = 0.0

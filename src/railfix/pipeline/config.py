@@ -112,11 +112,11 @@ class Config(ScreenSettings):
         Constellations used. GLONASS is left out by default: its channels have code biases of
         metres between them.
     exclude : tuple of str
-        Satellites ("G07") and constellations ("C") that are left out altogether.
+        Satellites ("G07") and constellations ("C") left out.
     signals : mapping of str to tuple of str
         Signals of each constellation in order of preference; the first one observed is used.
     frequencies : {"one", "two"}
-        Whether a second code of each satellite is combined with the first (not with SBAS).
+        Codes of a satellite combined (not with SBAS).
     two_frequencies : TwoFrequencyLimits
         Limits of that.
     screens : tuple of str
@@ -138,17 +138,17 @@ class Config(ScreenSettings):
     off_map_risk : float
         Probability that noise alone puts a position off the map; the noise is judged by the residuals of the 3-D fit.
     off_map_s : float [s]
-        Time off the map after which the filter gives up its place, and on it after which it begins anew. On the
+        Time off the map after which the filter gives up its place, or on it begins anew. On the
         recordings, with a right map, no two positions in a row are off it.
     track_risk : float
-        Probability of another track above which no position on a network is `ok` or `tracking` or has a level. `railfix
+        Probability of another track above which no position on a network is `ok`, `tracking` or has a level. `railfix
         which-track` allows the same.
     ionosphere : {"klobuchar", "off"}
         Model of the delay.
     troposphere : {"saastamoinen", "off"}
         Model of the delay.
     max_ephemeris_age_s : float or None
-        Tighter limit on the age of a record than its own validity.
+        Limit on the age of a record, tighter than its validity.
     map_plan_sigma_m, map_height_sigma_m : float or None
         In place of the track's own map error (P1: 0.30 m, 0.60 m).
     noise_scale : NoiseScaleLimits
@@ -162,7 +162,7 @@ class Config(ScreenSettings):
     interference : InterferenceLimits
         Signs of jamming and spoofing.
     sbas : tuple of path, or "stream"
-        Logs of SBAS messages, or "stream" for those that the receivers pass on: their corrections take the place of
+        Logs of SBAS messages, or "stream" for those of the receivers: their corrections take the place of
         the models, and satellites without a valid one are rejected. Empty: no SBAS.
     sbas_prn : int or "best"
         GEO whose messages are used; "best" is the one with the most usable fast corrections.
@@ -175,7 +175,7 @@ class Config(ScreenSettings):
     nominal : NominalErrors
         Satellite and atmospheric errors, added to a model of local errors where SBAS does not give them.
     protection : {"on", "off"}
-        Whether positions get a protection level along the line with its parts (`railfix.integrity.protection`).
+        Protection level along the line with its parts.
     risk : RiskBudget
         Integrity risk per hour, its shares, and the fault probabilities that the level assumes.
     integrity_support : path or None
@@ -186,7 +186,7 @@ class Config(ScreenSettings):
     alarm_limit_m : float
         Largest protection level of an available position. P4 takes a car length, 20 m.
     no_level_m : tuple of (float, float) [m]
-        Stretches of the line, chainages from and to, where local faults cannot be bounded: no level there
+        Chainages from and to where local faults cannot be bounded: no level there
         (``railfix error-model`` prints those of its runs).
     raim_protection : {"on", "off"}
         Whether positions also get P4's level: the largest slope times the largest undetected bias.
@@ -202,10 +202,10 @@ class Config(ScreenSettings):
     phase_sigma_m : float
         Standard deviation of a phase at the zenith, multipath included.
     filter : {"track", "off"}
-        Whether there is also a table of the filter along the track: codes, Dopplers, changes of the carrier phase and
+        Filter along the track: codes, Dopplers, changes of the carrier phase and
         sensors, from this and earlier epochs. `railfix run` and `railfix demo` ask for it.
     filter_sources : tuple of str
-        Measurements that the filter uses, where they are there: `code`, `phase` and `doppler` of the satellites, and
+        Measurements that the filter uses: `code`, `phase` and `doppler` of the satellites, and
         `wheel`, `radar`, `force`, `feature` (of the line, by inertial unit and wheel), `balise`, `range` of the sensors
         on board.
     tracking : TrackingLimits

@@ -68,7 +68,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column("kilometrage_m", "the line's own marking, where the track has one", lambda r: r.kilometrage_m),
         Column(
             "along_sigma_m",
-            "standard deviation along the line; with the other place of an ambiguous epoch by its probability",
+            "standard deviation along the line, other places of an ambiguous epoch included",
             lambda r: r.along_sigma_m,
         ),
         Column(
@@ -106,7 +106,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column(
             "raim_level_m",
             "P4's level: error by a fault that RAIM misses, and noise; infinite with a satellite unchecked, "
-            "empty with a fault left or `raim_protection` off",
+            "empty with a fault left",
             lambda r: r.raim.protection_level_m,
         ),
         Column(
@@ -117,18 +117,18 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "integer_risk_ppm",
-            "probability that one of them is wrong, or of the best candidates where none is fixed [1e-6]",
+            "probability that one of them, or of the best candidates, is wrong [1e-6]",
             lambda r: None if r.phase is None else 1e6 * r.phase.integer_risk,
         ),
         Column(
             "protection_level_m",
-            "along the line: the error exceeds it with the stated risk, all hypotheses together; "
-            "infinite where `protection_cause` says why, empty where a fault is left",
+            "along the line: the error exceeds it with the stated risk; infinite where `protection_cause` says "
+            "why, empty where a fault is left",
             lambda r: None if r.protection is None else r.protection.level.level_m,
         ),
         Column(
             "protection_fault_free_m",
-            "level for noise without a fault alone, with its share of the risk; may exceed `protection_level_m`",
+            "level for noise alone, with its share of the risk; may exceed `protection_level_m`",
             lambda r: None if r.protection is None else r.protection.level.fault_free_m,
         ),
         Column(
@@ -143,34 +143,33 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_k_fault_free",
-            "K of each part, of the second and third beside its threshold",
+            "K of each part",
             lambda r: None if r.protection is None else r.protection.level.k_fault_free,
         ),
         Column(
             "protection_k_one_fault",
-            "K of each part, of the second and third beside its threshold",
+            "K of each part",
             lambda r: None if r.protection is None else r.protection.level.k_one_fault,
         ),
         Column(
             "protection_k_two_faults",
-            "K of each part, of the second and third beside its threshold",
+            "K of each part",
             lambda r: None if r.protection is None else r.protection.level.k_two_faults,
         ),
         Column(
             "protection_separation",
-            "largest distance of the position without the satellites of a hypothesis, over its threshold",
+            "largest distance of the position of a hypothesis, over its threshold",
             lambda r: None if r.protection is None else r.protection.level.separation,
         ),
         Column(
             "protection_kind",
-            "basis: `sbas`, its integrity and hypotheses of local faults; or `separation`, "
-            "hypotheses of satellites' own faults as well",
+            "basis: `sbas` with local faults, or `separation`, with satellites' own faults as well",
             lambda r: None if r.protection is None else r.protection.kind,
             words=KINDS,
         ),
         Column(
             "protection_basis",
-            "priors of faults are `measured` on the line, or `indicative`: assumed, the level carries no risk an hour",
+            "priors of faults: `measured` on the line, or `indicative`: assumed, the level carries no risk an hour",
             lambda r: None if r.protection is None else r.protection.basis,
             words=BASES,
         ),
@@ -178,15 +177,15 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "protection_cause",
             "what sets the level: `fault_free`, `one_fault`, `two_faults`, `three_faults` or more; or why "
             "there is none: `unchecked`, `unchecked_constellation`, `unchecked_side`, `unchecked_map`, "
-            "`unchecked_together` (faults that nothing checks, by what they share), `budget`, `unbounded`, "
+            "`unchecked_together` (faults that nothing checks), `budget`, `unbounded`, "
             "`no_position`",
             lambda r: None if r.protection is None else r.protection.level.cause,
             words=tuple(c.name.lower() for c in Cause),
         ),
         Column(
             "protection_status",
-            "`available` within the alarm limit; `unavailable`, also where the status has a doubt about "
-            "the place; `alarm`: the ranges contradict the level, or a check has failed",
+            "`available` within the alarm limit; `unavailable`, also in doubt about the place; `alarm`: the "
+            "ranges contradict the level, or a check has failed",
             lambda r: None if r.protection is None else r.protection.status,
             words=tuple(s.name.lower() for s in LevelStatus),
         ),
@@ -225,8 +224,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "map_offset_across_m",
-            "mean of the 3-D positions of the last minutes, right of the line with rising chainage; empty "
-            "for the first minute",
+            "mean of the 3-D positions of the last minutes, right of the line with rising chainage",
             lambda r: r.map_offset.across_m,
         ),
         Column("map_offset_up_m", "the same, above the line", lambda r: r.map_offset.up_m),
@@ -247,7 +245,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "interference",
-            "`none`, `jamming_suspected` or `spoofing_suspected`, also where the status has something else to report",
+            "`none`, `jamming_suspected` or `spoofing_suspected`, also where the status has another",
             lambda r: None if r.interference is None else r.interference.suspicion,
             words=tuple(s.name.lower() for s in Suspicion),
         ),
@@ -298,13 +296,13 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         *(_observation_column(c) for screen in SCREENS for c in screen.columns if c.table == "observations"),
         Column(
             "second_share",
-            "two frequencies: weight of the second code, that of the first is 1 less it; negative: toward "
-            "the ionosphere-free combination; empty: the first code alone",
+            "two frequencies: weight of the second code; negative: toward the ionosphere-free combination; "
+            "empty: the first code alone",
             lambda o: _second(o, lambda r, _: r.share),
         ),
         Column(
             "ionosphere_measured_m",
-            "two frequencies: delay on the first signal beyond that of the model, by the epochs before",
+            "two frequencies: delay on the first signal beyond the model",
             lambda o: _second(o, lambda r, _: r.ionosphere_m),
         ),
         Column(

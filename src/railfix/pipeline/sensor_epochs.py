@@ -85,8 +85,7 @@ class SensorLimits(Settings):
         to the right of the antenna's path and above the antenna.
     balise : BaliseLimits
     return_sigmas, return_s : float
-        After an outage codes count again when three positions in a row are within so many sigmas of the carried place,
-        or so late.
+        After an outage codes count again when three positions in a row are within so many sigmas, or so late.
     wheel_sigma_m : float
         Of a way between two epochs beside the pulse: creep of a braked or driven wheel.
     radar_sigma_mps, radar_step_s : float

@@ -46,8 +46,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("antenna", "`front` or `rear`", lambda _: None, dtype=pl.String()),
         Column(
             "status",
-            "see `railfix.tracking.TrackStatus`; with levels, `tracking` and `coasting` have a finite one along the "
-            "line, no other status has",
+            "see `railfix.tracking.TrackStatus`; `tracking` and `coasting` alone have a finite level along the line",
             lambda r: r.tracked.status,
             words=tuple(s.text for s in TrackStatus),
         ),
@@ -76,15 +75,13 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("hypotheses", "places that are possible", lambda r: r.tracked.hypotheses, dtype=pl.Int16()),
         Column(
             "protection_level_m",
-            "exceeded by the error along the line with the stated risk, other branches included; infinite "
-            "where another place is likelier or measurements contradict the place; empty with "
-            "`tracking.level` off",
+            "exceeded by the error along the line with the stated risk; infinite where another place is likelier "
+            "or measurements contradict the place",
             lambda r: r.tracked.level_m,
         ),
         Column(
             "protection_level_ground_m",
-            "the same of the straight distance on the ground: on another lap of the same street the place "
-            "is right within it though the chainage is not",
+            "the same of the straight distance on the ground, also on another lap",
             lambda r: r.tracked.ground_level_m,
         ),
         Column("protection_noise_m", "its part by noise without a fault", lambda r: r.tracked.level_noise_m),
@@ -95,13 +92,13 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "over_reading_m",
-            "how far the train may be behind: the level, at least 2 % of the way since codes were used; "
-            "`L_DOUBTOVER` is it and the reference's `Q_LOCACC`",
+            "how far the train may be behind: the level, at least 2 % of the way since codes were used "
+            "(`L_DOUBTOVER` less `Q_LOCACC`)",
             lambda r: r.tracked.amount_m,
         ),
         Column(
             "under_reading_m",
-            "how far the train may be ahead, for `L_DOUBTUNDER`; counted as the other one",
+            "how far the train may be ahead, in the same way (`L_DOUBTUNDER`)",
             lambda r: r.tracked.amount_m,
         ),
         Column(
@@ -140,14 +137,13 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "measured_chainage_m",
-            "chainage of the vehicle's middle, or the antenna, to which the next three belong: means since "
-            "the epoch before",
+            "chainage of the vehicle's middle, or the antenna, for the next three: means since the epoch before",
             lambda r: r.sensed.under_m,
         ),
         Column(
             "measured_gradient_permille",
-            "gradient by tachometer and accelerometer, + where the line rises with chainage; empty where "
-            "the wheel slips or is slower than 1 m/s",
+            "gradient by tachometer and accelerometer, + where the line rises with chainage; empty in slips and "
+            "below 1 m/s",
             lambda r: 1e3 * r.sensed.gradient,
         ),
         Column(
@@ -157,8 +153,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "measured_cant_mm",
-            "cant there by the lean of the body, + with the left rail higher (it leans to the right); "
-            "needs a vehicle file",
+            "cant there by the lean of the body, + with the left rail higher; needs a vehicle file",
             lambda r: 1e3 * r.sensed.cant_m,
         ),
         Column(
@@ -168,8 +163,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "wheel_difference_m",
-            "distance by satellites over the last two minutes less that of the wheel with its circumference; empty for "
-            "the first minute",
+            "distance by satellites over the last two minutes less that of the wheel",
             lambda r: None if r.wheel is None else r.wheel.difference_m,
         ),
         Column(

@@ -30,7 +30,7 @@ class ClockOffsetLimits(Settings):
     Attributes
     ----------
     stability_m : float
-        Standard deviation of an offset about its mean at any epoch; infinite leaves every
+        Standard deviation of an offset about its mean; infinite leaves every
         constellation its own clock. On an urban recording the spread was 1.0 m (Galileo, BeiDou).
     correlation_s : float
         Epochs nearer to each other than this are not independent: errors of a standing

@@ -46,7 +46,7 @@ class MapOffsetLimits(Settings):
         The nominal sigmas are assumptions; on the recordings, with a right map and all screens, the statistic
         stays below the threshold of the status, 13.8 (``tests/studies/integrity_tables.py``).
     missed : float
-        Probability that the status misses an offset of the smallest detectable size.
+        Probability of missing an offset of the smallest detectable size.
     """
 
     window_s: float = Field(default=120.0, gt=0)

@@ -41,9 +41,9 @@ class RobustFitLimits(Settings):
     Attributes
     ----------
     keep : float
-        Residuals up to this many scales keep their weight (IGG-III: 1.5 to 2).
+        Residuals up to so many scales keep their weight.
     reject : float
-        Residuals from this many scales on have no weight (IGG-III: 3 to 8.5).
+        Residuals from so many scales on have no weight.
     iterations : int
         Reweightings. On the demonstration with 20 m on one satellite the fifth one changes no verdict.
     """
@@ -140,10 +140,10 @@ class NoiseScaleLimits(Settings):
         recordings): five such times are independent enough for a mean, and short enough that a street
         or a station left behind is forgotten before the next one.
     prior : float
-        Redundant ranges that a scale of 1 counts for, never forgotten: two or three epochs. Infinite holds the
+        Redundant ranges that a scale of 1 counts for: two or three epochs. Infinite holds the
         scale at 1.
     least_epochs : float
-        Epochs that the window spans at least, however slow the log, and gaps left out.
+        Epochs that the window spans at least, gaps left out.
     spread : float
         Degrees of freedom of the scale from epoch to epoch: the noise of single epochs varies more than chi-square
         says, so the variance stated for an epoch is that of its window counted this many times, and that of its own

@@ -42,7 +42,7 @@ class SectionLimits(Settings):
     Attributes
     ----------
     ambiguity_risk : float
-        Probability that noise makes the true place fit this much worse than the best one. Chi-square, one degree of
+        Probability that noise makes the true place fit so much worse than the best one. Chi-square, one degree of
         freedom. P1 3.2: wrong sections on sharp curves.
     reach_risk : float
         Other places are sought as far as noise has this probability: further than they are ambiguous, for a fault of
@@ -50,7 +50,7 @@ class SectionLimits(Settings):
     separation_m : float
         Least distance along the line between two distinct places.
     redundancy : int
-        Ranges beyond the unknowns (clocks and distance) below which a section is doubtful: on real
+        Ranges beyond the unknowns below which a section is doubtful: on real
         recordings of two constellations a quarter of the sections were wrong with one redundant
         range, 3 to 4 % with two.
     """

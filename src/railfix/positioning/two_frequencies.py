@@ -50,7 +50,7 @@ class TwoFrequencyLimits(Settings):
     delay_sigma_m : float
         Standard deviation of a broadcast group delay, difference of two signals.
     suspicion : float
-        Sigmas beyond which a difference of the two codes has the range weighted down by it.
+        Sigmas beyond which a difference of the two codes weighs the range down.
     least_suspicion_m : float [m]
         Smallest such difference.
     """

@@ -24,14 +24,14 @@ class BaseLimits(Settings):
     Attributes
     ----------
     longest_age_s, phase_age_s : float [s]
-        Age up to which the newest code errors, and phases, of the station are used. Without selective availability
+        Age up to which codes, and phases, of the station are used. Without selective availability
         errors of codes change by centimetres in 30 s, phases by millimetres in a second.
     sigma_m : float [m]
-        Standard deviation that a difference keeps beside the train's own noise: the station's smoothed multipath.
+        Standard deviation of a difference beside the train's noise: the station's smoothed multipath.
     per_km_m : float [m]
         Added for each kilometre between the two: ionosphere, troposphere and orbits seen from elsewhere.
     longest_km : float [km]
-        Distance from which on the station is not used.
+        Distance up to which the station is used.
     drift_m : float [m/sqrt(s)]
         Random walk of the differences of phases, in place of `PhaseLimits.drift_m`.
     """

@@ -98,7 +98,7 @@ class NominalErrors(Settings):
     typical_ionosphere_sigma_m : float
         Added to it, and to the ranges, with typical coefficients: what the two models differ by.
     troposphere_sigma_m : float
-        Vertical delay that the standard atmosphere leaves (DO-229D A.4.2.4: 0.12 m).
+        Vertical delay that the standard atmosphere leaves (DO-229D A.4.2.4).
     """
 
     satellite_sigma_m: float = Field(default=0.8, ge=0)

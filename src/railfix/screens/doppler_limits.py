@@ -53,7 +53,7 @@ class DopplerLimits(Settings):
     Attributes
     ----------
     mode : {"fixed", "receiver", "sigma"}
-        Limit as P1 has it, scaled by the receiver's own noise, or by the stated sigmas; see the module.
+        Limit scaled by the receiver's noise, P1's, or by the stated sigmas; see the module.
     step_m : float [m]
         Largest change against the Doppler up to `short_interval_s`; P1 table 6: 1.5.
     short_interval_s : float [s]
@@ -61,7 +61,7 @@ class DopplerLimits(Settings):
     correlation_s : float [s]
         Time over which the receiver smooths its codes. 1 s gives 2.9 m at 1 s.
     jerk_mps3 : float [m/s^3]
-        Largest jerk of the vehicle that must not cause a rejection; trains stay below 1.
+        Largest jerk of the vehicle; trains stay below 1.
     factor : float
         Modes "receiver" and "sigma": standard deviations.
     doppler_sigma_mps : float [m/s]

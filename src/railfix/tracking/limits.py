@@ -61,7 +61,7 @@ class TrackingLimits(Settings):
         Standard deviation and correlation time of the acceleration along the track (R. A. Singer, 1970). Trains
         brake and accelerate with up to 1.3 m/s2 and hold it for some seconds; cars with more, for shorter.
     service_acceleration_mps2, trusted_satellites : float, int
-        Without a sensor the speed by fewer satellites is not believed beyond this acceleration: one wall, or a station
+        Without a sensor the speed by fewer satellites is not used beyond this acceleration: one wall, or a station
         roof, can leave reflections alone, and they then agree with each other (`possible_speed`).
     degrees_of_freedom : float
         Of Student's t that measurement errors follow: 4 is the least integer with a finite kurtosis bound of the
@@ -78,7 +78,7 @@ class TrackingLimits(Settings):
     code_white_share : float
         White part of a code's error, over its standard deviation; per second, not per epoch.
     code_period_s : float
-        Codes count once in this time where phases or Dopplers carry the place on: their errors last for a minute, so
+        Codes count once in this time where phases or Dopplers carry on: their errors last for a minute, so
         the epochs between tell nothing new. 0 takes those of every epoch.
     slow_code_m, slow_code_s : float
         Displacement by orbits and ionosphere, and how long it lasts: about 1 m a satellite with a dilution of one;
@@ -99,14 +99,14 @@ class TrackingLimits(Settings):
     offset_walk_m : float
         Change of the offset between two constellations in the square root of a second.
     offset_prior_m : float
-        Standard deviation of such an offset before anything is known beside the first epoch's median.
+        Standard deviation of such an offset at first.
     map_roughness_m, map_correlation_m : float
         Least local error of the map across and up, and the length over which it changes. The map's stated accuracy
         counts where it is more, of heights the half.
     map_scale_m : float
-        Error of a length along the map [m per square root of m]; a larger one is learnt where the codes show it.
+        Error of a length along the map [m per square root of m].
     map_misfit_sigmas, map_misfit_s, map_misfit_kept_s : float
-        It is shown by a mean innovation over `map_misfit_s` of so many of its sigmas; what was learnt is forgotten
+        A larger one is shown by a mean innovation over `map_misfit_s` of so many sigmas; what was learnt is forgotten
         within `map_misfit_kept_s`.
     map_absolute_m : float
         Length over which the absolute error of the map changes (sigmas are those of the trajectory).
@@ -124,18 +124,18 @@ class TrackingLimits(Settings):
     least_probability : float
         Hypotheses below it are dropped: a hundredth of the risk of an independent error.
     most_hypotheses : int
-        Of more places at a start the most probable ones are taken.
+        Places at most, the most probable ones.
     start_sigma_m : float
-        Standard deviation of a hypothesis about its place when it begins.
+        Standard deviation of a hypothesis when it begins.
     start_separation_m : float
         Two places of the first epoch this close are one.
     gap_s : float
-        Time without measurements after which places are sought again beside the predicted one.
+        Time without measurements after which places are sought again.
     lost_motion_weight, lost_motion_s, lost_code_weight, lost_code_s : float
         The track is lost when the mean weight of motion, or of codes, was below these for so long; 1 is the weight of
         an error of one standard deviation. Epochs above them count down.
     bend_m : float
-        Where motion contradicts the track, places so far (and twice as far) before and behind are tried.
+        Where motion contradicts the track, places so far (and twice) before and behind are tried.
     level : {"on", "off"}
         Whether a bank of sub-filters gives a protection level; it costs as many filters as there are satellites.
     level_period_s : float
@@ -154,26 +154,26 @@ class TrackingLimits(Settings):
     level_sensor_prior : float
         Probability that a sensor on board is faulty at such a sample. An assumption.
     level_balise_prior : float
-        Probability that a balise read is not where the list has it (a wrong identity, list or reading). An assumption;
+        Probability that a balise is not where the list has it. An assumption;
         two wrong ones together are not bounded, so that it must be small.
     level_motion_prior : float
-        Probability that all Dopplers, or all phases, are wrong together at such a sample. An assumption.
+        Probability that all Dopplers, or all phases, are wrong together. An assumption.
     level_map_prior, level_map_m : float, float
         Probability that the map is wrong by more than its sigma, and by how much. An assumption.
     level_passes : int
         Rounds of reweighting of the sub-filters.
     level_doubt_s, level_doubt_code_s : float
-        A filter that its own motion, or codes, contradict for longer bounds nothing; mean weights are those of a lost
+        A filter contradicted by its motion, or codes, for longer bounds nothing; mean weights are those of a lost
         track. A contradiction of single epochs is noise, which is in the standard deviation.
     level_start_s : float
-        After a start no level before one place has a probability of 0.99, at most so long; none for so long after the
+        After a start no level before a place has a probability of 0.99, at most so long; none for so long after the
         track was lost.
     level_hold_s : float
-        A level that is withheld comes back so long after the last contradiction.
+        A level comes back so long after the last contradiction.
     end_doubt_s : float
-        At an open end, pushed beyond it with motion in doubt for so long, the track is lost.
+        Pushed beyond an open end with motion in doubt for so long, the track is lost.
     expired_sigma_m : float
-        Standard deviation from which on a predicted place is no position.
+        Largest standard deviation of a predicted position.
     """
 
     acceleration_mps2: float = Field(default=1.0, gt=0)

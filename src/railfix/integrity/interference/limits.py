@@ -75,7 +75,7 @@ class InterferenceLimits(Settings):
     gain_fall : float
         Fall of the front end's gain as a share of its recent peak; 14 % within a start without interference.
     equal_db : float [dB]
-        Standard deviation of C/N0 over the satellites below which they are equal; in open sky 1.2 dB and more.
+        Largest standard deviation of equal C/N0; in open sky 1.2 dB and more.
     clock_jump_m : float [m]
         Step of the codes against the Dopplers, whole milliseconds left out. Clocks of phones step by 30 m.
     drift_jump_mps, speed_jump_mps, position_jump_m, off_map_m : float
@@ -87,11 +87,11 @@ class InterferenceLimits(Settings):
     longest_gap_s : float [s]
         Epochs farther apart are not compared.
     largest_speed_sigma_mps, largest_sigma_m : float
-        Velocities and positions with larger standard deviations are not compared.
+        Less sure velocities and positions are not compared.
     hold_s, part_hold_s : float [s]
-        How long a fall, equal C/N0 and distance from the map last before they count; and parted constellations.
+        How long a fall, equal C/N0 or distance from the map lasts before it counts; and parted constellations.
     wheel_window_s, wheel_least_s : float [s]
-        Time over which distances by satellites and wheel are compared, and the shortest one.
+        Time over which satellites and wheel are compared, and the shortest one.
     wheel_m, wheel_sigmas : float [m]
         Least difference, and the same in standard deviations.
     wheel_level : {"on", "off"}

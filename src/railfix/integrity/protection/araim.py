@@ -49,7 +49,7 @@ class AraimBudget(Settings):
     unmonitored : float
         Probability up to which fault modes may be left out; more satellites at a time become modes until it is kept.
     most_faults : int
-        Satellites, constellations and the map that are faulty at a time, at most, in a mode.
+        Faulty at a time, at most, in a mode.
     map_prior : float
         Probability that the map is wrong; 0: no such mode.
     """

@@ -84,14 +84,14 @@ class RiskBudget(Settings):
         level is lowered until all tails together use their sum; a share twice as large lowers a K of 6 by 0.1, one
         of 3 by 0.2: thirds.
     unchecked_share : float
-        Of the risk, that faults which are not hypotheses may have together: where they are likelier, further ones
+        Of the risk, for faults that are not hypotheses: where they are likelier, further ones
         become hypotheses, up to four satellites at a time and three shared faults (constellation, side, map).
     exclusion_share : float
         Of the risk, for epochs with one, and as much again with two satellites excluded.
     false_alarm : float
         Probability in an epoch that noise alone makes the separations inconsistent; P4: 1e-3.
     satellite_prior : mapping of str to float
-        Probability that a satellite of a constellation (its letter) is faulty at a time: its own signal.
+        Probability that a satellite is faulty, by constellation: its own signal.
     local_prior : float
         The same of a fault by local causes, on top of that: multipath, interference. An assumption until measured on
         the line (P1 7).
@@ -99,7 +99,7 @@ class RiskBudget(Settings):
         Probability that the map is wrong by more than its stated error: the next track, heights without the geoid,
         another reference frame. An assumption; 0: no such hypothesis.
     side_prior : float
-        Probability that the low satellites of one side of the track are faulty together: `SUPPORTED_SIDE_PRIOR`. No
+        Probability that low satellites of one side of the track are faulty together: `SUPPORTED_SIDE_PRIOR`. No
         data supports a smaller one, and every output of the levels then says so; 0: no such hypothesis.
     side_elevation_deg : float
         Elevation up to which satellites count as low: of a wall as high as it is away.

@@ -34,20 +34,20 @@ class RaimLimits(Settings):
         Probability that noise alone is called a fault; P4: 0.001. An excluded satellite's own
         error must be over what noise reaches with this probability (chi-square mode).
     missed_detection : float
-        Probability that a fault of the minimal detectable size stays undetected. P4 gives no value.
+        Probability of missing a fault of the minimal detectable size. P4 gives no value.
     fixed_limit_m2 : float
-        Mode "fixed": limit on the sum of squared residuals and on the square of an excluded satellite's own error; P1
+        Mode "fixed": limit on the sum of squared residuals, and on the square of an excluded satellite's error; P1
         table 6 ("FDE 2 SAT, 100 m2").
     max_excluded : int
         Satellites excluded at an epoch at most: 0, 1 or 2 (P1 2.3(4): 2).
     min_redundancy : int
-        Degrees of freedom that must be left after an exclusion.
+        Degrees of freedom left after an exclusion.
     separation_risk : float
         Probability that noise makes the true exclusion fit this much worse than another one.
         Chi-square, one degree of freedom. Another exclusion of as many satellites that passes
         and fits nearly as well makes the epoch inseparable.
     same_position_m : float
-        Exclusions whose positions differ by less than this do not compete: either
+        Exclusions with positions nearer than this do not compete: either
         way the position is the same (the two satellites of a clock of their own). 0: they always do.
     noise_risk : float
         Two-sided probability that K sigma leaves to noise in the protection level; 1 gives K = 0,

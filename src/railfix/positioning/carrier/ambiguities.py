@@ -38,14 +38,14 @@ class PhaseLimits(Settings):
     Attributes
     ----------
     clocks : {"own", "shared"}
-        Whether the phases have a clock of their own or, as P4 writes, that of the codes.
+        Clock of the phases: their own, or that of the codes (P4).
     drift_m : float
         [m/sqrt(s)] Random walk of an ambiguity: what ionosphere, satellite orbit and
         clock, and multipath move a phase against the others. Without it, phases that drift by
         centimetres while satellites move by hundredths of a radian bias the position by metres.
         With codes of 1 m at 1 Hz, 0.01 averages over about 100 s. 0 holds ambiguities constant.
     hop_s : float
-        The walk is taken in steps at multiples of this time since the GPS epoch.
+        Steps of the walk.
     correlation_s : float
         Correlation time of code errors: epochs nearer
         to each other than this give the ambiguities no new information. The variance of the
@@ -54,13 +54,13 @@ class PhaseLimits(Settings):
     passes : int
         Linearisations of `phase_positions`; each has its own state, so that results do not depend on chunks.
     forget_s : float
-        An arc that `phase_positions` has not observed for this long starts again.
+        An arc not observed for this long starts again.
     integer_risk : float
         Beside a base station: largest probability of a wrong integer with which ambiguities are fixed.
     no_integer_prior : float
-        Probability that phases are no whole cycles (multipath, half a cycle), before they are compared with any.
+        Probability that phases are no whole cycles (multipath, half a cycle).
     largest_sigma_m : float
-        Epochs whose noise along the line is larger have no position.
+        Epochs with more noise along the line have no position.
     """
 
     clocks: PhaseClocks = "own"

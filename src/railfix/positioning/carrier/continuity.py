@@ -31,12 +31,12 @@ class ContinuityLimits(Settings):
         Standard deviation of a change of phase: at once, and for each second between the epochs
         (satellite clocks, delays).
     aside_m : float
-        Standard deviation across and up of a change of place at once (map points).
+        Standard deviation across and up of a sudden change of place (map points).
     across_share, up_share : float
         The same as shares of the distance moved: a position error of 5 m turns the line by 0.017 on a
         curve of 300 m radius, and by 0.0025 on a vertical curve of 2000 m.
     sigmas : float
-        Threshold of rejection, in standard deviations of the channel's own residual.
+        Standard deviations of the channel's residual that reject it.
     max_rejected : int
         Largest number of channels rejected; where more would be, no channel continues.
     max_gap_s : float

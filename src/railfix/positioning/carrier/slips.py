@@ -76,7 +76,7 @@ class CycleSlipLimits(Settings):
     jerk_mps3 : float
         Of the antenna; passenger trains stay below 0.5.
     code_m : float
-        Limit of code less phase where Dopplers are absent, or their own limit is wider than this.
+        Limit of code less phase where Dopplers are absent or less sharp.
     """
 
     max_gap_s: float = Field(default=31.0, gt=0)

@@ -30,10 +30,9 @@ class SmoothingLimits(Settings):
         Time constant: each code of an arc counts the same until the arc is this old, from then
         on older ones fade (DO-229D 2.1.4.1.5 takes 100 s, for the ionosphere's drift).
     clocks : {"own", "shared"}
-        "own": the mean change of all codes of an epoch against their phases is a clock, not
-        noise: subtracted before and added after averaging. For telephones, whose codes jump
-        together by tens of metres (urban 95 % of the error along the line 10.8 to 7.0 m, against 50 m
-        with "shared"); other receivers did not lose by it.
+        "own": the codes' mean change against their phases is a clock: subtracted before and added after averaging. For
+        telephones, whose codes jump together by tens of metres (urban 95 % of the error along the line 10.8 to 7.0 m,
+        against 50 m with "shared"); other receivers did not lose by it.
     """
 
     window_s: float = Field(default=100.0, gt=0)

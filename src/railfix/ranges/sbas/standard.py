@@ -154,16 +154,15 @@ class SbasLimits(Settings):
         Time-outs: those of precision approach (shorter, the default), or of en route to non-precision
         approach.
     type0 : {"stop", "as_type2"}
-        Type 0 stops its sender for 60 s, or holds fast corrections unless empty.
+        Type 0 stops its sender for 60 s, or has fast corrections.
     range_rate : {"mops", "off"}
-        Fast corrections change with their rate (DO-229D, A.4.4.3), or stay as sent.
+        Fast corrections change with their rate (DO-229D, A.4.4.3).
     incomplete : {"reject", "inflate"}
-        Without degradation data a satellite is rejected, or has sigma UDRE plus 8 m (DO-229D, J.2.2) and the shortest
-        time-out.
+        Without degradation data a satellite is rejected, or has 8 m more (DO-229D, J.2.2) and the shortest time-out.
     max_udrei : int or None
         Largest UDREI used; None is 11 for precision approach and 13 en route.
     message_s : float
-        [s] From the first bit of a message, to which its corrections refer, to its reception.
+        [s] From the first bit of a message to its reception.
     """
 
     mode: Literal["precision", "en_route"] = "precision"
