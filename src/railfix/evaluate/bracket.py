@@ -15,22 +15,13 @@ LARGEST_GAP_S = 2.5
 
 @dataclass(frozen=True, kw_only=True)
 class Bracket:
-    """Neighbouring instants of the reference for each of T times.
+    """Neighbouring instants of the reference for each of T times."""
 
-    Attributes
-    ----------
-    left, right : ndarray of int, shape (T,)
-        The same where a time is one of the reference.
-    share : ndarray, shape (T,)
-        0 at left, 1 at right.
-    inside : ndarray of bool, shape (T,)
-        False before the first, after the last, and in gaps of the reference.
-    """
-
+    #: The same where a time is one of the reference, shape (T,).
     left: Indices
     right: Indices
-    share: Floats
-    inside: Masks
+    share: Floats  #: 0 at left, 1 at right; shape (T,).
+    inside: Masks  #: False before the first, after the last, and in gaps of the reference; shape (T,).
 
     def of(self, values: Floats) -> Floats:
         """Values of the reference, shape (R,) or (R, n), interpolated linearly; NaN where not inside."""

@@ -63,26 +63,16 @@ OF_FILTER: Final = pl.col("branch_probability").is_not_null().any().over("run")
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaEpochs:
-    """Epochs of one antenna, with facts on their evaluation.
+    """Epochs of one antenna, with facts on their evaluation."""
 
-    Attributes
-    ----------
-    table : polars.DataFrame
-        `EPOCH_COLUMNS` without run, configuration and line; the run's protection levels with their parts.
-    errors : PlaceErrors
-    speed_from : {"reference", "places"}
-    outside, from_sections : int
-        Epochs of the log outside the reference; epochs with a reference whose environment is that of the sections.
-    step_s : float [s]
-        Step of the log.
-    """
-
+    #: `EPOCH_COLUMNS` without run, configuration and line; the run's protection levels with their parts.
     table: pl.DataFrame
+
     errors: PlaceErrors
     speed_from: str
-    outside: int
-    step_s: float
-    from_sections: int
+    outside: int  #: Epochs of the log outside the reference.
+    step_s: float  #: Step of the log.
+    from_sections: int  #: Epochs with a reference whose environment is that of the sections.
 
     @property
     def method(self) -> str:

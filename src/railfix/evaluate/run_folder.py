@@ -41,22 +41,13 @@ _ENDINGS: Final = (".parquet", ".csv")
 
 @dataclass(frozen=True, kw_only=True)
 class RunFolder(RunRecord):
-    """Results of a run, with one of its tables of positions.
+    """Results of a run, with one of its tables of positions."""
 
-    Attributes
-    ----------
-    positions_path : Path
-        The Parquet file of the table, or its CSV file where that is absent.
-    positions : polars.DataFrame
-        One row per epoch and antenna, see `railfix.pipeline.result_columns.POSITION_COLUMNS`; ``observed`` tells
-        whether the antenna has observations.
-    table : str
-        Name of the table: "positions" for the single-epoch positions.
-    """
-
-    positions_path: Path
+    positions_path: Path  #: The Parquet file of the table, or its CSV file where that is absent.
+    #: One row per epoch and antenna, see `railfix.pipeline.result_columns.POSITION_COLUMNS`; ``observed`` tells whether
+    #: the antenna has observations.
     positions: pl.DataFrame
-    table: str = POSITIONS_TABLE
+    table: str = POSITIONS_TABLE  #: Name of the table: "positions" for the single-epoch positions.
 
     @property
     def antennas(self) -> list[str]:

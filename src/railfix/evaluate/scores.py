@@ -20,33 +20,19 @@ WRONG_PLACE_M = 50.0
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """Figures of merit of a run.
+    """Figures of merit of a run."""
 
-    Attributes
-    ----------
-    epochs : int
-        Epochs with observations inside the time of the reference.
-    positions : int
-        Those with coordinates.
-    rate : float
-        positions / epochs.
-    mean_m, std_m : float [m]
-        Of the signed error.
-    p50_m, p95_m, max_m : float [m]
-        Of the absolute error.
-    wrong_place : float
-        Share of the positions more than `WRONG_PLACE_M` from the reference.
-    """
-
-    epochs: int
-    positions: int
-    rate: float
+    epochs: int  #: Epochs with observations inside the time of the reference.
+    positions: int  #: Those with coordinates.
+    rate: float  #: positions / epochs.
+    #: Of the signed error.
     mean_m: float
     std_m: float
+    #: Of the absolute error.
     p50_m: float
     p95_m: float
     max_m: float
-    wrong_place: float
+    wrong_place: float  #: Share of the positions more than `WRONG_PLACE_M` from the reference.
 
 
 def score(error_m: Floats, observed: Masks) -> Score:

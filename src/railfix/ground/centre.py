@@ -32,24 +32,14 @@ class TrainState(Enum):
 
 
 class CentreLimits(Settings):
-    """Times of the centre.
+    """Times of the centre."""
 
-    Attributes
-    ----------
-    lost_s : float [s]
-        After this time without a report the train is shown by simulated running.
-    error_s : float [s]
-        After this time without a report the train is in error.
-    age_s : float [s]
-        Largest age of a position when it was sent; older reports are rejected.
-    jump : int
-        A sequence number further ahead of the newest counts once the next report goes on from there: one wrong number
-        does not make all later ones old.
-    """
-
+    #: After this time without a report the train is shown by simulated running.
     lost_s: float = Field(default=3.0, gt=0)
-    error_s: float = Field(default=120.0, gt=0)
-    age_s: float = Field(default=5.0, gt=0)
+    error_s: float = Field(default=120.0, gt=0)  #: After this time without a report the train is in error.
+    age_s: float = Field(default=5.0, gt=0)  #: Largest age of a position when it was sent; older reports are rejected.
+    #: A sequence number further ahead of the newest counts once the next report goes on from there: one wrong number
+    #: does not make all later ones old.
     jump: int = Field(default=1000, ge=1)
 
     @model_validator(mode="after")
@@ -61,40 +51,19 @@ class CentreLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainRecord:
-    """What the centre knows of a train.
-
-    Attributes
-    ----------
-    train : int
-    state : TrainState
-    sequence : int
-        Newest sequence number received, -1 without one.
-    ahead : int
-        Number far ahead of it that the next report has to confirm, -1 without one.
-    message : TrainMessage or None
-        Newest report with a place.
-    heard_s : float [s]
-        Centre's clock (monotonic) when that report came in.
-    measured_s : float [s]
-        Centre's clock at the instant its place is valid at.
-    shown_m : float or None [m]
-        Place of the front that is shown.
-    jump_m : float or None [m]
-        Reported less simulated place at the last resynchronisation, positive in running direction.
-    departure_s : float or None [s]
-        Booked departure from the station, centre's clock.
-    """
+    """What the centre knows of a train."""
 
     train: int
     state: TrainState = TrainState.UNKNOWN
-    sequence: int = -1
-    ahead: int = -1
-    message: TrainMessage | None = None
-    heard_s: float = 0.0
-    measured_s: float = 0.0
-    shown_m: float | None = None
+    sequence: int = -1  #: Newest sequence number received, -1 without one.
+    ahead: int = -1  #: Number far ahead of it that the next report has to confirm, -1 without one.
+    message: TrainMessage | None = None  #: Newest report with a place.
+    heard_s: float = 0.0  #: Centre's clock (monotonic) when that report came in.
+    measured_s: float = 0.0  #: Centre's clock at the instant its place is valid at.
+    shown_m: float | None = None  #: Place of the front that is shown.
+    #: Reported less simulated place at the last resynchronisation, positive in running direction.
     jump_m: float | None = None
-    departure_s: float | None = None
+    departure_s: float | None = None  #: Booked departure from the station, centre's clock.
 
 
 class Rejection(Enum):

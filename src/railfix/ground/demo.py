@@ -98,22 +98,12 @@ _TIME_NS: Final = 1_400_000_000_000_000_000
 
 @dataclass(kw_only=True)
 class LinkedTraffic(Traffic):
-    """Traffic whose messages go over the links, and whose centre is the one at work.
-
-    Attributes
-    ----------
-    links : dict of int to TrainLinks
-    control : ControlCentre
-    verdicts : list of (TriangleVerdict, int)
-        Of the triangle, one a second.
-    rest_s : float or None [s]
-        When all trains stood still after a stop.
-    """
+    """Traffic whose messages go over the links, and whose centre is the one at work."""
 
     links: dict[int, TrainLinks]
     control: ControlCentre
-    verdicts: list[tuple[TriangleVerdict, int]]
-    rest_s: float | None = None
+    verdicts: list[tuple[TriangleVerdict, int]]  #: Of the triangle, one a second.
+    rest_s: float | None = None  #: When all trains stood still after a stop.
 
     def step(self) -> None:
         """Run a step and note when the trains rest."""

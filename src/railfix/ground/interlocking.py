@@ -23,90 +23,44 @@ from railfix.ground.layout import Layout, PointName, overlap
 
 
 class InterlockingLimits(Settings):
-    """Limits of the interlocking.
+    """Limits of the interlocking."""
 
-    Attributes
-    ----------
-    margin_m : float [m]
-        Kept between the end of an authority and what limits it.
-    release_s : float [s]
-        Points are released this long after the safe rear end has passed them.
-    speed_mps : float [m/s]
-        Highest speed of a train.
-    acceleration_mps2 : float [m/s^2]
-        Highest acceleration and deceleration, between two reports with speeds.
-    speed_error_mps : float [m/s]
-        Largest error of a reported speed.
-    widest_m : float [m]
-        Largest sum of over- and under-reading amount of a report that is taken.
-    """
-
-    margin_m: float = Field(default=20.0, ge=0)
+    margin_m: float = Field(default=20.0, ge=0)  #: Kept between the end of an authority and what limits it.
+    #: Points are released this long after the safe rear end has passed them.
     release_s: float = Field(default=3.0, ge=0)
-    speed_mps: float = Field(default=60.0, gt=0)
+    speed_mps: float = Field(default=60.0, gt=0)  #: Highest speed of a train.
+    #: Highest acceleration and deceleration, between two reports with speeds.
     acceleration_mps2: float = Field(default=2.0, gt=0)
-    speed_error_mps: float = Field(default=1.0, ge=0)
+    speed_error_mps: float = Field(default=1.0, ge=0)  #: Largest error of a reported speed.
+    #: Largest sum of over- and under-reading amount of a report that is taken.
     widest_m: float = Field(default=1000.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainInterval:
-    """Interval and route of a train.
-
-    Attributes
-    ----------
-    train : int
-    direction : {-1, 1}
-    rear_m, front_m : float [m]
-        Last safe rear and front ends.
-    end_m : float [m]
-        End of the authority.
-    sequence : int
-        Newest report.
-    tracks : mapping of int to int
-        Track in each station of the route.
-    station : int
-        Station where the route ends.
-    length_m : float [m]
-        Length of the train as configured.
-    standstill : bool
-    claimed_m : float or None [m]
-        Safe rear end of the newest report; the interval begins there once the next one confirms it. None where the
-        newest report does not confirm the train's integrity and length.
-    line : int or None
-        Line of the train's reports; None before the first.
-    measured_ns : int or None [ns]
-        Instant of the newest place, on the train's clock; None before the first.
-    speed_mps : float or None [m/s]
-        Newest speed.
-    stop : str or None
-        Why the train is stopped, until it is released by hand.
-    asked_m : float or None [m]
-        Shorter end of the authority that the train is asked to agree to.
-    asked_number : int
-        Number of the first authority that asks for it.
-    held : bool
-        A route was taken back: the next one is set by hand.
-    """
+    """Interval and route of a train."""
 
     train: int
     direction: int
+    #: Last safe rear and front ends.
     rear_m: float
     front_m: float
-    end_m: float
-    sequence: int
-    tracks: Mapping[int, int]
-    station: int
-    length_m: float
+    end_m: float  #: End of the authority.
+    sequence: int  #: Newest report.
+    tracks: Mapping[int, int]  #: Track in each station of the route.
+    station: int  #: Station where the route ends.
+    length_m: float  #: Length of the train as configured.
     standstill: bool = True
+    #: Safe rear end of the newest report; the interval begins there once the next one confirms it. None where the
+    #: newest report does not confirm the train's integrity and length.
     claimed_m: float | None = None
-    line: int | None = None
-    measured_ns: int | None = None
-    speed_mps: float | None = None
-    stop: str | None = None
-    asked_m: float | None = None
-    asked_number: int = 0
-    held: bool = False
+    line: int | None = None  #: Line of the train's reports; None before the first.
+    measured_ns: int | None = None  #: Instant of the newest place, on the train's clock; None before the first.
+    speed_mps: float | None = None  #: Newest speed.
+    stop: str | None = None  #: Why the train is stopped, until it is released by hand.
+    asked_m: float | None = None  #: Shorter end of the authority that the train is asked to agree to.
+    asked_number: int = 0  #: Number of the first authority that asks for it.
+    held: bool = False  #: A route was taken back: the next one is set by hand.
 
     @cached_property
     def interval_m(self) -> tuple[float, float]:
@@ -122,44 +76,23 @@ class TrainInterval:
 
 @dataclass(frozen=True, kw_only=True)
 class PointState:
-    """Points as the interlocking knows them.
+    """Points as the interlocking knows them."""
 
-    Attributes
-    ----------
-    wanted : {1, 2}
-        Track they are commanded to.
-    detected : {1, 2} or None
-        Track they are detected at; None while they move.
-    locked : mapping of int to float or None
-        Trains that lock them: None until the train's rear end has passed, then the time of release [s].
-    """
-
-    wanted: int = 1
-    detected: int | None = 1
+    wanted: int = 1  #: Track they are commanded to.
+    detected: int | None = 1  #: Track they are detected at; None while they move.
+    #: Trains that lock them: None until the train's rear end has passed, then the time of release [s].
     locked: Mapping[int, float | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Interlocking:
-    """State of the interlocking.
-
-    Attributes
-    ----------
-    trains : mapping of int to TrainInterval
-    points : mapping of PointName to PointState
-    stopped : bool
-        True while no authority is extended and no route set: satellite positioning is suspended.
-    granted : int
-        Number of the last authorities that were sent.
-    closed : frozenset of int
-        Blocks (`Layout.sections`) that no authority reaches into.
-    """
+    """State of the interlocking."""
 
     trains: Mapping[int, TrainInterval]
     points: Mapping[PointName, PointState]
-    stopped: bool = False
-    granted: int = 0
-    closed: frozenset[int] = frozenset()
+    stopped: bool = False  #: True while no authority is extended and no route set: satellite positioning is suspended.
+    granted: int = 0  #: Number of the last authorities that were sent.
+    closed: frozenset[int] = frozenset()  #: Blocks (`Layout.sections`) that no authority reaches into.
 
 
 class NearbyTrains:

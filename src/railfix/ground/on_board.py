@@ -19,31 +19,17 @@ _FORM: Final = struct.Struct("!BIQQqb??")
 
 
 class Authority(Settings):
-    """One authority message, sent after each report of the train, at a stop, and at least every second.
-
-    Attributes
-    ----------
-    train : int
-    number : int
-        Rises with every message of the centre, also over its restarts.
-    report : int
-        Sequence number of the train's newest report that the centre has stored, 0 without one: an acknowledgement,
-        and the train's measure of the age of this message on its own clock.
-    end_cm : int [cm]
-        Chainage where the authority ends.
-    direction : {-1, 1}
-    stopped : bool
-        Satellite positioning is suspended, the train stops.
-    shortens : bool
-        The end is one that the train is asked to take in place of a further one, where it can stop before it.
-    """
+    """One authority message, sent after each report of the train, at a stop, and at least every second."""
 
     train: Annotated[int, Field(ge=0, lt=1 << 32)]
-    number: Annotated[int, Field(ge=0, lt=1 << 63)]
+    number: Annotated[int, Field(ge=0, lt=1 << 63)]  #: Rises with every message of the centre, also over its restarts.
+    #: Sequence number of the train's newest report that the centre has stored, 0 without one: an acknowledgement, and
+    #: the train's measure of the age of this message on its own clock.
     report: Annotated[int, Field(ge=0, lt=1 << 63)]
-    end_cm: Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)]
+    end_cm: Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)]  #: Chainage where the authority ends.
     direction: Literal[-1, 1]
-    stopped: bool
+    stopped: bool  #: Satellite positioning is suspended, the train stops.
+    #: The end is one that the train is asked to take in place of a further one, where it can stop before it.
     shortens: bool = False
 
     def encode(self) -> bytes:
@@ -78,23 +64,15 @@ REMEMBERED: Final = 600
 
 
 class OnBoardLimits(Settings):
-    """Limits on board.
+    """Limits on board."""
 
-    Attributes
-    ----------
-    fresh_s : float [s]
-        Time limit of authorities: the train brakes where the newest one answers a report that was sent longer ago.
-    braking_mps2 : float [m/s^2]
-        Deceleration with which the train can stop before a shorter authority.
-    reaction_s : float [s]
-        Time before the brakes act, with that since the newest report.
-    """
-
+    #: Time limit of authorities: the train brakes where the newest one answers a report that was sent longer ago.
     fresh_s: float = option(
         "Time limit of authorities: older ones brake the train.", 15.0, name="--fresh", metavar="S", gt=0
     )
+    #: Deceleration with which the train can stop before a shorter authority.
     braking_mps2: float = Field(default=0.5, gt=0)
-    reaction_s: float = Field(default=3.0, ge=0)
+    reaction_s: float = Field(default=3.0, ge=0)  #: Time before the brakes act, with that since the newest report.
 
 
 @dataclass(kw_only=True)
@@ -103,35 +81,24 @@ class OnBoard:
 
     The age of an authority is counted from the sending of the report that it answers, on the train's monotonic clock.
     It is never too small, whatever the links do, and clocks of train and centre need not agree.
-
-    Attributes
-    ----------
-    direction : {-1, 1}
-    end_m : float [m]
-        End of the authority, the front end before the first; it is extended, and shortened where the centre asks for it
-        and the train can stop before.
-    number : int
-        Of the newest authority, -1 before the first.
-    stopped : bool
-        The newest authority is an order to stop.
-    before_turn : int
-        Newest report from before the last turn, or from before this start: what answers
-        it or an older one is refused.
-    stops_at_m : float or None [m]
-        Where the train's safe front end would come to rest if it braked now, the further of the last two places; None:
-        it agrees to no shorter end.
-    answered_s : float or None [s]
-        When the newest report was sent that an authority has answered; None before the first.
     """
 
     direction: int
+    #: End of the authority, the front end before the first; it is extended, and shortened where the centre asks for it
+    #: and the train can stop before.
     end_m: float
+
     limits: OnBoardLimits = field(default_factory=OnBoardLimits)
-    number: int = -1
-    stopped: bool = False
+    number: int = -1  #: Of the newest authority, -1 before the first.
+    stopped: bool = False  #: The newest authority is an order to stop.
+    #: Where the train's safe front end would come to rest if it braked now, the further of the last two places; None:
+    #: it agrees to no shorter end.
     stops_at_m: float | None = None
+    #: When the newest report was sent that an authority has answered; None before the first.
     answered_s: float | None = None
+    #: Newest report from before the last turn, or from before this start: what answers it or an older one is refused.
     before_turn: int = -1
+
     _newest: int = -1
     _granted: bool = False
     _place_m: float | None = None

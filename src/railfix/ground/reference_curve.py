@@ -12,24 +12,12 @@ from railfix.core.arrays import Floats, freeze_arrays
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceCurve:
-    """Reference run of one direction.
+    """Reference run of one direction."""
 
-    Attributes
-    ----------
-    direction : {-1, 1}
-        Direction against chainage.
-    running_s : ndarray, shape (N,) [s]
-        Running time without the standing times at stations, strictly rising.
-    chainage_m : ndarray, shape (N,) [m]
-        Front of the train, strictly rising or, with direction -1, falling.
-    stations_m : ndarray, shape (K,) [m]
-        Stopping places of the front, in the order of the run.
-    """
-
-    direction: int
-    running_s: Floats
-    chainage_m: Floats
-    stations_m: Floats
+    direction: int  #: Direction against chainage.
+    running_s: Floats  #: Running time without the standing times at stations, strictly rising; shape (N,).
+    chainage_m: Floats  #: Front of the train, strictly rising or, with direction -1, falling; shape (N,).
+    stations_m: Floats  #: Stopping places of the front, in the order of the run; shape (K,).
 
     def __post_init__(self) -> None:
         freeze_arrays(self)

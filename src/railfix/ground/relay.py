@@ -14,31 +14,20 @@ from railfix.core.settings import Settings
 
 
 class RelaySettings(Settings):
-    """Disturbances of a relay.
+    """Disturbances of a relay."""
 
-    Attributes
-    ----------
-    loss : float
-        Probability that a datagram is lost.
-    delay_s, jitter_s : float [s]
-        Delay of each datagram, and the largest random one on top of it: datagrams overtake each other.
-    bit_errors : float
-        Probability that one bit of a datagram is flipped.
-    repeats : float
-        Probability that a datagram is sent a second time, up to `repeat_s` later.
-    repeat_s : float [s]
-    insertions : float
-        Probability that a foreign datagram of random bytes, with the head of the one before, is put after a datagram.
-    seed : int
-    """
-
-    loss: float = Field(default=0.0, ge=0, le=1)
+    loss: float = Field(default=0.0, ge=0, le=1)  #: Probability that a datagram is lost.
+    #: Delay of each datagram, and the largest random one on top of it: datagrams overtake each other.
     delay_s: float = Field(default=0.0, ge=0)
     jitter_s: float = Field(default=0.0, ge=0)
-    bit_errors: float = Field(default=0.0, ge=0, le=1)
+    bit_errors: float = Field(default=0.0, ge=0, le=1)  #: Probability that one bit of a datagram is flipped.
+    #: Probability that a datagram is sent a second time, up to `repeat_s` later.
     repeats: float = Field(default=0.0, ge=0, le=1)
+
     repeat_s: float = Field(default=0.5, ge=0)
+    #: Probability that a foreign datagram of random bytes, with the head of the one before, is put after a datagram.
     insertions: float = Field(default=0.0, ge=0, le=1)
+
     seed: int = 0
 
 

@@ -38,25 +38,13 @@ SAME_EPOCH = np.timedelta64(100, "ms")
 
 @dataclass(frozen=True, kw_only=True)
 class StationFixes:
-    """Single-point positions of N receivers at T epochs, each epoch from the same satellites with the same weights.
+    """Single-point positions of N receivers at T epochs, each epoch from the same satellites with the same weights."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-        Epochs that at least one log has, rounded to 0.1 s.
-    points_m : ndarray, shape (N, 2) [m]
-        Known points, east and north of the first.
-    fixes_m : ndarray, shape (T, N, 2) [m]
-        NaN where a log has no epoch, or the common satellites are too few.
-    n_satellites : ndarray of int, shape (T,)
-    cn0_fallen : ndarray of bool, shape (T, N)
-    """
-
-    time: Datetimes
-    points_m: Floats
-    fixes_m: Floats
-    n_satellites: Integers
-    cn0_fallen: Masks
+    time: Datetimes  #: Epochs that at least one log has, rounded to 0.1 s; shape (T,).
+    points_m: Floats  #: Known points, east and north of the first; shape (N, 2).
+    fixes_m: Floats  #: NaN where a log has no epoch, or the common satellites are too few; shape (T, N, 2).
+    n_satellites: Integers  #: Shape (T,).
+    cn0_fallen: Masks  #: Shape (T, N).
 
     def __post_init__(self) -> None:
         freeze_arrays(self)

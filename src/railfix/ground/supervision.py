@@ -42,36 +42,23 @@ CLOCK_DRIFT, CLOCK_TOLERANCE_S = 1e-4, 1.0
 
 @dataclass(kw_only=True)
 class Supervision:
-    """Supervised trains of a line.
-
-    Attributes
-    ----------
-    layout : Layout
-    state : Interlocking
-    command : callable
-        Called with points that have to move and the track they are to lead to; `detected` takes what they report.
-    routes : {"automatic", "by hand"}
-    records : dict of int to TrainRecord
-    refusals : Counter of str
-        Routes refused, by reason.
-    routes_set : int
-    heard : set of int
-        Trains that have reported since the last authorities.
-    sent : dict of int to (float, bool)
-        When a train was sent its last authority [s], and whether it was an order to stop.
-    """
+    """Supervised trains of a line."""
 
     layout: Layout
     state: Interlocking
+    #: Called with points that have to move and the track they are to lead to; `detected` takes what they report.
     command: Callable[[PointName, int], None] = lambda *_: None
+
     routes: Literal["automatic", "by hand"] = "automatic"
     limits: InterlockingLimits = field(default_factory=InterlockingLimits)
     centre: CentreLimits = field(default_factory=CentreLimits)
     records: dict[int, TrainRecord] = field(default_factory=dict)
-    refusals: Counter[str] = field(default_factory=Counter)
+    refusals: Counter[str] = field(default_factory=Counter)  #: Routes refused, by reason.
     routes_set: int = 0
-    heard: set[int] = field(default_factory=set)
+    heard: set[int] = field(default_factory=set)  #: Trains that have reported since the last authorities.
+    #: When a train was sent its last authority [s], and whether it was an order to stop.
     sent: dict[int, tuple[float, bool]] = field(default_factory=dict)
+
     _clocks: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     def report(self, message: TrainMessage, now_s: float) -> Rejection | None:

@@ -22,33 +22,18 @@ _LAST: Final = 1000
 
 @dataclass(kw_only=True)
 class Metrics:
-    """Counts and times of a session.
-
-    Attributes
-    ----------
-    messages : Counter of MessageStatus
-    epochs : mapping of str to int
-        What became of the epochs: `LiveEngine.counts`.
-    skipped : Counter of str
-        Bytes and messages of the receivers that were not used.
-    lost : Counter of str
-        Connections that broke, by source.
-    sinks : sequence of Sink
-    hangups : int
-        SIGHUP received; nothing is reloaded by it.
-    processing_s, between_s : deque of float
-        Processing time of the last messages; times between them.
-    started : float
-    """
+    """Counts and times of a session."""
 
     messages: Counter[MessageStatus] = field(default_factory=Counter)
-    epochs: Mapping[str, int] = field(default_factory=dict)
-    skipped: Counter[str] = field(default_factory=Counter)
-    lost: Counter[str] = field(default_factory=Counter)
+    epochs: Mapping[str, int] = field(default_factory=dict)  #: What became of the epochs: `LiveEngine.counts`.
+    skipped: Counter[str] = field(default_factory=Counter)  #: Bytes and messages of the receivers that were not used.
+    lost: Counter[str] = field(default_factory=Counter)  #: Connections that broke, by source.
     sinks: Sequence[Sink] = ()
-    hangups: int = 0
+    hangups: int = 0  #: SIGHUP received; nothing is reloaded by it.
+    #: Processing time of the last messages; times between them.
     processing_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST))
     between_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST))
+
     started: float = field(default_factory=time.monotonic)
     _sent: float | None = None
 

@@ -41,27 +41,14 @@ _Queue = asyncio.Queue[tuple[str, ReceivedData | None] | Sensed]
 
 @dataclass(frozen=True, kw_only=True)
 class Hooks:
-    """What else a session does.
+    """What else a session does."""
 
-    Attributes
-    ----------
-    observe : callable or None
-        Called with every output, after the sinks.
-    sensed : callable or None
-        Called with what each source of a sensor completes.
-    save : callable or None
-        Called every `LiveSettings.state_every_s`, in idle time, with what a restart needs.
-    show : callable or None
-        Called with a text for the status line, twice a second.
-    metrics : Metrics
-        Counted in, and returned.
-    """
-
-    observe: Callable[[LiveOutput], None] | None = None
-    sensed: Callable[[Sensed], None] | None = None
+    observe: Callable[[LiveOutput], None] | None = None  #: Called with every output, after the sinks.
+    sensed: Callable[[Sensed], None] | None = None  #: Called with what each source of a sensor completes.
+    #: Called every `LiveSettings.state_every_s`, in idle time, with what a restart needs.
     save: Callable[[SavedSession], None] | None = None
-    show: Callable[[str], None] | None = None
-    metrics: Metrics = field(default_factory=Metrics)
+    show: Callable[[str], None] | None = None  #: Called with a text for the status line, twice a second.
+    metrics: Metrics = field(default_factory=Metrics)  #: Counted in, and returned.
 
 
 async def run_session(

@@ -32,27 +32,15 @@ class ReceiverState:
 
 @dataclass(frozen=True, kw_only=True)
 class ReceivedData:
-    """What some bytes completed.
+    """What some bytes completed."""
 
-    Attributes
-    ----------
-    epochs : tuple of Observations
-        One epoch each, with the channels observed in it.
-    navigation : Navigation or None
-    sbas : SbasFrames or None
-    skipped_bytes, bad_checksums : int
-    passed_over : mapping of str to int
-    after : ReceiverState
-        Of the stream after these bytes.
-    """
-
-    epochs: tuple[Observations, ...]
+    epochs: tuple[Observations, ...]  #: One epoch each, with the channels observed in it.
     navigation: Navigation | None = None
     sbas: SbasFrames | None = None
     skipped_bytes: int = 0
     bad_checksums: int = 0
     passed_over: dict[str, int] = field(default_factory=dict)
-    after: ReceiverState = field(default_factory=ReceiverState)
+    after: ReceiverState = field(default_factory=ReceiverState)  #: Of the stream after these bytes.
 
 
 def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:

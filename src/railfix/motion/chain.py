@@ -22,20 +22,11 @@ from railfix.core.arrays import Floats, Indices
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """Normal equations of N instants with n unknowns each; terms are added by copies.
+    """Normal equations of N instants with n unknowns each; terms are added by copies."""
 
-    Attributes
-    ----------
-    diagonal : ndarray, shape (N, n, n)
-        Information of each instant.
-    upper : ndarray, shape (N - 1, n, n)
-        Of each instant with the next.
-    right : ndarray, shape (N, n)
-    """
-
-    diagonal: Floats
-    upper: Floats
-    right: Floats
+    diagonal: Floats  #: Information of each instant, shape (N, n, n).
+    upper: Floats  #: Of each instant with the next, shape (N - 1, n, n).
+    right: Floats  #: Shape (N, n).
 
     @classmethod
     def empty(cls, instants: int, unknowns: int) -> Chain:

@@ -36,20 +36,11 @@ _LEAST_SCATTER: Final = 0.001
 
 @dataclass(frozen=True, kw_only=True)
 class RadarAlarm:
-    """What the radar's speeds show against those by satellites.
+    """What the radar's speeds show against those by satellites."""
 
-    Attributes
-    ----------
-    kind : {"mounting", "silent"}
-        A step of the ratio of the speeds; no speed while the train moves.
-    time : datetime64[ns]
-        From when on.
-    before, after : float
-        Ratio less 1 before a step and after it.
-    """
-
-    kind: Literal["mounting", "silent"]
-    time: np.datetime64
+    kind: Literal["mounting", "silent"]  #: A step of the ratio of the speeds; no speed while the train moves.
+    time: np.datetime64  #: From when on.
+    #: Ratio less 1 before a step and after it.
     before: float = float("nan")
     after: float = float("nan")
 
@@ -68,21 +59,12 @@ class RadarAlarm:
 
 @dataclass(kw_only=True)
 class RadarWatch:
-    """Ratios by window of GPS time, taken in order of time; nothing grows with the length of a session.
+    """Ratios by window of GPS time, taken in order of time; nothing grows with the length of a session."""
 
-    Attributes
-    ----------
-    ratio : deque of float
-        Of the last windows.
-    window : deque of int
-        Their numbers since the epoch of the clock.
-    silent : int
-        Windows without a speed, one after the other.
-    """
-
-    ratio: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
+    ratio: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))  #: Of the last windows.
+    #: Their numbers since the epoch of the clock.
     window: deque[int] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
-    silent: int = 0
+    silent: int = 0  #: Windows without a speed, one after the other.
     _open: int = -1
     _sums: Floats = field(default_factory=lambda: np.zeros(4))
 

@@ -21,16 +21,10 @@ def radar_speed_mps(shift_hz: Floats, carrier_hz: float, angle_rad: float) -> Fl
 
 
 class EchoLimits(Settings):
-    """Gate of ranges against the predicted one.
+    """Gate of ranges against the predicted one."""
 
-    Attributes
-    ----------
-    late_m : float
-        Least width of the gate toward long ranges: echoes are late, and separate from 0.3 m on (P2, table 3).
-    early_sigmas, late_sigmas : float
-        Width of the gate on both sides.
-    """
-
+    #: Least width of the gate toward long ranges: echoes are late, and separate from 0.3 m on (P2, table 3).
     late_m: float = Field(default=0.6, gt=0)
+    #: Width of the gate on both sides.
     early_sigmas: float = Field(default=3.0, gt=0)
     late_sigmas: float = Field(default=3.0, gt=0)

@@ -25,30 +25,16 @@ _UNIT_SHARE: Final = 0.05
 
 
 class TachometerLimits(Settings):
-    """Wheel and window of a tachometer.
+    """Wheel and window of a tachometer."""
 
-    Attributes
-    ----------
-    wheel_diameter_m : float
-        As entered on board.
-    pulses_per_turn : int
-        After multiplication of edges.
-    window_s : float
-        Time over which speeds are taken. P2 3.2 calls 0.1 s the usual smoothing of a tachometer; with uneven teeth
-        take that of a whole turn.
-    least_speed_mps : float
-        Below it there is no output (P2 1; 1 km/h).
-    silence_s : float
-        Time without a pulse after which there is no output.
-    jitter_s, resolution_s : float
-        Standard deviation of a pulse's instant, and the step of its clock.
-    """
-
-    wheel_diameter_m: float = Field(default=0.86, gt=0.2, lt=2.0)
-    pulses_per_turn: int = Field(default=60, ge=1)
+    wheel_diameter_m: float = Field(default=0.86, gt=0.2, lt=2.0)  #: As entered on board.
+    pulses_per_turn: int = Field(default=60, ge=1)  #: After multiplication of edges.
+    #: Time over which speeds are taken. P2 3.2 calls 0.1 s the usual smoothing of a tachometer; with uneven teeth take
+    #: that of a whole turn.
     window_s: float = Field(default=0.1, gt=0)
-    least_speed_mps: float = Field(default=1.0 / 3.6, gt=0)
-    silence_s: float = Field(default=0.3, gt=0)
+    least_speed_mps: float = Field(default=1.0 / 3.6, gt=0)  #: Below it there is no output (P2 1; 1 km/h).
+    silence_s: float = Field(default=0.3, gt=0)  #: Time without a pulse after which there is no output.
+    #: Standard deviation of a pulse's instant, and the step of its clock.
     jitter_s: float = Field(default=5e-6, ge=0)
     resolution_s: float = Field(default=1e-6, ge=0)
 
@@ -60,23 +46,13 @@ class TachometerLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class PulseSpeeds:
-    """Speeds at N instants asked for.
+    """Speeds at N instants asked for."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (N,)
-        Instant at which each speed holds, earlier than the one asked for; NaT where there is none.
-    speed_mps : ndarray, shape (N,) [m/s]
-        With the sign of the direction; NaN where the pulses say nothing.
-    sigma_mps : ndarray, shape (N,) [m/s]
-        By jitter and clock; the wheel's scale comes beside it.
-    bound_mps : ndarray, shape (N,) [m/s]
-        Size that the speed cannot exceed since the last pulse: ``p / (t - t_k)``; NaN before the first.
-    """
-
+    #: Instant at which each speed holds, earlier than the one asked for; NaT where there is none; shape (N,).
     time: Datetimes
-    speed_mps: Floats
-    sigma_mps: Floats
+    speed_mps: Floats  #: With the sign of the direction; NaN where the pulses say nothing; shape (N,).
+    sigma_mps: Floats  #: By jitter and clock; the wheel's scale comes beside it; shape (N,).
+    #: Size that the speed cannot exceed since the last pulse: ``p / (t - t_k)``; NaN before the first; shape (N,).
     bound_mps: Floats
 
 
@@ -191,21 +167,11 @@ def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedCheck:
-    """A log of speeds against speeds known to be right.
+    """A log of speeds against speeds known to be right."""
 
-    Attributes
-    ----------
-    ratio : float
-        Logged over right, without the unit.
-    unit : str
-        "m/s", or the unit that the log is really in.
-    lag_s : float
-        By how much its time tags are late.
-    """
-
-    ratio: float
-    unit: str
-    lag_s: float
+    ratio: float  #: Logged over right, without the unit.
+    unit: str  #: "m/s", or the unit that the log is really in.
+    lag_s: float  #: By how much its time tags are late.
 
 
 def check_speeds(

@@ -24,14 +24,7 @@ _FASTEST_MPS: Final = 150.0
 
 @dataclass(frozen=True, kw_only=True)
 class Wheel:
-    """A tachometer with the distance of one pulse.
-
-    Attributes
-    ----------
-    pulses : Pulses
-    pulse_m : float [m]
-    source : {"given", "estimated from the fixes", "metres in the table"}
-    """
+    """A tachometer with the distance of one pulse."""
 
     pulses: Pulses
     pulse_m: float

@@ -29,26 +29,16 @@ DECIMALS_DEG: Final = 9
 
 @dataclass(frozen=True)
 class Column(Generic[Source]):
-    """One column.
+    """One column."""
 
-    Attributes
-    ----------
-    name : str
-        Ends with the unit where there is one: ``along_sigma_m``.
-    meaning : str
-    values : callable
-        Values from the source of a table: an array with epochs on axis 0, one value for all rows, or None where the
-        source has none. Words are given by their number.
-    dtype : polars data type
-    words : tuple of str
-        Words that the numbers stand for.
-    """
-
-    name: str
+    name: str  #: Ends with the unit where there is one: ``along_sigma_m``.
     meaning: str
+    #: Values from the source of a table: an array with epochs on axis 0, one value for all rows, or None where the
+    #: source has none. Words are given by their number.
     values: Callable[[Source], NDArray[Any] | str | None]
+
     dtype: pl.DataType = field(default=pl.Float64(), kw_only=True)
-    words: tuple[str, ...] = field(default=(), kw_only=True)
+    words: tuple[str, ...] = field(default=(), kw_only=True)  #: Words that the numbers stand for.
 
     @property
     def unit(self) -> str:

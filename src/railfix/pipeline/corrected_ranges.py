@@ -52,44 +52,24 @@ class Models(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectedRanges(AntennaRanges):
-    """Corrected pseudoranges before positioning: T epochs by the K channels that the settings allow.
-
-    Attributes
-    ----------
-    observations : Observations
-    channels : Channels
-    satellites : SatelliteStates
-    ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
-        Delays subtracted from the codes; 0 where the model is off, NaN where SBAS has none.
-    nominal_m : ndarray, shape (T, K) [m]
-        Standard deviation of satellites and atmosphere: by SBAS, otherwise by `Config.nominal`.
-    bound_sigma_m, bias_m : ndarray, shape (T, K) [m]
-        Overbounding sigma and largest nominal bias of each range by the error model; 0 without one.
-    screens : mapping of str to Screened
-        Metric and verdict of each screen so far.
-    second : SecondCodes or None
-        Second codes of the satellites, where two frequencies are used.
-    combined : Combined or None
-        How the two were combined.
-    slips : Slips or None
-        Of all channels of the observations, where the carrier phase is used.
-    base : BaseDifferences or None
-        What a base station has subtracted.
-    """
+    """Corrected pseudoranges before positioning: T epochs by the K channels that the settings allow."""
 
     observations: Observations
     channels: Channels
     satellites: SatelliteStates
+    #: Delays subtracted from the codes; 0 where the model is off, NaN where SBAS has none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
+    #: Standard deviation of satellites and atmosphere: by SBAS, otherwise by `Config.nominal`; shape (T, K).
     nominal_m: Floats
+    #: Overbounding sigma and largest nominal bias of each range by the error model; 0 without one; shape (T, K).
     bound_sigma_m: Floats
     bias_m: Floats
-    screens: Mapping[str, Screened] = field(default_factory=dict)
-    second: SecondCodes | None = None
-    combined: Combined | None = None
-    slips: Slips | None = None
-    base: BaseDifferences | None = None
+    screens: Mapping[str, Screened] = field(default_factory=dict)  #: Metric and verdict of each screen so far.
+    second: SecondCodes | None = None  #: Second codes of the satellites, where two frequencies are used.
+    combined: Combined | None = None  #: How the two were combined.
+    slips: Slips | None = None  #: Of all channels of the observations, where the carrier phase is used.
+    base: BaseDifferences | None = None  #: What a base station has subtracted.
 
     @property
     def columns(self) -> Indices:

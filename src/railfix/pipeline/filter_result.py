@@ -30,16 +30,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class FilterFix:
-    """Place by the filter at its last epoch: what the place by the wheel begins from anew every few seconds.
-
-    Attributes
-    ----------
-    time : datetime64[ns]
-    arc_m, sigma_m, speed_mps : float
-        NaN where the filter has not decided on a place.
-    """
+    """Place by the filter at its last epoch: what the place by the wheel begins from anew every few seconds."""
 
     time: np.datetime64
+    #: NaN where the filter has not decided on a place.
     arc_m: float
     sigma_m: float
     speed_mps: float
@@ -51,31 +45,16 @@ class FilterFix:
 
 @dataclass(frozen=True, kw_only=True)
 class SingleEpochs:
-    """Results of single epochs that the filter along the track uses, shape (T,) each.
+    """Results of single epochs that the filter along the track uses, shape (T,) each."""
 
-    Attributes
-    ----------
-    noise_scale : ndarray
-        Noise of the receiver's codes against their sigmas.
-    arc_m, sigma_m : ndarray [m]
-        Position: after an outage codes count again when it agrees with the place that the sensors carried.
-    near_ecef_m : ndarray, shape (T, 3) [m]
-        3-D position without the line.
-    off_map : ndarray of bool
-        The train is away from the line: `railfix.pipeline.return_gate`.
-    map_offset : ndarray of bool
-        3-D positions of the last minutes lie beside or above the line.
-    spoofed : ndarray of bool
-        Spoofing is suspected.
-    """
-
-    noise_scale: Floats
+    noise_scale: Floats  #: Noise of the receiver's codes against their sigmas.
+    #: Position: after an outage codes count again when it agrees with the place that the sensors carried.
     arc_m: Floats
     sigma_m: Floats
-    near_ecef_m: Floats
-    off_map: Masks
-    map_offset: Masks
-    spoofed: Masks
+    near_ecef_m: Floats  #: 3-D position without the line, shape (T, 3).
+    off_map: Masks  #: The train is away from the line: `railfix.pipeline.return_gate`.
+    map_offset: Masks  #: 3-D positions of the last minutes lie beside or above the line.
+    spoofed: Masks  #: Spoofing is suspected.
 
 
 def single_epochs(result: AntennaResult, off_map: Masks, limits: MapOffsetLimits) -> SingleEpochs:
@@ -95,41 +74,24 @@ def single_epochs(result: AntennaResult, off_map: Masks, limits: MapOffsetLimits
 
 @dataclass(frozen=True, kw_only=True)
 class FilterState(NotebookTable):
-    """State of the filter along the track of one antenna after a chunk.
+    """State of the filter along the track of one antenna after a chunk."""
 
-    Attributes
-    ----------
-    line : Line or None
-        The trajectory as the filter sees it, made once.
-    slips : CycleSlipState or None
-        Of the carrier phases.
-    track : TrackState or None
-    level : LevelState
-        Of the filter that gives the levels.
-    sensors : SensorState
-    fixed, anchor : FilterFix or None
-        Place of the filter at the last epoch, and at the last one before the present stretch.
-    gate : ReturnState
-    wheel, pulled : WheelState
-        Of the comparison of distances by the wheel with those of single epochs, and of the filter.
-    disagreed : datetime64[ns]
-        Last epoch at which places or speeds of the two antennas disagreed.
-    passings : PassingState or None
-        Of balises and virtual ones.
-    """
-
-    line: Line | None = None
-    slips: CycleSlipState | None = None
+    line: Line | None = None  #: The trajectory as the filter sees it, made once.
+    slips: CycleSlipState | None = None  #: Of the carrier phases.
     track: TrackState | None = None
-    level: LevelState = field(default_factory=LevelState)
+    level: LevelState = field(default_factory=LevelState)  #: Of the filter that gives the levels.
     sensors: SensorState = field(default_factory=SensorState.empty)
+    #: Place of the filter at the last epoch, and at the last one before the present stretch.
     fixed: FilterFix | None = None
     anchor: FilterFix | None = None
+
     gate: ReturnState = field(default_factory=ReturnState)
+    #: Of the comparison of distances by the wheel with those of single epochs, and of the filter.
     wheel: WheelState = field(default_factory=WheelState)
     pulled: WheelState = field(default_factory=WheelState)
+    #: Last epoch at which places or speeds of the two antennas disagreed.
     disagreed: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    passings: PassingState | None = None
+    passings: PassingState | None = None  #: Of balises and virtual ones.
 
     def __repr__(self) -> str:
         if self.track is None or not self.track.hypotheses:
@@ -148,44 +110,27 @@ class FilterState(NotebookTable):
 
 @dataclass(frozen=True, kw_only=True)
 class AlongTrack(NotebookTable):
-    """Positions of one antenna by the filter along the track, T epochs.
+    """Positions of one antenna by the filter along the track, T epochs."""
 
-    Attributes
-    ----------
-    tracked : Tracked
-        Places along the antenna's trajectory, and what measured them; channels as `AntennaResult.columns`.
-    chainage_m, kilometrage_m : ndarray, shape (T,) [m]
-    ecef_m : ndarray, shape (T, 3) [m]
-    latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
-    direction : ndarray of int8, shape (T,)
-        1 toward rising chainage, -1 toward falling, 0 where the speed does not tell.
-    standstill : ndarray of bool, shape (T,)
-    sensed : SensedMotion
-        Motion since the epoch before and the line under the body, by wheel and inertial unit.
-    spacing_error_m : ndarray, shape (T,) [m]
-        Distance from the place of the other antenna less that of the antennas; NaN where it was not looked at.
-    wheel : WheelSigns or None
-        Distances by satellites against those of the wheel; None without a wheel.
-    replay : tuple of Replay
-        What the filter was given, to smooth it (`railfix.pipeline.smoothing`).
-    passings : tuple of Passing
-        Balises and virtual ones that were passed, and readings that are wrong.
-    """
-
+    #: Places along the antenna's trajectory, and what measured them; channels as `AntennaResult.columns`.
     tracked: Tracked
+    #: Shape (T,).
     chainage_m: Floats
     kilometrage_m: Floats
-    ecef_m: Floats
+    ecef_m: Floats  #: Shape (T, 3).
+    #: Shape (T,).
     latitude_deg: Floats
     longitude_deg: Floats
     height_m: Floats
-    direction: Codes
-    standstill: Masks
-    sensed: SensedMotion
+    direction: Codes  #: 1 toward rising chainage, -1 toward falling, 0 where the speed does not tell; shape (T,).
+    standstill: Masks  #: Shape (T,).
+    sensed: SensedMotion  #: Motion since the epoch before and the line under the body, by wheel and inertial unit.
+    #: Distance from the place of the other antenna less that of the antennas; NaN where it was not looked at; shape
+    #: (T,).
     spacing_error_m: Floats
-    wheel: WheelSigns | None = None
-    replay: tuple[Replay, ...] = ()
-    passings: tuple[Passing, ...] = ()
+    wheel: WheelSigns | None = None  #: Distances by satellites against those of the wheel; None without a wheel.
+    replay: tuple[Replay, ...] = ()  #: What the filter was given, to smooth it (`railfix.pipeline.smoothing`).
+    passings: tuple[Passing, ...] = ()  #: Balises and virtual ones that were passed, and readings that are wrong.
 
     @property
     def time(self) -> Datetimes:

@@ -27,36 +27,22 @@ _EPOCHS: Final = 300
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """What the filter was given for some epochs.
-
-    Attributes
-    ----------
-    epochs : GnssEpochs
-    sensors : SensorEpochs
-    before : TrackState or None
-        State before them.
-    """
+    """What the filter was given for some epochs."""
 
     epochs: GnssEpochs
     sensors: SensorEpochs
-    before: TrackState | None
+    before: TrackState | None  #: State before them.
 
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothedTrack:
-    """Places of T epochs by everything measured before and after them.
+    """Places of T epochs by everything measured before and after them."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    arc_m, sigma_m : ndarray, shape (T,) [m]
-    speed_mps : ndarray, shape (T,)
-    """
-
-    time: Datetimes
+    time: Datetimes  #: Shape (T,).
+    #: Shape (T,).
     arc_m: Floats
     sigma_m: Floats
-    speed_mps: Floats
+    speed_mps: Floats  #: Shape (T,).
 
 
 def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> SmoothedTrack:

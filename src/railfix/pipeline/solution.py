@@ -84,50 +84,28 @@ def satellites_rejected(member: Integers, reason: Bits) -> Integers:
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """Positions of one antenna, T epochs, before coordinates are dropped where the status says so.
+    """Positions of one antenna, T epochs, before coordinates are dropped where the status says so."""
 
-    Attributes
-    ----------
-    point : SinglePoint
-        Conventional position: every constellation with a clock of its own.
-    point_status : ndarray of int8, shape (T,)
-        `railfix.pipeline.solve.PointStatus`.
-    place : Place
-        Positions from the codes, after exclusions.
-    ties : ClockTies
-        Inter-system biases known before each epoch.
-    raim : RaimResult
-    status : ndarray of int8, shape (T,)
-        `reasons.Status`.
-    noise_scale, own_sigma_m : ndarray, shape (T,)
-    arc_m, along_sigma_m : ndarray, shape (T,) [m]
-        Position that is published: from the codes, or from code and phase.
-    phase : PhasePositions or None
-    protection : ProtectionResult or None
-    map_offset : MapOffset
-    off_map : ndarray of bool, shape (T,)
-        The train is away from the line: `railfix.pipeline.return_gate`.
-    interference : Interference or None
-        Of `railfix.pipeline.interference_stage`, which comes after; None where it is off.
-    araim : AraimResult or None
-        Of `railfix.pipeline.level_stage`, which comes after; None without an integrity support message.
-    """
-
-    point: SinglePoint
-    point_status: Codes
-    place: Place
-    ties: ClockTies
+    point: SinglePoint  #: Conventional position: every constellation with a clock of its own.
+    point_status: Codes  #: `railfix.pipeline.solve.PointStatus`, shape (T,).
+    place: Place  #: Positions from the codes, after exclusions.
+    ties: ClockTies  #: Inter-system biases known before each epoch.
     raim: RaimResult
-    status: Codes
+    status: Codes  #: `reasons.Status`, shape (T,).
+    #: Shape (T,).
     noise_scale: Floats
     own_sigma_m: Floats
+    #: Position that is published: from the codes, or from code and phase; shape (T,).
     arc_m: Floats
     along_sigma_m: Floats
+
     phase: PhasePositions | None
     protection: ProtectionResult | None
     map_offset: MapOffset
-    off_map: Masks
+    off_map: Masks  #: The train is away from the line: `railfix.pipeline.return_gate`; shape (T,).
+    #: Of `railfix.pipeline.interference_stage`, which comes after; None where it is off.
     interference: Interference | None = None
+    #: Of `railfix.pipeline.level_stage`, which comes after; None without an integrity support message.
     araim: AraimResult | None = None
 
 

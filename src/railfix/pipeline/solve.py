@@ -25,21 +25,11 @@ from railfix.positioning.single_point import SinglePoint, SinglePointLimits, sin
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """Positions of one antenna from one set of ranges, T epochs.
+    """Positions of one antenna from one set of ranges, T epochs."""
 
-    Attributes
-    ----------
-    point : SinglePoint
-        3-D position without the map.
-    section : Section
-        Best-fitting vertex of the trajectory.
-    constrained : Constrained
-        Position on the line.
-    """
-
-    point: SinglePoint
-    section: Section
-    constrained: Constrained
+    point: SinglePoint  #: 3-D position without the map.
+    section: Section  #: Best-fitting vertex of the trajectory.
+    constrained: Constrained  #: Position on the line.
 
 
 def place_on_line(ranges: Ranges, index: SearchIndex, point: SinglePoint, config: Config) -> Place:

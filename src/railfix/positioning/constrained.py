@@ -23,57 +23,30 @@ from railfix.track.trajectory import Trajectory
 
 
 class ConstrainedLimits(Settings):
-    """Limits of the iteration along the line.
+    """Limits of the iteration along the line."""
 
-    Attributes
-    ----------
-    tolerance_m : float
-        Last step inside a section: one of 5 m leaves 0.03 mm (`after_step`).
-    max_iterations : int
-        Steps, walks into a neighbouring section included.
-    """
-
+    #: Last step inside a section: one of 5 m leaves 0.03 mm (`after_step`).
     tolerance_m: float = Field(default=5.0, gt=0)
-    max_iterations: int = Field(default=40, ge=1)
+    max_iterations: int = Field(default=40, ge=1)  #: Steps, walks into a neighbouring section included.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Constrained:
-    """Positions along the line, T epochs.
+    """Positions along the line, T epochs."""
 
-    Attributes
-    ----------
-    arc_m : ndarray, shape (T,) [m]
-        Along the trajectory; NaN where the iteration did not settle or was not started.
-    section : ndarray of int, shape (T,)
-        Section that the position lies on, -1 where there is none.
-    sigma_m : ndarray, shape (T,) [m]
-        Standard deviation along the line from the weights and the map error.
-    exact_map_sigma_m : ndarray, shape (T,) [m]
-        The part of it that the weights give, as if the map were exact.
-    dilution : ndarray, shape (T,)
-        Along-track dilution: sigma along the line for unit, equal weights and an exact map. Infinite where the
-        satellites stand across the track.
-    overshoot_m : ndarray, shape (T,) [m]
-        How far beyond an end of the line the ranges pull a position clamped to it; 0 elsewhere.
-    clock_m : ndarray, shape (T, G) [m]
-    wsse : ndarray, shape (T,)
-        Weighted sum of squared residuals, map error allowed for.
-    residual_m : ndarray, shape (T, M) [m]
-        Code - range - clock at the position on the line.
-    iterations : ndarray of int, shape (T,)
-    """
-
-    arc_m: Floats
-    section: Indices
-    sigma_m: Floats
-    exact_map_sigma_m: Floats
+    arc_m: Floats  #: Along the trajectory; NaN where the iteration did not settle or was not started; shape (T,).
+    section: Indices  #: Section that the position lies on, -1 where there is none; shape (T,).
+    sigma_m: Floats  #: Standard deviation along the line from the weights and the map error, shape (T,).
+    exact_map_sigma_m: Floats  #: The part of it that the weights give, as if the map were exact; shape (T,).
+    #: Along-track dilution: sigma along the line for unit, equal weights and an exact map. Infinite where the
+    #: satellites stand across the track; shape (T,).
     dilution: Floats
+    #: How far beyond an end of the line the ranges pull a position clamped to it; 0 elsewhere; shape (T,).
     overshoot_m: Floats
-    clock_m: Floats
-    wsse: Floats
-    residual_m: Floats
-    iterations: Integers
+    clock_m: Floats  #: Shape (T, G).
+    wsse: Floats  #: Weighted sum of squared residuals, map error allowed for; shape (T,).
+    residual_m: Floats  #: Code - range - clock at the position on the line, shape (T, M).
+    iterations: Integers  #: Shape (T,).
 
 
 def constrained_position(

@@ -36,40 +36,23 @@ _NORMAL_MEDIAN: Final = 0.6745
 
 
 class RobustFitLimits(Settings):
-    """Limits of the robust fit.
+    """Limits of the robust fit."""
 
-    Attributes
-    ----------
-    keep : float
-        Residuals up to this many scales keep their weight (IGG-III: 1.5 to 2).
-    reject : float
-        Residuals from this many scales on have no weight (IGG-III: 3 to 8.5).
-    iterations : int
-        Reweightings. On the demonstration with 20 m on one satellite the fifth one changes no verdict.
-    """
-
-    keep: float = Field(default=1.5, gt=0)
-    reject: float = Field(default=4.0, gt=0)
+    keep: float = Field(default=1.5, gt=0)  #: Residuals up to this many scales keep their weight (IGG-III: 1.5 to 2).
+    reject: float = Field(default=4.0, gt=0)  #: Residuals from this many scales on have no weight (IGG-III: 3 to 8.5).
+    #: Reweightings. On the demonstration with 20 m on one satellite the fifth one changes no verdict.
     iterations: int = Field(default=5, ge=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobustFit:
-    """Ranges that agree with each other, T epochs by M channels.
+    """Ranges that agree with each other, T epochs by M channels."""
 
-    Attributes
-    ----------
-    kept : ndarray of bool, shape (T, M)
-        Used ranges whose residual is below `RobustFitLimits.reject` scales.
-    variance : ndarray, shape (T,)
-        Weighted sum of the squared residuals of the kept ranges over their degrees of freedom; NaN without any.
-    freedom : ndarray of int, shape (T,)
-        Kept ranges beyond clocks and unknowns of the place.
-    """
-
-    kept: Masks
+    kept: Masks  #: Used ranges whose residual is below `RobustFitLimits.reject` scales, shape (T, M).
+    #: Weighted sum of the squared residuals of the kept ranges over their degrees of freedom; NaN without any; shape
+    #: (T,).
     variance: Floats
-    freedom: Integers
+    freedom: Integers  #: Kept ranges beyond clocks and unknowns of the place, shape (T,).
 
 
 def map_information(trajectory: Trajectory, section: Indices) -> Floats:
@@ -131,48 +114,32 @@ _WIDENED: Final = stdtrit(np.arange(1, 129), 0.975) / ndtri(0.975)
 
 
 class NoiseScaleLimits(Settings):
-    """How the noise of a receiver is learnt.
+    """How the noise of a receiver is learnt."""
 
-    Attributes
-    ----------
-    window_s : float [s]
-        Time constant of forgetting. Errors of codes stay alike for about 20 s (correlation 0.6 after 10 s on
-        recordings): five such times are independent enough for a mean, and short enough that a street
-        or a station left behind is forgotten before the next one.
-    prior : float
-        Redundant ranges that a scale of 1 counts for, never forgotten: two or three epochs. Infinite holds the
-        scale at 1.
-    least_epochs : float
-        Epochs that the window spans at least, however slow the log, and gaps left out.
-    spread : float
-        Degrees of freedom of the scale from epoch to epoch: the noise of single epochs varies more than chi-square
-        says, so the variance stated for an epoch is that of its window counted this many times, and that of its own
-        residuals. 4 is also the Student t of code errors on recordings.
-    """
-
+    #: Time constant of forgetting. Errors of codes stay alike for about 20 s (correlation 0.6 after 10 s on
+    #: recordings): five such times are independent enough for a mean, and short enough that a street or a station left
+    #: behind is forgotten before the next one.
     window_s: float = Field(default=100.0, gt=0)
+    #: Redundant ranges that a scale of 1 counts for, never forgotten: two or three epochs. Infinite holds the scale at
+    #: 1.
     prior: float = Field(default=20.0, gt=0)
+    #: Epochs that the window spans at least, however slow the log, and gaps left out.
     least_epochs: float = Field(default=20.0, ge=1)
+    #: Degrees of freedom of the scale from epoch to epoch: the noise of single epochs varies more than chi-square says,
+    #: so the variance stated for an epoch is that of its window counted this many times, and that of its own residuals.
+    #: 4 is also the Student t of code errors on recordings.
     spread: float = Field(default=4.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseState:
-    """Decayed sums behind the noise scales, after the last epoch.
+    """Decayed sums behind the noise scales, after the last epoch."""
 
-    Attributes
-    ----------
-    time : datetime64[ns]
-        Of the last epoch; NaT before the first.
-    age : float [windows]
-        Of the last epoch.
-    robust, remaining : ndarray, shape (2,)
-        Weighted sum of squared residuals, and degrees of freedom: of the ranges that the robust fit kept, and of
-        those that RAIM left.
-    """
-
+    #: Of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0
+    age: float = 0.0  #: Of the last epoch [windows].
+    #: Weighted sum of squared residuals, and degrees of freedom: of the ranges that the robust fit kept, and of those
+    #: that RAIM left; shape (2,).
     robust: Floats = field(default_factory=lambda: np.zeros(2))
     remaining: Floats = field(default_factory=lambda: np.zeros(2))
 

@@ -16,18 +16,10 @@ _ROUNDS: Final = 10
 
 @dataclass(frozen=True, kw_only=True)
 class RobustClock:
-    """Clocks of T epochs, G groups, K channels.
+    """Clocks of T epochs, G groups, K channels."""
 
-    Attributes
-    ----------
-    clock_m : ndarray, shape (T, G) [m]
-        NaN with fewer than `least_ranges` ranges.
-    share : ndarray, shape (T, K)
-        Weight of each channel in its clock estimate; 0 for channels not used.
-    """
-
-    clock_m: Floats
-    share: Floats
+    clock_m: Floats  #: NaN with fewer than `least_ranges` ranges, shape (T, G).
+    share: Floats  #: Weight of each channel in its clock estimate; 0 for channels not used; shape (T, K).
 
 
 def robust_clock(

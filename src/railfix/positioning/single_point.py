@@ -18,50 +18,28 @@ from railfix.positioning.normal_equations import Ranges
 
 
 class SinglePointLimits(Settings):
-    """Limits of the iteration, and of the validation of its position (`conventional_status`).
+    """Limits of the iteration, and of the validation of its position (`conventional_status`)."""
 
-    Attributes
-    ----------
-    tolerance_m : float
-        The last step: one of 1 m leaves 0.01 mm (`after_step`).
-    max_iterations : int
-        Steps at most.
-    false_alarm : float
-        Probability that noise alone fails the chi-square test of the residuals.
-    dilution_limit : float
-        Largest position dilution of precision; 30, as RTKLIB has for the geometric one.
-    """
-
-    tolerance_m: float = Field(default=1.0, gt=0)
-    max_iterations: int = Field(default=12, ge=1)
+    tolerance_m: float = Field(default=1.0, gt=0)  #: The last step: one of 1 m leaves 0.01 mm (`after_step`).
+    max_iterations: int = Field(default=12, ge=1)  #: Steps at most.
+    #: Probability that noise alone fails the chi-square test of the residuals.
     false_alarm: float = Field(default=1e-3, gt=0, lt=0.5)
+    #: Largest position dilution of precision; 30, as RTKLIB has for the geometric one.
     dilution_limit: float = Field(default=30.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SinglePoint:
-    """3-D positions, T epochs.
+    """3-D positions, T epochs."""
 
-    Attributes
-    ----------
-    ecef_m : ndarray, shape (T, 3) [m]
-        NaN where there is none: fewer than three satellites beyond one a clock, singular
-        geometry, or no convergence.
-    clock_m : ndarray, shape (T, G) [m]
-    matrix : ndarray, shape (T, 3, 3) [1/m^2]
-        Normal matrix at the position.
-    covariance_m2 : ndarray, shape (T, 3, 3) [m^2]
-        Of the position, from the weights.
-    wsse : ndarray, shape (T,)
-    residual_m : ndarray, shape (T, M) [m]
-    """
-
+    #: NaN where there is none: fewer than three satellites beyond one a clock, singular geometry, or no convergence;
+    #: shape (T, 3).
     ecef_m: Floats
-    clock_m: Floats
-    matrix: Floats
-    covariance_m2: Floats
-    wsse: Floats
-    residual_m: Floats
+    clock_m: Floats  #: Shape (T, G).
+    matrix: Floats  #: Normal matrix at the position, shape (T, 3, 3) [1/m^2].
+    covariance_m2: Floats  #: Of the position, from the weights; shape (T, 3, 3).
+    wsse: Floats  #: Shape (T,).
+    residual_m: Floats  #: Shape (T, M).
 
     def take(self, epochs: Indices) -> SinglePoint:
         """The positions of some epochs, by index."""

@@ -99,17 +99,9 @@ _NAMED: Final = 5
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceSummary:
-    """Result of a reference.
+    """Result of a reference."""
 
-    Attributes
-    ----------
-    built : mapping of str to Built
-        By antenna.
-    notes : tuple of str
-    files : mapping of str to Path
-    """
-
-    built: Mapping[str, Built]
+    built: Mapping[str, Built]  #: By antenna.
     notes: tuple[str, ...]
     files: Mapping[str, Path]
 

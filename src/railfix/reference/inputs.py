@@ -24,30 +24,23 @@ from railfix.run.output import Overwrite
 
 
 class ReferenceInputs(InputFiles):
-    """Input files of a reference.
+    """Input files of a reference."""
 
-    Attributes
-    ----------
-    rtk, rtk_rear : Path or None
-        Positions of the front (or only) and of the rear antenna.
-    track : tuple of Path
-    vehicle : Path or None
-    front, rear, nav : tuple of Path
-        Observation files of either antenna and navigation files, for Doppler speeds; may be empty.
-    pulses, acceleration : Path or None
-    """
-
+    #: Positions of the front (or only) and of the rear antenna.
     rtk: Path | None = input_option(
         "Positions of the front (or only) antenna: RTKLIB .pos, NMEA (.nmea) or CSV with named columns.", None
     )
     rtk_rear: Path | None = input_option("The same of the rear antenna.", None)
+
     track: tuple[Path, ...] = track_option()
     vehicle: Path | None = vehicle_option()
+    #: Observation files of either antenna and navigation files, for Doppler speeds; may be empty.
     front: tuple[Path, ...] = input_option(
         "RINEX observation file of the front antenna, for Doppler speeds; repeat it for several.", (), metavar="OBS"
     )
     rear: tuple[Path, ...] = input_option("The same of the rear antenna.", (), metavar="OBS")
     nav: tuple[Path, ...] = input_option("RINEX navigation file, for Doppler speeds; repeat it for several.", ())
+
     pulses: Path | None = input_option(
         "Tachometer: time_gpst with count, distance_m, or one row per pulse; direction if known.",
         None,
@@ -89,26 +82,17 @@ class ReferenceInputs(InputFiles):
 
 
 class ReferenceOptions(Settings):
-    """Options that do not change the reference.
+    """Options that do not change the reference."""
 
-    Attributes
-    ----------
-    broken_lines : {"stop", "count"}
-        What to do with lines that cannot be read.
-    overwrite : {"refuse", "replace"}
-    track : TrackReading
-    columns : ColumnNames
-        Of positions in CSV.
-    date : date or None
-        Of NMEA logs that have none (UTC), and of RTCM 3 logs (to within half a week).
-    """
-
+    #: Of NMEA logs that have none (UTC), and of RTCM 3 logs (to within half a week).
     date: dt.date | None = option(
         "UTC date of an NMEA log without RMC sentences, or of an RTCM 3 log.", None, metavar="DATE"
     )
+    #: What to do with lines that cannot be read.
     broken_lines: BrokenLines = option(
         "Count broken lines of the input files and continue, instead of stopping.", "stop", name="--lenient"
     )
+
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
     track: TrackReading = Field(default_factory=TrackReading)
-    columns: ColumnNames = Field(default_factory=ColumnNames)
+    columns: ColumnNames = Field(default_factory=ColumnNames)  #: Of positions in CSV.

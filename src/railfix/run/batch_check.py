@@ -46,12 +46,7 @@ BATCH_COLUMNS: Final[Mapping[str, Column[CheckedAntenna]]] = by_name(
 
 @dataclass(kw_only=True)
 class BatchCheck:
-    """Epochs of one antenna, an epoch a second, with the places that the filter gave them.
-
-    Attributes
-    ----------
-    trajectory : Trajectory
-    """
+    """Epochs of one antenna, an epoch a second, with the places that the filter gave them."""
 
     trajectory: Trajectory
     _epochs: list[GnssEpochs] = field(default_factory=list)

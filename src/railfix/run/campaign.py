@@ -36,37 +36,23 @@ class Campaign(Settings):
 
     Fields that a pattern shares with `front` must agree: ``nav/{day}.nav*`` gives each run the files of its day,
     ``{line}/track.csv`` the track of its line. Names without fields or ``*`` are files of every run.
-
-    Attributes
-    ----------
-    front, rear : str
-        Patterns of the logs: ``logs/{train}/{day}/front.obs*``. Logs with the same fields are one run; several files
-        of one antenna are joined in the order of their names. `rear` may be empty.
-    nav, sp3 : str
-        Patterns of navigation and precise orbit files. `sp3` may be empty.
-    track : tuple of str
-        Patterns of the track's files, joined to a route in this order.
-    vehicle, tachometer, inertial, radar : str
-        Patterns, each of one file a run; may be empty.
-    reference : str
-        Pattern of the reference trajectory of a run, for the page on the campaign; may be empty.
-    config : Path or None
-    options : RunOptions
-        Of every run.
     """
 
+    #: Patterns of the logs: ``logs/{train}/{day}/front.obs*``. Logs with the same fields are one run; several files of
+    #: one antenna are joined in the order of their names. `rear` may be empty.
     front: str
-    nav: str
-    track: tuple[str, ...]
+    nav: str  #: Pattern of navigation files; that of precise orbits (`sp3`) may be empty.
+    track: tuple[str, ...]  #: Patterns of the track's files, joined to a route in this order.
     rear: str = ""
     sp3: str = ""
+    #: Patterns, each of one file a run; may be empty.
     vehicle: str = ""
     tachometer: str = ""
     inertial: str = ""
     radar: str = ""
-    reference: str = ""
+    reference: str = ""  #: Pattern of the reference trajectory of a run, for the page on the campaign; may be empty.
     config: Path | None = None
-    options: RunOptions = RunOptions()
+    options: RunOptions = RunOptions()  #: Of every run.
 
 
 #: Patterns of several files a run, and of one.

@@ -26,18 +26,10 @@ WITHOUT_EFFECT: Final = (("section", "predicted_sigmas"),)
 
 @dataclass(frozen=True, kw_only=True)
 class RunRecord:
-    """Record of a run: ``run.json`` in the folder that `run_files` wrote.
+    """Record of a run: ``run.json`` in the folder that `run_files` wrote."""
 
-    Attributes
-    ----------
-    path : Path
-        The folder.
-    record : mapping
-        ``run.json``.
-    """
-
-    path: Path
-    record: Mapping[str, Any]
+    path: Path  #: The folder.
+    record: Mapping[str, Any]  #: ``run.json``.
 
     def part(self, name: str) -> dict[str, Any]:
         """Return a table of the record.

@@ -123,44 +123,20 @@ def _one_by_one(rows: pl.LazyFrame, figures: Mapping[str, pl.Expr]) -> dict[str,
 
 @dataclass(frozen=True, kw_only=True)
 class RunProvenance:
-    """What a run was made from.
+    """What a run was made from."""
 
-    Attributes
-    ----------
-    files : sequence of mapping
-        Inputs with size and hash.
-    packages : mapping of str to str
-        `package_versions`.
-    asked : mapping
-        Settings as given.
-    config : Config
-        Settings that were in force.
-    options : RunOptions
-        Choices that are no settings of the positions.
-    line : mapping
-        Facts of the track map, the vehicle and the trajectories.
-    navigation : Navigation
-    """
-
-    files: Sequence[Mapping[str, Any]]
-    packages: Mapping[str, str]
-    asked: Mapping[str, Any]
-    config: Config
-    options: RunOptions
-    line: Mapping[str, Any]
+    files: Sequence[Mapping[str, Any]]  #: Inputs with size and hash.
+    packages: Mapping[str, str]  #: `package_versions`.
+    asked: Mapping[str, Any]  #: Settings as given.
+    config: Config  #: Settings that were in force.
+    options: RunOptions  #: Choices that are no settings of the positions.
+    line: Mapping[str, Any]  #: Facts of the track map, the vehicle and the trajectories.
     navigation: Navigation
 
 
 @dataclass(frozen=True, kw_only=True)
 class Figures:
-    """Percentiles of a run by antenna; empty where there are none.
-
-    Attributes
-    ----------
-    sigma : mapping of str to AlongSigma
-    levels : mapping of str to Levels
-    tracks : mapping of str to Filtered
-    """
+    """Percentiles of a run by antenna; empty where there are none."""
 
     sigma: Mapping[str, AlongSigma] = field(default_factory=dict)
     levels: Mapping[str, Levels] = field(default_factory=dict)

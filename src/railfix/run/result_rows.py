@@ -26,33 +26,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ResultRows:
-    """What is made of each chunk of results.
-
-    Attributes
-    ----------
-    folder : OutputFolder
-    line : OpenedLine
-    observations : bool
-        Whether rows of observations are wanted.
-    checks : SensorChecks or None
-        Takes those of the first antenna, where there are sensors.
-    replays : mapping of str to Replays
-        Keeps what the filter was given, by antenna; empty where nothing is smoothed.
-    batches : mapping of str to BatchCheck
-        The same, of the epochs that a batch is compared with.
-    passings : bool
-        Whether rows of balises and virtual ones are wanted.
-    balise_notes : list of str
-        Balises so far that were missed, or read where they are not.
-    """
+    """What is made of each chunk of results."""
 
     folder: OutputFolder
     line: OpenedLine
-    observations: bool
-    checks: SensorChecks | None
-    replays: Mapping[str, Replays]
+    observations: bool  #: Whether rows of observations are wanted.
+    checks: SensorChecks | None  #: Takes those of the first antenna, where there are sensors.
+    replays: Mapping[str, Replays]  #: Keeps what the filter was given, by antenna; empty where nothing is smoothed.
+    #: The same, of the epochs that a batch is compared with.
     batches: Mapping[str, BatchCheck] = field(default_factory=dict)
-    passings: bool = False
+    passings: bool = False  #: Whether rows of balises and virtual ones are wanted.
+    #: Balises so far that were missed, or read where they are not.
     balise_notes: list[str] = field(default_factory=list)
 
     def write(self, result: Result) -> None:

@@ -41,14 +41,9 @@ _RANGE_M: Final = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class SensorChecks:
-    """Positions and speeds of one antenna by satellites, to compare the sensors on board with.
+    """Positions and speeds of one antenna by satellites, to compare the sensors on board with."""
 
-    Attributes
-    ----------
-    speeds, places : list of polars.DataFrame
-        By Dopplers (`doppler_speeds`), and of single epochs that passed every check; of each chunk.
-    """
-
+    #: By Dopplers (`doppler_speeds`), and of single epochs that passed every check; of each chunk.
     speeds: list[pl.DataFrame] = field(default_factory=list)
     places: list[pl.DataFrame] = field(default_factory=list)
 

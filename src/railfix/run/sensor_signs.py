@@ -44,17 +44,11 @@ _GRAVITY_SHARE: Final = 0.12
 
 @dataclass(frozen=True)
 class PositionMotion:
-    """Motion of an antenna by its places, M cells of time; NaN where a neighbour is missing.
+    """Motion of an antenna by its places, M cells of time; NaN where a neighbour is missing."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (M,)
-    speed_mps, acceleration_mps2, gradient, heading_rate_radps : ndarray, shape (M,)
-        Toward rising chainage; the gradient is that of the line, as climb over horizontal length, and the heading, too,
-        with its rate positive to the right.
-    """
-
-    time: Datetimes
+    time: Datetimes  #: Shape (M,).
+    #: Toward rising chainage; the gradient is that of the line, as climb over horizontal length, and the heading, too,
+    #: with its rate positive to the right; shape (M,).
     speed_mps: Floats
     acceleration_mps2: Floats
     gradient: Floats

@@ -37,28 +37,19 @@ TRACK_FILE: Final = "track.csv"
 
 @dataclass(frozen=True, kw_only=True)
 class OpenedLine:
-    """The line and the path of each antenna on it.
-
-    Attributes
-    ----------
-    frame : FrameShift or None
-        How the track was moved to the frame of the satellites; None where no time was given.
-    route : RouteOfLog or None
-        The route through a network of tracks that was found from the log; None where the files are one route.
-    from_file : bool
-        Whether the track is that of its files as they are: no route of a network, no heights of a second source, and
-        not moved to another frame.
-    preparing : tuple of str
-        Notes on the cache of prepared lines.
-    """
+    """The line and the path of each antenna on it."""
 
     track: Track
     vehicle: Vehicle | None
     trajectories: dict[str, Trajectory]
+    #: How the track was moved to the frame of the satellites; None where no time was given.
     frame: FrameShift | None = None
+    #: The route through a network of tracks that was found from the log; None where the files are one route.
     route: RouteOfLog | None = None
+    #: Whether the track is that of its files as they are: no route of a network, no heights of a second source, and not
+    #: moved to another frame.
     from_file: bool = True
-    preparing: tuple[str, ...] = ()
+    preparing: tuple[str, ...] = ()  #: Notes on the cache of prepared lines.
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -235,31 +226,18 @@ def _paths(
 
 @dataclass(kw_only=True)
 class Log:
-    """The files of one antenna's log, read piece by piece.
-
-    Attributes
-    ----------
-    start, end : datetime or None
-        First epoch, and the time before which the last one lies.
-    date : datetime64 or None
-        Of RTCM 3 logs; see `railfix.run.options.LogReading`.
-    share : float
-        Part of the files that has been read, 0 to 1.
-    problems : list of str
-        Sentences on what was broken and passed over.
-    skipped : Counter of str
-        Skipped items, counted by kind.
-    """
+    """The files of one antenna's log, read piece by piece."""
 
     paths: tuple[Path, ...]
     chunk_epochs: int
     broken_lines: BrokenLines = "stop"
+    #: First epoch, and the time before which the last one lies.
     start: datetime | None = None
     end: datetime | None = None
-    date: np.datetime64 | None = None
-    share: float = 0.0
-    problems: list[str] = field(default_factory=list)
-    skipped: Counter[str] = field(default_factory=Counter)
+    date: np.datetime64 | None = None  #: Of RTCM 3 logs; see `railfix.run.options.LogReading`.
+    share: float = 0.0  #: Part of the files that has been read, 0 to 1.
+    problems: list[str] = field(default_factory=list)  #: Sentences on what was broken and passed over.
+    skipped: Counter[str] = field(default_factory=Counter)  #: Skipped items, counted by kind.
 
     def parts(self) -> Iterator[Observations]:
         """Pieces of the log in order of time; errors as of `railfix.io.rinex.scan_observations`."""

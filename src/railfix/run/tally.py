@@ -47,76 +47,50 @@ class MapOffsetFound:
 
 @dataclass(kw_only=True)
 class AntennaTally:
-    """Counts of one antenna.
+    """Counts of one antenna."""
 
-    Attributes
-    ----------
-    min_satellites : int
-        Satellites that an epoch needs.
-    judged : dict of str to bool
-        By verdict of a screen, whether it has judged anything.
-    epochs, observed, positioned : int
-        Epochs; those with at least one pseudorange; those with coordinates.
-    status : Counter of str
-    status_positioned : Counter of str
-        Of the epochs with coordinates.
-    short_first, short_only : Counter of str
-        Epochs with too few satellites by the reason that, in the order of the reasons, left too few, and by a
-        reason without which alone there would be enough. `not_observed`: too few were observed; `used`: enough
-        were used, but their clocks left no range for the place.
-    first_reason, only_reason : Counter of str
-        Rejected observations by the first reason that applied, and those that one reason alone rejected.
-    observations, used : int
-        Pseudoranges, and those that were used.
-    satellites : Counter of str
-        Observations by satellite.
-    unrecorded : Counter of str
-        Observations by satellite for which no navigation record was there or valid.
-    first, last : datetime64[ns] or None
-    conventional : int
-        Epochs with a conventional position.
-    conventional_nearest_m : float
-        Least distance of a conventional position from the trajectory; NaN when there was none.
-    map_detectable_m : ndarray, shape (2, 2) [m]
-        Least and largest offset across (first column) and up that a window finds; NaN without any window.
-    level_status : Counter of str
-        Epochs by status of the protection level; empty where levels are off.
-    without_budget : int
-        Epochs without a level because more faults than can be left out are likelier than the risk allows.
-    map_offset : MapOffsetFound or None
-        Where the 3-D positions contradicted the map most; None before there were enough.
-    interference : dict of str to (int, datetime64[ns])
-        Epochs with each sign of interference, and the first of them.
-    left_out, lasting : dict of str to (int, datetime64[ns])
-        Epochs at which the filter, and the single epochs, left a satellite's codes out as wrong for long, and the first
-        of them.
-    """
-
-    min_satellites: int = 3
-    judged: dict[str, bool] = field(default_factory=dict)
+    min_satellites: int = 3  #: Satellites that an epoch needs.
+    judged: dict[str, bool] = field(default_factory=dict)  #: By verdict of a screen, whether it has judged anything.
+    #: Epochs; those with at least one pseudorange; those with coordinates.
     epochs: int = 0
     observed: int = 0
     positioned: int = 0
+    #: Pseudoranges, and those that were used.
     observations: int = 0
     used: int = 0
+
     status: Counter[str] = field(default_factory=Counter)
-    status_positioned: Counter[str] = field(default_factory=Counter)
+    status_positioned: Counter[str] = field(default_factory=Counter)  #: Of the epochs with coordinates.
+    #: Epochs with too few satellites by the reason that, in the order of the reasons, left too few, and by a reason
+    #: without which alone there would be enough. `not_observed`: too few were observed; `used`: enough were used, but
+    #: their clocks left no range for the place.
     short_first: Counter[str] = field(default_factory=Counter)
     short_only: Counter[str] = field(default_factory=Counter)
+    #: Rejected observations by the first reason that applied, and those that one reason alone rejected.
     first_reason: Counter[str] = field(default_factory=Counter)
     only_reason: Counter[str] = field(default_factory=Counter)
-    satellites: Counter[str] = field(default_factory=Counter)
+    satellites: Counter[str] = field(default_factory=Counter)  #: Observations by satellite.
+    #: Observations by satellite for which no navigation record was there or valid.
     unrecorded: Counter[str] = field(default_factory=Counter)
+
     first: np.datetime64 | None = None
     last: np.datetime64 | None = None
-    conventional: int = 0
+    conventional: int = 0  #: Epochs with a conventional position.
+    #: Least distance of a conventional position from the trajectory; NaN when there was none.
     conventional_nearest_m: float = float("nan")
+    #: Epochs by status of the protection level; empty where levels are off.
     level_status: Counter[str] = field(default_factory=Counter)
+    #: Epochs without a level because more faults than can be left out are likelier than the risk allows.
     without_budget: int = 0
+    #: Where the 3-D positions contradicted the map most; None before there were enough.
     map_offset: MapOffsetFound | None = None
+    #: Epochs at which the filter, and the single epochs, left a satellite's codes out as wrong for long, and the first
+    #: of them.
     left_out: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
     lasting: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
+    #: Epochs with each sign of interference, and the first of them.
     interference: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
+    #: Least and largest offset across (first column) and up that a window finds; NaN without any window; shape (2, 2).
     map_detectable_m: Floats = field(default_factory=lambda: np.full((2, 2), np.nan))
 
     def add(self, result: AntennaResult) -> None:
@@ -256,26 +230,14 @@ def _nonzero(counts: Counter[str]) -> dict[str, int]:
 
 @dataclass(kw_only=True)
 class Tally:
-    """Counts of all antennas of a run.
+    """Counts of all antennas of a run."""
 
-    Attributes
-    ----------
-    min_satellites : int
-        Satellites that an epoch needs.
-    antennas : dict of str to AntennaTally
-    notes : dict of str
-        As keys, in the order in which they came.
-    chunks : list of (datetime64[ns], int, float)
-        First epoch of each chunk, its epochs of all antennas, and the time since the chunk before [s].
-    order : AntennaOrder, optional
-        Test of the order of two antennas.
-    """
-
-    min_satellites: int = 3
+    min_satellites: int = 3  #: Satellites that an epoch needs.
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
-    notes: dict[str, None] = field(default_factory=dict)
+    notes: dict[str, None] = field(default_factory=dict)  #: As keys, in the order in which they came.
+    #: First epoch of each chunk, its epochs of all antennas, and the time since the chunk before [s].
     chunks: list[tuple[np.datetime64, int, float]] = field(default_factory=list)
-    order: AntennaOrder | None = None
+    order: AntennaOrder | None = None  #: Test of the order of two antennas.
 
     def add(self, result: Result) -> None:
         """Count one more chunk."""

@@ -23,14 +23,9 @@ from railfix.screens.base import (
 
 
 class ElevationLimits(Settings):
-    """Limits of the elevation mask.
+    """Limits of the elevation mask."""
 
-    Attributes
-    ----------
-    mask_deg : float
-        Satellites below are rejected; P1 3.3 and table 6 use 20.
-    """
-
+    #: Satellites below are rejected; P1 3.3 and table 6 use 20.
     mask_deg: float = Field(default=20.0, ge=-90.0, lt=90.0)
 
 

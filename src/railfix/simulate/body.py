@@ -30,20 +30,13 @@ _RAIL_HEAD_M = 0.070
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaTruth:
-    """True positions of one antenna at n positions of the vehicle's middle.
+    """True positions of one antenna at n positions of the vehicle's middle."""
 
-    Attributes
-    ----------
-    ecef_m : ndarray, shape (n, 3) [m]
-    chainage_m : ndarray, shape (n,) [m]
-        Centreline point in the plane through the antenna perpendicular to the line between the bogie centres.
-    forward : ndarray, shape (n, 3)
-        Unit vector of the body's long axis.
-    """
-
-    ecef_m: Floats
+    ecef_m: Floats  #: Shape (n, 3).
+    #: Centreline point in the plane through the antenna perpendicular to the line between the bogie centres, shape
+    #: (n,).
     chainage_m: Floats
-    forward: Floats
+    forward: Floats  #: Unit vector of the body's long axis, shape (n, 3).
 
 
 def antenna_truth(

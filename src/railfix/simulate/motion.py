@@ -23,22 +23,14 @@ _ROUNDS: Final = 20
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """Pieces of constant jerk (without a limit of the jerk: of constant acceleration); the last one continues.
+    """Pieces of constant jerk (without a limit of the jerk: of constant acceleration); the last one continues."""
 
-    Attributes
-    ----------
-    time_s : ndarray, shape (P,) [s]
-        Start of each piece, rising from 0.
-    chainage_m, speed_mps, acceleration_mps2 : ndarray, shape (P,)
-        At the start of the piece; signs are those of rising chainage.
-    jerk_mps3 : ndarray, shape (P,), or float [m/s^3]
-    """
-
-    time_s: Floats
+    time_s: Floats  #: Start of each piece, rising from 0; shape (P,).
+    #: At the start of the piece; signs are those of rising chainage; shape (P,).
     chainage_m: Floats
     speed_mps: Floats
     acceleration_mps2: Floats
-    jerk_mps3: Floats | float = 0.0
+    jerk_mps3: Floats | float = 0.0  #: Shape (P,) [m/s^3].
 
     def at(self, time_s: ArrayLike) -> tuple[Floats, Floats]:
         """Chainage [m] and speed [m/s] at times; before 0 the train stands."""

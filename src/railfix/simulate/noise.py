@@ -88,21 +88,11 @@ class CodeSmoothing:
 
 @dataclass(frozen=True, kw_only=True)
 class LockState:
-    """Lock state of a receiver's channels.
+    """Lock state of a receiver's channels."""
 
-    Attributes
-    ----------
-    lost : ndarray of bool, shape (T, M)
-        Absent.
-    slip_cycles : ndarray, shape (T, M), or 0.0
-        Whole cycles that the phase has moved since the start.
-    loss_of_lock : ndarray of uint8, shape (T, M)
-        Bit 0 at the first epoch after a loss.
-    """
-
-    lost: Masks
-    slip_cycles: Floats | float
-    loss_of_lock: Bytes
+    lost: Masks  #: Absent, shape (T, M).
+    slip_cycles: Floats | float  #: Whole cycles that the phase has moved since the start, shape (T, M).
+    loss_of_lock: Bytes  #: Bit 0 at the first epoch after a loss, shape (T, M).
 
 
 class TrackingNoise:

@@ -25,21 +25,12 @@ _FLIGHT_S: Final = 0.08
 
 @dataclass(frozen=True, kw_only=True)
 class Links:
-    """Signals received at T instants: of one satellite, shapes (T,), or of S satellites, shapes (T, S).
+    """Signals received at T instants: of one satellite, shapes (T,), or of S satellites, shapes (T, S)."""
 
-    Attributes
-    ----------
-    range_m : ndarray, shape (T,) or (T, S) [m]
-        Geometric distance in the frame of reception, the Earth's rotation included.
-    satellite_ecef_m : ndarray, shape (T, 3) or (T, S, 3) [m]
-        At transmission, turned into the frame of reception.
-    clock_s : ndarray, shape (T,) or (T, S) [s]
-        Satellite clock with relativity, without group delay.
-    """
-
+    #: Geometric distance in the frame of reception, the Earth's rotation included; shape (T,) or (T, S).
     range_m: Floats
-    satellite_ecef_m: Floats
-    clock_s: Floats
+    satellite_ecef_m: Floats  #: At transmission, turned into the frame of reception; shape (T, 3) or (T, S, 3).
+    clock_s: Floats  #: Satellite clock with relativity, without group delay; shape (T,) or (T, S).
 
 
 def record_state(

@@ -42,29 +42,15 @@ _BEST_DBHZ: Final = 50.0
 
 @dataclass(frozen=True, kw_only=True)
 class Piece:
-    """Ground truth and observations of one antenna for some epochs.
-
-    Attributes
-    ----------
-    observations : Observations
-    geometry : SightGeometry
-        True positions of antenna and satellites.
-    clock_m : ndarray, shape (T,) [m]
-        Receiver clock times the speed of light.
-    code_sigma_m : ndarray, shape (T, M) [m]
-        Standard deviation of the noise in the codes.
-    clean_code_m : ndarray, shape (T, M) [m]
-        The codes without noise and without disturbances.
-    error_m : ndarray, shape (T, M) [m]
-        Part of `clean_code_m` that comes from `Scenario.errors` and that no model corrects: satellites,
-        atmosphere, faults and inter-system biases.
-    """
+    """Ground truth and observations of one antenna for some epochs."""
 
     observations: Observations
-    geometry: SightGeometry
-    clock_m: Floats
-    code_sigma_m: Floats
-    clean_code_m: Floats
+    geometry: SightGeometry  #: True positions of antenna and satellites.
+    clock_m: Floats  #: Receiver clock times the speed of light, shape (T,).
+    code_sigma_m: Floats  #: Standard deviation of the noise in the codes, shape (T, M).
+    clean_code_m: Floats  #: The codes without noise and without disturbances, shape (T, M).
+    #: Part of `clean_code_m` that comes from `Scenario.errors` and that no model corrects: satellites, atmosphere,
+    #: faults and inter-system biases; shape (T, M).
     error_m: Floats
 
 

@@ -48,31 +48,20 @@ _JOINT_M: Final = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class PlanElement:
-    """One element in plan.
+    """One element in plan."""
 
-    Attributes
-    ----------
-    x_m, y_m : float [m]
-        First point, easting and northing.
-    direction_rad : float [rad]
-        At the first point, counter-clockwise from the x axis.
-    first, last : float [1/m]
-        Curvature at the ends, positive to the left.
-    length_m : float [m]
-    law : str
-        Key of `LAWS`.
-    lean_m : float [m]
-        Of a Viennese bend: height of the centre of gravity times the change of the cant angle, positive where the right
-        rail rises. The law is of the way of the centre of gravity; the track lies beside it by so much.
-    """
-
+    #: First point, easting and northing.
     x_m: float
     y_m: float
-    direction_rad: float
+    direction_rad: float  #: At the first point, counter-clockwise from the x axis.
+    #: Curvature at the ends, positive to the left [1/m].
     first: float
     last: float
+
     length_m: float
-    law: str = "linear"
+    law: str = "linear"  #: Key of `LAWS`.
+    #: Of a Viennese bend: height of the centre of gravity times the change of the cant angle, positive where the right
+    #: rail rises. The law is of the way of the centre of gravity; the track lies beside it by so much.
     lean_m: float = 0.0
 
     def curvature_at(self, way_m: Floats) -> Floats:
@@ -108,26 +97,16 @@ class PlanElement:
 
 @dataclass(frozen=True, kw_only=True)
 class ProfileElement:
-    """One element of the profile: gradient, circular arc or parabola.
+    """One element of the profile: gradient, circular arc or parabola."""
 
-    Attributes
-    ----------
-    start_m, length_m : float [m]
-        Place and length in plan.
-    height_m : float [m]
-        At the start.
-    first, last : float
-        Gradient at the ends [m/m].
-    arc : str
-        ``"circle"`` or ``"parabola"``; a gradient is a parabola whose ends are equal.
-    """
-
+    #: Place and length in plan.
     start_m: float
     length_m: float
-    height_m: float
+    height_m: float  #: At the start.
+    #: Gradient at the ends [m/m].
     first: float
     last: float
-    arc: str = "parabola"
+    arc: str = "parabola"  #: ``"circle"`` or ``"parabola"``; a gradient is a parabola whose ends are equal.
 
     def height_at(self, place_m: Floats) -> Floats:
         """Height [m] at places in plan."""
@@ -172,30 +151,14 @@ def _sine(gradient: float) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class AlignmentPoints:
-    """Points of an alignment in grid coordinates, n points.
+    """Points of an alignment in grid coordinates, n points."""
 
-    Attributes
-    ----------
-    place_m : ndarray, shape (n,)
-        Length in plan from the start of the alignment.
-    xy_m : ndarray, shape (n, 2)
-        Easting and northing.
-    height_m : ndarray, shape (n,)
-        Middle between the rail tops; NaN without a profile.
-    curvature : ndarray, shape (n,) [1/m]
-        Positive to the left.
-    cant_m : ndarray, shape (n,)
-        Right rail above left rail; NaN without cant.
-    gradient : ndarray, shape (n,)
-        NaN without a profile.
-    """
-
-    place_m: Floats
-    xy_m: Floats
-    height_m: Floats
-    curvature: Floats
-    cant_m: Floats
-    gradient: Floats
+    place_m: Floats  #: Length in plan from the start of the alignment, shape (n,).
+    xy_m: Floats  #: Easting and northing, shape (n, 2).
+    height_m: Floats  #: Middle between the rail tops; NaN without a profile; shape (n,).
+    curvature: Floats  #: Positive to the left, shape (n,) [1/m].
+    cant_m: Floats  #: Right rail above left rail; NaN without cant; shape (n,).
+    gradient: Floats  #: NaN without a profile, shape (n,).
 
 
 def alignment_at(

@@ -46,28 +46,15 @@ REALISATIONS: Final = _ITRF | {name: _ITRF[itrf] for itrf, names in _ALIGNED.ite
 
 @dataclass(frozen=True)
 class HeldFrame:
-    """A frame that is a realisation of the ITRF at an epoch.
+    """A frame that is a realisation of the ITRF at an epoch."""
 
-    Attributes
-    ----------
-    itrf : str
-        Name of the realisation.
-    epoch : float [year]
-    plate : str
-        Plate of the ITRF2020 model that carries most of the country.
-    rest_mm : tuple of float [mm a year]
-        What the country moves against that plate, at the least and the most.
-    but : str
-        What else is left out.
-    border : tuple, optional
-        Another plate, and two places (latitude, longitude) of a line to the right of which it carries the country.
-    """
-
-    itrf: str
-    epoch: float
-    plate: str
+    itrf: str  #: Name of the realisation.
+    epoch: float  #: [year].
+    plate: str  #: Plate of the ITRF2020 model that carries most of the country.
+    #: What the country moves against that plate, at the least and the most [mm a year].
     rest_mm: tuple[float, float] = (0.0, 1.0)
-    but: str = ""
+    but: str = ""  #: What else is left out.
+    #: Another plate, and two places (latitude, longitude) of a line to the right of which it carries the country.
     border: tuple[str, tuple[float, float], tuple[float, float]] | None = None
 
     @property

@@ -37,25 +37,16 @@ _SPIRALS: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class Relation:
-    """Connection of two net elements as railML 3 and RailTopoModel have it.
-
-    Attributes
-    ----------
-    name : str
-    first, second : str
-        Names of the elements.
-    first_end, second_end : int
-        0 where the start of the element is meant, 1 where its end.
-    navigable : bool
-        Whether trains pass from one to the other.
-    """
+    """Connection of two net elements as railML 3 and RailTopoModel have it."""
 
     name: str
+    #: Names of the elements.
     first: str
     second: str
+    #: 0 where the start of the element is meant, 1 where its end.
     first_end: int
     second_end: int
-    navigable: bool
+    navigable: bool  #: Whether trains pass from one to the other.
 
 
 def _root(path: str | PathLike[str]) -> Any:

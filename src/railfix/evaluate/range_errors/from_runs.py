@@ -58,27 +58,13 @@ class StationBeside(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class ModelInputs:
-    """A run with its reference trajectory, and optionally a reference station.
+    """A run with its reference trajectory, and optionally a reference station."""
 
-    Attributes
-    ----------
-    run : Path
-        Folder written by ``railfix run``.
-    reference : Path
-        Reference trajectory of its antennas (`railfix.io.reference_log`).
-    base : tuple of Path
-        RINEX files of a nearby reference station; may be empty.
-    base_position_ecef_m : ndarray, shape (3,), or None [m]
-        Of the station, where its header is not good enough.
-    columns : mapping of str
-        Names of columns in a reference that is CSV.
-    """
-
-    run: Path
-    reference: Path
-    base: tuple[Path, ...] = ()
-    base_position_ecef_m: Floats | None = None
-    columns: Mapping[str, str] = field(default_factory=dict)
+    run: Path  #: Folder written by ``railfix run``.
+    reference: Path  #: Reference trajectory of its antennas (`railfix.io.reference_log`).
+    base: tuple[Path, ...] = ()  #: RINEX files of a nearby reference station; may be empty.
+    base_position_ecef_m: Floats | None = None  #: Of the station, where its header is not good enough; shape (3,).
+    columns: Mapping[str, str] = field(default_factory=dict)  #: Names of columns in a reference that is CSV.
 
 
 @dataclass(frozen=True, kw_only=True)

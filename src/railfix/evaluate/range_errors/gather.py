@@ -43,41 +43,25 @@ NO_RANGE: Final = (
 
 
 class GatherLimits(Settings):
-    """Limits for the range errors of a run.
+    """Limits for the range errors of a run."""
 
-    Attributes
-    ----------
-    largest_reference_sigma_m : float [m]
-        Epochs whose reference has a larger standard deviation are left out.
-    largest_reference_gap_s, largest_base_gap_s : float [s]
-        Longest gap of the reference trajectory and of the reference station that is interpolated over.
-    least_ranges : int
-        Fewest ranges of one constellation, after the screens, from which its receiver clock is estimated.
-    """
-
+    #: Epochs whose reference has a larger standard deviation are left out.
     largest_reference_sigma_m: float = Field(default=0.5, gt=0.0)
+    #: Longest gap of the reference trajectory and of the reference station that is interpolated over.
     largest_reference_gap_s: float = Field(default=2.5, gt=0.0)
     largest_base_gap_s: float = Field(default=35.0, gt=0.0)
+    #: Fewest ranges of one constellation, after the screens, from which its receiver clock is estimated.
     least_ranges: int = Field(default=4, ge=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RangeErrors:
-    """Errors of n pseudoranges with time and satellite.
-
-    Attributes
-    ----------
-    samples : ErrorSamples
-    time : ndarray of datetime64[ns], shape (n,)
-    satellite : ndarray of str, shape (n,)
-    epochs : int
-        Epochs with a reference position.
-    """
+    """Errors of n pseudoranges with time and satellite."""
 
     samples: ErrorSamples
-    time: Datetimes
-    satellite: Strings
-    epochs: int
+    time: Datetimes  #: Shape (n,).
+    satellite: Strings  #: Shape (n,).
+    epochs: int  #: Epochs with a reference position.
 
 
 def range_errors(

@@ -20,43 +20,26 @@ _LONGEST_SILENCE_S: Final = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class PowerState:
-    """State after a chunk, by channel ("G01" + "1C").
+    """State after a chunk, by channel ("G01" + "1C")."""
 
-    Attributes
-    ----------
-    channel : ndarray of str, shape (K,)
-    peak_db : ndarray, shape (K,)
-        Peak of C/N0 plus the decay since the GPS epoch; -inf before the first.
-    first_s, last_s : ndarray, shape (K,) [s]
-        When its present time of tracking began, and its last observation, since the GPS epoch; NaN before.
-    gain : float
-        Peak of the gain's logarithm plus the decay since the GPS epoch.
-    """
-
-    channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))
+    channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))  #: Shape (K,).
+    #: Peak of C/N0 plus the decay since the GPS epoch; -inf before the first; shape (K,).
     peak_db: Floats = field(default_factory=lambda: np.zeros(0))
+    #: When its present time of tracking began, and its last observation, since the GPS epoch; NaN before; shape (K,).
     first_s: Floats = field(default_factory=lambda: np.zeros(0))
     last_s: Floats = field(default_factory=lambda: np.zeros(0))
-    gain: float = -np.inf
+    gain: float = -np.inf  #: Peak of the gain's logarithm plus the decay since the GPS epoch.
 
 
 @dataclass(frozen=True, kw_only=True)
 class PowerSigns:
-    """Statistics of T epochs; NaN where too few satellites are compared.
+    """Statistics of T epochs; NaN where too few satellites are compared."""
 
-    Attributes
-    ----------
-    fall_db, spread_db : ndarray, shape (T,) [dB]
-        Median and standard deviation of the falls of C/N0 below the recent peak of each satellite.
-    difference_db : ndarray, shape (T,) [dB]
-        Standard deviation of C/N0 over the satellites.
-    gain_fall : ndarray, shape (T,)
-        Fall of the gain as a share of its recent peak; NaN where the receiver does not give it.
-    """
-
+    #: Median and standard deviation of the falls of C/N0 below the recent peak of each satellite, shape (T,).
     fall_db: Floats
     spread_db: Floats
-    difference_db: Floats
+    difference_db: Floats  #: Standard deviation of C/N0 over the satellites, shape (T,).
+    #: Fall of the gain as a share of its recent peak; NaN where the receiver does not give it; shape (T,).
     gain_fall: Floats
 
 

@@ -15,20 +15,12 @@ _NEVER = np.datetime64("NaT", "ns")
 
 @dataclass(frozen=True, kw_only=True)
 class HeldState:
-    """State of C conditions after a chunk.
+    """State of C conditions after a chunk."""
 
-    Attributes
-    ----------
-    time : datetime64[ns]
-        Last epoch; NaT before the first.
-    run_ns : ndarray of int64, shape (C,) [ns]
-        How long each condition had held.
-    last : ndarray of datetime64[ns], shape (C,)
-        When it last counted; NaT for never.
-    """
-
-    time: np.datetime64 = field(default_factory=lambda: _NEVER)
+    time: np.datetime64 = field(default_factory=lambda: _NEVER)  #: Last epoch; NaT before the first.
+    #: How long each condition had held, shape (C,).
     run_ns: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    #: When it last counted; NaT for never; shape (C,).
     last: Datetimes = field(default_factory=lambda: np.zeros(0, dtype="datetime64[ns]"))
 
 

@@ -55,26 +55,15 @@ def fields(bits: Bytes, layout: Mapping[str, Field]) -> dict[str, Floats]:
 
 @dataclass(frozen=True, kw_only=True)
 class Subframes:
-    """Raw navigation words as UBX has them, N rows in the order of the stream.
-
-    Attributes
-    ----------
-    signal : ndarray of int, shape (N,)
-        Signal number (UBX sigId; other formats are translated to it).
-    words : ndarray of uint32, shape (N, 10)
-        Words of 30 or 32 bits, right-aligned; unused ones 0.
-    order : ndarray of int, shape (N,)
-        Place in the stream, to tell which epoch came before.
-    skipped : mapping of str to int
-        Pages left out, by reason.
-    """
+    """Raw navigation words as UBX has them, N rows in the order of the stream."""
 
     satellite: Strings
-    signal: Integers
+    signal: Integers  #: Signal number (UBX sigId; other formats are translated to it); shape (N,).
     glonass_channel: Integers
+    #: Words of 30 or 32 bits, right-aligned; unused ones 0; shape (N, 10).
     words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]
-    order: Integers
-    skipped: Mapping[str, int] = field(default_factory=dict)
+    order: Integers  #: Place in the stream, to tell which epoch came before; shape (N,).
+    skipped: Mapping[str, int] = field(default_factory=dict)  #: Pages left out, by reason.
 
     def __len__(self) -> int:
         return len(self.satellite)
@@ -105,20 +94,14 @@ def joined_subframes(first: Subframes, second: Subframes) -> Subframes:
 
 @dataclass(frozen=True, kw_only=True)
 class SbasFrames:
-    """SBAS messages as a receiver passes them on, N of them; parity and preamble not checked here.
+    """SBAS messages as a receiver passes them on, N of them; parity and preamble not checked here."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (N,)
-        1 ns after the receiver's epoch before the message, because that epoch came too early to use it; NaT before the
-        receiver knew the time.
-    octets : ndarray of uint8, shape (N, 32)
-        The 250 bits from the first preamble bit on, zero behind.
-    """
-
+    #: 1 ns after the receiver's epoch before the message, because that epoch came too early to use it; NaT before the
+    #: receiver knew the time; shape (N,).
     time: Datetimes
+
     prn: Integers
-    octets: Bytes
+    octets: Bytes  #: The 250 bits from the first preamble bit on, zero behind; shape (N, 32).
 
     def __len__(self) -> int:
         return len(self.time)

@@ -31,40 +31,22 @@ _ADDRESS: Final = np.array([[c in text for c in range(256)] for text in (_LETTER
 
 @dataclass(frozen=True, kw_only=True)
 class Frames:
-    """Frames with valid checksums, in order of the stream.
+    """Frames with valid checksums, in order of the stream."""
 
-    Attributes
-    ----------
-    data : ndarray of uint8
-        The buffer.
-    protocol : ndarray of str, shape (N,)
-        "ubx", "rtcm3", "sbf" or "nmea".
-    kind : ndarray of int, shape (N,)
-        UBX: class * 256 + id; RTCM 3: message number; SBF: block number; NMEA: 0.
-    start, end : ndarray of int, shape (N,)
-        Payload in `data`: UBX without header and checksum; RTCM 3 likewise (message number included);
-        SBF from the time stamp on (after the 8 bytes of header); NMEA from ``$`` up to, not including, ``*``
-        (the end of its line belongs to the frame).
-    frame_start : ndarray of int, shape (N,)
-        First byte of the frame, its sync included.
-    consumed : int
-        Bytes of the buffer that are dealt with; the rest may be the start of a frame, and belongs before
-        the next buffer.
-    skipped_bytes : int
-        Of those, bytes outside frames.
-    bad_checksums : int
-        Complete candidates (sync and length plausible) outside frames whose checksum failed.
-    """
-
-    data: Bytes
-    protocol: Strings
-    kind: Integers
+    data: Bytes  #: The buffer.
+    protocol: Strings  #: "ubx", "rtcm3", "sbf" or "nmea"; shape (N,).
+    kind: Integers  #: UBX: class * 256 + id; RTCM 3: message number; SBF: block number; NMEA: 0; shape (N,).
+    #: Payload in `data`: UBX without header and checksum; RTCM 3 likewise (message number included); SBF from the time
+    #: stamp on (after the 8 bytes of header); NMEA from ``$`` up to, not including, ``*`` (the end of its line belongs
+    #: to the frame); shape (N,).
     start: Indices
     end: Indices
-    frame_start: Indices
+    frame_start: Indices  #: First byte of the frame, its sync included; shape (N,).
+    #: Bytes of the buffer that are dealt with; the rest may be the start of a frame, and belongs before the next
+    #: buffer.
     consumed: int
-    skipped_bytes: int
-    bad_checksums: int
+    skipped_bytes: int  #: Of those, bytes outside frames.
+    bad_checksums: int  #: Complete candidates (sync and length plausible) outside frames whose checksum failed.
 
     def __len__(self) -> int:
         return len(self.start)

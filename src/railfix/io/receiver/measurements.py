@@ -19,48 +19,26 @@ _SLIP, _HALF_CYCLE = 1, 2
 
 @dataclass(frozen=True, kw_only=True)
 class Measurements:
-    """Measurements of a log, N rows in T epochs.
+    """Measurements of a log, N rows in T epochs."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-        Time tags in the order of the stream.
-    epoch : ndarray of int, shape (N,)
-        Epoch of each measurement.
-    satellite, signal : ndarray of str, shape (N,)
-        Blank where RINEX has no name for it: not used, counted.
-    code_m, phase_cycles, doppler_hz, cn0_dbhz : ndarray, shape (N,)
-        NaN where absent or declared invalid by the receiver.
-    lock_s : ndarray, shape (N,) [s]
-        Time that the phase has been tracked without a break (at least).
-    half_cycle : ndarray of bool, shape (N,)
-        Half a cycle is unresolved.
-    polarity : ndarray of int, shape (N,)
-        A change means a jump of half a cycle.
-    glonass_channel : ndarray of int, shape (N,)
-        Frequency channel where the satellite is of GLONASS.
-    leap_seconds : int or None
-    receiver : str
-    skipped : mapping of str to int
-    alarm, gain : ndarray, shape (T,), or None
-        Indicators at each epoch (`Observations.receiver_alarm`, `Observations.front_end_gain`).
-    """
-
-    time: Datetimes
-    epoch: Indices
+    time: Datetimes  #: Time tags in the order of the stream, shape (T,).
+    epoch: Indices  #: Epoch of each measurement, shape (N,).
+    #: Blank where RINEX has no name for it: not used, counted; shape (N,).
     satellite: Strings
     signal: Strings
+    #: NaN where absent or declared invalid by the receiver, shape (N,).
     code_m: Floats
     phase_cycles: Floats
     doppler_hz: Floats
     cn0_dbhz: Floats
-    lock_s: Floats
-    half_cycle: Masks
-    polarity: Integers
-    glonass_channel: Integers
+    lock_s: Floats  #: Time that the phase has been tracked without a break (at least), shape (N,).
+    half_cycle: Masks  #: Half a cycle is unresolved, shape (N,).
+    polarity: Integers  #: A change means a jump of half a cycle, shape (N,).
+    glonass_channel: Integers  #: Frequency channel where the satellite is of GLONASS, shape (N,).
     leap_seconds: int | None = None
     receiver: str = ""
     skipped: Mapping[str, int] = field(default_factory=dict)
+    #: Indicators at each epoch (`Observations.receiver_alarm`, `Observations.front_end_gain`); shape (T,).
     alarm: Bytes | None = None
     gain: Floats | None = None
 

@@ -49,21 +49,11 @@ _KEEP: Final = np.array(
 
 @dataclass(frozen=True)
 class Fields:
-    """Values of fields, shape (n, k): n satellite lines by k observation types.
+    """Values of fields, shape (n, k): n satellite lines by k observation types."""
 
-    Attributes
-    ----------
-    value : ndarray of float64
-        NaN where blank, and where `bad`.
-    lock : ndarray of uint8
-        Loss-of-lock digit, 0 where blank.
-    bad : ndarray of bool
-        The field is neither blank nor a number, or one of its two indicators is no digit.
-    """
-
-    value: Floats
-    lock: Bytes
-    bad: Masks
+    value: Floats  #: NaN where blank, and where `bad`.
+    lock: Bytes  #: Loss-of-lock digit, 0 where blank.
+    bad: Masks  #: The field is neither blank nor a number, or one of its two indicators is no digit.
 
 
 def joined(parts: Sequence[Fields]) -> Fields:

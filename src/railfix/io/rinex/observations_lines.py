@@ -16,25 +16,14 @@ _ZERO: Final = ord("0")
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines of a block of text.
+    """Lines of a block of text."""
 
-    Attributes
-    ----------
-    data : ndarray of uint8
-        The text, padded with blanks so that fixed columns may extend beyond the end of a line.
-    start, length : ndarray of int64, shape (n,)
-        Start of each line, and its length without line end (LF or CR LF).
-    stop : ndarray of int64, shape (n,)
-        Start of the next line.
-    number : ndarray of int64, shape (n,)
-        1-based line numbers in the (decompressed) file.
-    """
-
-    data: Bytes
+    data: Bytes  #: The text, padded with blanks so that fixed columns may extend beyond the end of a line.
+    #: Start of each line, and its length without line end (LF or CR LF); shape (n,).
     start: Integers
     length: Integers
-    stop: Integers
-    number: Integers
+    stop: Integers  #: Start of the next line, shape (n,).
+    number: Integers  #: 1-based line numbers in the (decompressed) file, shape (n,).
 
     def __len__(self) -> int:
         return len(self.start)

@@ -23,96 +23,53 @@ from railfix.track.trajectory import Trajectory
 
 
 class ContinuityLimits(Settings):
-    """Limits of the test.
+    """Limits of the test."""
 
-    Attributes
-    ----------
-    phase_m, drift_mps : float
-        Standard deviation of a change of phase: at once, and for each second between the epochs
-        (satellite clocks, delays).
-    aside_m : float
-        Standard deviation across and up of a change of place at once (map points).
-    across_share, up_share : float
-        The same as shares of the distance moved: a position error of 5 m turns the line by 0.017 on a
-        curve of 300 m radius, and by 0.0025 on a vertical curve of 2000 m.
-    sigmas : float
-        Threshold of rejection, in standard deviations of the channel's own residual.
-    max_rejected : int
-        Largest number of channels rejected; where more would be, no channel continues.
-    max_gap_s : float
-        Longest interval that is judged.
-    """
-
+    #: Standard deviation of a change of phase: at once, and for each second between the epochs (satellite clocks,
+    #: delays).
     phase_m: float = Field(default=0.012, gt=0)
     drift_mps: float = Field(default=0.008, gt=0)
+    #: Standard deviation across and up of a change of place at once (map points).
     aside_m: float = Field(default=0.02, gt=0)
+    #: The same as shares of the distance moved: a position error of 5 m turns the line by 0.017 on a curve of 300 m
+    #: radius, and by 0.0025 on a vertical curve of 2000 m.
     across_share: float = Field(default=0.02, gt=0)
     up_share: float = Field(default=0.003, gt=0)
+    #: Threshold of rejection, in standard deviations of the channel's own residual.
     sigmas: float = Field(default=4.5, gt=0)
+    #: Largest number of channels rejected; where more would be, no channel continues.
     max_rejected: int = Field(default=8, ge=0)
-    max_gap_s: float = Field(default=31.0, gt=0)
+    max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is judged.
 
 
 @dataclass(frozen=True, kw_only=True)
 class ContinuityState:
-    """The last epoch of a chunk, by channel.
-
-    Attributes
-    ----------
-    time : datetime64[ns]
-    channels : tuple of (str, str)
-    phase_m : ndarray, shape (M,) [m]
-        Corrected phase; NaN where not used.
-    sat_ecef_m : ndarray, shape (M, 3) [m]
-    arc_m : float
-    """
+    """The last epoch of a chunk, by channel."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     channels: ChannelKeys = ()
-    phase_m: Floats = field(default_factory=lambda: np.empty(0))
-    sat_ecef_m: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    phase_m: Floats = field(default_factory=lambda: np.empty(0))  #: Corrected phase; NaN where not used; shape (M,).
+    sat_ecef_m: Floats = field(default_factory=lambda: np.empty((0, 3)))  #: Shape (M, 3).
     arc_m: float = float("nan")
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackJumps:
-    """Verdict on the change of each phase into its epoch, T epochs by M channels.
+    """Verdict on the change of each phase into its epoch, T epochs by M channels."""
 
-    Attributes
-    ----------
-    jump : ndarray of bool, shape (T, M)
-        True where the phase does not fit: a new arc begins.
-    metric_m : ndarray, shape (T, M) [m]
-        Change of phase less that of the channels kept; NaN where not judged.
-    judged : ndarray of bool, shape (T, M)
-    moved_m : ndarray, shape (T,) [m]
-        Way along the line since the epoch before, from the phases; NaN where not known.
-    moved_sigma_m : ndarray, shape (T,) [m]
-    """
-
-    jump: Masks
-    metric_m: Floats
-    judged: Masks
-    moved_m: Floats
-    moved_sigma_m: Floats
+    jump: Masks  #: True where the phase does not fit: a new arc begins; shape (T, M).
+    metric_m: Floats  #: Change of phase less that of the channels kept; NaN where not judged; shape (T, M).
+    judged: Masks  #: Shape (T, M).
+    moved_m: Floats  #: Way along the line since the epoch before, from the phases; NaN where not known; shape (T,).
+    moved_sigma_m: Floats  #: Shape (T,).
 
 
 class TrackedPhases(NamedTuple):
-    """Phases of T epochs by M channels.
+    """Phases of T epochs by M channels."""
 
-    Attributes
-    ----------
-    phase_m : ndarray, shape (T, M) [m]
-        Corrected phases (`observation_model.corrected_phase_m`), NaN where not used.
-    sat_ecef_m : ndarray, shape (T, M, 3) [m]
-        Satellites where there is a phase.
-    slip : ndarray of bool, shape (T, M)
-        Slips already known: not judged again.
-    """
-
-    phase_m: Floats
-    sat_ecef_m: Floats
-    slip: Masks
+    phase_m: Floats  #: Corrected phases (`observation_model.corrected_phase_m`), NaN where not used; shape (T, M).
+    sat_ecef_m: Floats  #: Satellites where there is a phase, shape (T, M, 3).
+    slip: Masks  #: Slips already known: not judged again; shape (T, M).
 
 
 def track_jumps(

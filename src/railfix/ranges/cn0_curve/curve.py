@@ -61,49 +61,26 @@ def satellite_kind(satellite: str) -> str:
 
 
 class CurveFit(Settings):
-    """Settings of the fit of a curve.
+    """Settings of the fit of a curve."""
 
-    Attributes
-    ----------
-    bin_deg : float [deg]
-        Width of the bins of elevation.
-    least_samples : int
-        A bin of fewer samples is left out.
-    least_bins : int
-        A kind and signal of fewer bins gets no curve.
-    clip_sigma : float
-        Samples further from their bin's median, in robust standard deviations, are left out.
-    """
-
-    bin_deg: float = Field(default=5.0, ge=0.1, le=30.0)
-    least_samples: int = Field(default=30, ge=1)
-    least_bins: int = Field(default=4, ge=2)
+    bin_deg: float = Field(default=5.0, ge=0.1, le=30.0)  #: Width of the bins of elevation.
+    least_samples: int = Field(default=30, ge=1)  #: A bin of fewer samples is left out.
+    least_bins: int = Field(default=4, ge=2)  #: A kind and signal of fewer bins gets no curve.
+    #: Samples further from their bin's median, in robust standard deviations, are left out.
     clip_sigma: float = Field(default=3.0, gt=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Mean:
-    """Mean C/N0 over elevation of one kind of satellites on one signal, B bins.
+    """Mean C/N0 over elevation of one kind of satellites on one signal, B bins."""
 
-    Attributes
-    ----------
-    kind : str
-        Key of `KINDS`.
-    signal : str
-    elevation_deg : ndarray, shape (B,) [deg]
-        Middles of the bins, rising.
-    mean_dbhz, spread_db : ndarray, shape (B,) [dB-Hz], [dB]
-        Mean and robust standard deviation.
-    count : ndarray of int, shape (B,)
-        Samples of each bin.
-    """
-
-    kind: str
+    kind: str  #: Key of `KINDS`.
     signal: str
-    elevation_deg: Floats
+    elevation_deg: Floats  #: Middles of the bins, rising; shape (B,).
+    #: Mean and robust standard deviation, shape (B,) [dB-Hz] [dB].
     mean_dbhz: Floats
     spread_db: Floats
-    count: Integers
+    count: Integers  #: Samples of each bin, shape (B,).
 
     def __post_init__(self) -> None:
         for name in ("elevation_deg", "mean_dbhz", "spread_db", "count"):
@@ -137,44 +114,27 @@ class SourceFile(Settings):
 
 
 class Cn0CurveSource(Settings):
-    """Log that a curve was made from.
+    """Log that a curve was made from."""
 
-    Attributes
-    ----------
-    antenna, receiver, marker : str
-        From the header of the log, as written.
-    start, end : str
-        First and last epoch used, ISO 8601, GPS time.
-    epochs : int
-    position_ecef_m : tuple of float
-        Position of the antenna.
-    railfix_version : str
-    file : tuple of SourceFile
-    """
-
+    #: From the header of the log, as written.
     antenna: str = ""
     receiver: str = ""
     marker: str = ""
+    #: First and last epoch used, ISO 8601, GPS time.
     start: str = ""
     end: str = ""
+
     epochs: int = Field(default=0, ge=0, strict=True)
-    position_ecef_m: tuple[float, ...] = ()
+    position_ecef_m: tuple[float, ...] = ()  #: Position of the antenna.
     railfix_version: str = ""
     file: tuple[SourceFile, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Curve:
-    """Mean C/N0 over elevation of an antenna and receiver.
+    """Mean C/N0 over elevation of an antenna and receiver."""
 
-    Attributes
-    ----------
-    means : tuple of Cn0Mean
-        One a kind and signal.
-    source : Cn0CurveSource
-    """
-
-    means: tuple[Cn0Mean, ...]
+    means: tuple[Cn0Mean, ...]  #: One a kind and signal.
     source: Cn0CurveSource = field(default_factory=Cn0CurveSource)
 
     def __post_init__(self) -> None:

@@ -43,14 +43,7 @@ _BELOW_SHARE: Final = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Calibration:
-    """A curve with the samples it was fitted to.
-
-    Attributes
-    ----------
-    curve : Cn0Curve
-    samples : Cn0Samples
-    notes : tuple of str
-    """
+    """A curve with the samples it was fitted to."""
 
     curve: Cn0Curve
     samples: Cn0Samples

@@ -29,16 +29,9 @@ TAIL_SCORE: Final = 1.0
 
 @dataclass(frozen=True, kw_only=True)
 class Overbound:
-    """Pair of normal distributions that bound a sample, one for each half.
+    """Pair of normal distributions that bound a sample, one for each half."""
 
-    Attributes
-    ----------
-    bias_m : float [m]
-        Distance of their means from zero, to either side.
-    sigma_m : float [m]
-    """
-
-    bias_m: float
+    bias_m: float  #: Distance of their means from zero, to either side.
     sigma_m: float
 
 
@@ -79,52 +72,32 @@ def gaussian_overbound(error_m: Floats) -> Overbound:
 
 
 class ErrorModelFit(Settings):
-    """Settings of the fit of an error model.
-
-    Attributes
-    ----------
-    bins : ErrorBins
-    least_blocks : int
-        Independent passes below which a bin takes the samples of a wider set of bins. 30: its largest error is then
-        about the quantile of 2 standard scores, so that at least the shoulder of the tail was seen.
-    block_s : float [s]
-        Length of the blocks that a satellite's samples are counted in. Errors are correlated over tens of
-        seconds where a train is at rest.
-    """
+    """Settings of the fit of an error model."""
 
     bins: ErrorBins = Field(default_factory=ErrorBins)
+    #: Independent passes below which a bin takes the samples of a wider set of bins. 30: its largest error is then
+    #: about the quantile of 2 standard scores, so that at least the shoulder of the tail was seen.
     least_blocks: int = option(
         "Passes of a satellite (30 s blocks) below which a bin takes the values of a wider one.", 30, metavar="N", ge=1
     )
+    #: Length of the blocks that a satellite's samples are counted in. Errors are correlated over tens of seconds where
+    #: a train is at rest.
     block_s: float = Field(default=30.0, gt=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorSamples:
-    """Errors of single pseudoranges, n samples.
+    """Errors of single pseudoranges, n samples."""
 
-    Attributes
-    ----------
-    error_m : ndarray, shape (n,) [m]
-    elevation_deg, relative_azimuth_deg, cn0_dbhz : ndarray, shape (n,)
-    block : ndarray of int, shape (n,)
-        Number of the satellite's block of time: samples of one block are not independent.
-    used : ndarray of bool, shape (n,)
-        Samples that passed every screen.
-    sigma_m : ndarray, shape (n,) [m]
-        Standard deviation that the protection level of the run gave the range.
-    chainage_m : ndarray, shape (n,) [m]
-        Place of the train; NaN where unknown.
-    """
-
-    error_m: Floats
+    error_m: Floats  #: Shape (n,).
+    #: Shape (n,).
     elevation_deg: Floats
     relative_azimuth_deg: Floats
     cn0_dbhz: Floats
-    block: Integers
-    used: Masks
-    sigma_m: Floats
-    chainage_m: Floats
+    block: Integers  #: Number of the satellite's block of time: samples of one block are not independent; shape (n,).
+    used: Masks  #: Samples that passed every screen, shape (n,).
+    sigma_m: Floats  #: Standard deviation that the protection level of the run gave the range, shape (n,).
+    chainage_m: Floats  #: Place of the train; NaN where unknown; shape (n,).
 
 
 def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStatistics:

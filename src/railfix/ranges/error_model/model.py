@@ -19,28 +19,14 @@ from railfix.core.settings import Settings, option
 
 
 class Conditions(Settings):
-    """Settings of a run that the errors of its corrected pseudoranges depend on.
+    """Settings of a run that the errors of its corrected pseudoranges depend on."""
 
-    Attributes
-    ----------
-    systems : tuple of str
-        Letters of the constellations.
-    signals : dict of str to tuple of str
-        Signals of each constellation in order of preference.
-    screens : tuple of str
-        Active screens.
-    elevation_mask_deg : float [deg]
-    codes : {"raw", "smoothed"}
-        Pseudoranges as received, or smoothed by the carrier phase.
-    ionosphere, troposphere : str
-        Models of the delays: "klobuchar", "saastamoinen", "off", or "sbas".
-    """
-
-    systems: tuple[str, ...]
-    signals: dict[str, tuple[str, ...]]
-    screens: tuple[str, ...]
+    systems: tuple[str, ...]  #: Letters of the constellations.
+    signals: dict[str, tuple[str, ...]]  #: Signals of each constellation in order of preference.
+    screens: tuple[str, ...]  #: Active screens.
     elevation_mask_deg: float = Field(ge=0.0, lt=90.0)
-    codes: Literal["raw", "smoothed"]
+    codes: Literal["raw", "smoothed"]  #: Pseudoranges as received, or smoothed by the carrier phase.
+    #: Models of the delays: "klobuchar", "saastamoinen", "off", or "sbas".
     ionosphere: Literal["klobuchar", "off", "sbas"]
     troposphere: Literal["saastamoinen", "off", "sbas"]
 
@@ -75,23 +61,16 @@ POOLED: Final = ("own", "all azimuths", "all azimuths and C/N0", "all azimuths a
 
 
 class ErrorBins(Settings):
-    """Edges of the bins.
+    """Edges of the bins."""
 
-    Attributes
-    ----------
-    elevation_deg : tuple of float
-        Edges, rising, E + 1 of them.
-    sectors : int
-        Sectors of azimuth relative to the car body, the first one centred ahead, clockwise.
-    cn0_dbhz : tuple of float
-        Edges, rising, C + 1 of them; values beyond the outer ones belong to the outer bins. Observations
-        without C/N0 go into the lowest.
-    """
-
+    #: Edges, rising, E + 1 of them.
     elevation_deg: tuple[Annotated[float, Field(ge=0.0, le=90.0)], ...] = option(
         "Edges of the bins of elevation.", (0.0, 15.0, 30.0, 45.0, 60.0, 90.0), name="--elevations", metavar="DEG,..."
     )
+    #: Sectors of azimuth relative to the car body, the first one centred ahead, clockwise.
     sectors: int = option("Sectors of azimuth, the first centred ahead of the car.", 4, metavar="N", ge=1)
+    #: Edges, rising, C + 1 of them; values beyond the outer ones belong to the outer bins. Observations without C/N0 go
+    #: into the lowest.
     cn0_dbhz: tuple[float, ...] = option(
         "Edges of the bins of C/N0; 0,60 puts all into one.",
         (0.0, 30.0, 35.0, 40.0, 45.0, 60.0),
@@ -136,52 +115,29 @@ class ErrorBins(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class BinStatistics:
-    """Figures of every bin, shape (E, A, C); NaN in bins without samples and without anything to pool.
+    """Figures of every bin, shape (E, A, C); NaN in bins without samples and without anything to pool."""
 
-    Attributes
-    ----------
-    count : ndarray of int
-        Samples of the bin itself.
-    blocks : ndarray of int
-        Passes of a satellite through it, counted once a block of time: samples are correlated.
-    bias_m, sigma_m : ndarray [m]
-        Mean and standard deviation of the samples used for the bin.
-    bound_bias_m, bound_sigma_m : ndarray [m]
-        `overbound.gaussian_overbound` of the same.
-    pooled : ndarray of int
-        Index into `POOLED`: where the bin has too few blocks, the samples of a wider set of bins.
-    """
-
-    count: Integers
-    blocks: Integers
+    count: Integers  #: Samples of the bin itself.
+    blocks: Integers  #: Passes of a satellite through it, counted once a block of time: samples are correlated.
+    #: Mean and standard deviation of the samples used for the bin.
     bias_m: Floats
     sigma_m: Floats
+    #: `overbound.gaussian_overbound` of the same.
     bound_bias_m: Floats
     bound_sigma_m: Floats
-    pooled: Integers
+    pooled: Integers  #: Index into `POOLED`: where the bin has too few blocks, the samples of a wider set of bins.
 
 
 class ErrorModelSource(Settings):
-    """Runs that a model was made from, for its file.
-
-    Attributes
-    ----------
-    runs : tuple of str
-    base : str
-        Marker of the reference station.
-    epochs : int
-    start, end, railfix_version : str
-    files : tuple of (str, str)
-        Names and SHA-256.
-    """
+    """Runs that a model was made from, for its file."""
 
     runs: tuple[str, ...] = ()
-    base: str = ""
+    base: str = ""  #: Marker of the reference station.
     epochs: int = Field(default=0, ge=0)
     start: str = ""
     end: str = ""
     railfix_version: str = ""
-    files: tuple[tuple[str, str], ...] = ()
+    files: tuple[tuple[str, str], ...] = ()  #: Names and SHA-256.
 
 
 #: Measured priors above this come of too few blocks of time to leave a level.
@@ -189,44 +145,30 @@ LARGEST_PRIOR: Final = 0.05
 
 
 class FaultRate(Settings):
-    """Probability that a used range is faulty at a time, measured.
+    """Probability that a used range is faulty at a time, measured."""
 
-    Attributes
-    ----------
-    beyond_sigma : float
-        A range is faulty beyond this many sigmas of the level: 5, which noise passes with 6e-7.
-    ranges, faulty : int
-        Ranges used, and those beyond.
-    blocks, faulty_blocks : int
-        Blocks of time of single satellites, which are independent of each other, and those with a faulty range.
-    prior : float
-        faulty / ranges.
-    upper : float
-        Upper end of the 95 % interval of the prior (Clopper and Pearson, one-sided, by blocks): the `local_prior`
-        to use.
-    together : float
-        Blocks of time with two faulty satellites or more, over what independent satellites give; 0 without any.
-    side_blocks, side_faulty_blocks : int
-        Blocks of time with two low satellites or more on one side of the track, each side counted for itself, and
-        those in which two of these were faulty.
-    side_upper : float
-        Upper end of the 95 % interval of the probability that low satellites of one side are faulty together, by
-        those blocks: the `side_prior` to use, where it is small enough to leave a level. 1 without such blocks.
-    no_level_m : tuple of (float, float) [m]
-        Stretches where local faults are more frequent than on the line (`faulty_stretches`), chainages from and to.
-    """
-
+    #: A range is faulty beyond this many sigmas of the level: 5, which noise passes with 6e-7.
     beyond_sigma: float = Field(gt=0)
+    #: Ranges used, and those beyond.
     ranges: int = Field(ge=0)
     faulty: int = Field(ge=0)
+    #: Blocks of time of single satellites, which are independent of each other, and those with a faulty range.
     blocks: int = Field(ge=0)
     faulty_blocks: int = Field(ge=0)
-    prior: float = Field(ge=0, le=1)
+    prior: float = Field(ge=0, le=1)  #: faulty / ranges.
+    #: Upper end of the 95 % interval of the prior (Clopper and Pearson, one-sided, by blocks): the `local_prior` to
+    #: use.
     upper: float = Field(ge=0, le=1)
+    #: Blocks of time with two faulty satellites or more, over what independent satellites give; 0 without any.
     together: float = Field(ge=0)
+    #: Blocks of time with two low satellites or more on one side of the track, each side counted for itself, and those
+    #: in which two of these were faulty.
     side_blocks: int = Field(default=0, ge=0)
     side_faulty_blocks: int = Field(default=0, ge=0)
+    #: Upper end of the 95 % interval of the probability that low satellites of one side are faulty together, by those
+    #: blocks: the `side_prior` to use, where it is small enough to leave a level. 1 without such blocks.
     side_upper: float = Field(default=1.0, ge=0, le=1)
+    #: Stretches where local faults are more frequent than on the line (`faulty_stretches`), chainages from and to.
     no_level_m: tuple[tuple[float, float], ...] = ()
 
     @property
@@ -237,30 +179,19 @@ class FaultRate(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorModel:
-    """Errors of corrected pseudoranges by bin.
-
-    Attributes
-    ----------
-    bins : ErrorBins
-    before, after : BinStatistics
-        Errors before and after the screens. Weights and protection level use those after them; the
-        difference is the effect of the screens.
-    covers : {"local", "satellite_and_atmosphere"}
-        "local": multipath and receiver noise alone (a reference station took the rest away).
-        "satellite_and_atmosphere": these, too, as they were on those days.
-    conditions : Conditions or None
-        Settings under which it holds; None: unknown, compared with nothing.
-    source : ErrorModelSource
-    faults : FaultRate or None
-        Rate of local faults among the ranges that the model was made of; None: not measured.
-    """
+    """Errors of corrected pseudoranges by bin."""
 
     bins: ErrorBins
+    #: Errors before and after the screens. Weights and protection level use those after them; the difference is the
+    #: effect of the screens.
     before: BinStatistics
     after: BinStatistics
+    #: "local": multipath and receiver noise alone (a reference station took the rest away). "satellite_and_atmosphere":
+    #: these, too, as they were on those days.
     covers: Literal["local", "satellite_and_atmosphere"]
-    conditions: Conditions | None = None
+    conditions: Conditions | None = None  #: Settings under which it holds; None: unknown, compared with nothing.
     source: ErrorModelSource = field(default_factory=ErrorModelSource)
+    #: Rate of local faults among the ranges that the model was made of; None: not measured.
     faults: FaultRate | None = None
 
     def at(

@@ -328,19 +328,11 @@ class SbasState:
         state = state.received(messages)  # whenever some arrive
         fixes = state.corrections.satellites(time, satellite, navigation)
         state = state.kept_from(time[-1])  # what later epochs need
-
-    Attributes
-    ----------
-    prn : int
-        Chosen beforehand: which GEO is best is known only after all messages were received.
-    limits : SbasLimits
-    messages : SbasMessages
-        Of that PRN, in the order of reception.
     """
 
-    prn: int
+    prn: int  #: Chosen beforehand: which GEO is best is known only after all messages were received.
     limits: SbasLimits = field(default_factory=SbasLimits)
-    messages: SbasMessages = field(default_factory=SbasMessages.none)
+    messages: SbasMessages = field(default_factory=SbasMessages.none)  #: Of that PRN, in the order of reception.
 
     def received(self, messages: SbasMessages) -> SbasState:
         """The state after more messages; those of other PRNs, and repeated ones of a second receiver, are left out."""

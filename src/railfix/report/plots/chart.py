@@ -47,23 +47,15 @@ class _Layer:
 
 @dataclass(frozen=True, kw_only=True)
 class Points(_Layer):
-    """Points, P of them.
+    """Points, P of them."""
 
-    Attributes
-    ----------
-    x, y : ndarray, shape (P,)
-        NaN is not drawn.
-    shape : {"dot", "square", "cross", "ring"}
-    size : float
-        Width in pixels of a page.
-    epoch_s : ndarray, shape (P,), or None [s]
-        Time since the start of the run; a click on a point shows the sky at that time.
-    """
-
+    #: NaN is not drawn, shape (P,).
     x: Floats
     y: Floats
+
     shape: Shape = "dot"
-    size: float = 3.0
+    size: float = 3.0  #: Width in pixels of a page.
+    #: Time since the start of the run; a click on a point shows the sky at that time; shape (P,).
     epoch_s: Floats | None = None
 
 
@@ -97,17 +89,12 @@ class Bars(_Layer):
 
 @dataclass(frozen=True, kw_only=True)
 class Cells(_Layer):
-    """Numbers of points in the cells of a grid; darker cells have more.
+    """Numbers of points in the cells of a grid; darker cells have more."""
 
-    Attributes
-    ----------
-    x_edges, y_edges : ndarray, shape (A + 1,), (B + 1,)
-    counts : ndarray of int, shape (A, B)
-    """
-
+    #: Shape (A + 1,), (B + 1,).
     x_edges: Floats
     y_edges: Floats
-    counts: Integers
+    counts: Integers  #: Shape (A, B).
 
     def __post_init__(self) -> None:
         if self.counts.shape != (len(self.x_edges) - 1, len(self.y_edges) - 1):
@@ -116,16 +103,10 @@ class Cells(_Layer):
 
 @dataclass(frozen=True, kw_only=True)
 class RangeBars(_Layer):
-    """A bar from minimum to maximum with a mark at the mean for each name, from the top down.
-
-    Attributes
-    ----------
-    names : tuple of str
-    low, mid, high : ndarray, shape (N,)
-        NaN is not drawn.
-    """
+    """A bar from minimum to maximum with a mark at the mean for each name, from the top down."""
 
     names: tuple[str, ...]
+    #: NaN is not drawn, shape (N,).
     low: Floats
     mid: Floats
     high: Floats
@@ -133,21 +114,13 @@ class RangeBars(_Layer):
 
 @dataclass(frozen=True, kw_only=True)
 class Marks(_Layer):
-    """Text at points.
+    """Text at points."""
 
-    Attributes
-    ----------
-    x, y : ndarray, shape (P,)
-    words : tuple of str
-        Lines separated by line feeds.
-    place : {"beside", "on"}
-        Beside a cross at the point, or centred on it without a cross.
-    """
-
+    #: Shape (P,).
     x: Floats
     y: Floats
-    words: tuple[str, ...]
-    place: Literal["beside", "on"] = "beside"
+    words: tuple[str, ...]  #: Lines separated by line feeds.
+    place: Literal["beside", "on"] = "beside"  #: Beside a cross at the point, or centred on it without a cross.
 
 
 Layer = Points | Curve | Band | Bars | Cells | RangeBars | Marks
@@ -155,41 +128,23 @@ Layer = Points | Curve | Band | Bars | Cells | RangeBars | Marks
 
 @dataclass(frozen=True, kw_only=True)
 class Chart:
-    """One chart.
+    """One chart."""
 
-    Attributes
-    ----------
-    name : str
-        Short, for files and anchors: ``error-time``.
-    title, caption : str
-        Heading; explanation with the counts of points left out.
-    x_label, y_label : str
-    layers : tuple of Layer
-        Drawn in this order.
-    start : datetime64[ns] or None
-        `x` is seconds from this time.
-    y_scale, x_scale : {"linear", "symlog", "log"}
-    y_linear : float
-        A symlog axis is linear up to here.
-    x_range, y_range : (float, float) or None
-    equal : bool
-        Equal scales on both axes; a scale bar and north are drawn.
-    width : {"wide", "half"}
-    """
-
-    name: str
+    name: str  #: Short, for files and anchors: ``error-time``.
+    #: Heading; explanation with the counts of points left out.
     title: str
     caption: str
+
     x_label: str
     y_label: str
-    layers: tuple[Layer, ...]
-    start: np.datetime64 | None = None
+    layers: tuple[Layer, ...]  #: Drawn in this order.
+    start: np.datetime64 | None = None  #: `x` is seconds from this time.
     x_scale: Scale = "linear"
     y_scale: Scale = "linear"
-    y_linear: float = 1.0
+    y_linear: float = 1.0  #: A symlog axis is linear up to here.
     x_range: tuple[float, float] | None = None
     y_range: tuple[float, float] | None = None
-    equal: bool = False
+    equal: bool = False  #: Equal scales on both axes; a scale bar and north are drawn.
     width: Literal["wide", "half"] = "wide"
 
     @property
@@ -207,34 +162,22 @@ class Chart:
 
 @dataclass(frozen=True, kw_only=True)
 class SkyEpochs:
-    """Satellites in view of an antenna, R rows over K epochs, for sky plots.
-
-    Attributes
-    ----------
-    name, title, caption : str
-    start : datetime64[ns]
-    epoch_s : ndarray, shape (K,) [s]
-        Rising, from `start`.
-    first : ndarray of int, shape (K + 1,)
-        Rows of epoch k: first[k] to first[k + 1].
-    satellite, signal : ndarray of str, shape (R,)
-    azimuth_deg, elevation_deg, cn0_dbhz : ndarray, shape (R,)
-    reason : ndarray of str, shape (R,)
-        First reason for its rejection, or ``used``.
-    """
+    """Satellites in view of an antenna, R rows over K epochs, for sky plots."""
 
     name: str
     title: str
     caption: str
     start: np.datetime64
-    epoch_s: Floats
-    first: Integers
+    epoch_s: Floats  #: Rising, from `start`; shape (K,).
+    first: Integers  #: Rows of epoch k: first[k] to first[k + 1]; shape (K + 1,).
+    #: Shape (R,).
     satellite: Strings
     signal: Strings
+    #: Shape (R,).
     azimuth_deg: Floats
     elevation_deg: Floats
     cn0_dbhz: Floats
-    reason: Strings = field(repr=False)
+    reason: Strings = field(repr=False)  #: First reason for its rejection, or ``used``; shape (R,).
 
     @property
     def empty(self) -> bool:

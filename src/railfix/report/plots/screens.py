@@ -248,27 +248,15 @@ def missing_columns(positions: pl.DataFrame, observations: pl.LazyFrame) -> list
 
 @dataclass(frozen=True, kw_only=True)
 class RunScreen:
-    """One screen of a run over one antenna.
+    """One screen of a run over one antenna."""
 
-    Attributes
-    ----------
-    antenna, name : str
-        ``front``, ``doppler``.
-    picture : ScreenPicture
-        A row an epoch, or an observation.
-    epoch : ndarray of int, shape (T,) or None
-        Epoch of each row; None where the rows are the epochs.
-    epoch_time : ndarray of datetime64[ns], shape (E,)
-    epoch_chainage_m : ndarray, shape (E,) [m]
-        Of the position; NaN without one.
-    """
-
+    #: ``front``, ``doppler``.
     antenna: str
     name: str
-    picture: ScreenPicture
-    epoch: NDArray[np.int32] | None
-    epoch_time: Datetimes
-    epoch_chainage_m: Floats
+    picture: ScreenPicture  #: A row an epoch, or an observation.
+    epoch: NDArray[np.int32] | None  #: Epoch of each row; None where the rows are the epochs; shape (T,).
+    epoch_time: Datetimes  #: Shape (E,).
+    epoch_chainage_m: Floats  #: Of the position; NaN without one; shape (E,).
 
     @property
     def time(self) -> Datetimes:

@@ -28,25 +28,14 @@ _NARROW_CHIPS: Final = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class TrackedCode:
-    """Tracked signals, shapes (N,).
+    """Tracked signals, shapes (N,)."""
 
-    Attributes
-    ----------
-    code_m, phase_m : ndarray [m]
-        Delay beyond the unobstructed direct signal.
-    rate_mps : ndarray [m/s]
-        Of the phase, at constant amplitudes of the paths.
-    gain_db : ndarray [dB]
-        Of the prompt correlator relative to the unobstructed direct signal.
-    main : ndarray of int
-        Path that the loops lock to.
-    """
-
+    #: Delay beyond the unobstructed direct signal.
     code_m: Floats
     phase_m: Floats
-    rate_mps: Floats
-    gain_db: Floats
-    main: Indices
+    rate_mps: Floats  #: Of the phase, at constant amplitudes of the paths.
+    gain_db: Floats  #: Of the prompt correlator relative to the unobstructed direct signal.
+    main: Indices  #: Path that the loops lock to.
 
 
 def tracked(

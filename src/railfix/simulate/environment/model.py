@@ -51,20 +51,11 @@ _LEAST_ELEVATION_DEG: Final = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Paths:
-    """Paths of N signals, the direct one first, shapes (P, N).
+    """Paths of N signals, the direct one first, shapes (P, N)."""
 
-    Attributes
-    ----------
-    field : ndarray of complex
-        Relative to the unobstructed direct signal, without the phase of the extra path.
-    extra_m : ndarray [m]
-    growth : ndarray [m/m]
-        Of the extra path with the antenna's chainage.
-    """
-
-    field: Complexes
+    field: Complexes  #: Relative to the unobstructed direct signal, without the phase of the extra path.
     extra_m: Floats
-    growth: Floats
+    growth: Floats  #: Of the extra path with the antenna's chainage [m/m].
 
 
 class Environment:

@@ -19,22 +19,15 @@ _LEAST: float = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class SideStreets:
-    """Side streets on one side of the line, n of them, by rising chainage.
+    """Side streets on one side of the line, n of them, by rising chainage."""
 
-    Attributes
-    ----------
-    start_m, end_m : ndarray, shape (n,) [m]
-        Chainages of the street's edges; the walls stand there.
-    front_m, depth_m : ndarray, shape (n,) [m]
-        Distance of the street's mouth from the track's axis, and length of the street's walls.
-    height_m, opposite_m, reflection : ndarray, shape (n,)
-        Height of the reflecting walls and of the walls across the street, and amplitude that they reflect.
-    """
-
+    #: Chainages of the street's edges; the walls stand there; shape (n,).
     start_m: Floats
     end_m: Floats
+    #: Distance of the street's mouth from the track's axis, and length of the street's walls; shape (n,).
     front_m: Floats
     depth_m: Floats
+    #: Height of the reflecting walls and of the walls across the street, and amplitude that they reflect; shape (n,).
     height_m: Floats
     opposite_m: Floats
     reflection: Floats

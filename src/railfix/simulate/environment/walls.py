@@ -30,24 +30,15 @@ _LEAST_LATERAL: Final = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class Rays:
-    """N directions to satellites from one antenna's places.
+    """N directions to satellites from one antenna's places."""
 
-    Attributes
-    ----------
-    chainage_m : ndarray, shape (N,)
-    height_m : float
-        Of the antenna over the rails.
-    x, y, z : ndarray, shape (N,)
-        Unit vector to the satellite.
-    wavelength_m : ndarray, shape (N,)
-    """
-
-    chainage_m: Floats
-    height_m: float
+    chainage_m: Floats  #: Shape (N,).
+    height_m: float  #: Of the antenna over the rails.
+    #: Unit vector to the satellite, shape (N,).
     x: Floats
     y: Floats
     z: Floats
-    wavelength_m: Floats
+    wavelength_m: Floats  #: Shape (N,).
 
     def take(self, rows: Indices) -> Rays:
         """Rays of some rows."""
@@ -105,32 +96,18 @@ def shadow(row: Strips, rays: Rays, *, x0: Floats | float = 0.0, y0: Floats | fl
 
 @dataclass(frozen=True, kw_only=True)
 class Reflections:
-    """Reflections by one row of walls, shapes (N,).
+    """Reflections by one row of walls, shapes (N,)."""
 
-    Attributes
-    ----------
-    amplitude : ndarray
-        0 where the wall is absent or too small.
-    extra_m : ndarray [m]
-        Excess over the direct path.
-    rate : ndarray
-        Growth of the excess with the antenna's chainage [m/m].
-    x_m, y_m : ndarray [m]
-        Mirror image of the antenna, from the antenna.
-    back_x, back_y : ndarray
-        Horizontal direction of arrival.
-    cosine : ndarray
-        Of the angle of incidence from the wall's normal.
-    """
-
-    amplitude: Floats
-    extra_m: Floats
-    rate: Floats
+    amplitude: Floats  #: 0 where the wall is absent or too small.
+    extra_m: Floats  #: Excess over the direct path.
+    rate: Floats  #: Growth of the excess with the antenna's chainage [m/m].
+    #: Mirror image of the antenna, from the antenna.
     x_m: Floats
     y_m: Floats
+    #: Horizontal direction of arrival.
     back_x: Floats
     back_y: Floats
-    cosine: Floats
+    cosine: Floats  #: Of the angle of incidence from the wall's normal.
 
 
 def reflections(row: Strips, rays: Rays) -> Reflections:

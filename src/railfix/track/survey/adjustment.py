@@ -38,26 +38,16 @@ _COLUMNS: Final = 20
 
 @dataclass(frozen=True, kw_only=True)
 class Adjusted:
-    """Result of an adjustment.
+    """Result of an adjustment."""
 
-    Attributes
-    ----------
-    ecef_m : tuple of ndarray, shape (n, 3) [m]
-        Positions of each run, its offset taken off.
-    line_m, line_sigma_m : ndarray, shape (J, 2) [m]
-        Points of the line across and above the reference line, and their standard deviations; of shape (0, 2) where
-        they were not asked for.
-    weight : tuple of ndarray, shape (n,)
-        Mean weight of the positions or codes of each row, about 1 without outliers; 0 without any.
-    scale : tuple of float
-        Standard deviation of the positions or codes of each run against those stated.
-    """
-
-    ecef_m: tuple[Floats, ...]
+    ecef_m: tuple[Floats, ...]  #: Positions of each run, its offset taken off; shape (n, 3).
+    #: Points of the line across and above the reference line, and their standard deviations; of shape (0, 2) where they
+    #: were not asked for; shape (J, 2).
     line_m: Floats
     line_sigma_m: Floats
+    #: Mean weight of the positions or codes of each row, about 1 without outliers; 0 without any; shape (n,).
     weight: tuple[Floats, ...]
-    scale: tuple[float, ...]
+    scale: tuple[float, ...]  #: Standard deviation of the positions or codes of each run against those stated.
 
 
 def adjust(

@@ -42,32 +42,16 @@ _OF_THE_MAP: Final = 95.0
 
 @dataclass(frozen=True, kw_only=True)
 class Survey:
-    """A surveyed line.
+    """A surveyed line."""
 
-    Attributes
-    ----------
-    track : Track
-        Its standard deviations are the 95th percentiles of those along it.
-    sigma_plan_m, sigma_height_m : ndarray, shape (V,) [m]
-        Standard deviations of each point across the line and in height.
-    passes : ndarray of int, shape (V,)
-        Number of passes at each point.
-    runs_ecef_m : tuple of ndarray, shape (n, 3) [m]
-        Adjusted positions of each run.
-    scale : tuple of float
-        Standard deviation of the positions or codes of each run against those stated.
-    beside_m : float [m]
-        Way of the runs that does not lie on the line.
-    closed : bool
-    """
-
-    track: Track
+    track: Track  #: Its standard deviations are the 95th percentiles of those along it.
+    #: Standard deviations of each point across the line and in height, shape (V,).
     sigma_plan_m: Floats
     sigma_height_m: Floats
-    passes: Integers
-    runs_ecef_m: tuple[Floats, ...]
-    scale: tuple[float, ...]
-    beside_m: float
+    passes: Integers  #: Number of passes at each point, shape (V,).
+    runs_ecef_m: tuple[Floats, ...]  #: Adjusted positions of each run, shape (n, 3).
+    scale: tuple[float, ...]  #: Standard deviation of the positions or codes of each run against those stated.
+    beside_m: float  #: Way of the runs that does not lie on the line.
     closed: bool
 
 
