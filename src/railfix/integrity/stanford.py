@@ -109,10 +109,6 @@ def stanford(
     bins : int
         Bins of an axis.
 
-    Returns
-    -------
-    Stanford
-
     Raises
     ------
     ValueError

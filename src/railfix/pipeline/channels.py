@@ -56,12 +56,7 @@ class Channels:
 
 
 class ChannelBook:
-    """Channels of observations under some settings, computed once for each set of channels.
-
-    Parameters
-    ----------
-    config : Config
-    """
+    """Channels of observations under some settings, computed once for each set of channels."""
 
     def __init__(self, config: Config) -> None:
         self._config = config

@@ -145,10 +145,6 @@ def protection_levels(
     sides : ndarray of bool, shape (T, 2, K)
         `low_sides`.
     config : Config
-
-    Returns
-    -------
-    ProtectionResult
     """
     covariance = np.where(raim.faulty[:, None, None], np.nan, model.covariance_m2)
     level = along_track_level(

@@ -108,10 +108,6 @@ def locate(obs: Observations, received: Received, config: Config, book: ChannelB
     ----------
     obs, received, config, book
         As for `uncorrected_ranges`.
-
-    Returns
-    -------
-    Located
     """
     return locate_ranges(obs.time, uncorrected_ranges(obs, received, config, book), config)
 

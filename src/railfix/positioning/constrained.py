@@ -69,10 +69,6 @@ def constrained_position(
     vertex : ndarray of int, shape (T,)
         Point to start from, as `section.search` picks it; -1 leaves the epoch without a position.
     limits : ConstrainedLimits, optional
-
-    Returns
-    -------
-    Constrained
     """
     limits = limits or ConstrainedLimits()
     start = np.where(ranges.n_used - ranges.n_clocks >= 1, vertex, -1)

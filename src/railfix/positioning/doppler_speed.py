@@ -161,10 +161,6 @@ def doppler_speed(
     tangent : ndarray, shape (T, 3)
         Unit vector along the track there.
     limits : DopplerSpeedLimits, optional
-
-    Returns
-    -------
-    DopplerSpeed
     """
     limits = limits or DopplerSpeedLimits()
     shape = (len(dopplers), 3)

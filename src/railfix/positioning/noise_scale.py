@@ -82,10 +82,6 @@ def robust_fit(
     information : ndarray, shape (T, 3, 3) [1/m^2], optional
         Known of the place beforehand (`map_information`: one unknown is left); none: three unknowns.
     limits : RobustFitLimits, optional
-
-    Returns
-    -------
-    RobustFit
     """
     limits = limits or RobustFitLimits()
     used = ranges.weight > 0

@@ -164,10 +164,6 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     ranges : Ranges
         T epochs.
     place_ecef_m : ndarray, shape (T, 3) [m]
-
-    Returns
-    -------
-    NormalEquations
     """
     system, means, rows, seen = kernels.ranges.reduced_equations(
         ranges.arrays, np.ascontiguousarray(place_ecef_m, dtype=np.float64)

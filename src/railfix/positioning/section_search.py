@@ -175,10 +175,6 @@ def search(
     point : SinglePoint
         3-D position from the same ranges and weights; NaN where there is none.
     limits : SectionLimits, optional
-
-    Returns
-    -------
-    Section
     """
     limits = limits or SectionLimits()
     epochs = len(ranges)

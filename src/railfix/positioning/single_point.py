@@ -56,10 +56,6 @@ def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLim
     start_ecef_m : ndarray, shape (T, 3) [m]
         Where the iteration starts; anywhere within a few thousand kilometres.
     limits : SinglePointLimits, optional
-
-    Returns
-    -------
-    SinglePoint
     """
     limits = limits or SinglePointLimits()
     place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterated_points(

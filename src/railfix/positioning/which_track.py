@@ -216,10 +216,6 @@ def track_posterior(
         Weights of the mapped tracks by name, from the last place or the interlocking; those not named have none.
     phases : sequence of MeanPhases
         Of each antenna, beside a base station; empty without.
-
-    Returns
-    -------
-    TrackPosterior
     """
     covariance = _covariance(fixes, errors, tracks)
     places = np.concatenate([fix.east_north_m for fix in fixes])

@@ -176,10 +176,6 @@ def sbas_delays(
     time : ndarray of datetime64[ns], shape (T,)
     seen : SeenFrom
     frequency_hz : ndarray, shape (K,) [Hz]
-
-    Returns
-    -------
-    Delays
     """
     shape = fixes.state.shape
     ionosphere, troposphere, sigma = np.full((3, *shape), np.nan)

@@ -134,10 +134,6 @@ def read_record(folder: Path) -> RunRecord:
     folder : Path
         That `railfix run` wrote.
 
-    Returns
-    -------
-    RunRecord
-
     Raises
     ------
     InputFileError

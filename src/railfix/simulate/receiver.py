@@ -103,12 +103,7 @@ _WALK = 5
 
 
 class ReceiverClocks:
-    """Clocks of all receivers of a scenario over time.
-
-    Parameters
-    ----------
-    scenario : Scenario
-    """
+    """Clocks of all receivers of a scenario over time."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario

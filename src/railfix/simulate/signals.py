@@ -57,10 +57,6 @@ class Piece:
 class Simulation:
     """Simulation of a scenario: line, motion, satellites, and observations in chunks.
 
-    Parameters
-    ----------
-    scenario : Scenario
-
     Attributes
     ----------
     scenario : Scenario

@@ -143,10 +143,6 @@ class Track(NotebookTable):
             WGS 84, ellipsoidal height.
         **attributes
             See `TrackFields`.
-
-        Returns
-        -------
-        Track
         """
         if unknown := attributes.keys() - TrackFields.__annotations__.keys():
             raise TypeError(f"a track has no {', '.join(sorted(unknown))}")

@@ -129,10 +129,6 @@ def satellite_states(
         of data (`issue_records`). A satellite is unhealthy also where the record of the usual
         selection flags it. Ignored for GLONASS.
 
-    Returns
-    -------
-    SatelliteStates
-
     Raises
     ------
     ValueError

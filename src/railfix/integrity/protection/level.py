@@ -147,10 +147,6 @@ def along_track_level(
     n_excluded : array_like of int, shape (T,) or ()
         Satellites that fault detection left out at this epoch (not: what the screens rejected before).
 
-    Returns
-    -------
-    ProtectionLevel
-
     Raises
     ------
     ValueError

@@ -107,10 +107,6 @@ def detect(
     scale : array_like, shape (T,) or ()
         Noise scale: standard deviation of this receiver's ranges over the sigmas of the weights.
         Not used in fixed mode.
-
-    Returns
-    -------
-    Detection
     """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)

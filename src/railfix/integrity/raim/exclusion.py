@@ -94,10 +94,6 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
     limits : RaimLimits, optional
     scale : array_like, shape (T,) or ()
         Noise scale, as in `detect`.
-
-    Returns
-    -------
-    Exclusion
     """
     limits = limits or RaimLimits()
     epochs, channels = model.root_weight.shape

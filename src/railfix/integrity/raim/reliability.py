@@ -68,10 +68,6 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
         Of the chi-square test, whatever the mode.
     scale : array_like, shape (T,) or ()
         Noise scale, as in `detect`; it does not touch the map error in `position_sigma_m`.
-
-    Returns
-    -------
-    Reliability
     """
     limits = limits or RaimLimits()
     scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(model),))

@@ -93,10 +93,6 @@ def cn0_curve_from_log(
     progress : callable, optional
         Called with the part that has been read, 0 to 1.
 
-    Returns
-    -------
-    Cn0Calibration
-
     Raises
     ------
     InputFileError

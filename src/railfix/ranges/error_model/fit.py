@@ -48,10 +48,6 @@ def gaussian_overbound(error_m: Floats) -> Overbound:
     error_m : ndarray, shape (n,) [m]
         At least three, finite.
 
-    Returns
-    -------
-    Overbound
-
     Raises
     ------
     ValueError
@@ -112,10 +108,6 @@ def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStat
     which : ndarray of bool, shape (n,)
         Samples to take.
     fit : ErrorModelFit
-
-    Returns
-    -------
-    BinStatistics
     """
     bins = fit.bins
     kept = which & np.isfinite(samples.error_m)

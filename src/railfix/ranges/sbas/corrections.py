@@ -163,10 +163,6 @@ class SbasCorrections:
         navigation : Navigation, optional
             A long-term correction is taken only if a record has its issue of data; the one before
             it, of another issue, is tried next. Without it, the newest is taken as it is.
-
-        Returns
-        -------
-        SatelliteCorrections
         """
         number = np.array([_NUMBER_OF.get(str(name), -1) for name in satellite], dtype=np.int64)
         tables, limits, at = self._tables, self.limits, time[:, None]
@@ -305,10 +301,6 @@ class SbasCorrections:
         time : ndarray of datetime64[ns], shape (T,)
         latitude_deg, longitude_deg : ndarray, shape (T,) [deg]
         elevation_deg, azimuth_deg : ndarray, shape (T, K) [deg]
-
-        Returns
-        -------
-        IonosphereDelays
         """
         return ionosphere(
             self._grid, self._tables, self.limits, time, latitude_deg, longitude_deg, elevation_deg, azimuth_deg

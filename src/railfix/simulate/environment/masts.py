@@ -75,12 +75,7 @@ class Conductor:
 
 
 class Electrification:
-    """Masts, beams and wires of an electrified line.
-
-    Parameters
-    ----------
-    settings : ElectrificationSettings
-    """
+    """Masts, beams and wires of an electrified line."""
 
     def __init__(self, settings: ElectrificationSettings) -> None:
         self.settings = settings
