@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field
 from railfix.core.arrays import Floats, Strings
 from railfix.core.errors import InputFileError
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.evaluate.bracket import LARGEST_GAP_S
+from railfix.evaluate.along_track import LARGEST_GAP_S
 from railfix.io.named_columns import read_named_columns
 from railfix.run.options import ColumnNames
 

@@ -16,7 +16,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.reasons import Status
 from railfix.pipeline.level_stage import KINDS
-from railfix.run.folder import RunRecord, read_parquet, read_record, reading_table
+from railfix.run.record import RunRecord, read_parquet, read_record, reading_table
 
 #: Columns that every table of positions has.
 NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")

@@ -11,13 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from railfix.ground.centre import CentreLimits, TrainRecord, TrainState, time_passed
-from railfix.ground.interlocking import Interlocking, stopped_trains
-from railfix.ground.interlocking_text import HEAD, from_documents, to_documents
+from railfix.ground.centre import CentreLimits, ReferenceCurve, TrainRecord, TrainState, time_passed
+from railfix.ground.interlocking import HEAD, Interlocking, from_documents, stopped_trains, to_documents
 from railfix.ground.layout import PointName
 from railfix.ground.monitor import MonitorLimits, MonitorState, advance, release
 from railfix.ground.monitor import Order as MonitorOrder
-from railfix.ground.reference_curve import ReferenceCurve
 from railfix.ground.stops import close_section, open_section, release_train, stop_trains
 from railfix.ground.store import DatabaseError, Store
 from railfix.ground.supervision import Supervision

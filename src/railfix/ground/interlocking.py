@@ -3,21 +3,26 @@
 A pure state machine. Occupied by a train is the interval from its last safe rear end to the end of its authority.
 Authorities are extended up to the nearest of: another train's interval, points that are not locked and detected for
 the train, the end of its route; less a margin. They are shortened by agreement alone (`railfix.ground.stops`);
-reports move the intervals (`railfix.ground.plausibility`).
+reports move the intervals (`railfix.ground.supervision`).
 It is not a national rule book: no shunting, no overlaps behind signals, no level crossings, no degraded working by
 hand.
+
+State of the interlocking as named texts of JSON for the store: its head, a text a train, a text a pair of points.
 """
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import Any, Final
 
 import numpy as np
 from pydantic import Field
 
+from railfix.core.errors import InputFileError
 from railfix.core.settings import Settings
 from railfix.ground.layout import Layout, PointName, overlap
 
@@ -314,3 +319,50 @@ def _limit_m(
                 if mine == lane and low < last and first < high:
                     end = min(end, direction * (low if direction > 0 else high))
     return direction * (end - limits.margin_m)
+
+
+#: Name of the text without trains and points, and beginnings of the names of theirs.
+HEAD: Final = "interlocking"
+_TRAIN, _POINTS = f"{HEAD} train ", f"{HEAD} points "
+
+
+def to_documents(state: Interlocking, before: Interlocking | None = None) -> dict[str, str]:
+    """Return the texts by name; with a state before only those that may have changed since."""
+    texts = {HEAD: json.dumps({"stopped": state.stopped, "granted": state.granted, "closed": sorted(state.closed)})}
+    trains, points = (before.trains, before.points) if before is not None else ({}, {})
+    for number, train in state.trains.items():
+        if train is not trains.get(number):
+            texts[f"{_TRAIN}{number}"] = json.dumps(_values(train))
+    for (station, side), point in state.points.items():
+        if point is not points.get((station, side)):
+            texts[f"{_POINTS}{station} {side}"] = json.dumps(_values(point))
+    return texts
+
+
+def from_documents(texts: Mapping[str, str]) -> Interlocking:
+    """Return the state from its texts. Times of release begin again: the clock of the process before is not known.
+
+    InputFileError: when an older version wrote them.
+    """
+    head = json.loads(texts[HEAD])
+    if "closed" not in head:
+        raise InputFileError("the centre's database", "is of an older version of railfix; name another database")
+    trains, points = {}, {}
+    for name, text in texts.items():
+        if name.startswith(_TRAIN):
+            values = json.loads(text)
+            tracks = {int(station): track for station, track in values.pop("tracks").items()}
+            trains[int(name.removeprefix(_TRAIN))] = TrainInterval(**values, tracks=tracks)
+        elif name.startswith(_POINTS):
+            values = json.loads(text)
+            station, side = map(int, name.removeprefix(_POINTS).split())
+            points[station, side] = PointState(**values | {"locked": dict.fromkeys(map(int, values["locked"]))})
+    # in the order of the line, whatever the order of the texts
+    return Interlocking(
+        trains=dict(sorted(trains.items())), points=dict(sorted(points.items())), stopped=head["stopped"],
+        granted=head["granted"], closed=frozenset(head["closed"]),
+    )  # fmt: skip
+
+
+def _values(record: TrainInterval | PointState) -> dict[str, Any]:
+    return {field.name: getattr(record, field.name) for field in fields(record)}

@@ -22,16 +22,14 @@ from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import Settings, load_settings
 from railfix.core.timescale import utc_to_gpst
-from railfix.ground.centre import CentreLimits
+from railfix.ground.centre import CentreLimits, ReferenceCurve
 from railfix.ground.control import ControlCentre, orders_of
-from railfix.ground.interlocking import InterlockingLimits, TrainInterval
-from railfix.ground.interlocking_text import HEAD
+from railfix.ground.interlocking import HEAD, InterlockingLimits, TrainInterval
 from railfix.ground.layout import Layout, LoopStation, PointName, layout_of
 from railfix.ground.link_quality import LinkName
 from railfix.ground.links import BEARERS, CentreLinks
 from railfix.ground.monitor import MonitorLimits
 from railfix.ground.quic import check_keys
-from railfix.ground.reference_curve import ReferenceCurve
 from railfix.ground.station_fixes import stream_fixes
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train

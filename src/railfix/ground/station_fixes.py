@@ -17,16 +17,15 @@ from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import satellite_states
-from railfix.live.arrivals import arrivals, fresh_state, next_arrival
 from railfix.live.settings import LiveSettings
-from railfix.live.stream import ReceivedData
+from railfix.live.stream import ReceivedData, arrivals, fresh_state, next_arrival
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
 from railfix.pipeline.received import Received as Known
 from railfix.pipeline.received import known_from_start, receive
+from railfix.positioning.constrained import single_point
 from railfix.positioning.normal_equations import Ranges, clock_groups
-from railfix.positioning.single_point import single_point
 from railfix.ranges.atmosphere import SeenFrom, modelled_delays
 from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m
 

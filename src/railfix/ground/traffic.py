@@ -9,8 +9,8 @@ from typing import Any, Final
 
 from railfix.ground.interlocking import TrainInterval
 from railfix.ground.layout import Layout, LoopStation, PointName, overlap
-from railfix.ground.on_board import Authority, OnBoard
 from railfix.ground.supervision import Supervision, standing_train
+from railfix.ground.train import Authority, OnBoard
 from railfix.io.train_message import MessageStatus, TrainMessage
 
 BRAKING_MPS2: Final = 0.7

@@ -14,15 +14,14 @@ from typing import Final
 import numpy as np
 
 from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
-from railfix.live.arrivals import arrivals, fresh_state, next_arrival
+from railfix.live.console import Metrics
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
 from railfix.live.forms import gga_sentence
-from railfix.live.metrics import Metrics
 from railfix.live.sensor_lines import FOREVER, Sensed, SensorLines
 from railfix.live.sinks import Sink
 from railfix.live.sources import Connected, Lost, hidden, is_file, read_source
 from railfix.live.state import SavedSession
-from railfix.live.stream import ReceivedData, ReceiverState
+from railfix.live.stream import ReceivedData, ReceiverState, arrivals, fresh_state, next_arrival
 from railfix.ranges.sbas import from_receiver
 
 #: Items that may wait for the processor before a source is held back.

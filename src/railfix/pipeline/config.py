@@ -32,13 +32,12 @@ from railfix.integrity.protection import RiskBudget
 from railfix.integrity.protection.araim import AraimBudget
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.positioning.carrier import ContinuityLimits, CycleSlipLimits, PhaseLimits, SmoothingLimits
-from railfix.positioning.constrained import ConstrainedLimits
+from railfix.positioning.constrained import ConstrainedLimits, SinglePointLimits
 from railfix.positioning.forgetting import LastingErrorLimits
 from railfix.positioning.intersystem_bias import ClockOffsetLimits
 from railfix.positioning.map_offset import MapOffsetLimits
 from railfix.positioning.noise_scale import NoiseScaleLimits, RobustFitLimits
 from railfix.positioning.section_search import SectionLimits
-from railfix.positioning.single_point import SinglePointLimits
 from railfix.positioning.two_frequencies import TwoFrequencyLimits
 from railfix.ranges.base_station import BaseLimits
 from railfix.ranges.sbas import SbasLimits

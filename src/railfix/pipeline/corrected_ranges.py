@@ -20,9 +20,9 @@ from railfix.pipeline.received import Received
 from railfix.pipeline.second_codes import second_codes
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import Slips
+from railfix.positioning.constrained import SinglePointLimits, single_point
 from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.section_search import SearchIndex, search
-from railfix.positioning.single_point import SinglePointLimits, single_point
 from railfix.positioning.two_frequencies import Combined, SecondCodes
 from railfix.ranges.atmosphere import SeenFrom, modelled_delays
 from railfix.ranges.base_station import BaseDifferences

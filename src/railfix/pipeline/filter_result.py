@@ -1,9 +1,13 @@
-"""What the filter along the track takes from single epochs, returns, and passes on to the next chunk."""
+"""What the filter along the track takes from single epochs, returns, and passes on to the next chunk.
+
+Smooth the filter along the track over a whole log: replay its chunks backward.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -15,17 +19,96 @@ from railfix.pipeline.passings import Passing, PassingState
 from railfix.pipeline.return_gate import ReturnState
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import SensorState
-from railfix.pipeline.smoothing import Replay
 from railfix.positioning.carrier import CycleSlipState
 from railfix.positioning.map_offset import MapOffsetLimits, beyond_threshold
 from railfix.screens import FilteredMotion
-from railfix.tracking import Line, Tracked, TrackState
+from railfix.tracking import (
+    BackwardInformation,
+    GnssEpochs,
+    Line,
+    SensorEpochs,
+    Step,
+    Tracked,
+    TrackingLimits,
+    TrackState,
+    smoothed,
+    track,
+)
 from railfix.tracking.levels import LevelState
 from railfix.tracking.result import is_bounded
 from railfix.tracking.state import StateIndex
 
 if TYPE_CHECKING:
     from railfix.pipeline.results import AntennaResult
+
+
+#: Epochs whose covariances are in memory at a time.
+_EPOCHS: Final = 300
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """What the filter was given for some epochs."""
+
+    epochs: GnssEpochs
+    sensors: SensorEpochs
+    before: TrackState | None  #: State before them.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmoothedTrack:
+    """Places of T epochs by everything measured before and after them."""
+
+    time: Datetimes  #: Shape (T,).
+    #: Shape (T,).
+    arc_m: Floats
+    sigma_m: Floats
+    speed_mps: Floats  #: Shape (T,).
+
+
+def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> SmoothedTrack:
+    """Return the places of all epochs.
+
+    Parameters
+    ----------
+    backward : iterable of Replay
+        The last one first.
+    line : Line
+    limits : TrackingLimits
+    """
+    parts: list[SmoothedTrack] = []
+    later: BackwardInformation | None = None
+    for replay in backward:
+        for epochs, before in reversed(_pieces(replay, line, limits)):
+            trace: list[Step] = []
+            track(epochs, line, before, limits=limits, sensors=replay.sensors, trace=trace)
+            found, later = smoothed(trace, before or TrackState.empty(), later, limits)
+            arc = found.arc_m + line.round_m(found.arc_m)
+            parts.append(SmoothedTrack(time=epochs.time, arc_m=arc, sigma_m=found.sigma_m, speed_mps=found.speed_mps))
+    parts.reverse()
+    empty = {"time": np.empty(0, dtype="datetime64[ns]")}
+    return SmoothedTrack(
+        **{
+            f.name: np.concatenate([getattr(part, f.name) for part in parts])
+            if parts
+            else empty.get(f.name, np.empty(0))
+            for f in fields(SmoothedTrack)
+        }
+    )
+
+
+def _pieces(replay: Replay, line: Line, limits: TrackingLimits) -> list[tuple[GnssEpochs, TrackState | None]]:
+    """Short pieces and the states before them; those with sensors are short already."""
+    size = len(replay.epochs)
+    sensed = any(getattr(replay.sensors, f.name) is not None for f in fields(SensorEpochs) if f.name != "wheel_sign")
+    if size <= _EPOCHS or sensed:
+        return [(replay.epochs, replay.before)] if size else []
+    state, pieces = replay.before, []
+    for first in range(0, size, _EPOCHS):
+        epochs = replay.epochs.take(slice(first, first + _EPOCHS))
+        pieces.append((epochs, state))
+        _, state = track(epochs, line, state, limits=limits)
+    return pieces
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +212,7 @@ class AlongTrack(NotebookTable):
     #: (T,).
     spacing_error_m: Floats
     wheel: WheelSigns | None = None  #: Distances by satellites against those of the wheel; None without a wheel.
-    replay: tuple[Replay, ...] = ()  #: What the filter was given, to smooth it (`railfix.pipeline.smoothing`).
+    replay: tuple[Replay, ...] = ()  #: What the filter was given, to smooth it (`railfix.pipeline.filter_result`).
     passings: tuple[Passing, ...] = ()  #: Balises and virtual ones that were passed, and readings that are wrong.
 
     @property

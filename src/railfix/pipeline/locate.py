@@ -15,9 +15,9 @@ from railfix.pipeline.channels import ChannelBook, Channels
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import ANCHOR_SIGMA_M, usable_ranges, without
 from railfix.pipeline.received import Received
+from railfix.positioning.constrained import single_point
 from railfix.positioning.noise_scale import robust_fit
 from railfix.positioning.normal_equations import Ranges
-from railfix.positioning.single_point import single_point
 from railfix.ranges.atmosphere import SeenFrom, modelled_delays
 from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m, first_available
 

@@ -13,7 +13,7 @@ from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.features import FeatureLimits
-from railfix.motion.ranging import EchoLimits
+from railfix.motion.radar import EchoLimits
 from railfix.motion.samples import (
     BaliseReadings,
     GroundUnits,

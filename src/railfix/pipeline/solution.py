@@ -17,16 +17,23 @@ from railfix.integrity.raim import LinearModel
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
-from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
 from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.lasting_errors import lasting_errors
 from railfix.pipeline.level_stage import bounding_model, low_sides, protection_levels, unresolved_alternatives
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
 from railfix.pipeline.return_gate import OffMapState, off_map_epochs
-from railfix.pipeline.solve import Place, line_model, place_on_line, redundancy_of, validate_point
+from railfix.pipeline.solve import (
+    Place,
+    fault_free,
+    line_model,
+    place_on_line,
+    redundancy_of,
+    validate_point,
+    with_p4_level,
+)
 from railfix.positioning.antenna_rows import AntennaRows, rows_of
 from railfix.positioning.carrier import PhasePositions
-from railfix.positioning.constrained import constrained_position
+from railfix.positioning.constrained import SinglePoint, constrained_position, single_point
 from railfix.positioning.intersystem_bias import tie_clocks
 from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
 from railfix.positioning.noise_scale import (
@@ -42,7 +49,6 @@ from railfix.positioning.noise_scale import (
 )
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, fit
 from railfix.positioning.section_search import SearchIndex
-from railfix.positioning.single_point import SinglePoint, single_point
 
 
 def reason_of_all_channels(corrected: CorrectedRanges) -> Bits:

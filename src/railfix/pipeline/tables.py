@@ -13,9 +13,16 @@ import numpy as np
 import polars as pl
 
 from railfix.core.reasons import Reason, reason_text
-from railfix.pipeline.columns import Column, decimals, table_of
 from railfix.pipeline.filter_result import AlongTrack
-from railfix.pipeline.result_columns import CHANNEL_COLUMNS, OBSERVATION_COLUMNS, POSITION_COLUMNS, Observed
+from railfix.pipeline.result_columns import (
+    CHANNEL_COLUMNS,
+    OBSERVATION_COLUMNS,
+    POSITION_COLUMNS,
+    Column,
+    Observed,
+    decimals,
+    table_of,
+)
 from railfix.pipeline.results import AntennaResult, Result
 
 if TYPE_CHECKING:

@@ -19,9 +19,9 @@ from pydantic import Field
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import EVERY
+from railfix.positioning.constrained import SinglePoint
 from railfix.positioning.forgetting import correlated_sums
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges
-from railfix.positioning.single_point import SinglePoint
 
 
 class ClockOffsetLimits(Settings):

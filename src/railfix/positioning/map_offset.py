@@ -21,9 +21,9 @@ from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.constrained import SinglePoint
 from railfix.positioning.forgetting import correlated_sums
 from railfix.positioning.normal_equations import RangeArrays, Ranges
-from railfix.positioning.single_point import SinglePoint
 from railfix.track.trajectory import Trajectory
 
 #: Sums of a window.

@@ -21,7 +21,7 @@ from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
 from railfix.io.sensor_log import Acceleration, Pulses
-from railfix.motion.wheel import Wheel, wheel_of
+from railfix.motion.tachometer import Wheel, wheel_of
 from railfix.positioning.doppler_speed import Dopplers, DopplerSpeed, doppler_speed
 from railfix.reference.assemble import Built, assembled
 from railfix.reference.fixes import Fixes, judge_alone, judge_pair, judge_place, judge_travel

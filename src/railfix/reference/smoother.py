@@ -17,8 +17,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices
 from railfix.core.timescale import seconds
-from railfix.motion.chain import Chain
-from railfix.motion.singer import singer_steps
+from railfix.motion.chain import Chain, singer_steps
 from railfix.reference.settings import ReferenceSettings
 
 #: Standard deviations of what nothing is known of: speed [m/s], difference of the wheel's distance [m].

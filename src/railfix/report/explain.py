@@ -22,7 +22,7 @@ from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.geodesy import enu_axes
 from railfix.evaluate.run_folder import RunFolder, read_run
-from railfix.run.folder import reading_table
+from railfix.run.record import reading_table
 from railfix.track import read_track
 
 #: What the status of a single epoch says.

@@ -17,7 +17,7 @@ from railfix.evaluate.place import track_of
 from railfix.evaluate.run_folder import NO_MORE, POSITIONS_TABLE, RunFolder, read_run, read_table, tables_of
 from railfix.pipeline.config import Config
 from railfix.ranges.cn0_curve import Cn0Curve, read_cn0_curve
-from railfix.run.folder import reading_table
+from railfix.run.record import reading_table
 from railfix.screens import SCREENS
 from railfix.track import Track
 

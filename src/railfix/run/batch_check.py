@@ -10,8 +10,8 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats, Masks
-from railfix.pipeline.columns import Column, by_name, float_column
 from railfix.pipeline.filter_result import AlongTrack
+from railfix.pipeline.result_columns import Column, by_name, float_column
 from railfix.run.output import OutputFolder
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs

@@ -21,11 +21,11 @@ from railfix.core.files import write_whole
 from railfix.core.settings import Settings, load_settings
 from railfix.pipeline.config import Config, load_config
 from railfix.run.driver import run_files
-from railfix.run.folder import read_record
 from railfix.run.inputs import RunInputs
 from railfix.run.options import RunOptions
 from railfix.run.output import check_folder
 from railfix.run.processor import with_measured_priors
+from railfix.run.record import read_record
 
 #: A field in a pattern: ``{day}``.
 _FIELD: Final = re.compile(r"\{(\w+)\}")

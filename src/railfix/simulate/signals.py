@@ -16,15 +16,12 @@ from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.simulate.alignment import Alignment, build_alignment
-from railfix.simulate.body import AntennaTruth, BodyMotion, antenna_truth
-from railfix.simulate.constellation import simulated_navigation
+from railfix.simulate.constellation import SatelliteTable, links, simulated_navigation
 from railfix.simulate.disturbance import CN0_SECOND_DB, Disturbances, SightGeometry
 from railfix.simulate.environment import Environment
 from railfix.simulate.errors.common import CommonErrors, fault_m
-from railfix.simulate.motion import Motion, build_motion
-from railfix.simulate.noise import ionosphere_m, troposphere_m
-from railfix.simulate.receiver import SIGNALS, Receiver, ReceiverClocks, group_delay_s
-from railfix.simulate.satellites import SatelliteTable, links
+from railfix.simulate.motion import AntennaTruth, BodyMotion, Motion, antenna_truth, build_motion
+from railfix.simulate.receiver import SIGNALS, Receiver, ReceiverClocks, group_delay_s, ionosphere_m, troposphere_m
 from railfix.simulate.scenario import ANTENNAS, Scenario
 
 #: Receivers report C/N0 in steps [dB-Hz].

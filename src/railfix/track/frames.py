@@ -21,8 +21,18 @@ from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import read_text
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
-from railfix.track.crs import REGIONAL, WORKING_FRAME, geodetic_of, is_in_area, kind_of_frame, operation_of
-from railfix.track.frame_table import HELD, REALISATIONS, SAME, HeldFrame
+from railfix.track.crs import (
+    HELD,
+    REALISATIONS,
+    REGIONAL,
+    SAME,
+    WORKING_FRAME,
+    HeldFrame,
+    geodetic_of,
+    is_in_area,
+    kind_of_frame,
+    operation_of,
+)
 from railfix.track.track import UNNAMED, Track
 
 PLATES: Final = tuple("AMUR ANTA ARAB AUST CARB EURA INDI NAZC NOAM NUBI PCFC SOAM SOMA".split())

@@ -18,8 +18,8 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.settings import Settings, load_settings
-from railfix.track.closing import joins_m
 from railfix.track.from_positions import ANTENNA_PATH
+from railfix.track.polyline import joins_m
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Strings
 from railfix.core.errors import InputFileError
-from railfix.evaluate.bracket import bracket
+from railfix.evaluate.along_track import bracket
 from railfix.gnss.observations import Observations
 from railfix.io.logs import scan_observations
 from railfix.pipeline.base_station import BaseStation

@@ -12,6 +12,8 @@ of three parts, each of which has its share of the risk,
 - no fault: ``K_ff sigma_0 + b_0``;
 - one fault, two faults (and more, where these are hypotheses): the largest ``T_J + K sigma_J + b_J``, the share divided
   in proportion to the priors, so that all hypotheses of a part have one K.
+
+May the position be used? The level against the alarm limit.
 """
 
 from __future__ import annotations
@@ -337,3 +339,39 @@ def _channels(channel: Indices, place: Indices) -> Indices:
 def _sets(n: int, size: int) -> Indices:
     """Return all sets of places, shape (size, K)."""
     return np.array(list(combinations(range(n), size)), dtype=np.intp).reshape(math.comb(n, size), size).T
+
+
+class LevelStatus(IntEnum):
+    """Of an epoch, against an alarm limit."""
+
+    #: The level is within the alarm limit.
+    AVAILABLE = 0
+    #: The level is above the alarm limit, infinite, or there is no position.
+    UNAVAILABLE = 1
+    #: The ranges contradict each other: the level does not hold.
+    ALARM = 2
+
+
+def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayLike = True) -> Codes:
+    """LevelStatus of epochs.
+
+    Parameters
+    ----------
+    level_m : array_like, shape (T,) [m]
+        Protection level; NaN where there is no position.
+    alarm_limit_m : float [m]
+    consistent : array_like of bool, shape (T,) or ()
+        `ProtectionLevel.consistent`. An epoch with a position and without consistency alarms.
+
+    Returns
+    -------
+    ndarray of int8, shape (T,)
+        `LevelStatus`.
+    """
+    if not alarm_limit_m > 0.0:
+        raise ValueError(f"alarm_limit_m must be positive, got {alarm_limit_m}")
+    level = np.asarray(level_m, dtype=np.float64)
+    status = np.full(level.shape, LevelStatus.UNAVAILABLE, dtype=np.int8)
+    status[level <= alarm_limit_m] = LevelStatus.AVAILABLE
+    status[~np.isnan(level) & ~np.asarray(consistent)] = LevelStatus.ALARM
+    return status

@@ -14,7 +14,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import ByteStream
 from railfix.gnss.observations import ObservationHeader
-from railfix.io.rinex.observations_signals import SYSTEMS, SignalColumn, columns_of
+from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, columns_of
 
 #: Time systems of TIME OF FIRST OBS, and the default of files without one by constellation.
 TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")

@@ -24,8 +24,7 @@ from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks, Strings
 from railfix.gnss.observations import channels_with_data
 from railfix.io.rinex.header import RinexHeader
 from railfix.io.rinex.observations_epochs import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, EpochHeads, FaultLog
-from railfix.io.rinex.observations_lines import Lines
-from railfix.io.rinex.observations_signals import KINDS, SYSTEMS, SignalColumn
+from railfix.io.rinex.observations_lines import KINDS, SYSTEMS, Lines, SignalColumn
 
 Words = NDArray[np.uint64]
 

@@ -27,7 +27,7 @@ from railfix.positioning.carrier.ambiguities import (
     repeats_of,
     startable,
 )
-from railfix.positioning.carrier.arcs import channel_of
+from railfix.positioning.carrier.continuity import channel_of
 from railfix.positioning.carrier.integers import IntegerChannels, fix_integers
 from railfix.positioning.carrier.observation_model import (
     Linearised,

@@ -26,7 +26,7 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz
-from railfix.positioning.carrier.arcs import ChannelKeys, channel_keys, rows_before
+from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, rows_before
 
 #: One millisecond as a distance [m]: the step of receivers that keep their clock near GPS time.
 MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT

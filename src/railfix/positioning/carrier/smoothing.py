@@ -4,6 +4,8 @@ Code less phase is constant along an arc, but for noise and for the ionosphere, 
 code as much as it advances the phase: it drifts by twice the change of the delay. Its mean over
 the arc so far, put back on the phase, is a code with less noise. The window's end limits the
 drift: with the delay changing at 1 mm/s a window of 100 s leaves up to 0.2 m.
+
+Linear recursions along time without a loop over epochs.
 """
 
 from __future__ import annotations
@@ -17,8 +19,22 @@ from pydantic import Field
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
-from railfix.positioning.carrier.arcs import ChannelKeys, channel_keys, rows_before
-from railfix.positioning.carrier.recursion import linear_recursion
+from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, rows_before
+
+
+def linear_recursion(gain: Floats, drive: Floats) -> Floats:
+    """``x_k = gain_k x_{k-1} + drive_k`` along axis 0 with x_{-1} = 0, without a loop over epochs.
+
+    Pairs (gain, drive) are composed over strides of 1, 2, 4, ...: log2(T) passes over the arrays.
+    No division and no growing product: gains in [0, 1] make it as stable as the recursion itself.
+    """
+    total, factor = drive.copy(), gain.copy()  # gains may have fewer elements, those of `drive` broadcast
+    stride = 1
+    while stride < len(total):
+        total[stride:] = total[stride:] + factor[stride:] * total[:-stride]
+        factor[stride:] = factor[stride:] * factor[:-stride]
+        stride *= 2
+    return total
 
 
 class SmoothingLimits(Settings):

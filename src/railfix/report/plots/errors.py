@@ -36,8 +36,14 @@ from railfix.report.plots.chart import (
     Marks,
     Points,
     RangeBars,
+    counts_sentence,
+    floats,
+    nice_step,
+    since,
+    spread,
+    start_of,
+    words,
 )
-from railfix.report.plots.columns import counts_sentence, floats, nice_step, since, spread, start_of, words
 
 _ERROR_LABEL: Final = "error along the line [m]"
 _SIGN: Final = "+ is toward the end of the line."

@@ -26,8 +26,6 @@ from railfix.report.plots.chart import (
     Layer,
     Marks,
     Points,
-)
-from railfix.report.plots.columns import (
     counts_sentence,
     floats,
     nice_step,

@@ -18,8 +18,19 @@ from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
 from railfix.pipeline.config import Config
 from railfix.ranges.cn0_curve import Cn0Curve, Cn0Samples
-from railfix.report.plots.chart import BLACK, RED, Chart, Curve, Layer, Points
-from railfix.report.plots.columns import counts_sentence, extremes, floats, nice_step, spread
+from railfix.report.plots.chart import (
+    BLACK,
+    RED,
+    Chart,
+    Curve,
+    Layer,
+    Points,
+    counts_sentence,
+    extremes,
+    floats,
+    nice_step,
+    spread,
+)
 from railfix.report.plots.draw import draw_chart, save_figure
 from railfix.report.plots.signals import open_sky_chart
 from railfix.report.runs import read_runs

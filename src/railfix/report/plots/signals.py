@@ -12,8 +12,23 @@ from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.reasons import Reason, first_reason, reason_names
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean
 from railfix.ranges.cn0_curve.curve import satellite_kind
-from railfix.report.plots.chart import BLACK, BLUE, GREY, PURPLE, RED, Cells, Chart, Curve, Layer, Points, SkyEpochs
-from railfix.report.plots.columns import floats, since, start_of, words
+from railfix.report.plots.chart import (
+    BLACK,
+    BLUE,
+    GREY,
+    PURPLE,
+    RED,
+    Cells,
+    Chart,
+    Curve,
+    Layer,
+    Points,
+    SkyEpochs,
+    floats,
+    since,
+    start_of,
+    words,
+)
 from railfix.screens import Cn0Limits
 
 #: Cells of C/N0 over elevation.

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Complexes, Floats
-from railfix.simulate.environment.diffraction import edge_amplitude, per_metre, strip_field
+from railfix.simulate.environment.correlator import edge_amplitude, per_metre, strip_field
 from railfix.simulate.environment.settings import ElectrificationSettings
 from railfix.simulate.environment.walls import Rays
 
