@@ -108,7 +108,6 @@ def along_track_error(
     arc_m : ndarray, shape (T,) [m]
         Answers along the trajectory; NaN where there is none.
     reference_ecef_m : ndarray, shape (T, 3) [m]
-    trajectory : Trajectory
     same_place_m : float
         Passes of the map up to this far from the reference are its place.
 

@@ -149,7 +149,6 @@ def travelled(
     known : ndarray of bool, shape (T,)
     speed_mps : ndarray, shape (T,) [m/s]
         Of the reference; NaN where unknown.
-    options : EvaluationOptions
     """
     at = np.flatnonzero(known)
     moved = np.full(len(time), np.nan)

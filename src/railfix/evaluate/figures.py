@@ -101,8 +101,6 @@ def block_limits(
         NaN where there is no error, where the standard deviation of the position is not known.
     observed, positioned : ndarray of bool, shape (T,)
     block : ndarray of int, shape (T,)
-    replicates, seed : int
-    confidence : float
     """
     names, member = np.unique(block, return_inverse=True)
     blocks = len(names)
@@ -345,7 +343,6 @@ def figures_by(parts: Iterable[pl.DataFrame], groupings: Sequence[str], options:
         the largest part.
     groupings : sequence of str
         Which classes: ``f"{grouping}_group"``.
-    options : EvaluationOptions
     """
     kinds = [(position, "own") for position in POSITIONS] + [("constrained", "common"), ("conventional", "common")]
     tables: dict[str, list[list[pl.DataFrame]]] = {grouping: [[] for _ in kinds] for grouping in groupings}

@@ -177,7 +177,6 @@ def read_run(
 
     Parameters
     ----------
-    path : Path
     table : str
         Which table of positions. A table other than "positions" takes the satellites used and the conventional
         position from the single-epoch positions of the same time and antenna.

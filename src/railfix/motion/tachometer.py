@@ -316,7 +316,6 @@ def wheel_of(pulses: Pulses, pulse_m: float | None, time: Datetimes, arc_m: Floa
 
     Parameters
     ----------
-    pulses : Pulses
     pulse_m : float or None [m]
     time : ndarray of datetime64[ns], shape (F,)
         Of good fixes.

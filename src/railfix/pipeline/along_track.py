@@ -67,10 +67,6 @@ def along_track(
     ----------
     ranges : CorrectedRanges
         After all screens and exclusions.
-    single : SingleEpochs
-    trajectory : Trajectory
-    config : Config
-    state : FilterState
     samples : SensorSamples, optional
         Of the sensors on board since the chunk before.
     surroundings : LineReferences, optional

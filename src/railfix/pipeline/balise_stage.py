@@ -60,14 +60,10 @@ def balise_epochs(
 
     Parameters
     ----------
-    readings : BaliseReadings
     edges : ndarray of datetime64[ns], shape (T + 1,)
         Epoch before the chunk, and its epochs.
-    listed : ListedBalises
     trajectory : Trajectory
         Of the antenna.
-    state : BaliseState
-    limits : BaliseLimits
     """
     found = BaliseEpochs.none(len(edges) - 1)
     index, arc = listed.index_of(readings.balise), arcs_of_balises(listed, trajectory, limits)

@@ -123,14 +123,11 @@ def correct_ranges(
 
     Parameters
     ----------
-    obs : Observations
     channels : Channels
         Of these observations.
-    config : Config
     received : Received
         Navigation records and coefficients; where SBAS is used, its corrections replace the models, and satellites
         without a valid one are rejected.
-    antennas : AntennaRows
     error_model : ErrorModel, optional
         Gives the least sigmas of the protection level; the weights are those of ``config.noise``.
 

@@ -136,16 +136,12 @@ def feature_fixes(
 
     Parameters
     ----------
-    rates : RateSeries
-    line : LineFeatures
     facing : float
         1 where the front points to rising arc length, else -1.
     sigma_m : float [m]
         Of the place by the wheel.
-    state : FeatureState
     noise : tuple of float
         Standard deviations of gradient and curvature in one metre.
-    limits : FeatureLimits
     """
     ways = np.concatenate([[0.0], rates.way_m]) + state.way_m
     heading, pitch = (

@@ -73,8 +73,6 @@ def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> Sm
     ----------
     backward : iterable of Replay
         The last one first.
-    line : Line
-    limits : TrackingLimits
     """
     parts: list[SmoothedTrack] = []
     later: BackwardInformation | None = None

@@ -96,8 +96,6 @@ def find_interference(
         Of the same epochs.
     index : SearchIndex
         Of the antenna's trajectory.
-    state : InterferenceState
-    limits : InterferenceLimits
     """
     observations, reason = corrected.observations, corrected.reason
     channel = np.char.add(corrected.satellite, corrected.signal)

@@ -56,12 +56,10 @@ def uncorrected_ranges(obs: Observations, received: Received, config: Config, bo
 
     Parameters
     ----------
-    obs : Observations
     received : Received
         Navigation records and coefficients.
     config : Config
         Constellations, signals, mask, noise and atmosphere.
-    book : ChannelBook
     """
     channels = book.of(obs, received.navigation)
     satellite, columns = channels.satellite, channels.columns

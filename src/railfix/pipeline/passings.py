@@ -106,8 +106,6 @@ def find_passings(
         Of the antenna.
     readings : BaliseReadings
         Since the chunk before.
-    state : PassingState or None
-    limits : BaliseLimits
     """
     state = state or PassingState.empty(len(listed))
     own = trajectory.arc_at_chainage(listed.chainage_m)

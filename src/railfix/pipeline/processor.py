@@ -284,7 +284,6 @@ class EpochProcessor:
 
         Parameters
         ----------
-        solved : SolvedChunk
         state : State
             Of it only what the filter left after the chunk before is used, and replaced.
         """

@@ -71,8 +71,6 @@ def known_from_start(
 
     Parameters
     ----------
-    config : Config
-    navigation : Navigation, optional
     messages : SbasMessages, optional
         Recorded messages, of which the GEO is chosen if the settings ask for the best.
 
@@ -108,8 +106,6 @@ def receive(
 
     Parameters
     ----------
-    before : Received
-    config : Config
     time : datetime64[ns]
         Of the next epoch, NaT where there is none; SBAS messages that neither it nor a later one can use are dropped.
     navigation : Navigation, optional

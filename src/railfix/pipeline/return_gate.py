@@ -63,8 +63,6 @@ def gated_codes(
         Position of each epoch by itself; NaN where there is none.
     state : ReturnState
         With the place of the filter at the epoch before the first.
-    line : Line
-    limits : SensorLimits
     """
     refused = np.zeros(len(time), dtype=np.bool_)
     ways = state.way_m + np.cumsum(way_m)
@@ -114,7 +112,6 @@ def off_map_epochs(
     time : ndarray of datetime64[ns], shape (T,)
     on_map, off_map : ndarray of bool, shape (T,)
         Single-epoch positions that the ranges fit, and those that they contradict; both False without a position.
-    state : OffMapState
     least_s : float [s]
         How long positions contradict the state before it changes.
     """

@@ -130,9 +130,6 @@ def sensed_motion(
         Of the antenna: tells which way the front points, and where the body is.
     sine_at : callable
         Sine of the gradient in rising arc length at arc lengths.
-    state : SensedState
-    tachometer : TachometerLimits
-    limits : SlipLimits
     """
     facing = trajectory.front_sign
     ends = edges.astype("datetime64[ns]").astype(np.int64)

@@ -141,8 +141,6 @@ def sensor_epochs(
         Epochs of the antenna.
     trajectory : Trajectory
         Tells which way the front points.
-    state : SensorState
-    limits : SensorLimits
     sine_at : callable, optional
         Sine of the gradient at arc lengths; the line is unknown without.
     sources : container of str

@@ -124,8 +124,6 @@ def solve(
     ----------
     corrected : CorrectedRanges
         After the screens of the observations.
-    antennas : AntennaRows
-    config : Config
     states : sequence of AntennaState
         By antenna.
     """

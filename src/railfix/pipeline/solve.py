@@ -57,11 +57,8 @@ def place_on_line(ranges: Ranges, index: SearchIndex, point: SinglePoint, config
 
     Parameters
     ----------
-    ranges : Ranges
-    index : SearchIndex
     point : SinglePoint
         3-D position from the same ranges.
-    config : Config
     """
     section = search(ranges, index, point, limits=config.section)
     vertex = np.where(ranges.n_used >= config.min_satellites, section.vertex, -1)
@@ -118,7 +115,6 @@ def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, l
         From which it was computed.
     noise_scale : ndarray, shape (T,)
         Standard deviation of this receiver's ranges over the sigmas of the weights.
-    limits : SinglePointLimits
     """
     test = detect(
         point.wsse,
@@ -162,7 +158,6 @@ def fault_free(
     ----------
     ranges : Ranges
         T epochs by K channels.
-    antennas : AntennaRows
     place : Place
         Positions from these ranges.
     scale : ndarray, shape (T,)

@@ -36,7 +36,6 @@ def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
     ----------
     name : str
         Goes into the column ``antenna``.
-    result : AntennaResult
 
     Returns
     -------
@@ -75,7 +74,6 @@ def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack |
     ----------
     name : str
         Goes into the column ``antenna``.
-    result : AntennaResult
     tracked : AlongTrack, optional
         Of the filter along the track.
 

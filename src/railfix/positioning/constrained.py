@@ -73,7 +73,6 @@ def constrained_position(
         V points.
     vertex : ndarray of int, shape (T,)
         Point to start from, as `section.search` picks it; -1 leaves the epoch without a position.
-    limits : ConstrainedLimits, optional
     """
     limits = limits or ConstrainedLimits()
     start = np.where(ranges.n_used - ranges.n_clocks >= 1, vertex, -1)
@@ -175,7 +174,6 @@ def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLim
         T epochs.
     start_ecef_m : ndarray, shape (T, 3) [m]
         Where the iteration starts; anywhere within a few thousand kilometres.
-    limits : SinglePointLimits, optional
     """
     limits = limits or SinglePointLimits()
     place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterated_points(

@@ -107,8 +107,6 @@ def dopplers_of_log(
 
     Parameters
     ----------
-    obs : Observations
-    navigation : Navigation
     systems : sequence of str
         Constellations asked for.
     signals : mapping of str to sequence of str
@@ -155,12 +153,10 @@ def doppler_speed(
 
     Parameters
     ----------
-    dopplers : Dopplers
     ecef_m : ndarray, shape (T, 3) [m]
         Where the antenna is; 10 m off change a range rate by 2 mm/s. NaN: no speed.
     tangent : ndarray, shape (T, 3)
         Unit vector along the track there.
-    limits : DopplerSpeedLimits, optional
     """
     limits = limits or DopplerSpeedLimits()
     shape = (len(dopplers), 3)

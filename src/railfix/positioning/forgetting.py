@@ -48,7 +48,6 @@ def ages(time: Datetimes, last: np.datetime64, last_age: float, *, window_s: flo
     last_age : float [windows]
         Of that epoch; 0 before all.
     window_s : float [s]
-    least_epochs : float
     """
     step = np.minimum(steps_s(time, last) / window_s, 1.0 / least_epochs)
     return np.cumsum(np.concatenate([[last_age], step]))[1:]

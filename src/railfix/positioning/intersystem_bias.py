@@ -92,7 +92,6 @@ def tie_clocks(
         Of each receiver.
     parts : sequence of slice
         Rows of each.
-    limits : ClockOffsetLimits, optional
 
     Returns
     -------

@@ -148,12 +148,8 @@ def map_offset(
         What the 3-D positions were solved with: ranges that agree with each other.
     point : SinglePoint
         3-D positions.
-    errors : OffsetErrors
-    antennas : AntennaRows
-    positions : LinePositions
     states : sequence of MapOffsetState
         By antenna.
-    limits : MapOffsetLimits, optional
 
     Returns
     -------

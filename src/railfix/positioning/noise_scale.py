@@ -83,7 +83,6 @@ def robust_fit(
         Solution of the plain fit; steps from it are linear.
     information : ndarray, shape (T, 3, 3) [1/m^2], optional
         Known of the place beforehand (`map_information`: one unknown is left); none: three unknowns.
-    limits : RobustFitLimits, optional
     """
     limits = limits or RobustFitLimits()
     used = ranges.weight > 0
@@ -160,8 +159,6 @@ def robust_scale(
         On the line.
     teaching : ndarray of bool, shape (T,)
         Epochs to learn from: those that are on the map.
-    state : NoiseState
-    limits : NoiseScaleLimits
 
     Returns
     -------
@@ -197,8 +194,6 @@ def stated_scale(
         Epochs to learn from: resolved, and on the map.
     robust : ndarray, shape (T,)
         Robust scale, which takes the place of a scale of 1 as the prior.
-    state : NoiseState
-    limits : NoiseScaleLimits
 
     Returns
     -------
@@ -237,7 +232,6 @@ def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits:
     ----------
     scale, wsse : ndarray, shape (T,)
     redundancy : ndarray of int, shape (T,)
-    limits : NoiseScaleLimits
     """
     freedom = np.where(np.isfinite(wsse), np.maximum(redundancy, 0), 0)
     own = np.where(freedom > 0, np.fmax(wsse, 0.0), 0.0)

@@ -171,10 +171,8 @@ def search(
     ----------
     ranges : Ranges
         T epochs.
-    index : SearchIndex
     point : SinglePoint
         3-D position from the same ranges and weights; NaN where there is none.
-    limits : SectionLimits, optional
     """
     limits = limits or SectionLimits()
     epochs = len(ranges)

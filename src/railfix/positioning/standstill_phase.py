@@ -48,7 +48,6 @@ class IntegerSearch:
         Parameters
         ----------
         cycles : ndarray, shape (n,)
-        count : int
         below : float
             Vectors of larger squares are left out.
 
@@ -189,7 +188,6 @@ def phase_log_likelihood(
         Covariance of the places about those: along the track, of the map, of height.
     codes : sequence of CodePlace, length A
     phases : sequence of MeanPhases, length A
-    fault_prior : float
 
     Returns
     -------

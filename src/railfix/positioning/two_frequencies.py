@@ -126,13 +126,10 @@ def combine_codes(
     time : ndarray of datetime64[ns], shape (T,)
     code_m, noise_m : ndarray, shape (T, K) [m]
         First codes, corrected by the models, NaN where unusable; and the noise that the weights assume.
-    second : SecondCodes
     prior_sigma_m : ndarray, shape (T, K) [m]
         Standard deviation of the modelled ionosphere on the first frequency, along the sight.
     pairs : tuple of (tuple of str, ndarray of int)
         Names of the pairs, length Q, and the number of the group of each whose receiver delay is common, shape (Q,).
-    state : TwoFrequencyState
-    limits : TwoFrequencyLimits
 
     Returns
     -------

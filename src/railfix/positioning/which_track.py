@@ -133,7 +133,6 @@ def standstill_fix(
         Time over which it is the mean.
     common_m : ndarray, shape (K,)
         Standard deviation of satellite and atmosphere errors, common to both antennas.
-    errors : StandstillErrors
     receivers : int
         2 where a base station's codes are subtracted, which have such errors too.
 
@@ -206,12 +205,10 @@ def track_posterior(
 
     Parameters
     ----------
-    tracks : sequence of YardTrack
     fixes : sequence of StandstillFix
         Of one antenna or both.
     arms_m : sequence of float [m]
         Place of each antenna along the train from a common point, positive to its front.
-    errors : StandstillErrors
     prior : mapping of str to float, optional
         Weights of the mapped tracks by name, from the last place or the interlocking; those not named have none.
     phases : sequence of MeanPhases

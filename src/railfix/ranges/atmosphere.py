@@ -237,7 +237,6 @@ def modelled_delays(
     Parameters
     ----------
     time : ndarray of datetime64[ns], shape (T,)
-    seen : SeenFrom
     frequency_hz : ndarray, shape (K,) [Hz]
     klobuchar : ndarray, shape (8,), or None
         None: off.

@@ -146,7 +146,6 @@ def corrected_satellites(states: SatelliteStates, fixes: SatelliteCorrections) -
     ----------
     states : SatelliteStates
         Of the records that the corrections are for.
-    fixes : SatelliteCorrections
 
     Returns
     -------
@@ -171,10 +170,7 @@ def sbas_delays(
 
     Parameters
     ----------
-    sbas : SbasCorrections
-    fixes : SatelliteCorrections
     time : ndarray of datetime64[ns], shape (T,)
-    seen : SeenFrom
     frequency_hz : ndarray, shape (K,) [Hz]
     """
     shape = fixes.state.shape

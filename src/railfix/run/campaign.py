@@ -161,7 +161,6 @@ def run_campaign(
     executor : Executor
         Of `concurrent.futures`: processes on this machine, or any other with its interface whose workers see the
         same files.
-    progress : CampaignProgress, optional
     lost : tuple of type
         Errors by which the executor reports that a worker process is gone.
 

@@ -69,7 +69,6 @@ def measured_features(
         See `read_measured`.
     of_map : sequence of Feature
         Features of the map, by chainage.
-    limits : FeatureLimits, optional
     """
     limits = limits or FeatureLimits()
     alone = [_features(run, limits) for run in runs]

@@ -94,12 +94,10 @@ def sign_notes(
 
     Parameters
     ----------
-    samples : SensorSamples
     places : polars.DataFrame
         ``time_gpst`` and ``chainage_m`` of single epochs of one antenna that passed every check.
     trajectory : Trajectory
         Of that antenna.
-    tachometer : TachometerLimits
     """
     wheel, radar, inertial = samples.tachometer, samples.radar, samples.inertial
     yield from _forces_at_rest(inertial)
@@ -287,8 +285,6 @@ def range_notes(
 
     Parameters
     ----------
-    ranging : StationRanges
-    units : GroundUnits
     places : polars.DataFrame
         ``time_gpst`` and ``chainage_m`` of an antenna.
     trajectory : Trajectory

@@ -212,7 +212,6 @@ def antenna_pair_screen(
         Of `spacing_direction`.
     tags : TagDifference, optional
         Without it the instants count as one.
-    limits : AntennaPairLimits, optional
 
     Returns
     -------

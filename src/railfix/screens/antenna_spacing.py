@@ -62,7 +62,6 @@ def antenna_spacing_screen(
     facing : array_like of int, shape (P,) or scalar
         1 where the vehicle's front looks to rising chainage, -1 to falling, 0 where that is unknown:
         then the order of the two is not judged.
-    limits : AntennaSpacingLimits, optional
 
     Returns
     -------

@@ -171,9 +171,6 @@ class ObservationScreen(Screen[Limits]):
 
         Parameters
         ----------
-        antenna : AntennaRanges
-        limits : Limits
-        setup : ScreenSetup
         state : object
             Returned with the chunk before; None at the start. Screens without memory return None.
         """

@@ -70,7 +70,6 @@ def cn0_screen(
         NaN where the log has none: not judged.
     elevation_deg : array_like, shape (T, M) [deg]
     satellite, signal : ndarray of str, shape (M,)
-    limits : Cn0Limits, optional
     curve : Cn0Curve, optional
         Without one only the floor is applied.
 

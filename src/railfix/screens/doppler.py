@@ -112,12 +112,10 @@ def doppler_screen(
     time : array_like of datetime64[ns], shape (T,)
     code_m, doppler_hz : array_like, shape (T, M) [m], [Hz]
         NaN where absent. Implausible codes (0, 1e9) must be left out by the caller.
-    channels : DopplerChannels
     break_before : array_like of bool, shape (T,), optional
         Nothing is differenced across the step into these epochs.
     code_sigma_m : array_like, shape (T, M) [m], optional
         Noise of the codes, asked for by mode "sigma"; NaN there: not judged.
-    limits : DopplerLimits, optional
     state : DopplerState, optional
         Left by the chunk before.
 
@@ -244,7 +242,6 @@ def suspicions(
         Of the satellites that are under suspicion already.
     since_before : ndarray of int64, shape (M,) [ns]
         Start of the suspicion; NaT as a number for none.
-    hold_ns : int
 
     Returns
     -------

@@ -107,7 +107,6 @@ def expected_limit_m(interval_s: Floats, sigma_m: Floats, *, limits: DopplerLimi
     interval_s : ndarray, shape (T,) [s]
     sigma_m : ndarray, shape (T + 1, M) [m]
         Of the codes, the epoch before the first one included.
-    limits : DopplerLimits
     """
     interval = interval_s[:, None]
     fresh = -np.expm1(-interval / limits.correlation_s)
@@ -127,7 +126,6 @@ def receiver_limit_m(
     metric_m : ndarray, shape (T, M) [m]
     sum_log, weight : float
         Sum of the logarithms of the epochs' scales so far, and their number.
-    limits : DopplerLimits
 
     Notes
     -----

@@ -36,7 +36,6 @@ def elevation_screen(elevation_deg: ArrayLike, *, limits: ElevationLimits | None
     ----------
     elevation_deg : array_like, shape (T, M) [deg]
         NaN where unknown: not judged.
-    limits : ElevationLimits, optional
     """
     limits = limits or ElevationLimits()
     metric = np.asarray(elevation_deg, dtype=np.float64)

@@ -78,7 +78,6 @@ def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Traje
 
     Parameters
     ----------
-    log : PositionLog
     epochs : polars.DataFrame
         Positions of railfix of one antenna of the same log: the epochs that a rate is counted of.
     trajectory : Trajectory
@@ -120,7 +119,6 @@ def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) 
 
     Parameters
     ----------
-    log : PositionLog
     run : Path
         Folder of railfix's run on the same receiver log.
     out : Path

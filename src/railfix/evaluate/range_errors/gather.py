@@ -106,13 +106,10 @@ def range_errors(
 
     Parameters
     ----------
-    result : AntennaResult
     trajectory : Trajectory
         Of the antenna; gives the azimuth of the vehicle.
-    reference : AntennaReference
     base : CommonErrors, optional
         Without one, satellite and atmospheric errors remain.
-    limits : GatherLimits, optional
     block_s : float [s]
         Length of the blocks of `ErrorSamples.block`.
 

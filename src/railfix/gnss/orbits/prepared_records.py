@@ -81,7 +81,6 @@ def group_delay_s(
 
     Parameters
     ----------
-    records : KeplerRecords
     signal : str
         RINEX 3 code without its type letter: "1C".
     clock : {"broadcast", "ionosphere_free"}

@@ -193,7 +193,6 @@ def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, i
 
     Parameters
     ----------
-    navigation : Navigation
     satellite : ndarray of str, shape (M,)
     time : ndarray of datetime64[ns], shape (T,)
     issue : ndarray of int, shape (T, M)

@@ -67,8 +67,6 @@ def power_signs(
     cn0_dbhz : ndarray, shape (T, K)
     gain : ndarray, shape (T,)
         In the receiver's unit, + for more gain; NaN where unknown.
-    state : PowerState
-    limits : InterferenceLimits
     """
     seen, now = np.isfinite(cn0_dbhz), seconds(time - GPS_EPOCH)[:, None]
     peak, first, last = _arranged(state, channel)
@@ -149,7 +147,6 @@ def held(
     ----------
     time : ndarray of datetime64[ns], shape (T,)
     signs : ndarray of bool, shape (T, C)
-    state : HeldState
     hold_s, release_s : ndarray, shape (C,) [s]
         A time of holding of 0 counts at once.
 

@@ -104,8 +104,6 @@ def wheel_signs(
         Positions along the line, of single epochs or of the filter; NaN without one.
     wheel_m : ndarray, shape (T,) [m]
         Distance that the wheel has rolled since the epoch before; NaN where it is not known.
-    state : WheelState
-    limits : InterferenceLimits
     signed : bool
         Whether the wheel's distance has the sign of the motion along the line.
     """

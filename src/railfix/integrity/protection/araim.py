@@ -112,10 +112,8 @@ def araim_levels(
 
     Parameters
     ----------
-    geometry : AraimGeometry
     phmi, false_alarm : sequence of float, length Q
         Of each component.
-    budget : AraimBudget
     """
     epochs, count = geometry.sigma_int_m.shape
     events = _events(geometry)

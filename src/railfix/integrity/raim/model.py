@@ -261,7 +261,6 @@ def linearised(
 
     Parameters
     ----------
-    ranges : RangeArrays
     place_ecef_m : ndarray, shape (T, 3) [m]
         Positions; NaN where there is none.
     axes : ndarray, shape (T, 3, 3)

@@ -61,7 +61,6 @@ def indicators_at(frames: Frames, places: Integers, before: Indicators) -> tuple
 
     Parameters
     ----------
-    frames : Frames
     places : ndarray of int, shape (T,)
         Rising; each has what the messages before it report.
     before : Indicators

@@ -111,8 +111,6 @@ def linearise(
     ----------
     ranges : Ranges
         T epochs.
-    phases : Phases
-    trajectory : Trajectory
     arc_m : ndarray, shape (T,) [m]
         Finite and on the line.
     clocks : {"own", "shared"}
@@ -261,11 +259,9 @@ def own_unknowns(
 
     Parameters
     ----------
-    lin : Linearised
     ambiguity_m : ndarray, shape (T, M, 3) [m]
         Of each channel, and its response to a map 1 m off across and in height.
     covariance_m2 : ndarray, shape (T, M, M) [m^2]
-    trajectory : Trajectory
     repeats : ndarray, shape (T,)
         Epochs with the same code errors: the ambiguities' variance is larger by that.
     """

@@ -58,8 +58,6 @@ def fast_in_force(
 
     Parameters
     ----------
-    tables : SatelliteTables
-    limits : SbasLimits
     time, stop : ndarray of datetime64[ns], shape (T, 1)
         Epochs, and when the GEO was last stopped.
     number : ndarray of int, shape (1, K)
@@ -176,8 +174,6 @@ def long_term_in_force(
 
     Parameters
     ----------
-    tables : SatelliteTables
-    limits : SbasLimits
     time : ndarray of datetime64[ns], shape (T,)
     satellite, number : ndarray, shape (K,)
         And its number of the PRN mask.

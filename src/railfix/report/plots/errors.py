@@ -304,7 +304,6 @@ def levels_over_time(positions: pl.DataFrame, alarm_limit_m: float, *, title: st
     positions : polars.DataFrame
         Of one antenna, columns of `railfix.pipeline.result_columns.POSITION_COLUMNS`.
     alarm_limit_m : float [m]
-    title : str
     """
     start = start_of(positions)
     x = since(positions, start)

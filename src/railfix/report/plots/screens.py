@@ -70,7 +70,6 @@ def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[
 
     Parameters
     ----------
-    picture : ScreenPicture
     time : ndarray of datetime64[ns], shape (T,), or (E,) with `epoch`
     epoch : ndarray of int, shape (T,), optional
         Epoch of each row of the picture, where `time` is that of E epochs.

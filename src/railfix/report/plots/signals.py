@@ -63,7 +63,6 @@ def cn0_over_elevation(
         Curve of the open sky. Without it, the mean of these observations themselves is drawn.
     mask_deg : float, optional [deg]
         Elevation mask.
-    title : str
 
     Returns
     -------
@@ -189,7 +188,6 @@ def sky_epochs(
         Largest number of epochs, evenly spaced.
     start : datetime64[ns], optional
         Origin of the times; the first epoch if not given.
-    title : str
 
     Returns
     -------

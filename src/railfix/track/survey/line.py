@@ -78,14 +78,11 @@ def adjust(
 
     Parameters
     ----------
-    runs : sequence of SurveyRun
     near_ecef_m : sequence of ndarray, shape (n, 3) [m]
         Approximate positions of every row, right to a kilometre.
-    line, ties : ReferenceLine and Ties, optional
     repeats : sequence of ndarray, shape (n,), optional
         How often the run passes the place of each row: minutes later reflections are the same there, so all passes
         together count as one.
-    limits : SurveyLimits, optional
     sigmas : {"none", "line"}
         Whether the standard deviations of the line are computed, which takes longer than the adjustment.
     """
@@ -255,8 +252,6 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
     ----------
     runs : sequence of SurveyRun
         Over one line, each with three positions or more.
-    limits : SurveyLimits, optional
-    name : str
 
     Raises
     ------
