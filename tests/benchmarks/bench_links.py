@@ -32,9 +32,9 @@ from typing import Any
 
 import numpy as np
 
+from railfix.ground.demo import LinkDisturbance, RelaySettings
 from railfix.ground.links import BEARERS, CentreLinks, TrainLinks, bearers_of
 from railfix.ground.quic import write_keys
-from railfix.ground.relay import LinkDisturbance, RelaySettings
 
 #: Namespaces, and addresses of both bearers in each.
 TRAIN, CENTRE = f"rf{os.getpid()}t", f"rf{os.getpid()}c"

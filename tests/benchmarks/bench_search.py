@@ -21,9 +21,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
 
 import synthetic
+from railfix.positioning.constrained import SinglePoint, single_point
 from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.section_search import SearchIndex, search
-from railfix.positioning.single_point import SinglePoint, single_point
 from railfix.track.trajectory import Trajectory
 
 LENGTHS_M = (1_000.0, 200_000.0)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from bad_inputs import Desk, desk_in
 from railfix.cli import app
-from railfix.cli.verdict import verdict_of_evaluation
+from railfix.cli.console import verdict_of_evaluation
 from railfix.evaluate import RunAndReference, evaluate_runs
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})

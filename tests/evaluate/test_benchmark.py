@@ -21,7 +21,7 @@ from railfix.core.errors import InputFileError, MismatchError, RailfixError, Set
 from railfix.core.files import file_sha256, read_bytes
 from railfix.evaluate import EvaluationOptions, evaluate_run
 from railfix.evaluate.benchmark import read_case, read_cases, run_benchmark, write_case
-from railfix.evaluate.benchmark.programs import RTKLIB_SINGLE, rows_at_epochs
+from railfix.evaluate.benchmark.table import RTKLIB_SINGLE, rows_at_epochs
 from railfix.pipeline.config import Config
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 

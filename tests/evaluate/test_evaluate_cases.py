@@ -33,10 +33,10 @@ from railfix.evaluate import (
     evaluate_runs,
 )
 from railfix.evaluate.epochs import travelled, with_missing
+from railfix.evaluate.figures import block_limits
 from railfix.evaluate.intervals import BRANCH_COLUMNS, OUTAGE_COLUMNS
 from railfix.evaluate.options import read_sections
 from railfix.evaluate.run_folder import tables_of
-from railfix.evaluate.scores import block_limits
 from railfix.io.reference_log import AntennaReference
 from railfix.run import run_files
 from railfix.simulate.demonstration import demo_inputs

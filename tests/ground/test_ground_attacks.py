@@ -14,18 +14,15 @@ import pytest
 from attacked_line import run_sequence
 from railfix.core.errors import InputFileError
 from railfix.core.settings import load_settings
-from railfix.ground import plausibility, stops
+from railfix.ground import stops, supervision
 from railfix.ground.control import ControlCentre, orders_of
-from railfix.ground.interlocking import Interlocking, InterlockingLimits, extended, stopped_trains
-from railfix.ground.interlocking_text import from_documents
+from railfix.ground.interlocking import Interlocking, InterlockingLimits, extended, from_documents, stopped_trains
 from railfix.ground.layout import Layout, LoopStation
-from railfix.ground.on_board import Authority, OnBoard, OnBoardLimits
-from railfix.ground.plausibility import report_received
 from railfix.ground.serve import CentreFile, _check_line
 from railfix.ground.stops import overlaps_stopped, release_train
 from railfix.ground.store import Store
-from railfix.ground.supervision import Supervision, at_start, standing_train
-from railfix.ground.train import _Desk, is_complete
+from railfix.ground.supervision import Supervision, at_start, report_received, standing_train
+from railfix.ground.train import Authority, OnBoard, OnBoardLimits, _Desk, is_complete
 from railfix.ground.triangle import TriangleVerdict
 from railfix.io.train_message import MessageStatus, TrainMessage, decode
 from test_ground_interlocking import RULES, take_out
@@ -36,24 +33,22 @@ pytestmark = pytest.mark.requirement("F4", "F6")
 LINE = Layout(stations=tuple(LoopStation(name=n, begin_m=m, end_m=m + 400.0) for n, m in (("A", 0.0), ("B", 6000.0))))
 LIMITS = InterlockingLimits()
 LENGTH_M = 200.0
-RULES["integrity"] = {plausibility.confirms_rear: {"message.complete and ": ""}}
+RULES["integrity"] = {supervision.confirms_rear: {"message.complete and ": ""}}
 RULES["length"] = {
-    plausibility.confirms_rear: {"abs(message.length_cm / 100.0 - known.length_m) <= LENGTH_ROUNDING_M": "True"},
-    plausibility.report_received: {
+    supervision.confirms_rear: {"abs(message.length_cm / 100.0 - known.length_m) <= LENGTH_ROUNDING_M": "True"},
+    supervision.report_received: {
         "(over_cm / 100.0 + before.length_m)": "(over_cm / 100.0 + message.length_cm / 100.0)"
     },
-    plausibility.compute_contradiction: {"message.length_cm == 0": "False"},
+    supervision.compute_contradiction: {"message.length_cm == 0": "False"},
 }
-RULES["two reports"] = {
-    plausibility.report_received: {"min(facing * rear, facing * before.claimed_m)": "facing * rear"}
-}
+RULES["two reports"] = {supervision.report_received: {"min(facing * rear, facing * before.claimed_m)": "facing * rear"}}
 RULES["way"] = {
-    plausibility.compute_contradiction: {
+    supervision.compute_contradiction: {
         "way > _longest_way_m(known.speed_mps, speed, elapsed, limits)": "False",
     }
 }
 RULES["roll-back"] = {
-    plausibility.compute_contradiction: {
+    supervision.compute_contradiction: {
         "direction * front + under < direction * known.rear_m + known.length_m": "False"
     }
 }
@@ -63,7 +58,7 @@ RULES["agreed"] = {
         "further - direction * known.asked_m > ROUNDING_M": "False",
     }
 }
-RULES["clock"] = {plausibility.compute_contradiction: {"latest_ns is not None and": "False and"}}
+RULES["clock"] = {supervision.compute_contradiction: {"latest_ns is not None and": "False and"}}
 RULES["turns"] = {OnBoard.receive: {"authority.report <= self.before_turn": "False"}}
 
 

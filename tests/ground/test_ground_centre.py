@@ -18,13 +18,13 @@ from hypothesis import strategies as st
 
 from railfix.ground.centre import (
     CentreLimits,
+    ReferenceCurve,
     Rejection,
     TrainRecord,
     TrainState,
     report_received,
     time_passed,
 )
-from railfix.ground.reference_curve import ReferenceCurve
 from railfix.ground.store import Store
 from railfix.io.train_message import MessageStatus, TrainMessage
 from railfix.simulate.demonstration import demo_truth

@@ -23,18 +23,18 @@ from railfix.ground.interlocking import (
     TrainInterval,
     _limit_m,
     extended,
+    from_documents,
     points_reported,
     released,
     route_requested,
     stopped_trains,
+    to_documents,
 )
-from railfix.ground.interlocking_text import from_documents, to_documents
 from railfix.ground.layout import Layout, LoopStation, layout_of, overlap
-from railfix.ground.on_board import Authority, OnBoard, OnBoardLimits
-from railfix.ground.plausibility import compute_contradiction, report_received
 from railfix.ground.stops import close_section, open_section, release_train, stop_trains
-from railfix.ground.supervision import Supervision
+from railfix.ground.supervision import Supervision, compute_contradiction, report_received
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
+from railfix.ground.train import Authority, OnBoard, OnBoardLimits
 from railfix.io.train_message import MessageError, MessageStatus, TrainMessage
 
 pytestmark = [pytest.mark.requirement("F4"), pytest.mark.requirement("F5")]

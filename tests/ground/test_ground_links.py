@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 from railfix.core.errors import OutputError
+from railfix.ground.demo import LinkDisturbance, Relay, RelaySettings
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
 from railfix.ground.link_quality import LinkChoice, LinkLimits, LinkMeter, coverage, round_trips
 from railfix.ground.links import BEARERS, CentreLinks, TrainLinks, bearers_of
 from railfix.ground.quic import LinkProtocol, configuration, connected, write_keys
-from railfix.ground.relay import LinkDisturbance, Relay, RelaySettings
 
 pytestmark = pytest.mark.requirement("F3")
 

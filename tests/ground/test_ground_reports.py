@@ -7,13 +7,12 @@ from typing import Any
 
 import pytest
 
-from railfix.ground import plausibility, stops
+from railfix.ground import stops, supervision
 from railfix.ground.interlocking import Interlocking, PointState, TrainInterval, extended, route_requested
 from railfix.ground.layout import Layout, LoopStation
-from railfix.ground.on_board import Authority, OnBoard
-from railfix.ground.plausibility import report_received
 from railfix.ground.stops import release_train
-from railfix.ground.supervision import Supervision, at_start, standing_train
+from railfix.ground.supervision import Supervision, at_start, report_received, standing_train
+from railfix.ground.train import Authority, OnBoard
 from test_ground_attacks import LENGTH_M, LIMITS, after, report
 from test_ground_attacks import LINE as TWO
 from test_ground_attacks import state as state
@@ -26,13 +25,13 @@ LINE = Layout(
     stations=tuple(LoopStation(name="ABC"[k], begin_m=2000.0 * k, end_m=2000.0 * k + 400.0) for k in range(3))
 )
 RULES["creep"] = {
-    plausibility.compute_contradiction: {
+    supervision.compute_contradiction: {
         "direction * front - over > direction * known.end_m": (
             "direction * front - over > max(direction * known.end_m, direction * known.front_m)"
         )
     }
 }
-RULES["tracks kept"] = {plausibility._turned: {"if station in under": "if station == known.station"}}
+RULES["tracks kept"] = {supervision._turned: {"if station in under": "if station == known.station"}}
 RULES["end of the place"] = {OnBoard.receive: {"if not self._granted:": "if False:"}}
 RULES["two places"] = {OnBoard.moved: {"self.direction * before)": "-1e9)"}}
 RULES["unknown before"] = {OnBoard.receive: {"authority.shortens and not (agrees or self._granted)": "False"}}

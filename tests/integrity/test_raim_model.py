@@ -13,9 +13,8 @@ import raim_oracle as oracle
 import synthetic
 from railfix.integrity.raim import constrained_model
 from railfix.integrity.raim.model import compact, regular_inverse
-from railfix.positioning.constrained import constrained_position
+from railfix.positioning.constrained import constrained_position, single_point
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies
-from railfix.positioning.single_point import single_point
 from raim_oracle import point_model
 
 pytestmark = pytest.mark.requirement("B6")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from railfix.io.receiver import nav_messages
-from railfix.io.receiver.bits import fields, sign_magnitude, signed, unsigned
+from railfix.io.receiver.framing import fields, sign_magnitude, signed, unsigned
 from railfix.io.receiver.log import StreamState, decode
 from test_receiver_logs import ubx_frame
 

@@ -18,8 +18,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io import read_any_positions, rinex
 from railfix.io.receiver import sbf, ubx
-from railfix.io.receiver.bits import Subframes, sbas_frames
-from railfix.io.receiver.framing import find_frames
+from railfix.io.receiver.framing import Subframes, find_frames, sbas_frames
 from railfix.io.receiver.log import StreamState, decode
 from railfix.live.stream import ReceiverState, receive_bytes
 from railfix.ranges.sbas import from_receiver

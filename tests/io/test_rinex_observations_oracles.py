@@ -10,7 +10,7 @@ import pytest
 from railfix.core.files import read_bytes
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io.rinex import read_observations, scan_observations
-from railfix.io.rinex.observations_signals import KINDS, signal_of
+from railfix.io.rinex.observations_lines import KINDS, signal_of
 
 pytestmark = [pytest.mark.requirement("A7"), pytest.mark.filterwarnings("ignore")]
 

@@ -24,10 +24,10 @@ from railfix.gnss.observations import Observations
 from railfix.io import read_any_positions
 from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_json
 from railfix.live.channels import TwoChannels, compare, digests
+from railfix.live.console import Metrics
 from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.forms import nmea_bytes, tpv_bytes
 from railfix.live.lag import Lag
-from railfix.live.metrics import Metrics
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
 from railfix.live.sources import _Chunks, check_source

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 import railfix
-from railfix.live.arrivals import next_arrival
 from railfix.live.sinks import MqttTarget
+from railfix.live.stream import next_arrival
 from railfix.simulate.demonstration import demo_files
 from test_live_sinks import broker as broker
 from test_live_sinks import log_of, output, program

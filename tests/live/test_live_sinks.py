@@ -31,9 +31,8 @@ from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_j
 from railfix.live.console import SessionLog
 from railfix.live.engine import LiveOutput
 from railfix.live.forms import etcs_form
-from railfix.live.outlets import Outlet
 from railfix.live.settings import LiveSettings
-from railfix.live.sinks import open_sink
+from railfix.live.sinks import Outlet, open_sink
 from railfix.simulate.demonstration import demo_files
 from ubx_made import log_of
 

@@ -27,8 +27,8 @@ from railfix.gnss.observations import Observations
 from railfix.io.receiver.framing import find_frames
 from railfix.io.receiver.log import StreamState, decode
 from railfix.io.receiver.rtcm import unfinished_epoch
+from railfix.live.console import Metrics
 from railfix.live.engine import LiveEngine, LiveOutput
-from railfix.live.metrics import Metrics
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
 from railfix.live.sources import Connected, Lost, read_source

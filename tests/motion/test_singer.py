@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from railfix.motion.singer import singer_steps
+from railfix.motion.chain import singer_steps
 
 SHARES = np.geomspace(1e-6, 10.0, 57)
 

@@ -25,14 +25,13 @@ from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import correct_ranges
-from railfix.pipeline.fault_exclusion import fault_free
 from railfix.pipeline.level_stage import level_facts, low_sides, prior_basis_text, protection_levels
 from railfix.pipeline.processor import AntennaResult
 from railfix.pipeline.results import State
-from railfix.pipeline.solve import place_on_line
+from railfix.pipeline.solve import fault_free, place_on_line
 from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.constrained import single_point
 from railfix.positioning.map_offset import MapOffset
-from railfix.positioning.single_point import single_point
 from railfix.ranges.atmosphere import saastamoinen_delay_m
 from railfix.ranges.corrected import REASONS
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, read_sbas

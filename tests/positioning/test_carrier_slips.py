@@ -8,7 +8,7 @@ import pytest
 import carrier_cases
 from railfix.gnss.observations import Observations
 from railfix.positioning.carrier import CycleSlipLimits, SlipReason, find_slips, number_arcs
-from railfix.positioning.carrier.arcs import NO_ARC, channel_of
+from railfix.positioning.carrier.continuity import NO_ARC, channel_of
 
 MILLISECOND_M = 299_792.458
 

@@ -8,7 +8,7 @@ import pytest
 import carrier_cases
 from railfix.gnss.observations import Observations
 from railfix.positioning.carrier import SmoothedCodes, SmoothingLimits, SmoothingState, find_slips, smooth_codes
-from railfix.positioning.carrier.recursion import linear_recursion
+from railfix.positioning.carrier.smoothing import linear_recursion
 
 
 def smoothed(obs: Observations, slip: np.ndarray | None = None, **limits: object) -> SmoothedCodes:

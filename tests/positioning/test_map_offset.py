@@ -13,6 +13,7 @@ import raim_oracle as oracle
 import synthetic
 from railfix.core.timescale import seconds, timedelta
 from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.constrained import SinglePoint, single_point
 from railfix.positioning.map_offset import (
     LinePositions,
     MapOffset,
@@ -24,7 +25,6 @@ from railfix.positioning.map_offset import (
 )
 from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.section_search import SearchIndex
-from railfix.positioning.single_point import SinglePoint, single_point
 
 pytestmark = pytest.mark.requirement("C4")
 

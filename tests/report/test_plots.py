@@ -16,8 +16,21 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.reasons import Reason
 from railfix.integrity.stanford import stanford as sorted_epochs
 from railfix.report import plots
-from railfix.report.plots.chart import Band, Bars, Cells, Chart, Curve, Marks, Points, RangeBars, SkyEpochs
-from railfix.report.plots.columns import extremes, nice_step, one_per_cell, spread
+from railfix.report.plots.chart import (
+    Band,
+    Bars,
+    Cells,
+    Chart,
+    Curve,
+    Marks,
+    Points,
+    RangeBars,
+    SkyEpochs,
+    extremes,
+    nice_step,
+    one_per_cell,
+    spread,
+)
 from railfix.screens import Cn0Limits
 from railfix.track import Track
 

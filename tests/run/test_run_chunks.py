@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from railfix.core.errors import OutputError
 from railfix.gnss.observations import Observations
 from railfix.pipeline.tables import rounded
-from railfix.run.chunks import aligned
 from railfix.run.output import OutputFolder
+from railfix.run.sources import aligned
 
 START = np.datetime64("2026-05-12T03:00:00", "ns")
 

@@ -11,7 +11,7 @@ from railfix.core.arrays import Floats
 from railfix.gnss.observations import concatenate
 from railfix.simulate import ReceiverSettings, Scenario, Simulation, SkySettings
 from railfix.simulate.environment import Environment, EnvironmentSettings
-from railfix.simulate.environment.diffraction import circular_reflection, received_amplitude
+from railfix.simulate.environment.correlator import circular_reflection, received_amplitude
 from railfix.simulate.environment.settings import (
     AntennaSettings,
     NeighbourSettings,
@@ -19,18 +19,19 @@ from railfix.simulate.environment.settings import (
     SideStreetSettings,
     TreeSettings,
 )
-from railfix.simulate.environment.side_streets import (
+from railfix.simulate.environment.structures import build_structures, tree_rows
+from railfix.simulate.environment.walls import (
+    Rays,
     SideStreets,
     equipment_amplitude,
     foliage,
     neighbour_clearance,
     neighbour_reflection,
+    second_reflection,
     street_reflections,
 )
-from railfix.simulate.environment.structures import build_structures, tree_rows
-from railfix.simulate.environment.walls import Rays, second_reflection
 from railfix.simulate.errors.settings import TrackingSettings
-from railfix.simulate.noise import CodeSmoothing, TrackingNoise
+from railfix.simulate.receiver import CodeSmoothing, TrackingNoise
 from railfix.simulate.scenario_file import load_scenario
 from test_simulate_environment import LINE_M, WAVE, rays, section, seen, wall
 from test_simulate_signals import whole

@@ -22,6 +22,7 @@ from railfix.simulate import (
     Simulation,
     SkySettings,
 )
+from railfix.simulate.constellation import links
 from railfix.simulate.errors import (
     ClockWalkSettings,
     ErrorSettings,
@@ -33,8 +34,7 @@ from railfix.simulate.errors import (
 )
 from railfix.simulate.errors.common import CommonErrors, ionosphere_mapping, pierce_point_km, troposphere_mapping
 from railfix.simulate.errors.processes import GaussMarkov
-from railfix.simulate.noise import CarriedNoise, NoiseSettings, TrackingNoise, TrackingSettings
-from railfix.simulate.satellites import links
+from railfix.simulate.receiver import CarriedNoise, NoiseSettings, TrackingNoise, TrackingSettings
 
 pytestmark = pytest.mark.requirement("D4")
 

@@ -30,8 +30,7 @@ from railfix.simulate import (
     run_curve,
     shuttle,
 )
-from railfix.simulate.body import BodyMotion
-from railfix.simulate.motion import limit_jerk
+from railfix.simulate.motion import BodyMotion, limit_jerk
 from railfix.simulate.run import vehicle_table
 from railfix.track import read_track, write_track_csv
 from railfix.track.vehicle import antenna_trajectory, read_vehicle

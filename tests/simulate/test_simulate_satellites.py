@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from railfix.simulate import Scenario, SkySettings, build_alignment, simulated_navigation
-from railfix.simulate.satellites import SatelliteTable, links
+from railfix.simulate.constellation import SatelliteTable, links
 
 pytestmark = pytest.mark.requirement("D4")
 

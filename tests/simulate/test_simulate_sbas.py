@@ -13,7 +13,7 @@ from railfix.io.rinex import read_observations
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, SbasLimits, SbasMessages, read_sbas
 from railfix.simulate import Scenario, Simulation, write_run
 from railfix.simulate.errors import SatelliteFault
-from railfix.simulate.noise import ionosphere_m
+from railfix.simulate.receiver import ionosphere_m
 from railfix.simulate.sbas import SbasSettings, service
 from railfix.simulate.sbas.service import sbas_messages, write_sbas
 from railfix.simulate.scenario import ReferenceStation

@@ -26,9 +26,8 @@ from railfix.simulate.sensors import (
     SlipInterval,
     TachometerSettings,
 )
-from railfix.simulate.sensors.inertial import gravity_mps2
+from railfix.simulate.sensors.body_sensors import gravity_mps2, wheel_slips
 from railfix.simulate.sensors.tables import COLUMNS, dropouts, sensor_tables
-from railfix.simulate.sensors.wheel import wheel_slips
 
 pytestmark = pytest.mark.requirement("D4")
 

@@ -27,7 +27,7 @@ from railfix.simulate import (
     SkySettings,
     write_run,
 )
-from railfix.simulate.satellites import Links, links
+from railfix.simulate.constellation import Links, links
 from synthetic import travelled_range
 
 pytestmark = pytest.mark.requirement("D4")

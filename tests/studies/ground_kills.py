@@ -22,14 +22,13 @@ from pathlib import Path
 import numpy as np
 
 from ground_load import BEARERS_OF, centre_file
-from railfix.ground.interlocking import Interlocking
-from railfix.ground.interlocking_text import HEAD, from_documents
+from railfix.ground.interlocking import HEAD, Interlocking, from_documents
 from railfix.ground.layout import overlap
 from railfix.ground.links import TrainLinks, first_sequence
-from railfix.ground.on_board import Authority, OnBoard
 from railfix.ground.serve import run_centre
 from railfix.ground.store import Store
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
+from railfix.ground.train import Authority, OnBoard
 from railfix.io.train_message import encode
 
 #: Station and direction of each train at the start.

@@ -27,12 +27,12 @@ import paths  # noqa: F401
 from railfix.ground.control import ControlCentre
 from railfix.ground.layout import Layout
 from railfix.ground.links import TrainLinks, bearers_of, first_sequence
-from railfix.ground.on_board import Authority, OnBoard
 from railfix.ground.quic import write_keys
 from railfix.ground.serve import COLLECTION, STEP_S
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
+from railfix.ground.train import Authority, OnBoard
 from railfix.io.train_message import encode
 
 CENTRE = {"A": ("127.0.1.1", 4433), "B": ("127.0.2.1", 4433)}

@@ -38,8 +38,8 @@ from railfix.positioning.constrained import constrained_position
 from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, fit
 from railfix.ranges.error_model import ErrorBins, ErrorModelFit, read_error_model, write_error_model
 from railfix.run.driver import open_inputs
-from railfix.run.folder import read_record
 from railfix.run.processor import processor_of
+from railfix.run.record import read_record
 from railfix.track.trajectory import Trajectory
 
 MASK: Final = {"elevation": {"mask_deg": 15.0}}

@@ -25,7 +25,7 @@ from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import without
 from railfix.pipeline.processor import AntennaResult
-from railfix.positioning.constrained import Constrained, constrained_position
+from railfix.positioning.constrained import Constrained, constrained_position, single_point
 from railfix.positioning.intersystem_bias import OffsetState, tie_clocks
 from railfix.positioning.noise_scale import (
     NoiseState,
@@ -37,7 +37,6 @@ from railfix.positioning.noise_scale import (
 )
 from railfix.positioning.normal_equations import Ranges, clock_groups
 from railfix.positioning.section_search import SearchIndex, search
-from railfix.positioning.single_point import single_point
 from railfix.ranges.weights import code_sigma_m
 from railfix.run.processor import processor_of
 from railfix.track import Track, from_positions

@@ -13,6 +13,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, Final, get_args
 
+from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 import paths
@@ -27,10 +28,9 @@ from railfix.evaluate import (
     STANFORD_COLUMNS,
 )
 from railfix.evaluate.intervals import BRANCH_COLUMNS, OUTAGE_COLUMNS
-from railfix.pipeline.columns import UNITS, Column
 from railfix.pipeline.config import Config
 from railfix.pipeline.passing_table import PASSING_COLUMNS
-from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
+from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS, UNITS, Column
 from railfix.pipeline.train_table import SMOOTHED_COLUMNS, TRAIN_COLUMNS
 from railfix.run.batch_check import BATCH_COLUMNS
 from railfix.run.route import ON_TRACK_COLUMNS, TRACK_COLUMNS
@@ -55,24 +55,29 @@ EVALUATION: Final[Mapping[str, Mapping[str, str]]] = {
 }
 
 
-def _attribute_docs(item: object) -> dict[str, str]:
-    """Descriptions in the Attributes section of a numpydoc docstring, by name."""
-    text = inspect.getdoc(item) or ""
-    _, _, section = text.partition("Attributes\n----------\n")
-    section = re.split(r"\n\n[A-Z][a-z]+\n-+\n", section)[0]
+def _field_comments(kind: type) -> dict[str, str]:
+    """Return the `#:` comments of the fields of a class, its bases included.
+
+    One at the end of a line is that of its field; one on lines of its own is that of the fields that follow it, up to
+    the next comment or empty line.
+    """
     docs: dict[str, str] = {}
-    names: list[str] = []
-    for line in section.splitlines():
-        if line.startswith(" "):
-            for name in names:
-                docs[name] = f"{docs[name]} {line.strip()}".strip()
-        elif line.strip():
-            head, _, kind = line.partition(" : ")
-            names = [n.strip() for n in head.split(",")]
-            unit = re.search(r"\[[^\]]+\]$", kind)
-            docs |= dict.fromkeys(names, "")
-            if unit:
-                docs |= dict.fromkeys(names, unit.group())
+    for base in reversed(kind.__mro__):
+        if base in (object, BaseModel, Settings) or not base.__module__.startswith("railfix"):
+            continue
+        above: list[str] = []
+        fields_follow = False
+        for line in inspect.getsource(base).splitlines():
+            text = line.strip()
+            if text.startswith("#:"):
+                above = [text[2:].strip()] if fields_follow else [*above, text[2:].strip()]
+                fields_follow = False
+            elif found := re.match(r"(\w+): .*?(?:#: (.*))?$", text):
+                docs[found[1]] = found[2] or " ".join(above)
+                fields_follow = True
+                above = [] if found[2] else above
+            elif not text:
+                above = []
     return docs
 
 
@@ -142,14 +147,14 @@ def _as_toml(value: object) -> str:
 
 def _setting_cells(prefix: str, group: Settings) -> Iterator[tuple[str, str, str, str]]:
     """Group, key, default with bounds, and the first sentence of the description of each setting."""
-    docs = _attribute_docs(type(group))
+    docs = _field_comments(type(group))
     for name, field in type(group).model_fields.items():
         value = getattr(group, name)
         if isinstance(value, Settings):
             yield from _setting_cells(f"{prefix}.{name}".strip("."), value)
             continue
-        unit, text = re.match(r"(?:\[([^\]]+)\]\s*)?(.*)", docs.get(name, ""), flags=re.DOTALL).groups()  # type: ignore[union-attr]
-        sentence = re.split(r"(?<=[a-z)`])[.;:] ", text)[0].rstrip(".").replace("``", "`")
+        first = re.split(r"(?<=[a-z)`\]])[.;:] ", docs.get(name, ""))[0].rstrip(".").replace("``", "`")
+        sentence, unit = re.match(r"(.*?)(?: \[([^\]]+)\])?$", first).groups()  # type: ignore[union-attr]
         default = (
             f"`{value if isinstance(value, str) else _as_toml(value)}`" if value not in (None, "", (), {}) else "none"
         )

@@ -26,7 +26,7 @@ from railfix.simulate.errors import (
     TroposphereErrorSettings,
 )
 from railfix.simulate.errors.common import ionosphere_mapping, troposphere_mapping
-from railfix.simulate.noise import NoiseSettings
+from railfix.simulate.receiver import NoiseSettings
 from railfix.simulate.sensors import RadarSettings
 from test_simulate_errors import LONG, STANDING, added_m, axes_of, correlation, full, noise_of, on_and_off
 from test_simulate_sensors import FORCES, RATES, difference, radar

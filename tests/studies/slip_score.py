@@ -26,7 +26,7 @@ from railfix.pipeline import sensed_motion as stage
 from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, sensor_epochs
 from railfix.simulate import Simulation
 from railfix.simulate.scenario_file import load_recipe
-from railfix.simulate.sensors.wheel import wheel_slips
+from railfix.simulate.sensors.body_sensors import wheel_slips
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
 from sensed_ride import sensors_of

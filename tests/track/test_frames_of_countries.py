@@ -8,8 +8,7 @@ from pyproj import CRS, Transformer
 
 from frame_cases import FRAMES, ITRF, MOTION, TIME, YEAR, moved
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.track.crs import frame_degrees, kind_of_frame, older_datum_note
-from railfix.track.frame_table import HELD, REALISATIONS, SAME
+from railfix.track.crs import HELD, REALISATIONS, SAME, frame_degrees, kind_of_frame, older_datum_note
 from railfix.track.frames import points_at
 
 pytestmark = pytest.mark.requirement("A9")

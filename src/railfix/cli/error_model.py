@@ -24,7 +24,7 @@ from railfix.ranges.error_model import (
     write_error_model,
 )
 from railfix.run import read_record
-from railfix.run.base_station import place_of
+from railfix.run.processor import place_of
 
 
 @from_models

@@ -11,9 +11,15 @@ import polars as pl
 import typer
 from rich.console import Console
 
-from railfix.cli.console import console_of_tables, show_files, show_notes, show_table, show_verdict
+from railfix.cli.console import (
+    console_of_tables,
+    show_files,
+    show_notes,
+    show_table,
+    show_verdict,
+    verdict_of_evaluation,
+)
 from railfix.cli.options import OutOption, OverwriteOption, Without, from_models, overwriting
-from railfix.cli.verdict import verdict_of_evaluation
 from railfix.core.errors import SettingsError
 from railfix.core.tables import Column, listing, number, percent, signed
 from railfix.evaluate import EvaluationOptions, RunAndReference, TrackFiles, evaluate_runs, write_evaluation

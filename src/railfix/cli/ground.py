@@ -18,7 +18,7 @@ from railfix.cli.options import check_outputs, from_models
 from railfix.core.errors import MismatchError, OutputError, SettingsError
 from railfix.core.settings import Settings, option
 from railfix.ground.monitor import MonitorLimits
-from railfix.ground.on_board import OnBoardLimits
+from railfix.ground.train import OnBoardLimits
 from railfix.ground.triangle import TriangleLimits
 from railfix.run.output import Overwrite
 
@@ -111,7 +111,7 @@ def monitor(
         raise SettingsError("--nav is missing: logs need navigation files")
     observations = [read_observations(path) for path in logs]
     if point:
-        from railfix.run.base_station import place_of
+        from railfix.run.processor import place_of
 
         points = np.stack([place_of(text, "--point") for text in point])
     else:
@@ -152,7 +152,7 @@ def _monitor_live(
     from railfix.ground.triangle import TriangleVerdict
     from railfix.io import read_navigation
     from railfix.live.sources import check_source, is_file
-    from railfix.run.base_station import place_of
+    from railfix.run.processor import place_of
 
     if not choices.point:
         raise SettingsError("--point is missing: streams name no known points; give it once for each receiver")

@@ -12,8 +12,7 @@ from railfix.cli.command import SIGNALLED
 from railfix.cli.options import from_models
 from railfix.cli.settings import Choices, set_value, settings_of
 from railfix.core.settings import validated
-from railfix.live.inputs import LiveInputs
-from railfix.live.settings import LiveSettings
+from railfix.live.settings import LiveInputs, LiveSettings
 
 
 @from_models

@@ -13,8 +13,7 @@ from rich.table import Table
 from railfix.cli.command import Command, Commands
 from railfix.cli.console import console_of_tables, show_notes
 from railfix.cli.map_network import Columns, MapReading, match_command, network, route
-from railfix.cli.map_service import service
-from railfix.cli.map_survey import survey
+from railfix.cli.map_runs import service, survey
 from railfix.cli.options import OverwriteOption, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
 from railfix.io.nmea import read_any_positions

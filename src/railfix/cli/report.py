@@ -16,9 +16,9 @@ from railfix.evaluate import EvaluationOptions
 from railfix.report import write_report
 from railfix.report.explain import explain_epoch, time_text, write_explanation
 from railfix.report.plots.screens import draw_run_screens
-from railfix.run.folder import reading_table
 from railfix.run.options import ColumnNames
 from railfix.run.output import OutputFolder
+from railfix.run.record import reading_table
 
 #: ``M_MMAP_THRESHOLD`` of ``malloc.h``, and the size from which on an array has pages of its own [bytes].
 _THRESHOLD: Final = (-3, 1 << 17)

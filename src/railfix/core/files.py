@@ -279,7 +279,6 @@ def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
 
     Parameters
     ----------
-    path : path
     what : str
         What the file should be, with its article ("the record of a run").
 

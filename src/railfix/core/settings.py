@@ -106,8 +106,6 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> 
 
     Parameters
     ----------
-    model : type of Settings
-    values : mapping
     source : str
         Where the values come from, for the message: a path, or "--set".
 

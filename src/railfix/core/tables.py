@@ -38,27 +38,18 @@ signed: Final = partial(number, sign="+")
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """A table whose first column names the rows; a page offers it as a CSV file of this name.
-
-    Attributes
-    ----------
-    numeric, code : sequence of int
-        Columns of numbers, of code.
-    marked : sequence of int
-        Rows that stand out.
-    links : sequence of str
-        Address of the page on each row, blank without one; empty where no row has one.
-    """
+    """A table whose first column names the rows; a page offers it as a CSV file of this name."""
 
     kind: ClassVar[str] = "table"
     name: str
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
+    #: Columns of numbers, of code.
     numeric: Sequence[int] = ()
     code: Sequence[int] = ()
-    marked: Sequence[int] = ()
-    links: Sequence[str] = ()
+    marked: Sequence[int] = ()  #: Rows that stand out.
+    links: Sequence[str] = ()  #: Address of the page on each row, blank without one; empty where no row has one.
 
 
 #: Head, column and format of a column of a table.

@@ -73,10 +73,6 @@ def from_week(week: ArrayLike, seconds_of_week: ArrayLike) -> Datetimes:
     week : array_like of int
         Full GPS week (no roll-over).
     seconds_of_week : array_like of float [s]
-
-    Returns
-    -------
-    ndarray of datetime64[ns]
     """
     weeks = np.asarray(week, dtype=np.int64) * SECONDS_PER_WEEK
     result = GPS_EPOCH + weeks.astype("timedelta64[s]") + timedelta(seconds_of_week)

@@ -16,14 +16,13 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError
 from railfix.core.reasons import Status
 from railfix.evaluate.along_track import along_track_error, interpolate_reference
-from railfix.evaluate.scores import Score, score
+from railfix.evaluate.figures import Score, score
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.config import Config, FilterSource
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import AntennaResult, State
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
-from railfix.run.chunks import aligned
 from railfix.run.driver import Progress, notes_of, open_inputs, sensors_of
 from railfix.run.inputs import RunInputs
 from railfix.run.options import RunOptions
@@ -31,6 +30,7 @@ from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import RunProvenance, package_versions, run_record
 from railfix.run.sensors import balises_of
+from railfix.run.sources import aligned
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS, ScreenSetup
 from railfix.track.trajectory import Trajectory
@@ -51,44 +51,28 @@ _SENSORS: Final[Mapping[FilterSource, tuple[str, ...]]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """Rates and errors of one choice of screens, or of sources of the filter along the track, on one antenna.
+    """Rates and errors of one choice of screens, or of sources of the filter along the track, on one antenna."""
 
-    Attributes
-    ----------
-    choice : str
-        "all", "none", "only raim", "without raim"; "filter", "filter without phase".
-    screens, sources : tuple of str
-        Active screens; sources of the filter along the track, empty for single epochs.
-    epochs : int
-        Epochs with observations, and with a reference where one is given.
-    rate, ok_rate : float
-        Share of the epochs with coordinates, and of those of status ok; of the filter: tracking.
-    n_used : float
-        Satellites used, mean over the epochs.
-    sigma_p50_m : float [m]
-        Median of the standard deviation along the line, of the epochs with coordinates.
-    coordinates, ok, conventional : Score or None
-        Errors of all positions, of those with status ok, and of the conventional position from the same ranges;
-        None without a reference.
-    outage : Score or None
-        Errors at the epochs without observations, such as those in tunnels; None where there are none.
-    normalised_p95 : float
-        95th percentile of the error size over the standard deviation; NaN without a reference.
-    """
-
-    choice: str
+    choice: str  #: "all", "none", "only raim", "without raim"; "filter", "filter without phase".
+    #: Active screens; sources of the filter along the track, empty for single epochs.
     screens: tuple[str, ...]
     sources: tuple[str, ...]
+
     antenna: str
-    epochs: int
+    epochs: int  #: Epochs with observations, and with a reference where one is given.
+    #: Share of the epochs with coordinates, and of those of status ok; of the filter: tracking.
     rate: float
     ok_rate: float
-    n_used: float
-    sigma_p50_m: float
+    n_used: float  #: Satellites used, mean over the epochs.
+    sigma_p50_m: float  #: Median of the standard deviation along the line, of the epochs with coordinates.
+    #: Errors of all positions, of those with status ok, and of the conventional position from the same ranges; None
+    #: without a reference.
     coordinates: Score | None = None
     ok: Score | None = None
     conventional: Score | None = None
+    #: Errors at the epochs without observations, such as those in tunnels; None where there are none.
     outage: Score | None = None
+    #: 95th percentile of the error size over the standard deviation; NaN without a reference.
     normalised_p95: float = float("nan")
 
     def as_row(self) -> dict[str, Any]:

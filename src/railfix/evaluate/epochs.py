@@ -12,7 +12,7 @@ import polars as pl
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.errors import MismatchError
 from railfix.core.timescale import seconds
-from railfix.evaluate.bracket import bracket
+from railfix.evaluate.along_track import bracket
 from railfix.evaluate.integrity import PARTS, STATED
 from railfix.evaluate.options import EvaluationOptions, Sections
 from railfix.evaluate.place import Answers, PlaceErrors, TrackFiles, errors_of
@@ -63,26 +63,16 @@ OF_FILTER: Final = pl.col("branch_probability").is_not_null().any().over("run")
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaEpochs:
-    """Epochs of one antenna, with facts on their evaluation.
+    """Epochs of one antenna, with facts on their evaluation."""
 
-    Attributes
-    ----------
-    table : polars.DataFrame
-        `EPOCH_COLUMNS` without run, configuration and line; the run's protection levels with their parts.
-    errors : PlaceErrors
-    speed_from : {"reference", "places"}
-    outside, from_sections : int
-        Epochs of the log outside the reference; epochs with a reference whose environment is that of the sections.
-    step_s : float [s]
-        Step of the log.
-    """
-
+    #: `EPOCH_COLUMNS` without run, configuration and line; the run's protection levels with their parts.
     table: pl.DataFrame
+
     errors: PlaceErrors
     speed_from: str
-    outside: int
-    step_s: float
-    from_sections: int
+    outside: int  #: Epochs of the log outside the reference.
+    step_s: float  #: Step of the log.
+    from_sections: int  #: Epochs with a reference whose environment is that of the sections.
 
     @property
     def method(self) -> str:
@@ -159,7 +149,6 @@ def travelled(
     known : ndarray of bool, shape (T,)
     speed_mps : ndarray, shape (T,) [m/s]
         Of the reference; NaN where unknown.
-    options : EvaluationOptions
     """
     at = np.flatnonzero(known)
     moved = np.full(len(time), np.nan)

@@ -62,39 +62,22 @@ class RunAndReference:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluatedRun:
-    """Facts on the evaluation of one run: name, configuration and line as in the tables.
-
-    Attributes
-    ----------
-    table : str
-        Table of positions.
-    reference : str
-        The file, or "given" for arrays.
-    method, speed_from : mapping of str to str
-        By antenna: "chainage" or "trajectory"; "reference" or "places".
-    outside : mapping of str to int
-        Epochs of the log outside the reference, by antenna.
-    step_s : mapping of str to float
-        Step of the log, by antenna.
-    protection : mapping
-        What its protection levels rest on, as ``run.json`` says.
-    inputs : tuple of mapping
-        Files that were read, with size and hash.
-    """
+    """Facts on the evaluation of one run: name, configuration and line as in the tables."""
 
     name: str
     configuration: str
     line: str
     path: Path
-    table: str
-    reference: str
+    table: str  #: Table of positions.
+    reference: str  #: The file, or "given" for arrays.
+    #: By antenna: "chainage" or "trajectory"; "reference" or "places".
     method: Mapping[str, str]
     speed_from: Mapping[str, str]
-    outside: Mapping[str, int]
-    step_s: Mapping[str, float]
-    protection: Mapping[str, Any]
+    outside: Mapping[str, int]  #: Epochs of the log outside the reference, by antenna.
+    step_s: Mapping[str, float]  #: Step of the log, by antenna.
+    protection: Mapping[str, Any]  #: What its protection levels rest on, as ``run.json`` says.
     settings: Mapping[str, Any]
-    inputs: tuple[Mapping[str, Any], ...]
+    inputs: tuple[Mapping[str, Any], ...]  #: Files that were read, with size and hash.
     notes: tuple[str, ...]
 
 

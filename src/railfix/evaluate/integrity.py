@@ -104,18 +104,10 @@ class LevelledRun:
 
 @dataclass(frozen=True, kw_only=True)
 class Integrity:
-    """Levels of one kind against the errors.
+    """Levels of one kind against the errors."""
 
-    Attributes
-    ----------
-    stanford : polars.DataFrame
-        `railfix.evaluate.figures.KEYS`, then `STANFORD_COLUMNS`.
-    beyond : polars.DataFrame
-        `BEYOND_COLUMNS`, the largest excess first.
-    """
-
-    stanford: pl.DataFrame
-    beyond: pl.DataFrame
+    stanford: pl.DataFrame  #: `railfix.evaluate.figures.KEYS`, then `STANFORD_COLUMNS`.
+    beyond: pl.DataFrame  #: `BEYOND_COLUMNS`, the largest excess first.
 
 
 def level_name(kind: str) -> str:

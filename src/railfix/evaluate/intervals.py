@@ -8,8 +8,7 @@ from typing import Final
 import polars as pl
 
 from railfix.evaluate.epochs import OF_FILTER, level_columns
-from railfix.evaluate.figures import AIDED, ALL, KEYS, POSITIONS, at_largest, positioned
-from railfix.evaluate.scores import WRONG_PLACE_M
+from railfix.evaluate.figures import AIDED, ALL, KEYS, POSITIONS, WRONG_PLACE_M, at_largest, positioned
 
 #: Columns of the table of intervals beside its keys, with their unit and meaning.
 INTERVAL_COLUMNS: Final[dict[str, str]] = {

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field
 from railfix.core.arrays import Floats, Strings
 from railfix.core.errors import InputFileError
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.evaluate.bracket import LARGEST_GAP_S
+from railfix.evaluate.along_track import LARGEST_GAP_S
 from railfix.io.named_columns import read_named_columns
 from railfix.run.options import ColumnNames
 
@@ -75,21 +75,7 @@ class EvaluationInputs(Settings):
 
 
 class EvaluationOptions(Settings):
-    """Settings of an evaluation; the options of `railfix evaluate` say what most are.
-
-    Attributes
-    ----------
-    satellite_edges : tuple
-        Limits between the classes of satellites used.
-    over_m : tuple of float [m]
-        Error sizes; the share of errors above each is counted.
-    block_s : float [s]
-        Length of the blocks of time that are resampled for confidence limits.
-    replicates : int
-        Number of resamples.
-    confidence : float
-        Probability of the confidence limits, between 0 and 1.
-    """
+    """Settings of an evaluation; the options of `railfix evaluate` say what most are."""
 
     method: Literal["auto", "chainage", "trajectory"] = option(
         "Errors as differences of chainage, or along the trajectory from the reference position.", "auto"
@@ -115,35 +101,29 @@ class EvaluationOptions(Settings):
     speed_edges_kmh: RisingEdges = option(
         "Limits between the speed classes.", (20.0, 60.0, 100.0), name="--speed-classes", metavar="KMH,..."
     )
-    satellite_edges: RisingCounts = (4, 5, 6, 7, 8, 10, 12, 15, 20)
-    over_m: RisingEdges = (5.0, 10.0, 20.0, 50.0)
+    satellite_edges: RisingCounts = (4, 5, 6, 7, 8, 10, 12, 15, 20)  #: Limits between the classes of satellites used.
+    over_m: RisingEdges = (5.0, 10.0, 20.0, 50.0)  #: Error sizes; the share of errors above each is counted.
     alarm_limits_m: tuple[Positive, ...] = option(
         "Alarm limits that protection levels are compared with, besides the run's own.",
         (10.0, 20.0, 40.0),
         name="--alarm-limit",
         metavar="M,...",
     )
-    block_s: Positive = 60.0
-    replicates: int = Field(default=1000, ge=1)
+    block_s: Positive = 60.0  #: Length of the blocks of time that are resampled for confidence limits.
+    replicates: int = Field(default=1000, ge=1)  #: Number of resamples.
     seed: int = option("Seed of the random numbers of the confidence limits.", 0, metavar="N", ge=0)
-    confidence: float = Field(default=0.95, gt=0.0, lt=1.0)
+    confidence: float = Field(default=0.95, gt=0.0, lt=1.0)  #: Probability of the confidence limits, between 0 and 1.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sections:
-    """S stretches of the line, rising, none over another.
-
-    Attributes
-    ----------
-    path : Path
-    from_m, to_m : ndarray, shape (S,) [m]
-        Chainage; the end belongs to the next one.
-    environment : tuple of str
-    """
+    """S stretches of the line, rising, none over another."""
 
     path: Path
+    #: Chainage; the end belongs to the next one; shape (S,).
     from_m: Floats
     to_m: Floats
+
     environment: tuple[str, ...]
 
     def at(self, chainage_m: Floats) -> Strings:

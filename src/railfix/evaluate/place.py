@@ -49,48 +49,29 @@ class TrackFiles(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """Positions of one antenna, and the reference at their times, T epochs.
+    """Positions of one antenna, and the reference at their times, T epochs."""
 
-    Attributes
-    ----------
-    chainage_m, conventional_chainage_m : ndarray, shape (T,) [m]
-        NaN without a position.
-    ecef_m : ndarray, shape (T, 3) [m]
-    reference_chainage_m : ndarray, shape (T,) [m]
-    reference_ecef_m : ndarray, shape (T, 3) [m]
-        NaN outside the reference.
-    """
-
+    #: NaN without a position, shape (T,).
     chainage_m: Floats
     conventional_chainage_m: Floats
-    ecef_m: Floats
-    reference_chainage_m: Floats
-    reference_ecef_m: Floats
+    ecef_m: Floats  #: Shape (T, 3).
+    reference_chainage_m: Floats  #: Shape (T,).
+    reference_ecef_m: Floats  #: NaN outside the reference, shape (T, 3).
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlaceErrors:
-    """Signed errors of one antenna, T epochs, + toward the end of the line.
-
-    Attributes
-    ----------
-    method : {"chainage", "trajectory"}
-    error_m, conventional_error_m : ndarray, shape (T,) [m]
-    distance_m : ndarray, shape (T,) [m]
-        Straight distance between the position on the map and the reference: its point on the map where the
-        trajectory is read, else its own position.
-    reference_chainage_m : ndarray, shape (T,) [m]
-        Of the reference; from the map where the reference has no chainage.
-    files : tuple of (str, Path)
-        Track and vehicle, if they were read.
-    """
+    """Signed errors of one antenna, T epochs, + toward the end of the line."""
 
     method: Method
+    #: Shape (T,).
     error_m: Floats
     conventional_error_m: Floats
+    #: Straight distance between the position on the map and the reference: its point on the map where the trajectory is
+    #: read, else its own position; shape (T,).
     distance_m: Floats
-    reference_chainage_m: Floats
-    files: tuple[tuple[str, Path], ...] = ()
+    reference_chainage_m: Floats  #: Of the reference; from the map where the reference has no chainage; shape (T,).
+    files: tuple[tuple[str, Path], ...] = ()  #: Track and vehicle, if they were read.
     notes: tuple[str, ...] = ()
 
 

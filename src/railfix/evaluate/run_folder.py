@@ -16,7 +16,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.reasons import Status
 from railfix.pipeline.level_stage import KINDS
-from railfix.run.folder import RunRecord, read_parquet, read_record, reading_table
+from railfix.run.record import RunRecord, read_parquet, read_record, reading_table
 
 #: Columns that every table of positions has.
 NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")
@@ -41,22 +41,13 @@ _ENDINGS: Final = (".parquet", ".csv")
 
 @dataclass(frozen=True, kw_only=True)
 class RunFolder(RunRecord):
-    """Results of a run, with one of its tables of positions.
+    """Results of a run, with one of its tables of positions."""
 
-    Attributes
-    ----------
-    positions_path : Path
-        The Parquet file of the table, or its CSV file where that is absent.
-    positions : polars.DataFrame
-        One row per epoch and antenna, see `railfix.pipeline.result_columns.POSITION_COLUMNS`; ``observed`` tells
-        whether the antenna has observations.
-    table : str
-        Name of the table: "positions" for the single-epoch positions.
-    """
-
-    positions_path: Path
+    positions_path: Path  #: The Parquet file of the table, or its CSV file where that is absent.
+    #: One row per epoch and antenna, see `railfix.pipeline.result_columns.POSITION_COLUMNS`; ``observed`` tells whether
+    #: the antenna has observations.
     positions: pl.DataFrame
-    table: str = POSITIONS_TABLE
+    table: str = POSITIONS_TABLE  #: Name of the table: "positions" for the single-epoch positions.
 
     @property
     def antennas(self) -> list[str]:
@@ -186,7 +177,6 @@ def read_run(
 
     Parameters
     ----------
-    path : Path
     table : str
         Which table of positions. A table other than "positions" takes the satellites used and the conventional
         position from the single-epoch positions of the same time and antenna.

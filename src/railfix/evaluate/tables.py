@@ -11,9 +11,8 @@ import polars as pl
 
 from railfix.core.tables import Column, Table, count, listing, number, percent, signed
 from railfix.evaluate.evaluation import Evaluation
-from railfix.evaluate.figures import WITH_SATELLITES
+from railfix.evaluate.figures import WITH_SATELLITES, WRONG_PLACE_M
 from railfix.evaluate.integrity import Integrity
-from railfix.evaluate.scores import WRONG_PLACE_M
 
 _NAMES: Final = {"constrained": "on the map", "constrained_ok": "on the map, ok", "conventional": "conventional"}
 _POSITION: Final = pl.col("position").replace(_NAMES)

@@ -51,53 +51,22 @@ class _NavigationRecords(FrozenArrays, NotebookTable):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class KeplerRecords(_NavigationRecords):
-    """Keplerian records of GPS, QZSS, Galileo and BeiDou, n rows.
+    """Keplerian records of GPS, QZSS, Galileo and BeiDou, n rows."""
 
-    Attributes
-    ----------
-    satellite : ndarray of str, shape (n,)
-    message : ndarray of str, shape (n,)
-        "LNAV", "CNAV", "CNV2" (GPS, QZSS), "INAV", "FNAV" (Galileo), "D1", "D2", "CNV1" to "CNV3" (BeiDou; D2 is sent
-        by GEO satellites).
-    toc, toe : ndarray of datetime64[ns], shape (n,)
-        Clock and ephemeris reference times, GPS time. The week is resolved from toc.
-    transmitted : ndarray of datetime64[ns], shape (n,)
-        Transmission time of the message; NaT where the file has none (or the 0.9999e9 of RINEX).
-    af0_s, af1, af2 : ndarray, shape (n,)
-        Clock polynomial [s, s/s, s/s^2].
-    sqrt_a, eccentricity, m0, delta_n, omega0, i0, omega, omega_dot, i_dot : ndarray, shape (n,)
-        [m^0.5, -, rad, rad/s, rad, rad, rad, rad/s, rad/s].
-    a_dot, delta_n_dot : ndarray, shape (n,) [m/s, rad/s^2]
-        Rates of the semi-major axis and of delta_n; 0 in the messages that have none.
-    cuc, cus, crc, crs, cic, cis : ndarray, shape (n,)
-        Harmonic corrections [rad, rad, m, m, rad, rad].
-    toe_sow_s : ndarray, shape (n,) [s]
-        Toe as seconds of the constellation's own week (BDT for BeiDou): enters the node's longitude.
-    health : ndarray of int, shape (n,)
-        As broadcast: GPS/QZSS 6-bit SV health (CNAV: 3 bits, L1, L2, L5), Galileo 9-bit word, BeiDou SatH1 (CNV: HS).
-    accuracy_m : ndarray, shape (n,) [m]
-        URA or SISA as written; nominal value of the URA_ED index of CNAV, NaN for CNV1 to CNV3.
-    iode, iodc : ndarray of int, shape (n,)
-        Issue of data (IODnav of Galileo in both; AODE and AODC of BeiDou).
-    data_source : ndarray of int, shape (n,)
-        Data sources of Galileo, codes on L2 of GPS and QZSS; 0 for BeiDou.
-    group_delay_1_s, group_delay_2_s : ndarray, shape (n,) [s]
-        GPS/QZSS TGD and NaN; Galileo BGD E5a/E1 and BGD E5b/E1; BeiDou TGD1 and TGD2, of CNV1 and CNV2 TGD_B1Cp and
-        TGD_B2ap, of CNV3 TGD_B2bI and NaN.
-    inter_signal_s : ndarray, shape (n, 6) [s]
-        Inter-signal corrections: GPS/QZSS L1 C/A, L2C, L5I5, L5Q5, L1C_D, L1C_P; BeiDou B1C_D and B2a_D; NaN elsewhere.
-    fit_interval_h : ndarray, shape (n,) [h]
-        GPS/QZSS fit interval in hours (QZSS flag 0 -> 2, 1 -> 4; GPS flag 0 -> 4); NaN elsewhere.
-    """
-
-    satellite: Strings
+    satellite: Strings  #: Shape (n,).
+    #: "LNAV", "CNAV", "CNV2" (GPS, QZSS), "INAV", "FNAV" (Galileo), "D1", "D2", "CNV1" to "CNV3" (BeiDou; D2 is sent by
+    #: GEO satellites); shape (n,).
     message: Strings
+    #: Clock and ephemeris reference times, GPS time. The week is resolved from toc; shape (n,).
     toc: Datetimes
     toe: Datetimes
+    #: Transmission time of the message; NaT where the file has none (or the 0.9999e9 of RINEX); shape (n,).
     transmitted: Datetimes
+    #: Clock polynomial [s, s/s, s/s^2]; shape (n,).
     af0_s: Floats
     af1: Floats
     af2: Floats
+    #: [m^0.5, -, rad, rad/s, rad, rad, rad, rad/s, rad/s]; shape (n,).
     sqrt_a: Floats
     eccentricity: Floats
     m0: Floats
@@ -107,60 +76,54 @@ class KeplerRecords(_NavigationRecords):
     omega: Floats
     omega_dot: Floats
     i_dot: Floats
+    #: Rates of the semi-major axis and of delta_n; 0 in the messages that have none; shape (n,) [m/s, rad/s^2].
     a_dot: Floats
     delta_n_dot: Floats
+    #: Harmonic corrections [rad, rad, m, m, rad, rad]; shape (n,).
     cuc: Floats
     cus: Floats
     crc: Floats
     crs: Floats
     cic: Floats
     cis: Floats
+    #: Toe as seconds of the constellation's own week (BDT for BeiDou): enters the node's longitude; shape (n,).
     toe_sow_s: Floats
+    #: As broadcast: GPS/QZSS 6-bit SV health (CNAV: 3 bits, L1, L2, L5), Galileo 9-bit word, BeiDou SatH1 (CNV: HS);
+    #: shape (n,).
     health: Integers
+    #: URA or SISA as written; nominal value of the URA_ED index of CNAV, NaN for CNV1 to CNV3; shape (n,).
     accuracy_m: Floats
+    #: Issue of data (IODnav of Galileo in both; AODE and AODC of BeiDou); shape (n,).
     iode: Integers
     iodc: Integers
-    data_source: Integers
+    data_source: Integers  #: Data sources of Galileo, codes on L2 of GPS and QZSS; 0 for BeiDou; shape (n,).
+    #: GPS/QZSS TGD and NaN; Galileo BGD E5a/E1 and BGD E5b/E1; BeiDou TGD1 and TGD2, of CNV1 and CNV2 TGD_B1Cp and
+    #: TGD_B2ap, of CNV3 TGD_B2bI and NaN; shape (n,).
     group_delay_1_s: Floats
     group_delay_2_s: Floats
+    #: Inter-signal corrections: GPS/QZSS L1 C/A, L2C, L5I5, L5Q5, L1C_D, L1C_P; BeiDou B1C_D and B2a_D; NaN elsewhere;
+    #: shape (n, 6).
     inter_signal_s: Floats
+    #: GPS/QZSS fit interval in hours (QZSS flag 0 -> 2, 1 -> 4; GPS flag 0 -> 4); NaN elsewhere; shape (n,) [h].
     fit_interval_h: Floats
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class GlonassRecords(_NavigationRecords):
-    """State-vector records of GLONASS, n rows.
+    """State-vector records of GLONASS, n rows."""
 
-    Attributes
-    ----------
-    satellite : ndarray of str, shape (n,)
-    toe : ndarray of datetime64[ns], shape (n,)
-        Reference time, UTC of the message turned into GPS time.
-    transmitted : ndarray of datetime64[ns], shape (n,)
-        Message frame time, GPS time; NaT when absent.
-    clock_bias_s : ndarray, shape (n,) [s]
-        -tau_n, the correction to be added (as RINEX writes it).
-    relative_frequency : ndarray, shape (n,)
-        +gamma_n.
-    position_ecef_m, velocity_ecef_mps, acceleration_ecef_mps2 : ndarray, shape (n, 3)
-        PZ-90, metres (RINEX writes kilometres); the acceleration is the luni-solar part.
-    health : ndarray of int, shape (n,)
-        0 is healthy.
-    frequency_channel : ndarray of int, shape (n,)
-    age_days : ndarray, shape (n,)
-    """
-
-    satellite: Strings
-    toe: Datetimes
-    transmitted: Datetimes
-    clock_bias_s: Floats
-    relative_frequency: Floats
+    satellite: Strings  #: Shape (n,).
+    toe: Datetimes  #: Reference time, UTC of the message turned into GPS time; shape (n,).
+    transmitted: Datetimes  #: Message frame time, GPS time; NaT when absent; shape (n,).
+    clock_bias_s: Floats  #: -tau_n, the correction to be added (as RINEX writes it); shape (n,).
+    relative_frequency: Floats  #: +gamma_n, shape (n,).
+    #: PZ-90, metres (RINEX writes kilometres); the acceleration is the luni-solar part; shape (n, 3).
     position_ecef_m: Floats
     velocity_ecef_mps: Floats
     acceleration_ecef_mps2: Floats
-    health: Integers
-    frequency_channel: Integers
-    age_days: Floats
+    health: Integers  #: 0 is healthy, shape (n,).
+    frequency_channel: Integers  #: Shape (n,).
+    age_days: Floats  #: Shape (n,).
 
 
 @dataclass(frozen=True, kw_only=True)

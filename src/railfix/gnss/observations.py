@@ -23,40 +23,25 @@ MAX_PROBLEMS: Final = 50
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationHeader:
-    """Header of an observation log.
+    """Header of an observation log."""
 
-    Attributes
-    ----------
-    version : float
-        RINEX version, NaN when the log is no RINEX file.
-    marker : str
-    receiver, antenna : str
-        Receiver type and antenna type, as written.
-    approximate_ecef_m : ndarray, shape (3,) [m]
-        APPROX POSITION XYZ; NaN when absent or all zero.
-    antenna_delta_hen_m : ndarray, shape (3,) [m]
-        Antenna height, east and north eccentricity.
-    interval_s : float
-        INTERVAL [s], NaN when absent.
-    glonass_channel : mapping of str to int
-        Frequency channel of GLONASS satellites ("R05" -> 1).
-    leap_seconds : int or None
-    signals : mapping of str to tuple of str
-        Signals declared for each constellation, RINEX 3 codes without the type letter ("1C", "2W").
-    receiver_clock_applied : bool
-        RCV CLOCK OFFS APPL: time tags, codes and phases are already corrected for the receiver clock.
-    """
-
-    version: float = float("nan")
+    version: float = float("nan")  #: RINEX version, NaN when the log is no RINEX file.
     marker: str = ""
+    #: Receiver type and antenna type, as written.
     receiver: str = ""
     antenna: str = ""
+    #: APPROX POSITION XYZ; NaN when absent or all zero; shape (3,).
     approximate_ecef_m: Floats = field(default_factory=lambda: np.full(3, np.nan))
+    #: Antenna height, east and north eccentricity; shape (3,).
     antenna_delta_hen_m: Floats = field(default_factory=lambda: np.zeros(3))
-    interval_s: float = float("nan")
+    interval_s: float = float("nan")  #: INTERVAL [s], NaN when absent.
+    #: Frequency channel of GLONASS satellites ("R05" -> 1).
     glonass_channel: Mapping[str, int] = field(default_factory=dict)
+
     leap_seconds: int | None = None
+    #: Signals declared for each constellation, RINEX 3 codes without the type letter ("1C", "2W").
     signals: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    #: RCV CLOCK OFFS APPL: time tags, codes and phases are already corrected for the receiver clock.
     receiver_clock_applied: bool = False
 
 

@@ -1,6 +1,6 @@
 # The names of `railfix.ground`, imported at their first use (lazy-loader).
 
-from .centre import CentreLimits, TrainRecord, TrainState, report_received, time_passed
+from .centre import CentreLimits, ReferenceCurve, TrainRecord, TrainState, report_received, time_passed
 from .interlocking import (
     Interlocking,
     InterlockingLimits,
@@ -12,10 +12,9 @@ from .interlocking import (
 )
 from .layout import Layout, LoopStation
 from .monitor import MonitorLimits, MonitorState, advance, release
-from .on_board import Authority, OnBoard, OnBoardLimits
-from .reference_curve import ReferenceCurve
 from .station_fixes import StationFixes, station_fixes
 from .supervision import Supervision
+from .train import Authority, OnBoard, OnBoardLimits
 from .triangle import TriangleLimits, TriangleResult, TriangleVerdict, compare_triangle, limits_for_false_stops
 
 __all__ = [

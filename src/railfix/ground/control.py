@@ -11,13 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from railfix.ground.centre import CentreLimits, TrainRecord, TrainState, time_passed
-from railfix.ground.interlocking import Interlocking, stopped_trains
-from railfix.ground.interlocking_text import HEAD, from_documents, to_documents
+from railfix.ground.centre import CentreLimits, ReferenceCurve, TrainRecord, TrainState, time_passed
+from railfix.ground.interlocking import HEAD, Interlocking, from_documents, stopped_trains, to_documents
 from railfix.ground.layout import PointName
 from railfix.ground.monitor import MonitorLimits, MonitorState, advance, release
 from railfix.ground.monitor import Order as MonitorOrder
-from railfix.ground.reference_curve import ReferenceCurve
 from railfix.ground.stops import close_section, open_section, release_train, stop_trains
 from railfix.ground.store import DatabaseError, Store
 from railfix.ground.supervision import Supervision
@@ -65,47 +63,26 @@ class StopOrder:
 
 @dataclass(kw_only=True)
 class ControlCentre:
-    """Control centre.
-
-    Attributes
-    ----------
-    supervision : Supervision
-    store : Store
-    curves : dict of int to ReferenceCurve
-        By direction.
-    send : callable
-        Sends bytes to a train.
-    clock : callable
-        Centre's clock, which never runs backwards [s].
-    wall_ns : callable
-        Time for the log [ns].
-    monitor : MonitorState or None
-        Of satellite positioning; None where nothing judges it.
-    rejected : Counter of str
-        Reports that did not count, by reason.
-    stops : dict of int to StopOrder
-        Trains that are ordered to stop.
-    database : str or None
-        Why the database does not take the state: nothing is granted meanwhile, and the trains stop in time.
-    interference : dict of int to SuspectedInterference
-        What the newest report of each train suspects.
-    """
+    """Control centre."""
 
     supervision: Supervision
     store: Store
-    curves: dict[int, ReferenceCurve]
-    send: Callable[[int, bytes], None]
-    clock: Callable[[], float]
-    wall_ns: Callable[[], int]
-    monitor: MonitorState | None = None
+    curves: dict[int, ReferenceCurve]  #: By direction.
+    send: Callable[[int, bytes], None]  #: Sends bytes to a train.
+    clock: Callable[[], float]  #: Centre's clock, which never runs backwards [s].
+    wall_ns: Callable[[], int]  #: Time for the log [ns].
+    monitor: MonitorState | None = None  #: Of satellite positioning; None where nothing judges it.
     times: MonitorLimits = field(default_factory=MonitorLimits)
     lines: list[str] = field(default_factory=list)
     reports: int = 0
-    rejected: Counter[str] = field(default_factory=Counter)
+    rejected: Counter[str] = field(default_factory=Counter)  #: Reports that did not count, by reason.
     stop_s: float | None = None
-    stops: dict[int, StopOrder] = field(default_factory=dict)
+    stops: dict[int, StopOrder] = field(default_factory=dict)  #: Trains that are ordered to stop.
+    #: Why the database does not take the state: nothing is granted meanwhile, and the trains stop in time.
     database: str | None = None
+    #: What the newest report of each train suspects.
     interference: dict[int, SuspectedInterference] = field(default_factory=dict)
+
     _failed_s: float = 0.0
     _routes: dict[int, int] = field(init=False)
     _verdict: tuple[TriangleVerdict, int] | None = None

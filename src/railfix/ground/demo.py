@@ -1,6 +1,8 @@
 """Demonstration of the ground side: two trains on a line with a passing loop, real links, and a satellite fault.
 
 The centre is that of ``railfix ground centre`` (`railfix.ground.control`), with the clock of the simulated traffic.
+
+Relay of datagrams on loopback addresses with seeded loss, delay, reordering, outages and bit errors.
 """
 
 from __future__ import annotations
@@ -9,31 +11,147 @@ import asyncio
 import contextlib
 import random
 import tempfile
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Floats
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotation
+from railfix.core.settings import Settings
+from railfix.ground.centre import ReferenceCurve
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.link_quality import LinkLimits, LinkName, draw_coverage
 from railfix.ground.links import BEARERS, CentreLinks, TrainLinks, bearers_of
 from railfix.ground.monitor import MonitorState
-from railfix.ground.on_board import Authority, OnBoard
 from railfix.ground.quic import write_keys
-from railfix.ground.reference_curve import ReferenceCurve
-from railfix.ground.relay import Relay, RelaySettings
 from railfix.ground.station_fixes import StationFixes, fixes_of_ranges
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start
 from railfix.ground.traffic import SimulatedTrain, Traffic, line_with_loops
+from railfix.ground.train import Authority, OnBoard
 from railfix.ground.triangle import TriangleLimits, TriangleVerdict, compare_triangle
 from railfix.ground.web import PageServer, Sessions, page_app
 from railfix.io.train_message import TrainMessage, encode
 from railfix.positioning.normal_equations import Ranges
+
+
+class RelaySettings(Settings):
+    """Disturbances of a relay."""
+
+    loss: float = Field(default=0.0, ge=0, le=1)  #: Probability that a datagram is lost.
+    #: Delay of each datagram, and the largest random one on top of it: datagrams overtake each other.
+    delay_s: float = Field(default=0.0, ge=0)
+    jitter_s: float = Field(default=0.0, ge=0)
+    bit_errors: float = Field(default=0.0, ge=0, le=1)  #: Probability that one bit of a datagram is flipped.
+    #: Probability that a datagram is sent a second time, up to `repeat_s` later.
+    repeats: float = Field(default=0.0, ge=0, le=1)
+
+    repeat_s: float = Field(default=0.5, ge=0)
+    #: Probability that a foreign datagram of random bytes, with the head of the one before, is put after a datagram.
+    insertions: float = Field(default=0.0, ge=0, le=1)
+
+    seed: int = 0
+
+
+class LinkDisturbance:
+    """Seeded disturbance of packets of any kind.
+
+    Attributes
+    ----------
+    settings : RelaySettings
+        May be replaced while packets pass.
+    up : bool
+        False: an outage, every packet is lost.
+    counts : Counter of str
+    """
+
+    def __init__(self, settings: RelaySettings) -> None:
+        self.settings, self.up = settings, True
+        self.counts: Counter[str] = Counter()
+        self._random = random.Random(settings.seed)
+
+    def packet(self, data: bytes, send: Callable[[bytes], None]) -> None:
+        """Pass a packet on, by `send`, or not."""
+        settings, rng = self.settings, self._random
+        self.counts["datagrams"] += 1
+        if not self.up or rng.random() < settings.loss:
+            self.counts["lost"] += 1
+            return
+        if rng.random() < settings.bit_errors:
+            self.counts["bit errors"] += 1
+            bit = rng.randrange(8 * len(data))
+            data = data[: bit // 8] + bytes([data[bit // 8] ^ 1 << bit % 8]) + data[bit // 8 + 1 :]
+        delay = settings.delay_s + rng.uniform(0.0, settings.jitter_s)
+        self._later(delay, data, send)
+        if rng.random() < settings.repeats:
+            self.counts["repeated"] += 1
+            self._later(delay + rng.uniform(0.0, settings.repeat_s), data, send)
+        if rng.random() < settings.insertions:
+            self.counts["inserted"] += 1
+            self._later(delay, data[:20] + rng.randbytes(max(len(data) - 20, 1)), send)
+
+    @staticmethod
+    def _later(delay_s: float, data: bytes, send: Callable[[bytes], None]) -> None:
+        if delay_s > 0.0:
+            asyncio.get_running_loop().call_later(delay_s, send, data)
+        else:
+            send(data)
+
+
+class Relay(asyncio.DatagramProtocol):
+    """Relay between one client and a target."""
+
+    def __init__(self, target: tuple[str, int], settings: RelaySettings) -> None:
+        self.disturbance = LinkDisturbance(settings)
+        self.address: tuple[str, int] = ("", 0)
+        self._target = target
+        self._here: asyncio.DatagramTransport | None = None
+        self._there: asyncio.DatagramTransport | None = None
+        self._client: Any = None
+
+    async def open(self, host: str) -> None:
+        """Open the relay at a loopback address, at a free port."""
+        loop = asyncio.get_running_loop()
+        self._here, _ = await loop.create_datagram_endpoint(lambda: self, local_addr=(host, 0))
+        self._there, _ = await loop.create_datagram_endpoint(lambda: _Back(self), local_addr=(host, 0))
+        self.address = self._here.get_extra_info("sockname")[:2]
+
+    def close(self) -> None:
+        """Close the relay."""
+        for transport in (self._here, self._there):
+            if transport is not None:
+                transport.close()
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:
+        """Pass a datagram of the client on."""
+        self._client = addr
+        self._pass(data, self._there, self._target)
+
+    def back(self, data: bytes) -> None:
+        """Pass a datagram of the target back."""
+        if self._client is not None:
+            self._pass(data, self._here, self._client)
+
+    def _pass(self, data: bytes, transport: asyncio.DatagramTransport | None, address: Any) -> None:
+        def send(datagram: bytes) -> None:
+            if transport is not None and not transport.is_closing():
+                transport.sendto(datagram, address)
+
+        self.disturbance.packet(data, send)
+
+
+class _Back(asyncio.DatagramProtocol):
+    def __init__(self, relay: Relay) -> None:
+        self._relay = relay
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:  # noqa: ARG002
+        self._relay.back(data)
+
 
 #: East and north of the receivers [m].
 PLAN_M: Floats = np.array([[0.0, 0.0], [800.0, 100.0], [300.0, 700.0]])
@@ -98,22 +216,12 @@ _TIME_NS: Final = 1_400_000_000_000_000_000
 
 @dataclass(kw_only=True)
 class LinkedTraffic(Traffic):
-    """Traffic whose messages go over the links, and whose centre is the one at work.
-
-    Attributes
-    ----------
-    links : dict of int to TrainLinks
-    control : ControlCentre
-    verdicts : list of (TriangleVerdict, int)
-        Of the triangle, one a second.
-    rest_s : float or None [s]
-        When all trains stood still after a stop.
-    """
+    """Traffic whose messages go over the links, and whose centre is the one at work."""
 
     links: dict[int, TrainLinks]
     control: ControlCentre
-    verdicts: list[tuple[TriangleVerdict, int]]
-    rest_s: float | None = None
+    verdicts: list[tuple[TriangleVerdict, int]]  #: Of the triangle, one a second.
+    rest_s: float | None = None  #: When all trains stood still after a stop.
 
     def step(self) -> None:
         """Run a step and note when the trains rest."""

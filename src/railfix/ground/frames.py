@@ -51,22 +51,12 @@ class Threat(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """One frame.
-
-    Attributes
-    ----------
-    kind : FrameKind
-    sender : int
-    sequence : int
-    time_ns : int [ns]
-        Sender's monotonic clock when it was sent.
-    payload : bytes
-    """
+    """One frame."""
 
     kind: FrameKind
     sender: int
     sequence: int
-    time_ns: int
+    time_ns: int  #: Sender's monotonic clock when it was sent.
     payload: bytes = b""
 
     def encode(self) -> bytes:
@@ -104,21 +94,13 @@ class Echo:
 
 
 class ReceiverLimits(Settings):
-    """Limits of a receiver.
+    """Limits of a receiver."""
 
-    Attributes
-    ----------
-    delay_s : float [s]
-        Largest delay above the shortest one seen.
-    drift : float
-        Largest drift of the clocks against each other; the shortest delay is forgotten at this rate.
-    jump : int
-        Larger steps of the sequence number count once the next frame goes on from there, so that one wrong number
-        does not make all later ones old.
-    """
-
-    delay_s: float = Field(default=5.0, gt=0)
+    delay_s: float = Field(default=5.0, gt=0)  #: Largest delay above the shortest one seen.
+    #: Largest drift of the clocks against each other; the shortest delay is forgotten at this rate.
     drift: float = Field(default=1e-4, ge=0)
+    #: Larger steps of the sequence number count once the next frame goes on from there, so that one wrong number does
+    #: not make all later ones old.
     jump: int = Field(default=1000, ge=1)
 
 
@@ -153,23 +135,13 @@ class _Seen:
 
 @dataclass(kw_only=True)
 class FrameReceiver:
-    """Receiver of the frames of one sender over any number of links.
+    """Receiver of the frames of one sender over any number of links."""
 
-    Attributes
-    ----------
-    sender : int
-        The only one whose frames count; the certificate of the connection names it.
-    limits : ReceiverLimits
-    threats : Counter of Threat
-        Frames that were rejected, by threat; deletions are the numbers that a newer one has skipped.
-    second_copies : int
-        Frames that the other link had brought before.
-    """
-
-    sender: int
+    sender: int  #: The only one whose frames count; the certificate of the connection names it.
     limits: ReceiverLimits = field(default_factory=ReceiverLimits)
+    #: Frames that were rejected, by threat; deletions are the numbers that a newer one has skipped.
     threats: Counter[Threat] = field(default_factory=Counter)
-    second_copies: int = 0
+    second_copies: int = 0  #: Frames that the other link had brought before.
     _accepted: _Seen = field(default_factory=_Seen)
     _links: dict[tuple[str, FrameKind], _Seen] = field(default_factory=dict)
     _shortest_ns: float | None = None

@@ -3,110 +3,69 @@
 A pure state machine. Occupied by a train is the interval from its last safe rear end to the end of its authority.
 Authorities are extended up to the nearest of: another train's interval, points that are not locked and detected for
 the train, the end of its route; less a margin. They are shortened by agreement alone (`railfix.ground.stops`);
-reports move the intervals (`railfix.ground.plausibility`).
+reports move the intervals (`railfix.ground.supervision`).
 It is not a national rule book: no shunting, no overlaps behind signals, no level crossings, no degraded working by
 hand.
+
+State of the interlocking as named texts of JSON for the store: its head, a text a train, a text a pair of points.
 """
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import Any, Final
 
 import numpy as np
 from pydantic import Field
 
+from railfix.core.errors import InputFileError
 from railfix.core.settings import Settings
 from railfix.ground.layout import Layout, PointName, overlap
 
 
 class InterlockingLimits(Settings):
-    """Limits of the interlocking.
+    """Limits of the interlocking."""
 
-    Attributes
-    ----------
-    margin_m : float [m]
-        Kept between the end of an authority and what limits it.
-    release_s : float [s]
-        Points are released this long after the safe rear end has passed them.
-    speed_mps : float [m/s]
-        Highest speed of a train.
-    acceleration_mps2 : float [m/s^2]
-        Highest acceleration and deceleration, between two reports with speeds.
-    speed_error_mps : float [m/s]
-        Largest error of a reported speed.
-    widest_m : float [m]
-        Largest sum of over- and under-reading amount of a report that is taken.
-    """
-
-    margin_m: float = Field(default=20.0, ge=0)
+    margin_m: float = Field(default=20.0, ge=0)  #: Kept between the end of an authority and what limits it.
+    #: Points are released this long after the safe rear end has passed them.
     release_s: float = Field(default=3.0, ge=0)
-    speed_mps: float = Field(default=60.0, gt=0)
+    speed_mps: float = Field(default=60.0, gt=0)  #: Highest speed of a train.
+    #: Highest acceleration and deceleration, between two reports with speeds.
     acceleration_mps2: float = Field(default=2.0, gt=0)
-    speed_error_mps: float = Field(default=1.0, ge=0)
+    speed_error_mps: float = Field(default=1.0, ge=0)  #: Largest error of a reported speed.
+    #: Largest sum of over- and under-reading amount of a report that is taken.
     widest_m: float = Field(default=1000.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainInterval:
-    """Interval and route of a train.
-
-    Attributes
-    ----------
-    train : int
-    direction : {-1, 1}
-    rear_m, front_m : float [m]
-        Last safe rear and front ends.
-    end_m : float [m]
-        End of the authority.
-    sequence : int
-        Newest report.
-    tracks : mapping of int to int
-        Track in each station of the route.
-    station : int
-        Station where the route ends.
-    length_m : float [m]
-        Length of the train as configured.
-    standstill : bool
-    claimed_m : float or None [m]
-        Safe rear end of the newest report; the interval begins there once the next one confirms it. None where the
-        newest report does not confirm the train's integrity and length.
-    line : int or None
-        Line of the train's reports; None before the first.
-    measured_ns : int or None [ns]
-        Instant of the newest place, on the train's clock; None before the first.
-    speed_mps : float or None [m/s]
-        Newest speed.
-    stop : str or None
-        Why the train is stopped, until it is released by hand.
-    asked_m : float or None [m]
-        Shorter end of the authority that the train is asked to agree to.
-    asked_number : int
-        Number of the first authority that asks for it.
-    held : bool
-        A route was taken back: the next one is set by hand.
-    """
+    """Interval and route of a train."""
 
     train: int
     direction: int
+    #: Last safe rear and front ends.
     rear_m: float
     front_m: float
-    end_m: float
-    sequence: int
-    tracks: Mapping[int, int]
-    station: int
-    length_m: float
+    end_m: float  #: End of the authority.
+    sequence: int  #: Newest report.
+    tracks: Mapping[int, int]  #: Track in each station of the route.
+    station: int  #: Station where the route ends.
+    length_m: float  #: Length of the train as configured.
     standstill: bool = True
+    #: Safe rear end of the newest report; the interval begins there once the next one confirms it. None where the
+    #: newest report does not confirm the train's integrity and length.
     claimed_m: float | None = None
-    line: int | None = None
-    measured_ns: int | None = None
-    speed_mps: float | None = None
-    stop: str | None = None
-    asked_m: float | None = None
-    asked_number: int = 0
-    held: bool = False
+    line: int | None = None  #: Line of the train's reports; None before the first.
+    measured_ns: int | None = None  #: Instant of the newest place, on the train's clock; None before the first.
+    speed_mps: float | None = None  #: Newest speed.
+    stop: str | None = None  #: Why the train is stopped, until it is released by hand.
+    asked_m: float | None = None  #: Shorter end of the authority that the train is asked to agree to.
+    asked_number: int = 0  #: Number of the first authority that asks for it.
+    held: bool = False  #: A route was taken back: the next one is set by hand.
 
     @cached_property
     def interval_m(self) -> tuple[float, float]:
@@ -122,44 +81,23 @@ class TrainInterval:
 
 @dataclass(frozen=True, kw_only=True)
 class PointState:
-    """Points as the interlocking knows them.
+    """Points as the interlocking knows them."""
 
-    Attributes
-    ----------
-    wanted : {1, 2}
-        Track they are commanded to.
-    detected : {1, 2} or None
-        Track they are detected at; None while they move.
-    locked : mapping of int to float or None
-        Trains that lock them: None until the train's rear end has passed, then the time of release [s].
-    """
-
-    wanted: int = 1
-    detected: int | None = 1
+    wanted: int = 1  #: Track they are commanded to.
+    detected: int | None = 1  #: Track they are detected at; None while they move.
+    #: Trains that lock them: None until the train's rear end has passed, then the time of release [s].
     locked: Mapping[int, float | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Interlocking:
-    """State of the interlocking.
-
-    Attributes
-    ----------
-    trains : mapping of int to TrainInterval
-    points : mapping of PointName to PointState
-    stopped : bool
-        True while no authority is extended and no route set: satellite positioning is suspended.
-    granted : int
-        Number of the last authorities that were sent.
-    closed : frozenset of int
-        Blocks (`Layout.sections`) that no authority reaches into.
-    """
+    """State of the interlocking."""
 
     trains: Mapping[int, TrainInterval]
     points: Mapping[PointName, PointState]
-    stopped: bool = False
-    granted: int = 0
-    closed: frozenset[int] = frozenset()
+    stopped: bool = False  #: True while no authority is extended and no route set: satellite positioning is suspended.
+    granted: int = 0  #: Number of the last authorities that were sent.
+    closed: frozenset[int] = frozenset()  #: Blocks (`Layout.sections`) that no authority reaches into.
 
 
 class NearbyTrains:
@@ -381,3 +319,50 @@ def _limit_m(
                 if mine == lane and low < last and first < high:
                     end = min(end, direction * (low if direction > 0 else high))
     return direction * (end - limits.margin_m)
+
+
+#: Name of the text without trains and points, and beginnings of the names of theirs.
+HEAD: Final = "interlocking"
+_TRAIN, _POINTS = f"{HEAD} train ", f"{HEAD} points "
+
+
+def to_documents(state: Interlocking, before: Interlocking | None = None) -> dict[str, str]:
+    """Return the texts by name; with a state before only those that may have changed since."""
+    texts = {HEAD: json.dumps({"stopped": state.stopped, "granted": state.granted, "closed": sorted(state.closed)})}
+    trains, points = (before.trains, before.points) if before is not None else ({}, {})
+    for number, train in state.trains.items():
+        if train is not trains.get(number):
+            texts[f"{_TRAIN}{number}"] = json.dumps(_values(train))
+    for (station, side), point in state.points.items():
+        if point is not points.get((station, side)):
+            texts[f"{_POINTS}{station} {side}"] = json.dumps(_values(point))
+    return texts
+
+
+def from_documents(texts: Mapping[str, str]) -> Interlocking:
+    """Return the state from its texts. Times of release begin again: the clock of the process before is not known.
+
+    InputFileError: when an older version wrote them.
+    """
+    head = json.loads(texts[HEAD])
+    if "closed" not in head:
+        raise InputFileError("the centre's database", "is of an older version of railfix; name another database")
+    trains, points = {}, {}
+    for name, text in texts.items():
+        if name.startswith(_TRAIN):
+            values = json.loads(text)
+            tracks = {int(station): track for station, track in values.pop("tracks").items()}
+            trains[int(name.removeprefix(_TRAIN))] = TrainInterval(**values, tracks=tracks)
+        elif name.startswith(_POINTS):
+            values = json.loads(text)
+            station, side = map(int, name.removeprefix(_POINTS).split())
+            points[station, side] = PointState(**values | {"locked": dict.fromkeys(map(int, values["locked"]))})
+    # in the order of the line, whatever the order of the texts
+    return Interlocking(
+        trains=dict(sorted(trains.items())), points=dict(sorted(points.items())), stopped=head["stopped"],
+        granted=head["granted"], closed=frozenset(head["closed"]),
+    )  # fmt: skip
+
+
+def _values(record: TrainInterval | PointState) -> dict[str, Any]:
+    return {field.name: getattr(record, field.name) for field in fields(record)}

@@ -28,20 +28,13 @@ Piece = tuple[int, float, float]
 
 
 class LoopStation(Settings):
-    """Station with two tracks.
-
-    Attributes
-    ----------
-    name : str
-    begin_m, end_m : float [m]
-        Outer ends of the points.
-    points_m : float [m]
-        Length from the outer end of the points to where the tracks are clear of each other.
-    """
+    """Station with two tracks."""
 
     name: str
+    #: Outer ends of the points.
     begin_m: float
     end_m: float
+    #: Length from the outer end of the points to where the tracks are clear of each other.
     points_m: float = Field(default=60.0, gt=0)
 
     @model_validator(mode="after")
@@ -166,17 +159,10 @@ _STEP_M: Final = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkLayout:
-    """Layout, and the tracks of the network that it stands for.
+    """Layout, and the tracks of the network that it stands for."""
 
-    Attributes
-    ----------
-    layout : Layout
-        Chainage from the line's first end along the single line and track 1 of each station.
-    tracks : tuple of (str, ...)
-        Names of the tracks of the line in order: one of the single line, track 1 and track 2 of a station.
-    """
-
-    layout: Layout
+    layout: Layout  #: Chainage from the line's first end along the single line and track 1 of each station.
+    #: Names of the tracks of the line in order: one of the single line, track 1 and track 2 of a station.
     tracks: tuple[tuple[str, ...], ...]
 
 

@@ -28,56 +28,33 @@ class LinkResult(NamedTuple):
 
 
 class LinkLimits(Settings):
-    """Limits of the links.
+    """Limits of the links."""
 
-    Attributes
-    ----------
-    answer_s : float [s]
-        An echo that takes longer counts as none (T); a centre lets one wait up to 0.2 s for an authority to go with.
-    misses : int
-        Misses in a row after which the spare link is taken.
-    good : int
-        Answers in a row before the normal link is taken again.
-    good_s : float [s]
-        Time since the fall-back before the normal link is taken again.
-    window : int
-        Frames of the response rate.
-    place_m : float [m]
-        Length of a place of the coverage map.
-    idle_s : float [s]
-        A connection without any packet for this time, at most 10 s, is made anew: so the trains of a centre that was
-        killed come back.
-    """
-
+    #: An echo that takes longer counts as none (T); a centre lets one wait up to 0.2 s for an authority to go with.
     answer_s: float = Field(default=1.0, gt=0)
-    misses: int = Field(default=3, ge=1)
-    good: int = Field(default=10, ge=1)
-    good_s: float = Field(default=30.0, ge=0)
-    window: int = Field(default=60, ge=1)
-    place_m: float = Field(default=100.0, gt=0)
+    misses: int = Field(default=3, ge=1)  #: Misses in a row after which the spare link is taken.
+    good: int = Field(default=10, ge=1)  #: Answers in a row before the normal link is taken again.
+    good_s: float = Field(default=30.0, ge=0)  #: Time since the fall-back before the normal link is taken again.
+    window: int = Field(default=60, ge=1)  #: Frames of the response rate.
+    place_m: float = Field(default=100.0, gt=0)  #: Length of a place of the coverage map.
+    #: A connection without any packet for this time, at most 10 s, is made anew: so the trains of a centre that was
+    #: killed come back.
     idle_s: float = Field(default=5.0, gt=0, le=10)
 
 
 @dataclass(kw_only=True)
 class LinkMeter:
-    """Response rate and round-trip time of one link.
-
-    Attributes
-    ----------
-    limits : LinkLimits
-    misses, good : int
-        Misses, and answers, in a row.
-    coverage : dict of (int, int) to (int, int)
-        Answered and sent frames by place and running direction.
-    results : deque of LinkResult
-        The last `KEPT` frames, by the time of their result.
-    """
+    """Response rate and round-trip time of one link."""
 
     limits: LinkLimits = field(default_factory=LinkLimits)
+    #: Misses, and answers, in a row.
     misses: int = 0
     good: int = 0
+    #: Answered and sent frames by place and running direction.
     coverage: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
+    #: The last `KEPT` frames, by the time of their result.
     results: deque[LinkResult] = field(default_factory=lambda: deque(maxlen=KEPT))
+
     _open: dict[int, tuple[float, float | None, int]] = field(default_factory=dict)
 
     def sent(self, sequence: int, now_s: float, *, chainage_m: float | None = None, direction: int = 0) -> None:
@@ -132,18 +109,10 @@ LinkName = Literal["A", "B"]
 
 @dataclass(frozen=True, kw_only=True)
 class LinkChoice:
-    """Link in use with a normal link A and a spare link B.
-
-    Attributes
-    ----------
-    active : {"A", "B"}
-    since_s : float [s]
-        When it was taken.
-    switches : int
-    """
+    """Link in use with a normal link A and a spare link B."""
 
     active: LinkName = "A"
-    since_s: float = 0.0
+    since_s: float = 0.0  #: When it was taken.
     switches: int = 0
 
     def after(self, now_s: float, normal: LinkMeter, spare: LinkMeter) -> LinkChoice:

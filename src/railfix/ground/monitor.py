@@ -31,53 +31,27 @@ class Order(Enum):
 
 
 class MonitorLimits(Settings):
-    """Times of the monitor.
+    """Times of the monitor."""
 
-    Attributes
-    ----------
-    late_s : float [s]
-        A set of three fixes is late after this time; with the period of the fixes below the time to alert of 6 s.
-    settle_s : float [s]
-        Time after a stop in which `GROUND_LOST` is replaced by a more exact cause: an error that grows takes one fix
-        out of its circle before the others.
-    healthy_s : float [s]
-        Healthy time before a stop can be released.
-    """
-
+    #: A set of three fixes is late after this time; with the period of the fixes below the time to alert of 6 s.
     late_s: float = option("Time after which three fixes are late.", 3.0, name="--late", metavar="S", gt=0, le=5.0)
+    #: Time after a stop in which `GROUND_LOST` is replaced by a more exact cause: an error that grows takes one fix out
+    #: of its circle before the others.
     settle_s: float = Field(default=10.0, ge=0)
-    healthy_s: float = Field(default=300.0, gt=0)
+    healthy_s: float = Field(default=300.0, gt=0)  #: Healthy time before a stop can be released.
 
 
 @dataclass(frozen=True, kw_only=True)
 class MonitorState:
-    """State of the monitor.
+    """State of the monitor."""
 
-    Attributes
-    ----------
-    stopped : bool
-        True before the first healthy period was released, and from a stop to its release.
-    cause : TriangleVerdict or None
-        TriangleVerdict that stopped the trains; None at the start.
-    receiver : int
-        Receiver that the cause names, -1 where it names none.
-    since_s : float [s]
-        When the stop was given.
-    complete_s : float [s]
-        Time of the last set of three fixes.
-    healthy_since_s : float or None [s]
-        Start of the present healthy time.
-    warning : int
-        Receiver that drifts inside its circle, -1 where none does.
-    """
-
-    stopped: bool = True
-    cause: TriangleVerdict | None = None
-    receiver: int = -1
-    since_s: float = 0.0
-    complete_s: float = 0.0
-    healthy_since_s: float | None = None
-    warning: int = -1
+    stopped: bool = True  #: True before the first healthy period was released, and from a stop to its release.
+    cause: TriangleVerdict | None = None  #: TriangleVerdict that stopped the trains; None at the start.
+    receiver: int = -1  #: Receiver that the cause names, -1 where it names none.
+    since_s: float = 0.0  #: When the stop was given.
+    complete_s: float = 0.0  #: Time of the last set of three fixes.
+    healthy_since_s: float | None = None  #: Start of the present healthy time.
+    warning: int = -1  #: Receiver that drifts inside its circle, -1 where none does.
 
 
 def advance(
@@ -146,18 +120,11 @@ def release(
 
 @dataclass(frozen=True, kw_only=True)
 class MonitoredLog:
-    """Result of the monitor over a log.
-
-    Attributes
-    ----------
-    fixes : StationFixes
-    triangle : TriangleResult
-    orders : tuple of (datetime64, Order, TriangleVerdict, int)
-        Orders to the trains, with the cause and the receiver it names.
-    """
+    """Result of the monitor over a log."""
 
     fixes: StationFixes
     triangle: TriangleResult
+    #: Orders to the trains, with the cause and the receiver it names.
     orders: tuple[tuple[np.datetime64, Order, TriangleVerdict, int], ...]
 
     def table(self) -> pl.DataFrame:

@@ -22,16 +22,14 @@ from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import Settings, load_settings
 from railfix.core.timescale import utc_to_gpst
-from railfix.ground.centre import CentreLimits
+from railfix.ground.centre import CentreLimits, ReferenceCurve
 from railfix.ground.control import ControlCentre, orders_of
-from railfix.ground.interlocking import InterlockingLimits, TrainInterval
-from railfix.ground.interlocking_text import HEAD
+from railfix.ground.interlocking import HEAD, InterlockingLimits, TrainInterval
 from railfix.ground.layout import Layout, LoopStation, PointName, layout_of
 from railfix.ground.link_quality import LinkName
 from railfix.ground.links import BEARERS, CentreLinks
 from railfix.ground.monitor import MonitorLimits
 from railfix.ground.quic import check_keys
-from railfix.ground.reference_curve import ReferenceCurve
 from railfix.ground.station_fixes import stream_fixes
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
@@ -63,47 +61,24 @@ Address = Annotated[tuple[str, int], BeforeValidator(parse_address)]
 
 
 class TrainPlace(Settings):
-    """Train at rest at the first start of the centre.
-
-    Attributes
-    ----------
-    number : int
-    station : str
-    track : {1, 2}
-    direction : {-1, 1}
-        In which the front looks, against chainage.
-    front_m, length_m : float [m]
-        Front end and length.
-    bound_m : float [m]
-        The front is at most so far from `front_m`.
-    """
+    """Train at rest at the first start of the centre."""
 
     number: int = Field(gt=0, lt=1 << 32)
     station: str
     track: Literal[1, 2]
-    direction: Literal[-1, 1]
+    direction: Literal[-1, 1]  #: In which the front looks, against chainage.
+    #: Front end and length.
     front_m: float
     length_m: float = Field(gt=0)
-    bound_m: float = Field(default=10.0, ge=0)
+    bound_m: float = Field(default=10.0, ge=0)  #: The front is at most so far from `front_m`.
 
 
 class TriangleInputs(Settings):
-    """Reference triangle on live streams.
+    """Reference triangle on live streams."""
 
-    Attributes
-    ----------
-    sources : tuple of str, length 3
-        As of ``railfix live``.
-    points : tuple of (float, float, float), length 3 [deg, deg, m]
-        Latitude, longitude and height of the known points.
-    nav : tuple of Path
-        Navigation known from the start; records from the streams are added.
-    limits : TriangleLimits
-    """
-
-    sources: tuple[str, str, str]
-    points: tuple[Place, Place, Place]
-    nav: tuple[Path, ...] = ()
+    sources: tuple[str, str, str]  #: As of ``railfix live``, length 3.
+    points: tuple[Place, Place, Place]  #: Latitude, longitude and height of the known points; length 3 [deg, deg, m].
+    nav: tuple[Path, ...] = ()  #: Navigation known from the start; records from the streams are added.
     limits: TriangleLimits = TriangleLimits()
 
     def points_ecef_m(self) -> Floats:
@@ -112,47 +87,25 @@ class TriangleInputs(Settings):
 
 
 class CentreFile(Settings):
-    """File of a centre; paths are relative to it.
+    """File of a centre; paths are relative to it."""
 
-    Attributes
-    ----------
-    keys : Path
-        Folder with ``authority.pem``, ``centre.pem`` and ``centre.key`` of ``railfix ground keys``.
-    listen : dict of {"A", "B"} to HOST:PORT
-        Address of each bearer.
-    stations : tuple of LoopStation
-        The line; or else
-    network : tuple of Path
-        Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout`).
-    drive : {"left", "right"}
-        Side on which trains pass a station of the network.
-    trains : tuple of TrainPlace
-        Where they are at the first start; afterwards the database knows.
-    database : str
-        File of SQLite, or the address of an SQL database (``postgresql+psycopg://...``).
-    routes : {"automatic", "by hand"}
-        Whether a train that nears the end of its track is given the route to the next station.
-    speed_mps : float [m/s]
-        Of the reference run curve, for simulated running.
-    points_s : float [s]
-        Time in which the simulated points move: there is no interface to real ones.
-    triangle : TriangleInputs or None
-        Judges satellite positioning; the first start is then a stop, to be released by hand. Without it nothing does.
-    centre, interlocking, monitor : settings
-        `CentreLimits`, `InterlockingLimits`, `MonitorLimits`.
-    """
-
-    keys: Path
-    listen: dict[LinkName, Address]
-    stations: tuple[LoopStation, ...] = ()
+    keys: Path  #: Folder with ``authority.pem``, ``centre.pem`` and ``centre.key`` of ``railfix ground keys``.
+    listen: dict[LinkName, Address]  #: Address of each bearer.
+    stations: tuple[LoopStation, ...] = ()  #: The line; or else
+    #: Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout`).
     network: tuple[Path, ...] = ()
-    drive: Literal["left", "right"] = "left"
+    drive: Literal["left", "right"] = "left"  #: Side on which trains pass a station of the network.
+    #: Where they are at the first start; afterwards the database knows.
     trains: Annotated[tuple[TrainPlace, ...], Field(min_length=1)]
-    database: str = "centre.db"
+    database: str = "centre.db"  #: File of SQLite, or the address of an SQL database (``postgresql+psycopg://...``).
+    #: Whether a train that nears the end of its track is given the route to the next station.
     routes: Literal["automatic", "by hand"] = "automatic"
-    speed_mps: float = Field(default=20.0, gt=0)
+    speed_mps: float = Field(default=20.0, gt=0)  #: Of the reference run curve, for simulated running.
+    #: Time in which the simulated points move: there is no interface to real ones.
     points_s: float = Field(default=5.0, ge=0)
+    #: Judges satellite positioning; the first start is then a stop, to be released by hand. Without it nothing does.
     triangle: TriangleInputs | None = None
+    #: `CentreLimits`, `InterlockingLimits`, `MonitorLimits`.
     centre: CentreLimits = CentreLimits()
     interlocking: InterlockingLimits = InterlockingLimits()
     monitor: MonitorLimits = MonitorLimits()

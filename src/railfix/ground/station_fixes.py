@@ -17,16 +17,15 @@ from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import satellite_states
-from railfix.live.arrivals import arrivals, fresh_state, next_arrival
 from railfix.live.settings import LiveSettings
-from railfix.live.stream import ReceivedData
+from railfix.live.stream import ReceivedData, arrivals, fresh_state, next_arrival
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
 from railfix.pipeline.received import Received as Known
 from railfix.pipeline.received import known_from_start, receive
+from railfix.positioning.constrained import single_point
 from railfix.positioning.normal_equations import Ranges, clock_groups
-from railfix.positioning.single_point import single_point
 from railfix.ranges.atmosphere import SeenFrom, modelled_delays
 from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m
 
@@ -38,25 +37,13 @@ SAME_EPOCH = np.timedelta64(100, "ms")
 
 @dataclass(frozen=True, kw_only=True)
 class StationFixes:
-    """Single-point positions of N receivers at T epochs, each epoch from the same satellites with the same weights.
+    """Single-point positions of N receivers at T epochs, each epoch from the same satellites with the same weights."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-        Epochs that at least one log has, rounded to 0.1 s.
-    points_m : ndarray, shape (N, 2) [m]
-        Known points, east and north of the first.
-    fixes_m : ndarray, shape (T, N, 2) [m]
-        NaN where a log has no epoch, or the common satellites are too few.
-    n_satellites : ndarray of int, shape (T,)
-    cn0_fallen : ndarray of bool, shape (T, N)
-    """
-
-    time: Datetimes
-    points_m: Floats
-    fixes_m: Floats
-    n_satellites: Integers
-    cn0_fallen: Masks
+    time: Datetimes  #: Epochs that at least one log has, rounded to 0.1 s; shape (T,).
+    points_m: Floats  #: Known points, east and north of the first; shape (N, 2).
+    fixes_m: Floats  #: NaN where a log has no epoch, or the common satellites are too few; shape (T, N, 2).
+    n_satellites: Integers  #: Shape (T,).
+    cn0_fallen: Masks  #: Shape (T, N).
 
     def __post_init__(self) -> None:
         freeze_arrays(self)

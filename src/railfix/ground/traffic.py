@@ -9,8 +9,8 @@ from typing import Any, Final
 
 from railfix.ground.interlocking import TrainInterval
 from railfix.ground.layout import Layout, LoopStation, PointName, overlap
-from railfix.ground.on_board import Authority, OnBoard
 from railfix.ground.supervision import Supervision, standing_train
+from railfix.ground.train import Authority, OnBoard
 from railfix.io.train_message import MessageStatus, TrainMessage
 
 BRAKING_MPS2: Final = 0.7
@@ -31,20 +31,11 @@ def line_with_loops(stations: int = 6, *, apart_m: float = 1500.0, length_m: flo
 
 @dataclass(kw_only=True)
 class SimulatedTrain:
-    """Train with its on-board supervision.
-
-    Attributes
-    ----------
-    number : int
-    front_m, speed_mps : float
-    on_board : OnBoard
-    tracks : dict of int to int
-        Track in each station that the points have led it to.
-    """
+    """Train with its on-board supervision."""
 
     number: int
     front_m: float
-    tracks: dict[int, int]
+    tracks: dict[int, int]  #: Track in each station that the points have led it to.
     on_board: OnBoard
     length_m: float = 80.0
     speed_mps: float = 0.0
@@ -128,22 +119,14 @@ class Traffic:
     """Traffic on a line: the trains and points, and the centre that supervises them.
 
     Its messages are those of a subclass: `send_report` and `exchange`.
-
-    Attributes
-    ----------
-    centre : Supervision
-    centre_works : bool
-        False while the centre is stopped: it hears nothing, and no points are detected.
-    violations : Counter of str
-        Invariants that were broken, by kind and in seconds.
     """
 
     trains: dict[int, SimulatedTrain]
     centre: Supervision
     random: random.Random
-    centre_works: bool = True
+    centre_works: bool = True  #: False while the centre is stopped: it hears nothing, and no points are detected.
     now_s: float = 0.0
-    violations: Counter[str] = field(default_factory=Counter)
+    violations: Counter[str] = field(default_factory=Counter)  #: Invariants that were broken, by kind and in seconds.
     moving: dict[PointName, tuple[float, int]] = field(default_factory=dict)
     _stopped_s: float | None = None
 

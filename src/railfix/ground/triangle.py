@@ -50,18 +50,12 @@ STOPPING: Final = frozenset(verdict for verdict in TriangleVerdict if verdict >=
 
 
 class TriangleLimits(Settings):
-    """Limits of the triangle.
+    """Limits of the triangle."""
 
-    Attributes
-    ----------
-    radius_m : float [m]
-        Radius of the circle of allowable error. An error of up to this size stays unseen: it belongs into the error
-        budget of the trains.
-    side_m : float [m]
-        Largest deviation of the vector between two fixes from that between their points.
-    """
-
+    #: Radius of the circle of allowable error. An error of up to this size stays unseen: it belongs into the error
+    #: budget of the trains.
     radius_m: float = option("Radius of the circle of allowable error.", 12.0, name="--radius", metavar="M", gt=0)
+    #: Largest deviation of the vector between two fixes from that between their points.
     side_m: float = option("Largest deviation of the vector between two fixes.", 6.0, name="--side", metavar="M", gt=0)
 
     @model_validator(mode="after")
@@ -108,30 +102,14 @@ def limits_for_false_stops(
 
 @dataclass(frozen=True, kw_only=True)
 class TriangleResult:
-    """Comparison of T sets of fixes with the reference triangle.
+    """Comparison of T sets of fixes with the reference triangle."""
 
-    Attributes
-    ----------
-    error_m : ndarray, shape (T, 3) [m]
-        Horizontal distance of each fix from its point; NaN without a fix.
-    side_error_m : ndarray, shape (T, 3) [m]
-        Deviation of the vector between two fixes, in the order of `SIDES`.
-    distance_error_m : ndarray, shape (T, 3) [m]
-        Deviation of the length of that vector.
-    bearing_error_deg : ndarray, shape (T, 3) [deg]
-        Deviation of its bearing, clockwise, in [-180, 180).
-    verdict : ndarray of int8, shape (T,)
-        `TriangleVerdict`.
-    receiver : ndarray of int, shape (T,)
-        Receiver that the verdict names, -1 where it names none.
-    """
-
-    error_m: Floats
-    side_error_m: Floats
-    distance_error_m: Floats
-    bearing_error_deg: Floats
-    verdict: Codes
-    receiver: Integers
+    error_m: Floats  #: Horizontal distance of each fix from its point; NaN without a fix; shape (T, 3).
+    side_error_m: Floats  #: Deviation of the vector between two fixes, in the order of `SIDES`; shape (T, 3).
+    distance_error_m: Floats  #: Deviation of the length of that vector, shape (T, 3).
+    bearing_error_deg: Floats  #: Deviation of its bearing, clockwise, in [-180, 180); shape (T, 3).
+    verdict: Codes  #: `TriangleVerdict`, shape (T,).
+    receiver: Integers  #: Receiver that the verdict names, -1 where it names none; shape (T,).
 
     def __post_init__(self) -> None:
         freeze_arrays(self)

@@ -41,82 +41,40 @@ class Region(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Continuity:
-    """Does what is available stay so? Windows that start at an available epoch.
-
-    Attributes
-    ----------
-    window_s : float [s]
-    windows : int
-        Windows that the run covers to their end.
-    kept : int
-        Those in which every epoch is available and none is missing.
-    probability : float
-        kept / windows; NaN without windows.
-    """
+    """Does what is available stay so? Windows that start at an available epoch."""
 
     window_s: float
-    windows: int
-    kept: int
-    probability: float
+    windows: int  #: Windows that the run covers to their end.
+    kept: int  #: Those in which every epoch is available and none is missing.
+    probability: float  #: kept / windows; NaN without windows.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Blocks:
-    """The run in blocks of time: errors stay alike for tens of seconds, so a block is worth an epoch of statistics.
+    """The run in blocks of time: errors stay alike for tens of seconds, so a block is worth an epoch of statistics."""
 
-    Attributes
-    ----------
-    start : ndarray of datetime64[ns], shape (B,)
-        Blocks with epochs.
-    epochs : ndarray of int, shape (B,)
-    available : ndarray of int, shape (B,)
-        Those with a level within the alarm limit.
-    misleading : ndarray of int, shape (B,)
-        Those whose error is over the level.
-    """
-
-    start: Datetimes
-    epochs: Integers
-    available: Integers
-    misleading: Integers
+    start: Datetimes  #: Blocks with epochs, shape (B,).
+    epochs: Integers  #: Shape (B,).
+    available: Integers  #: Those with a level within the alarm limit, shape (B,).
+    misleading: Integers  #: Those whose error is over the level, shape (B,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stanford:
-    """Stanford diagram of T epochs.
-
-    Attributes
-    ----------
-    alarm_limit_m : float [m]
-    region : ndarray of int8, shape (T,)
-        `Region`.
-    counts : dict of Region to int
-        Epochs of each region; they add up to T.
-    available_rate : float
-        Epochs with a level within the alarm limit, judged or not / T.
-    misleading_rate : float
-        Epochs whose error is over the level / epochs with both; NaN without any.
-    beyond : ndarray of int
-        Indices of the epochs whose error is over the level, the largest excess first.
-    continuity : tuple of Continuity
-        One a window.
-    blocks : Blocks
-    edges_m : ndarray, shape (N + 1,) [m]
-        Of the bins of error and level alike; the last bin holds all that is larger, its upper edge is infinite.
-    histogram : ndarray of int, shape (N, N)
-        Epochs by bin of the absolute error (axis 0) and of the level (axis 1).
-    """
+    """Stanford diagram of T epochs."""
 
     alarm_limit_m: float
-    region: Codes
-    counts: dict[Region, int]
-    available_rate: float
-    misleading_rate: float
-    beyond: Indices
-    continuity: tuple[Continuity, ...]
+    region: Codes  #: `Region`, shape (T,).
+    counts: dict[Region, int]  #: Epochs of each region; they add up to T.
+    available_rate: float  #: Epochs with a level within the alarm limit, judged or not / T.
+    misleading_rate: float  #: Epochs whose error is over the level / epochs with both; NaN without any.
+    beyond: Indices  #: Indices of the epochs whose error is over the level, the largest excess first.
+    continuity: tuple[Continuity, ...]  #: One a window.
     blocks: Blocks
+    #: Of the bins of error and level alike; the last bin holds all that is larger, its upper edge is infinite; shape (N
+    #: + 1,).
     edges_m: Floats
-    histogram: Integers
+    histogram: Integers  #: Epochs by bin of the absolute error (axis 0) and of the level (axis 1), shape (N, N).
 
 
 def stanford(
@@ -150,10 +108,6 @@ def stanford(
         Width of the bins; default: twice the alarm limit over `bins`.
     bins : int
         Bins of an axis.
-
-    Returns
-    -------
-    Stanford
 
     Raises
     ------

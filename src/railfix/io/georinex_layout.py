@@ -20,7 +20,7 @@ from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_records, kepler_records
-from railfix.io.rinex.observations_signals import KINDS, signal_of
+from railfix.io.rinex.observations_lines import KINDS, signal_of
 from railfix.io.rinex.write_navigation import glonass_numbers, kepler_numbers
 
 if TYPE_CHECKING:

@@ -25,22 +25,15 @@ _BLOCK: Final = 4096
 
 @dataclass(frozen=True, kw_only=True)
 class NamedColumns:
-    """A table as text, with the line number of each row, from 1.
-
-    Attributes
-    ----------
-    metadata : dict of str
-        ``# key: value`` comments above the header; of a repeated key the values, joined by "; ".
-    line : ndarray of int, shape (n,)
-    cells : dict of polars.Series of str
-        Cells of each column, stripped.
-    """
+    """A table as text, with the line number of each row, from 1."""
 
     path: str
+    #: ``# key: value`` comments above the header; of a repeated key the values, joined by "; ".
     metadata: dict[str, str]
+
     header_line: int
-    line: Integers
-    cells: dict[str, pl.Series]
+    line: Integers  #: Shape (n,).
+    cells: dict[str, pl.Series]  #: Cells of each column, stripped.
 
     def __len__(self) -> int:
         return len(self.line)

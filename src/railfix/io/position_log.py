@@ -35,35 +35,18 @@ _CARTESIAN: Final = ("x_m", "y_m", "z_m")
 
 @dataclass(frozen=True, kw_only=True)
 class PositionLog:
-    """Positions of one antenna in the order of the file, n rows.
-
-    Attributes
-    ----------
-    path : str
-    time : ndarray of datetime64[ns], shape (n,)
-        GPS time; NaT where the log has none.
-    ecef_m : ndarray, shape (n, 3) [m]
-        NaN where a row has no position.
-    quality : ndarray of int, shape (n,)
-        Q of RTKLIB (manual 2.4.2, B.1): 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP; or the number in the log; -1
-        where it has none.
-    sigma_m : ndarray, shape (n, 3) [m]
-        Standard deviations north, east, up; NaN where the log has none.
-    line : ndarray of int, shape (n,)
-        Line number of each row in the file.
-    notes : tuple of str
-    ratio : ndarray, shape (n,), or None
-        Ratio of the ambiguity test, where the log has it.
-    """
+    """Positions of one antenna in the order of the file, n rows."""
 
     path: str
-    time: Datetimes
-    ecef_m: Floats
+    time: Datetimes  #: GPS time; NaT where the log has none; shape (n,).
+    ecef_m: Floats  #: NaN where a row has no position, shape (n, 3).
+    #: Q of RTKLIB (manual 2.4.2, B.1): 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP; or the number in the log; -1
+    #: where it has none; shape (n,).
     quality: Integers
-    sigma_m: Floats
-    line: Integers
+    sigma_m: Floats  #: Standard deviations north, east, up; NaN where the log has none; shape (n, 3).
+    line: Integers  #: Line number of each row in the file, shape (n,).
     notes: tuple[str, ...] = ()
-    ratio: Floats | None = None
+    ratio: Floats | None = None  #: Ratio of the ambiguity test, where the log has it; shape (n,).
 
     def __len__(self) -> int:
         return len(self.ecef_m)

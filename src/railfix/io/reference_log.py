@@ -50,32 +50,15 @@ _FIX: Final = 1
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaReference:
-    """Reference positions of one antenna, R epochs.
+    """Reference positions of one antenna, R epochs."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (R,)
-        Rising, GPS time.
-    ecef_m : ndarray, shape (R, 3) [m]
-    chainage_m : ndarray, shape (R,) [m]
-        NaN where the file has none.
-    speed_mps : ndarray, shape (R,) [m/s]
-        Along the line, positive toward rising chainage; NaN where unknown.
-    sigma_m : ndarray, shape (R,) [m]
-        Standard deviation along the track; NaN where the file has none.
-    source : ndarray of str, shape (R,)
-        One of `SOURCES`.
-    environment : ndarray of str, shape (R,)
-        Blank where the file has none.
-    """
-
-    time: Datetimes
-    ecef_m: Floats
-    chainage_m: Floats
-    speed_mps: Floats
-    sigma_m: Floats
-    source: Strings
-    environment: Strings
+    time: Datetimes  #: Rising, GPS time; shape (R,).
+    ecef_m: Floats  #: Shape (R, 3).
+    chainage_m: Floats  #: NaN where the file has none, shape (R,).
+    speed_mps: Floats  #: Along the line, positive toward rising chainage; NaN where unknown; shape (R,).
+    sigma_m: Floats  #: Standard deviation along the track; NaN where the file has none; shape (R,).
+    source: Strings  #: One of `SOURCES`, shape (R,).
+    environment: Strings  #: Blank where the file has none, shape (R,).
 
     def __post_init__(self) -> None:
         epochs = len(self.time)

@@ -25,23 +25,13 @@ LONGEST_STEP_S = 1.0
 
 @dataclass(frozen=True, kw_only=True)
 class Pulses:
-    """Cumulative pulses of a tachometer, P rows.
-
-    Attributes
-    ----------
-    count : ndarray, shape (P,)
-        Falling where the train runs backward, if the table has the direction.
-    kind : {"count", "pulse", "distance"}
-        Rows are readings of a counter, single pulses, or distances in metres.
-    signed : bool
-        Whether the count has a direction: it falls somewhere, or the table has the column.
-    """
+    """Cumulative pulses of a tachometer, P rows."""
 
     path: str
     time: Datetimes
-    count: Floats
-    kind: str
-    signed: bool
+    count: Floats  #: Falling where the train runs backward, if the table has the direction; shape (P,).
+    kind: str  #: Rows are readings of a counter, single pulses, or distances in metres.
+    signed: bool  #: Whether the count has a direction: it falls somewhere, or the table has the column.
 
     def at(self, time: Datetimes) -> Floats:
         """Interpolate the count linearly; NaN outside the table and in gaps during which the train moves."""

@@ -69,74 +69,36 @@ class SuspectedInterference(IntEnum):
 
 
 class TrainMessage(Settings):
-    """One position message.
+    """One position message."""
 
-    Attributes
-    ----------
-    train : int
-        Identity of the train.
-    sequence : int
-        Number of the message, counted by the sender.
-    time_ns : int [ns]
-        Instant the position is valid at, GPS time since 1980-01-06.
-    sent_ns : int [ns]
-        Sender's clock when it was sent, GPS time; with the receiver's clock it gives the age.
-    line : int
-        Identity of the line or track.
-    chainage_cm : int or None [cm]
-        Front end of the train along the line; None without a position.
-    over_cm, under_cm : int or None [cm]
-        The train's front is at most `under_cm` ahead of and `over_cm` behind `chainage_cm`
-        (SUBSET-026 3.6.4: under- and over-reading amount).
-    speed_cmps, speed_bound_cmps : int or None [cm/s]
-        Positive with rising chainage; bound of its error.
-    direction : {-1, 0, 1}
-        Running direction against chainage, 0 where unknown.
-    facing : {-1, 0, 1}
-        Direction in which the front end looks.
-    standstill : bool
-    status : MessageStatus
-    sources : Source
-    protection_level_cm : int or None [cm]
-    track_permille : int or None
-        Probability that the train is on `line`, in thousandths, rounded down.
-    length_cm : int [cm]
-        Train length.
-    complete : bool
-        Train integrity confirmed.
-    sigma_cm : int or None [cm]
-        Standard deviation of the place along the line, rounded up.
-    authority : int or None
-        Number of the newest authority that the train has taken: its acknowledgement to the ground side.
-    authority_end_cm : int or None [cm]
-        Where the authority ends that the train holds, rounded away from it.
-    interference : SuspectedInterference or None
-        None from trains that do not look for it.
-    """
-
-    train: Unsigned
-    sequence: Unsigned
-    time_ns: Unsigned
-    sent_ns: Unsigned
-    line: Unsigned
-    chainage_cm: Signed | None = None
+    train: Unsigned  #: Identity of the train.
+    sequence: Unsigned  #: Number of the message, counted by the sender.
+    time_ns: Unsigned  #: Instant the position is valid at, GPS time since 1980-01-06.
+    sent_ns: Unsigned  #: Sender's clock when it was sent, GPS time; with the receiver's clock it gives the age.
+    line: Unsigned  #: Identity of the line or track.
+    chainage_cm: Signed | None = None  #: Front end of the train along the line; None without a position.
+    #: The train's front is at most `under_cm` ahead of and `over_cm` behind `chainage_cm` (SUBSET-026 3.6.4: under- and
+    #: over-reading amount).
     over_cm: Unsigned | None = None
     under_cm: Unsigned | None = None
+    #: Positive with rising chainage; bound of its error [cm/s].
     speed_cmps: Signed | None = None
     speed_bound_cmps: Unsigned | None = None
-    direction: Annotated[int, Field(ge=-1, le=1)] = 0
-    facing: Annotated[int, Field(ge=-1, le=1)] = 0
+    direction: Annotated[int, Field(ge=-1, le=1)] = 0  #: Running direction against chainage, 0 where unknown.
+    facing: Annotated[int, Field(ge=-1, le=1)] = 0  #: Direction in which the front end looks.
     standstill: bool = False
     status: MessageStatus = MessageStatus.NO_POSITION
     sources: Source = Source(0)
     protection_level_cm: Unsigned | None = None
+    #: Probability that the train is on `line`, in thousandths, rounded down.
     track_permille: Annotated[int, Field(ge=0, le=1000)] | None = None
-    length_cm: Unsigned = 0
-    complete: bool = False
-    sigma_cm: Unsigned | None = None
+    length_cm: Unsigned = 0  #: Train length.
+    complete: bool = False  #: Train integrity confirmed.
+    sigma_cm: Unsigned | None = None  #: Standard deviation of the place along the line, rounded up.
+    #: Number of the newest authority that the train has taken: its acknowledgement to the ground side.
     authority: Unsigned | None = None
-    authority_end_cm: Signed | None = None
-    interference: SuspectedInterference | None = None
+    authority_end_cm: Signed | None = None  #: Where the authority ends that the train holds, rounded away from it.
+    interference: SuspectedInterference | None = None  #: None from trains that do not look for it.
 
     @model_validator(mode="after")
     def _place_with_bounds(self) -> Self:

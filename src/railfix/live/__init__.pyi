@@ -2,11 +2,10 @@
 
 from .channels import TwoChannels
 from .command import run_live
+from .console import Metrics
 from .engine import EngineState, LiveEngine, LiveOutput
-from .inputs import LiveInputs
-from .metrics import Metrics
 from .session import Hooks, run_session
-from .settings import LiveSettings
+from .settings import LiveInputs, LiveSettings
 from .sinks import Sink, open_sink
 from .sources import read_source
 from .state import SavedSession, load_state, write_state

@@ -1,4 +1,7 @@
-"""A live session from its inputs: what ``railfix live`` does."""
+"""A live session from its inputs: what ``railfix live`` does.
+
+Tables of the results of a live session, as ``railfix run`` writes them.
+"""
 
 from __future__ import annotations
 
@@ -7,42 +10,86 @@ import contextlib
 import gc
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Final, Literal
 
 import numpy as np
+import polars as pl
 
 from railfix import kernels
 from railfix.core.arrays import Floats
 from railfix.core.errors import OutputError, SettingsError
 from railfix.io.logs import read_navigation
 from railfix.live.channels import TwoChannels
-from railfix.live.console import SessionLog, check_log_file
+from railfix.live.console import SessionLog, check_log_file, serve_metrics
 from railfix.live.engine import LiveEngine, LiveOutput
-from railfix.live.inputs import LiveInputs
-from railfix.live.metrics import serve_metrics
-from railfix.live.outlets import Outlet
-from railfix.live.place_watch import PlaceWatch
-from railfix.live.record import ResultTables
 from railfix.live.sensor_lines import FOREVER, Sensed
-from railfix.live.sensor_watch import SensorWatch
 from railfix.live.session import Hooks, run_session
-from railfix.live.settings import LiveSettings
-from railfix.live.sinks import file_of, open_sink
+from railfix.live.settings import LiveInputs, LiveSettings
+from railfix.live.sinks import Outlet, file_of, open_sink
 from railfix.live.sources import check_source, is_file
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
 from railfix.live.warm_up import prepare_kernels
+from railfix.live.watches import PlaceWatch, SensorWatch
 from railfix.motion.samples import SensorSamples
-from railfix.pipeline.passing_table import balise_notes
+from railfix.pipeline.passing_table import balise_notes, passing_table
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
-from railfix.run.base_station import place_of
+from railfix.pipeline.tables import positions_table, rounded
+from railfix.pipeline.train_table import train_table
 from railfix.run.driver import time_of
-from railfix.run.output import check_not_input
-from railfix.run.processor import processor_of
+from railfix.run.output import OutputFolder, Overwrite, check_not_input
+from railfix.run.processor import place_of, processor_of
 from railfix.run.sensors import balises_of, check_filter, read_sensors, units_of_ranges
 from railfix.run.sources import OpenedLine, open_line
+
+#: Results that are kept in memory before they are written.
+_BLOCK = 600
+
+
+class ResultTables:
+    """A context manager that writes ``positions.*``, ``train.*`` and ``passings.*`` of a session into a folder."""
+
+    def __init__(self, out: Path, *, overwrite: Overwrite, inputs: Sequence[Path]) -> None:
+        self._folder = OutputFolder(out, overwrite=overwrite, inputs=list(inputs))
+        self._positions: list[pl.DataFrame] = []
+        self._train: list[pl.DataFrame] = []
+        self._passings: list[pl.DataFrame] = []
+
+    def __enter__(self) -> ResultTables:
+        self._folder.__enter__()
+        return self
+
+    def add(self, output: LiveOutput) -> None:
+        """Take the rows of one output."""
+        if output.result is None or output.part == "message":
+            return
+        self._positions.append(positions_table(output.result))
+        if output.result.fusion:
+            self._train.append(train_table(output.result))
+        if any(own.passings for own in output.result.fusion.values()):
+            self._passings.append(passing_table(output.result))
+        if len(self._positions) >= _BLOCK:
+            self._write()
+
+    def _write(self) -> None:
+        for name, tables in (("positions", self._positions), ("train", self._train), ("passings", self._passings)):
+            if tables:
+                table = pl.concat(tables)
+                self._folder.append_parquet(f"{name}.parquet", table)
+                self._folder.append_csv(f"{name}.csv", rounded(table))
+                tables.clear()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self._write()
+            self._folder.commit({})
+        self._folder.__exit__(kind, error, trace)
+
 
 #: Longest distance from the reference location that a position report of ETCS can say, doubts apart [m].
 _REACH_OF_REFERENCE_M: Final = 300_000.0

@@ -39,41 +39,23 @@ _ORDER_STEP_M = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOutput:
-    """One message, and the result it was made from (None without input).
-
-    Attributes
-    ----------
-    message : TrainMessage
-    result : Result or None
-    part : {"both", "rows", "message"}
-        What of it goes out: both; the rows of the result alone, because the message of its period has gone out
-        before; or such a message later, alone.
-    """
+    """One message, and the result it was made from (None without input)."""
 
     message: TrainMessage
     result: Result | None
+    #: What of it goes out: both; the rows of the result alone, because the message of its period has gone out before;
+    #: or such a message later, alone.
     part: Literal["both", "rows", "message"] = "both"
 
 
 @dataclass(frozen=True, kw_only=True)
 class EngineState:
-    """What a restarted session continues from.
-
-    Attributes
-    ----------
-    state : State
-    done_ns : int [ns]
-        Time tag of the last epoch, GPS time since 1980; 0 before the first.
-    last_tag : mapping of str to int [ns]
-        Last time tag of each antenna.
-    sequence : int
-        Number of the last message, or one that no message has reached when the next state is saved.
-    """
+    """What a restarted session continues from."""
 
     state: State
-    done_ns: int
-    last_tag: Mapping[str, int]
-    sequence: int
+    done_ns: int  #: Time tag of the last epoch, GPS time since 1980; 0 before the first.
+    last_tag: Mapping[str, int]  #: Last time tag of each antenna.
+    sequence: int  #: Number of the last message, or one that no message has reached when the next state is saved.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,21 +16,11 @@ STEADY_EPOCHS: Final = 5
 
 @dataclass(kw_only=True)
 class Lag:
-    """Delay of epochs above the shortest one seen, so that the clocks need not agree.
+    """Delay of epochs above the shortest one seen, so that the clocks need not agree."""
 
-    Attributes
-    ----------
-    behind_s : float [s]
-        With more delay epochs are skipped until it is a quarter of that; infinite: never.
-    skipped : int
-        Epochs skipped since the session fell behind.
-    told : list of str
-        What is to be said of it.
-    """
-
-    behind_s: float
-    skipped: int = 0
-    told: list[str] = field(default_factory=list)
+    behind_s: float  #: With more delay epochs are skipped until it is a quarter of that; infinite: never.
+    skipped: int = 0  #: Epochs skipped since the session fell behind.
+    told: list[str] = field(default_factory=list)  #: What is to be said of it.
     _shortest_ns: float | None = None
     _at_ns: int = 0
     _since_ns: int = 0

@@ -37,22 +37,13 @@ _LINE_BYTES: Final = 4096
 
 @dataclass(frozen=True, kw_only=True)
 class Sensed:
-    """What some bytes of a sensor's stream completed.
-
-    Attributes
-    ----------
-    sensor : str
-    samples : SensorSamples
-    until : datetime64[ns]
-        Time up to which the sensor has been heard; NaT before the first row, `FOREVER` of a whole table.
-    skipped : int
-        Lines that are no rows, or whose time is before that of the row before.
-    """
+    """What some bytes of a sensor's stream completed."""
 
     sensor: str
     samples: SensorSamples = field(default_factory=SensorSamples)
+    #: Time up to which the sensor has been heard; NaT before the first row, `FOREVER` of a whole table.
     until: np.datetime64
-    skipped: int = 0
+    skipped: int = 0  #: Lines that are no rows, or whose time is before that of the row before.
 
     def unsurveyed(self, units: GroundUnits | None) -> int:
         """Count the ranges to ground units that are not among these, which are not used."""
@@ -61,25 +52,14 @@ class Sensed:
 
 @dataclass(kw_only=True)
 class SensorLines:
-    """Rows of one sensor's stream.
+    """Rows of one sensor's stream."""
 
-    Attributes
-    ----------
-    sensor, source : str
-        Which of `railfix.motion.samples.SENSORS`, and its source for the messages.
-    columns : tuple of str
-        Names of the columns; empty before the header line.
-    until : datetime64[ns]
-        Of the last row.
-    rest : bytes
-        Line that has no end yet.
-    """
-
+    #: Which of `railfix.motion.samples.SENSORS`, and its source for the messages.
     sensor: str
     source: str
-    columns: tuple[str, ...] = ()
-    until: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    rest: bytes = b""
+    columns: tuple[str, ...] = ()  #: Names of the columns; empty before the header line.
+    until: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Of the last row.
+    rest: bytes = b""  #: Line that has no end yet.
 
     def after_break(self) -> None:
         """Begin a line anew where the connection broke."""

@@ -14,15 +14,14 @@ from typing import Final
 import numpy as np
 
 from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
-from railfix.live.arrivals import arrivals, fresh_state, next_arrival
+from railfix.live.console import Metrics
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
 from railfix.live.forms import gga_sentence
-from railfix.live.metrics import Metrics
 from railfix.live.sensor_lines import FOREVER, Sensed, SensorLines
 from railfix.live.sinks import Sink
 from railfix.live.sources import Connected, Lost, hidden, is_file, read_source
 from railfix.live.state import SavedSession
-from railfix.live.stream import ReceivedData, ReceiverState
+from railfix.live.stream import ReceivedData, ReceiverState, arrivals, fresh_state, next_arrival
 from railfix.ranges.sbas import from_receiver
 
 #: Items that may wait for the processor before a source is held back.
@@ -41,27 +40,14 @@ _Queue = asyncio.Queue[tuple[str, ReceivedData | None] | Sensed]
 
 @dataclass(frozen=True, kw_only=True)
 class Hooks:
-    """What else a session does.
+    """What else a session does."""
 
-    Attributes
-    ----------
-    observe : callable or None
-        Called with every output, after the sinks.
-    sensed : callable or None
-        Called with what each source of a sensor completes.
-    save : callable or None
-        Called every `LiveSettings.state_every_s`, in idle time, with what a restart needs.
-    show : callable or None
-        Called with a text for the status line, twice a second.
-    metrics : Metrics
-        Counted in, and returned.
-    """
-
-    observe: Callable[[LiveOutput], None] | None = None
-    sensed: Callable[[Sensed], None] | None = None
+    observe: Callable[[LiveOutput], None] | None = None  #: Called with every output, after the sinks.
+    sensed: Callable[[Sensed], None] | None = None  #: Called with what each source of a sensor completes.
+    #: Called every `LiveSettings.state_every_s`, in idle time, with what a restart needs.
     save: Callable[[SavedSession], None] | None = None
-    show: Callable[[str], None] | None = None
-    metrics: Metrics = field(default_factory=Metrics)
+    show: Callable[[str], None] | None = None  #: Called with a text for the status line, twice a second.
+    metrics: Metrics = field(default_factory=Metrics)  #: Counted in, and returned.
 
 
 async def run_session(

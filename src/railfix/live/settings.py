@@ -1,4 +1,7 @@
-"""Settings of live operation."""
+"""Settings of live operation.
+
+Inputs of a live session: each an option of ``railfix live``.
+"""
 
 from __future__ import annotations
 
@@ -7,83 +10,147 @@ from typing import Literal
 
 from pydantic import Field
 
-from railfix.core.settings import Settings
+from railfix.core.settings import Settings, option
+from railfix.pipeline.config import Config
+from railfix.run.inputs import balise_list_option, input_option, virtual_balises_option
+from railfix.run.options import LogReading, TrackReading
+from railfix.run.output import Overwrite
 
 
 class LiveSettings(Settings):
-    """Settings of live operation.
+    """Settings of live operation."""
 
-    Attributes
-    ----------
-    period_s : float [s]
-        A message is due every period, also without input (P1 2.1: 0.1 s).
-    pair_wait_s : float [s]
-        Longest wait for the other antenna's epoch after the first one of a pair has arrived.
-    sensor_wait_s : float [s]
-        Longest wait for the sensors on board to be heard up to an epoch; what one of them says since the epoch before
-        is left out then.
-    no_input : {"send", "skip"}
-        Whether a period without input has a message.
-    restart_epochs : int
-        Epochs in a row with tags before the last one after which the receiver counts as restarted.
-    reconnect : {"on", "off"}
-        Whether a connection that broke is opened again, with waits that double from `reconnect_first_s` to
-        `reconnect_longest_s`; off, the session ends with its sources. The first connection must succeed in any case.
-    reconnect_first_s, reconnect_longest_s : float [s]
-    silence_s : float [s]
-        A connection without a byte for so long counts as broken.
-    gga_s : float [s]
-        How often the caster of the base station is sent the train's position (GGA), for a virtual station; 0: never.
-    ntrip_certificates : path or None
-        Certificates (PEM) that casters over TLS may have beside those that the system trusts.
-    waiting : int
-        Messages that may wait for a slow target; further ones are dropped for it and counted.
-    behind_s : float [s]
-        Delay above the shortest one seen with which epochs are skipped up to the present, said in the log; not where
-        the epochs are recorded ones.
-    state_every_s : float [s]
-        How often the state file is written.
-    state_age_s : float [s]
-        Longest time from the last epoch of a state file to the first new one; after it only ephemerides and the
-        sequence number are taken from the file.
-    log_bytes, log_files : int
-        Size at which a log file is put aside, and how many of these are kept.
-    train, line : int
-        Identities for the message.
-    facing : {-1, 0, 1}
-        Direction in which the train's front end looks against rising chainage; 0 where unknown: then the chainage
-        of the message is that of the reference point, not of the front end.
-    front_offset_m : float [m]
-        Front end of the train ahead of the point whose chainage is computed.
-    length_m : float [m]
-        Train length.
-    reference : int
-        Identity of the reference location of ETCS position reports (NID_LRBG).
-    reference_m : float [m]
-        Its chainage.
-    """
-
+    #: A message is due every period, also without input (P1 2.1: 0.1 s).
     period_s: float = Field(default=0.1, gt=0.0, le=60.0)
+    #: Longest wait for the other antenna's epoch after the first one of a pair has arrived.
     pair_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
+    #: Longest wait for the sensors on board to be heard up to an epoch; what one of them says since the epoch before is
+    #: left out then.
     sensor_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
-    no_input: Literal["send", "skip"] = "send"
+    no_input: Literal["send", "skip"] = "send"  #: Whether a period without input has a message.
+    #: Epochs in a row with tags before the last one after which the receiver counts as restarted.
     restart_epochs: int = Field(default=3, ge=1)
+    #: Whether a connection that broke is opened again, with waits that double from `reconnect_first_s` to
+    #: `reconnect_longest_s`; off, the session ends with its sources. The first connection must succeed in any case.
     reconnect: Literal["on", "off"] = "on"
+
     reconnect_first_s: float = Field(default=1.0, gt=0.0, le=600.0)
     reconnect_longest_s: float = Field(default=30.0, gt=0.0, le=3600.0)
+    #: A connection without a byte for so long counts as broken.
     silence_s: float = Field(default=30.0, gt=0.0, le=3600.0)
+    #: How often the caster of the base station is sent the train's position (GGA), for a virtual station; 0: never.
     gga_s: float = Field(default=0.0, ge=0.0, le=3600.0)
+    #: Certificates (PEM) that casters over TLS may have beside those that the system trusts.
     ntrip_certificates: Path | None = None
+    #: Messages that may wait for a slow target; further ones are dropped for it and counted.
     waiting: int = Field(default=100, ge=1, le=100_000)
+    #: Delay above the shortest one seen with which epochs are skipped up to the present, said in the log; not where the
+    #: epochs are recorded ones.
     behind_s: float = Field(default=5.0, ge=0.5, le=3600.0)
-    state_every_s: float = Field(default=5.0, gt=0.0, le=3600.0)
+    state_every_s: float = Field(default=5.0, gt=0.0, le=3600.0)  #: How often the state file is written.
+    #: Longest time from the last epoch of a state file to the first new one; after it only ephemerides and the sequence
+    #: number are taken from the file.
     state_age_s: float = Field(default=60.0, gt=0.0, le=3600.0)
+    #: Size at which a log file is put aside, and how many of these are kept.
     log_bytes: int = Field(default=1_000_000, ge=1000)
     log_files: int = Field(default=5, ge=1, le=1000)
+    #: Identities for the message.
     train: int = Field(default=0, ge=0)
     line: int = Field(default=0, ge=0)
+    #: Direction in which the train's front end looks against rising chainage; 0 where unknown: then the chainage of the
+    #: message is that of the reference point, not of the front end.
     facing: Literal[-1, 0, 1] = 0
+    #: Front end of the train ahead of the point whose chainage is computed.
     front_offset_m: float = Field(default=0.0, ge=0.0)
-    length_m: float = Field(default=0.0, ge=0.0)
+    length_m: float = Field(default=0.0, ge=0.0)  #: Train length.
+    #: Identity of the reference location of ETCS position reports (NID_LRBG).
     reference: int = Field(default=0, ge=0, lt=1 << 24)
-    reference_m: float = 0.0
+    reference_m: float = 0.0  #: Its chainage.
+
+
+#: Sensors on board.
+Sensor = Literal["tachometer", "inertial", "radar", "ranging", "balises"]
+SENSORS: tuple[Sensor, ...] = ("tachometer", "inertial", "radar", "ranging", "balises")
+
+
+class LiveInputs(Settings):
+    """Inputs of a live session; see ``railfix live --help``."""
+
+    front: str = input_option(
+        "Stream of the front antenna's receiver: a file, tcp://HOST:PORT, serial:DEVICE?baud=115200, "
+        "ntrip://[USER:PASSWORD@]HOST:PORT/MOUNT (ntrips:// over TLS), or - (standard input).",
+        metavar="SOURCE",
+    )
+    track: tuple[Path, ...] = input_option("Track map; repeat it for a route.", metavar="TRACK")
+    rear: str | None = input_option("The same of the rear antenna.", None, metavar="SOURCE")
+    vehicle: Path | None = input_option("Vehicle of the antennas.", None, metavar="TOML")
+    nav: tuple[Path, ...] = input_option("Navigation files known from the start.", (), metavar="FILE")
+    base: str | None = input_option(
+        "Stream of a base station: RTCM 3 (MSM, and 1005 or 1006 with its position) or as of --front.",
+        None,
+        metavar="SOURCE",
+    )
+    base_place: str | None = option(
+        "Position of the base station; from its stream or header without it.", None, metavar="LAT,LON,HEIGHT"
+    )
+    tachometer: str | None = input_option(
+        "Pulses of a tachometer: the rows of the table of `railfix run` as lines of CSV, header first, from a "
+        "source as of --front; or the whole table, a file. A row with the time alone says that no pulse came.",
+        None,
+        metavar="SOURCE",
+    )
+    inertial: str | None = input_option("The same of an inertial unit.", None, metavar="SOURCE")
+    radar: str | None = input_option("The same of the speeds of a Doppler radar.", None, metavar="SOURCE")
+    ranging: str | None = input_option("The same of two-way ranges to ground units.", None, metavar="SOURCE")
+    ranging_units: Path | None = input_option("Surveyed ground units: unit, x_m, y_m, z_m (ECEF).", None, metavar="CSV")
+    balises: str | None = input_option("The same of balises that are read.", None, metavar="SOURCE")
+    balise_list: Path | None = balise_list_option()
+    virtual_balises: Path | None = virtual_balises_option()
+    send: tuple[str, ...] = option(
+        "Where messages go: json, cbor, nmea, tpv, etcs, positions, train or passings at -, a file, udp://HOST:PORT, "
+        "tcp-server://HOST:PORT or mqtt://[USER:PASSWORD@]HOST:PORT/TOPIC. Default: json@-.",
+        ("json@-",),
+        metavar="FORM@TARGET",
+    )
+    speed: float | None = option(
+        "Replay files this many times as fast as recorded; else without pause.", None, metavar="TIMES", ge=0.01
+    )
+    channels: Literal["1", "2"] = option("2: a second process checks every message; a difference ends the output.", "1")
+    metrics: str | None = option("Serve Prometheus text at /metrics.", None, metavar="HOST:PORT")
+    state: Path | None = option(
+        "Write what a restarted session needs into this file now and then, and continue from it.", None, metavar="FILE"
+    )
+    log: Path | None = option("Also log into this file, which rotates.", None, metavar="FILE")
+    out: Path | None = option("Also write the tables of results into this folder.", None, metavar="DIR")
+    overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
+    config: Config = Field(default_factory=Config)
+    live: LiveSettings = Field(default_factory=LiveSettings)
+    reading: TrackReading = Field(default_factory=TrackReading)
+    logs: LogReading = Field(default_factory=LogReading)
+
+    @property
+    def antennas(self) -> tuple[Literal["front", "rear"], ...]:
+        """Antennas with a stream."""
+        return ("front",) if self.rear is None else ("front", "rear")
+
+    @property
+    def sources(self) -> dict[str, str]:
+        """Streams by antenna, and of the base station."""
+        given = {"front": self.front, "rear": self.rear, "base": self.base}
+        return {name: source for name, source in given.items() if source is not None}
+
+    @property
+    def sensors(self) -> dict[Sensor, str]:
+        """Streams or tables of the sensors on board that are given."""
+        return {name: source for name in SENSORS if (source := getattr(self, name)) is not None}
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """Files that the positions depend on, by their role."""
+        named = {f"track {k}": path for k, path in enumerate(self.track)}
+        given = {
+            "vehicle": self.vehicle, "ranging units": self.ranging_units, "balise list": self.balise_list,
+            "virtual balises": self.virtual_balises, "cn0 curve": self.config.cn0_curve,
+            "error model": self.config.error_model, "integrity support": self.config.integrity_support,
+        }  # fmt: skip
+        return named | {name: path for name, path in given.items() if path is not None}

@@ -59,18 +59,10 @@ class SavedSession:
 
 @dataclass(frozen=True, kw_only=True)
 class Loaded:
-    """A state file as it was found.
+    """A state file as it was found."""
 
-    Attributes
-    ----------
-    session : SavedSession or None
-        None where the file is not used.
-    outcome : str
-        One sentence for the log.
-    """
-
-    session: SavedSession | None
-    outcome: str
+    session: SavedSession | None  #: None where the file is not used.
+    outcome: str  #: One sentence for the log.
 
 
 def belongs_to(

@@ -1,7 +1,7 @@
 # The names of `railfix.motion`, imported at their first use (lazy-loader).
 
 from .features import Feature, FeatureLimits, LineSeries, LocatedFeature, line_series, locate, map_features
-from .ranging import EchoLimits, radar_speed_mps, two_way_range_m
+from .radar import EchoLimits, radar_speed_mps, two_way_range_m
 from .samples import InertialSamples, RadarSpeeds, SensorSamples, StationRanges, TachometerPulses
 from .slip import MotionState, SlipLimits, SlipResult, find_slips
 from .tachometer import (

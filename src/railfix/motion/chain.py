@@ -9,11 +9,14 @@ References
 ----------
 R. A. Sweet, A cyclic reduction algorithm for solving block tridiagonal systems, 1977,
 doi:10.1137/0714050. H. E. Rauch, F. Tung, C. T. Striebel, 1965, doi:10.2514/3.3166.
+
+Motion with an acceleration that is a first-order Gauss-Markov process.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
@@ -22,20 +25,11 @@ from railfix.core.arrays import Floats, Indices
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """Normal equations of N instants with n unknowns each; terms are added by copies.
+    """Normal equations of N instants with n unknowns each; terms are added by copies."""
 
-    Attributes
-    ----------
-    diagonal : ndarray, shape (N, n, n)
-        Information of each instant.
-    upper : ndarray, shape (N - 1, n, n)
-        Of each instant with the next.
-    right : ndarray, shape (N, n)
-    """
-
-    diagonal: Floats
-    upper: Floats
-    right: Floats
+    diagonal: Floats  #: Information of each instant, shape (N, n, n).
+    upper: Floats  #: Of each instant with the next, shape (N - 1, n, n).
+    right: Floats  #: Shape (N, n).
 
     @classmethod
     def empty(cls, instants: int, unknowns: int) -> Chain:
@@ -138,3 +132,64 @@ def _reduce(diagonal: Floats, upper: Floats, right: Floats) -> tuple[Floats, Flo
     beside[odd - 1] = with_left
     beside[inner] = with_right[:m]
     return value, covariance, beside
+
+
+#: Below this dt / tau the closed forms cancel, and their power series are summed.
+_SERIES_BELOW: Final = 1.0
+_ORDERS: Final = np.arange(32)
+_FACTORIALS: Final = np.cumprod(np.maximum(_ORDERS, 1).astype(np.float64))
+_ONCE: Final = (-1.0) ** _ORDERS / _FACTORIALS
+"""Coefficients of exp(-x); of exp(-2 x); of x exp(-x)."""
+_TWICE: Final = (-2.0) ** _ORDERS / _FACTORIALS
+_X_ONCE: Final = -_ORDERS * _ONCE
+#: Coefficients of the closed forms below from their first power of x on; all lower ones are zero.
+_SERIES: Final = {
+    (0, 0): (5, -_TWICE / 2.0 - 2.0 * _X_ONCE),
+    (0, 1): (4, _TWICE / 2.0 - _ONCE + _X_ONCE),
+    (0, 2): (3, -_TWICE / 2.0 - _X_ONCE),
+    (1, 1): (3, 2.0 * _ONCE - _TWICE / 2.0),
+    (1, 2): (2, _TWICE / 2.0 - _ONCE),
+    (2, 2): (1, -_TWICE / 2.0),
+}
+
+
+def singer_steps(dt: Floats, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]:
+    """Compute the transition of position, speed and acceleration, and the covariance of its noise.
+
+    The acceleration is a first-order Gauss-Markov process (R. A. Singer, Estimating optimal tracking filter
+    performance for manned maneuvering targets, 1970, doi:10.1109/TAES.1970.310128): the noise is the integral of
+    f f' 2 sigma^2 / tau over the step, where f is the response to an impulse of the acceleration.
+
+    Parameters
+    ----------
+    dt : ndarray, shape (K,) [s]
+    sigma_mps2, tau_s : float [m/s2], [s]
+        Standard deviation and correlation time of the acceleration.
+
+    Returns
+    -------
+    step, noise : ndarray, shape (K, 3, 3)
+    """
+    x = dt / tau_s
+    once, twice = np.exp(-x), np.exp(-2.0 * x)
+    closed = {
+        (0, 0): (1.0 - twice) / 2.0 + x + x**3 / 3.0 - x**2 - 2.0 * x * once,
+        (0, 1): (twice + 1.0 + x**2) / 2.0 - once + x * once - x,
+        (0, 2): (1.0 - twice) / 2.0 - x * once,
+        (1, 1): 2.0 * once - (3.0 + twice) / 2.0 + x,
+        (1, 2): (twice + 1.0) / 2.0 - once,
+        (2, 2): (1.0 - twice) / 2.0,
+    }
+    small = x < _SERIES_BELOW
+    powers = np.where(small, x, 0.0)[:, None] ** _ORDERS
+    density = 2.0 * sigma_mps2**2 / tau_s
+    noise = np.empty((len(dt), 3, 3))
+    for (i, j), (first, series) in _SERIES.items():
+        value = np.where(small, powers[:, first:] @ series[first:], closed[i, j])
+        noise[:, i, j] = noise[:, j, i] = density * tau_s ** (5 - i - j) * value
+    step = np.zeros((len(dt), 3, 3))
+    step[:, [0, 1], [0, 1]] = 1.0
+    step[:, 0, 1], step[:, 2, 2] = dt, once
+    step[:, 0, 2] = tau_s**2 * np.where(small, powers[:, 2:] @ _ONCE[2:], x - 1.0 + once)
+    step[:, 1, 2] = -tau_s * np.expm1(-x)
+    return step, noise

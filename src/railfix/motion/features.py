@@ -24,55 +24,28 @@ QUANTITIES: Final[tuple[Quantity, ...]] = ("gradient", "curvature")
 
 
 class FeatureLimits(Settings):
-    """What a feature is, and when a measured one is accepted.
+    """What a feature is, and when a measured one is accepted."""
 
-    Attributes
-    ----------
-    step_m : float
-        Spacing of the series along the line.
-    base_m : float
-        Length over which a change is taken: about that between the bogies of a vehicle, which rounds what is shorter.
-    gradient_change, curvature_change_1pm : float
-        Least change: 3 permille, and from straight to a radius of 1000 m.
-    half_length_m : float
-        Line before and behind a feature that is compared.
-    likelihood_ratio : float
-        Of the place found to any other place of the window.
-    gap_sigmas : float
-        Disagreement with the distance to the last accepted feature.
-    fit_limit : float
-        Mean square of the other quantity's residual over its variance.
-    scale_sigma : float
-        Of a way by wheel, as a share.
-    """
-
-    step_m: float = Field(default=1.0, gt=0)
+    step_m: float = Field(default=1.0, gt=0)  #: Spacing of the series along the line.
+    #: Length over which a change is taken: about that between the bogies of a vehicle, which rounds what is shorter.
     base_m: float = Field(default=15.0, gt=0)
+    #: Least change: 3 permille, and from straight to a radius of 1000 m.
     gradient_change: float = Field(default=0.003, gt=0)
     curvature_change_1pm: float = Field(default=1e-3, gt=0)
-    half_length_m: float = Field(default=60.0, gt=0)
-    likelihood_ratio: float = Field(default=1e3, gt=1)
-    gap_sigmas: float = Field(default=3.0, gt=0)
-    fit_limit: float = Field(default=3.0, gt=0)
-    scale_sigma: float = Field(default=2e-3, gt=0)
+    half_length_m: float = Field(default=60.0, gt=0)  #: Line before and behind a feature that is compared.
+    likelihood_ratio: float = Field(default=1e3, gt=1)  #: Of the place found to any other place of the window.
+    gap_sigmas: float = Field(default=3.0, gt=0)  #: Disagreement with the distance to the last accepted feature.
+    fit_limit: float = Field(default=3.0, gt=0)  #: Mean square of the other quantity's residual over its variance.
+    scale_sigma: float = Field(default=2e-3, gt=0)  #: Of a way by wheel, as a share.
 
 
 @dataclass(frozen=True, kw_only=True)
 class LineSeries:
-    """Gradient and curvature along a line, N places `FeatureLimits.step_m` apart.
+    """Gradient and curvature along a line, N places `FeatureLimits.step_m` apart."""
 
-    Attributes
-    ----------
-    arc_m : ndarray, shape (N,) [m]
-    gradient : ndarray, shape (N,)
-        Climb over horizontal length in rising arc length.
-    curvature_1pm : ndarray, shape (N,) [1/m]
-        + to the right in rising arc length.
-    """
-
-    arc_m: Floats
-    gradient: Floats
-    curvature_1pm: Floats
+    arc_m: Floats  #: Shape (N,).
+    gradient: Floats  #: Climb over horizontal length in rising arc length, shape (N,).
+    curvature_1pm: Floats  #: + to the right in rising arc length, shape (N,).
 
     def of(self, quantity: Quantity) -> Floats:
         """Values of one quantity."""
@@ -81,14 +54,7 @@ class LineSeries:
 
 @dataclass(frozen=True, kw_only=True)
 class Feature:
-    """A change of gradient or curvature.
-
-    Attributes
-    ----------
-    arc_m : float [m]
-    quantity : {"gradient", "curvature"}
-    change : float
-    """
+    """A change of gradient or curvature."""
 
     arc_m: float
     quantity: Quantity
@@ -147,23 +113,12 @@ def map_features(
 
 @dataclass(frozen=True, kw_only=True)
 class LocatedFeature:
-    """Where a measured series lies on the line.
-
-    Attributes
-    ----------
-    verdict : {"accepted", "ambiguous", "none"}
-    arc_m : float [m]
-        Of the middle of the series; NaN unless accepted.
-    sigma_m : float [m]
-        ``sqrt(S / integral (dq/ds)^2 ds)`` with the noise density S of the measured quantity.
-    reason : str
-        Why it is not accepted.
-    """
+    """Where a measured series lies on the line."""
 
     verdict: Literal["accepted", "ambiguous", "none"]
-    arc_m: float
-    sigma_m: float
-    reason: str = ""
+    arc_m: float  #: Of the middle of the series; NaN unless accepted.
+    sigma_m: float  #: ``sqrt(S / integral (dq/ds)^2 ds)`` with the noise density S of the measured quantity.
+    reason: str = ""  #: Why it is not accepted.
 
 
 def locate(

@@ -32,20 +32,12 @@ def _freeze(samples: Any) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class TachometerPulses:
-    """Pulses of a tachometer, N of them.
+    """Pulses of a tachometer, N of them."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (N,)
-        Instant of each pulse.
-    pulse : ndarray of int64, shape (N,)
-        Number of the pulse: a gap means lost pulses.
-    direction : ndarray of int64, shape (N,)
-        1 when the vehicle moves forward, -1 backward, 0 where the sensor does not report it.
-    """
-
-    time: Datetimes = field(default_factory=_times)
+    time: Datetimes = field(default_factory=_times)  #: Instant of each pulse, shape (N,).
+    #: Number of the pulse: a gap means lost pulses; shape (N,).
     pulse: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    #: 1 when the vehicle moves forward, -1 backward, 0 where the sensor does not report it; shape (N,).
     direction: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
@@ -57,19 +49,12 @@ class TachometerPulses:
 
 @dataclass(frozen=True, kw_only=True)
 class InertialSamples:
-    """Samples of an inertial unit fixed to the vehicle body, N of them.
+    """Samples of an inertial unit fixed to the vehicle body, N of them."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (N,)
-    force_mps2 : ndarray, shape (N, 3) [m/s^2]
-        Specific force forward, right, down; about (0, 0, -9.8) at rest.
-    rate_radps : ndarray, shape (N, 3) [rad/s]
-        Angular rate about forward (roll), right (pitch), down (yaw).
-    """
-
-    time: Datetimes = field(default_factory=_times)
+    time: Datetimes = field(default_factory=_times)  #: Shape (N,).
+    #: Specific force forward, right, down; about (0, 0, -9.8) at rest; shape (N, 3).
     force_mps2: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    #: Angular rate about forward (roll), right (pitch), down (yaw); shape (N, 3).
     rate_radps: Floats = field(default_factory=lambda: np.empty((0, 3)))
 
     def __post_init__(self) -> None:
@@ -81,16 +66,10 @@ class InertialSamples:
 
 @dataclass(frozen=True, kw_only=True)
 class RadarSpeeds:
-    """Speeds over ground of a Doppler radar, N of them.
+    """Speeds over ground of a Doppler radar, N of them."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (N,)
-    speed_mps : ndarray, shape (N,) [m/s]
-        Forward positive; NaN without a signal.
-    """
-
-    time: Datetimes = field(default_factory=_times)
+    time: Datetimes = field(default_factory=_times)  #: Shape (N,).
+    #: Forward positive; NaN without a signal; shape (N,).
     speed_mps: Floats = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
@@ -102,21 +81,13 @@ class RadarSpeeds:
 
 @dataclass(frozen=True, kw_only=True)
 class StationRanges:
-    """Two-way ranges to radio stations beside the track, N of them.
+    """Two-way ranges to radio stations beside the track, N of them."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (N,)
-    station : ndarray of str, shape (N,)
-        Name of the station on the ground.
-    range_m : ndarray, shape (N,) [m]
-    sigma_m : ndarray, shape (N,) [m]
-        Standard deviation that the device reports; NaN where it reports none.
-    """
-
-    time: Datetimes = field(default_factory=_times)
+    time: Datetimes = field(default_factory=_times)  #: Shape (N,).
+    #: Name of the station on the ground, shape (N,).
     station: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))
-    range_m: Floats = field(default_factory=lambda: np.empty(0))
+    range_m: Floats = field(default_factory=lambda: np.empty(0))  #: Shape (N,).
+    #: Standard deviation that the device reports; NaN where it reports none; shape (N,).
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
@@ -128,16 +99,10 @@ class StationRanges:
 
 @dataclass(frozen=True, kw_only=True)
 class GroundUnits:
-    """Surveyed radio stations beside the track, U of them.
+    """Surveyed radio stations beside the track, U of them."""
 
-    Attributes
-    ----------
-    name : ndarray of str, shape (U,)
-    ecef_m : ndarray, shape (U, 3) [m]
-    """
-
-    name: Strings
-    ecef_m: Floats
+    name: Strings  #: Shape (U,).
+    ecef_m: Floats  #: Shape (U, 3).
 
     def __len__(self) -> int:
         return len(self.name)
@@ -145,20 +110,11 @@ class GroundUnits:
 
 @dataclass(frozen=True, kw_only=True)
 class BaliseReadings:
-    """Balises that the train's reader has passed, N of them; of a group the reading that the list places.
+    """Balises that the train's reader has passed, N of them; of a group the reading that the list places."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (N,)
-        At which the reader was over the balise.
-    balise : ndarray of str, shape (N,)
-        Identity.
-    sigma_m : ndarray, shape (N,) [m]
-        Standard deviation along the line that the reader reports; NaN where it reports none.
-    """
-
-    time: Datetimes = field(default_factory=_times)
-    balise: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))
+    time: Datetimes = field(default_factory=_times)  #: At which the reader was over the balise, shape (N,).
+    balise: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))  #: Identity, shape (N,).
+    #: Standard deviation along the line that the reader reports; NaN where it reports none; shape (N,).
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
@@ -170,22 +126,12 @@ class BaliseReadings:
 
 @dataclass(frozen=True, kw_only=True)
 class ListedBalises:
-    """Balises, or places without one, along a line, M of them.
+    """Balises, or places without one, along a line, M of them."""
 
-    Attributes
-    ----------
-    name : ndarray of str, shape (M,)
-    chainage_m : ndarray, shape (M,) [m]
-    sigma_m : ndarray, shape (M,) [m]
-        Standard deviation of the chainage.
-    virtual : ndarray of bool, shape (M,)
-        Places whose passing is reported; there is no balise.
-    """
-
-    name: Strings
-    chainage_m: Floats
-    sigma_m: Floats
-    virtual: Masks
+    name: Strings  #: Shape (M,).
+    chainage_m: Floats  #: Shape (M,).
+    sigma_m: Floats  #: Standard deviation of the chainage, shape (M,).
+    virtual: Masks  #: Places whose passing is reported; there is no balise; shape (M,).
 
     def __len__(self) -> int:
         return len(self.name)
@@ -198,26 +144,16 @@ class ListedBalises:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSamples:
-    """Samples of all sensors on board received since the chunk before.
-
-    Attributes
-    ----------
-    tachometer : TachometerPulses
-    inertial : InertialSamples
-    radar : RadarSpeeds
-    ranging : StationRanges
-    balises : BaliseReadings
-        Each without rows where the sensor is absent or has sent nothing.
-    silent : frozenset of str
-        Sensors not yet heard up to the epoch that the samples are given with (live): what they say since the epoch
-        before is not known. Their samples may come with the next epoch.
-    """
+    """Samples of all sensors on board received since the chunk before."""
 
     tachometer: TachometerPulses = field(default_factory=TachometerPulses)
     inertial: InertialSamples = field(default_factory=InertialSamples)
     radar: RadarSpeeds = field(default_factory=RadarSpeeds)
     ranging: StationRanges = field(default_factory=StationRanges)
+    #: Each without rows where the sensor is absent or has sent nothing.
     balises: BaliseReadings = field(default_factory=BaliseReadings)
+    #: Sensors not yet heard up to the epoch that the samples are given with (live): what they say since the epoch
+    #: before is not known. Their samples may come with the next epoch.
     silent: frozenset[str] = frozenset()
 
     @property

@@ -56,63 +56,39 @@ class MotionState(IntEnum):
 
 
 class SlipLimits(Settings):
-    """Limits of the detection.
+    """Limits of the detection."""
 
-    Attributes
-    ----------
-    rule : {"map", "p2"}
-        Reference of the pitch, the line's gradient or P2's limit; "p2" has neither latch nor look-back.
-    p2_limit : float
-        Sine of the pitch: 35 permille of line (P2 2.1) and 10 permille of body.
-    map_limit : float
-        Sine of the pitch against the line's: 0.1 m/s2 of wheel against train.
-    noise_sigmas, noise_s : float
-        The limit is at least so many standard deviations while the wheel rolls, over such a time: a
-        body that pitches shakes its accelerometer too, the more the higher it is mounted.
-    confirm_s : float
-        Time over the limit after which a slip is one.
-    latch_mps, latch_share, latch_s : float
-        A slip ends when wheel and inertia agree so well for so long.
-    carry_drift_mps2 : float
-        The two may differ by so much more a second of the carry: 1e-3 of gravity, the offset of the accelerometer and
-        the error of the pitch together.
-    look_back_s : float
-        How long before the detection the carry begins.
-    longest_carry_s : float
-        After this the carried speed has expired: `carry_drift_mps2` has become 0.3 m/s.
-    smoothing_s : float
-        Time constant of the mean of the pitch: of the body's pitching at about 1 Hz and of vibration.
-    offset_s : float
-        Time constant of the accelerometer's offset.
-    standing_s : float
-        Time without a pulse after which a vehicle at rest stands.
-    pitch_s, bias_s : float
-        Time constants of the gyro's pitch and bias. Without a line the pitch
-        by wheel and accelerometer takes its place.
-    settling_s : float
-        Time for which the body swings after a stop; its pitch then is the one of the standstill.
-    rolling_limit, rolling_s, rolling_mps : float
-        Change of the pitch at standstill, duration and speed that mean rolling away.
-    """
-
+    #: Reference of the pitch, the line's gradient or P2's limit; "p2" has neither latch nor look-back.
     rule: Literal["map", "p2"] = "map"
+    #: Sine of the pitch: 35 permille of line (P2 2.1) and 10 permille of body.
     p2_limit: float = Field(default=0.045, gt=0)
+    #: Sine of the pitch against the line's: 0.1 m/s2 of wheel against train.
     map_limit: float = Field(default=0.015, gt=0)
+    #: The limit is at least so many standard deviations while the wheel rolls, over such a time: a body that pitches
+    #: shakes its accelerometer too, the more the higher it is mounted.
     noise_sigmas: float = Field(default=5.0, ge=0)
     noise_s: float = Field(default=30.0, gt=0)
-    confirm_s: float = Field(default=0.1, ge=0)
+    confirm_s: float = Field(default=0.1, ge=0)  #: Time over the limit after which a slip is one.
+    #: A slip ends when wheel and inertia agree so well for so long.
     latch_mps: float = Field(default=0.15, gt=0)
     latch_share: float = Field(default=0.01, ge=0)
     latch_s: float = Field(default=0.5, ge=0)
+    #: The two may differ by so much more a second of the carry: 1e-3 of gravity, the offset of the accelerometer and
+    #: the error of the pitch together.
     carry_drift_mps2: float = Field(default=0.01, ge=0)
-    look_back_s: float = Field(default=0.3, ge=0)
+    look_back_s: float = Field(default=0.3, ge=0)  #: How long before the detection the carry begins.
+    #: After this the carried speed has expired: `carry_drift_mps2` has become 0.3 m/s.
     longest_carry_s: float = Field(default=30.0, gt=0)
+    #: Time constant of the mean of the pitch: of the body's pitching at about 1 Hz and of vibration.
     smoothing_s: float = Field(default=0.2, gt=0)
-    offset_s: float = Field(default=60.0, gt=0)
-    standing_s: float = Field(default=1.0, gt=0)
+    offset_s: float = Field(default=60.0, gt=0)  #: Time constant of the accelerometer's offset.
+    standing_s: float = Field(default=1.0, gt=0)  #: Time without a pulse after which a vehicle at rest stands.
+    #: Time constants of the gyro's pitch and bias. Without a line the pitch by wheel and accelerometer takes its place.
     pitch_s: float = Field(default=20.0, gt=0)
     bias_s: float = Field(default=200.0, gt=0)
+    #: Time for which the body swings after a stop; its pitch then is the one of the standstill.
     settling_s: float = Field(default=2.0, ge=0)
+    #: Change of the pitch at standstill, duration and speed that mean rolling away.
     rolling_limit: float = Field(default=0.002, gt=0)
     rolling_s: float = Field(default=0.3, gt=0)
     rolling_mps: float = Field(default=0.05, gt=0)
@@ -120,51 +96,28 @@ class SlipLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class SlipResult:
-    """Speed and its source at N samples.
+    """Speed and its source at N samples."""
 
-    Attributes
-    ----------
-    state : ndarray of int8, shape (N,)
-        `MotionState`.
-    speed_mps : ndarray, shape (N,) [m/s]
-        Of the wheel where it rolls, else carried; NaN in INIT and EXPIRED.
-    way_m : ndarray, shape (N,) [m]
-        Integral of the speed from the first sample, each slip corrected from its look-back on; at its end by what wheel
-        and inertia differ by then, which has grown evenly since.
-    metric : ndarray, shape (N,)
-        Sine of the pitch by wheel and accelerometer less the reference pitch; NaN without pulses.
-    smooth : ndarray, shape (N,)
-        Mean of the metric over `SlipLimits.smoothing_s`, the accelerometer's offset taken off: what is compared.
-    pitch : ndarray, shape (N,)
-        Sine of the reference pitch; NaN before it is known.
-    gyro_bias_radps : ndarray, shape (N,) [rad/s]
-        Of the pitch rate, as learnt; 0 without a gyro.
-    offset_mps2 : ndarray, shape (N,) [m/s2]
-        Of the accelerometer, as learnt.
-    """
-
-    state: Codes
-    speed_mps: Floats
+    state: Codes  #: `MotionState`, shape (N,).
+    speed_mps: Floats  #: Of the wheel where it rolls, else carried; NaN in INIT and EXPIRED; shape (N,).
+    #: Integral of the speed from the first sample, each slip corrected from its look-back on; at its end by what wheel
+    #: and inertia differ by then, which has grown evenly since; shape (N,).
     way_m: Floats
+    #: Sine of the pitch by wheel and accelerometer less the reference pitch; NaN without pulses; shape (N,).
     metric: Floats
+    #: Mean of the metric over `SlipLimits.smoothing_s`, the accelerometer's offset taken off: what is compared; shape
+    #: (N,).
     smooth: Floats
-    pitch: Floats
-    gyro_bias_radps: Floats
-    offset_mps2: Floats
+    pitch: Floats  #: Sine of the reference pitch; NaN before it is known; shape (N,).
+    gyro_bias_radps: Floats  #: Of the pitch rate, as learnt; 0 without a gyro; shape (N,).
+    offset_mps2: Floats  #: Of the accelerometer, as learnt; shape (N,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class SlipState:
-    """What one call of `find_slips` leaves to the next.
+    """What one call of `find_slips` leaves to the next."""
 
-    Attributes
-    ----------
-    time_s : float [s]
-        Of the last sample.
-    automaton : _Automaton
-    """
-
-    time_s: float
+    time_s: float  #: Of the last sample.
     automaton: _Automaton
 
 
@@ -197,29 +150,21 @@ def roll_sine(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floa
 
 
 class MotionSamples(NamedTuple):
-    """N samples of wheel and body, 10 to 100 a second.
+    """N samples of wheel and body, 10 to 100 a second."""
 
-    Attributes
-    ----------
-    time_s, force_mps2 : ndarray, shape (N,) [s], [m/s2]
-        Rising; specific force along the vehicle.
-    wheel_mps, wheel_mps2 : ndarray, shape (N,) [m/s], [m/s2]
-        Speed of the wheel at the samples, and its acceleration; NaN where pulses say nothing.
-    line_sine : ndarray, shape (N,)
-        Sine of the line's gradient at the vehicle, + up forward; NaN where it is not known.
-    body : ndarray, shape (N, 3), optional [m/s2, rad/s, rad/s]
-        Specific force to the right, pitch rate and yaw rate of the body, for the rate of the pitch
-        (`pitch_rate_radps`) at the speed carried through a slip: that of the wheel would lean the body; NaN for none.
-    since_pulse_s : ndarray, shape (N,), optional [s]
-        Time since the last pulse: a vehicle that creeps has pulses without a speed. Without it that of the last speed.
-    """
-
-    time_s: Floats
+    time_s: Floats  #: Rising, shape (N,).
+    #: Speed of the wheel at the samples, and its acceleration; NaN without pulses; shape (N,).
     wheel_mps: Floats
     wheel_mps2: Floats
-    force_mps2: Floats
+    force_mps2: Floats  #: Specific force along the vehicle, shape (N,).
+    #: Sine of the line's gradient at the vehicle, + up forward; NaN where it is not known; shape (N,).
     line_sine: Floats
+    #: Specific force to the right, pitch rate and yaw rate of the body, for the rate of the pitch (`pitch_rate_radps`)
+    #: at the speed carried through a slip: that of the wheel would lean the body; NaN for none; shape (N, 3) [m/s2,
+    #: rad/s, rad/s].
     body: Floats | None = None
+    #: Time since the last pulse: a vehicle that creeps has pulses without a speed. Without it that of the last speed;
+    #: shape (N,).
     since_pulse_s: Floats | None = None
 
 

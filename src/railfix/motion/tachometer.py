@@ -3,6 +3,8 @@
 P2 measures the time between pulses instead of counting pulses: a count needs a moving average, which delays and
 blurs the acceleration. Over the pulses k0 to k the mean speed is ``(k - k0) p / (t_k - t_k0)``; where the acceleration
 is even it is the speed at the middle of the interval, and that instant is returned with it.
+
+Tachometer pulses as a signed distance along the track.
 """
 
 from __future__ import annotations
@@ -14,8 +16,10 @@ import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.errors import MismatchError
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
+from railfix.io.sensor_log import Pulses
 from railfix.motion.samples import TachometerPulses
 
 #: Ratios of a speed in a wrong unit to one in m/s, and the names of the units.
@@ -25,30 +29,16 @@ _UNIT_SHARE: Final = 0.05
 
 
 class TachometerLimits(Settings):
-    """Wheel and window of a tachometer.
+    """Wheel and window of a tachometer."""
 
-    Attributes
-    ----------
-    wheel_diameter_m : float
-        As entered on board.
-    pulses_per_turn : int
-        After multiplication of edges.
-    window_s : float
-        Time over which speeds are taken. P2 3.2 calls 0.1 s the usual smoothing of a tachometer; with uneven teeth
-        take that of a whole turn.
-    least_speed_mps : float
-        Below it there is no output (P2 1; 1 km/h).
-    silence_s : float
-        Time without a pulse after which there is no output.
-    jitter_s, resolution_s : float
-        Standard deviation of a pulse's instant, and the step of its clock.
-    """
-
-    wheel_diameter_m: float = Field(default=0.86, gt=0.2, lt=2.0)
-    pulses_per_turn: int = Field(default=60, ge=1)
+    wheel_diameter_m: float = Field(default=0.86, gt=0.2, lt=2.0)  #: As entered on board.
+    pulses_per_turn: int = Field(default=60, ge=1)  #: After multiplication of edges.
+    #: Time over which speeds are taken. P2 3.2 calls 0.1 s the usual smoothing of a tachometer; with uneven teeth take
+    #: that of a whole turn.
     window_s: float = Field(default=0.1, gt=0)
-    least_speed_mps: float = Field(default=1.0 / 3.6, gt=0)
-    silence_s: float = Field(default=0.3, gt=0)
+    least_speed_mps: float = Field(default=1.0 / 3.6, gt=0)  #: Below it there is no output (P2 1; 1 km/h).
+    silence_s: float = Field(default=0.3, gt=0)  #: Time without a pulse after which there is no output.
+    #: Standard deviation of a pulse's instant, and the step of its clock.
     jitter_s: float = Field(default=5e-6, ge=0)
     resolution_s: float = Field(default=1e-6, ge=0)
 
@@ -60,23 +50,13 @@ class TachometerLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class PulseSpeeds:
-    """Speeds at N instants asked for.
+    """Speeds at N instants asked for."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (N,)
-        Instant at which each speed holds, earlier than the one asked for; NaT where there is none.
-    speed_mps : ndarray, shape (N,) [m/s]
-        With the sign of the direction; NaN where the pulses say nothing.
-    sigma_mps : ndarray, shape (N,) [m/s]
-        By jitter and clock; the wheel's scale comes beside it.
-    bound_mps : ndarray, shape (N,) [m/s]
-        Size that the speed cannot exceed since the last pulse: ``p / (t - t_k)``; NaN before the first.
-    """
-
+    #: Instant at which each speed holds, earlier than the one asked for; NaT where there is none; shape (N,).
     time: Datetimes
-    speed_mps: Floats
-    sigma_mps: Floats
+    speed_mps: Floats  #: With the sign of the direction; NaN where the pulses say nothing; shape (N,).
+    sigma_mps: Floats  #: By jitter and clock; the wheel's scale comes beside it; shape (N,).
+    #: Size that the speed cannot exceed since the last pulse: ``p / (t - t_k)``; NaN before the first; shape (N,).
     bound_mps: Floats
 
 
@@ -191,21 +171,11 @@ def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedCheck:
-    """A log of speeds against speeds known to be right.
+    """A log of speeds against speeds known to be right."""
 
-    Attributes
-    ----------
-    ratio : float
-        Logged over right, without the unit.
-    unit : str
-        "m/s", or the unit that the log is really in.
-    lag_s : float
-        By how much its time tags are late.
-    """
-
-    ratio: float
-    unit: str
-    lag_s: float
+    ratio: float  #: Logged over right, without the unit.
+    unit: str  #: "m/s", or the unit that the log is really in.
+    lag_s: float  #: By how much its time tags are late.
 
 
 def check_speeds(
@@ -249,3 +219,140 @@ def check_speeds(
         unit="m/s" if unit is None else _UNITS[unit],
         lag_s=round(float(lags[best]), 3),
     )
+
+
+#: Windows that the distance of a pulse is estimated from: length [s], least distance [m], least number.
+_WINDOW_S: Final = 10.0
+_LEAST_DISTANCE_M: Final = 30.0
+_LEAST_WINDOWS: Final = 5
+#: Lowest speed that determines a direction [m/s].
+_DIRECTION_MPS: Final = 0.3
+#: Highest plausible speed [m/s].
+_FASTEST_MPS: Final = 150.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wheel:
+    """A tachometer with the distance of one pulse."""
+
+    pulses: Pulses
+    pulse_m: float
+    source: str
+
+    @property
+    def reading_sigma_m(self) -> float:
+        """Standard deviation of a reading [m]: uniform within a pulse for a counter, 0 for a distance."""
+        return self.pulse_m / float(np.sqrt(12.0)) if self.pulses.kind == "count" else 0.0
+
+    def distance_m(self, time: Datetimes, speed_hint_mps: Floats) -> Floats:
+        """Cumulated distance along rising chainage at instants.
+
+        Parameters
+        ----------
+        time : ndarray of datetime64[ns], shape (N,)
+        speed_hint_mps : ndarray, shape (N,) [m/s]
+            Speeds from another source, for the direction of unsigned pulses; NaN where unknown. Where the
+            direction changes, it is taken to change at the longest standstill.
+
+        Returns
+        -------
+        ndarray, shape (N,) [m]
+            NaN where the table has no reading, and where a turn without a stop leaves the direction open.
+        """
+        run = self.pulse_m * self.pulses.at(time)
+        sign = _direction(run, speed_hint_mps)
+        if self.pulses.signed:
+            # A signed counter gives the direction itself; the hints only give the sense of its sign.
+            rising = np.sign(np.nansum(np.diff(run) * sign))
+            return run if rising >= 0 else -run
+        step = np.diff(run) * sign
+        return _cumulate(run, step)
+
+
+def _cumulate(run: Floats, step: Floats) -> Floats:
+    """Sum of signed steps; NaN where an unknown step separates an instant from the next."""
+    known = np.isfinite(step)
+    total = np.concatenate([[0.0], np.cumsum(np.where(known, step, 0.0))])
+    open_ = np.isnan(run)
+    # An instant between two unknown steps belongs to no stretch; one at the edge of a stretch stays with it, and
+    # the first instant after a hole is given up so that no difference spans it.
+    open_[1:] |= ~known
+    return np.where(open_, np.nan, total)
+
+
+def _direction(run: Floats, hint: Floats) -> Floats:
+    """1 or -1 of each step, NaN where it is open, shape (N - 1,)."""
+    known = np.where(np.abs(hint) > _DIRECTION_MPS, np.sign(hint), np.nan)
+    at = np.flatnonzero(np.isfinite(known))
+    if not len(at):
+        return np.ones(len(run) - 1)
+    steps = np.arange(len(run) - 1) + 0.5
+    after = np.clip(np.searchsorted(at, steps), 0, len(at) - 1)
+    before = np.clip(np.searchsorted(at, steps) - 1, 0, len(at) - 1)
+    sign = known[at[before]].copy()
+    turning = np.flatnonzero(known[at[1:]] != known[at[:-1]])
+    for k in turning.tolist():
+        first, last = int(at[k]), int(at[k + 1])
+        sign[first:last] = _turn(np.diff(run[first : last + 1]), float(known[first]), float(known[last]))
+    sign[: at[0]] = known[at[after[: at[0]]]]
+    return sign
+
+
+def _turn(step: Floats, before: float, after: float) -> Floats:
+    """Direction within a stretch in which it changes: at the longest stop, or open."""
+    standing = np.abs(np.nan_to_num(step, nan=1.0)) < 1e-9
+    if not standing.any():
+        # Neighbours that see both directions need no stop between them.
+        return np.full(len(step), np.nan)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], standing, [False]]).astype(np.int8)))
+    begin, end = edges[::2], edges[1::2]
+    longest = int(np.argmax(end - begin))
+    middle = (int(begin[longest]) + int(end[longest])) // 2
+    return np.where(np.arange(len(step)) < middle, before, after)
+
+
+def wheel_of(pulses: Pulses, pulse_m: float | None, time: Datetimes, arc_m: Floats) -> Wheel:
+    """Tachometer with the distance of a pulse as given, or estimated from fixes: the median over windows.
+
+    Parameters
+    ----------
+    pulse_m : float or None [m]
+    time : ndarray of datetime64[ns], shape (F,)
+        Of good fixes.
+    arc_m : ndarray, shape (F,) [m]
+
+    Raises
+    ------
+    MismatchError
+        Too few fixes to estimate it, or pulses that imply an impossible speed.
+    """
+    source = "given"
+    if pulses.kind == "distance":
+        pulse_m, source = 1.0, "metres in the table"
+    elif pulse_m is None:
+        pulse_m, source = _estimate(pulses, time, arc_m), "estimated from the fixes"
+    speed = np.abs(np.diff(pulses.count)) * pulse_m / seconds(np.diff(pulses.time))
+    if speed.max() > _FASTEST_MPS:
+        row = int(np.argmax(speed))
+        raise MismatchError(
+            f"{pulses.path}: {speed[row]:.0f} m/s between rows {row + 1} and {row + 2} with {pulse_m:.6g} m a pulse; "
+            "does the counter wrap, or is the distance of a pulse wrong?"
+        )
+    return Wheel(pulses=pulses, pulse_m=pulse_m, source=source)
+
+
+def _estimate(pulses: Pulses, time: Datetimes, arc_m: Floats) -> float:
+    count = pulses.at(time)
+    t = seconds(time - time[0])
+    end = np.searchsorted(t, t + _WINDOW_S)
+    start = np.flatnonzero(end < len(t))
+    end = end[start]
+    inside = t[end] - t[start] <= 1.5 * _WINDOW_S
+    distance, turned = np.abs(arc_m[end] - arc_m[start])[inside], np.abs(count[end] - count[start])[inside]
+    usable = (distance > _LEAST_DISTANCE_M) & np.isfinite(turned) & (turned > 0)
+    if usable.sum() < _LEAST_WINDOWS:
+        raise MismatchError(
+            f"{pulses.path}: too few fixes while the train runs to tell the distance of a pulse; give it (wheel "
+            "circumference and pulses a turn)"
+        )
+    return float(np.median(distance[usable] / turned[usable]))

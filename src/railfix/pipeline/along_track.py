@@ -19,12 +19,11 @@ from railfix.motion.samples import BaliseReadings, ListedBalises, SensorSamples
 from railfix.pipeline.balise_stage import BaliseLimits
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
-from railfix.pipeline.filter_result import AlongTrack, FilterFix, FilterState, SingleEpochs
+from railfix.pipeline.filter_result import AlongTrack, FilterFix, FilterState, Replay, SingleEpochs, SmoothedTrack
 from railfix.pipeline.passings import find_passings
 from railfix.pipeline.return_gate import ReturnState, gated_codes
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import LineReferences, sensor_epochs
-from railfix.pipeline.smoothing import Replay, SmoothedTrack
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.screens import Screened
 from railfix.track.trajectory import Trajectory
@@ -68,10 +67,6 @@ def along_track(
     ----------
     ranges : CorrectedRanges
         After all screens and exclusions.
-    single : SingleEpochs
-    trajectory : Trajectory
-    config : Config
-    state : FilterState
     samples : SensorSamples, optional
         Of the sensors on board since the chunk before.
     surroundings : LineReferences, optional

@@ -20,39 +20,21 @@ AGAIN_S: Final = 60.0
 
 
 class BaliseLimits(Settings):
-    """Reader of balises on the vehicle.
+    """Reader of balises on the vehicle."""
 
-    Attributes
-    ----------
-    ahead_m : float
-        Place of the reader ahead of the vehicle's middle, without a vehicle file of the antenna.
-    sigma_m : float
-        Least standard deviation of a reading along the line: SUBSET-036 has 1 m for the vital use of a balise's place.
-    contradiction_sigmas : float
-        A balise further than this from the filter is wrong.
-    """
-
-    ahead_m: float = 0.0
+    ahead_m: float = 0.0  #: Place of the reader ahead of the vehicle's middle, without a vehicle file of the antenna.
+    #: Least standard deviation of a reading along the line: SUBSET-036 has 1 m for the vital use of a balise's place.
     sigma_m: float = Field(default=1.0, gt=0)
-    contradiction_sigmas: float = Field(default=5.0, gt=0)
+    contradiction_sigmas: float = Field(default=5.0, gt=0)  #: A balise further than this from the filter is wrong.
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaliseState:
-    """Last balise read before a chunk.
+    """Last balise read before a chunk."""
 
-    Attributes
-    ----------
-    balise : str
-        Identity; blank before the first.
-    time : datetime64[ns]
-    turn : int
-        Column of `railfix.tracking.BaliseEpochs` that it was in.
-    """
-
-    balise: str = ""
+    balise: str = ""  #: Identity; blank before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    turn: int = 1
+    turn: int = 1  #: Column of `railfix.tracking.BaliseEpochs` that it was in.
 
 
 def arcs_of_balises(listed: ListedBalises, trajectory: Trajectory, limits: BaliseLimits) -> Floats:
@@ -77,14 +59,10 @@ def balise_epochs(
 
     Parameters
     ----------
-    readings : BaliseReadings
     edges : ndarray of datetime64[ns], shape (T + 1,)
         Epoch before the chunk, and its epochs.
-    listed : ListedBalises
     trajectory : Trajectory
         Of the antenna.
-    state : BaliseState
-    limits : BaliseLimits
     """
     found = BaliseEpochs.none(len(edges) - 1)
     index, arc = listed.index_of(readings.balise), arcs_of_balises(listed, trajectory, limits)

@@ -20,7 +20,7 @@ from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.received import Received
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import corrected_phase_m, number_arcs
-from railfix.positioning.robust_clock import robust_clock
+from railfix.positioning.noise_scale import robust_clock
 from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.base_station import BaseErrors
 from railfix.track import Track

@@ -105,11 +105,8 @@ def code_and_phase(
         With their slips (`with_slips`).
     ranges : Ranges
         Codes that the position was solved with; a phase is used where its code is.
-    trajectory : Trajectory
     arc_m : ndarray, shape (T,) [m]
         Positions from the codes alone.
-    config : Config
-    state : CarrierState
 
     Returns
     -------

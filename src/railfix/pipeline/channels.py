@@ -28,62 +28,35 @@ _REMEMBERED: Final = 64
 
 @dataclass(frozen=True, kw_only=True)
 class Channels:
-    """M channels of a log, and the K of them that settings allow.
+    """M channels of a log, and the K of them that settings allow."""
 
-    Attributes
-    ----------
-    columns : ndarray of int, shape (K,)
-        Where they stand in the observations, those of one clock side by side, a satellite's best signal first.
-    satellite, signal : ndarray of str, shape (K,)
-    groups : tuple of slice
-        Channels of one receiver clock.
-    clocks : tuple of str
-        Letter of each receiver clock.
-    clock : ndarray of str, shape (K,)
-        Letter of the receiver clock of each channel.
-    frequency_hz : ndarray, shape (K,) [Hz]
-    every_frequency_hz : ndarray, shape (M,) [Hz]
-    left_out : ndarray of int64, shape (M,)
-        Reason of the channels that settings leave out, 0 for the others.
-    member : ndarray of int64, shape (M, S)
-        1 where a channel is of a satellite, S satellites.
-    second : ndarray of int, shape (K, P)
-        Columns of the second signals of each channel's satellite, in order of preference; -1 for none. P is 0 with
-        one frequency.
-    second_signal, second_ratio, second_noise : ndarray, shape (K, P)
-        Signal with the letter of the constellation, square of the first frequency over it, and its noise over that of
-        L1 C/A.
-    pair_names : tuple of str, length K P
-        Satellite and both signals.
-    pair_groups : ndarray of int, shape (K P,)
-        Number of the pairs with one delay in the receiver.
-    """
-
+    #: Where they stand in the observations, those of one clock side by side, a satellite's best signal first; shape
+    #: (K,).
     columns: Indices
+    #: Shape (K,).
     satellite: Strings
     signal: Strings
-    groups: tuple[slice, ...]
-    clocks: tuple[str, ...]
-    clock: Strings
-    frequency_hz: Floats
-    every_frequency_hz: Floats
-    left_out: Integers
-    member: Integers
+    groups: tuple[slice, ...]  #: Channels of one receiver clock.
+    clocks: tuple[str, ...]  #: Letter of each receiver clock.
+    clock: Strings  #: Letter of the receiver clock of each channel, shape (K,).
+    frequency_hz: Floats  #: Shape (K,).
+    every_frequency_hz: Floats  #: Shape (M,).
+    left_out: Integers  #: Reason of the channels that settings leave out, 0 for the others; shape (M,).
+    member: Integers  #: 1 where a channel is of a satellite, S satellites; shape (M, S).
+    #: Columns of the second signals of each channel's satellite, in order of preference; -1 for none. P is 0 with one
+    #: frequency; shape (K, P).
     second: Indices
+    #: Signal with the letter of the constellation, square of the first frequency over it, and its noise over that of L1
+    #: C/A; shape (K, P).
     second_signal: Strings
     second_ratio: Floats
     second_noise: Floats
-    pair_names: tuple[str, ...]
-    pair_groups: Integers
+    pair_names: tuple[str, ...]  #: Satellite and both signals, length K P.
+    pair_groups: Integers  #: Number of the pairs with one delay in the receiver, shape (K P,).
 
 
 class ChannelBook:
-    """Channels of observations under some settings, computed once for each set of channels.
-
-    Parameters
-    ----------
-    config : Config
-    """
+    """Channels of observations under some settings, computed once for each set of channels."""
 
     def __init__(self, config: Config) -> None:
         self._config = config

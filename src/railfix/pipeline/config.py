@@ -32,13 +32,12 @@ from railfix.integrity.protection import RiskBudget
 from railfix.integrity.protection.araim import AraimBudget
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.positioning.carrier import ContinuityLimits, CycleSlipLimits, PhaseLimits, SmoothingLimits
-from railfix.positioning.constrained import ConstrainedLimits
+from railfix.positioning.constrained import ConstrainedLimits, SinglePointLimits
 from railfix.positioning.forgetting import LastingErrorLimits
 from railfix.positioning.intersystem_bias import ClockOffsetLimits
 from railfix.positioning.map_offset import MapOffsetLimits
 from railfix.positioning.noise_scale import NoiseScaleLimits, RobustFitLimits
 from railfix.positioning.section_search import SectionLimits
-from railfix.positioning.single_point import SinglePointLimits
 from railfix.positioning.two_frequencies import TwoFrequencyLimits
 from railfix.ranges.base_station import BaseLimits
 from railfix.ranges.sbas import SbasLimits
@@ -103,170 +102,107 @@ class Config(ScreenSettings):
 
     Attributes
     ----------
-    preset : {"default", "strict", "p1"}
-        Base preset; other settings override it. "p1" is table 6 of P1: elevation mask 20 deg, C/N0 floor 30 dB-Hz
-        and 10 dB-Hz below the curve, Doppler 1.5 m (no hold), antenna pair 5 m with one clock for both receivers
-        (P1 2.3(3)), RAIM with two satellites and 100 m^2, antenna spacing 5 m, failed checks dropped. What P1 does
-        not specify (weights, noise, inter-system biases, ambiguous sections) is as in "default".
-    systems : tuple of str
-        Constellations used. GLONASS is left out by default: its channels have code biases of
-        metres between them.
-    exclude : tuple of str
-        Satellites ("G07") and constellations ("C") left out.
-    signals : mapping of str to tuple of str
-        Signals of each constellation in order of preference; the first one observed is used.
-    frequencies : {"one", "two"}
-        Codes of a satellite combined (not with SBAS).
-    two_frequencies : TwoFrequencyLimits
-        Limits of that.
-    screens : tuple of str
-        Screens that are on; health and validity of the satellites are always checked.
-    cn0_curve : path or None
-        File of the mean C/N0 over elevation (``railfix cn0-curve``); without it only the floor is used.
-    failed_checks : {"keep", "drop"}
-        Coordinates of positions with a failed check (`reasons.CHECK_FAILED`): kept, with the status of
-        the check, or dropped as P1 does.
-    largest_sigma_m : float
-        Availability/accuracy threshold: a position whose single-epoch sigma (`AntennaResult.own_sigma_m`)
-        exceeds it is `uncertain`, a failed check. With ``carrier = "float"`` the sigma of the published position
-        is compared. P4 takes a car length, 20 m, as acceptable; the preset "strict" uses 10 m and drops failed
-        checks.
-    min_satellites : int
-        Satellites that a position needs. P1 3.2: 3; 2 is possible and ambiguous on curves.
-    dilution_limit : float
-        Largest along-track dilution [m/m] of a position.
-    off_map_risk : float
-        Probability that noise alone puts a position off the map; the noise is judged by the residuals of the 3-D fit.
-    off_map_s : float [s]
-        Time off the map after which the filter gives up its place, or on it begins anew. On the
-        recordings, with a right map, no two positions in a row are off it.
-    track_risk : float
-        Probability of another track above which no position on a network is `ok`, `tracking` or has a level. `railfix
-        which-track` allows the same.
-    ionosphere : {"klobuchar", "off"}
-        Model of the delay.
-    troposphere : {"saastamoinen", "off"}
-        Model of the delay.
-    max_ephemeris_age_s : float or None
-        Limit on the age of a record, tighter than its validity.
-    map_plan_sigma_m, map_height_sigma_m : float or None
-        In place of the track's own map error (P1: 0.30 m, 0.60 m).
-    noise_scale : NoiseScaleLimits
-        Estimation of the receiver's noise from the residuals.
-    lasting_errors : LastingErrorLimits
-        Satellites that are wrong for a minute and longer.
-    robust_fit : RobustFitLimits
-        Selection of the ranges of an epoch that agree with each other; clock offsets and noise are estimated from them.
-    map_offset : MapOffsetLimits
-        Test of the map against the 3-D positions of the last minutes.
-    interference : InterferenceLimits
-        Signs of jamming and spoofing.
-    sbas : tuple of path, or "stream"
-        Logs of SBAS messages, or "stream" for those of the receivers: their corrections take the place of
-        the models, and satellites without a valid one are rejected. Empty: no SBAS.
-    sbas_prn : int or "best"
-        GEO whose messages are used; "best" is the one with the most usable fast corrections.
-    sbas_limits : SbasLimits
-        Time-outs, use of message type 0, treatment of missing degradation data.
-    error_model : path or None
-        Errors by direction and C/N0 (``railfix error-model``): in the protection level the sigma of no range falls
-        below their overbounds. Weights, screens and RAIM stay those of `noise`. Without it the level is based on
-        `noise` times the scale estimated so far, which bounds no tails.
-    nominal : NominalErrors
-        Satellite and atmospheric errors, added to a model of local errors where SBAS does not give them.
-    protection : {"on", "off"}
-        Protection level along the line with its parts.
-    risk : RiskBudget
-        Integrity risk per hour, its shares, and the fault probabilities that the level assumes.
-    integrity_support : path or None
-        Integrity support message (TOML, ``docs/protection-level.md``): its satellites have ARAIM levels besides,
-        along the track and in 3-D. Not with SBAS.
-    araim : AraimBudget
-        Allocation of the risk of these.
-    alarm_limit_m : float
-        Largest protection level of an available position. P4 takes a car length, 20 m.
-    no_level_m : tuple of (float, float) [m]
-        Chainages from and to where local faults cannot be bounded: no level there
-        (``railfix error-model`` prints those of its runs).
-    raim_protection : {"on", "off"}
-        Whether positions also get P4's level: the largest slope times the largest undetected bias.
-    noise, elevation, cn0, doppler, antenna_pair, raim, antenna_spacing
+    elevation, cn0, doppler, antenna_pair, raim, antenna_spacing
         Limits of the weights and the screens.
-    clock_offsets, single_point, section, constrained
-        Limits of these stages.
-    carrier : {"off", "smoothed", "float", "fixed"}
-        Use of the carrier phase: none; codes smoothed by it; or code and phase together with float
-        ambiguities, from this and earlier epochs, and with integer ones beside a base station ("fixed").
-        On recordings smoothing helps most on a phone, float
-        ambiguities under open sky; in towns, where arcs last seconds, neither removes large errors.
-    phase_sigma_m : float
-        Standard deviation of a phase at the zenith, multipath included.
-    filter : {"track", "off"}
-        Filter along the track: codes, Dopplers, changes of the carrier phase and
-        sensors, from this and earlier epochs. `railfix run` and `railfix demo` ask for it.
-    filter_sources : tuple of str
-        Measurements that the filter uses: `code`, `phase` and `doppler` of the satellites, and
-        `wheel`, `radar`, `force`, `feature` (of the line, by inertial unit and wheel), `balise`, `range` of the sensors
-        on board.
-    tracking : TrackingLimits
-        Noise of motion and measurements of that filter.
-    sensors : SensorLimits
-        Noise of the sensors on board, and the wheel of the tachometer.
-    base : BaseLimits
-        Limits of the differences with a base station.
-    slips, smoothing, continuity, phase
-        Limits of the stages of the carrier phase.
     """
 
+    #: Base preset; other settings override it. "p1" is table 6 of P1: elevation mask 20 deg, C/N0 floor 30 dB-Hz and 10
+    #: dB-Hz below the curve, Doppler 1.5 m (no hold), antenna pair 5 m with one clock for both receivers (P1 2.3(3)),
+    #: RAIM with two satellites and 100 m^2, antenna spacing 5 m, failed checks dropped. What P1 does not specify
+    #: (weights, noise, inter-system biases, ambiguous sections) is as in "default".
     preset: Literal["default", "strict", "p1"] = "default"
+    #: Constellations used. GLONASS is left out by default: its channels have code biases of metres between them.
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
+    #: Satellites ("G07") and constellations ("C") left out.
     exclude: tuple[Annotated[str, Field(pattern=r"^[GJECR]([0-9]{2})?$")], ...] = ()
+    #: Signals of each constellation in order of preference; the first one observed is used.
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
-    frequencies: Literal["one", "two"] = "one"
-    two_frequencies: TwoFrequencyLimits = TwoFrequencyLimits()
+    frequencies: Literal["one", "two"] = "one"  #: Codes of a satellite combined (not with SBAS).
+    two_frequencies: TwoFrequencyLimits = TwoFrequencyLimits()  #: Limits of that.
+    #: Screens that are on; health and validity of the satellites are always checked.
     screens: tuple[str, ...] = SCREEN_NAMES
+    #: File of the mean C/N0 over elevation (``railfix cn0-curve``); without it only the floor is used.
     cn0_curve: Path | None = None
+    #: Coordinates of positions with a failed check (`reasons.CHECK_FAILED`): kept, with the status of the check, or
+    #: dropped as P1 does.
     failed_checks: Literal["keep", "drop"] = "keep"
+    #: Availability/accuracy threshold: a position whose single-epoch sigma (`AntennaResult.own_sigma_m`) exceeds it is
+    #: `uncertain`, a failed check. With ``carrier = "float"`` the sigma of the published position is compared. P4 takes
+    #: a car length, 20 m, as acceptable; the preset "strict" uses 10 m and drops failed checks.
     largest_sigma_m: float = Field(default=20.0, gt=0)
+    #: Satellites that a position needs. P1 3.2: 3; 2 is possible and ambiguous on curves.
     min_satellites: int = Field(default=3, ge=2)
-    dilution_limit: float = Field(default=20.0, gt=0)
+    dilution_limit: float = Field(default=20.0, gt=0)  #: Largest along-track dilution [m/m] of a position.
+    #: Probability that noise alone puts a position off the map; the noise is judged by the residuals of the 3-D fit.
     off_map_risk: float = Field(default=1e-6, gt=0, lt=1)
+    #: Time off the map after which the filter gives up its place, or on it begins anew. On the recordings, with a right
+    #: map, no two positions in a row are off it.
     off_map_s: float = Field(default=10.0, gt=0)
+    #: Probability of another track above which no position on a network is `ok`, `tracking` or has a level. `railfix
+    #: which-track` allows the same.
     track_risk: float = Field(default=1e-3, gt=0, lt=1)
-    ionosphere: Literal["klobuchar", "off"] = "klobuchar"
-    troposphere: Literal["saastamoinen", "off"] = "saastamoinen"
+    ionosphere: Literal["klobuchar", "off"] = "klobuchar"  #: Model of the delay.
+    troposphere: Literal["saastamoinen", "off"] = "saastamoinen"  #: Model of the delay.
+    #: Limit on the age of a record, tighter than its validity.
     max_ephemeris_age_s: float | None = Field(default=None, gt=0)
+    #: In place of the track's own map error (P1: 0.30 m, 0.60 m).
     map_plan_sigma_m: float | None = Field(default=None, gt=0)
     map_height_sigma_m: float | None = Field(default=None, gt=0)
-    noise_scale: NoiseScaleLimits = NoiseScaleLimits()
-    lasting_errors: LastingErrorLimits = LastingErrorLimits()
+    noise_scale: NoiseScaleLimits = NoiseScaleLimits()  #: Estimation of the receiver's noise from the residuals.
+    lasting_errors: LastingErrorLimits = LastingErrorLimits()  #: Satellites that are wrong for a minute and longer.
+    #: Selection of the ranges of an epoch that agree with each other; clock offsets and noise are estimated from them.
     robust_fit: RobustFitLimits = RobustFitLimits()
-    map_offset: MapOffsetLimits = MapOffsetLimits()
-    interference: InterferenceLimits = InterferenceLimits()
-    noise: CodeNoise = CodeNoise()
+    map_offset: MapOffsetLimits = MapOffsetLimits()  #: Test of the map against the 3-D positions of the last minutes.
+    interference: InterferenceLimits = InterferenceLimits()  #: Signs of jamming and spoofing.
+    noise: CodeNoise = CodeNoise()  #: Limits of the weights and the screens.
+    #: Logs of SBAS messages, or "stream" for those of the receivers: their corrections take the place of the models,
+    #: and satellites without a valid one are rejected. Empty: no SBAS.
     sbas: tuple[Path, ...] | Literal["stream"] = ()
+    #: GEO whose messages are used; "best" is the one with the most usable fast corrections.
     sbas_prn: int | Literal["best"] = "best"
-    sbas_limits: SbasLimits = SbasLimits()
-    base: BaseLimits = BaseLimits()
+    sbas_limits: SbasLimits = SbasLimits()  #: Time-outs, use of message type 0, treatment of missing degradation data.
+    base: BaseLimits = BaseLimits()  #: Limits of the differences with a base station.
+    #: Errors by direction and C/N0 (``railfix error-model``): in the protection level the sigma of no range falls below
+    #: their overbounds. Weights, screens and RAIM stay those of `noise`. Without it the level is based on `noise` times
+    #: the scale estimated so far, which bounds no tails.
     error_model: Path | None = None
+    #: Satellite and atmospheric errors, added to a model of local errors where SBAS does not give them.
     nominal: NominalErrors = NominalErrors()
-    protection: Literal["on", "off"] = "on"
+    protection: Literal["on", "off"] = "on"  #: Protection level along the line with its parts.
+    #: Integrity risk per hour, its shares, and the fault probabilities that the level assumes.
     risk: RiskBudget = RiskBudget()
+    #: Integrity support message (TOML, ``docs/protection-level.md``): its satellites have ARAIM levels besides, along
+    #: the track and in 3-D. Not with SBAS.
     integrity_support: Path | None = None
-    araim: AraimBudget = AraimBudget()
+    araim: AraimBudget = AraimBudget()  #: Allocation of the risk of these.
+    #: Largest protection level of an available position. P4 takes a car length, 20 m.
     alarm_limit_m: float = Field(default=20.0, gt=0, le=1e5)
+    #: Chainages from and to where local faults cannot be bounded: no level there (``railfix error-model`` prints those
+    #: of its runs).
     no_level_m: tuple[tuple[float, float], ...] = ()
+    #: Whether positions also get P4's level: the largest slope times the largest undetected bias.
     raim_protection: Literal["on", "off"] = "off"
+    #: Use of the carrier phase: none; codes smoothed by it; or code and phase together with float ambiguities, from
+    #: this and earlier epochs, and with integer ones beside a base station ("fixed"). On recordings smoothing helps
+    #: most on a phone, float ambiguities under open sky; in towns, where arcs last seconds, neither removes large
+    #: errors.
     carrier: Literal["off", "smoothed", "float", "fixed"] = "off"
+    #: Standard deviation of a phase at the zenith, multipath included.
     phase_sigma_m: float = Field(default=0.01, gt=0)
+    #: Limits of the stages of the carrier phase.
     slips: CycleSlipLimits = CycleSlipLimits()
     smoothing: SmoothingLimits = SmoothingLimits()
     continuity: ContinuityLimits = ContinuityLimits()
     phase: PhaseLimits = PhaseLimits()
+    #: Filter along the track: codes, Dopplers, changes of the carrier phase and sensors, from this and earlier epochs.
+    #: `railfix run` and `railfix demo` ask for it.
     filter: Literal["track", "off"] = "track"
+    #: Measurements that the filter uses: `code`, `phase` and `doppler` of the satellites, and `wheel`, `radar`,
+    #: `force`, `feature` (of the line, by inertial unit and wheel), `balise`, `range` of the sensors on board.
     filter_sources: tuple[FilterSource, ...] = FILTER_SOURCES
-    tracking: TrackingLimits = TrackingLimits()
-    sensors: SensorLimits = SensorLimits()
+    tracking: TrackingLimits = TrackingLimits()  #: Noise of motion and measurements of that filter.
+    sensors: SensorLimits = SensorLimits()  #: Noise of the sensors on board, and the wheel of the tachometer.
+    #: Limits of these stages.
     clock_offsets: ClockOffsetLimits = ClockOffsetLimits()
     single_point: SinglePointLimits = SinglePointLimits()
     section: SectionLimits = SectionLimits()

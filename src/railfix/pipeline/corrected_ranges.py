@@ -20,9 +20,9 @@ from railfix.pipeline.received import Received
 from railfix.pipeline.second_codes import second_codes
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import Slips
+from railfix.positioning.constrained import SinglePointLimits, single_point
 from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.section_search import SearchIndex, search
-from railfix.positioning.single_point import SinglePointLimits, single_point
 from railfix.positioning.two_frequencies import Combined, SecondCodes
 from railfix.ranges.atmosphere import SeenFrom, modelled_delays
 from railfix.ranges.base_station import BaseDifferences
@@ -52,44 +52,24 @@ class Models(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectedRanges(AntennaRanges):
-    """Corrected pseudoranges before positioning: T epochs by the K channels that the settings allow.
-
-    Attributes
-    ----------
-    observations : Observations
-    channels : Channels
-    satellites : SatelliteStates
-    ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
-        Delays subtracted from the codes; 0 where the model is off, NaN where SBAS has none.
-    nominal_m : ndarray, shape (T, K) [m]
-        Standard deviation of satellites and atmosphere: by SBAS, otherwise by `Config.nominal`.
-    bound_sigma_m, bias_m : ndarray, shape (T, K) [m]
-        Overbounding sigma and largest nominal bias of each range by the error model; 0 without one.
-    screens : mapping of str to Screened
-        Metric and verdict of each screen so far.
-    second : SecondCodes or None
-        Second codes of the satellites, where two frequencies are used.
-    combined : Combined or None
-        How the two were combined.
-    slips : Slips or None
-        Of all channels of the observations, where the carrier phase is used.
-    base : BaseDifferences or None
-        What a base station has subtracted.
-    """
+    """Corrected pseudoranges before positioning: T epochs by the K channels that the settings allow."""
 
     observations: Observations
     channels: Channels
     satellites: SatelliteStates
+    #: Delays subtracted from the codes; 0 where the model is off, NaN where SBAS has none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
+    #: Standard deviation of satellites and atmosphere: by SBAS, otherwise by `Config.nominal`; shape (T, K).
     nominal_m: Floats
+    #: Overbounding sigma and largest nominal bias of each range by the error model; 0 without one; shape (T, K).
     bound_sigma_m: Floats
     bias_m: Floats
-    screens: Mapping[str, Screened] = field(default_factory=dict)
-    second: SecondCodes | None = None
-    combined: Combined | None = None
-    slips: Slips | None = None
-    base: BaseDifferences | None = None
+    screens: Mapping[str, Screened] = field(default_factory=dict)  #: Metric and verdict of each screen so far.
+    second: SecondCodes | None = None  #: Second codes of the satellites, where two frequencies are used.
+    combined: Combined | None = None  #: How the two were combined.
+    slips: Slips | None = None  #: Of all channels of the observations, where the carrier phase is used.
+    base: BaseDifferences | None = None  #: What a base station has subtracted.
 
     @property
     def columns(self) -> Indices:
@@ -143,14 +123,11 @@ def correct_ranges(
 
     Parameters
     ----------
-    obs : Observations
     channels : Channels
         Of these observations.
-    config : Config
     received : Received
         Navigation records and coefficients; where SBAS is used, its corrections replace the models, and satellites
         without a valid one are rejected.
-    antennas : AntennaRows
     error_model : ErrorModel, optional
         Gives the least sigmas of the protection level; the weights are those of ``config.noise``.
 

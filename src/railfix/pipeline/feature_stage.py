@@ -30,23 +30,15 @@ _LEAST_POINTS: Final = 30
 
 @dataclass(frozen=True, kw_only=True)
 class LineFeatures:
-    """Gradient and curvature of a line, and its features in order; arc lengths are those of the line itself.
-
-    Attributes
-    ----------
-    series : LineSeries
-    features : tuple of Feature
-    antenna_m, body_m : ndarray, shape (V,) [m]
-        Arc lengths of the antenna's trajectory, and of the body's middle on the line then: the body turns about it.
-    line : Line
-        Tells whether it is closed.
-    """
+    """Gradient and curvature of a line, and its features in order; arc lengths are those of the line itself."""
 
     series: LineSeries
     features: tuple[Feature, ...]
+    #: Arc lengths of the antenna's trajectory, and of the body's middle on the line then: the body turns about it;
+    #: shape (V,).
     antenna_m: Floats
     body_m: Floats
-    line: Line
+    line: Line  #: Tells whether it is closed.
 
     @classmethod
     def of(cls, track: Track, trajectory: Trajectory, limits: FeatureLimits) -> LineFeatures:
@@ -77,32 +69,18 @@ def ahead_m(trajectory: Trajectory) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class RateSeries:
-    """Rates of the body at K ticks.
+    """Rates of the body at K ticks."""
 
-    Attributes
-    ----------
-    time, known : ndarray of datetime64[ns], shape (K,)
-        At which they hold, and when they were known.
-    way_m : ndarray, shape (K,) [m]
-        Wheel's way since the tick before the first, in rising arc length.
-    arc_m : ndarray, shape (K,) [m]
-        Place of the antenna by the wheel; NaN where it is not known.
-    turned_rad, climbed_rad : ndarray, shape (K,)
-        Change of heading (+ to the right) and of pitch (+ nose up) since the tick before.
-    speed_mps : ndarray, shape (K,) [m/s]
-        In rising arc length.
-    rolls : ndarray of bool, shape (K,)
-        The wheel rolls.
-    """
-
+    #: At which they hold, and when they were known; shape (K,).
     time: Datetimes
     known: Datetimes
-    way_m: Floats
-    arc_m: Floats
+    way_m: Floats  #: Wheel's way since the tick before the first, in rising arc length; shape (K,).
+    arc_m: Floats  #: Place of the antenna by the wheel; NaN where it is not known; shape (K,).
+    #: Change of heading (+ to the right) and of pitch (+ nose up) since the tick before, shape (K,).
     turned_rad: Floats
     climbed_rad: Floats
-    speed_mps: Floats
-    rolls: Masks
+    speed_mps: Floats  #: In rising arc length, shape (K,).
+    rolls: Masks  #: The wheel rolls, shape (K,).
 
     def arc_at(self, time: Datetimes) -> Floats:
         """Places at times after the first tick, on from the tick before each [m]."""
@@ -113,46 +91,25 @@ class RateSeries:
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureState:
-    """What one chunk leaves to the next.
+    """What one chunk leaves to the next."""
 
-    Attributes
-    ----------
-    way_m : float [m]
-        Way at the last tick.
-    angles : tuple of float [rad]
-        Heading and pitch there, from any beginning.
-    metre : ndarray of int64, shape (M,)
-        Whole metres of way passed without a break, in the order of travel.
-    heading_rad, pitch_rad : ndarray, shape (M,)
-        At each.
-    last : tuple of float or None
-        Place of the last accepted feature, its standard deviation, and the way there [m].
-    done_m : float [m]
-        Place up to which features have been compared; NaN before the first.
-    """
-
-    way_m: float = 0.0
-    angles: tuple[float, float] = (0.0, 0.0)
+    way_m: float = 0.0  #: Way at the last tick.
+    angles: tuple[float, float] = (0.0, 0.0)  #: Heading and pitch there, from any beginning [rad].
+    #: Whole metres of way passed without a break, in the order of travel; shape (M,).
     metre: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    #: At each, shape (M,).
     heading_rad: Floats = field(default_factory=lambda: np.empty(0))
     pitch_rad: Floats = field(default_factory=lambda: np.empty(0))
+    #: Place of the last accepted feature, its standard deviation, and the way there [m].
     last: tuple[float, float, float] | None = None
-    done_m: float = float("nan")
+    done_m: float = float("nan")  #: Place up to which features have been compared; NaN before the first.
 
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureFix:
-    """Verdict on one feature.
+    """Verdict on one feature."""
 
-    Attributes
-    ----------
-    tick : int
-        After which of the ticks it was passed.
-    feature : Feature
-    located : LocatedFeature
-    """
-
-    tick: int
+    tick: int  #: After which of the ticks it was passed.
     feature: Feature
     located: LocatedFeature
 
@@ -179,16 +136,12 @@ def feature_fixes(
 
     Parameters
     ----------
-    rates : RateSeries
-    line : LineFeatures
     facing : float
         1 where the front points to rising arc length, else -1.
     sigma_m : float [m]
         Of the place by the wheel.
-    state : FeatureState
     noise : tuple of float
         Standard deviations of gradient and curvature in one metre.
-    limits : FeatureLimits
     """
     ways = np.concatenate([[0.0], rates.way_m]) + state.way_m
     heading, pitch = (

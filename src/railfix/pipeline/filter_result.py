@@ -1,9 +1,13 @@
-"""What the filter along the track takes from single epochs, returns, and passes on to the next chunk."""
+"""What the filter along the track takes from single epochs, returns, and passes on to the next chunk.
+
+Smooth the filter along the track over a whole log: replay its chunks backward.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -15,11 +19,21 @@ from railfix.pipeline.passings import Passing, PassingState
 from railfix.pipeline.return_gate import ReturnState
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import SensorState
-from railfix.pipeline.smoothing import Replay
 from railfix.positioning.carrier import CycleSlipState
 from railfix.positioning.map_offset import MapOffsetLimits, beyond_threshold
 from railfix.screens import FilteredMotion
-from railfix.tracking import Line, Tracked, TrackState
+from railfix.tracking import (
+    BackwardInformation,
+    GnssEpochs,
+    Line,
+    SensorEpochs,
+    Step,
+    Tracked,
+    TrackingLimits,
+    TrackState,
+    smoothed,
+    track,
+)
 from railfix.tracking.levels import LevelState
 from railfix.tracking.result import is_bounded
 from railfix.tracking.state import StateIndex
@@ -28,18 +42,79 @@ if TYPE_CHECKING:
     from railfix.pipeline.results import AntennaResult
 
 
+#: Epochs whose covariances are in memory at a time.
+_EPOCHS: Final = 300
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """What the filter was given for some epochs."""
+
+    epochs: GnssEpochs
+    sensors: SensorEpochs
+    before: TrackState | None  #: State before them.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmoothedTrack:
+    """Places of T epochs by everything measured before and after them."""
+
+    time: Datetimes  #: Shape (T,).
+    #: Shape (T,).
+    arc_m: Floats
+    sigma_m: Floats
+    speed_mps: Floats  #: Shape (T,).
+
+
+def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> SmoothedTrack:
+    """Return the places of all epochs.
+
+    Parameters
+    ----------
+    backward : iterable of Replay
+        The last one first.
+    """
+    parts: list[SmoothedTrack] = []
+    later: BackwardInformation | None = None
+    for replay in backward:
+        for epochs, before in reversed(_pieces(replay, line, limits)):
+            trace: list[Step] = []
+            track(epochs, line, before, limits=limits, sensors=replay.sensors, trace=trace)
+            found, later = smoothed(trace, before or TrackState.empty(), later, limits)
+            arc = found.arc_m + line.round_m(found.arc_m)
+            parts.append(SmoothedTrack(time=epochs.time, arc_m=arc, sigma_m=found.sigma_m, speed_mps=found.speed_mps))
+    parts.reverse()
+    empty = {"time": np.empty(0, dtype="datetime64[ns]")}
+    return SmoothedTrack(
+        **{
+            f.name: np.concatenate([getattr(part, f.name) for part in parts])
+            if parts
+            else empty.get(f.name, np.empty(0))
+            for f in fields(SmoothedTrack)
+        }
+    )
+
+
+def _pieces(replay: Replay, line: Line, limits: TrackingLimits) -> list[tuple[GnssEpochs, TrackState | None]]:
+    """Short pieces and the states before them; those with sensors are short already."""
+    size = len(replay.epochs)
+    sensed = any(getattr(replay.sensors, f.name) is not None for f in fields(SensorEpochs) if f.name != "wheel_sign")
+    if size <= _EPOCHS or sensed:
+        return [(replay.epochs, replay.before)] if size else []
+    state, pieces = replay.before, []
+    for first in range(0, size, _EPOCHS):
+        epochs = replay.epochs.take(slice(first, first + _EPOCHS))
+        pieces.append((epochs, state))
+        _, state = track(epochs, line, state, limits=limits)
+    return pieces
+
+
 @dataclass(frozen=True, kw_only=True)
 class FilterFix:
-    """Place by the filter at its last epoch: what the place by the wheel begins from anew every few seconds.
-
-    Attributes
-    ----------
-    time : datetime64[ns]
-    arc_m, sigma_m, speed_mps : float
-        NaN where the filter has not decided on a place.
-    """
+    """Place by the filter at its last epoch: what the place by the wheel begins from anew every few seconds."""
 
     time: np.datetime64
+    #: NaN where the filter has not decided on a place.
     arc_m: float
     sigma_m: float
     speed_mps: float
@@ -51,31 +126,16 @@ class FilterFix:
 
 @dataclass(frozen=True, kw_only=True)
 class SingleEpochs:
-    """Results of single epochs that the filter along the track uses, shape (T,) each.
+    """Results of single epochs that the filter along the track uses, shape (T,) each."""
 
-    Attributes
-    ----------
-    noise_scale : ndarray
-        Noise of the receiver's codes against their sigmas.
-    arc_m, sigma_m : ndarray [m]
-        Position: after an outage codes count again when it agrees with the place that the sensors carried.
-    near_ecef_m : ndarray, shape (T, 3) [m]
-        3-D position without the line.
-    off_map : ndarray of bool
-        The train is away from the line: `railfix.pipeline.return_gate`.
-    map_offset : ndarray of bool
-        3-D positions of the last minutes lie beside or above the line.
-    spoofed : ndarray of bool
-        Spoofing is suspected.
-    """
-
-    noise_scale: Floats
+    noise_scale: Floats  #: Noise of the receiver's codes against their sigmas.
+    #: Position: after an outage codes count again when it agrees with the place that the sensors carried.
     arc_m: Floats
     sigma_m: Floats
-    near_ecef_m: Floats
-    off_map: Masks
-    map_offset: Masks
-    spoofed: Masks
+    near_ecef_m: Floats  #: 3-D position without the line, shape (T, 3).
+    off_map: Masks  #: The train is away from the line: `railfix.pipeline.return_gate`.
+    map_offset: Masks  #: 3-D positions of the last minutes lie beside or above the line.
+    spoofed: Masks  #: Spoofing is suspected.
 
 
 def single_epochs(result: AntennaResult, off_map: Masks, limits: MapOffsetLimits) -> SingleEpochs:
@@ -95,41 +155,24 @@ def single_epochs(result: AntennaResult, off_map: Masks, limits: MapOffsetLimits
 
 @dataclass(frozen=True, kw_only=True)
 class FilterState(NotebookTable):
-    """State of the filter along the track of one antenna after a chunk.
+    """State of the filter along the track of one antenna after a chunk."""
 
-    Attributes
-    ----------
-    line : Line or None
-        The trajectory as the filter sees it, made once.
-    slips : CycleSlipState or None
-        Of the carrier phases.
-    track : TrackState or None
-    level : LevelState
-        Of the filter that gives the levels.
-    sensors : SensorState
-    fixed, anchor : FilterFix or None
-        Place of the filter at the last epoch, and at the last one before the present stretch.
-    gate : ReturnState
-    wheel, pulled : WheelState
-        Of the comparison of distances by the wheel with those of single epochs, and of the filter.
-    disagreed : datetime64[ns]
-        Last epoch at which places or speeds of the two antennas disagreed.
-    passings : PassingState or None
-        Of balises and virtual ones.
-    """
-
-    line: Line | None = None
-    slips: CycleSlipState | None = None
+    line: Line | None = None  #: The trajectory as the filter sees it, made once.
+    slips: CycleSlipState | None = None  #: Of the carrier phases.
     track: TrackState | None = None
-    level: LevelState = field(default_factory=LevelState)
+    level: LevelState = field(default_factory=LevelState)  #: Of the filter that gives the levels.
     sensors: SensorState = field(default_factory=SensorState.empty)
+    #: Place of the filter at the last epoch, and at the last one before the present stretch.
     fixed: FilterFix | None = None
     anchor: FilterFix | None = None
+
     gate: ReturnState = field(default_factory=ReturnState)
+    #: Of the comparison of distances by the wheel with those of single epochs, and of the filter.
     wheel: WheelState = field(default_factory=WheelState)
     pulled: WheelState = field(default_factory=WheelState)
+    #: Last epoch at which places or speeds of the two antennas disagreed.
     disagreed: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    passings: PassingState | None = None
+    passings: PassingState | None = None  #: Of balises and virtual ones.
 
     def __repr__(self) -> str:
         if self.track is None or not self.track.hypotheses:
@@ -148,44 +191,27 @@ class FilterState(NotebookTable):
 
 @dataclass(frozen=True, kw_only=True)
 class AlongTrack(NotebookTable):
-    """Positions of one antenna by the filter along the track, T epochs.
+    """Positions of one antenna by the filter along the track, T epochs."""
 
-    Attributes
-    ----------
-    tracked : Tracked
-        Places along the antenna's trajectory, and what measured them; channels as `AntennaResult.columns`.
-    chainage_m, kilometrage_m : ndarray, shape (T,) [m]
-    ecef_m : ndarray, shape (T, 3) [m]
-    latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
-    direction : ndarray of int8, shape (T,)
-        1 toward rising chainage, -1 toward falling, 0 where the speed does not tell.
-    standstill : ndarray of bool, shape (T,)
-    sensed : SensedMotion
-        Motion since the epoch before and the line under the body, by wheel and inertial unit.
-    spacing_error_m : ndarray, shape (T,) [m]
-        Distance from the place of the other antenna less that of the antennas; NaN where it was not looked at.
-    wheel : WheelSigns or None
-        Distances by satellites against those of the wheel; None without a wheel.
-    replay : tuple of Replay
-        What the filter was given, to smooth it (`railfix.pipeline.smoothing`).
-    passings : tuple of Passing
-        Balises and virtual ones that were passed, and readings that are wrong.
-    """
-
+    #: Places along the antenna's trajectory, and what measured them; channels as `AntennaResult.columns`.
     tracked: Tracked
+    #: Shape (T,).
     chainage_m: Floats
     kilometrage_m: Floats
-    ecef_m: Floats
+    ecef_m: Floats  #: Shape (T, 3).
+    #: Shape (T,).
     latitude_deg: Floats
     longitude_deg: Floats
     height_m: Floats
-    direction: Codes
-    standstill: Masks
-    sensed: SensedMotion
+    direction: Codes  #: 1 toward rising chainage, -1 toward falling, 0 where the speed does not tell; shape (T,).
+    standstill: Masks  #: Shape (T,).
+    sensed: SensedMotion  #: Motion since the epoch before and the line under the body, by wheel and inertial unit.
+    #: Distance from the place of the other antenna less that of the antennas; NaN where it was not looked at; shape
+    #: (T,).
     spacing_error_m: Floats
-    wheel: WheelSigns | None = None
-    replay: tuple[Replay, ...] = ()
-    passings: tuple[Passing, ...] = ()
+    wheel: WheelSigns | None = None  #: Distances by satellites against those of the wheel; None without a wheel.
+    replay: tuple[Replay, ...] = ()  #: What the filter was given, to smooth it (`railfix.pipeline.filter_result`).
+    passings: tuple[Passing, ...] = ()  #: Balises and virtual ones that were passed, and readings that are wrong.
 
     @property
     def time(self) -> Datetimes:

@@ -53,43 +53,23 @@ _SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
 
 @dataclass(frozen=True, kw_only=True)
 class InterferenceState:
-    """State of the signs after a chunk.
-
-    Attributes
-    ----------
-    power : PowerState
-    motion : MotionSignState
-    held : HeldState
-    second : int
-        GPS second of the last epoch that was looked at.
-    broken, alarm : bool, int
-        Break and the receiver's alarms since then.
-    latest : Interference or None
-        Of that epoch.
-    """
+    """State of the signs after a chunk."""
 
     power: PowerState = field(default_factory=PowerState)
     motion: MotionSignState = field(default_factory=MotionSignState)
     held: HeldState = field(default_factory=HeldState)
-    second: int = -1
+    second: int = -1  #: GPS second of the last epoch that was looked at.
+    #: Break and the receiver's alarms since then.
     broken: bool = False
     alarm: int = 0
-    latest: Interference | None = None
+    latest: Interference | None = None  #: Of that epoch.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Interference:
-    """Interference of T epochs.
+    """Interference of T epochs."""
 
-    Attributes
-    ----------
-    causes : ndarray of int64, shape (T,)
-        `Sign` bits, each for as long as its time of release.
-    power : PowerSigns
-    motion : MotionSigns
-    """
-
-    causes: Bits
+    causes: Bits  #: `Sign` bits, each for as long as its time of release; shape (T,).
     power: PowerSigns
     motion: MotionSigns
 
@@ -116,8 +96,6 @@ def find_interference(
         Of the same epochs.
     index : SearchIndex
         Of the antenna's trajectory.
-    state : InterferenceState
-    limits : InterferenceLimits
     """
     observations, reason = corrected.observations, corrected.reason
     channel = np.char.add(corrected.satellite, corrected.signal)

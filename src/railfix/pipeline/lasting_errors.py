@@ -54,12 +54,10 @@ def lasting_errors(
         T epochs by K channels.
     ranges : Ranges
         Of them.
-    antennas : AntennaRows
     place : Place
         Positions from these ranges.
     noise : ndarray, shape (T,)
         Noise scale of the receiver.
-    config : Config
     states : sequence of LastingErrorState
         By antenna.
     """

@@ -132,23 +132,16 @@ def protection_levels(
 
     Parameters
     ----------
-    corrected : CorrectedRanges
     model : LinearModel
         Of the positions on the line.
     offset : MapOffset
         What of it lies beyond its own sigma is a bias of the level; what it would not find is covered by the hypothesis
         of a wrong map.
-    raim : RaimResult
     scale : ndarray, shape (T,)
         The receiver's noise scale. Quiet residuals shrink no level: it is taken as 1 at least, and with an error model
         the sigma of no range falls below the model's.
     sides : ndarray of bool, shape (T, 2, K)
         `low_sides`.
-    config : Config
-
-    Returns
-    -------
-    ProtectionResult
     """
     covariance = np.where(raim.faulty[:, None, None], np.nan, model.covariance_m2)
     level = along_track_level(
@@ -189,12 +182,10 @@ def unresolved_alternatives(
     ----------
     corrected, sides, config
         As for `protection_levels`.
-    antennas : AntennaRows
     place : Place
         Epochs that are ambiguous already are not looked at.
     bounding : tuple of LinearModel and ndarray, shape (T,)
         Of the positions, and the noise scale; `bounding_model` where there is an error model.
-    protection : ProtectionResult
     """
     return places_beyond_the_level(
         antennas,
@@ -225,14 +216,12 @@ def judged(
 
     Parameters
     ----------
-    protection : ProtectionResult
     status : ndarray of int8, shape (T,)
         `reasons.Status`.
     has : ndarray of bool, shape (T,)
         Epochs that keep their coordinates; the others lose the level, too.
     chainage_m : ndarray, shape (T,) [m]
         Positions; where the level reaches a stretch of `Config.no_level_m` it is infinite.
-    config : Config
     """
     values = {}
     kept = has.all()
@@ -270,10 +259,6 @@ def with_araim(
     ----------
     corrected : CorrectedRanges
         With all reasons.
-    solution : Solution
-    antennas : AntennaRows
-    support : IntegritySupport or None
-    config : Config
     """
     if support is None:
         return solution
@@ -343,7 +328,6 @@ def with_map(geometry: AraimGeometry, plan_m: float, height_m: float, prior: flo
 
     Parameters
     ----------
-    geometry : AraimGeometry
     plan_m, height_m : float [m]
         Standard deviations of the map across and up.
     prior : float

@@ -15,9 +15,9 @@ from railfix.pipeline.channels import ChannelBook, Channels
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import ANCHOR_SIGMA_M, usable_ranges, without
 from railfix.pipeline.received import Received
+from railfix.positioning.constrained import single_point
 from railfix.positioning.noise_scale import robust_fit
 from railfix.positioning.normal_equations import Ranges
-from railfix.positioning.single_point import single_point
 from railfix.ranges.atmosphere import SeenFrom, modelled_delays
 from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m, first_available
 
@@ -28,46 +28,27 @@ _LEAST_REDUNDANCY: Final = 2
 
 @dataclass(frozen=True, kw_only=True)
 class Located:
-    """3-D positions of one antenna, T epochs.
+    """3-D positions of one antenna, T epochs."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    ecef_m : ndarray, shape (T, 3) [m]
-        NaN where there is no position.
-    sigma_m : ndarray, shape (T, 3) [m]
-        Standard deviations north, east and up: from the sigmas of the ranges, atmosphere and orbits included, and
-        larger where the residuals are.
-    n_used : ndarray of int, shape (T,)
-    """
-
-    time: Datetimes
-    ecef_m: Floats
+    time: Datetimes  #: Shape (T,).
+    ecef_m: Floats  #: NaN where there is no position, shape (T, 3).
+    #: Standard deviations north, east and up: from the sigmas of the ranges, atmosphere and orbits included, and larger
+    #: where the residuals are; shape (T, 3).
     sigma_m: Floats
-    n_used: Integers
+    n_used: Integers  #: Shape (T,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class UncorrectedRanges:
-    """Corrected ranges of one antenna seen from an approximate place, T epochs by K channels.
-
-    Attributes
-    ----------
-    channels : Channels
-    ranges : Ranges
-        Weight 0 where a range cannot be used.
-    states : SatelliteStates
-    elevation_deg, azimuth_deg : ndarray, shape (T, K)
-    place_ecef_m : ndarray, shape (T, 3) [m]
-        The approximate place; NaN where the codes give none.
-    """
+    """Corrected ranges of one antenna seen from an approximate place, T epochs by K channels."""
 
     channels: Channels
-    ranges: Ranges
+    ranges: Ranges  #: Weight 0 where a range cannot be used.
     states: SatelliteStates
+    #: Shape (T, K).
     elevation_deg: Floats
     azimuth_deg: Floats
-    place_ecef_m: Floats
+    place_ecef_m: Floats  #: The approximate place; NaN where the codes give none; shape (T, 3).
 
 
 def uncorrected_ranges(obs: Observations, received: Received, config: Config, book: ChannelBook) -> UncorrectedRanges:
@@ -75,12 +56,10 @@ def uncorrected_ranges(obs: Observations, received: Received, config: Config, bo
 
     Parameters
     ----------
-    obs : Observations
     received : Received
         Navigation records and coefficients.
     config : Config
         Constellations, signals, mask, noise and atmosphere.
-    book : ChannelBook
     """
     channels = book.of(obs, received.navigation)
     satellite, columns = channels.satellite, channels.columns
@@ -127,10 +106,6 @@ def locate(obs: Observations, received: Received, config: Config, book: ChannelB
     ----------
     obs, received, config, book
         As for `uncorrected_ranges`.
-
-    Returns
-    -------
-    Located
     """
     return locate_ranges(obs.time, uncorrected_ranges(obs, received, config, book), config)
 

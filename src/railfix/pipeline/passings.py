@@ -34,38 +34,22 @@ _VALUES: Final = ("arc_m", "speed_mps", "sigma_m", "level_m", "amount_m")
 
 @dataclass(frozen=True, kw_only=True)
 class Passing:
-    """A place that was passed, or a balise that was read where the filter is not.
-
-    Attributes
-    ----------
-    balise : str
-    verdict : int
-        Number of one of `VERDICTS`: a place without a balise; a balise that was read, or was not though it was passed;
-        a reading that contradicts the filter, or of a balise that is not listed.
-    chainage_m : float [m]
-        As listed; NaN where it is not.
-    time, earliest, latest : datetime64[ns]
-        Of the passing, by the filter, with its interval; of a contradicting reading the instant of the reading, NaT.
-    read : datetime64[ns]
-        Time of the reading; NaT without one.
-    read_error_m : float [m]
-        Listed place less that of the filter at the reading.
-    here : str
-        For a reading that contradicts: the balise that is listed nearest to the place of the filter.
-    speed_mps, sigma_m, level_m, amount_m, odometer_m : float
-        At the passing, or reading: speed, standard deviation, level and over- and under-reading amount of the place,
-        and what an odometer that meets SUBSET-041 is allowed since the balise read before.
-    """
+    """A place that was passed, or a balise that was read where the filter is not."""
 
     balise: str
+    #: Number of one of `VERDICTS`: a place without a balise; a balise that was read, or was not though it was passed; a
+    #: reading that contradicts the filter, or of a balise that is not listed.
     verdict: int
-    chainage_m: float
+    chainage_m: float  #: As listed; NaN where it is not.
+    #: Of the passing, by the filter, with its interval; of a contradicting reading the instant of the reading, NaT.
     time: np.datetime64
     earliest: np.datetime64 = _NEVER
     latest: np.datetime64 = _NEVER
-    read: np.datetime64 = _NEVER
-    read_error_m: float = float("nan")
-    here: str = ""
+    read: np.datetime64 = _NEVER  #: Time of the reading; NaT without one.
+    read_error_m: float = float("nan")  #: Listed place less that of the filter at the reading.
+    here: str = ""  #: For a reading that contradicts: the balise that is listed nearest to the place of the filter.
+    #: At the passing, or reading: speed, standard deviation, level and over- and under-reading amount of the place, and
+    #: what an odometer that meets SUBSET-041 is allowed since the balise read before.
     speed_mps: float = float("nan")
     sigma_m: float = float("nan")
     level_m: float = float("nan")
@@ -75,35 +59,20 @@ class Passing:
 
 @dataclass(frozen=True, kw_only=True)
 class PassingState:
-    """What one chunk leaves to the next; M places.
+    """What one chunk leaves to the next; M places."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (1,) or (0,)
-    values : ndarray, shape (1, 5) or (0, 5)
-        Of the last epoch with a place, as `_VALUES`.
-    side : ndarray of int, shape (M,)
-        On which side of each place the train was last for certain: -1 before it, 1 beyond, 0 not known.
-    since, over : ndarray of datetime64[ns], shape (M,)
-        When that ended, and when the place of the filter was last over it.
-    over_values : ndarray, shape (M, 6)
-        `_VALUES` then, and the odometer's confidence.
-    read : ndarray of datetime64[ns], shape (M,)
-        Last reading.
-    waiting : BaliseReadings
-        Not yet compared, as the epoch after them is to come.
-    right : tuple of (datetime64[ns], float)
-        Readings that were right, the last before the chunk first, with the place of the filter [m].
-    """
-
-    time: Datetimes
-    values: Floats
+    time: Datetimes  #: Shape (1,) or (0,).
+    values: Floats  #: Of the last epoch with a place, as `_VALUES`; shape (1, 5) or (0, 5).
+    #: On which side of each place the train was last for certain: -1 before it, 1 beyond, 0 not known; shape (M,).
     side: Integers
+    #: When that ended, and when the place of the filter was last over it; shape (M,).
     since: Datetimes
     over: Datetimes
-    over_values: Floats
-    read: Datetimes
+    over_values: Floats  #: `_VALUES` then, and the odometer's confidence; shape (M, 6).
+    read: Datetimes  #: Last reading, shape (M,).
+    #: Not yet compared, as the epoch after them is to come.
     waiting: BaliseReadings = field(default_factory=BaliseReadings)
+    #: Readings that were right, the last before the chunk first, with the place of the filter [m].
     right: tuple[tuple[np.datetime64, float], ...] = ()
 
     @classmethod
@@ -137,8 +106,6 @@ def find_passings(
         Of the antenna.
     readings : BaliseReadings
         Since the chunk before.
-    state : PassingState or None
-    limits : BaliseLimits
     """
     state = state or PassingState.empty(len(listed))
     own = trajectory.arc_at_chainage(listed.chainage_m)

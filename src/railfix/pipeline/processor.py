@@ -50,27 +50,13 @@ __all__ = ["AntennaResult", "AntennaState", "EpochProcessor", "Result", "SolvedC
 
 @dataclass(frozen=True, kw_only=True)
 class SolvedChunk:
-    """Single epochs of a chunk, and what the filter along the track takes from them.
-
-    Attributes
-    ----------
-    results : mapping of str to AntennaResult
-    ranges : mapping of str to CorrectedRanges
-        After all screens and exclusions, by antenna.
-    off_map : mapping of str to ndarray of bool, shape (T,)
-        The train is away from the line.
-    pair : PairedEpochs or None
-        Common epochs of two antennas of one vehicle.
-    sensors : SensorSamples or None
-        Of the sensors on board since the chunk before.
-    notes : tuple of str
-    """
+    """Single epochs of a chunk, and what the filter along the track takes from them."""
 
     results: Mapping[str, AntennaResult]
-    ranges: Mapping[str, CorrectedRanges]
-    off_map: Mapping[str, Masks]
-    pair: PairedEpochs | None
-    sensors: SensorSamples | None
+    ranges: Mapping[str, CorrectedRanges]  #: After all screens and exclusions, by antenna.
+    off_map: Mapping[str, Masks]  #: The train is away from the line, shape (T,).
+    pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.
+    sensors: SensorSamples | None  #: Of the sensors on board since the chunk before.
     notes: tuple[str, ...]
 
 
@@ -298,7 +284,6 @@ class EpochProcessor:
 
         Parameters
         ----------
-        solved : SolvedChunk
         state : State
             Of it only what the filter left after the chunk before is used, and replaced.
         """

@@ -51,32 +51,17 @@ def no_navigation() -> Navigation:
 
 @dataclass(frozen=True, kw_only=True)
 class Received:
-    """Everything received beside the observations, up to the current epoch.
-
-    Attributes
-    ----------
-    navigation : Navigation
-    messages : SbasState or None
-        SBAS messages of the GEO in use; None: SBAS is not used.
-    sbas : SbasCorrections or None
-        Corrections by these messages.
-    klobuchar : ndarray, shape (8,), or None
-        Ionospheric coefficients in use; None leaves the ionosphere uncorrected, or to SBAS.
-    ionosphere_sigma_m : float
-        Standard deviation of the vertical delay by coefficients that were not received; else 0.
-    notes : tuple of str
-        Data that were asked for, and the data used in their place, one sentence each.
-    base : BaseErrors or None
-        Range errors that a base station has measured.
-    """
+    """Everything received beside the observations, up to the current epoch."""
 
     navigation: Navigation = field(default_factory=no_navigation)
-    messages: SbasState | None = None
-    sbas: SbasCorrections | None = None
+    messages: SbasState | None = None  #: SBAS messages of the GEO in use; None: SBAS is not used.
+    sbas: SbasCorrections | None = None  #: Corrections by these messages.
+    #: Ionospheric coefficients in use; None leaves the ionosphere uncorrected, or to SBAS; shape (8,).
     klobuchar: Floats | None = None
+    #: Standard deviation of the vertical delay by coefficients that were not received; else 0.
     ionosphere_sigma_m: float = 0.0
-    notes: tuple[str, ...] = ()
-    base: BaseErrors | None = None
+    notes: tuple[str, ...] = ()  #: Data that were asked for, and the data used in their place, one sentence each.
+    base: BaseErrors | None = None  #: Range errors that a base station has measured.
 
 
 def known_from_start(
@@ -86,8 +71,6 @@ def known_from_start(
 
     Parameters
     ----------
-    config : Config
-    navigation : Navigation, optional
     messages : SbasMessages, optional
         Recorded messages, of which the GEO is chosen if the settings ask for the best.
 
@@ -123,8 +106,6 @@ def receive(
 
     Parameters
     ----------
-    before : Received
-    config : Config
     time : datetime64[ns]
         Of the next epoch, NaT where there is none; SBAS messages that neither it nor a later one can use are dropped.
     navigation : Navigation, optional

@@ -22,13 +22,12 @@ from railfix.pipeline.interference_stage import Interference, InterferenceState
 from railfix.pipeline.received import Received
 from railfix.pipeline.return_gate import OffMapState
 from railfix.positioning.carrier import PhasePositions
-from railfix.positioning.constrained import Constrained
+from railfix.positioning.constrained import Constrained, SinglePoint
 from railfix.positioning.forgetting import LastingErrorState
 from railfix.positioning.intersystem_bias import OffsetState
 from railfix.positioning.map_offset import MapOffset, MapOffsetState
 from railfix.positioning.noise_scale import NoiseState
 from railfix.positioning.section_search import Section
-from railfix.positioning.single_point import SinglePoint
 from railfix.positioning.two_frequencies import Combined, SecondCodes, TwoFrequencyState
 from railfix.screens import Screened
 
@@ -40,27 +39,16 @@ Rows = TypeVar("Rows", bound="DataclassInstance")
 
 @dataclass(frozen=True, kw_only=True)
 class RaimResult:
-    """Detection and exclusion of T epochs.
+    """Detection and exclusion of T epochs."""
 
-    Attributes
-    ----------
-    outcome : ndarray of int8, shape (T,)
-        `raim.Outcome`.
-    statistic, threshold : ndarray, shape (T,)
-        Before any exclusion; in noise variances, or in m^2 with the fixed limit.
-    excluded : ndarray of bool, shape (T, K)
-    own_error_m : ndarray, shape (T, K) [m]
-        Error of the channels named as faulty against all others; NaN elsewhere.
-    protection_level_m : ndarray, shape (T,) [m]
-        `raim.reliability` of the remaining ranges; infinite where a fault of one of them cannot be detected, NaN
-        where there is no position, where a fault is left in it, or where the level or RAIM is off.
-    """
-
-    outcome: Codes
+    outcome: Codes  #: `raim.Outcome`, shape (T,).
+    #: Before any exclusion; in noise variances, or in m^2 with the fixed limit; shape (T,).
     statistic: Floats
     threshold: Floats
-    excluded: Masks
-    own_error_m: Floats
+    excluded: Masks  #: Shape (T, K).
+    own_error_m: Floats  #: Error of the channels named as faulty against all others; NaN elsewhere; shape (T, K).
+    #: `raim.reliability` of the remaining ranges; infinite where a fault of one of them cannot be detected, NaN where
+    #: there is no position, where a fault is left in it, or where the level or RAIM is off; shape (T,).
     protection_level_m: Floats
 
     @property
@@ -71,62 +59,31 @@ class RaimResult:
 
 @dataclass(frozen=True, kw_only=True)
 class ProtectionResult:
-    """Protection levels of T epochs.
+    """Protection levels of T epochs."""
 
-    Attributes
-    ----------
-    level : ProtectionLevel
-        NaN without a position, and where RAIM has left a fault in it. Channels count as `AntennaResult.columns` do.
-    status : ndarray of int8, shape (T,)
-        `protection.LevelStatus` against `Config.alarm_limit_m`.
-    kind : str
-        Hypotheses of the levels: "sbas" or "separation" (`level_stage.KINDS`).
-    basis : str
-        "measured" or "indicative": whether the priors were measured on the line (`level_stage.BASES`).
-    """
-
+    #: NaN without a position, and where RAIM has left a fault in it. Channels count as `AntennaResult.columns` do.
     level: ProtectionLevel
-    status: Codes
-    kind: str
-    basis: str
+    status: Codes  #: `protection.LevelStatus` against `Config.alarm_limit_m`, shape (T,).
+    kind: str  #: Hypotheses of the levels: "sbas" or "separation" (`level_stage.KINDS`).
+    basis: str  #: "measured" or "indicative": whether the priors were measured on the line (`level_stage.BASES`).
 
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaState(NotebookTable):
-    """State of one antenna after a chunk.
+    """State of one antenna after a chunk."""
 
-    Attributes
-    ----------
-    noise : NoiseState
-        Sums behind the noise scales.
-    map_offset : MapOffsetState
-        Sums behind the test of the map.
-    lasting : LastingErrorState
-        Means of the residuals of each satellite.
-    off_map : OffMapState
-        Whether the train was away from the line.
-    offsets : OffsetState
-        Inter-system biases estimated so far.
-    screens : mapping of str to object
-        State of each screen that has one, by its name.
-    carrier : CarrierState or None
-        State of the carrier-phase stages, where they are used.
-    ended : datetime64[ns]
-        Last epoch; NaT before the first.
-    two_frequencies : TwoFrequencyState
-        Mean differences of the two codes of satellites.
-    interference : InterferenceState
-    """
-
-    noise: NoiseState = field(default_factory=NoiseState)
-    map_offset: MapOffsetState = field(default_factory=MapOffsetState)
-    lasting: LastingErrorState = field(default_factory=LastingErrorState)
-    off_map: OffMapState = field(default_factory=OffMapState)
-    offsets: OffsetState = field(default_factory=OffsetState)
-    screens: Mapping[str, Any] = field(default_factory=dict)
-    carrier: CarrierState | None = None
+    noise: NoiseState = field(default_factory=NoiseState)  #: Sums behind the noise scales.
+    map_offset: MapOffsetState = field(default_factory=MapOffsetState)  #: Sums behind the test of the map.
+    lasting: LastingErrorState = field(default_factory=LastingErrorState)  #: Means of the residuals of each satellite.
+    off_map: OffMapState = field(default_factory=OffMapState)  #: Whether the train was away from the line.
+    offsets: OffsetState = field(default_factory=OffsetState)  #: Inter-system biases estimated so far.
+    screens: Mapping[str, Any] = field(default_factory=dict)  #: State of each screen that has one, by its name.
+    carrier: CarrierState | None = None  #: State of the carrier-phase stages, where they are used.
+    #: Last epoch; NaT before the first.
     ended: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    #: Mean differences of the two codes of satellites.
     two_frequencies: TwoFrequencyState = field(default_factory=TwoFrequencyState)
+
     interference: InterferenceState = field(default_factory=InterferenceState)
 
     def __repr__(self) -> str:

@@ -25,28 +25,15 @@ _NEVER: Final = np.datetime64("NaT", "ns")
 
 @dataclass(frozen=True, kw_only=True)
 class ReturnState:
-    """What one chunk leaves to the next.
+    """What one chunk leaves to the next."""
 
-    Attributes
-    ----------
-    time : datetime64[ns]
-        Last epoch whose codes counted; NaT before the first.
-    place_m, sigma_m : float [m]
-        Coasted place at the last epoch and its standard deviation; NaN where no sensor gives a way.
-    way_m : float [m]
-        Since the filter's own place.
-    returned : datetime64[ns]
-        First epoch with codes after the outage; NaT without.
-    agreeing : int
-        Positions in a row that agreed since.
-    """
-
-    time: np.datetime64 = _NEVER
+    time: np.datetime64 = _NEVER  #: Last epoch whose codes counted; NaT before the first.
+    #: Coasted place at the last epoch and its standard deviation; NaN where no sensor gives a way.
     place_m: float = float("nan")
     sigma_m: float = float("nan")
-    way_m: float = 0.0
-    returned: np.datetime64 = _NEVER
-    agreeing: int = 0
+    way_m: float = 0.0  #: Since the filter's own place.
+    returned: np.datetime64 = _NEVER  #: First epoch with codes after the outage; NaT without.
+    agreeing: int = 0  #: Positions in a row that agreed since.
 
 
 def gated_codes(
@@ -76,8 +63,6 @@ def gated_codes(
         Position of each epoch by itself; NaN where there is none.
     state : ReturnState
         With the place of the filter at the epoch before the first.
-    line : Line
-    limits : SensorLimits
     """
     refused = np.zeros(len(time), dtype=np.bool_)
     ways = state.way_m + np.cumsum(way_m)
@@ -105,20 +90,11 @@ def gated_codes(
 
 @dataclass(frozen=True, kw_only=True)
 class OffMapState:
-    """State of the test after a chunk.
+    """State of the test after a chunk."""
 
-    Attributes
-    ----------
-    off : bool
-        The train was off the map at the last epoch.
-    known : bool
-        A position has been tested; the first one of a log decides alone.
-    since : datetime64[ns]
-        First of the last positions in a row that contradict `off`; NaT where the last one agrees with it.
-    """
-
-    off: bool = False
-    known: bool = False
+    off: bool = False  #: The train was off the map at the last epoch.
+    known: bool = False  #: A position has been tested; the first one of a log decides alone.
+    #: First of the last positions in a row that contradict `off`; NaT where the last one agrees with it.
     since: np.datetime64 = _NEVER
 
 
@@ -136,7 +112,6 @@ def off_map_epochs(
     time : ndarray of datetime64[ns], shape (T,)
     on_map, off_map : ndarray of bool, shape (T,)
         Single-epoch positions that the ranges fit, and those that they contradict; both False without a position.
-    state : OffMapState
     least_s : float [s]
         How long positions contradict the state before it changes.
     """

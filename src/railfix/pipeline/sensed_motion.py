@@ -54,30 +54,17 @@ _RANK: Final = np.array(
 
 @dataclass(frozen=True, kw_only=True)
 class SensedMotion:
-    """Motion of T intervals between epochs; forward is that of the vehicle.
+    """Motion of T intervals between epochs; forward is that of the vehicle."""
 
-    Attributes
-    ----------
-    state : ndarray of int8, shape (T,)
-        `railfix.motion.slip.MotionState`; INIT without both sensors.
-    way_m : ndarray, shape (T,) [m]
-        Forward by inertia where the state is one of `CARRIED`, NaN elsewhere.
-    doubt_mps : ndarray, shape (T,) [m/s]
-        Speed that a slip not detected yet may have had.
-    swing_mps2 : ndarray, shape (T,) [m/s2]
-        Part of the mean specific force forward that the pitching of the body makes, 0 without a gyro.
-    gradient, curvature_1pm, cant_m, under_m : ndarray, shape (T,)
-        Of the line under the body, toward rising arc length (P2 2.3): climb over way by wheel and accelerometer
-        (an offset of 0.01 m/s2 is 0.001),
-        curvature by the yaw rate, + to the right, lean of the body over the contact points of the wheels, + with the
-        left rail higher; and chainage of the body's middle then. NaN where the wheel does not roll faster than
-        `SLOWEST_MPS`; cant without a vehicle.
-    """
-
-    state: Codes
-    way_m: Floats
-    doubt_mps: Floats
+    state: Codes  #: `railfix.motion.slip.MotionState`; INIT without both sensors; shape (T,).
+    way_m: Floats  #: Forward by inertia where the state is one of `CARRIED`, NaN elsewhere; shape (T,).
+    doubt_mps: Floats  #: Speed that a slip not detected yet may have had, shape (T,).
+    #: Part of the mean specific force forward that the pitching of the body makes, 0 without a gyro; shape (T,).
     swing_mps2: Floats
+    #: Of the line under the body, toward rising arc length (P2 2.3): climb over way by wheel and accelerometer (an
+    #: offset of 0.01 m/s2 is 0.001), curvature by the yaw rate, + to the right, lean of the body over the contact
+    #: points of the wheels, + with the left rail higher; and chainage of the body's middle then. NaN where the wheel
+    #: does not roll faster than `SLOWEST_MPS`; cant without a vehicle; shape (T,).
     gradient: Floats
     curvature_1pm: Floats
     cant_m: Floats
@@ -91,22 +78,12 @@ class SensedMotion:
 
 @dataclass(frozen=True, kw_only=True)
 class SensedState:
-    """What one chunk leaves to the next.
+    """What one chunk leaves to the next."""
 
-    Attributes
-    ----------
-    tick : int
-        Number of the last sample since the beginning of GPS time; 0 before the first.
-    arc_m : float [m]
-        Place of the antenna then, by the wheel since the last one of the filter; NaN where it is not known.
-    sigma_m : float [m]
-        Standard deviation of that place of the filter.
-    slip : SlipState or None
-    """
-
-    tick: int = 0
+    tick: int = 0  #: Number of the last sample since the beginning of GPS time; 0 before the first.
+    #: Place of the antenna then, by the wheel since the last one of the filter; NaN where it is not known.
     arc_m: float = float("nan")
-    sigma_m: float = float("nan")
+    sigma_m: float = float("nan")  #: Standard deviation of that place of the filter.
     slip: SlipState | None = None
 
     @property
@@ -153,9 +130,6 @@ def sensed_motion(
         Of the antenna: tells which way the front points, and where the body is.
     sine_at : callable
         Sine of the gradient in rising arc length at arc lengths.
-    state : SensedState
-    tachometer : TachometerLimits
-    limits : SlipLimits
     """
     facing = trajectory.front_sign
     ends = edges.astype("datetime64[ns]").astype(np.int64)

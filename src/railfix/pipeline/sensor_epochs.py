@@ -13,7 +13,7 @@ from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.features import FeatureLimits
-from railfix.motion.ranging import EchoLimits
+from railfix.motion.radar import EchoLimits
 from railfix.motion.samples import (
     BaliseReadings,
     GroundUnits,
@@ -42,14 +42,7 @@ Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, Sta
 
 @dataclass(frozen=True, kw_only=True)
 class LineReferences:
-    """What sensors are compared with.
-
-    Attributes
-    ----------
-    features : LineFeatures or None
-    units : GroundUnits or None
-    balises : ListedBalises or None
-    """
+    """What sensors are compared with."""
 
     features: LineFeatures | None = None
     units: GroundUnits | None = None
@@ -57,81 +50,51 @@ class LineReferences:
 
 
 class SensorLimits(Settings):
-    """Noise of the sensors as the filter sees them.
-
-    Attributes
-    ----------
-    tachometer : TachometerLimits
-    slip : SlipLimits
-        Of the detection of slip and slide by tachometer and inertial unit together.
-    carry_sigma_mps : float
-        Of the speed that the inertial unit carries through a slip, a stop or a start.
-    feature : FeatureLimits
-        Of places by changes of gradient and curvature.
-    gradient_noise, curvature_noise_1pm : float
-        Standard deviations in one metre of way: swings of the body of 1 mrad, and of its heading.
-    map_length_m : float
-        Length over which the errors of the map change (as `TrackingLimits.map_correlation_m`): a map of 0.3 m places no
-        feature better than some metres, one of 0.05 m to half a metre.
-    feature_sigma_m : float
-        Least standard deviation of such a place: the map's, and that of the body on its bogies.
-    range_sigma_m : float
-        Of a two-way range where the device reports none: 0.19 to 0.24 m (P2 3.3), echoes and drifts of the unit's
-        answering delay beside it.
-    echo : EchoLimits
-        Gate of ranges against the place of the filter.
-    range_ahead_m, range_right_m, range_above_m : float
-        Place of the vehicle's ranging unit: ahead of the vehicle's middle (without a vehicle file: of the antenna),
-        to the right of the antenna's path and above the antenna.
-    balise : BaliseLimits
-    return_sigmas, return_s : float
-        After an outage codes count again when three positions in a row are within so many sigmas, or so late.
-    wheel_sigma_m : float
-        Of a way between two epochs beside the pulse: creep of a braked or driven wheel.
-    radar_sigma_mps, radar_step_s : float
-        Of one speed, and the usual time between two.
-    force_sigma_mps2 : float
-        Of a mean force between two epochs: pitching of the body beside the sensor's noise (1 mrad is 0.01 m/s2),
-        and the map's gradient.
-    """
+    """Noise of the sensors as the filter sees them."""
 
     tachometer: TachometerLimits = Field(default_factory=TachometerLimits)
+    #: Of the detection of slip and slide by tachometer and inertial unit together.
     slip: SlipLimits = Field(default_factory=SlipLimits)
+    #: Of the speed that the inertial unit carries through a slip, a stop or a start.
     carry_sigma_mps: float = Field(default=0.1, gt=0)
-    feature: FeatureLimits = Field(default_factory=FeatureLimits)
+    feature: FeatureLimits = Field(default_factory=FeatureLimits)  #: Of places by changes of gradient and curvature.
+    #: Standard deviations in one metre of way: swings of the body of 1 mrad, and of its heading.
     gradient_noise: float = Field(default=1e-3, gt=0)
     curvature_noise_1pm: float = Field(default=1e-4, gt=0)
+    #: Length over which the errors of the map change (as `TrackingLimits.map_correlation_m`): a map of 0.3 m places no
+    #: feature better than some metres, one of 0.05 m to half a metre.
     map_length_m: float = Field(default=50.0, gt=0)
+    #: Least standard deviation of such a place: the map's, and that of the body on its bogies.
     feature_sigma_m: float = Field(default=0.5, gt=0)
+    #: Of a two-way range where the device reports none: 0.19 to 0.24 m (P2 3.3), echoes and drifts of the unit's
+    #: answering delay beside it.
     range_sigma_m: float = Field(default=0.5, gt=0)
-    echo: EchoLimits = Field(default_factory=EchoLimits)
+    echo: EchoLimits = Field(default_factory=EchoLimits)  #: Gate of ranges against the place of the filter.
+    #: Place of the vehicle's ranging unit: ahead of the vehicle's middle (without a vehicle file: of the antenna), to
+    #: the right of the antenna's path and above the antenna.
     range_ahead_m: float = 0.0
     range_right_m: float = 0.0
     range_above_m: float = 0.0
+
     balise: BaliseLimits = Field(default_factory=BaliseLimits)
+    #: After an outage codes count again when three positions in a row are within so many sigmas, or so late.
     return_sigmas: float = Field(default=4.0, gt=0)
     return_s: float = Field(default=60.0, ge=0)
+    #: Of a way between two epochs beside the pulse: creep of a braked or driven wheel.
     wheel_sigma_m: float = Field(default=0.01, gt=0)
+    #: Of one speed, and the usual time between two.
     radar_sigma_mps: float = Field(default=0.1, gt=0)
     radar_step_s: float = Field(default=0.1, gt=0)
+    #: Of a mean force between two epochs: pitching of the body beside the sensor's noise (1 mrad is 0.01 m/s2), and the
+    #: map's gradient.
     force_sigma_mps2: float = Field(default=0.05, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorState:
-    """Samples that the next chunk still needs.
+    """Samples that the next chunk still needs."""
 
-    Attributes
-    ----------
-    time : datetime64[ns]
-        Last epoch; NaT before the first.
-    samples : SensorSamples
-    motion : SensedState
-    features : FeatureState
-    balises : BaliseState
-    """
-
-    time: np.datetime64
+    time: np.datetime64  #: Last epoch; NaT before the first.
     samples: SensorSamples
     motion: SensedState = field(default_factory=SensedState)
     features: FeatureState = field(default_factory=FeatureState)
@@ -177,8 +140,6 @@ def sensor_epochs(
         Epochs of the antenna.
     trajectory : Trajectory
         Tells which way the front points.
-    state : SensorState
-    limits : SensorLimits
     sine_at : callable, optional
         Sine of the gradient at arc lengths; the line is unknown without.
     sources : container of str

@@ -17,16 +17,23 @@ from railfix.integrity.raim import LinearModel
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
-from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
 from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.lasting_errors import lasting_errors
 from railfix.pipeline.level_stage import bounding_model, low_sides, protection_levels, unresolved_alternatives
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
 from railfix.pipeline.return_gate import OffMapState, off_map_epochs
-from railfix.pipeline.solve import Place, line_model, place_on_line, redundancy_of, validate_point
+from railfix.pipeline.solve import (
+    Place,
+    fault_free,
+    line_model,
+    place_on_line,
+    redundancy_of,
+    validate_point,
+    with_p4_level,
+)
 from railfix.positioning.antenna_rows import AntennaRows, rows_of
 from railfix.positioning.carrier import PhasePositions
-from railfix.positioning.constrained import constrained_position
+from railfix.positioning.constrained import SinglePoint, constrained_position, single_point
 from railfix.positioning.intersystem_bias import tie_clocks
 from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
 from railfix.positioning.noise_scale import (
@@ -42,7 +49,6 @@ from railfix.positioning.noise_scale import (
 )
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, fit
 from railfix.positioning.section_search import SearchIndex
-from railfix.positioning.single_point import SinglePoint, single_point
 
 
 def reason_of_all_channels(corrected: CorrectedRanges) -> Bits:
@@ -84,50 +90,28 @@ def satellites_rejected(member: Integers, reason: Bits) -> Integers:
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """Positions of one antenna, T epochs, before coordinates are dropped where the status says so.
+    """Positions of one antenna, T epochs, before coordinates are dropped where the status says so."""
 
-    Attributes
-    ----------
-    point : SinglePoint
-        Conventional position: every constellation with a clock of its own.
-    point_status : ndarray of int8, shape (T,)
-        `railfix.pipeline.solve.PointStatus`.
-    place : Place
-        Positions from the codes, after exclusions.
-    ties : ClockTies
-        Inter-system biases known before each epoch.
-    raim : RaimResult
-    status : ndarray of int8, shape (T,)
-        `reasons.Status`.
-    noise_scale, own_sigma_m : ndarray, shape (T,)
-    arc_m, along_sigma_m : ndarray, shape (T,) [m]
-        Position that is published: from the codes, or from code and phase.
-    phase : PhasePositions or None
-    protection : ProtectionResult or None
-    map_offset : MapOffset
-    off_map : ndarray of bool, shape (T,)
-        The train is away from the line: `railfix.pipeline.return_gate`.
-    interference : Interference or None
-        Of `railfix.pipeline.interference_stage`, which comes after; None where it is off.
-    araim : AraimResult or None
-        Of `railfix.pipeline.level_stage`, which comes after; None without an integrity support message.
-    """
-
-    point: SinglePoint
-    point_status: Codes
-    place: Place
-    ties: ClockTies
+    point: SinglePoint  #: Conventional position: every constellation with a clock of its own.
+    point_status: Codes  #: `railfix.pipeline.solve.PointStatus`, shape (T,).
+    place: Place  #: Positions from the codes, after exclusions.
+    ties: ClockTies  #: Inter-system biases known before each epoch.
     raim: RaimResult
-    status: Codes
+    status: Codes  #: `reasons.Status`, shape (T,).
+    #: Shape (T,).
     noise_scale: Floats
     own_sigma_m: Floats
+    #: Position that is published: from the codes, or from code and phase; shape (T,).
     arc_m: Floats
     along_sigma_m: Floats
+
     phase: PhasePositions | None
     protection: ProtectionResult | None
     map_offset: MapOffset
-    off_map: Masks
+    off_map: Masks  #: The train is away from the line: `railfix.pipeline.return_gate`; shape (T,).
+    #: Of `railfix.pipeline.interference_stage`, which comes after; None where it is off.
     interference: Interference | None = None
+    #: Of `railfix.pipeline.level_stage`, which comes after; None without an integrity support message.
     araim: AraimResult | None = None
 
 
@@ -140,8 +124,6 @@ def solve(
     ----------
     corrected : CorrectedRanges
         After the screens of the observations.
-    antennas : AntennaRows
-    config : Config
     states : sequence of AntennaState
         By antenna.
     """

@@ -27,24 +27,14 @@ _CURVED_MPS2: Final = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyEpochs:
-    """Epochs of a log that a survey uses.
+    """Epochs of a log that a survey uses."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    ecef_m, sigma_m : ndarray, shape (T, 3) [m]
-        3-D positions, NaN where there is none, and standard deviations east, north, up.
-    n_used : ndarray of int, shape (T,)
-        Satellites of the position.
-    signals : RunSignals
-        Rows are those epochs.
-    """
-
-    time: Datetimes
+    time: Datetimes  #: Shape (T,).
+    #: 3-D positions, NaN where there is none, and standard deviations east, north, up; shape (T, 3).
     ecef_m: Floats
     sigma_m: Floats
-    n_used: Indices
-    signals: RunSignals
+    n_used: Indices  #: Satellites of the position, shape (T,).
+    signals: RunSignals  #: Rows are those epochs.
 
 
 def survey_run(

@@ -13,9 +13,16 @@ import numpy as np
 import polars as pl
 
 from railfix.core.reasons import Reason, reason_text
-from railfix.pipeline.columns import Column, decimals, table_of
 from railfix.pipeline.filter_result import AlongTrack
-from railfix.pipeline.result_columns import CHANNEL_COLUMNS, OBSERVATION_COLUMNS, POSITION_COLUMNS, Observed
+from railfix.pipeline.result_columns import (
+    CHANNEL_COLUMNS,
+    OBSERVATION_COLUMNS,
+    POSITION_COLUMNS,
+    Column,
+    Observed,
+    decimals,
+    table_of,
+)
 from railfix.pipeline.results import AntennaResult, Result
 
 if TYPE_CHECKING:
@@ -29,7 +36,6 @@ def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
     ----------
     name : str
         Goes into the column ``antenna``.
-    result : AntennaResult
 
     Returns
     -------
@@ -68,7 +74,6 @@ def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack |
     ----------
     name : str
         Goes into the column ``antenna``.
-    result : AntennaResult
     tracked : AlongTrack, optional
         Of the filter along the track.
 

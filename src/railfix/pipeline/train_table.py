@@ -12,11 +12,10 @@ import polars as pl
 from railfix.core.arrays import Floats, Strings
 from railfix.motion.slip import MotionState
 from railfix.pipeline.along_track import on_line_m
-from railfix.pipeline.columns import Column, by_name, float_column, table_of
-from railfix.pipeline.filter_result import AlongTrack
+from railfix.pipeline.filter_result import AlongTrack, SmoothedTrack
+from railfix.pipeline.result_columns import Column, by_name, float_column, table_of
 from railfix.pipeline.results import Result
 from railfix.pipeline.sensed_motion import CARRIED
-from railfix.pipeline.smoothing import SmoothedTrack
 from railfix.pipeline.tables import in_time_order
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Kind, TrackStatus

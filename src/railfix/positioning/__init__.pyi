@@ -1,8 +1,7 @@
 # The names of `railfix.positioning`, imported at their first use (lazy-loader).
 
-from .constrained import Constrained, ConstrainedLimits
+from .constrained import Constrained, ConstrainedLimits, SinglePoint, SinglePointLimits
 from .section_search import SearchIndex, Section, SectionLimits
-from .single_point import SinglePoint, SinglePointLimits
 from .stages import find_section, point_position, position_on_line, weighted_ranges
 
 __all__ = [

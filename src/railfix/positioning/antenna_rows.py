@@ -29,18 +29,10 @@ EVERY: Final = slice(None)
 
 @dataclass(frozen=True)
 class AntennaRows:
-    """Which rows are of which antenna.
+    """Which rows are of which antenna."""
 
-    Attributes
-    ----------
-    indices : tuple of SearchIndex
-        Of the trajectory of each antenna; their maps have the same sigmas.
-    parts : tuple of slice
-        Rows of each antenna, one after the other; `EVERY` of a single one.
-    """
-
-    indices: tuple[SearchIndex, ...]
-    parts: tuple[slice, ...]
+    indices: tuple[SearchIndex, ...]  #: Of the trajectory of each antenna; their maps have the same sigmas.
+    parts: tuple[slice, ...]  #: Rows of each antenna, one after the other; `EVERY` of a single one.
 
     @classmethod
     def of(cls, index: SearchIndex) -> AntennaRows:

@@ -5,11 +5,16 @@ trajectory. Unknown are d and one clock a constellation. The map is not exact: i
 across the track and its height error are common to all satellites of an epoch, so they are
 carried as an added covariance ``H_m S_m H_m^T`` - computed here as two more unknowns with that
 covariance as their prior, which is the same thing (the matrix inversion lemma).
+
+Conventional positioning: the 3-D single point, without the map.
+
+The reference method of P1 section 5. Weighted least squares in x, y, z and one receiver clock a
+constellation; the nearest point of the trajectory is taken afterwards by the pipeline.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -23,57 +28,30 @@ from railfix.track.trajectory import Trajectory
 
 
 class ConstrainedLimits(Settings):
-    """Limits of the iteration along the line.
+    """Limits of the iteration along the line."""
 
-    Attributes
-    ----------
-    tolerance_m : float
-        Last step inside a section: one of 5 m leaves 0.03 mm (`after_step`).
-    max_iterations : int
-        Steps, walks into a neighbouring section included.
-    """
-
+    #: Last step inside a section: one of 5 m leaves 0.03 mm (`after_step`).
     tolerance_m: float = Field(default=5.0, gt=0)
-    max_iterations: int = Field(default=40, ge=1)
+    max_iterations: int = Field(default=40, ge=1)  #: Steps, walks into a neighbouring section included.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Constrained:
-    """Positions along the line, T epochs.
+    """Positions along the line, T epochs."""
 
-    Attributes
-    ----------
-    arc_m : ndarray, shape (T,) [m]
-        Along the trajectory; NaN where the iteration did not settle or was not started.
-    section : ndarray of int, shape (T,)
-        Section that the position lies on, -1 where there is none.
-    sigma_m : ndarray, shape (T,) [m]
-        Standard deviation along the line from the weights and the map error.
-    exact_map_sigma_m : ndarray, shape (T,) [m]
-        The part of it that the weights give, as if the map were exact.
-    dilution : ndarray, shape (T,)
-        Along-track dilution: sigma along the line for unit, equal weights and an exact map. Infinite where the
-        satellites stand across the track.
-    overshoot_m : ndarray, shape (T,) [m]
-        How far beyond an end of the line the ranges pull a position clamped to it; 0 elsewhere.
-    clock_m : ndarray, shape (T, G) [m]
-    wsse : ndarray, shape (T,)
-        Weighted sum of squared residuals, map error allowed for.
-    residual_m : ndarray, shape (T, M) [m]
-        Code - range - clock at the position on the line.
-    iterations : ndarray of int, shape (T,)
-    """
-
-    arc_m: Floats
-    section: Indices
-    sigma_m: Floats
-    exact_map_sigma_m: Floats
+    arc_m: Floats  #: Along the trajectory; NaN where the iteration did not settle or was not started; shape (T,).
+    section: Indices  #: Section that the position lies on, -1 where there is none; shape (T,).
+    sigma_m: Floats  #: Standard deviation along the line from the weights and the map error, shape (T,).
+    exact_map_sigma_m: Floats  #: The part of it that the weights give, as if the map were exact; shape (T,).
+    #: Along-track dilution: sigma along the line for unit, equal weights and an exact map. Infinite where the
+    #: satellites stand across the track; shape (T,).
     dilution: Floats
+    #: How far beyond an end of the line the ranges pull a position clamped to it; 0 elsewhere; shape (T,).
     overshoot_m: Floats
-    clock_m: Floats
-    wsse: Floats
-    residual_m: Floats
-    iterations: Integers
+    clock_m: Floats  #: Shape (T, G).
+    wsse: Floats  #: Weighted sum of squared residuals, map error allowed for; shape (T,).
+    residual_m: Floats  #: Code - range - clock at the position on the line, shape (T, M).
+    iterations: Integers  #: Shape (T,).
 
 
 def constrained_position(
@@ -95,11 +73,6 @@ def constrained_position(
         V points.
     vertex : ndarray of int, shape (T,)
         Point to start from, as `section.search` picks it; -1 leaves the epoch without a position.
-    limits : ConstrainedLimits, optional
-
-    Returns
-    -------
-    Constrained
     """
     limits = limits or ConstrainedLimits()
     start = np.where(ranges.n_used - ranges.n_clocks >= 1, vertex, -1)
@@ -161,3 +134,55 @@ class SectionArrays(NamedTuple):
     length_m: Floats  # (S,)
     plan_m: float
     height_m: float
+
+
+class SinglePointLimits(Settings):
+    """Limits of the iteration, and of the validation of its position (`conventional_status`)."""
+
+    tolerance_m: float = Field(default=1.0, gt=0)  #: The last step: one of 1 m leaves 0.01 mm (`after_step`).
+    max_iterations: int = Field(default=12, ge=1)  #: Steps at most.
+    #: Probability that noise alone fails the chi-square test of the residuals.
+    false_alarm: float = Field(default=1e-3, gt=0, lt=0.5)
+    #: Largest position dilution of precision; 30, as RTKLIB has for the geometric one.
+    dilution_limit: float = Field(default=30.0, gt=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SinglePoint:
+    """3-D positions, T epochs."""
+
+    #: NaN where there is none: fewer than three satellites beyond one a clock, singular geometry, or no convergence;
+    #: shape (T, 3).
+    ecef_m: Floats
+    clock_m: Floats  #: Shape (T, G).
+    matrix: Floats  #: Normal matrix at the position, shape (T, 3, 3) [1/m^2].
+    covariance_m2: Floats  #: Of the position, from the weights; shape (T, 3, 3).
+    wsse: Floats  #: Shape (T,).
+    residual_m: Floats  #: Shape (T, M).
+
+    def take(self, epochs: Indices) -> SinglePoint:
+        """The positions of some epochs, by index."""
+        return SinglePoint(**{item.name: getattr(self, item.name)[epochs] for item in fields(self)})
+
+
+def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLimits | None = None) -> SinglePoint:
+    """Single-point positions of all epochs at once.
+
+    Parameters
+    ----------
+    ranges : Ranges
+        T epochs.
+    start_ecef_m : ndarray, shape (T, 3) [m]
+        Where the iteration starts; anywhere within a few thousand kilometres.
+    """
+    limits = limits or SinglePointLimits()
+    place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterated_points(
+        ranges.arrays,
+        np.ascontiguousarray(start_ecef_m, dtype=np.float64),
+        np.asarray(ranges.n_used - ranges.n_clocks >= 3),
+        limits.tolerance_m,
+        limits.max_iterations,
+    )
+    return SinglePoint(
+        ecef_m=place, clock_m=clock, matrix=matrix, covariance_m2=covariance, wsse=wsse, residual_m=residual
+    )

@@ -43,59 +43,34 @@ _TELLING: Final = 2.0
 
 
 class DopplerSpeedLimits(Settings):
-    """Limits and weights of the Doppler speed.
+    """Limits and weights of the Doppler speed."""
 
-    Attributes
-    ----------
-    mask_deg : float
-        Elevation mask.
-    zenith_mps, floor_mps : float
-        ``sigma^2 = floor^2 + (zenith 10^((45 - min(C/N0, 50)) / 20))^2`` of a Doppler. Only ratios matter to
-        the speed: the receiver's own size is found from the residuals of the log.
-    outlier : float
-        A Doppler is left out when its residual is over this many of its own standard deviations
-        (the w-test of W. Baarda, 1968); the largest goes first.
-    most_rejected : int
-        Dopplers left out at an epoch at most.
-    min_satellites : int
-        Satellites that must be left; 2 are solved for.
-    """
-
-    mask_deg: float = 10.0
+    mask_deg: float = 10.0  #: Elevation mask.
+    #: ``sigma^2 = floor^2 + (zenith 10^((45 - min(C/N0, 50)) / 20))^2`` of a Doppler. Only ratios matter to the speed:
+    #: the receiver's own size is found from the residuals of the log.
     zenith_mps: float = Field(default=0.03, gt=0)
     floor_mps: float = Field(default=0.02, gt=0)
+    #: A Doppler is left out when its residual is over this many of its own standard deviations (the w-test of W.
+    #: Baarda, 1968); the largest goes first.
     outlier: float = Field(default=3.5, gt=0)
-    most_rejected: int = Field(default=8, ge=0)
-    min_satellites: int = Field(default=4, ge=3)
+    most_rejected: int = Field(default=8, ge=0)  #: Dopplers left out at an epoch at most.
+    min_satellites: int = Field(default=4, ge=3)  #: Satellites that must be left; 2 are solved for.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dopplers:
-    """Dopplers of one receiver with their satellites, T epochs by K satellites.
+    """Dopplers of one receiver with their satellites, T epochs by K satellites."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    satellite : ndarray of str, shape (K,)
-        A satellite with several signals has several channels, of which one an epoch has a number.
-    rate_mps : ndarray, shape (T, K) [m/s]
-        ``-lambda D``: positive when the satellite recedes; NaN where absent.
-    cn0_dbhz : ndarray, shape (T, K)
-    sat_ecef_m, earlier_ecef_m : ndarray, shape (T, K, 3) [m]
-        At the instant of transmission, and a second earlier.
-    sat_velocity_mps : ndarray, shape (T, K, 3) [m/s]
-    clock_rate_mps : ndarray, shape (T, K) [m/s]
-        c times the drift of the satellite clock, relativity included.
-    """
-
-    time: Datetimes
+    time: Datetimes  #: Shape (T,).
+    #: A satellite with several signals has several channels, of which one an epoch has a number; shape (K,).
     satellite: Strings
-    rate_mps: Floats
-    cn0_dbhz: Floats
+    rate_mps: Floats  #: ``-lambda D``: positive when the satellite recedes; NaN where absent; shape (T, K).
+    cn0_dbhz: Floats  #: Shape (T, K).
+    #: At the instant of transmission, and a second earlier; shape (T, K, 3).
     sat_ecef_m: Floats
     earlier_ecef_m: Floats
-    sat_velocity_mps: Floats
-    clock_rate_mps: Floats
+    sat_velocity_mps: Floats  #: Shape (T, K, 3).
+    clock_rate_mps: Floats  #: c times the drift of the satellite clock, relativity included; shape (T, K).
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -107,30 +82,18 @@ class Dopplers:
 
 @dataclass(frozen=True, kw_only=True)
 class DopplerSpeed:
-    """Speed along the track, T epochs.
+    """Speed along the track, T epochs."""
 
-    Attributes
-    ----------
-    speed_mps, sigma_mps : ndarray, shape (T,) [m/s]
-        + along the tangent; NaN where too few satellites are left.
-    clock_drift_mps : ndarray, shape (T,) [m/s]
-        c times the drift of the receiver clock.
-    residual_mps : ndarray, shape (T, K) [m/s]
-        Measured less fitted, of used and rejected Dopplers; NaN elsewhere.
-    used, rejected : ndarray of bool, shape (T, K)
-    n_used : ndarray of int, shape (T,)
-    scale : float
-        Standard deviation of the receiver's Dopplers against that of the limits, over the whole log.
-    """
-
+    #: + along the tangent; NaN where too few satellites are left; shape (T,).
     speed_mps: Floats
     sigma_mps: Floats
-    clock_drift_mps: Floats
-    residual_mps: Floats
+    clock_drift_mps: Floats  #: c times the drift of the receiver clock, shape (T,).
+    residual_mps: Floats  #: Measured less fitted, of used and rejected Dopplers; NaN elsewhere; shape (T, K).
+    #: Shape (T, K).
     used: Masks
     rejected: Masks
-    n_used: Integers
-    scale: float
+    n_used: Integers  #: Shape (T,).
+    scale: float  #: Standard deviation of the receiver's Dopplers against that of the limits, over the whole log.
 
 
 def dopplers_of_log(
@@ -144,8 +107,6 @@ def dopplers_of_log(
 
     Parameters
     ----------
-    obs : Observations
-    navigation : Navigation
     systems : sequence of str
         Constellations asked for.
     signals : mapping of str to sequence of str
@@ -192,16 +153,10 @@ def doppler_speed(
 
     Parameters
     ----------
-    dopplers : Dopplers
     ecef_m : ndarray, shape (T, 3) [m]
         Where the antenna is; 10 m off change a range rate by 2 mm/s. NaN: no speed.
     tangent : ndarray, shape (T, 3)
         Unit vector along the track there.
-    limits : DopplerSpeedLimits, optional
-
-    Returns
-    -------
-    DopplerSpeed
     """
     limits = limits or DopplerSpeedLimits()
     shape = (len(dopplers), 3)

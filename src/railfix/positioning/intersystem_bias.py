@@ -19,51 +19,34 @@ from pydantic import Field
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import EVERY
+from railfix.positioning.constrained import SinglePoint
 from railfix.positioning.forgetting import correlated_sums
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges
-from railfix.positioning.single_point import SinglePoint
 
 
 class ClockOffsetLimits(Settings):
-    """Limits of the inter-system biases.
+    """Limits of the inter-system biases."""
 
-    Attributes
-    ----------
-    stability_m : float
-        Standard deviation of an offset about its mean; infinite leaves every
-        constellation its own clock. On an urban recording the spread was 1.0 m (Galileo, BeiDou).
-    correlation_s : float
-        Epochs nearer to each other than this are not independent: errors of a standing
-        train are correlated over tens of seconds.
-    window_s : float
-        Time constant of forgetting: offsets are stable to a metre over hours, so half an hour loses
-        nothing, and the effect of a receiver restart or of an undetected error fades.
-    """
-
+    #: Standard deviation of an offset about its mean; infinite leaves every constellation its own clock. On an urban
+    #: recording the spread was 1.0 m (Galileo, BeiDou).
     stability_m: float = Field(default=1.0, gt=0, allow_inf_nan=True)
+    #: Epochs nearer to each other than this are not independent: errors of a standing train are correlated over tens of
+    #: seconds.
     correlation_s: float = Field(default=30.0, gt=0)
+    #: Time constant of forgetting: offsets are stable to a metre over hours, so half an hour loses nothing, and the
+    #: effect of a receiver restart or of an undetected error fades.
     window_s: float = Field(default=1800.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class OffsetState:
-    """Offsets estimated so far, by clock letter.
+    """Offsets estimated so far, by clock letter."""
 
-    Attributes
-    ----------
-    information : mapping of str to float [1/m^2]
-    moment : mapping of str to float [1/m]
-        Information times offset.
-    last : datetime64[ns]
-        Time of the last epoch, NaT before the first.
-    age : float [windows]
-        Of the last epoch.
-    """
-
-    information: Mapping[str, float] = field(default_factory=dict)
-    moment: Mapping[str, float] = field(default_factory=dict)
+    information: Mapping[str, float] = field(default_factory=dict)  #: [1/m^2].
+    moment: Mapping[str, float] = field(default_factory=dict)  #: Information times offset [1/m].
+    #: Time of the last epoch, NaT before the first.
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0
+    age: float = 0.0  #: Of the last epoch [windows].
 
     def sums(self, letters: Sequence[str]) -> Floats:
         """Return the information of some clocks, then their moments, in one array."""
@@ -109,7 +92,6 @@ def tie_clocks(
         Of each receiver.
     parts : sequence of slice
         Rows of each.
-    limits : ClockOffsetLimits, optional
 
     Returns
     -------

@@ -21,9 +21,9 @@ from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.constrained import SinglePoint
 from railfix.positioning.forgetting import correlated_sums
 from railfix.positioning.normal_equations import RangeArrays, Ranges
-from railfix.positioning.single_point import SinglePoint
 from railfix.track.trajectory import Trajectory
 
 #: Sums of a window.
@@ -31,29 +31,18 @@ _SUMS: Final = 9
 
 
 class MapOffsetLimits(Settings):
-    """Limits of the test of the map.
+    """Limits of the test of the map."""
 
-    Attributes
-    ----------
-    window_s : float [s]
-        Time constant of forgetting: long enough for six independent samples, short enough to find a wrong stretch.
-    correlation_s : float [s]
-        Epochs nearer to each other than this count as one sample.
-    least_samples : float
-        Independent samples needed before a verdict: one minute.
-    note_risk, risk : float
-        Probability that noise alone passes the test: of the note, of the status (chi-square, two degrees of freedom).
-        The nominal sigmas are assumptions; on the recordings, with a right map and all screens, the statistic
-        stays below the threshold of the status, 13.8 (``tests/studies/integrity_tables.py``).
-    missed : float
-        Probability of missing an offset of the smallest detectable size.
-    """
-
+    #: Time constant of forgetting: long enough for six independent samples, short enough to find a wrong stretch.
     window_s: float = Field(default=120.0, gt=0)
-    correlation_s: float = Field(default=20.0, gt=0)
-    least_samples: float = Field(default=3.0, gt=0)
+    correlation_s: float = Field(default=20.0, gt=0)  #: Epochs nearer to each other than this count as one sample.
+    least_samples: float = Field(default=3.0, gt=0)  #: Independent samples needed before a verdict: one minute.
+    #: Probability that noise alone passes the test: of the note, of the status (chi-square, two degrees of freedom).
+    #: The nominal sigmas are assumptions; on the recordings, with a right map and all screens, the statistic stays
+    #: below the threshold of the status, 13.8 (``tests/studies/integrity_tables.py``).
     note_risk: float = Field(default=1e-2, gt=0, lt=1)
     risk: float = Field(default=1e-3, gt=0, lt=1)
+    #: Probability of missing an offset of the smallest detectable size.
     missed: float = Field(default=1e-2, gt=0, lt=1)
 
     @cached_property
@@ -74,44 +63,27 @@ class MapOffsetLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class MapOffsetState:
-    """Decayed sums after the last epoch.
+    """Decayed sums after the last epoch."""
 
-    Attributes
-    ----------
-    time : datetime64[ns]
-        Of the last epoch; NaT before the first.
-    age : float [windows]
-        Of the last epoch.
-    sums : ndarray, shape (18,)
-        Information matrix (across, mixed, up), information times offset (2), nominal covariance (3), samples: of the
-        epochs that are on the map, then of those off it.
-    """
-
+    #: Of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0
+    age: float = 0.0  #: Of the last epoch [windows].
+    #: Information matrix (across, mixed, up), information times offset (2), nominal covariance (3), samples: of the
+    #: epochs that are on the map, then of those off it; shape (18,).
     sums: Floats = field(default_factory=lambda: np.zeros(2 * _SUMS))
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapOffset:
-    """Mean offset of the 3-D positions from the line over the window, T epochs; NaN before there are enough samples.
+    """Mean offset of the 3-D positions from the line over the window, T epochs; NaN before there are enough samples."""
 
-    Attributes
-    ----------
-    across_m, up_m : ndarray, shape (T,) [m]
-        Right of the line in the direction of rising chainage, and above it.
-    covariance_m2 : ndarray, shape (T, 2, 2) [m^2]
-        Of a right map, across and up: noise, satellites, atmosphere and the stated error of the map.
-    statistic : ndarray, shape (T,)
-        Square of the offset in sigmas, both components together.
-    detectable_m : ndarray, shape (T, 2) [m]
-        Smallest offsets across and up that the test finds, each alone; smaller ones are not excluded.
-    """
-
+    #: Right of the line in the direction of rising chainage, and above it; shape (T,).
     across_m: Floats
     up_m: Floats
+    #: Of a right map, across and up: noise, satellites, atmosphere and the stated error of the map; shape (T, 2, 2).
     covariance_m2: Floats
-    statistic: Floats
+    statistic: Floats  #: Square of the offset in sigmas, both components together; shape (T,).
+    #: Smallest offsets across and up that the test finds, each alone; smaller ones are not excluded; shape (T, 2).
     detectable_m: Floats
 
     @property
@@ -141,33 +113,18 @@ class MapOffset:
 
 
 class OffsetErrors(NamedTuple):
-    """Errors of the ranges of T epochs.
+    """Errors of the ranges of T epochs."""
 
-    Attributes
-    ----------
-    nominal_m : ndarray, shape (T, M) [m]
-        Standard deviations of satellites and atmosphere.
-    variance : ndarray, shape (T,)
-        Of the ranges against their weights.
-    """
-
-    nominal_m: Floats
-    variance: Floats
+    nominal_m: Floats  #: Standard deviations of satellites and atmosphere, shape (T, M).
+    variance: Floats  #: Of the ranges against their weights, shape (T,).
 
 
 class LinePositions(NamedTuple):
-    """Positions on the line at T epochs.
+    """Positions on the line at T epochs."""
 
-    Attributes
-    ----------
-    arc_m : ndarray, shape (T,) [m]
-        NaN where there is none.
-    off_map : ndarray of bool, shape (T,)
-        The train is away from the line. These epochs have a window of their own: what a train was beside while it was
-        away says nothing of the map once it is on it.
-    """
-
-    arc_m: Floats
+    arc_m: Floats  #: NaN where there is none, shape (T,).
+    #: The train is away from the line. These epochs have a window of their own: what a train was beside while it was
+    #: away says nothing of the map once it is on it; shape (T,).
     off_map: Masks
 
 
@@ -191,12 +148,8 @@ def map_offset(
         What the 3-D positions were solved with: ranges that agree with each other.
     point : SinglePoint
         3-D positions.
-    errors : OffsetErrors
-    antennas : AntennaRows
-    positions : LinePositions
     states : sequence of MapOffsetState
         By antenna.
-    limits : MapOffsetLimits, optional
 
     Returns
     -------

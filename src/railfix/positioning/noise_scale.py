@@ -13,6 +13,8 @@ Iteratively reweighted least squares with the IGG-III weights (Y. Yang, L. Song 
 correlated observations based on bifactor equivalent weights, Journal of Geodesy 76, 2002) and the median of the
 absolute residuals as scale: a range whose residual passes `reject` scales has no part in the fit at all. No
 noise level is assumed, so that the noise of a receiver can be learnt from what is kept.
+
+Robust receiver clock estimate from residuals at a known position.
 """
 
 from __future__ import annotations
@@ -36,40 +38,23 @@ _NORMAL_MEDIAN: Final = 0.6745
 
 
 class RobustFitLimits(Settings):
-    """Limits of the robust fit.
+    """Limits of the robust fit."""
 
-    Attributes
-    ----------
-    keep : float
-        Residuals up to so many scales keep their weight.
-    reject : float
-        Residuals from so many scales on have no weight.
-    iterations : int
-        Reweightings. On the demonstration with 20 m on one satellite the fifth one changes no verdict.
-    """
-
-    keep: float = Field(default=1.5, gt=0)
-    reject: float = Field(default=4.0, gt=0)
+    keep: float = Field(default=1.5, gt=0)  #: Residuals up to so many scales keep their weight.
+    reject: float = Field(default=4.0, gt=0)  #: Residuals from so many scales on have no weight.
+    #: Reweightings. On the demonstration with 20 m on one satellite the fifth one changes no verdict.
     iterations: int = Field(default=5, ge=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobustFit:
-    """Ranges that agree with each other, T epochs by M channels.
+    """Ranges that agree with each other, T epochs by M channels."""
 
-    Attributes
-    ----------
-    kept : ndarray of bool, shape (T, M)
-        Used ranges whose residual is below `RobustFitLimits.reject` scales.
-    variance : ndarray, shape (T,)
-        Weighted sum of the squared residuals of the kept ranges over their degrees of freedom; NaN without any.
-    freedom : ndarray of int, shape (T,)
-        Kept ranges beyond clocks and unknowns of the place.
-    """
-
-    kept: Masks
+    kept: Masks  #: Used ranges whose residual is below `RobustFitLimits.reject` scales, shape (T, M).
+    #: Weighted sum of the squared residuals of the kept ranges over their degrees of freedom; NaN without any; shape
+    #: (T,).
     variance: Floats
-    freedom: Integers
+    freedom: Integers  #: Kept ranges beyond clocks and unknowns of the place, shape (T,).
 
 
 def map_information(trajectory: Trajectory, section: Indices) -> Floats:
@@ -98,11 +83,6 @@ def robust_fit(
         Solution of the plain fit; steps from it are linear.
     information : ndarray, shape (T, 3, 3) [1/m^2], optional
         Known of the place beforehand (`map_information`: one unknown is left); none: three unknowns.
-    limits : RobustFitLimits, optional
-
-    Returns
-    -------
-    RobustFit
     """
     limits = limits or RobustFitLimits()
     used = ranges.weight > 0
@@ -131,48 +111,30 @@ _WIDENED: Final = stdtrit(np.arange(1, 129), 0.975) / ndtri(0.975)
 
 
 class NoiseScaleLimits(Settings):
-    """How the noise of a receiver is learnt.
+    """How the noise of a receiver is learnt."""
 
-    Attributes
-    ----------
-    window_s : float [s]
-        Time constant of forgetting. Errors of codes stay alike for about 20 s (correlation 0.6 after 10 s on
-        recordings): five such times are independent enough for a mean, and short enough that a street
-        or a station left behind is forgotten before the next one.
-    prior : float
-        Redundant ranges that a scale of 1 counts for: two or three epochs. Infinite holds the
-        scale at 1.
-    least_epochs : float
-        Epochs that the window spans at least, gaps left out.
-    spread : float
-        Degrees of freedom of the scale from epoch to epoch: the noise of single epochs varies more than chi-square
-        says, so the variance stated for an epoch is that of its window counted this many times, and that of its own
-        residuals. 4 is also the Student t of code errors on recordings.
-    """
-
+    #: Time constant of forgetting. Errors of codes stay alike for about 20 s (correlation 0.6 after 10 s on
+    #: recordings): five such times are independent enough for a mean, and short enough that a street or a station left
+    #: behind is forgotten before the next one.
     window_s: float = Field(default=100.0, gt=0)
+    #: Redundant ranges that a scale of 1 counts for: two or three epochs. Infinite holds the scale at 1.
     prior: float = Field(default=20.0, gt=0)
-    least_epochs: float = Field(default=20.0, ge=1)
+    least_epochs: float = Field(default=20.0, ge=1)  #: Epochs that the window spans at least, gaps left out.
+    #: Degrees of freedom of the scale from epoch to epoch: the noise of single epochs varies more than chi-square says,
+    #: so the variance stated for an epoch is that of its window counted this many times, and that of its own residuals.
+    #: 4 is also the Student t of code errors on recordings.
     spread: float = Field(default=4.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseState:
-    """Decayed sums behind the noise scales, after the last epoch.
+    """Decayed sums behind the noise scales, after the last epoch."""
 
-    Attributes
-    ----------
-    time : datetime64[ns]
-        Of the last epoch; NaT before the first.
-    age : float [windows]
-        Of the last epoch.
-    robust, remaining : ndarray, shape (2,)
-        Weighted sum of squared residuals, and degrees of freedom: of the ranges that the robust fit kept, and of
-        those that RAIM left.
-    """
-
+    #: Of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0
+    age: float = 0.0  #: Of the last epoch [windows].
+    #: Weighted sum of squared residuals, and degrees of freedom: of the ranges that the robust fit kept, and of those
+    #: that RAIM left; shape (2,).
     robust: Floats = field(default_factory=lambda: np.zeros(2))
     remaining: Floats = field(default_factory=lambda: np.zeros(2))
 
@@ -195,8 +157,6 @@ def robust_scale(
         On the line.
     teaching : ndarray of bool, shape (T,)
         Epochs to learn from: those that are on the map.
-    state : NoiseState
-    limits : NoiseScaleLimits
 
     Returns
     -------
@@ -232,8 +192,6 @@ def stated_scale(
         Epochs to learn from: resolved, and on the map.
     robust : ndarray, shape (T,)
         Robust scale, which takes the place of a scale of 1 as the prior.
-    state : NoiseState
-    limits : NoiseScaleLimits
 
     Returns
     -------
@@ -272,7 +230,6 @@ def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits:
     ----------
     scale, wsse : ndarray, shape (T,)
     redundancy : ndarray of int, shape (T,)
-    limits : NoiseScaleLimits
     """
     freedom = np.where(np.isfinite(wsse), np.maximum(redundancy, 0), 0)
     own = np.where(freedom > 0, np.fmax(wsse, 0.0), 0.0)
@@ -293,3 +250,52 @@ def own_sigma_m(redundancy: Integers, wsse: Floats, sigma_m: Floats, scale: Floa
     freedom = np.maximum(redundancy, 1)
     shown = np.sqrt(np.maximum(wsse, 0.0) / freedom)
     return np.asarray(sigma_m * np.maximum(scale, shown) * _WIDENED[np.minimum(freedom, len(_WIDENED)) - 1])
+
+
+#: Huber's tuning constant [sigma]: 95 % efficiency for normal errors.
+HUBER: Final = 1.345
+_ROUNDS: Final = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustClock:
+    """Clocks of T epochs, G groups, K channels."""
+
+    clock_m: Floats  #: NaN with fewer than `least_ranges` ranges, shape (T, G).
+    share: Floats  #: Weight of each channel in its clock estimate; 0 for channels not used; shape (T, K).
+
+
+def robust_clock(
+    residual_m: Floats, sigma_m: Floats, groups: tuple[slice, ...], *, least_ranges: int = 4
+) -> RobustClock:
+    """Receiver clock of each group: Huber-weighted mean of the residuals, starting at their median.
+
+    Parameters
+    ----------
+    residual_m, sigma_m : ndarray, shape (T, K) [m]
+        Range errors plus the clock; NaN is ignored.
+    groups : tuple of slice
+        Channels of one receiver clock.
+    least_ranges : int
+        Fewest ranges from which a clock is estimated.
+    """
+    clock = np.full((len(residual_m), len(groups)), np.nan)
+    share = np.zeros(residual_m.shape)
+    for g, group in enumerate(groups):
+        part, sigma = residual_m[:, group], sigma_m[:, group]
+        valid = np.isfinite(part) & np.isfinite(sigma)
+        rows = np.flatnonzero(valid.sum(axis=1) >= least_ranges)
+        if not len(rows):
+            continue
+        part, valid = np.where(valid, part, np.nan)[rows], valid[rows]
+        root = np.where(valid, 1.0 / np.where(valid, sigma[rows], 1.0), 0.0)
+        value = np.nanmedian(part, axis=1)
+        residual = np.where(valid, part, 0.0)
+        for _ in range(_ROUNDS):
+            score = np.abs(residual - value[:, None]) * root
+            weight = root**2 * np.minimum(1.0, HUBER / np.maximum(score, 1e-12))
+            total = weight.sum(axis=1)
+            value = (weight * residual).sum(axis=1) / total
+        clock[rows, g] = value
+        share[rows, group] = weight / total[:, None]
+    return RobustClock(clock_m=clock, share=share)

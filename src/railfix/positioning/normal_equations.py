@@ -31,18 +31,11 @@ UNTIED_M: Final = 1e6
 
 @dataclass(frozen=True, kw_only=True)
 class ClockTies:
-    """Known offsets between the receiver clocks of the constellations.
+    """Known offsets between the receiver clocks of the constellations."""
 
-    Attributes
-    ----------
-    offset_m : ndarray, shape (T, G) [m]
-        Receiver clock of each group less a clock common to all; any finite value where unknown.
-    sigma_m : ndarray, shape (T, G) [m]
-        Its standard deviation; `UNTIED_M` where nothing is known.
-    """
-
+    #: Receiver clock of each group less a clock common to all; any finite value where unknown; shape (T, G).
     offset_m: Floats
-    sigma_m: Floats
+    sigma_m: Floats  #: Its standard deviation; `UNTIED_M` where nothing is known; shape (T, G).
 
     def take(self, epochs: Masks | Indices) -> ClockTies:
         """The ties of some epochs, by mask or index."""
@@ -77,28 +70,15 @@ class RangeArrays(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Ranges:
-    """Corrected pseudoranges of an antenna, ready to be fitted: T epochs by M channels.
+    """Corrected pseudoranges of an antenna, ready to be fitted: T epochs by M channels."""
 
-    Attributes
-    ----------
-    sat_ecef_m : ndarray, shape (T, M, 3) [m]
-        Satellites in ECEF at transmit time; any finite value where the weight is 0.
-    code_m : ndarray, shape (T, M) [m]
-        Corrected pseudorange (satellite clock, group delay, ionosphere, troposphere applied);
-        any finite value where the weight is 0.
-    weight : ndarray, shape (T, M) [1/m^2]
-        1/sigma^2, 0 for what is not used.
-    groups : tuple of slice
-        Channels that share one receiver clock stand side by side; one slice a clock.
-    ties : ClockTies or None
-        Known offsets between these clocks; None: none.
-    """
-
-    sat_ecef_m: Floats
+    sat_ecef_m: Floats  #: Satellites in ECEF at transmit time; any finite value where the weight is 0; shape (T, M, 3).
+    #: Corrected pseudorange (satellite clock, group delay, ionosphere, troposphere applied); any finite value where the
+    #: weight is 0; shape (T, M).
     code_m: Floats
-    weight: Floats
-    groups: tuple[slice, ...]
-    ties: ClockTies | None = None
+    weight: Floats  #: 1/sigma^2, 0 for what is not used; shape (T, M) [1/m^2].
+    groups: tuple[slice, ...]  #: Channels that share one receiver clock stand side by side; one slice a clock.
+    ties: ClockTies | None = None  #: Known offsets between these clocks; None: none.
 
     def __len__(self) -> int:
         return len(self.code_m)
@@ -145,33 +125,15 @@ class Ranges:
 
 @dataclass(frozen=True, kw_only=True)
 class NormalEquations:
-    """Fit of ranges around a place, the clocks eliminated.
+    """Fit of ranges around a place, the clocks eliminated."""
 
-    Attributes
-    ----------
-    matrix : ndarray, shape (T, 3, 3) [1/m^2]
-        Normal matrix of the place in ECEF.
-    vector : ndarray, shape (T, 3) [1/m]
-        Right-hand side: the step that lowers `wsse` most is ``matrix^-1 vector``.
-    wsse : ndarray, shape (T,)
-        Weighted sum of squared residuals at the place itself.
-    clock_m : ndarray, shape (T, G) [m]
-        Receiver clock of each group at the place; NaN where the group has no satellite.
-    residual_m : ndarray, shape (T, M) [m]
-        Code - range - clock; 0 where the weight is 0.
-    clock_slope : ndarray, shape (T, 3, G)
-        Decrease of `clock_m` by a step from the place, per metre of each axis.
-    design : ndarray, shape (T, 3, M)
-        Decrease of `residual_m` by a step from the place, per metre of each axis.
-    """
-
-    matrix: Floats
-    vector: Floats
-    wsse: Floats
-    clock_m: Floats
-    residual_m: Floats
-    clock_slope: Floats
-    design: Floats
+    matrix: Floats  #: Normal matrix of the place in ECEF, shape (T, 3, 3) [1/m^2].
+    vector: Floats  #: Right-hand side: the step that lowers `wsse` most is ``matrix^-1 vector``; shape (T, 3) [1/m].
+    wsse: Floats  #: Weighted sum of squared residuals at the place itself, shape (T,).
+    clock_m: Floats  #: Receiver clock of each group at the place; NaN where the group has no satellite; shape (T, G).
+    residual_m: Floats  #: Code - range - clock; 0 where the weight is 0; shape (T, M).
+    clock_slope: Floats  #: Decrease of `clock_m` by a step from the place, per metre of each axis; shape (T, 3, G).
+    design: Floats  #: Decrease of `residual_m` by a step from the place, per metre of each axis; shape (T, 3, M).
 
 
 def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
@@ -202,10 +164,6 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     ranges : Ranges
         T epochs.
     place_ecef_m : ndarray, shape (T, 3) [m]
-
-    Returns
-    -------
-    NormalEquations
     """
     system, means, rows, seen = kernels.ranges.reduced_equations(
         ranges.arrays, np.ascontiguousarray(place_ecef_m, dtype=np.float64)

@@ -31,33 +31,23 @@ from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.settings import Settings
 from railfix.kernels.layout import CLEAR_M, FAN_OUT, ROTATION_GRADIENT
+from railfix.positioning.constrained import SinglePoint
 from railfix.positioning.normal_equations import Ranges, fit, normal_equations
-from railfix.positioning.single_point import SinglePoint
 from railfix.track.trajectory import Trajectory
 
 
 class SectionLimits(Settings):
-    """Limits of ambiguous sections.
+    """Limits of ambiguous sections."""
 
-    Attributes
-    ----------
-    ambiguity_risk : float
-        Probability that noise makes the true place fit so much worse than the best one. Chi-square, one degree of
-        freedom. P1 3.2: wrong sections on sharp curves.
-    reach_risk : float
-        Other places are sought as far as noise has this probability: further than they are ambiguous, for a fault of
-        one range can hide that much.
-    separation_m : float
-        Least distance along the line between two distinct places.
-    redundancy : int
-        Ranges beyond the unknowns below which a section is doubtful: on real
-        recordings of two constellations a quarter of the sections were wrong with one redundant
-        range, 3 to 4 % with two.
-    """
-
+    #: Probability that noise makes the true place fit so much worse than the best one. Chi-square, one degree of
+    #: freedom. P1 3.2: wrong sections on sharp curves.
     ambiguity_risk: float = Field(default=1e-3, gt=0, lt=1)
+    #: Other places are sought as far as noise has this probability: further than they are ambiguous, for a fault of one
+    #: range can hide that much.
     reach_risk: float = Field(default=1e-16, gt=0, lt=1)
-    separation_m: float = Field(default=30.0, ge=0)
+    separation_m: float = Field(default=30.0, ge=0)  #: Least distance along the line between two distinct places.
+    #: Ranges beyond the unknowns below which a section is doubtful: on real recordings of two constellations a quarter
+    #: of the sections were wrong with one redundant range, 3 to 4 % with two.
     redundancy: int = Field(default=2, ge=0)
 
     @cached_property
@@ -73,29 +63,16 @@ class SectionLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """The best point of the trajectory, T epochs.
+    """The best point of the trajectory, T epochs."""
 
-    Attributes
-    ----------
-    vertex : ndarray of int, shape (T,)
-        Point with the least q; -1 where no range is redundant with the clocks.
-    q : ndarray, shape (T,)
-        Its weighted sum of squared residuals.
-    excess : ndarray, shape (T,)
-        How much worse the best other place fits, in q at its own best point between the points of
-        the trajectory, in variances estimated from the fit of the best place (never
-        below the variance of the weights); negative when it fits better, infinite when there is none.
-    other_vertex : ndarray of int, shape (T,)
-        Where that other place is; -1 when there is none.
-    evaluations : ndarray of int, shape (T,)
-        Points whose q was computed.
-    """
-
-    vertex: Indices
-    q: Floats
+    vertex: Indices  #: Point with the least q; -1 where no range is redundant with the clocks; shape (T,).
+    q: Floats  #: Its weighted sum of squared residuals, shape (T,).
+    #: How much worse the best other place fits, in q at its own best point between the points of the trajectory, in
+    #: variances estimated from the fit of the best place (never below the variance of the weights); negative when it
+    #: fits better, infinite when there is none; shape (T,).
     excess: Floats
-    other_vertex: Indices
-    evaluations: Integers
+    other_vertex: Indices  #: Where that other place is; -1 when there is none; shape (T,).
+    evaluations: Integers  #: Points whose q was computed, shape (T,).
 
 
 @dataclass(frozen=True)
@@ -164,26 +141,17 @@ class SearchIndex:
 
 
 class SectionCandidates(NamedTuple):
-    """Points looked at, sorted by epoch and point, with q and its slope there; n epochs, p points.
+    """Points looked at, sorted by epoch and point, with q and its slope there; n epochs, p points."""
 
-    Attributes
-    ----------
-    at, points : ndarray of int, shape (n,)
-        The epochs, and how many points each has (at least one).
-    vertex, q, half_gradient : ndarray, shapes (p,), (p,), (p, 3)
-    matrix : ndarray, shape (m, 3, 3)
-        Normal matrices.
-    matrix_of : ndarray of int, shape (p,)
-        Which of them belongs to each point.
-    """
-
+    #: The epochs, and how many points each has (at least one); shape (n,).
     at: Indices
     points: Indices
+    #: Shapes (p,), (p,), (p, 3).
     vertex: Indices
     q: Floats
     half_gradient: Floats
-    matrix: Floats
-    matrix_of: Indices
+    matrix: Floats  #: Normal matrices, shape (m, 3, 3).
+    matrix_of: Indices  #: Which of them belongs to each point, shape (p,).
 
 
 def _searchable(ranges: Ranges) -> Masks:
@@ -203,14 +171,8 @@ def search(
     ----------
     ranges : Ranges
         T epochs.
-    index : SearchIndex
     point : SinglePoint
         3-D position from the same ranges and weights; NaN where there is none.
-    limits : SectionLimits, optional
-
-    Returns
-    -------
-    Section
     """
     limits = limits or SectionLimits()
     epochs = len(ranges)

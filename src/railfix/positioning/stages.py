@@ -9,10 +9,16 @@ from __future__ import annotations
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Strings
-from railfix.positioning.constrained import Constrained, ConstrainedLimits, constrained_position
+from railfix.positioning.constrained import (
+    Constrained,
+    ConstrainedLimits,
+    SinglePoint,
+    SinglePointLimits,
+    constrained_position,
+    single_point,
+)
 from railfix.positioning.normal_equations import Ranges, clock_groups
 from railfix.positioning.section_search import SearchIndex, Section, SectionLimits, search
-from railfix.positioning.single_point import SinglePoint, SinglePointLimits, single_point
 from railfix.track.trajectory import Trajectory
 
 

@@ -48,7 +48,6 @@ class IntegerSearch:
         Parameters
         ----------
         cycles : ndarray, shape (n,)
-        count : int
         below : float
             Vectors of larger squares are left out.
 
@@ -150,22 +149,14 @@ _NEGLIGIBLE: Final = -5.0
 
 @dataclass(frozen=True, kw_only=True)
 class MeanPhases:
-    """Mean double differences of the carrier phases of one antenna, n pairs of satellites.
+    """Mean double differences of the carrier phases of one antenna, n pairs of satellites."""
 
-    Attributes
-    ----------
-    difference_m : ndarray, shape (n,)
-        Observed less computed for the origin; differs from a multiple of the wavelength by the place and errors.
-    away : ndarray, shape (n, 3)
-        Change of it with the place, east, north, up.
-    wavelength_m : ndarray, shape (n,)
-    covariance_m2 : ndarray, shape (n, n)
-    """
-
+    #: Observed less computed for the origin; differs from a multiple of the wavelength by the place and errors; shape
+    #: (n,).
     difference_m: Floats
-    away: Floats
-    wavelength_m: Floats
-    covariance_m2: Floats
+    away: Floats  #: Change of it with the place, east, north, up; shape (n, 3).
+    wavelength_m: Floats  #: Shape (n,).
+    covariance_m2: Floats  #: Shape (n, n).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,7 +188,6 @@ def phase_log_likelihood(
         Covariance of the places about those: along the track, of the map, of height.
     codes : sequence of CodePlace, length A
     phases : sequence of MeanPhases, length A
-    fault_prior : float
 
     Returns
     -------

@@ -39,81 +39,45 @@ _LEAST_PRIOR: Final = 0.04
 
 
 class TwoFrequencyLimits(Settings):
-    """Limits of the combination of two frequencies.
+    """Limits of the combination of two frequencies."""
 
-    Attributes
-    ----------
-    window_s : float
-        Time constant of the mean differences of the codes: what Klobuchar's model misses changes over many minutes.
-    correlation_s : float
-        Epochs nearer to each other than this are one sample: multipath of a standing train lasts so long.
-    delay_sigma_m : float
-        Standard deviation of a broadcast group delay, difference of two signals.
-    suspicion : float
-        Sigmas beyond which a difference of the two codes weighs the range down.
-    least_suspicion_m : float [m]
-        Smallest such difference.
-    """
-
+    #: Time constant of the mean differences of the codes: what Klobuchar's model misses changes over many minutes.
     window_s: float = Field(default=600.0, gt=0)
+    #: Epochs nearer to each other than this are one sample: multipath of a standing train lasts so long.
     correlation_s: float = Field(default=60.0, gt=0)
+    #: Standard deviation of a broadcast group delay, difference of two signals.
     delay_sigma_m: float = Field(default=0.2, gt=0)
+    #: Sigmas beyond which a difference of the two codes weighs the range down.
     suspicion: float = Field(default=4.0, gt=0)
-    least_suspicion_m: float = Field(default=3.0, gt=0)
+    least_suspicion_m: float = Field(default=3.0, gt=0)  #: Smallest such difference.
 
 
 @dataclass(frozen=True, kw_only=True)
 class SecondCodes:
-    """Second codes of satellites: T epochs by K channels of the first.
+    """Second codes of satellites: T epochs by K channels of the first."""
 
-    Attributes
-    ----------
-    code_m : ndarray, shape (T, K) [m]
-        Corrected by the models; NaN where there is none.
-    noise_m : ndarray, shape (T, K) [m]
-        Standard deviation of noise and multipath that the weights assume.
-    cn0_dbhz : ndarray, shape (T, K)
-    delay_sigma_m : ndarray, shape (T, K) [m]
-        Of a group delay that is not broadcast in full, beside `TwoFrequencyLimits.delay_sigma_m`.
-    ratio : ndarray, shape (T, K)
-        Square of the first frequency over the second.
-    pair : ndarray of int, shape (T, K)
-        Number of satellite and signals among the names of pairs.
-    column : ndarray of int, shape (T, K)
-        Channel of the observations.
-    """
-
-    code_m: Floats
-    noise_m: Floats
-    cn0_dbhz: Floats
+    code_m: Floats  #: Corrected by the models; NaN where there is none; shape (T, K).
+    noise_m: Floats  #: Standard deviation of noise and multipath that the weights assume, shape (T, K).
+    cn0_dbhz: Floats  #: Shape (T, K).
+    #: Of a group delay that is not broadcast in full, beside `TwoFrequencyLimits.delay_sigma_m`; shape (T, K).
     delay_sigma_m: Floats
-    ratio: Floats
-    pair: Integers
-    column: Integers
+    ratio: Floats  #: Square of the first frequency over the second, shape (T, K).
+    pair: Integers  #: Number of satellite and signals among the names of pairs, shape (T, K).
+    column: Integers  #: Channel of the observations, shape (T, K).
 
 
 @dataclass(frozen=True, kw_only=True)
 class TwoFrequencyState:
-    """Mean differences of the codes so far, Q pairs of signals of a satellite.
+    """Mean differences of the codes so far, Q pairs of signals of a satellite."""
 
-    Attributes
-    ----------
-    names : tuple of str, length Q
-    sums : ndarray, shape (2 Q,)
-        Information [1/m^2] of each pair, then moments [1/m].
-    scale : ndarray, shape (2,)
-        Sum of the sizes of the differences over the assumed ones, and their number.
-    last : datetime64[ns]
-        Time of the last epoch, NaT before the first.
-    age : float [windows]
-        Of the last epoch.
-    """
-
-    names: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()  #: Length Q.
+    #: Information [1/m^2] of each pair, then moments [1/m]; shape (2 Q,).
     sums: Floats = field(default_factory=lambda: np.empty(0))
+    #: Sum of the sizes of the differences over the assumed ones, and their number; shape (2,).
     scale: Floats = field(default_factory=lambda: np.zeros(2))
+    #: Time of the last epoch, NaT before the first.
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0
+    age: float = 0.0  #: Of the last epoch [windows].
 
     def with_pairs(self, names: tuple[str, ...]) -> tuple[TwoFrequencyState, Integers]:
         """Return the state with the pairs of a chunk among its own, and the number of each of them."""
@@ -133,29 +97,16 @@ class TwoFrequencyState:
 
 @dataclass(frozen=True, kw_only=True)
 class Combined:
-    """One pseudorange a satellite from two codes: T epochs by K channels; NaN where the first code is alone.
+    """One pseudorange a satellite from two codes: T epochs by K channels; NaN where the first code is alone."""
 
-    Attributes
-    ----------
-    code_m : ndarray, shape (T, K) [m]
-    variance_m2 : ndarray, shape (T, K) [m^2]
-        Added to that of the first code.
-    share : ndarray, shape (T, K)
-        Weight of the second code; that of the first is 1 less it.
-    ionosphere_m, ionosphere_sigma_m : ndarray, shape (T, K) [m]
-        Delay on the first frequency beyond that of the model.
-    difference_m : ndarray, shape (T, K) [m]
-        Second code less first, what is predicted taken off.
-    suspected : ndarray of bool, shape (T, K)
-    """
-
-    code_m: Floats
-    variance_m2: Floats
-    share: Floats
+    code_m: Floats  #: Shape (T, K).
+    variance_m2: Floats  #: Added to that of the first code, shape (T, K).
+    share: Floats  #: Weight of the second code; that of the first is 1 less it; shape (T, K).
+    #: Delay on the first frequency beyond that of the model, shape (T, K).
     ionosphere_m: Floats
     ionosphere_sigma_m: Floats
-    difference_m: Floats
-    suspected: Masks
+    difference_m: Floats  #: Second code less first, what is predicted taken off; shape (T, K).
+    suspected: Masks  #: Shape (T, K).
 
 
 def combine_codes(
@@ -175,13 +126,10 @@ def combine_codes(
     time : ndarray of datetime64[ns], shape (T,)
     code_m, noise_m : ndarray, shape (T, K) [m]
         First codes, corrected by the models, NaN where unusable; and the noise that the weights assume.
-    second : SecondCodes
     prior_sigma_m : ndarray, shape (T, K) [m]
         Standard deviation of the modelled ionosphere on the first frequency, along the sight.
     pairs : tuple of (tuple of str, ndarray of int)
         Names of the pairs, length Q, and the number of the group of each whose receiver delay is common, shape (Q,).
-    state : TwoFrequencyState
-    limits : TwoFrequencyLimits
 
     Returns
     -------

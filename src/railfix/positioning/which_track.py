@@ -50,37 +50,25 @@ NONE: Final = "none"
 
 
 class StandstillErrors(Settings):
-    """Errors of codes at rest, and prior of a track that the map does not have.
+    """Errors of codes at rest, and prior of a track that the map does not have."""
 
-    Attributes
-    ----------
-    code_bias_m : float [m]
-        Constant part of a satellite's code at the zenith (multipath); divided by the sine of the elevation.
-    code_noise_m : float [m]
-        Part that varies, correlated over `correlation_s`, likewise.
-    correlation_s : float [s]
-    phase_bias_m : float [m]
-        Constant part of a satellite's carrier phase at the zenith, likewise.
-    phase_fault_prior : float
-        Probability that the phases of a standstill follow no model, by a slip or half a cycle that was not seen.
-    antenna_sigma_m : float [m]
-        Error of each antenna's place on the train, along and across: spacing, sway, lean.
-    map_sigma_m : float [m]
-        Error across the track that all tracks of a yard have in common, lean of the antenna on canted track included.
-    unmapped_prior : float
-    unmapped_width_m : float [m]
-        Width over which a track that the map does not have can lie.
-    """
-
+    #: Constant part of a satellite's code at the zenith (multipath); divided by the sine of the elevation.
     code_bias_m: float = option("Constant code error of a satellite at the zenith.", 0.6, metavar="M", gt=0)
+    #: Part that varies, correlated over `correlation_s`, likewise.
     code_noise_m: float = option("Varying code error of a satellite at the zenith.", 0.5, metavar="M", gt=0)
+
     correlation_s: float = option("Time over which the varying part persists.", 60.0, metavar="S", gt=0)
+    #: Constant part of a satellite's carrier phase at the zenith, likewise.
     phase_bias_m: float = option("Constant phase error of a satellite at the zenith.", 0.005, metavar="M", gt=0)
+    #: Probability that the phases of a standstill follow no model, by a slip or half a cycle that was not seen.
     phase_fault_prior: float = Field(default=1e-3, gt=0, lt=1)
+    #: Error of each antenna's place on the train, along and across: spacing, sway, lean.
     antenna_sigma_m: float = Field(default=0.05, gt=0)
+    #: Error across the track that all tracks of a yard have in common, lean of the antenna on canted track included.
     map_sigma_m: float = option("Error of the map across the track, common to its tracks.", 0.3, metavar="M", ge=0)
+
     unmapped_prior: float = option("Prior probability of a track not in the map.", 0.05, metavar="P", gt=0, lt=1)
-    unmapped_width_m: float = Field(default=60.0, gt=0)
+    unmapped_width_m: float = Field(default=60.0, gt=0)  #: Width over which a track that the map does not have can lie.
 
     def bias_m(self, elevation_deg: Floats) -> Floats:
         """Standard deviation of the constant code error [m]."""
@@ -106,29 +94,14 @@ def _sine(elevation_deg: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class StandstillFix:
-    """Mean place of one antenna at rest.
+    """Mean place of one antenna at rest."""
 
-    Attributes
-    ----------
-    east_north_m : ndarray, shape (2,)
-        From the origin of the yard's coordinates.
-    own_m2 : ndarray, shape (2, 2)
-        Covariance of what this antenna alone has: code bias and noise.
-    common_m2 : ndarray, shape (2, 2)
-        Of what both antennas have: satellites and atmosphere.
-    misfit : float
-        Weighted sum of squares of the residuals.
-    freedom : int
-    place : CodePlace or None
-        With the height, for phases; None where there are none.
-    """
-
-    east_north_m: Floats
-    own_m2: Floats
-    common_m2: Floats
-    misfit: float
+    east_north_m: Floats  #: From the origin of the yard's coordinates, shape (2,).
+    own_m2: Floats  #: Covariance of what this antenna alone has: code bias and noise; shape (2, 2).
+    common_m2: Floats  #: Of what both antennas have: satellites and atmosphere; shape (2, 2).
+    misfit: float  #: Weighted sum of squares of the residuals.
     freedom: int
-    place: CodePlace | None = None
+    place: CodePlace | None = None  #: With the height, for phases; None where there are none.
 
     @property
     def fits(self) -> bool:
@@ -160,7 +133,6 @@ def standstill_fix(
         Time over which it is the mean.
     common_m : ndarray, shape (K,)
         Standard deviation of satellite and atmosphere errors, common to both antennas.
-    errors : StandstillErrors
     receivers : int
         2 where a base station's codes are subtracted, which have such errors too.
 
@@ -207,23 +179,12 @@ class YardTrack:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackPosterior:
-    """Probabilities of tracks.
+    """Probabilities of tracks."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of the tracks, then `NONE`.
-    probability : ndarray, shape (tracks + 1,)
-    with_rising : ndarray, shape (tracks,)
-        Probability that the train stands on the track and faces its direction.
-    fits : bool
-        Whether the codes agree with the error model.
-    """
-
-    names: tuple[str, ...]
-    probability: Floats
-    with_rising: Floats
-    fits: bool
+    names: tuple[str, ...]  #: Of the tracks, then `NONE`.
+    probability: Floats  #: Shape (tracks + 1,).
+    with_rising: Floats  #: Probability that the train stands on the track and faces its direction, shape (tracks,).
+    fits: bool  #: Whether the codes agree with the error model.
 
     def decision(self, *, risk: float) -> str:
         """Name of the track whose probability exceeds one minus the risk; empty while undecided."""
@@ -244,20 +205,14 @@ def track_posterior(
 
     Parameters
     ----------
-    tracks : sequence of YardTrack
     fixes : sequence of StandstillFix
         Of one antenna or both.
     arms_m : sequence of float [m]
         Place of each antenna along the train from a common point, positive to its front.
-    errors : StandstillErrors
     prior : mapping of str to float, optional
         Weights of the mapped tracks by name, from the last place or the interlocking; those not named have none.
     phases : sequence of MeanPhases
         Of each antenna, beside a base station; empty without.
-
-    Returns
-    -------
-    TrackPosterior
     """
     covariance = _covariance(fixes, errors, tracks)
     places = np.concatenate([fix.east_north_m for fix in fixes])
@@ -386,21 +341,11 @@ def _distances(points_m: Floats, places_m: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class _Places:
-    """Hypotheses of a track, U shifts across it.
+    """Hypotheses of a track, U shifts across it."""
 
-    Attributes
-    ----------
-    log_evidence : ndarray, shape (U,)
-        Likelihood integrated over the place along the track.
-    expected_m : ndarray, shape (U, A, 2)
-        Most likely places of the antennas.
-    heading : ndarray, shape (A, 2)
-        Unit vectors along the track there.
-    """
-
-    log_evidence: Floats
-    expected_m: Floats
-    heading: Floats
+    log_evidence: Floats  #: Likelihood integrated over the place along the track, shape (U,).
+    expected_m: Floats  #: Most likely places of the antennas, shape (U, A, 2).
+    heading: Floats  #: Unit vectors along the track there, shape (A, 2).
 
 
 def _places(

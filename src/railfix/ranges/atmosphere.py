@@ -182,22 +182,15 @@ def rtca_troposphere_m(time: Datetimes, latitude_deg: Floats, height_m: Floats, 
 
 @dataclass(frozen=True, kw_only=True)
 class SeenFrom:
-    """Directions to the satellites from a receiver position good to some hundred metres: T epochs by K channels.
+    """Directions to the satellites from a receiver position good to some hundred metres: T epochs by K channels."""
 
-    Attributes
-    ----------
-    receiver_ecef_m : ndarray, shape (T, 3) [m]
-    latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
-        Geodetic coordinates of the receiver.
-    satellite_ecef_m : ndarray, shape (T, K, 3) [m]
-    elevation_deg, azimuth_deg : ndarray, shape (T, K)
-    """
-
-    receiver_ecef_m: Floats
+    receiver_ecef_m: Floats  #: Shape (T, 3).
+    #: Geodetic coordinates of the receiver, shape (T,).
     latitude_deg: Floats
     longitude_deg: Floats
     height_m: Floats
-    satellite_ecef_m: Floats
+    satellite_ecef_m: Floats  #: Shape (T, K, 3).
+    #: Shape (T, K).
     elevation_deg: Floats
     azimuth_deg: Floats
 
@@ -219,23 +212,15 @@ class SeenFrom:
 
 @dataclass(frozen=True, kw_only=True)
 class Delays:
-    """Delays of T epochs by K channels, and the standard deviation of the errors that remain after them.
+    """Delays of T epochs by K channels, and the standard deviation of the errors that remain after them."""
 
-    Attributes
-    ----------
-    ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
-        On the channel's own carrier; 0 where a model is off, NaN where SBAS has none.
-    sigma_m : ndarray, shape (T, K) [m]
-        To be added to that of local errors; 0 by models with received coefficients, NaN where a part of it is
-        unknown.
-    reason : ndarray of int64, shape (T, K)
-        Flags of unknown delays (`railfix.core.reasons.Reason`).
-    """
-
+    #: On the channel's own carrier; 0 where a model is off, NaN where SBAS has none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
+    #: To be added to that of local errors; 0 by models with received coefficients, NaN where a part of it is unknown;
+    #: shape (T, K).
     sigma_m: Floats
-    reason: Bits
+    reason: Bits  #: Flags of unknown delays (`railfix.core.reasons.Reason`), shape (T, K).
 
 
 def modelled_delays(
@@ -252,7 +237,6 @@ def modelled_delays(
     Parameters
     ----------
     time : ndarray of datetime64[ns], shape (T,)
-    seen : SeenFrom
     frequency_hz : ndarray, shape (K,) [Hz]
     klobuchar : ndarray, shape (8,), or None
         None: off.

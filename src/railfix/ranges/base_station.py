@@ -19,75 +19,46 @@ _SAME_S: Final = 0.05
 
 
 class BaseLimits(Settings):
-    """Limits of the differences with a base station.
+    """Limits of the differences with a base station."""
 
-    Attributes
-    ----------
-    longest_age_s, phase_age_s : float [s]
-        Age up to which codes, and phases, of the station are used. Without selective availability
-        errors of codes change by centimetres in 30 s, phases by millimetres in a second.
-    sigma_m : float [m]
-        Standard deviation of a difference beside the train's noise: the station's smoothed multipath.
-    per_km_m : float [m]
-        Added for each kilometre between the two: ionosphere, troposphere and orbits seen from elsewhere.
-    longest_km : float [km]
-        Distance up to which the station is used.
-    drift_m : float [m/sqrt(s)]
-        Random walk of the differences of phases, in place of `PhaseLimits.drift_m`.
-    """
-
+    #: Age up to which codes, and phases, of the station are used. Without selective availability errors of codes change
+    #: by centimetres in 30 s, phases by millimetres in a second.
     longest_age_s: float = Field(default=60.0, gt=0, le=600)
     phase_age_s: float = Field(default=1.1, gt=0, le=30)
+    #: Standard deviation of a difference beside the train's noise: the station's smoothed multipath.
     sigma_m: float = Field(default=0.3, gt=0)
+    #: Added for each kilometre between the two: ionosphere, troposphere and orbits seen from elsewhere.
     per_km_m: float = Field(default=0.004, ge=0)
-    longest_km: float = Field(default=100.0, gt=0)
+    longest_km: float = Field(default=100.0, gt=0)  #: Distance up to which the station is used [km].
+    #: Random walk of the differences of phases, in place of `PhaseLimits.drift_m` [m/sqrt(s)].
     drift_m: float = Field(default=0.001, ge=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaseDifferences:
-    """What a base station subtracts from the ranges of a train, T epochs by K channels.
+    """What a base station subtracts from the ranges of a train, T epochs by K channels."""
 
-    Attributes
-    ----------
-    code_m, phase_m : ndarray, shape (T, K) [m]
-        NaN where the station has none that is new enough.
-    arc : ndarray of int64, shape (T, K)
-        Number of the arc of the station's phase.
-    sigma_m : ndarray, shape (T, K) [m]
-        Standard deviation of the errors of satellite and atmosphere that the difference of codes keeps.
-    """
-
+    #: NaN where the station has none that is new enough, shape (T, K).
     code_m: Floats
     phase_m: Floats
-    arc: Integers
+    arc: Integers  #: Number of the arc of the station's phase, shape (T, K).
+    #: Standard deviation of the errors of satellite and atmosphere that the difference of codes keeps, shape (T, K).
     sigma_m: Floats
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaseErrors:
-    """Errors of the ranges of a base station by channel, B epochs by S channels.
+    """Errors of the ranges of a base station by channel, B epochs by S channels."""
 
-    Attributes
-    ----------
-    ecef_m : ndarray, shape (3,) [m]
-    time : ndarray of datetime64[ns], shape (B,)
-    satellite, signal : ndarray of str, shape (S,)
-    code_m : ndarray, shape (B, S) [m]
-        Corrected code less range and receiver clock of its constellation; NaN where not observed.
-    phase_m : ndarray, shape (B, S) [m]
-        The same of the phase, less one clock for all constellations, with its ambiguity.
-    arc : ndarray of int64, shape (B, S)
-        Number of the arc of each phase.
-    """
-
-    ecef_m: Floats
-    time: Datetimes
+    ecef_m: Floats  #: Shape (3,).
+    time: Datetimes  #: Shape (B,).
+    #: Shape (S,).
     satellite: Strings
     signal: Strings
+    #: Corrected code less range and receiver clock of its constellation; NaN where not observed; shape (B, S).
     code_m: Floats
-    phase_m: Floats
-    arc: Integers
+    phase_m: Floats  #: The same of the phase, less one clock for all constellations, with its ambiguity; shape (B, S).
+    arc: Integers  #: Number of the arc of each phase, shape (B, S).
 
     def __len__(self) -> int:
         return len(self.time)

@@ -34,37 +34,23 @@ from railfix.ranges.weights import (
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectedCodes:
-    """Corrected pseudoranges of T epochs by K channels, those of one receiver clock side by side.
+    """Corrected pseudoranges of T epochs by K channels, those of one receiver clock side by side."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    satellite, signal, clock : ndarray of str, shape (K,)
-        Clock: letter of the receiver clock that a channel is measured with.
-    column : ndarray of int, shape (K,)
-        Channels of the observations.
-    sat_ecef_m : ndarray, shape (T, K, 3) [m]
-        Satellites at the time of transmission.
-    code_m : ndarray, shape (T, K) [m]
-        Pseudorange with satellite clock, group delay and atmosphere applied; NaN where there is none, where another
-        signal of the satellite is used, or where no healthy record is valid.
-    sigma_m : ndarray, shape (T, K) [m]
-        Its standard deviation by C/N0, elevation and stated accuracy.
-    elevation_deg, azimuth_deg : ndarray, shape (T, K)
-    frequency_hz : ndarray, shape (K,)
-    """
-
-    time: Datetimes
+    time: Datetimes  #: Shape (T,).
+    #: Clock: letter of the receiver clock that a channel is measured with; shape (K,).
     satellite: Strings
     signal: Strings
     clock: Strings
-    column: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
-    sat_ecef_m: Floats
+    column: np.ndarray[tuple[int, ...], np.dtype[np.intp]]  #: Channels of the observations, shape (K,).
+    sat_ecef_m: Floats  #: Satellites at the time of transmission, shape (T, K, 3).
+    #: Pseudorange with satellite clock, group delay and atmosphere applied; NaN where there is none, where another
+    #: signal of the satellite is used, or where no healthy record is valid; shape (T, K).
     code_m: Floats
-    sigma_m: Floats
+    sigma_m: Floats  #: Its standard deviation by C/N0, elevation and stated accuracy; shape (T, K).
+    #: Shape (T, K).
     elevation_deg: Floats
     azimuth_deg: Floats
-    frequency_hz: Floats
+    frequency_hz: Floats  #: Shape (K,).
 
 
 def corrected_ranges(
@@ -160,7 +146,6 @@ def corrected_satellites(states: SatelliteStates, fixes: SatelliteCorrections) -
     ----------
     states : SatelliteStates
         Of the records that the corrections are for.
-    fixes : SatelliteCorrections
 
     Returns
     -------
@@ -185,15 +170,8 @@ def sbas_delays(
 
     Parameters
     ----------
-    sbas : SbasCorrections
-    fixes : SatelliteCorrections
     time : ndarray of datetime64[ns], shape (T,)
-    seen : SeenFrom
     frequency_hz : ndarray, shape (K,) [Hz]
-
-    Returns
-    -------
-    Delays
     """
     shape = fixes.state.shape
     ionosphere, troposphere, sigma = np.full((3, *shape), np.nan)

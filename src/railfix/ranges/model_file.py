@@ -18,7 +18,6 @@ def read_model_file(model: type[Model], path: FilePath, *, what: str, format_nam
     ----------
     model : type of Settings
         With a field `format`.
-    path : path
     what : str
         What the file should be, with its article ("an error model").
     format_name : str

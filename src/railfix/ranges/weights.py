@@ -44,23 +44,15 @@ class CodeNoise(Settings):
     """Standard deviation of a corrected pseudorange from C/N0 and elevation.
 
     ``sigma^2 = floor_sigma_m^2 + (zenith_sigma_m * 10^((cn0_reference - min(C/N0, cn0_cap)) / 20) / sin(el))^2``
-
-    Attributes
-    ----------
-    model : {"cn0_elevation", "elevation"}
-        "elevation" leaves the C/N0 factor out.
-    zenith_sigma_m : float
-        At the zenith and the reference C/N0. Only ratios matter to the position: its value for a
-        receiver is estimated from the residuals (`pipeline.AntennaState`).
-    floor_sigma_m : float
-        Error floor: residual errors of satellite clock and orbit, ionosphere and troposphere.
-    cn0_reference_dbhz, cn0_cap_dbhz : float
-        A C/N0 above the cap counts as the cap.
     """
 
-    model: Literal["cn0_elevation", "elevation"] = "cn0_elevation"
+    model: Literal["cn0_elevation", "elevation"] = "cn0_elevation"  #: "elevation" leaves the C/N0 factor out.
+    #: At the zenith and the reference C/N0. Only ratios matter to the position: its value for a receiver is estimated
+    #: from the residuals (`pipeline.AntennaState`).
     zenith_sigma_m: float = Field(default=1.0, gt=0)
+    #: Error floor: residual errors of satellite clock and orbit, ionosphere and troposphere.
     floor_sigma_m: float = Field(default=1.0, ge=0)
+    #: A C/N0 above the cap counts as the cap.
     cn0_reference_dbhz: float = 45.0
     cn0_cap_dbhz: float = 50.0
 
@@ -84,27 +76,19 @@ class NominalErrors(Settings):
 
     ``sigma^2 = satellite^2 + (ionosphere F(el))^2 + (troposphere m(el))^2`` with the mappings of DO-229D
     (A.4.4.10.4 and A.4.2.4).
-
-    Attributes
-    ----------
-    satellite_sigma_m : float
-        Orbit and clock in the range; GPS and Galileo stay near half a metre, their service definitions
-        promise 2 m and 95 % of the time less.
-    usual_accuracy_m : float
-        Accuracies of records (URA, SISA) up to this stand for `satellite_sigma_m`: 2 to 4.85 m are usual.
-        A worse one is believed: it is added to the sigma of the satellite's ranges.
-    ionosphere_sigma_m : float
-        Vertical delay that Klobuchar's model leaves. Mostly common to all satellites, taken as independent.
-    typical_ionosphere_sigma_m : float
-        Added to it, and to the ranges, with typical coefficients: what the two models differ by.
-    troposphere_sigma_m : float
-        Vertical delay that the standard atmosphere leaves (DO-229D A.4.2.4).
     """
 
+    #: Orbit and clock in the range; GPS and Galileo stay near half a metre, their service definitions promise 2 m and
+    #: 95 % of the time less.
     satellite_sigma_m: float = Field(default=0.8, ge=0)
+    #: Accuracies of records (URA, SISA) up to this stand for `satellite_sigma_m`: 2 to 4.85 m are usual. A worse one is
+    #: believed: it is added to the sigma of the satellite's ranges.
     usual_accuracy_m: float = Field(default=5.0, gt=0)
+    #: Vertical delay that Klobuchar's model leaves. Mostly common to all satellites, taken as independent.
     ionosphere_sigma_m: float = Field(default=1.0, ge=0)
+    #: Added to it, and to the ranges, with typical coefficients: what the two models differ by.
     typical_ionosphere_sigma_m: float = Field(default=2.0, ge=0)
+    #: Vertical delay that the standard atmosphere leaves (DO-229D A.4.2.4).
     troposphere_sigma_m: float = Field(default=0.12, ge=0)
 
     def sigma_m(self, elevation_deg: Floats) -> Floats:

@@ -6,9 +6,8 @@
 from railfix.io.sensor_log import Acceleration, Pulses, read_acceleration, read_pulses
 from railfix.reference.assemble import Built, Gap
 from railfix.reference.build import ReferenceData, build_references
-from railfix.reference.driver import ReferenceSummary, reference_files
+from railfix.reference.driver import ReferenceInputs, ReferenceOptions, ReferenceSummary, reference_files
 from railfix.reference.fixes import Fixes, FixRejection
-from railfix.reference.inputs import ReferenceInputs, ReferenceOptions
 from railfix.reference.settings import ReferenceSettings
 
 __all__ = [

@@ -28,28 +28,15 @@ class Gap:
 
 @dataclass(frozen=True, kw_only=True)
 class Built:
-    """Reference of one antenna, with its fixes and gaps.
-
-    Attributes
-    ----------
-    reference : AntennaReference
-    fixes : Fixes
-        Every row of the position log with its reasons for rejection.
-    gaps : tuple of Gap
-    left_out : dict of str to int
-        Instants without a reference by reason: ``before_first_fix``, ``after_last_fix``, ``long_gap``, ``uncertain``.
-    bridged_by : dict of str to int
-        Bridged instants by the sensors that measured there.
-    facts : dict
-        Estimated and used parameters, as plain values.
-    """
+    """Reference of one antenna, with its fixes and gaps."""
 
     reference: AntennaReference
-    fixes: Fixes
+    fixes: Fixes  #: Every row of the position log with its reasons for rejection.
     gaps: tuple[Gap, ...]
+    #: Instants without a reference by reason: ``before_first_fix``, ``after_last_fix``, ``long_gap``, ``uncertain``.
     left_out: dict[str, int]
-    bridged_by: dict[str, int]
-    facts: dict[str, Any]
+    bridged_by: dict[str, int]  #: Bridged instants by the sensors that measured there.
+    facts: dict[str, Any]  #: Estimated and used parameters, as plain values.
 
 
 def assembled(

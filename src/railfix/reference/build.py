@@ -21,7 +21,7 @@ from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
 from railfix.io.sensor_log import Acceleration, Pulses
-from railfix.motion.wheel import Wheel, wheel_of
+from railfix.motion.tachometer import Wheel, wheel_of
 from railfix.positioning.doppler_speed import Dopplers, DopplerSpeed, doppler_speed
 from railfix.reference.assemble import Built, assembled
 from railfix.reference.fixes import Fixes, judge_alone, judge_pair, judge_place, judge_travel
@@ -49,31 +49,15 @@ _TELLING: Final = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceData:
-    """Measurements for a reference.
+    """Measurements for a reference."""
 
-    Attributes
-    ----------
-    logs : mapping of str to PositionLog
-        Positions by antenna, front, rear or both.
-    trajectories : mapping of str to Trajectory
-        Of these antennas, and of those of `dopplers`.
-    dopplers : mapping of str to Dopplers
-        By antenna; may be empty.
-    pulses : Pulses or None
-    acceleration : Acceleration or None
-    facing : {1, -1}
-        1 where the vehicle's front points to rising chainage.
-    distance_m : float [m]
-        Between the two antennas on the body; NaN where the body is not known.
-    """
-
-    logs: Mapping[str, PositionLog]
-    trajectories: Mapping[str, Trajectory]
-    dopplers: Mapping[str, Dopplers] = field(default_factory=dict)
+    logs: Mapping[str, PositionLog]  #: Positions by antenna, front, rear or both.
+    trajectories: Mapping[str, Trajectory]  #: Of these antennas, and of those of `dopplers`.
+    dopplers: Mapping[str, Dopplers] = field(default_factory=dict)  #: By antenna; may be empty.
     pulses: Pulses | None = None
     acceleration: Acceleration | None = None
-    facing: int = 1
-    distance_m: float = float("nan")
+    facing: int = 1  #: 1 where the vehicle's front points to rising chainage.
+    distance_m: float = float("nan")  #: Between the two antennas on the body; NaN where the body is not known.
 
 
 def build_references(data: ReferenceData, settings: ReferenceSettings | None = None) -> dict[str, Built]:

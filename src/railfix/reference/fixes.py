@@ -48,40 +48,22 @@ class FixRejection(IntFlag):
 
 @dataclass(frozen=True, kw_only=True)
 class Fixes:
-    """Positions of one antenna with the reasons for rejection, n rows in order of time.
+    """Positions of one antenna with the reasons for rejection, n rows in order of time."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (n,)
-    ecef_m : ndarray, shape (n, 3) [m]
-    quality : ndarray of int, shape (n,)
-    ratio : ndarray, shape (n,)
-        NaN where the log has none.
-    sigma_enu_m : ndarray, shape (n, 3) [m]
-        East, north, up; NaN where the log has none.
-    rejection : ndarray of int64, shape (n,)
-        `FixRejection` bits; a row that is rejected at one stage is not checked at the next.
-    spacing_m : ndarray, shape (n,) [m]
-        Distance to the other antenna minus that on the vehicle; NaN where it was not checked.
-    arc_m, lateral_m, height_m : ndarray, shape (n,) [m]
-        Position on the trajectory, and distance from it; NaN where it was not checked.
-    sigma_m : ndarray, shape (n,) [m]
-        Along the track.
-    travel_m : ndarray, shape (n,) [m]
-        Distance from the previous good fix minus the distance travelled; NaN where no sensor measured that.
-    """
-
-    time: Datetimes
-    ecef_m: Floats
-    quality: Integers
-    ratio: Floats
-    sigma_enu_m: Floats
-    rejection: Bits
+    time: Datetimes  #: Shape (n,).
+    ecef_m: Floats  #: Shape (n, 3).
+    quality: Integers  #: Shape (n,).
+    ratio: Floats  #: NaN where the log has none, shape (n,).
+    sigma_enu_m: Floats  #: East, north, up; NaN where the log has none; shape (n, 3).
+    rejection: Bits  #: `FixRejection` bits; a row that is rejected at one stage is not checked at the next; shape (n,).
+    #: Distance to the other antenna minus that on the vehicle; NaN where it was not checked; shape (n,).
     spacing_m: Floats
+    #: Position on the trajectory, and distance from it; NaN where it was not checked; shape (n,).
     arc_m: Floats
     lateral_m: Floats
     height_m: Floats
-    sigma_m: Floats
+    sigma_m: Floats  #: Along the track, shape (n,).
+    #: Distance from the previous good fix minus the distance travelled; NaN where no sensor measured that; shape (n,).
     travel_m: Floats
 
     def __len__(self) -> int:

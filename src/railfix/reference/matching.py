@@ -22,22 +22,14 @@ _JITTER_M = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class MatchedReference:
-    """Positions on a trajectory, F of them.
+    """Positions on a trajectory, F of them."""
 
-    Attributes
-    ----------
-    arc_m : ndarray, shape (F,) [m]
-        Of the pass chosen; NaN where no pass is near enough.
-    lateral_m, height_m : ndarray, shape (F,) [m]
-        To the right of and above the trajectory there; those of the nearest point where no pass is near enough.
-    section : ndarray of int, shape (F,)
-        Segment of the trajectory.
-    """
-
-    arc_m: Floats
+    arc_m: Floats  #: Of the pass chosen; NaN where no pass is near enough; shape (F,).
+    #: To the right of and above the trajectory there; those of the nearest point where no pass is near enough; shape
+    #: (F,).
     lateral_m: Floats
     height_m: Floats
-    section: Indices
+    section: Indices  #: Segment of the trajectory, shape (F,).
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,8 +17,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices
 from railfix.core.timescale import seconds
-from railfix.motion.chain import Chain
-from railfix.motion.singer import singer_steps
+from railfix.motion.chain import Chain, singer_steps
 from railfix.reference.settings import ReferenceSettings
 
 #: Standard deviations of what nothing is known of: speed [m/s], difference of the wheel's distance [m].
@@ -37,50 +36,31 @@ _LEAST_STEP_M: Final = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """Measurements along one antenna's path at N instants; NaN where there is none.
+    """Measurements along one antenna's path at N instants; NaN where there is none."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (N,)
-        Rising, steps of at most some seconds.
-    fix_m, fix_sigma_m : ndarray, shape (N,) [m]
-        Arc length of good fixes.
-    doppler_mps, doppler_sigma_mps : ndarray, shape (N,) [m/s]
-    wheel_m : ndarray, shape (N,) [m]
-        Cumulated distance of the wheel along rising chainage, from any start.
-    wheel_sigma_m : float [m]
-        Of one reading: half a pulse and the like.
-    acceleration_mps2 : ndarray, shape (N - 1,) [m/s2]
-        Mean of each step along rising chainage, without gravity.
-    """
-
-    time: Datetimes
+    time: Datetimes  #: Rising, steps of at most some seconds; shape (N,).
+    #: Arc length of good fixes, shape (N,).
     fix_m: Floats
     fix_sigma_m: Floats
+    #: Shape (N,).
     doppler_mps: Floats
     doppler_sigma_mps: Floats
-    wheel_m: Floats
-    wheel_sigma_m: float
-    acceleration_mps2: Floats
+    wheel_m: Floats  #: Cumulated distance of the wheel along rising chainage, from any start; shape (N,).
+    wheel_sigma_m: float  #: Of one reading: half a pulse and the like.
+    acceleration_mps2: Floats  #: Mean of each step along rising chainage, without gravity; shape (N - 1,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothedReference:
-    """Position and speed at every instant.
+    """Position and speed at every instant."""
 
-    Attributes
-    ----------
-    arc_m, sigma_m : ndarray, shape (N,) [m]
-    speed_mps, speed_sigma_mps : ndarray, shape (N,) [m/s]
-    wheel_scale : ndarray, shape (N,)
-        Share that the wheel's distance is too long by; NaN without a wheel.
-    """
-
+    #: Shape (N,).
     arc_m: Floats
     sigma_m: Floats
+    #: Shape (N,).
     speed_mps: Floats
     speed_sigma_mps: Floats
-    wheel_scale: Floats
+    wheel_scale: Floats  #: Share that the wheel's distance is too long by; NaN without a wheel; shape (N,).
 
 
 class _Unknowns:
@@ -235,22 +215,12 @@ def _one(unknowns: _Unknowns, unknown: int) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class Closings:
-    """Closing errors of a measured distance between fixes, over W windows.
+    """Closing errors of a measured distance between fixes, over W windows."""
 
-    Attributes
-    ----------
-    error_m : ndarray, shape (W,) [m]
-        Way measured less way between the fixes.
-    white_m2 : ndarray, shape (W,) [m2]
-        Variance that single readings and the fixes explain.
-    duration_s : ndarray, shape (W,) [s]
-    way_m : ndarray, shape (W,) [m]
-    """
-
-    error_m: Floats
-    white_m2: Floats
-    duration_s: Floats
-    way_m: Floats
+    error_m: Floats  #: Way measured less way between the fixes, shape (W,).
+    white_m2: Floats  #: Variance that single readings and the fixes explain, shape (W,) [m2].
+    duration_s: Floats  #: Shape (W,).
+    way_m: Floats  #: Shape (W,).
 
     def __len__(self) -> int:
         return len(self.error_m)

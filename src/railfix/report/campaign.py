@@ -47,23 +47,12 @@ _FIGURES: Final[Sequence[Column]] = (
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignReport:
-    """What a campaign found.
+    """What a campaign found."""
 
-    Attributes
-    ----------
-    sentences : tuple of str
-        At most five: how many runs, how good, the worst, what has failed.
-    tables : tuple of Table
-        Of the runs, of those that failed, of the worst epochs.
-    charts : tuple of Chart
-    notes : tuple of str
-        On runs that could not be compared with their reference.
-    """
-
-    sentences: tuple[str, ...]
-    tables: tuple[Table, ...]
+    sentences: tuple[str, ...]  #: At most five: how many runs, how good, the worst, what has failed.
+    tables: tuple[Table, ...]  #: Of the runs, of those that failed, of the worst epochs.
     charts: tuple[Chart, ...]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  #: On runs that could not be compared with their reference.
 
 
 def report_campaign(runs: pl.DataFrame, out: Path) -> CampaignReport:

@@ -22,7 +22,7 @@ from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.geodesy import enu_axes
 from railfix.evaluate.run_folder import RunFolder, read_run
-from railfix.run.folder import reading_table
+from railfix.run.record import reading_table
 from railfix.track import read_track
 
 #: What the status of a single epoch says.
@@ -65,34 +65,20 @@ _COLUMNS: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
-    """One epoch of one antenna.
-
-    Attributes
-    ----------
-    run : Path
-    antenna : str
-    time : numpy.datetime64
-        GPS time of the epoch.
-    asked : str
-        The time that was asked for.
-    single, track : mapping
-        Rows of ``positions`` and ``train``; `track` is empty where the filter was off.
-    satellites : polars.DataFrame
-        Every observation, those used first, with its elevation, residual and fate, the weight and innovation that the
-        filter gave it, and for those used how far the single position would move along the line without it, and its
-        standard deviation then [m]; null where it would have none.
-    sentences : tuple of str
-        Where, how sure, and what set sigma, level and status.
-    """
+    """One epoch of one antenna."""
 
     run: Path
     antenna: str
-    time: np.datetime64
-    asked: str
+    time: np.datetime64  #: GPS time of the epoch.
+    asked: str  #: The time that was asked for.
+    #: Rows of ``positions`` and ``train``; `track` is empty where the filter was off.
     single: Mapping[str, Any]
     track: Mapping[str, Any]
+    #: Every observation, those used first, with its elevation, residual and fate, the weight and innovation that the
+    #: filter gave it, and for those used how far the single position would move along the line without it, and its
+    #: standard deviation then [m]; null where it would have none.
     satellites: pl.DataFrame
-    sentences: tuple[str, ...]
+    sentences: tuple[str, ...]  #: Where, how sure, and what set sigma, level and status.
 
 
 def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanation:

@@ -18,8 +18,7 @@ from railfix.evaluate.run_folder import floats
 from railfix.evaluate.tables import evaluation_of, level_tables
 from railfix.pipeline.level_stage import prior_basis_text
 from railfix.report.plots.campaign import processing_time
-from railfix.report.plots.chart import Chart, SkyEpochs
-from railfix.report.plots.columns import start_of
+from railfix.report.plots.chart import Chart, SkyEpochs, start_of
 from railfix.report.plots.errors import (
     error_over_chainage,
     error_over_time,

@@ -50,29 +50,17 @@ def headline(run: ReportedRun, antenna: str, evaluation: Evaluation | None) -> H
 
 @dataclass(frozen=True, kw_only=True)
 class _Compared:
-    """Positions that passed every check beside the conventional ones of the same epochs.
+    """Positions that passed every check beside the conventional ones of the same epochs."""
 
-    Attributes
-    ----------
-    on_map_m, conventional_m : ndarray, shape (N,) [m]
-        Error sizes.
-    epochs : polars.DataFrame
-        Of the N epochs.
-    rate, conventional_rate : float
-        Share of the epochs with observations that have such a position.
-    marked_m : ndarray [m]
-        Error sizes of the positions that failed a check.
-    statuses : list of str
-        Their statuses.
-    """
-
+    #: Error sizes, shape (N,).
     on_map_m: Floats
     conventional_m: Floats
-    epochs: pl.DataFrame
+    epochs: pl.DataFrame  #: Of the N epochs.
+    #: Share of the epochs with observations that have such a position.
     rate: float
     conventional_rate: float
-    marked_m: Floats
-    statuses: list[str]
+    marked_m: Floats  #: Error sizes of the positions that failed a check.
+    statuses: list[str]  #: Their statuses.
 
 
 def _compare(errors: pl.DataFrame) -> _Compared:

@@ -17,7 +17,7 @@ from railfix.evaluate.place import track_of
 from railfix.evaluate.run_folder import NO_MORE, POSITIONS_TABLE, RunFolder, read_run, read_table, tables_of
 from railfix.pipeline.config import Config
 from railfix.ranges.cn0_curve import Cn0Curve, read_cn0_curve
-from railfix.run.folder import reading_table
+from railfix.run.record import reading_table
 from railfix.screens import SCREENS
 from railfix.track import Track
 
@@ -39,42 +39,20 @@ _ERRORS: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class ReportedRun:
-    """One run with the content of its part of the report.
+    """One run with the content of its part of the report."""
 
-    Attributes
-    ----------
-    name : str
-        Of the folder, with as many parent folders as are needed to tell the runs apart.
-    folder : RunFolder
-    config : Config
-        Settings that were used.
-    observations : polars.LazyFrame or None
-        None where the run wrote none.
-    errors, filtered : polars.DataFrame or None
-        Of `railfix.evaluate.EPOCH_COLUMNS` those that the report uses, and levels: of the single-epoch positions, and
-        of the filter along the track; None without a reference or without a filter.
-    train : polars.DataFrame or None
-        Times, places and sigmas by the filter along the track, None without.
-    reference : str
-        Path of the reference; empty without one.
-    conventional : Path or None
-        Run that the conventional positions come from, where it is another one.
-    track : Track or None
-        None where its files cannot be read.
-    curve : Cn0Curve or None
-    notes : tuple of str
-    """
-
-    name: str
+    name: str  #: Of the folder, with as many parent folders as are needed to tell the runs apart.
     folder: RunFolder
-    config: Config
-    observations: pl.LazyFrame | None
+    config: Config  #: Settings that were used.
+    observations: pl.LazyFrame | None  #: None where the run wrote none.
+    #: Of `railfix.evaluate.EPOCH_COLUMNS` those that the report uses, and levels: of the single-epoch positions, and of
+    #: the filter along the track; None without a reference or without a filter.
     errors: pl.DataFrame | None
     filtered: pl.DataFrame | None
-    train: pl.DataFrame | None
-    reference: str
-    conventional: Path | None
-    track: Track | None
+    train: pl.DataFrame | None  #: Times, places and sigmas by the filter along the track, None without.
+    reference: str  #: Path of the reference; empty without one.
+    conventional: Path | None  #: Run that the conventional positions come from, where it is another one.
+    track: Track | None  #: None where its files cannot be read.
     curve: Cn0Curve | None
     notes: tuple[str, ...]
 

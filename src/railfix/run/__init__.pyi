@@ -1,9 +1,9 @@
 # The names of `railfix.run`, imported at their first use (lazy-loader).
 
 from .driver import RunSummary, run_files
-from .folder import RunRecord, read_record
 from .inputs import RunInputs
 from .options import RunOptions, TrackReading
+from .record import RunRecord, read_record
 
 __all__ = [
     "RunInputs",

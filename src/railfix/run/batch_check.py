@@ -10,8 +10,8 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats, Masks
-from railfix.pipeline.columns import Column, by_name, float_column
 from railfix.pipeline.filter_result import AlongTrack
+from railfix.pipeline.result_columns import Column, by_name, float_column
 from railfix.run.output import OutputFolder
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs
@@ -46,12 +46,7 @@ BATCH_COLUMNS: Final[Mapping[str, Column[CheckedAntenna]]] = by_name(
 
 @dataclass(kw_only=True)
 class BatchCheck:
-    """Epochs of one antenna, an epoch a second, with the places that the filter gave them.
-
-    Attributes
-    ----------
-    trajectory : Trajectory
-    """
+    """Epochs of one antenna, an epoch a second, with the places that the filter gave them."""
 
     trajectory: Trajectory
     _epochs: list[GnssEpochs] = field(default_factory=list)

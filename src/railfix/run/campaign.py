@@ -21,11 +21,11 @@ from railfix.core.files import write_whole
 from railfix.core.settings import Settings, load_settings
 from railfix.pipeline.config import Config, load_config
 from railfix.run.driver import run_files
-from railfix.run.folder import read_record
 from railfix.run.inputs import RunInputs
 from railfix.run.options import RunOptions
 from railfix.run.output import check_folder
 from railfix.run.processor import with_measured_priors
+from railfix.run.record import read_record
 
 #: A field in a pattern: ``{day}``.
 _FIELD: Final = re.compile(r"\{(\w+)\}")
@@ -36,37 +36,23 @@ class Campaign(Settings):
 
     Fields that a pattern shares with `front` must agree: ``nav/{day}.nav*`` gives each run the files of its day,
     ``{line}/track.csv`` the track of its line. Names without fields or ``*`` are files of every run.
-
-    Attributes
-    ----------
-    front, rear : str
-        Patterns of the logs: ``logs/{train}/{day}/front.obs*``. Logs with the same fields are one run; several files
-        of one antenna are joined in the order of their names. `rear` may be empty.
-    nav, sp3 : str
-        Patterns of navigation and precise orbit files. `sp3` may be empty.
-    track : tuple of str
-        Patterns of the track's files, joined to a route in this order.
-    vehicle, tachometer, inertial, radar : str
-        Patterns, each of one file a run; may be empty.
-    reference : str
-        Pattern of the reference trajectory of a run, for the page on the campaign; may be empty.
-    config : Path or None
-    options : RunOptions
-        Of every run.
     """
 
+    #: Patterns of the logs: ``logs/{train}/{day}/front.obs*``. Logs with the same fields are one run; several files of
+    #: one antenna are joined in the order of their names. `rear` may be empty.
     front: str
-    nav: str
-    track: tuple[str, ...]
+    nav: str  #: Pattern of navigation files; that of precise orbits (`sp3`) may be empty.
+    track: tuple[str, ...]  #: Patterns of the track's files, joined to a route in this order.
     rear: str = ""
     sp3: str = ""
+    #: Patterns, each of one file a run; may be empty.
     vehicle: str = ""
     tachometer: str = ""
     inertial: str = ""
     radar: str = ""
-    reference: str = ""
+    reference: str = ""  #: Pattern of the reference trajectory of a run, for the page on the campaign; may be empty.
     config: Path | None = None
-    options: RunOptions = RunOptions()
+    options: RunOptions = RunOptions()  #: Of every run.
 
 
 #: Patterns of several files a run, and of one.
@@ -175,7 +161,6 @@ def run_campaign(
     executor : Executor
         Of `concurrent.futures`: processes on this machine, or any other with its interface whose workers see the
         same files.
-    progress : CampaignProgress, optional
     lost : tuple of type
         Errors by which the executor reports that a worker process is gone.
 

@@ -22,21 +22,18 @@ from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import basis_of, level_facts, prior_basis_text, risk_of
 from railfix.pipeline.processor import EpochProcessor, SolvedChunk, State
-from railfix.run.base_station import Beside, base_log
 from railfix.run.batch_check import BatchCheck, add_batch
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
-from railfix.run.chunks import aligned, read_ahead, without_beside
 from railfix.run.inputs import Antenna, RunInputs
 from railfix.run.mate import add_mate_results
 from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
-from railfix.run.processor import processor_of
+from railfix.run.processor import Beside, base_log, processor_of
 from railfix.run.record import AlongSigma, Figures, Filtered, Levels, RunProvenance, package_versions, run_record
-from railfix.run.result_rows import Replays, ResultRows, add_smoothed, shortened
 from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sensors import balises_of, check_filter, read_sensors, units_of_ranges
-from railfix.run.sources import TRACK_FILE, Log, OpenedLine, open_line
-from railfix.run.tally import Tally
+from railfix.run.sources import TRACK_FILE, Log, OpenedLine, aligned, open_line, read_ahead, without_beside
+from railfix.run.tally import Replays, ResultRows, Tally, add_smoothed, shortened
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
 from railfix.track.quality import error_note

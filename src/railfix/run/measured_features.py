@@ -51,21 +51,11 @@ def read_measured(folder: Path) -> pl.DataFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredFeature:
-    """A feature that runs show together.
+    """A feature that runs show together."""
 
-    Attributes
-    ----------
-    feature : Feature
-        Its `arc_m` is a chainage.
-    places_m : ndarray, shape (R,) [m]
-        Its chainage by each of the runs that show it alone.
-    map_m : float [m]
-        Chainage of the same feature of the map; NaN where the map has none.
-    """
-
-    feature: Feature
-    places_m: Floats
-    map_m: float
+    feature: Feature  #: Its `arc_m` is a chainage.
+    places_m: Floats  #: Its chainage by each of the runs that show it alone, shape (R,).
+    map_m: float  #: Chainage of the same feature of the map; NaN where the map has none.
 
 
 def measured_features(
@@ -79,7 +69,6 @@ def measured_features(
         See `read_measured`.
     of_map : sequence of Feature
         Features of the map, by chainage.
-    limits : FeatureLimits, optional
     """
     limits = limits or FeatureLimits()
     alone = [_features(run, limits) for run in runs]

@@ -97,26 +97,15 @@ class Alternative:
 
 @dataclass(frozen=True, kw_only=True)
 class RouteOfLog:
-    """Route of a log through a network, with the probability of every track near it.
-
-    Attributes
-    ----------
-    tracks : tuple of int
-        Of the route, in order.
-    left_out : tuple of int
-        Tracks of the most probable sequence that no route joins to those: the train turned back over them.
-    log : PlanLog
-        Positions that were matched, in the frame of the network.
-    time : datetime64
-        Of the frame's epoch.
-    """
+    """Route of a log through a network, with the probability of every track near it."""
 
     network: Network
-    tracks: tuple[int, ...]
+    tracks: tuple[int, ...]  #: Of the route, in order.
+    #: Tracks of the most probable sequence that no route joins to those: the train turned back over them.
     left_out: tuple[int, ...]
-    log: PlanLog
+    log: PlanLog  #: Positions that were matched, in the frame of the network.
     matched: Matched
-    time: np.datetime64
+    time: np.datetime64  #: Of the frame's epoch.
     reading: TrackReading
 
     @cached_property
@@ -287,23 +276,13 @@ class RouteOfLog:
 
 @dataclass(frozen=True, kw_only=True)
 class LogPositions:
-    """Conventional positions of a log once a second, from which a line that is not known yet is found.
+    """Conventional positions of a log once a second, from which a line that is not known yet is found."""
 
-    Attributes
-    ----------
-    path : str
-        Names the log in messages.
-    parts : callable
-        The pieces of the log in order of time.
-    time : datetime64 or None
-        Of the epoch of frames; None without a navigation record.
-    """
-
-    path: str
-    parts: Callable[[], Iterable[Observations]]
+    path: str  #: Names the log in messages.
+    parts: Callable[[], Iterable[Observations]]  #: The pieces of the log in order of time.
     navigation: Navigation
     config: Config
-    time: np.datetime64 | None
+    time: np.datetime64 | None  #: Of the epoch of frames; None without a navigation record.
     reading: TrackReading
 
     @cached_property

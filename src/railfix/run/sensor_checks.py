@@ -1,23 +1,223 @@
-"""Notes on sensors that contradict the satellites: units, time tags, wheel diameter, position of the ranging unit."""
+"""Notes on sensors that contradict the satellites: units, time tags, wheel diameter, position of the ranging unit.
+
+Signs, units, axes and time tags of the sensors on board, compared with the positions of single epochs.
+
+These do not depend on the sensors, as the speeds of the filter do: a sensor mounted backwards moves the filter too.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final
 
 import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats
-from railfix.core.timescale import seconds
-from railfix.motion.radar_watch import RadarWatch
-from railfix.motion.samples import GroundUnits, RadarSpeeds, SensorSamples, StationRanges
+from railfix.core.constants import GRAVITY_MPS2
+from railfix.core.timescale import gpst_minus_utc, seconds, timedelta
+from railfix.motion.radar import RadarWatch
+from railfix.motion.samples import (
+    GroundUnits,
+    InertialSamples,
+    RadarSpeeds,
+    SensorSamples,
+    StationRanges,
+    TachometerPulses,
+)
 from railfix.motion.tachometer import SpeedCheck, TachometerLimits, check_speeds, pulse_speeds
 from railfix.pipeline.sensor_epochs import SensorLimits, ranging_lever_m
-from railfix.run.sensor_signs import sign_notes
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
+
+#: Places are averaged over cells of this length [s].
+_CELL_S: Final = 4.0
+#: A train that moves, for signs of speeds [m/s].
+_MOVING_MPS: Final = 1.0
+#: Cells that are needed for a statement, and the least root mean square of what is compared: changes of a force [m/s2]
+#: and of a speed [m/s], a rate [rad/s].
+_LEAST_CELLS: Final = 15
+_LEAST_FORCE_MPS2: Final = 0.08
+_LEAST_SPEED_MPS: Final = 1.0
+_LEAST_RATE_RADPS: Final = 0.003
+#: A slope of measured over expected values below this is a reversed sign, above that a rate in degrees.
+_REVERSED: Final = -0.3
+_IN_DEGREES: Final = 10.0
+#: Lags that are tried, and the least that is told [s]; what is left unexplained at no lag is more by this factor.
+_LONGEST_LAG_S: Final = 20.0
+_LEAST_LAG_S: Final = 2.0
+_LESS_ALIKE: Final = 2.0
+#: Share of gravity that a force at rest may differ from it by.
+_GRAVITY_SHARE: Final = 0.12
+
+
+@dataclass(frozen=True)
+class PositionMotion:
+    """Motion of an antenna by its places, M cells of time; NaN where a neighbour is missing."""
+
+    time: Datetimes  #: Shape (M,).
+    #: Toward rising chainage; the gradient is that of the line, as climb over horizontal length, and the heading, too,
+    #: with its rate positive to the right; shape (M,).
+    speed_mps: Floats
+    acceleration_mps2: Floats
+    gradient: Floats
+    heading_rate_radps: Floats
+
+
+def motion_of(places: pl.DataFrame, trajectory: Trajectory) -> PositionMotion:
+    """Compute the motion by ``time_gpst`` and ``chainage_m`` of single epochs, from cells of 4 s that have some."""
+    time = places["time_gpst"].to_numpy().astype("datetime64[ns]")
+    since = seconds(time - time[0])
+    cell = (since // _CELL_S).astype(np.int64)
+    with np.errstate(invalid="ignore"):
+        count = np.bincount(cell)
+        t, chainage = (np.bincount(cell, values) / count for values in (since, places["chainage_m"].to_numpy()))
+    arc = trajectory.arc_at_chainage(chainage)
+    heading = np.radians(trajectory.heading_deg)[trajectory.segment_at(arc)[0]]
+    step, way, turned = np.diff(t), np.diff(chainage), heading[2:] - heading[:-2]
+    span = t[2:] - t[:-2]
+    speed, gained, rate = (np.full(len(t), np.nan) for _ in range(3))
+    speed[1:-1] = (chainage[2:] - chainage[:-2]) / span
+    gained[1:-1] = 2.0 * (way[1:] / step[1:] - way[:-1] / step[:-1]) / span
+    rate[1:-1] = np.arctan2(np.sin(turned), np.cos(turned)) / span
+    known = count > 0
+    gradient = Line.of(trajectory).gradient_at(arc)
+    return PositionMotion(time[0] + timedelta(t[known]), speed[known], gained[known], gradient[known], rate[known])
+
+
+def sign_notes(
+    samples: SensorSamples, places: pl.DataFrame, trajectory: Trajectory, tachometer: TachometerLimits
+) -> Iterator[str]:
+    """Yield a sentence on each sensor with a wrong sign, unit, axis, or time tags seconds off.
+
+    Parameters
+    ----------
+    places : polars.DataFrame
+        ``time_gpst`` and ``chainage_m`` of single epochs of one antenna that passed every check.
+    trajectory : Trajectory
+        Of that antenna.
+    """
+    wheel, radar, inertial = samples.tachometer, samples.radar, samples.inertial
+    yield from _forces_at_rest(inertial)
+    if len(places) < 2:
+        return
+    motion, facing = motion_of(places, trajectory), trajectory.front_sign
+    time, forward = motion.time, facing * motion.speed_mps
+    if len(wheel):
+        directed = "the direction of its pulses is" if wheel.direction.any() else None
+        speeds = partial(_wheel_speeds, wheel, tachometer)
+        yield from _of_speeds("tachometer", time, forward, speeds, directed)
+    if len(radar):
+        yield from _of_speeds("radar", time, forward, partial(_radar_speeds, radar), "the sign of its speeds is")
+    if len(inertial):
+        expected = facing * (motion.acceleration_mps2 + GRAVITY_MPS2 * motion.gradient)
+        force = partial(_means, inertial.time, inertial.force_mps2[:, 0])
+        lag = _lag_s(time, expected, force, _LEAST_FORCE_MPS2)
+        if lag:
+            yield _late("inertial", lag, time[0])
+            return
+        slope = _slope(_centre(expected), _centre(force(time)), _LEAST_FORCE_MPS2)
+        if slope < _REVERSED:
+            yield (
+                "inertial: its force forward is opposite to the acceleration by satellites; the unit is mounted "
+                "backwards, or facing in the vehicle file is wrong"
+            )
+        yaw = _means(inertial.time, inertial.rate_radps[:, 2], time)
+        slope = _slope(motion.heading_rate_radps, yaw, _LEAST_RATE_RADPS)
+        if slope < _REVERSED:
+            yield "inertial: its yaw rate is opposite to that of the line; it must be positive to the right, about down"
+        if abs(slope) > _IN_DEGREES:
+            yield "inertial: its rates are in degrees per second, not in radians; convert them"
+
+
+def _of_speeds(
+    name: str, time: Datetimes, forward: Floats, speeds: Callable[[Datetimes], Floats], directed: str | None
+) -> Iterator[str]:
+    """Check the time tags of a sensor of speeds, and its sign; `directed` names what has the sign."""
+    lag = _lag_s(time, np.abs(forward), lambda at: np.abs(speeds(at)), _LEAST_SPEED_MPS)
+    if lag:
+        yield _late(name, lag, time[0])
+        return
+    measured = speeds(time)
+    known = np.isfinite(measured) & (np.abs(forward) > _MOVING_MPS)
+    if directed and known.sum() >= _LEAST_CELLS and np.mean(measured[known] * forward[known] < 0.0) > 0.5:
+        yield f"{name}: {directed} opposite to the motion by satellites; reverse it, or correct the vehicle's facing"
+
+
+def _lag_s(time: Datetimes, expected: Floats, measured: Callable[[Datetimes], Floats], least: float) -> float:
+    """Lag of the sensor's time tags behind the satellites' [s]; 0 where none of seconds is certain."""
+    x, found = _centre(expected), {}
+    for lag in np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S + 1.0).tolist():
+        y = measured(time + timedelta(np.array([lag])))
+        both = np.isfinite(x) & np.isfinite(y)
+        if both.sum() >= _LEAST_CELLS and x[both].std() >= least and y[both].std() > 0.0:
+            found[lag] = float(np.corrcoef(x[both], y[both])[0, 1]) ** 2
+    if 0.0 not in found:
+        return 0.0
+    best = max(found, key=lambda lag: found[lag])
+    certain = found[best] > 0.5 and 1.0 - found[0.0] > _LESS_ALIKE * (1.0 - found[best])
+    return best if certain and abs(best) >= _LEAST_LAG_S else 0.0
+
+
+def _late(name: str, lag_s: float, time: np.datetime64) -> str:
+    leap = int(gpst_minus_utc(time))
+    utc = "they are UTC, GPS time is expected" if abs(lag_s + leap) <= 1.0 else "correct them"
+    way = "late" if lag_s > 0 else "early"
+    return f"{name}: its time tags are {abs(lag_s):.0f} s {way} against the satellites'; {utc}"
+
+
+def _wheel_speeds(pulses: TachometerPulses, limits: TachometerLimits, time: Datetimes) -> Floats:
+    return pulse_speeds(pulses, time, limits=limits).speed_mps
+
+
+def _radar_speeds(radar: RadarSpeeds, time: Datetimes) -> Floats:
+    at = np.clip(np.searchsorted(radar.time, time), 0, len(radar) - 1)
+    return np.where(np.abs(seconds(radar.time[at] - time)) < 1.0, radar.speed_mps[at], np.nan)
+
+
+def _means(time: Datetimes, values: Floats, middle: Datetimes) -> Floats:
+    """Means of samples over two cells about instants; NaN where the samples do not reach so far."""
+    half = timedelta(np.array([_CELL_S]))
+    begin, end = middle - half, middle + half
+    first, last = np.searchsorted(time, begin), np.searchsorted(time, end)
+    whole = (last > first) & (begin >= time[0]) & (end <= time[-1])
+    total = np.concatenate([[0.0], np.cumsum(np.nan_to_num(values))])
+    return np.where(whole, (total[last] - total[first]) / np.maximum(last - first, 1), np.nan)
+
+
+def _centre(values: Floats) -> Floats:
+    """Values less their mean: an offset of the unit on the body has no part in what it is compared by."""
+    known = np.isfinite(values)
+    return values - (values[known].mean() if known.any() else 0.0)
+
+
+def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
+    """The mean force is gravity, upward: -9.8 m/s2 on the axis that points down."""
+    if not np.isfinite(inertial.force_mps2).any(axis=0).all():
+        return
+    forward, right, down = np.nanmedian(inertial.force_mps2, axis=0).tolist()
+    size = float(np.sqrt(forward**2 + right**2 + down**2))
+    if abs(size - 1.0) < _GRAVITY_SHARE:
+        yield "inertial: its forces are in g, not in m/s2; multiply them by 9.80665"
+    elif abs(size / GRAVITY_MPS2 - 1.0) > _GRAVITY_SHARE:
+        yield f"inertial: its mean force is {size:.2f} m/s2, gravity {GRAVITY_MPS2:.2f}; specific forces are expected"
+    elif abs(down) < 0.8 * size:
+        axis = "force_forward_mps2" if abs(forward) > abs(right) else "force_right_mps2"
+        yield f"inertial: gravity is in {axis}, not in force_down_mps2; swap the columns of the axes"
+    elif down > 0.0:
+        yield f"inertial: force_down_mps2 is {down:+.1f} in the mean, -9.8 was expected; the unit is upside down"
+
+
+def _slope(expected: Floats, measured: Floats, least: float) -> float:
+    """Slope of measured over expected values; NaN where there are too few, or these are too small."""
+    known = np.isfinite(expected) & np.isfinite(measured)
+    x, y = expected[known], measured[known]
+    if len(x) < _LEAST_CELLS or np.sqrt(np.mean(x * x)) < least:
+        return float("nan")
+    return float((x * y).sum() / (x * x).sum())
+
 
 #: Speeds of the wheel are compared this far apart [ns].
 _STEP_NS: Final = 500_000_000
@@ -41,14 +241,9 @@ _RANGE_M: Final = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class SensorChecks:
-    """Positions and speeds of one antenna by satellites, to compare the sensors on board with.
+    """Positions and speeds of one antenna by satellites, to compare the sensors on board with."""
 
-    Attributes
-    ----------
-    speeds, places : list of polars.DataFrame
-        By Dopplers (`doppler_speeds`), and of single epochs that passed every check; of each chunk.
-    """
-
+    #: By Dopplers (`doppler_speeds`), and of single epochs that passed every check; of each chunk.
     speeds: list[pl.DataFrame] = field(default_factory=list)
     places: list[pl.DataFrame] = field(default_factory=list)
 
@@ -74,7 +269,7 @@ class SensorChecks:
         return notes
 
     def radar_alarms(self, radar: RadarSpeeds) -> tuple[str, ...]:
-        """Return a sentence on each alarm of the radar while its table lasts (live: `railfix.live.sensor_watch`)."""
+        """Return a sentence on each alarm of the radar while its table lasts (live: `railfix.live.watches`)."""
         if not self.speeds or not len(radar):
             return ()
         speeds = pl.concat(self.speeds)
@@ -90,8 +285,6 @@ def range_notes(
 
     Parameters
     ----------
-    ranging : StationRanges
-    units : GroundUnits
     places : polars.DataFrame
         ``time_gpst`` and ``chainage_m`` of an antenna.
     trajectory : Trajectory

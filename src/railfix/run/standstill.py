@@ -38,32 +38,18 @@ _LOST, _HALF_CYCLE = 1, 2
 
 @dataclass(frozen=True, kw_only=True)
 class StandstillCodes:
-    """Codes of one antenna at rest, minus those computed for an origin: T epochs, K satellites.
+    """Codes of one antenna at rest, minus those computed for an origin: T epochs, K satellites."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    residual_m : ndarray, shape (T, K)
-        Receiver clock of each constellation removed.
-    system : ndarray of str, shape (K,)
-    azimuth_deg, elevation_deg, common_m : ndarray, shape (K,)
-        `common_m`: standard deviation of satellite and atmosphere errors.
-    receivers : int
-        2 where a base station's codes are subtracted.
-    origin_ecef_m : ndarray, shape (3,)
-    phases : StandstillPhases or None
-        None without a base station.
-    """
-
-    time: Datetimes
-    residual_m: Floats
-    system: Strings
+    time: Datetimes  #: Shape (T,).
+    residual_m: Floats  #: Receiver clock of each constellation removed, shape (T, K).
+    system: Strings  #: Shape (K,).
+    #: `common_m`: standard deviation of satellite and atmosphere errors; shape (K,).
     azimuth_deg: Floats
     elevation_deg: Floats
     common_m: Floats
-    receivers: int
-    origin_ecef_m: Floats
-    phases: StandstillPhases | None = None
+    receivers: int  #: 2 where a base station's codes are subtracted.
+    origin_ecef_m: Floats  #: Shape (3,).
+    phases: StandstillPhases | None = None  #: None without a base station.
 
     def fix(self, epochs: slice, errors: StandstillErrors) -> StandstillFix | None:
         """Mean place over some epochs."""
@@ -179,31 +165,15 @@ def _common_channels(seen: UncorrectedRanges, other: UncorrectedRanges) -> tuple
 
 @dataclass(frozen=True, kw_only=True)
 class StandstillPhases:
-    """Carrier phases of an antenna at rest less those of a base station, T epochs, M satellites.
+    """Carrier phases of an antenna at rest less those of a base station, T epochs, M satellites."""
 
-    Attributes
-    ----------
-    difference_m : ndarray, shape (T, M)
-        Less those computed for the origin; NaN where one of the receivers has none.
-    lost : ndarray of bool, shape (T, M)
-        Whether one of them reports a slip since the epoch before.
-    toward : ndarray, shape (T, M, 3)
-        Unit vectors to the satellites, east, north, up.
-    elevation_deg : ndarray, shape (T, M)
-    wavelength_m : ndarray, shape (M,)
-    group : ndarray of str, shape (M,)
-        Satellites on one clock and signal.
-    distance_m : float
-        From the base station.
-    """
-
-    difference_m: Floats
-    lost: Masks
-    toward: Floats
-    elevation_deg: Floats
-    wavelength_m: Floats
-    group: Strings
-    distance_m: float
+    difference_m: Floats  #: Less those computed for the origin; NaN where one of the receivers has none; shape (T, M).
+    lost: Masks  #: Whether one of them reports a slip since the epoch before, shape (T, M).
+    toward: Floats  #: Unit vectors to the satellites, east, north, up; shape (T, M, 3).
+    elevation_deg: Floats  #: Shape (T, M).
+    wavelength_m: Floats  #: Shape (M,).
+    group: Strings  #: Satellites on one clock and signal, shape (M,).
+    distance_m: float  #: From the base station.
 
     def mean(self, epochs: slice, errors: StandstillErrors) -> MeanPhases:
         """Mean double differences over some epochs, of each satellite over its longest unbroken part."""

@@ -1,11 +1,16 @@
-"""Counts over a run, added up chunk by chunk."""
+"""Counts over a run, added up chunk by chunk.
+
+Rows of a run: the tables of each chunk, and the columns of the smoother at the end.
+"""
 
 from __future__ import annotations
 
+import pickle
+import tempfile
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -14,8 +19,21 @@ from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.integrity.interference import CAUSES
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.pipeline.compared import AntennaOrder
-from railfix.pipeline.filter_result import AlongTrack
-from railfix.pipeline.processor import AntennaResult, Result
+from railfix.pipeline.filter_result import AlongTrack, Replay, smooth
+from railfix.pipeline.passing_table import balise_notes, passing_table
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.results import AntennaResult, Result
+from railfix.pipeline.tables import antenna_positions, observations_table, positions_table, rounded
+from railfix.pipeline.train_table import antenna_train, smoothed_table, train_table, with_smoothed
+from railfix.run.batch_check import BatchCheck
+from railfix.run.output import OutputFolder
+from railfix.run.sensor_checks import SensorChecks
+from railfix.run.sources import OpenedLine
+from railfix.tracking import Line
+
+if TYPE_CHECKING:
+    import polars as pl
+
 
 _NOT_A_REJECTION = Reason.NOT_OBSERVED
 _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
@@ -47,76 +65,50 @@ class MapOffsetFound:
 
 @dataclass(kw_only=True)
 class AntennaTally:
-    """Counts of one antenna.
+    """Counts of one antenna."""
 
-    Attributes
-    ----------
-    min_satellites : int
-        Satellites that an epoch needs.
-    judged : dict of str to bool
-        By verdict of a screen, whether it has judged anything.
-    epochs, observed, positioned : int
-        Epochs; those with at least one pseudorange; those with coordinates.
-    status : Counter of str
-    status_positioned : Counter of str
-        Of the epochs with coordinates.
-    short_first, short_only : Counter of str
-        Epochs with too few satellites by the reason that, in the order of the reasons, left too few, and by a
-        reason without which alone there would be enough. `not_observed`: too few were observed; `used`: enough
-        were used, but their clocks left no range for the place.
-    first_reason, only_reason : Counter of str
-        Rejected observations by the first reason that applied, and those that one reason alone rejected.
-    observations, used : int
-        Pseudoranges, and those that were used.
-    satellites : Counter of str
-        Observations by satellite.
-    unrecorded : Counter of str
-        Observations by satellite for which no navigation record was there or valid.
-    first, last : datetime64[ns] or None
-    conventional : int
-        Epochs with a conventional position.
-    conventional_nearest_m : float
-        Least distance of a conventional position from the trajectory; NaN when there was none.
-    map_detectable_m : ndarray, shape (2, 2) [m]
-        Least and largest offset across (first column) and up that a window finds; NaN without any window.
-    level_status : Counter of str
-        Epochs by status of the protection level; empty where levels are off.
-    without_budget : int
-        Epochs without a level because more faults than can be left out are likelier than the risk allows.
-    map_offset : MapOffsetFound or None
-        Where the 3-D positions contradicted the map most; None before there were enough.
-    interference : dict of str to (int, datetime64[ns])
-        Epochs with each sign of interference, and the first of them.
-    left_out, lasting : dict of str to (int, datetime64[ns])
-        Epochs at which the filter, and the single epochs, left a satellite's codes out as wrong for long, and the first
-        of them.
-    """
-
-    min_satellites: int = 3
-    judged: dict[str, bool] = field(default_factory=dict)
+    min_satellites: int = 3  #: Satellites that an epoch needs.
+    judged: dict[str, bool] = field(default_factory=dict)  #: By verdict of a screen, whether it has judged anything.
+    #: Epochs; those with at least one pseudorange; those with coordinates.
     epochs: int = 0
     observed: int = 0
     positioned: int = 0
+    #: Pseudoranges, and those that were used.
     observations: int = 0
     used: int = 0
+
     status: Counter[str] = field(default_factory=Counter)
-    status_positioned: Counter[str] = field(default_factory=Counter)
+    status_positioned: Counter[str] = field(default_factory=Counter)  #: Of the epochs with coordinates.
+    #: Epochs with too few satellites by the reason that, in the order of the reasons, left too few, and by a reason
+    #: without which alone there would be enough. `not_observed`: too few were observed; `used`: enough were used, but
+    #: their clocks left no range for the place.
     short_first: Counter[str] = field(default_factory=Counter)
     short_only: Counter[str] = field(default_factory=Counter)
+    #: Rejected observations by the first reason that applied, and those that one reason alone rejected.
     first_reason: Counter[str] = field(default_factory=Counter)
     only_reason: Counter[str] = field(default_factory=Counter)
-    satellites: Counter[str] = field(default_factory=Counter)
+    satellites: Counter[str] = field(default_factory=Counter)  #: Observations by satellite.
+    #: Observations by satellite for which no navigation record was there or valid.
     unrecorded: Counter[str] = field(default_factory=Counter)
+
     first: np.datetime64 | None = None
     last: np.datetime64 | None = None
-    conventional: int = 0
+    conventional: int = 0  #: Epochs with a conventional position.
+    #: Least distance of a conventional position from the trajectory; NaN when there was none.
     conventional_nearest_m: float = float("nan")
+    #: Epochs by status of the protection level; empty where levels are off.
     level_status: Counter[str] = field(default_factory=Counter)
+    #: Epochs without a level because more faults than can be left out are likelier than the risk allows.
     without_budget: int = 0
+    #: Where the 3-D positions contradicted the map most; None before there were enough.
     map_offset: MapOffsetFound | None = None
+    #: Epochs at which the filter, and the single epochs, left a satellite's codes out as wrong for long, and the first
+    #: of them.
     left_out: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
     lasting: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
+    #: Epochs with each sign of interference, and the first of them.
     interference: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
+    #: Least and largest offset across (first column) and up that a window finds; NaN without any window; shape (2, 2).
     map_detectable_m: Floats = field(default_factory=lambda: np.full((2, 2), np.nan))
 
     def add(self, result: AntennaResult) -> None:
@@ -256,26 +248,14 @@ def _nonzero(counts: Counter[str]) -> dict[str, int]:
 
 @dataclass(kw_only=True)
 class Tally:
-    """Counts of all antennas of a run.
+    """Counts of all antennas of a run."""
 
-    Attributes
-    ----------
-    min_satellites : int
-        Satellites that an epoch needs.
-    antennas : dict of str to AntennaTally
-    notes : dict of str
-        As keys, in the order in which they came.
-    chunks : list of (datetime64[ns], int, float)
-        First epoch of each chunk, its epochs of all antennas, and the time since the chunk before [s].
-    order : AntennaOrder, optional
-        Test of the order of two antennas.
-    """
-
-    min_satellites: int = 3
+    min_satellites: int = 3  #: Satellites that an epoch needs.
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
-    notes: dict[str, None] = field(default_factory=dict)
+    notes: dict[str, None] = field(default_factory=dict)  #: As keys, in the order in which they came.
+    #: First epoch of each chunk, its epochs of all antennas, and the time since the chunk before [s].
     chunks: list[tuple[np.datetime64, int, float]] = field(default_factory=list)
-    order: AntennaOrder | None = None
+    order: AntennaOrder | None = None  #: Test of the order of two antennas.
 
     def add(self, result: Result) -> None:
         """Count one more chunk."""
@@ -324,3 +304,100 @@ def _count_left_out(
         name, first = str(satellite[k]), time[int(np.argmax(left_out[:, k]))]
         before = counts.get(name, (0, first))
         counts[name] = (before[0] + int(left_out[:, k].sum()), before[1])
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultRows:
+    """What is made of each chunk of results."""
+
+    folder: OutputFolder
+    line: OpenedLine
+    observations: bool  #: Whether rows of observations are wanted.
+    checks: SensorChecks | None  #: Takes those of the first antenna, where there are sensors.
+    replays: Mapping[str, Replays]  #: Keeps what the filter was given, by antenna; empty where nothing is smoothed.
+    #: The same, of the epochs that a batch is compared with.
+    batches: Mapping[str, BatchCheck] = field(default_factory=dict)
+    passings: bool = False  #: Whether rows of balises and virtual ones are wanted.
+    #: Balises so far that were missed, or read where they are not.
+    balise_notes: list[str] = field(default_factory=list)
+
+    def write(self, result: Result) -> None:
+        """Write the rows of a chunk, with their tracks on a route of a network."""
+        tables = {"positions": positions_table(result)}
+        if result.fusion:
+            tables["train"] = train_table(result)
+        if self.observations:
+            tables["observations"] = observations_table(result)
+        if self.checks is not None and result.fusion:
+            name = next(iter(result.fusion))
+            self.checks.take(antenna_positions(name, result.antennas[name]), antenna_train(name, result.fusion[name]))
+        for name, own in result.fusion.items():
+            self.balise_notes.extend(balise_notes(name, own.passings))
+        if self.passings:
+            tables["passings"] = passing_table(result)
+        for name, check in self.batches.items():
+            if name in result.fusion:
+                check.take(result.fusion[name])
+        for name, kept in self.replays.items():
+            if name in result.fusion:
+                kept.keep(result.fusion[name].replay)
+        if self.line.route is not None:
+            tables["positions"], tables["tracks"] = self.line.route.on_tracks(tables["positions"], self.line.track)
+            if "train" in tables:
+                tables["train"], _ = self.line.route.on_tracks(tables["train"], self.line.track)
+        for name, table in tables.items():
+            self.folder.append_parquet(f"{name}.parquet", table)
+            if name != "observations":
+                self.folder.append_csv(f"{name}.csv", rounded(table))
+
+
+#: Notes on balises that a run gives.
+_MOST_NOTES: Final = 20
+
+
+def shortened(notes: list[str]) -> list[str]:
+    """Return the first notes, and how many there are beside."""
+    more = len(notes) - _MOST_NOTES
+    return notes if more <= 0 else [*notes[:_MOST_NOTES], f"{more} more notes on balises; see the table of passings"]
+
+
+class Replays:
+    """What the filter was given, chunk by chunk, in a file that ends with the process."""
+
+    def __init__(self) -> None:
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the run
+        self._starts: list[int] = []
+
+    def __del__(self) -> None:
+        self._file.close()
+
+    def keep(self, chunk: tuple[Replay, ...]) -> None:
+        """Add a chunk."""
+        self._starts.append(self._file.tell())
+        pickle.dump(chunk, self._file, protocol=pickle.HIGHEST_PROTOCOL)
+
+    def backward(self) -> Iterator[Replay]:
+        """Yield what was kept, the last first."""
+        for start in reversed(self._starts):
+            self._file.seek(start)
+            yield from reversed(pickle.load(self._file))
+
+
+def add_smoothed(replays: Mapping[str, Replays], processor: EpochProcessor, folder: OutputFolder) -> None:
+    """Write `train.*` again with the columns of the smoother, after the last chunk."""
+    smoothed = {}
+    for name, kept in replays.items():
+        trajectory = processor.trajectories[name]
+        result = smooth(kept.backward(), Line.of(trajectory), processor.config.tracking)
+        smoothed[name] = smoothed_table(result, trajectory)
+    done = dict.fromkeys(smoothed, 0)
+
+    def widened(table: pl.DataFrame) -> pl.DataFrame:
+        parts = {}
+        for name, whole in smoothed.items():
+            count = int((table["antenna"] == name).sum())
+            parts[name] = whole[done[name] : done[name] + count]
+            done[name] += count
+        return with_smoothed(table, parts)
+
+    folder.change("train", widened)

@@ -55,54 +55,33 @@ SEPARATE_CLOCKS_M: Final = 100.0
 
 
 class AntennaPairLimits(Settings):
-    """Limits of the screen by two antennas.
+    """Limits of the screen by two antennas."""
 
-    Attributes
-    ----------
-    limit_m : float [m]
-        Largest difference from what is expected; P1 table 6: 5.
-    elevation_error_deg, azimuth_error_deg : float [deg]
-        Error of the satellite's direction from the car body; P1 2.3(3): 3 and 3.5.
-    clocks : {"common", "median"}
-        One clock by hardware, or the median of each constellation.
-    least_satellites : int
-        "median": satellites of a constellation that both antennas need.
-    tag_tolerance_s : float [s]
-        Largest difference of the time tags of a pair of epochs.
-    verdict : {"weigh", "reject"}
-        Treatment of a satellite whose difference does not fit: its sigma grows on both antennas, as which of
-        them is wrong is unknown, or it is rejected on both, as in P1.
-    """
-
+    #: Largest difference from what is expected; P1 table 6: 5.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
+    #: Error of the satellite's direction from the car body; P1 2.3(3): 3 and 3.5.
     elevation_error_deg: float = Field(default=3.0, ge=0.0, le=90.0)
     azimuth_error_deg: float = Field(default=3.5, ge=0.0, le=90.0)
-    clocks: Literal["common", "median"] = "median"
-    least_satellites: int = Field(default=4, ge=3)
+    clocks: Literal["common", "median"] = "median"  #: One clock by hardware, or the median of each constellation.
+    least_satellites: int = Field(default=4, ge=3)  #: "median": satellites of a constellation that both antennas need.
+    #: Largest difference of the time tags of a pair of epochs.
     tag_tolerance_s: float = Field(default=0.01, ge=0.0, lt=1.0)
+    #: Treatment of a satellite whose difference does not fit: its sigma grows on both antennas, as which of them is
+    #: wrong is unknown, or it is rejected on both, as in P1.
     verdict: Literal["weigh", "reject"] = "weigh"
 
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaPairScreened(Screened):
-    """Verdict on P pairs of epochs and C pairs of channels; the metric is measured less expected [m].
+    """Verdict on P pairs of epochs and C pairs of channels; the metric is measured less expected [m]."""
 
-    Attributes
-    ----------
-    expected_m : ndarray, shape (P, C) [m]
-        Pseudorange of the rear antenna less that of the front one, from the spacing.
-    ambiguity_m : ndarray, shape (P, C) [m]
-        What the errors of the angles explain; within it nothing is rejected, whatever the limit.
-    clock_m : ndarray, shape (P, C) [m]
-        Clock of the rear receiver less that of the front one, as taken out; 0 where common, NaN where it should be.
-    clocks : str
-        How the clocks were treated, in words.
-    """
-
-    expected_m: Floats
+    expected_m: Floats  #: Pseudorange of the rear antenna less that of the front one, from the spacing; shape (P, C).
+    #: What the errors of the angles explain; within it nothing is rejected, whatever the limit; shape (P, C).
     ambiguity_m: Floats
+    #: Clock of the rear receiver less that of the front one, as taken out; 0 where common, NaN where it should be;
+    #: shape (P, C).
     clock_m: Floats
-    clocks: str
+    clocks: str  #: How the clocks were treated, in words.
 
 
 class Spacing(NamedTuple):
@@ -114,18 +93,10 @@ class Spacing(NamedTuple):
 
 
 class TagDifference(NamedTuple):
-    """Instants of the two receivers.
+    """Instants of the two receivers."""
 
-    Attributes
-    ----------
-    later : array_like of timedelta64[ns], shape (P,)
-        Time tags of the rear receiver less those of the front one.
-    range_rate_mps : array_like, shape (P, C) [m/s]
-        ``-lambda D``, NaN where unknown: then left out.
-    """
-
-    later: ArrayLike
-    range_rate_mps: ArrayLike
+    later: ArrayLike  #: Time tags of the rear receiver less those of the front one, shape (P,).
+    range_rate_mps: ArrayLike  #: ``-lambda D``, NaN where unknown: then left out; shape (P, C).
 
 
 def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> Spacing:
@@ -136,10 +107,6 @@ def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> Spacin
     front_ecef_m, rear_ecef_m : array_like, shape (P, 3) [m]
         On their trajectories at the same instant. Both may be wrong along the track by as much as the
         line stays straight: only their difference counts.
-
-    Returns
-    -------
-    Spacing
     """
     front, rear = np.asarray(front_ecef_m, dtype=np.float64), np.asarray(rear_ecef_m, dtype=np.float64)
     latitude, longitude, _ = geodetic_from_ecef((front + rear) / 2.0)
@@ -245,7 +212,6 @@ def antenna_pair_screen(
         Of `spacing_direction`.
     tags : TagDifference, optional
         Without it the instants count as one.
-    limits : AntennaPairLimits, optional
 
     Returns
     -------

@@ -27,26 +27,18 @@ from railfix.screens.base import (
 
 
 class AntennaSpacingLimits(Settings):
-    """Limits of the check of two positions.
+    """Limits of the check of two positions."""
 
-    Attributes
-    ----------
-    limit_m : float [m]
-        Largest difference from the spacing; P1 table 6: 5.
-    filter_sigmas : float
-        Places by the filter differ by more than the limit where both were predicted: by so many of their standard
-        deviations too. The same of their speeds.
-    filter_speed_mps : float [m/s]
-        Largest difference of the two speeds by the filter. Antennas of one vehicle have one speed, but for a few cm/s
-        where the track curves or its cant changes; a lesser difference of single epochs moves no place by a metre.
-    filter_held_s : float [s]
-        Time for which neither place is trusted: a wrong speed leaves a wrong place behind, which codes take back within
-        some 20 s.
-    """
-
+    #: Largest difference from the spacing; P1 table 6: 5.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
+    #: Places by the filter differ by more than the limit where both were predicted: by so many of their standard
+    #: deviations too. The same of their speeds.
     filter_sigmas: float = Field(default=4.0, gt=0.0, allow_inf_nan=False)
+    #: Largest difference of the two speeds by the filter. Antennas of one vehicle have one speed, but for a few cm/s
+    #: where the track curves or its cant changes; a lesser difference of single epochs moves no place by a metre.
     filter_speed_mps: float = Field(default=1.5, gt=0.0)
+    #: Time for which neither place is trusted: a wrong speed leaves a wrong place behind, which codes take back within
+    #: some 20 s.
     filter_held_s: float = Field(default=20.0, ge=0.0, allow_inf_nan=False)
 
 
@@ -70,7 +62,6 @@ def antenna_spacing_screen(
     facing : array_like of int, shape (P,) or scalar
         1 where the vehicle's front looks to rising chainage, -1 to falling, 0 where that is unknown:
         then the order of the two is not judged.
-    limits : AntennaSpacingLimits, optional
 
     Returns
     -------

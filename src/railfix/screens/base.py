@@ -27,77 +27,47 @@ LEAST_SUSPICION: Final = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaRanges:
-    """Corrected ranges of one antenna as a screen sees them: T epochs by K channels.
+    """Corrected ranges of one antenna as a screen sees them: T epochs by K channels."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    break_before : ndarray of bool, shape (T,)
-        Epochs that must not be differenced with the one before.
-    satellite, signal, frequency_hz : ndarray, shape (K,)
-        Of each channel.
-    code_m, doppler_hz, cn0_dbhz : ndarray, shape (T, K)
-        As observed.
-    anchor_ecef_m : ndarray, shape (T, 3) [m]
-        Approximate place of the antenna, from which the directions to the satellites are computed.
-    elevation_deg, azimuth_deg : ndarray, shape (T, K)
-    corrected_code_m, sigma_m : ndarray, shape (T, K) [m]
-        Pseudoranges with satellite clock, group delay and atmosphere applied, and their standard deviations.
-    reason : ndarray of int64, shape (T, K)
-        `reasons.Reason` bits so far, 0 = usable.
-    """
-
-    time: Datetimes
-    break_before: Masks
+    time: Datetimes  #: Shape (T,).
+    break_before: Masks  #: Epochs that must not be differenced with the one before, shape (T,).
+    #: Of each channel, shape (K,).
     satellite: Strings
     signal: Strings
     frequency_hz: Floats
+    #: As observed, shape (T, K).
     code_m: Floats
     doppler_hz: Floats
     cn0_dbhz: Floats
+    #: Approximate place of the antenna, from which the directions to the satellites are computed; shape (T, 3).
     anchor_ecef_m: Floats
+    #: Shape (T, K).
     elevation_deg: Floats
     azimuth_deg: Floats
+    #: Pseudoranges with satellite clock, group delay and atmosphere applied, and their standard deviations; shape (T,
+    #: K).
     corrected_code_m: Floats
     sigma_m: Floats
-    reason: Bits
+    reason: Bits  #: `reasons.Reason` bits so far, 0 = usable; shape (T, K).
 
 
 @dataclass(frozen=True, kw_only=True)
 class Screened:
-    """Metric and verdict of one screen, T epochs by M channels, or P pairs of positions.
+    """Metric and verdict of one screen, T epochs by M channels, or P pairs of positions."""
 
-    Attributes
-    ----------
-    metric : ndarray
-        Measured quantity in the unit that the screen names; NaN where it cannot judge.
-    reject : ndarray of bool
-        True = rejected. Where the metric is NaN the screen does not reject.
-    """
-
-    metric: Floats
-    reject: Masks
+    metric: Floats  #: Measured quantity in the unit that the screen names; NaN where it cannot judge.
+    reject: Masks  #: True = rejected. Where the metric is NaN the screen does not reject.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """A screen's result on the channels of one antenna.
+    """A screen's result on the channels of one antenna."""
 
-    Attributes
-    ----------
-    name : str
-        Key in `AntennaResult.screens`: the screen's own name, or one a verdict where it has several.
-    reason : Reason
-        Given to the rejected observations.
-    screened : Screened
-        Shapes (T, K).
-    error_m : ndarray, shape (T, K), or None [m]
-        Size of the error that was measured: what fails is weighted down by it and not rejected. None: rejected.
-    """
-
-    name: str
-    reason: Reason
-    screened: Screened
+    name: str  #: Key in `AntennaResult.screens`: the screen's own name, or one a verdict where it has several.
+    reason: Reason  #: Given to the rejected observations.
+    screened: Screened  #: Shapes (T, K).
+    #: Size of the error that was measured: what fails is weighted down by it and not rejected. None: rejected; shape
+    #: (T, K).
     error_m: Floats | None = None
 
 
@@ -125,68 +95,34 @@ def suspicion_sigma_m(reject: Masks, error_m: Floats, sigma_m: Floats) -> Floats
 
 @dataclass(frozen=True, kw_only=True)
 class ScreenSetup:
-    """Facts of a run that some screens need.
+    """Facts of a run that some screens need."""
 
-    Attributes
-    ----------
-    antennas : int
-        Number of antennas.
-    spacing_known : bool
-        Whether a vehicle file places both antennas on one vehicle.
-    cn0_curve : Cn0Curve or None
-        Mean C/N0 over elevation of antenna and receiver.
-    """
-
-    antennas: int = 1
-    spacing_known: bool = False
-    cn0_curve: Cn0Curve | None = None
+    antennas: int = 1  #: Number of antennas.
+    spacing_known: bool = False  #: Whether a vehicle file places both antennas on one vehicle.
+    cn0_curve: Cn0Curve | None = None  #: Mean C/N0 over elevation of antenna and receiver.
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScreenColumn:
-    """A column of the result tables that a screen fills.
+    """A column of the result tables that a screen fills."""
 
-    Attributes
-    ----------
-    name : str
-        With its unit: ``metric_doppler_m``.
-    meaning : str
-    verdict : str
-        Key in `AntennaResult.screens`.
-    field : str
-        Array of that verdict: "metric", or another one of a subclass of `Screened`.
-    table : {"observations", "positions"}
-    """
-
-    name: str
+    name: str  #: With its unit: ``metric_doppler_m``.
     meaning: str
-    verdict: str
-    field: str = "metric"
+    verdict: str  #: Key in `AntennaResult.screens`.
+    field: str = "metric"  #: Array of that verdict: "metric", or another one of a subclass of `Screened`.
     table: Literal["observations", "positions"] = "observations"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScreenPicture:
-    """Data of the picture of one screen, T epochs by M channels (M = 1 for a screen of positions).
-
-    Attributes
-    ----------
-    title : str
-    label : str
-        Name of the metric, with its unit.
-    metric : ndarray, shape (T, M)
-    reject : ndarray of bool, shape (T, M)
-    limit : ndarray or float
-        Broadcasts to (T, M).
-    sides : {"both", "above", "below"}
-        Side on which the screen rejects: beyond the limit on both sides, above it, or below it.
-    """
+    """Data of the picture of one screen, T epochs by M channels (M = 1 for a screen of positions)."""
 
     title: str
-    label: str
-    metric: Floats
-    reject: Masks
-    limit: Floats | float
+    label: str  #: Name of the metric, with its unit.
+    metric: Floats  #: Shape (T, M).
+    reject: Masks  #: Shape (T, M).
+    limit: Floats | float  #: Broadcasts to (T, M).
+    #: Side on which the screen rejects: beyond the limit on both sides, above it, or below it.
     sides: Literal["both", "above", "below"] = "both"
 
 
@@ -204,24 +140,12 @@ class RunTables(Protocol):
 
 
 class Screen(ABC, Generic[Limits]):
-    """One screen; derive from the subclass for what it judges.
+    """One screen; derive from the subclass for what it judges."""
 
-    Attributes
-    ----------
-    name : str
-        In `Config.screens`, and of its group of settings.
-    limits : Limits
-        Default limits; their type has the fields of the group of settings.
-    needs : str
-        Data without which it cannot judge, for the note.
-    columns : tuple of ScreenColumn
-        Columns of the result tables.
-    """
-
-    name: ClassVar[str]
-    limits: Limits
-    needs: ClassVar[str]
-    columns: ClassVar[tuple[ScreenColumn, ...]] = ()
+    name: ClassVar[str]  #: In `Config.screens`, and of its group of settings.
+    limits: Limits  #: Default limits; their type has the fields of the group of settings.
+    needs: ClassVar[str]  #: Data without which it cannot judge, for the note.
+    columns: ClassVar[tuple[ScreenColumn, ...]] = ()  #: Columns of the result tables.
 
     def unable(self, limits: Limits, setup: ScreenSetup) -> bool:  # noqa: ARG002  for screens that override it
         """Return whether the screen can judge nothing in this run."""
@@ -247,9 +171,6 @@ class ObservationScreen(Screen[Limits]):
 
         Parameters
         ----------
-        antenna : AntennaRanges
-        limits : Limits
-        setup : ScreenSetup
         state : object
             Returned with the chunk before; None at the start. Screens without memory return None.
         """
@@ -257,23 +178,16 @@ class ObservationScreen(Screen[Limits]):
 
 @dataclass(frozen=True, kw_only=True)
 class PairedEpochs:
-    """Common epochs of two antennas of one vehicle, P of them.
+    """Common epochs of two antennas of one vehicle, P of them."""
 
-    Attributes
-    ----------
-    front_epoch, rear_epoch : ndarray of int, shape (P,)
-        Epochs of each antenna that belong together.
-    front_ecef_m, rear_ecef_m : ndarray, shape (P, 3) [m]
-        Approximate places of the antennas on their trajectories.
-    along_m : ndarray, shape (P,) [m]
-        Chainage of the front antenna less that of the rear one: negative where the vehicle faces falling
-        chainage.
-    """
-
+    #: Epochs of each antenna that belong together, shape (P,).
     front_epoch: Indices
     rear_epoch: Indices
+    #: Approximate places of the antennas on their trajectories, shape (P, 3).
     front_ecef_m: Floats
     rear_ecef_m: Floats
+    #: Chainage of the front antenna less that of the rear one: negative where the vehicle faces falling chainage; shape
+    #: (P,).
     along_m: Floats
 
 
@@ -311,15 +225,9 @@ class FilteredMotion(NamedTuple):
 
 
 class PositionScreen(_OfTwoAntennas[Limits]):
-    """A screen of the positions of two antennas of one vehicle.
+    """A screen of the positions of two antennas of one vehicle."""
 
-    Attributes
-    ----------
-    status : Status
-        Given to the epochs of both antennas whose positions are rejected.
-    """
-
-    status: ClassVar[Status]
+    status: ClassVar[Status]  #: Given to the epochs of both antennas whose positions are rejected.
 
     @abstractmethod
     def judge(self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: Limits) -> Screened:

@@ -33,38 +33,23 @@ from railfix.screens.base import (
 
 
 class Cn0Limits(Settings):
-    """Limits of the screen of signal strength.
+    """Limits of the screen of signal strength."""
 
-    Attributes
-    ----------
-    deficit_dbhz : float or None [dB-Hz]
-        Largest deficit against the mean at the elevation; P1 table 6: 10. None switches the
-        curve off.
-    floor_dbhz : float or None [dB-Hz]
-        Weakest signal used; None, the default, switches the floor off. P1 table 6: 30, for its receivers. C/N0 is
-        measured differently by each receiver: 30 rejects over half of the signals of an M8T in a city, where 20 to 25
-        fits.
-    """
-
+    #: Largest deficit against the mean at the elevation; P1 table 6: 10. None switches the curve off.
     deficit_dbhz: float | None = Field(default=10.0, gt=0.0, allow_inf_nan=False)
+    #: Weakest signal used; None, the default, switches the floor off. P1 table 6: 30, for its receivers. C/N0 is
+    #: measured differently by each receiver: 30 rejects over half of the signals of an M8T in a city, where 20 to 25
+    #: fits.
     floor_dbhz: float | None = Field(default=None, gt=0.0, lt=100.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Screened:
-    """Verdicts on signal strength, two screens with a reason each.
+    """Verdicts on signal strength, two screens with a reason each."""
 
-    Attributes
-    ----------
-    floor : Screened
-        The metric is C/N0 [dB-Hz].
-    curve : Screened
-        The metric is the deficit, mean at the elevation less C/N0 [dB]; NaN where the curve does not
-        reach: no curve given, none for the constellation and signal, elevation unknown or below
-        the lowest of the curve.
-    """
-
-    floor: Screened
+    floor: Screened  #: The metric is C/N0 [dB-Hz].
+    #: The metric is the deficit, mean at the elevation less C/N0 [dB]; NaN where the curve does not reach: no curve
+    #: given, none for the constellation and signal, elevation unknown or below the lowest of the curve.
     curve: Screened
 
 
@@ -85,7 +70,6 @@ def cn0_screen(
         NaN where the log has none: not judged.
     elevation_deg : array_like, shape (T, M) [deg]
     satellite, signal : ndarray of str, shape (M,)
-    limits : Cn0Limits, optional
     curve : Cn0Curve, optional
         Without one only the floor is applied.
 

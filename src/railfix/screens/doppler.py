@@ -42,18 +42,11 @@ _NS: Final = 1e9
 
 @dataclass(frozen=True, kw_only=True)
 class DopplerScreened(Screened):
-    """Verdict of the Doppler screen; the metric is P1's, from one epoch to the next [m].
+    """Verdict of the Doppler screen; the metric is P1's, from one epoch to the next [m]."""
 
-    Attributes
-    ----------
-    limit_m : ndarray, shape (T, M) [m]
-        NaN where the metric is.
-    level_m : ndarray, shape (T, M) [m]
-        How far a suspected satellite stands from the level it had before its jump, 0 where it is
-        not suspected, NaN where the metric is.
-    """
-
-    limit_m: Floats
+    limit_m: Floats  #: NaN where the metric is, shape (T, M).
+    #: How far a suspected satellite stands from the level it had before its jump, 0 where it is not suspected, NaN
+    #: where the metric is; shape (T, M).
     level_m: Floats
 
 
@@ -63,32 +56,20 @@ def _none(kind: str) -> Strings:
 
 @dataclass(frozen=True, kw_only=True)
 class DopplerState:
-    """The last epoch seen, and the satellites under suspicion then; shapes (M,).
+    """The last epoch seen, and the satellites under suspicion then; shapes (M,)."""
 
-    Attributes
-    ----------
-    time : datetime64[ns]
-        NaT before the first epoch.
-    satellite, signal : ndarray of str
-        Channels; those of the next chunk may be others.
-    code_m, doppler_hz, code_sigma_m : ndarray
-        NaN where absent.
-    level_m : ndarray [m]
-        See `DopplerScreened`.
-    since : ndarray of datetime64[ns]
-        Time of the jump, NaT where not suspected.
-    scale_sum, scale_epochs : float
-        Sum of the logarithms of the receiver's scale, and how many epochs are in it (mode "receiver").
-    """
-
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
+    #: Channels; those of the next chunk may be others.
     satellite: Strings = field(default_factory=lambda: _none("<U3"))
     signal: Strings = field(default_factory=lambda: _none("<U2"))
+    #: NaN where absent.
     code_m: Floats = field(default_factory=lambda: np.empty(0))
     doppler_hz: Floats = field(default_factory=lambda: np.empty(0))
     code_sigma_m: Floats = field(default_factory=lambda: np.empty(0))
-    level_m: Floats = field(default_factory=lambda: np.empty(0))
+    level_m: Floats = field(default_factory=lambda: np.empty(0))  #: See `DopplerScreened`.
+    #: Time of the jump, NaT where not suspected.
     since: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
+    #: Sum of the logarithms of the receiver's scale, and how many epochs are in it (mode "receiver").
     scale_sum: float = 0.0
     scale_epochs: float = 0.0
 
@@ -131,12 +112,10 @@ def doppler_screen(
     time : array_like of datetime64[ns], shape (T,)
     code_m, doppler_hz : array_like, shape (T, M) [m], [Hz]
         NaN where absent. Implausible codes (0, 1e9) must be left out by the caller.
-    channels : DopplerChannels
     break_before : array_like of bool, shape (T,), optional
         Nothing is differenced across the step into these epochs.
     code_sigma_m : array_like, shape (T, M) [m], optional
         Noise of the codes, asked for by mode "sigma"; NaN there: not judged.
-    limits : DopplerLimits, optional
     state : DopplerState, optional
         Left by the chunk before.
 
@@ -263,7 +242,6 @@ def suspicions(
         Of the satellites that are under suspicion already.
     since_before : ndarray of int64, shape (M,) [ns]
         Start of the suspicion; NaT as a number for none.
-    hold_ns : int
 
     Returns
     -------

@@ -48,50 +48,33 @@ _LEAST_CHANGES: Final = 5
 
 
 class DopplerLimits(Settings):
-    """Limits of the Doppler screen.
+    """Limits of the Doppler screen."""
 
-    Attributes
-    ----------
-    mode : {"fixed", "receiver", "sigma"}
-        Limit scaled by the receiver's noise, P1's, or by the stated sigmas; see the module.
-    step_m : float [m]
-        Largest change against the Doppler up to `short_interval_s`; P1 table 6: 1.5.
-    short_interval_s : float [s]
-        P1's interval is 0.1 s; twice that, so that one lost epoch changes nothing.
-    correlation_s : float [s]
-        Time over which the receiver smooths its codes. 1 s gives 2.9 m at 1 s.
-    jerk_mps3 : float [m/s^3]
-        Largest jerk of the vehicle; trains stay below 1.
-    factor : float
-        Modes "receiver" and "sigma": standard deviations.
-    doppler_sigma_mps : float [m/s]
-        Mode "sigma": standard deviation of a range rate from the Doppler.
-    prior_epochs : float
-        Mode "receiver": weight of the fixed limit in the estimate of the scale, in epochs.
-    longest_interval_s : float [s]
-        Over a longer interval the screen cannot judge.
-    hold_s : float [s]
-        How long a satellite stays rejected after a jump; 0 rejects only the epochs of the jumps out and back, which is
-        exactly P1's test.
-    least_satellites : int
-        Satellites of one clock needed to take its step out.
-    verdict : {"weigh", "reject"}
-        Treatment of a suspected satellite: its sigma grows by the size of the jump
-        (`railfix.screens.suspicion_sigma_m`), or it is rejected, as in P1. Where few satellites are left,
-        the geometry without one turns a few metres into a hundred; a weight does not.
-    """
-
+    #: Limit scaled by the receiver's noise, P1's, or by the stated sigmas; see the module.
     mode: Literal["fixed", "receiver", "sigma"] = "receiver"
+    #: Largest change against the Doppler up to `short_interval_s`; P1 table 6: 1.5.
     step_m: float = Field(default=1.5, gt=0.0, allow_inf_nan=False)
+    #: P1's interval is 0.1 s; twice that, so that one lost epoch changes nothing.
     short_interval_s: float = Field(default=0.2, gt=0.0, allow_inf_nan=False)
+    #: Time over which the receiver smooths its codes. 1 s gives 2.9 m at 1 s.
     correlation_s: float = Field(default=1.0, gt=0.0, allow_inf_nan=False)
+    #: Largest jerk of the vehicle; trains stay below 1 [m/s^3].
     jerk_mps3: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
+    #: Modes "receiver" and "sigma": standard deviations.
     factor: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
+    #: Mode "sigma": standard deviation of a range rate from the Doppler.
     doppler_sigma_mps: float = Field(default=0.1, ge=0.0, allow_inf_nan=False)
+    #: Mode "receiver": weight of the fixed limit in the estimate of the scale, in epochs.
     prior_epochs: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
+    #: Over a longer interval the screen cannot judge.
     longest_interval_s: float = Field(default=2.5, gt=0.0, allow_inf_nan=False)
+    #: How long a satellite stays rejected after a jump; 0 rejects only the epochs of the jumps out and back, which is
+    #: exactly P1's test.
     hold_s: float = Field(default=2.0, ge=0.0, allow_inf_nan=False)
-    least_satellites: int = Field(default=3, ge=3)
+    least_satellites: int = Field(default=3, ge=3)  #: Satellites of one clock needed to take its step out.
+    #: Treatment of a suspected satellite: its sigma grows by the size of the jump
+    #: (`railfix.screens.suspicion_sigma_m`), or it is rejected, as in P1. Where few satellites are left, the geometry
+    #: without one turns a few metres into a hundred; a weight does not.
     verdict: Literal["weigh", "reject"] = "weigh"
 
 
@@ -124,7 +107,6 @@ def expected_limit_m(interval_s: Floats, sigma_m: Floats, *, limits: DopplerLimi
     interval_s : ndarray, shape (T,) [s]
     sigma_m : ndarray, shape (T + 1, M) [m]
         Of the codes, the epoch before the first one included.
-    limits : DopplerLimits
     """
     interval = interval_s[:, None]
     fresh = -np.expm1(-interval / limits.correlation_s)
@@ -144,7 +126,6 @@ def receiver_limit_m(
     metric_m : ndarray, shape (T, M) [m]
     sum_log, weight : float
         Sum of the logarithms of the epochs' scales so far, and their number.
-    limits : DopplerLimits
 
     Notes
     -----

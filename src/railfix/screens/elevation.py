@@ -23,14 +23,9 @@ from railfix.screens.base import (
 
 
 class ElevationLimits(Settings):
-    """Limits of the elevation mask.
+    """Limits of the elevation mask."""
 
-    Attributes
-    ----------
-    mask_deg : float
-        Satellites below are rejected; P1 3.3 and table 6 use 20.
-    """
-
+    #: Satellites below are rejected; P1 3.3 and table 6 use 20.
     mask_deg: float = Field(default=20.0, ge=-90.0, lt=90.0)
 
 
@@ -41,7 +36,6 @@ def elevation_screen(elevation_deg: ArrayLike, *, limits: ElevationLimits | None
     ----------
     elevation_deg : array_like, shape (T, M) [deg]
         NaN where unknown: not judged.
-    limits : ElevationLimits, optional
     """
     limits = limits or ElevationLimits()
     metric = np.asarray(elevation_deg, dtype=np.float64)

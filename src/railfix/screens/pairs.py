@@ -86,7 +86,6 @@ def pair_antennas(
 
     Parameters
     ----------
-    front, rear : AntennaRanges
     front_anchor_ecef_m : ndarray, shape (T, 3) [m]
         Approximate places of the front antenna.
     front_path, rear_path : Trajectory

@@ -9,7 +9,6 @@ use, by the same published formulas, so that an error in either shows as a posit
 """
 
 from railfix.simulate.alignment import Alignment, build_alignment
-from railfix.simulate.body import AntennaTruth, antenna_truth
 from railfix.simulate.constellation import simulated_navigation
 from railfix.simulate.demonstration import DEMO_FILES, demo_files, demo_folder
 from railfix.simulate.disturbance import Disturbance, Disturbances, SightGeometry
@@ -23,7 +22,7 @@ from railfix.simulate.line_settings import (
     MapError,
     Terrain,
 )
-from railfix.simulate.motion import Motion, build_motion, run_curve, shuttle
+from railfix.simulate.motion import AntennaTruth, Motion, antenna_truth, build_motion, run_curve, shuttle
 from railfix.simulate.run import section_table, truth_table, write_run
 from railfix.simulate.scenario import (
     ANTENNAS,

@@ -53,17 +53,10 @@ GRADIENT: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class Alignment(Knots):
-    """A line of given elements.
-
-    Attributes
-    ----------
-    settings : LineSettings
-    file : FileLine or None
-        The curve through the points of a track file, in place of the integrated one.
-    """
+    """A line of given elements."""
 
     settings: LineSettings
-    file: FileLine | None = None
+    file: FileLine | None = None  #: The curve through the points of a track file, in place of the integrated one.
 
     @property
     def length_m(self) -> float:

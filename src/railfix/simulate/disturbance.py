@@ -11,54 +11,30 @@ from railfix.core.arrays import Datetimes, Floats, Strings
 
 @dataclass(frozen=True, kw_only=True)
 class SightGeometry:
-    """Positions of one antenna and directions to its satellites at T epochs, M channels.
+    """Positions of one antenna and directions to its satellites at T epochs, M channels."""
 
-    Attributes
-    ----------
-    antenna : str
-        "front" or "rear".
-    time : ndarray of datetime64[ns], shape (T,)
-    satellite, signal : ndarray of str, shape (M,)
-    chainage_m : ndarray, shape (T,) [m]
-        Of the centreline point abeam the antenna.
-    speed_mps : ndarray, shape (T,) [m/s]
-        Negative toward falling chainage.
-    antenna_ecef_m : ndarray, shape (T, 3) [m]
-    heading_deg : ndarray, shape (T,) [deg]
-        Azimuth of the vehicle's forward axis.
-    elevation_deg, azimuth_deg : ndarray, shape (T, M) [deg]
-    """
-
-    antenna: str
-    time: Datetimes
+    antenna: str  #: "front" or "rear".
+    time: Datetimes  #: Shape (T,).
+    #: Shape (M,).
     satellite: Strings
     signal: Strings
-    chainage_m: Floats
-    speed_mps: Floats
-    antenna_ecef_m: Floats
-    heading_deg: Floats
+    chainage_m: Floats  #: Of the centreline point abeam the antenna, shape (T,).
+    speed_mps: Floats  #: Negative toward falling chainage, shape (T,).
+    antenna_ecef_m: Floats  #: Shape (T, 3).
+    heading_deg: Floats  #: Azimuth of the vehicle's forward axis, shape (T,).
+    #: Shape (T, M).
     elevation_deg: Floats
     azimuth_deg: Floats
 
 
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
-    """Terms added to the observations, shapes (T, M).
+    """Terms added to the observations, shapes (T, M)."""
 
-    Attributes
-    ----------
-    code_m : ndarray [m]
-        NaN where the signal is lost; all observables are then absent.
-    phase_m : ndarray [m]
-    doppler_hz : ndarray [Hz]
-    cn0_db : ndarray [dB]
-        Negative where the signal is attenuated.
-    """
-
-    code_m: Floats
+    code_m: Floats  #: NaN where the signal is lost; all observables are then absent.
     phase_m: Floats
     doppler_hz: Floats
-    cn0_db: Floats
+    cn0_db: Floats  #: Negative where the signal is attenuated.
 
 
 #: A source of disturbances: a function of the geometry alone, so that results do not depend on the chunks.

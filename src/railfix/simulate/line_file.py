@@ -36,20 +36,14 @@ _CANT_STEP_M: Final = 0.005
 
 @dataclass(frozen=True, kw_only=True)
 class Knots:
-    """Curvature, lean and gradient, linear between knots.
+    """Curvature, lean and gradient, linear between knots."""
 
-    Attributes
-    ----------
-    knot_m, curvature, lean_m : ndarray, shape (K,)
-        Chainage of the elements' ends from 0 [m]; in plan, right positive [1/m]; cant, positive where the vehicle
-        leans right [m].
-    grade_knot_m, grade : ndarray, shape (G,)
-        Chainage [m] and gradient [m/m, climb over plan length].
-    """
-
+    #: Chainage of the elements' ends from 0 [m]; in plan, right positive [1/m]; cant, positive where the vehicle leans
+    #: right [m]; shape (K,).
     knot_m: Floats
     curvature: Floats
     lean_m: Floats
+    #: Chainage [m] and gradient [m/m, climb over plan length]; shape (G,).
     grade_knot_m: Floats
     grade: Floats
 
@@ -176,22 +170,11 @@ _TIGHTEST_M: Final = 30.0
 
 @dataclass(frozen=True, kw_only=True)
 class FileLine:
-    """The line of a track file.
+    """The line of a track file."""
 
-    Attributes
-    ----------
-    track : Track
-        The file's points that are used.
-    point_m : ndarray, shape (V,) [m]
-        Chainage of the points on the curve.
-    curve : CubicHermiteSpline
-        Points of the line, ECEF [m], over chainage [m].
-    knots : Knots
-    """
-
-    track: Track
-    point_m: Floats
-    curve: CubicHermiteSpline[np.float64]
+    track: Track  #: The file's points that are used.
+    point_m: Floats  #: Chainage of the points on the curve, shape (V,).
+    curve: CubicHermiteSpline[np.float64]  #: Points of the line, ECEF [m], over chainage [m].
     knots: Knots
 
 

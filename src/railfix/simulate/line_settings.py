@@ -27,23 +27,15 @@ LONGEST_LINE_M: Final = 1e7
 
 
 class Element(ScenarioSettings):
-    """Horizontal alignment element.
+    """Horizontal alignment element."""
 
-    Attributes
-    ----------
-    kind : {"straight", "transition", "curve"}
-        A transition is a clothoid from the element before to the one after; cant rises with its curvature.
-    length_m : float
-    radius_m : float
-        Of a curve, positive to the right; infinite for the others.
-    cant_m : float
-        Of a curve: outer rail above inner rail.
-    """
-
+    #: A transition is a clothoid from the element before to the one after; cant rises with its curvature.
     kind: Literal["straight", "transition", "curve"]
+
     length_m: float = Field(gt=0.0, le=LONGEST_LINE_M)
+    #: Of a curve, positive to the right; infinite for the others.
     radius_m: float = Field(default=math.inf, allow_inf_nan=True)
-    cant_m: float = Field(default=0.0, ge=0.0, le=0.3)
+    cant_m: float = Field(default=0.0, ge=0.0, le=0.3)  #: Of a curve: outer rail above inner rail.
 
     @model_validator(mode="after")
     def _curves_alone_bend(self) -> Element:
@@ -59,65 +51,36 @@ class Element(ScenarioSettings):
 
 
 class Gradient(ScenarioSettings):
-    """Gradient from a chainage on.
+    """Gradient from a chainage on."""
 
-    Attributes
-    ----------
-    from_m : float
-        Chainage of the change, the middle of its vertical curve.
-    permille : float
-        Positive where the line rises with chainage.
-    vertical_radius_m : float
-        Radius of the vertical curve that joins it to the gradient before.
-    """
-
-    from_m: NotNegative
-    permille: float = Field(ge=-100.0, le=100.0)
-    vertical_radius_m: Positive = 4000.0
+    from_m: NotNegative  #: Chainage of the change, the middle of its vertical curve.
+    permille: float = Field(ge=-100.0, le=100.0)  #: Positive where the line rises with chainage.
+    vertical_radius_m: Positive = 4000.0  #: Radius of the vertical curve that joins it to the gradient before.
 
 
 class Terrain(ScenarioSettings):
-    """Limits of the elements of a generated line from a chainage on; lengths and radii are uniform in their ranges.
-
-    Attributes
-    ----------
-    from_m : float
-    straight_m, curve_m, radius_m : tuple of float
-        Range of the lengths of straights and curves, transitions not counted, and of the radii.
-    permille : float
-        Steepest gradient.
-    gradient_m : tuple of float
-        Range of the distance between two changes of gradient.
-    """
+    """Limits of the elements of a generated line from a chainage on; lengths and radii are uniform in their ranges."""
 
     from_m: NotNegative = 0.0
+    #: Range of the lengths of straights and curves, transitions not counted, and of the radii.
     straight_m: Annotated[Between, at_least(1.0)] = (200.0, 1500.0)
     curve_m: Annotated[Between, at_least(1.0)] = (100.0, 500.0)
     radius_m: Annotated[Between, at_least(100.0)] = (400.0, 1600.0)
-    permille: float = Field(default=10.0, ge=0.0, le=35.0)
+    permille: float = Field(default=10.0, ge=0.0, le=35.0)  #: Steepest gradient.
+    #: Range of the distance between two changes of gradient.
     gradient_m: Annotated[Between, at_least(200.0)] = (400.0, 1500.0)
 
 
 class GeneratedLine(ScenarioSettings):
-    """Commercial line generated from a seed.
+    """Commercial line generated from a seed."""
 
-    Attributes
-    ----------
-    seed : int
-        Of the line alone, so that several runs share it.
-    speed_mps : float
-        The cant is the equilibrium cant at this speed, up to `largest_cant_m`, in steps of 5 mm.
-    largest_cant_m : float
-    vertical_radius_m : float
-    terrain : tuple of Terrain
-        By rising `from_m`, the first from 0.
-    """
-
-    seed: Seed = 1
+    seed: Seed = 1  #: Of the line alone, so that several runs share it.
+    #: The cant is the equilibrium cant at this speed, up to `largest_cant_m`, in steps of 5 mm.
     speed_mps: Positive = 110.0 / 3.6
+
     largest_cant_m: NotNegative = 0.105
     vertical_radius_m: Positive = 4000.0
-    terrain: tuple[Terrain, ...] = (Terrain(),)
+    terrain: tuple[Terrain, ...] = (Terrain(),)  #: By rising `from_m`, the first from 0.
 
     @field_validator("terrain")
     @classmethod
@@ -129,21 +92,13 @@ class GeneratedLine(ScenarioSettings):
 
 
 class LineFile(ScenarioSettings):
-    """Track file used as the line.
+    """Track file used as the line."""
 
-    Attributes
-    ----------
-    path : str
-        As `railfix.track.read_track` reads it; in a scenario file relative to that file.
-    from_m, to_m : float
-        Part of the file's chainage that is used.
-    crs, height_datum, geoid : str
-        As the options of `read_track`; empty where the file states them itself.
-    """
-
-    path: str
+    path: str  #: As `railfix.track.read_track` reads it; in a scenario file relative to that file.
+    #: Part of the file's chainage that is used.
     from_m: NotNegative = 0.0
     to_m: float = Field(default=math.inf, allow_inf_nan=True)
+    #: As the options of `read_track`; empty where the file states them itself.
     crs: str = ""
     height_datum: str = ""
     geoid: str = ""
@@ -152,21 +107,11 @@ class LineFile(ScenarioSettings):
 
 
 class MapError(ScenarioSettings):
-    """Offset of the map from the true line: a smooth Gaussian function of chainage.
+    """Offset of the map from the true line: a smooth Gaussian function of chainage."""
 
-    Attributes
-    ----------
-    plan_sigma_m : float
-        Standard deviation of each of the east and north offsets.
-    height_sigma_m : float
-    correlation_m : float
-        Distance along the line over which the correlation falls to exp(-1/2).
-    seed : int
-    """
-
-    plan_sigma_m: NotNegative = 0.0
+    plan_sigma_m: NotNegative = 0.0  #: Standard deviation of each of the east and north offsets.
     height_sigma_m: NotNegative = 0.0
-    correlation_m: Positive = 500.0
+    correlation_m: Positive = 500.0  #: Distance along the line over which the correlation falls to exp(-1/2).
     seed: Seed = 1
 
 
@@ -178,44 +123,28 @@ def _length_m(given: dict[str, Any]) -> float:
 
 
 class LineSettings(ScenarioSettings):
-    """The line and the spacing of its map.
-
-    Attributes
-    ----------
-    name : str
-    kind : {"pattern", "elements", "generated", "file"}
-        The pattern of P1's test line; `elements` and `gradients`; `generated`; or `file`.
-    latitude_deg, longitude_deg, height_m : float
-        First point; ellipsoidal height. Not used for a file.
-    azimuth_deg : float
-        Direction of the line at its first point. Not used for a file.
-    kilometrage_start_m : float
-        Kilometrage of the first point; it rises with chainage. A file brings its own.
-    straight_spacing_m, curve_spacing_m : float
-        Largest spacing of the map's points; curves include their transitions. A file brings its points.
-    elements : tuple of Element
-    gradients : tuple of Gradient
-        Level where there is none.
-    length_m : float
-        The pattern, 756 m long, is repeated (every second time mirrored) and cut off here; a generated
-        line ends here. Elements have their own sum, and a file its own length (NaN here).
-    generated : GeneratedLine
-    file : LineFile or None
-    map_error : MapError
-    """
+    """The line and the spacing of its map."""
 
     name: str = "made test line"
+    #: The pattern of P1's test line; `elements` and `gradients`; `generated`; or `file`.
     kind: Literal["pattern", "elements", "generated", "file"] = "pattern"
+    #: First point; ellipsoidal height. Not used for a file.
     latitude_deg: float = Field(default=35.05, gt=-80.0, lt=80.0)
     longitude_deg: Finite = 135.45
     height_m: Finite = 162.0
-    azimuth_deg: Finite = 63.0
+    azimuth_deg: Finite = 63.0  #: Direction of the line at its first point. Not used for a file.
+    #: Kilometrage of the first point; it rises with chainage. A file brings its own.
     kilometrage_start_m: Finite = 12_340.0
+    #: Largest spacing of the map's points; curves include their transitions. A file brings its points.
     straight_spacing_m: Positive = 20.0
     curve_spacing_m: Positive = 2.32
+
     elements: tuple[Element, ...] = ()
-    gradients: tuple[Gradient, ...] = ()
+    gradients: tuple[Gradient, ...] = ()  #: Level where there is none.
+    #: The pattern, 756 m long, is repeated (every second time mirrored) and cut off here; a generated line ends here.
+    #: Elements have their own sum, and a file its own length (NaN here).
     length_m: float = Field(default_factory=_length_m, allow_inf_nan=True)
+
     generated: GeneratedLine = GeneratedLine()
     file: LineFile | None = None
     map_error: MapError = MapError()

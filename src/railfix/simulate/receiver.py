@@ -1,23 +1,211 @@
-"""A simulated receiver: its channels, their constants, and the noise and lock state carried between chunks."""
+"""A simulated receiver: its channels, their constants, and the noise and lock state carried between chunks.
+
+Time-correlated receiver noise, loss of lock and re-acquisition, with the state carried between chunks.
+
+Klobuchar (IS-GPS-200, 20.3.3.5.2.5) and Saastamoinen with the standard atmosphere and 70 % relative
+humidity: a receiver that applies them corrects the simulated delays exactly, unless a scale changes them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
 
-from railfix.core.arrays import Datetimes, Floats
+from railfix.core.arrays import Bytes, Datetimes, Floats, Masks
 from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.gnss.navigation import KeplerRecords
 from railfix.gnss.observations import ObservationHeader
+from railfix.simulate.constellation import newest_record
 from railfix.simulate.errors.common import CommonErrors
 from railfix.simulate.errors.processes import ClockWalk, satellite_key
-from railfix.simulate.errors.settings import InterSystemSettings
-from railfix.simulate.noise import CarriedNoise, CodeSmoothing, TrackingNoise
-from railfix.simulate.satellites import newest_record
+from railfix.simulate.errors.settings import InterSystemSettings, NoiseSettings, TrackingSettings
 from railfix.simulate.scenario import ANTENNAS, Scenario
+
+
+class CarriedNoise:
+    """Correlated noise of a receiver's channels, chunk by chunk; results do not depend on the chunks.
+
+    The key is the seed, another one for each receiver.
+    """
+
+    def __init__(self, settings: NoiseSettings, *, key: Sequence[int], channels: int, interval_s: float) -> None:
+        self._settings = settings
+        self._code = _FirstOrder((*key, 0), channels, interval_s / settings.code_correlation_time_s)
+        self._cn0 = _FirstOrder((*key, 1), channels, interval_s / settings.cn0_wander_time_s)
+
+    def code(self, white: Floats) -> Floats:
+        """Code noise of standard deviation 1, shape (T, M), from white noise of that shape."""
+        share = self._settings.code_correlated_share
+        if share == 0.0:
+            return white
+        return np.asarray(np.sqrt(1.0 - share) * white + np.sqrt(share) * self._code.next(len(white)))
+
+    def cn0_db(self, epochs: int) -> Floats | float:
+        """Variation of C/N0 [dB] over the next epochs, shape (T, M); 0 where there is none."""
+        sigma = self._settings.cn0_wander_sigma_db
+        return 0.0 if sigma == 0.0 else sigma * self._cn0.next(epochs)
+
+
+class _FirstOrder:
+    """Autoregressive series of order 1 and standard deviation 1: ``x[k] = rho x[k-1] + sqrt(1 - rho^2) w[k]``."""
+
+    def __init__(self, key: Sequence[int], channels: int, steps_a_time: float) -> None:
+        self._rng = np.random.default_rng(list(key))
+        self._rho = float(np.exp(-steps_a_time))
+        self._state = self._rho * self._rng.standard_normal((1, channels))
+
+    def next(self, epochs: int) -> Floats:
+        white = np.sqrt(1.0 - self._rho**2) * self._rng.standard_normal((epochs, self._state.shape[1]))
+        series, self._state = lfilter([1.0], [1.0, -self._rho], white, axis=0, zi=self._state)
+        return np.asarray(series)
+
+
+class CodeSmoothing:
+    """Filter of first order on the code errors of a receiver's channels, restarted after each loss of lock.
+
+    ``y[k] = y[k-1] + (1 - exp(-interval / time)) (x[k] - y[k-1])``, y = x at the first epoch of a lock; a time constant
+    of 0 is no filter. The state is carried from chunk to chunk.
+    """
+
+    def __init__(self, time_s: float, *, channels: int, interval_s: float) -> None:
+        self._keep = float(np.exp(-interval_s / time_s)) if time_s > 0.0 else 0.0
+        self._state = np.full(channels, np.nan)
+
+    def next(self, error_m: Floats, lost: Masks) -> Floats:
+        """Filtered errors of the next epochs, shape (T, M); unchanged where lost."""
+        if self._keep == 0.0:
+            return error_m
+        smoothed, keep = error_m.copy(), self._keep
+        locked = np.zeros((len(error_m) + 2, error_m.shape[1]), dtype=np.int8)
+        locked[1:-1] = ~lost
+        change = np.diff(locked, axis=0)
+        for channel in np.flatnonzero((~lost).any(axis=0)):
+            starts, ends = (np.flatnonzero(change[:, channel] == sign) for sign in (1, -1))
+            for first, last in zip(starts.tolist(), ends.tolist(), strict=True):
+                x = error_m[first:last, channel]
+                before = self._state[channel] if first == 0 and np.isfinite(self._state[channel]) else x[0]
+                smoothed[first:last, channel] = lfilter([1.0 - keep], [1.0, -keep], x, zi=[keep * before])[0]
+        self._state = np.where(lost[-1], np.nan, smoothed[-1])
+        return smoothed
+
+
+@dataclass(frozen=True, kw_only=True)
+class LockState:
+    """Lock state of a receiver's channels."""
+
+    lost: Masks  #: Absent, shape (T, M).
+    slip_cycles: Floats | float  #: Whole cycles that the phase has moved since the start, shape (T, M).
+    loss_of_lock: Bytes  #: Bit 0 at the first epoch after a loss, shape (T, M).
+
+
+class TrackingNoise:
+    """Loss of lock and re-acquisition of a receiver's channels; the state is carried from chunk to chunk.
+
+    The key is the seed of the slips, another one for each receiver.
+    """
+
+    def __init__(self, settings: TrackingSettings, *, key: Sequence[int], channels: int, interval_s: float) -> None:
+        self._settings = settings
+        self._wait = int(np.ceil(settings.reacquisition_s / interval_s - 1e-9))
+        self._salt = np.random.default_rng(list(key)).integers(0, 2**63, channels, dtype=np.uint64)
+        # Epochs since the signal could last not be tracked; at the start as if it always could.
+        self._since = np.full(channels, self._wait + 1, dtype=np.int64)
+        self._seen = np.zeros(channels, dtype=np.bool_)
+        self._present = np.zeros(channels, dtype=np.bool_)
+        self._losses = np.zeros(channels, dtype=np.uint64)
+        self._weak = np.zeros(channels, dtype=np.bool_)
+
+    def too_weak(self, cn0_dbhz: Floats) -> Masks:
+        """Signals that have fallen below the threshold and not yet risen to the C/N0 of re-acquisition."""
+        threshold, again = self._settings.threshold_dbhz, self._settings.reacquisition_dbhz
+        if threshold is None:
+            return np.zeros(cn0_dbhz.shape, dtype=np.bool_)
+        weak = cn0_dbhz < threshold
+        if again is None:
+            return np.asarray(weak)
+        # The last of both events decides; between them the state before the first epoch.
+        epoch = np.arange(1, len(cn0_dbhz) + 1)[:, None]
+        fallen = np.maximum.accumulate(np.where(weak, epoch, np.where(self._weak, 0, -1)), axis=0)
+        risen = np.maximum.accumulate(
+            np.where(cn0_dbhz >= max(again, threshold), epoch, np.where(self._weak, -1, 0)), axis=0
+        )
+        state = fallen > risen
+        self._weak = state[-1]
+        return np.asarray(state)
+
+    def follow(self, bad: Masks) -> LockState:
+        """Lock state over the next epochs of channels that cannot be tracked where `bad`, shape (T, M)."""
+        epoch = np.arange(1, len(bad) + 1, dtype=np.int64)[:, None]
+        last_bad = np.maximum.accumulate(np.where(bad, epoch, -self._since), axis=0)
+        since = epoch - last_bad
+        lost = bad | (since <= self._wait)
+        here = np.concatenate([self._present[None], ~lost])
+        seen = np.maximum.accumulate(np.concatenate([self._seen[None], ~lost]), axis=0)
+        back = here[1:] & ~here[:-1] & seen[:-1]
+        losses = self._losses + np.cumsum(back, axis=0, dtype=np.uint64)
+        self._since = np.minimum(since[-1], self._wait + 1)
+        self._present, self._seen, self._losses = here[-1], seen[-1], losses[-1]
+        if self._settings.slips == "none":
+            return LockState(lost=lost, slip_cycles=0.0, loss_of_lock=np.zeros(bad.shape, dtype=np.uint8))
+        return LockState(lost=lost, slip_cycles=_cycles(self._salt, losses), loss_of_lock=back.astype(np.uint8))
+
+
+def _cycles(salt: NDArray[np.uint64], losses: NDArray[np.uint64]) -> Floats:
+    """Whole cycles in +-2e6 for each channel and number of losses, 0 for none (mixed by splitmix64)."""
+    mixed = salt + losses * np.uint64(0x9E3779B97F4A7C15)
+    mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    mixed ^= mixed >> np.uint64(31)
+    cycles = (mixed % np.uint64(4_000_001)).astype(np.float64) - 2_000_000.0
+    return np.where(losses == 0, 0.0, cycles)
+
+
+_HUMIDITY: Final = 0.7
+
+
+def ionosphere_m(
+    coefficients: Floats,
+    second_of_day_s: Floats,
+    latitude_deg: Floats,
+    longitude_deg: Floats,
+    elevation_deg: Floats,
+    azimuth_deg: Floats,
+    *,
+    frequency_hz: float | Floats,
+) -> Floats:
+    """Klobuchar's delay [m] at a frequency, all arguments of one shape; angles inside in semicircles."""
+    elevation, azimuth = elevation_deg / 180.0, np.radians(azimuth_deg)
+    psi = 0.0137 / (elevation + 0.11) - 0.022
+    phi = np.clip(latitude_deg / 180.0 + psi * np.cos(azimuth), -0.416, 0.416)
+    lam = longitude_deg / 180.0 + psi * np.sin(azimuth) / np.cos(phi * np.pi)
+    magnetic = phi + 0.064 * np.cos((lam - 1.617) * np.pi)
+    local = (43_200.0 * lam + second_of_day_s) % 86_400.0
+    slant = 1.0 + 16.0 * (0.53 - elevation) ** 3
+    powers = magnetic[..., None] ** np.arange(4)
+    amplitude = np.maximum(powers @ coefficients[:4], 0.0)
+    period = np.maximum(powers @ coefficients[4:], 72_000.0)
+    x = 2.0 * np.pi * (local - 50_400.0) / period
+    bulge = np.where(np.abs(x) < 1.57, amplitude * (1.0 - x**2 / 2.0 + x**4 / 24.0), 0.0)
+    return SPEED_OF_LIGHT * slant * (5e-9 + bulge) * (FREQUENCY_L1 / frequency_hz) ** 2
+
+
+def troposphere_m(latitude_deg: Floats, height_m: Floats, elevation_deg: Floats) -> Floats:
+    """Saastamoinen's delay [m], all arguments of one shape."""
+    height = np.maximum(height_m, 0.0)
+    pressure = 1013.25 * (1.0 - 2.2557e-5 * height) ** 5.2568
+    temperature = 15.0 - 6.5e-3 * height + 273.16
+    vapour = 6.108 * _HUMIDITY * np.exp((17.15 * temperature - 4684.0) / (temperature - 38.45))
+    sine = np.sin(np.radians(elevation_deg))
+    dry = 0.0022768 * pressure / (1.0 - 0.00266 * np.cos(2.0 * np.radians(latitude_deg)) - 0.00028 * height / 1e3)
+    wet = 0.002277 * (1255.0 / temperature + 0.05) * vapour
+    return np.asarray((dry + wet) / sine)
+
 
 #: Signals of each constellation, the first one first.
 SIGNALS: Final = {"G": ("1C", "2L"), "J": ("1C", "2L"), "E": ("1C", "7Q"), "C": ("2I", "6I")}
@@ -103,12 +291,7 @@ _WALK = 5
 
 
 class ReceiverClocks:
-    """Clocks of all receivers of a scenario over time.
-
-    Parameters
-    ----------
-    scenario : Scenario
-    """
+    """Clocks of all receivers of a scenario over time."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario

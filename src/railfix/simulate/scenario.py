@@ -42,28 +42,15 @@ LONGEST_S: Final = 8.64e6
 
 
 class Station(ScenarioSettings):
-    """Where the train stops.
+    """Where the train stops."""
 
-    Attributes
-    ----------
-    at_m : float
-        Chainage of the vehicle's middle.
-    dwell_s : float
-    name : str
-    """
-
-    at_m: NotNegative
+    at_m: NotNegative  #: Chainage of the vehicle's middle.
     dwell_s: NotNegative = 30.0
     name: str = ""
 
 
 class SpeedLimit(ScenarioSettings):
-    """Highest speed of the vehicle's middle on a part of the line.
-
-    Attributes
-    ----------
-    from_m, to_m, limit_mps : float
-    """
+    """Highest speed of the vehicle's middle on a part of the line."""
 
     from_m: Finite
     to_m: Finite
@@ -73,41 +60,27 @@ class SpeedLimit(ScenarioSettings):
 
 
 class RunSettings(ScenarioSettings):
-    """Motion of the train: it stands, runs from stop to stop and back, until the end of the run.
+    """Motion of the train: it stands, runs from stop to stop and back, until the end of the run."""
 
-    Attributes
-    ----------
-    cruise_mps, acceleration_mps2, deceleration_mps2 : float
-        Accelerations are constant. Where a leg is too short the cruising speed is not reached.
-    first_stand_s, stand_s : float
-        Standing times at the start of the run, and at each end without a station.
-    end_margin_m : float
-        Distance from the vehicle's middle to the ends of the line where the train turns.
-    stations : tuple of Station
-        Stops by rising chainage, the first and the last included; without any the train runs from end to end.
-    limits : tuple of SpeedLimit
-    cant_deficiency_m : float or None
-        Curves are run at the speed whose equilibrium cant is the curve's cant and this; None: curves do not limit.
-    jerk_mps3 : float or None
-        Largest jerk; None: accelerations begin and end at once.
-    direction : {"rising", "falling"}
-        Of the first leg. The vehicle's front points to rising chainage either way.
-    at_end : {"return", "stand"}
-        After the last stop.
-    """
-
+    #: Accelerations are constant. Where a leg is too short the cruising speed is not reached.
     cruise_mps: Positive = 40.0 / 3.6
     acceleration_mps2: Positive = 0.7
     deceleration_mps2: Positive = 0.8
+    #: Standing times at the start of the run, and at each end without a station.
     first_stand_s: NotNegative = 15.0
     stand_s: NotNegative = 10.0
+    #: Distance from the vehicle's middle to the ends of the line where the train turns.
     end_margin_m: NotNegative = 20.0
+    #: Stops by rising chainage, the first and the last included; without any the train runs from end to end.
     stations: tuple[Station, ...] = ()
+
     limits: tuple[SpeedLimit, ...] = ()
+    #: Curves are run at the speed whose equilibrium cant is the curve's cant and this; None: curves do not limit.
     cant_deficiency_m: Positive | None = None
-    jerk_mps3: Positive | None = None
+    jerk_mps3: Positive | None = None  #: Largest jerk; None: accelerations begin and end at once.
+    #: Of the first leg. The vehicle's front points to rising chainage either way.
     direction: Literal["rising", "falling"] = "rising"
-    at_end: Literal["return", "stand"] = "return"
+    at_end: Literal["return", "stand"] = "return"  #: After the last stop.
 
     @field_validator("stations")
     @classmethod
@@ -124,20 +97,6 @@ class VehicleSettings(ScenarioSettings):
     The origin lies midway between the bogie centres at the height of the rail tops; the front points
     in the direction of rising chainage. Cant is measured between the wheels' contact points,
     70 mm wider than the gauge.
-
-    Attributes
-    ----------
-    name : str
-    bogie_distance_m, gauge_m : float
-    front, rear : tuple of float
-    sway_sigma_deg, sway_period_s : float
-        Roll of the body about its forward axis at 20 m/s and more, in proportion to the speed below that.
-        Not in the vehicle's file, as it is unknown in practice.
-    pitch_sigma_deg, pitch_period_s : float
-        Random pitch of the body on its suspension at 20 m/s and more, in proportion to the speed below that.
-    pitch_deg_per_mps2 : float
-        Pitch under a constant acceleration, positive where the front rises when the train accelerates toward
-        rising chainage; it follows the acceleration as a damped oscillator of `pitch_period_s`.
     """
 
     name: str = "made test car"
@@ -145,38 +104,32 @@ class VehicleSettings(ScenarioSettings):
     gauge_m: Positive = 1.067
     front: Three = (9.1, 0.25, 3.95)
     rear: Three = (-9.1, 0.25, 3.95)
+    #: Roll of the body about its forward axis at 20 m/s and more, in proportion to the speed below that. Not in the
+    #: vehicle's file, as it is unknown in practice.
     sway_sigma_deg: NotNegative = 0.0
     sway_period_s: Positive = 1.5
+    #: Random pitch of the body on its suspension at 20 m/s and more, in proportion to the speed below that.
     pitch_sigma_deg: NotNegative = 0.0
     pitch_period_s: Positive = 1.0
+    #: Pitch under a constant acceleration, positive where the front rises when the train accelerates toward rising
+    #: chainage; it follows the acceleration as a damped oscillator of `pitch_period_s`.
     pitch_deg_per_mps2: Finite = 0.0
 
 
 class SkySettings(ScenarioSettings):
-    """Satellites and atmosphere.
+    """Satellites and atmosphere."""
 
-    Attributes
-    ----------
-    systems : str
-        Letters out of G (30 satellites in 6 planes), J (3 inclined, 1 over the equator), E (24 in 3
-        planes), C (24 in 3 planes and 3 inclined geosynchronous; no GEO); or those of the file.
-    nav : str or None
-        A RINEX navigation file in place of the simulated satellites; in a scenario file relative to that file.
-    cutoff_deg : float
-        Elevation below which no signal is tracked.
-    unhealthy : tuple of str
-        Satellites whose newer records say unhealthy, while the record before the run says healthy.
-    satellites_at_most : int or None
-        Only that many, the highest of each epoch, are tracked.
-    ionosphere_scale, troposphere_scale : float
-        Delays in the ranges as multiples of the models'; 1 leaves no error after correction.
-    """
-
+    #: Letters out of G (30 satellites in 6 planes), J (3 inclined, 1 over the equator), E (24 in 3 planes), C (24 in 3
+    #: planes and 3 inclined geosynchronous; no GEO); or those of the file.
     systems: str = "GJE"
+    #: A RINEX navigation file in place of the simulated satellites; in a scenario file relative to that file.
     nav: str | None = None
-    cutoff_deg: float = Field(default=5.0, ge=0.0, lt=90.0)
+    cutoff_deg: float = Field(default=5.0, ge=0.0, lt=90.0)  #: Elevation below which no signal is tracked.
+    #: Satellites whose newer records say unhealthy, while the record before the run says healthy.
     unhealthy: tuple[str, ...] = ("G02",)
+    #: Only that many, the highest of each epoch, are tracked.
     satellites_at_most: Annotated[int, Field(ge=1)] | None = None
+    #: Delays in the ranges as multiples of the models'; 1 leaves no error after correction.
     ionosphere_scale: NotNegative = 1.0
     troposphere_scale: NotNegative = 1.0
 
@@ -199,107 +152,63 @@ class ReceiverSettings(ScenarioSettings):
 
     The standard deviation of a code is ``code_sigma_m * 10^(-(min(C/N0, 50) - 45) / 20) /
     sin(elevation)`` with the C/N0 that is written.
-
-    Attributes
-    ----------
-    signals_per_satellite : {1, 2}
-        1 gives four observables a satellite, 2 gives eight.
-    code_sigma_m, phase_sigma_m, doppler_sigma_hz, cn0_sigma_dbhz : float
-        0 switches that noise off.
-    code_smoothing_s : float
-        Time constant with which the code follows its multipath error while locked, as with carrier smoothing.
-    cn0_horizon_dbhz, cn0_rise_db : float
-        C/N0 of an unobstructed signal at the horizon, and its rise in proportion to the sine of the elevation.
-    cn0_satellite_sigma_db : float
-        Constant difference of each satellite's C/N0.
-    clocks : {"separate", "common"}
-        Whether the two receivers run on one clock by hardware.
-    clock_bias_s, clock_drift : float
-        Of the front receiver at the start [s], and [s/s]; a separate rear clock has other values of
-        this size.
-    clock_steps : {"none", "millisecond"}
-        "millisecond" puts a clock that is over half a millisecond off back by a whole one.
     """
 
-    signals_per_satellite: Literal[1, 2] = 1
+    signals_per_satellite: Literal[1, 2] = 1  #: 1 gives four observables a satellite, 2 gives eight.
+    #: 0 switches that noise off.
     code_sigma_m: NotNegative = 0.5
     phase_sigma_m: NotNegative = 0.002
     doppler_sigma_hz: NotNegative = 0.05
     cn0_sigma_dbhz: NotNegative = 0.7
+    #: Time constant with which the code follows its multipath error while locked, as with carrier smoothing.
     code_smoothing_s: NotNegative = 0.0
+    #: C/N0 of an unobstructed signal at the horizon, and its rise in proportion to the sine of the elevation.
     cn0_horizon_dbhz: Finite = CN0_HORIZON_DBHZ
     cn0_rise_db: Finite = CN0_RISE_DB
-    cn0_satellite_sigma_db: NotNegative = 0.0
-    clocks: Literal["separate", "common"] = "separate"
+    cn0_satellite_sigma_db: NotNegative = 0.0  #: Constant difference of each satellite's C/N0.
+    clocks: Literal["separate", "common"] = "separate"  #: Whether the two receivers run on one clock by hardware.
+    #: Of the front receiver at the start [s], and [s/s]; a separate rear clock has other values of this size.
     clock_bias_s: float = Field(default=1.2e-4, gt=-0.01, lt=0.01)
     clock_drift: Finite = 2.0e-7
+    #: "millisecond" puts a clock that is over half a millisecond off back by a whole one.
     clock_steps: Literal["none", "millisecond"] = "none"
 
 
 class ReferenceStation(ScenarioSettings):
-    """Receiver that stands beside the line under an open sky; its clock and noise are its own.
+    """Receiver that stands beside the line under an open sky; its clock and noise are its own."""
 
-    Attributes
-    ----------
-    name : str
-        Of its log; small letters, digits and hyphens.
-    chainage_m, lateral_m, height_m : float
-        Position: along the line, to the right of the track's axis, above the rails.
-    faults : tuple of SatelliteFault
-        Faults of this receiver alone, by satellite.
-    """
-
-    name: str = Field(default="station", pattern="^[a-z][a-z0-9-]*$")
+    name: str = Field(default="station", pattern="^[a-z][a-z0-9-]*$")  #: Of its log; small letters, digits and hyphens.
+    #: Position: along the line, to the right of the track's axis, above the rails.
     chainage_m: Finite = 0.0
     lateral_m: Finite = 50.0
     height_m: Finite = 10.0
-    faults: tuple[SatelliteFault, ...] = ()
+    faults: tuple[SatelliteFault, ...] = ()  #: Faults of this receiver alone, by satellite.
 
 
 class Scenario(ScenarioSettings):
-    """One run.
+    """One run."""
 
-    Attributes
-    ----------
-    seed : int
-        The same scenario gives the same numbers.
-    start : datetime64
-        First time tag, GPS time.
-    duration_s, rate_hz : float
-        The number of epochs is their product; the interval must be a multiple of 100 ns.
-    line, run, vehicle, sky, receiver
-        Settings of the parts.
-    errors : ErrorSettings
-        Errors of satellites, atmosphere and receivers beyond the noise of `receiver`; none by default.
-    sensors : SensorSettings or None
-        Sensors on board besides the receivers.
-    stations : tuple of ReferenceStation
-        Reference stations whose observations are written beside the train's.
-    sbas : SbasSettings or None
-        SBAS that corrects the simulated errors, and that the train receives.
-    environment : EnvironmentSettings
-        Structures along the line; none by default.
-    place_seed : int
-        Seed of the structures along the line, so that runs of other seeds pass the same structures.
-    multipath : tuple of Disturbances
-        Further disturbances of the signals, from Python only; not in `describe` nor in scenario files.
-    """
-
-    seed: Seed = 20_240_305
-    start: GpsTime = np.datetime64("2024-03-05T03:10:00", "ns")
+    seed: Seed = 20_240_305  #: The same scenario gives the same numbers.
+    start: GpsTime = np.datetime64("2024-03-05T03:10:00", "ns")  #: First time tag, GPS time.
+    #: The number of epochs is their product; the interval must be a multiple of 100 ns.
     duration_s: float = Field(default=200.0, gt=0.0, le=LONGEST_S)
     rate_hz: float = Field(default=10.0, gt=0.0, le=1000.0)
+    #: Settings of the parts.
     line: LineSettings = LineSettings()
     run: RunSettings = RunSettings()
     vehicle: VehicleSettings = VehicleSettings()
     sky: SkySettings = SkySettings()
     receiver: ReceiverSettings = ReceiverSettings()
+    #: Errors of satellites, atmosphere and receivers beyond the noise of `receiver`; none by default.
     errors: ErrorSettings = ErrorSettings()
-    environment: EnvironmentSettings = EnvironmentSettings()
+    environment: EnvironmentSettings = EnvironmentSettings()  #: Structures along the line; none by default.
+    #: Seed of the structures along the line, so that runs of other seeds pass the same structures.
     place_seed: Seed = 1
-    sensors: SensorSettings | None = None
+    sensors: SensorSettings | None = None  #: Sensors on board besides the receivers.
+    #: Reference stations whose observations are written beside the train's.
     stations: tuple[ReferenceStation, ...] = ()
-    sbas: SbasSettings | None = None
+    sbas: SbasSettings | None = None  #: SBAS that corrects the simulated errors, and that the train receives.
+    #: Further disturbances of the signals, from Python only; not in `describe` nor in scenario files.
     multipath: tuple[Disturbances, ...] = Field(default=(), exclude=True)
 
     @field_validator("stations")

@@ -59,22 +59,12 @@ _FOLDER: Final = Path(__file__).resolve().parent / "scenarios"
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """Contents of a scenario file: the settings of one run or of several.
-
-    Attributes
-    ----------
-    path : Path
-    description : str
-    names : tuple of str
-        Of the runs; one empty name where the file is a single run.
-    tables : tuple of dict
-        Settings of each run, paths in them absolute.
-    """
+    """Contents of a scenario file: the settings of one run or of several."""
 
     path: Path
     description: str
-    names: tuple[str, ...]
-    tables: tuple[Mapping[str, Any], ...]
+    names: tuple[str, ...]  #: Of the runs; one empty name where the file is a single run.
+    tables: tuple[Mapping[str, Any], ...]  #: Settings of each run, paths in them absolute.
 
     def scenario(self, number: int = 0, *, changes: Mapping[str, Any] | None = None) -> Scenario:
         """Scenario of a run, counted from 0, with settings that override those of the file, in tables as the file has

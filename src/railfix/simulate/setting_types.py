@@ -89,14 +89,9 @@ class ScenarioSettings(Settings):
 
 
 class Interval(ScenarioSettings):
-    """Part of a run.
+    """Part of a run."""
 
-    Attributes
-    ----------
-    start_s, end_s : float
-        Seconds after the start of the run; an end of None is the end of the run.
-    """
-
+    #: Seconds after the start of the run; an end of None is the end of the run.
     start_s: Finite
     end_s: Annotated[float, Field(allow_inf_nan=False)] | None = None
 

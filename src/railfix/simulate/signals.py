@@ -16,15 +16,12 @@ from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.simulate.alignment import Alignment, build_alignment
-from railfix.simulate.body import AntennaTruth, BodyMotion, antenna_truth
-from railfix.simulate.constellation import simulated_navigation
+from railfix.simulate.constellation import SatelliteTable, links, simulated_navigation
 from railfix.simulate.disturbance import CN0_SECOND_DB, Disturbances, SightGeometry
 from railfix.simulate.environment import Environment
 from railfix.simulate.errors.common import CommonErrors, fault_m
-from railfix.simulate.motion import Motion, build_motion
-from railfix.simulate.noise import ionosphere_m, troposphere_m
-from railfix.simulate.receiver import SIGNALS, Receiver, ReceiverClocks, group_delay_s
-from railfix.simulate.satellites import SatelliteTable, links
+from railfix.simulate.motion import AntennaTruth, BodyMotion, Motion, antenna_truth, build_motion
+from railfix.simulate.receiver import SIGNALS, Receiver, ReceiverClocks, group_delay_s, ionosphere_m, troposphere_m
 from railfix.simulate.scenario import ANTENNAS, Scenario
 
 #: Receivers report C/N0 in steps [dB-Hz].
@@ -42,38 +39,20 @@ _BEST_DBHZ: Final = 50.0
 
 @dataclass(frozen=True, kw_only=True)
 class Piece:
-    """Ground truth and observations of one antenna for some epochs.
-
-    Attributes
-    ----------
-    observations : Observations
-    geometry : SightGeometry
-        True positions of antenna and satellites.
-    clock_m : ndarray, shape (T,) [m]
-        Receiver clock times the speed of light.
-    code_sigma_m : ndarray, shape (T, M) [m]
-        Standard deviation of the noise in the codes.
-    clean_code_m : ndarray, shape (T, M) [m]
-        The codes without noise and without disturbances.
-    error_m : ndarray, shape (T, M) [m]
-        Part of `clean_code_m` that comes from `Scenario.errors` and that no model corrects: satellites,
-        atmosphere, faults and inter-system biases.
-    """
+    """Ground truth and observations of one antenna for some epochs."""
 
     observations: Observations
-    geometry: SightGeometry
-    clock_m: Floats
-    code_sigma_m: Floats
-    clean_code_m: Floats
+    geometry: SightGeometry  #: True positions of antenna and satellites.
+    clock_m: Floats  #: Receiver clock times the speed of light, shape (T,).
+    code_sigma_m: Floats  #: Standard deviation of the noise in the codes, shape (T, M).
+    clean_code_m: Floats  #: The codes without noise and without disturbances, shape (T, M).
+    #: Part of `clean_code_m` that comes from `Scenario.errors` and that no model corrects: satellites, atmosphere,
+    #: faults and inter-system biases; shape (T, M).
     error_m: Floats
 
 
 class Simulation:
     """Simulation of a scenario: line, motion, satellites, and observations in chunks.
-
-    Parameters
-    ----------
-    scenario : Scenario
 
     Attributes
     ----------

@@ -4,6 +4,8 @@ In plan an element has a curvature that runs from its first to its last value by
 Bloss, cosine, sine, Helmert, Viennese); the direction is its integral in closed form, the place that of the direction
 by Gauss-Legendre quadrature. Profile and cant are closed forms. Lengths are those of the plan, directions are
 counter-clockwise from the x axis (easting), curvature is positive to the left, as in IFC 4.3 and LandXML.
+
+Segments of a route from the alignment elements of a design file (IFC, LandXML).
 """
 
 from __future__ import annotations
@@ -14,8 +16,13 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from pyproj import CRS, Transformer
 
 from railfix.core.arrays import Floats, Masks
+from railfix.core.errors import InputFileError
+from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, frame_degrees, is_in_area, older_datum_note, unit_of_grid
+from railfix.track.heights import stated_heights
+from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
 
 #: Share of the change of curvature or cant at a share t of the element, and its integral from 0 to t (IFC 4.3.2,
 #: IfcAlignmentHorizontalSegmentTypeEnum and IfcAlignmentCantSegmentTypeEnum).
@@ -48,31 +55,20 @@ _JOINT_M: Final = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class PlanElement:
-    """One element in plan.
+    """One element in plan."""
 
-    Attributes
-    ----------
-    x_m, y_m : float [m]
-        First point, easting and northing.
-    direction_rad : float [rad]
-        At the first point, counter-clockwise from the x axis.
-    first, last : float [1/m]
-        Curvature at the ends, positive to the left.
-    length_m : float [m]
-    law : str
-        Key of `LAWS`.
-    lean_m : float [m]
-        Of a Viennese bend: height of the centre of gravity times the change of the cant angle, positive where the right
-        rail rises. The law is of the way of the centre of gravity; the track lies beside it by so much.
-    """
-
+    #: First point, easting and northing.
     x_m: float
     y_m: float
-    direction_rad: float
+    direction_rad: float  #: At the first point, counter-clockwise from the x axis.
+    #: Curvature at the ends, positive to the left [1/m].
     first: float
     last: float
+
     length_m: float
-    law: str = "linear"
+    law: str = "linear"  #: Key of `LAWS`.
+    #: Of a Viennese bend: height of the centre of gravity times the change of the cant angle, positive where the right
+    #: rail rises. The law is of the way of the centre of gravity; the track lies beside it by so much.
     lean_m: float = 0.0
 
     def curvature_at(self, way_m: Floats) -> Floats:
@@ -108,26 +104,16 @@ class PlanElement:
 
 @dataclass(frozen=True, kw_only=True)
 class ProfileElement:
-    """One element of the profile: gradient, circular arc or parabola.
+    """One element of the profile: gradient, circular arc or parabola."""
 
-    Attributes
-    ----------
-    start_m, length_m : float [m]
-        Place and length in plan.
-    height_m : float [m]
-        At the start.
-    first, last : float
-        Gradient at the ends [m/m].
-    arc : str
-        ``"circle"`` or ``"parabola"``; a gradient is a parabola whose ends are equal.
-    """
-
+    #: Place and length in plan.
     start_m: float
     length_m: float
-    height_m: float
+    height_m: float  #: At the start.
+    #: Gradient at the ends [m/m].
     first: float
     last: float
-    arc: str = "parabola"
+    arc: str = "parabola"  #: ``"circle"`` or ``"parabola"``; a gradient is a parabola whose ends are equal.
 
     def height_at(self, place_m: Floats) -> Floats:
         """Height [m] at places in plan."""
@@ -172,30 +158,14 @@ def _sine(gradient: float) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class AlignmentPoints:
-    """Points of an alignment in grid coordinates, n points.
+    """Points of an alignment in grid coordinates, n points."""
 
-    Attributes
-    ----------
-    place_m : ndarray, shape (n,)
-        Length in plan from the start of the alignment.
-    xy_m : ndarray, shape (n, 2)
-        Easting and northing.
-    height_m : ndarray, shape (n,)
-        Middle between the rail tops; NaN without a profile.
-    curvature : ndarray, shape (n,) [1/m]
-        Positive to the left.
-    cant_m : ndarray, shape (n,)
-        Right rail above left rail; NaN without cant.
-    gradient : ndarray, shape (n,)
-        NaN without a profile.
-    """
-
-    place_m: Floats
-    xy_m: Floats
-    height_m: Floats
-    curvature: Floats
-    cant_m: Floats
-    gradient: Floats
+    place_m: Floats  #: Length in plan from the start of the alignment, shape (n,).
+    xy_m: Floats  #: Easting and northing, shape (n, 2).
+    height_m: Floats  #: Middle between the rail tops; NaN without a profile; shape (n,).
+    curvature: Floats  #: Positive to the left, shape (n,) [1/m].
+    cant_m: Floats  #: Right rail above left rail; NaN without cant; shape (n,).
+    gradient: Floats  #: NaN without a profile, shape (n,).
 
 
 def alignment_at(
@@ -257,3 +227,117 @@ def alignment_points(
     wide = [gap for gap in gaps if gap > _JOINT_M]
     notes = (f"{len(wide)} of {len(gaps)} joints in plan do not meet, the widest by {max(wide):.3f} m",) if wide else ()
     return alignment_at(place, plan, profile, cant), notes
+
+
+#: Longest part of an alignment to which its profile is extended [m].
+_PROFILE_BEYOND_M: Final = 50.0
+
+
+def segment_of_design(
+    *,
+    path: str,
+    name: str,
+    plan: Sequence[PlanElement],
+    profile: Sequence[ProfileElement],
+    cant: Sequence[CantElement],
+    reading: MapReading,
+    grid: tuple[float, float, float, float, float, float] | None = None,
+    notes: tuple[str, ...] = (),
+) -> Segment:
+    """The points of one alignment as a segment, without heights where the profile is empty.
+
+    The CRS, which is required, is that of the grid, height datum and geoid those of the profile. `grid`: easting,
+    northing, height, cosine and sine of the rotation, and scale that turn the file's coordinates into those of the
+    grid. InputFileError: when the alignment has no element, or no grid. SettingsError: when the height datum is
+    missing.
+    """
+    if not plan:
+        raise InputFileError(path, f"alignment {name!r} has no element in plan")
+    crs = reading.crs
+    if crs is None:
+        raise InputFileError(path, f"alignment {name!r} is in a grid that the file does not name; give --crs")
+    points, joints = alignment_points(plan, profile, cant)
+    xy, up, scale = points.xy_m, 0.0, 1.0
+    unit = unit_of_grid(crs, path=path)
+    if grid is not None:
+        if unit != 1.0:
+            raise InputFileError(path, f"the grid {crs} is not in metres, which is not read; give one in metres")
+        east, north, up, cosine, sine, scale = grid
+        xy = np.array([east, north]) + scale * xy @ np.array([[cosine, sine], [-sine, cosine]])
+    xy /= unit
+    curvature = points.curvature
+    if grid is None and _within(crs, xy[:, ::-1]) and not _within(crs, xy):
+        # northing before easting turns the plane over, so a curve to the left in the file is one to the right
+        xy, curvature = xy[:, ::-1], -curvature
+        joints = (*joints, f"{name}: the file has northing before easting")
+    latitude, longitude, frame = frame_degrees(crs, xy[:, 0], xy[:, 1], path=f"{path} ({name})")
+    _check_length(plan, frame, latitude, longitude, path=f"{path} ({name})")
+    height, model, datum = np.full(len(latitude), np.nan), "", NO_HEIGHTS
+    if profile:
+        joints += _check_profile(plan, profile, path=f"{path} ({name})")
+        height, model, datum = stated_heights(points.height_m + up, latitude, longitude, reading, path=path)
+    radius = np.full(len(latitude), np.inf)
+    bent = np.abs(curvature) > 1e-9
+    radius[bent] = -1.0 / curvature[bent] * scale
+    return Segment(
+        source=f"{path} ({name})",
+        file=path,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=height,
+        kilometrage_m=np.full(len(latitude), np.nan),
+        cant_m=points.cant_m * _side_of_curve(curvature, bent),
+        radius_m=radius,
+        gradient_permille=points.gradient * 1e3,
+        crs=crs,
+        frame=frame,
+        height_datum=datum,
+        geoid=model,
+        metadata={"name": name},
+        notes=(*notes, *joints, *older_datum_note(crs)),
+    )
+
+
+def _check_profile(plan: Sequence[PlanElement], profile: Sequence[ProfileElement], *, path: str) -> tuple[str, ...]:
+    """Reject a profile that leaves out more of the plan than `_PROFILE_BEYOND_M`; note what it leaves out."""
+    length, low = sum(element.length_m for element in plan), min(element.start_m for element in profile)
+    high = max(element.start_m + element.length_m for element in profile)
+    left_out = max(low, 0.0) + max(length - high, 0.0)
+    where = f"the profile runs from {low:.0f} to {high:.0f} m of an alignment of {length:.0f} m"
+    if left_out > _PROFILE_BEYOND_M:
+        raise InputFileError(path, f"{where}; mend its stations, or remove it and give --heights")
+    return (f"{path}: {where}; its last gradients go on",) if left_out > 1.0 else ()
+
+
+def _check_length(plan: Sequence[PlanElement], frame: str, latitude: Floats, longitude: Floats, *, path: str) -> None:
+    """Reject an alignment whose length on the map is not that of its design: its grid is another one."""
+    designed = sum(element.length_m for element in plan)
+    geod = CRS.from_user_input(frame).get_geod()
+    found = float(geod.line_length(longitude, latitude)) if geod is not None else designed
+    if abs(found - designed) > LARGEST_SCALE * designed + 0.5:
+        raise InputFileError(
+            path,
+            f"the design is {designed:.0f} m long, on the map {found:.0f} m; give the right --crs, or mend the "
+            "elements that do not meet",
+        )
+
+
+def _side_of_curve(curvature: Floats, bent: Masks) -> Floats:
+    """Side of the curve at each point, and of the nearest curve where the line is straight: at the foot of a ramp."""
+    if not bent.any():
+        return np.ones(len(curvature))
+    place = np.arange(len(curvature))
+    nearest = np.searchsorted(place[bent], place).clip(0, bent.sum() - 1)
+    before = (nearest - 1).clip(0)
+    nearer = np.abs(place[bent][before] - place) < np.abs(place[bent][nearest] - place)
+    return np.asarray(np.sign(curvature[bent])[np.where(nearer, before, nearest)])
+
+
+def _within(crs: str, xy: Floats) -> bool:
+    """Whether coordinates lie in the area of use of a CRS; True where it has none."""
+    system = CRS.from_user_input(crs)
+    if system.area_of_use is None:
+        return True
+    transformer = Transformer.from_crs(system.to_2d(), "EPSG:4326", always_xy=True)
+    longitude, latitude = (np.asarray(v) for v in transformer.transform(xy[:, 0], xy[:, 1]))
+    return bool(is_in_area(system, latitude, longitude, margin_deg=MARGIN_DEG).all())

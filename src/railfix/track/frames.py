@@ -21,8 +21,18 @@ from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import read_text
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
-from railfix.track.crs import REGIONAL, WORKING_FRAME, geodetic_of, is_in_area, kind_of_frame, operation_of
-from railfix.track.frame_table import HELD, REALISATIONS, SAME, HeldFrame
+from railfix.track.crs import (
+    HELD,
+    REALISATIONS,
+    REGIONAL,
+    SAME,
+    WORKING_FRAME,
+    HeldFrame,
+    geodetic_of,
+    is_in_area,
+    kind_of_frame,
+    operation_of,
+)
 from railfix.track.track import UNNAMED, Track
 
 PLATES: Final = tuple("AMUR ANTA ARAB AUST CARB EURA INDI NAZC NOAM NUBI PCFC SOAM SOMA".split())
@@ -30,27 +40,16 @@ PLATES: Final = tuple("AMUR ANTA ARAB AUST CARB EURA INDI NAZC NOAM NUBI PCFC SO
 
 @dataclass(frozen=True, kw_only=True)
 class FrameShift:
-    """How a map was moved to the frame of the satellites.
+    """How a map was moved to the frame of the satellites."""
 
-    Attributes
-    ----------
-    frame : str
-        Frame of the map, as its CRS is named.
-    used : str
-        Frame and epoch of the positions.
-    method : str
-        The transformation, in words.
-    east_m, north_m, up_m : float
-        Shift at the middle of the line.
-    notes : tuple of str
-    """
-
-    frame: str
-    used: str
-    method: str
+    frame: str  #: Frame of the map, as its CRS is named.
+    used: str  #: Frame and epoch of the positions.
+    method: str  #: The transformation, in words.
+    #: Shift at the middle of the line.
     east_m: float = 0.0
     north_m: float = 0.0
     up_m: float = 0.0
+
     notes: tuple[str, ...] = ()
 
     @property
@@ -73,21 +72,12 @@ def decimal_year(time: np.datetime64 | Datetimes) -> float:
 
 
 class MapMotion(TypedDict, total=False):
-    """What moves coordinates of a map to the frame of the satellites, beside PROJ.
+    """What moves coordinates of a map to the frame of the satellites, beside PROJ."""
 
-    Attributes
-    ----------
-    epoch : float or None [year]
-        Epoch of the map's coordinates, where its frame is an ITRF.
-    plate : str or None
-        Plate that moves coordinates of an ITRF from `epoch` to the time of the log: one of `PLATES`.
-    parameters : path or None
-        Semi-dynamic correction of Japan (``SemiDynaEXE`` format) that moves coordinates in JGD2011 to its own epoch,
-        deformation included; `epoch` is that of the file then, from which on the plate moves them.
-    """
-
-    epoch: float | None
-    plate: str | None
+    epoch: float | None  #: Epoch of the map's coordinates, where its frame is an ITRF [year].
+    plate: str | None  #: Plate that moves coordinates of an ITRF from `epoch` to the time of the log: one of `PLATES`.
+    #: Semi-dynamic correction of Japan (``SemiDynaEXE`` format) that moves coordinates in JGD2011 to its own epoch,
+    #: deformation included; `epoch` is that of the file then, from which on the plate moves them.
     parameters: str | PathLike[str] | None
 
 

@@ -24,62 +24,34 @@ ANTENNA_PATH = "the track was made from positions of an antenna: it is that ante
 
 
 class ThinningLimits(Settings):
-    """Limits for the selection of positions as points of a map.
+    """Limits for the selection of positions as points of a map."""
 
-    Attributes
-    ----------
-    spacing_m : float [m]
-        Smallest distance between consecutive points.
-    standing_mps : float [m/s]
-        Below this horizontal speed over `standing_window_s` the antenna is stationary and its positions
-        are noise or drift. Requires times; 0 keeps all.
-    standing_window_s : float [s]
-        Half of the window of the displacement.
-    chord_m : float [m]
-        Where positions between two points deviate from their chord by more, the furthest becomes a
-        point too (P1 4.1(3): chords within 0.30 m of the curve). Requires times, to distinguish a bend
-        from noise while stationary.
-    jump_m : float [m]
-        Neighbouring points further apart, joined by a straight line, are reported.
-    gap_m : float [m]
-        Neighbouring points further apart do not form a line: an error.
-    speed_mps : float [m/s]
-        Positions that the vehicle could reach from the others only faster than this are wrong and dropped; without
-        times, those further than `gap_m` from the others.
-    """
-
-    spacing_m: float = Field(default=5.0, gt=0)
+    spacing_m: float = Field(default=5.0, gt=0)  #: Smallest distance between consecutive points.
+    #: Where positions between two points deviate from their chord by more, the furthest becomes a point too (P1 4.1(3):
+    #: chords within 0.30 m of the curve). Requires times, to distinguish a bend from noise while stationary.
     chord_m: float = Field(default=0.30, gt=0)
+    #: Below this horizontal speed over `standing_window_s` the antenna is stationary and its positions are noise or
+    #: drift. Requires times; 0 keeps all.
     standing_mps: float = Field(default=0.2, ge=0)
-    standing_window_s: float = Field(default=3.0, gt=0)
+    standing_window_s: float = Field(default=3.0, gt=0)  #: Half of the window of the displacement.
+    #: Neighbouring points further apart, joined by a straight line, are reported.
     jump_m: float = Field(default=50.0, gt=0)
-    gap_m: float = Field(default=2000.0, gt=0)
+    gap_m: float = Field(default=2000.0, gt=0)  #: Neighbouring points further apart do not form a line: an error.
+    #: Positions that the vehicle could reach from the others only faster than this are wrong and dropped; without
+    #: times, those further than `gap_m` from the others.
     speed_mps: float = Field(default=150.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Thinned:
-    """Result of the selection of positions.
+    """Result of the selection of positions."""
 
-    Attributes
-    ----------
-    kept : ndarray of int, shape (V,)
-        Rows that became points of the map, in order.
-    dropped : dict of int
-        Number of rows by reason.
-    jumps : ndarray of int, shape (j,)
-        Points whose successor is further away than `ThinningLimits.jump_m`.
-    jump_m : ndarray, shape (j,) [m]
-        Distance to the successor.
-    turns : ndarray of int, shape (t,)
-        Points at which the path turns back by more than 120 degrees: the vehicle reversed, or a position
-        is wrong.
-    """
-
-    kept: Indices
-    dropped: dict[str, int]
-    jumps: Indices
-    jump_m: Floats
+    kept: Indices  #: Rows that became points of the map, in order; shape (V,).
+    dropped: dict[str, int]  #: Number of rows by reason.
+    jumps: Indices  #: Points whose successor is further away than `ThinningLimits.jump_m`, shape (j,).
+    jump_m: Floats  #: Distance to the successor, shape (j,).
+    #: Points at which the path turns back by more than 120 degrees: the vehicle reversed, or a position is wrong; shape
+    #: (t,).
     turns: Indices
 
 

@@ -18,9 +18,16 @@ from railfix.core.settings import misspelt
 from railfix.track.crs import frame_degrees, known_crs, older_datum_note, unit_of_heights, used_crs
 from railfix.track.csv_file import OPTIONAL_COLUMNS, attributes
 from railfix.track.heights import HEIGHT_DATUMS, ellipsoidal_heights, own_height_datum
-from railfix.track.openstreetmap import is_of_openstreetmap, metadata_of, no_track, read_overpass, with_left_out
 from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
-from railfix.track.vector_file import name_of, plan_segment
+from railfix.track.vector_file import (
+    is_of_openstreetmap,
+    metadata_of,
+    name_of,
+    no_track,
+    plan_segment,
+    read_overpass,
+    with_left_out,
+)
 
 #: RFC 7946, section 4: longitude and latitude on WGS 84 where the file names no CRS.
 RFC_CRS: Final = "OGC:CRS84"

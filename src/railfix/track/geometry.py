@@ -16,34 +16,19 @@ _BEND_WINDOW_M = 40.0
 
 @dataclass(frozen=True, kw_only=True)
 class Geometry:
-    """Spacing, curvature and gradients of a track of V points.
+    """Spacing, curvature and gradients of a track of V points."""
 
-    Attributes
-    ----------
-    spacing_m : ndarray, shape (V - 1,) [m]
-        Length of each segment.
-    turn_deg : ndarray, shape (V,) [deg]
-        Horizontal turn at each point, positive to the right; NaN at the ends and at duplicates.
-    reach_m : ndarray, shape (V,) [m]
-        Mean length of the two segments at each point; NaN where `turn_deg` is.
-    mid_chord_m : ndarray, shape (V - 1,) [m]
-        Arc minus chord at the middle of each segment, ``L^2 / (8 R)``, positive in a right curve; R
-        from the map where both ends have it, else from the circle through neighbouring points.
-    gradient_permille : ndarray, shape (V - 1,)
-        Gradient from the heights; NaN at duplicates.
-    height_spike_m : ndarray, shape (V,) [m]
-        Height over the straight line between the neighbours; NaN at the ends.
-    map_curvature, point_curvature : ndarray, shape (V,) [1/m]
-        Mean curvature over about 40 m from `Track.radius_m`, NaN where it is not known throughout, and from the points;
-        positive to the right.
-    """
-
-    spacing_m: Floats
+    spacing_m: Floats  #: Length of each segment, shape (V - 1,).
+    #: Horizontal turn at each point, positive to the right; NaN at the ends and at duplicates; shape (V,).
     turn_deg: Floats
-    reach_m: Floats
+    reach_m: Floats  #: Mean length of the two segments at each point; NaN where `turn_deg` is; shape (V,).
+    #: Arc minus chord at the middle of each segment, ``L^2 / (8 R)``, positive in a right curve; R from the map where
+    #: both ends have it, else from the circle through neighbouring points; shape (V - 1,).
     mid_chord_m: Floats
-    gradient_permille: Floats
-    height_spike_m: Floats
+    gradient_permille: Floats  #: Gradient from the heights; NaN at duplicates; shape (V - 1,).
+    height_spike_m: Floats  #: Height over the straight line between the neighbours; NaN at the ends; shape (V,).
+    #: Mean curvature over about 40 m from `Track.radius_m`, NaN where it is not known throughout, and from the points;
+    #: positive to the right; shape (V,) [1/m].
     map_curvature: Floats
     point_curvature: Floats
 

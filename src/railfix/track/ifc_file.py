@@ -12,8 +12,7 @@ import numpy as np
 from railfix.core.errors import InputFileError
 from railfix.core.files import read_text
 from railfix.track.crs import LARGEST_SCALE, used_crs
-from railfix.track.design import segment_of_design
-from railfix.track.elements import CantElement, PlanElement, ProfileElement
+from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
 from railfix.track.segment import MapReading, Segment
 
 _LAWS: Final = {

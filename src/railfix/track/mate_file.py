@@ -26,8 +26,7 @@ from railfix.core.files import text_lines
 from railfix.core.mate import read_mate
 from railfix.io.named_columns import read_named_columns
 from railfix.track.crs import used_crs
-from railfix.track.design import segment_of_design
-from railfix.track.elements import CantElement, PlanElement, ProfileElement
+from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
 from railfix.track.segment import MapReading, Segment
 
 _POSITION: Final = "S_DM_TRACK_SEGMENT_POSITION"

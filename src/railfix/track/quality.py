@@ -26,74 +26,43 @@ _LEAST_CANT_M: Final = 5e-4
 
 
 class MapLimits(Settings):
-    """Limits of a track map; a value on the limit passes.
+    """Limits of a track map; a value on the limit passes."""
 
-    Attributes
-    ----------
-    mid_chord_m : float [m]
-        Chord from arc at the middle of a segment (P1 4.1(3): 0.30 m).
-    spacing_m : float [m]
-        Longest segment (P1 2.2(1): some tens of metres on straight track).
-    gap_m : float [m]
-        A segment longer than this is a point that does not belong to the line, or a missing piece of it.
-    near_duplicate_m : float [m]
-        Points nearer than this are the same point measured twice.
-    kink_deg : float [deg]
-        A turn at a point of more than this and sharper than `least_radius_m` is a kink.
-    sharp_kink_deg : float [deg]
-        A kink of more than this is an error, else a warning.
-    least_radius_m : float [m]
-        Smallest radius that a railway vehicle can pass.
-    gradient_permille : float
-        Steepest segment.
-    height_spike_m : float [m]
-        Largest deviation of the height of a point from the line through its neighbours.
-    gradient_difference_permille : float
-        Largest difference of the gradient attribute from the heights, over `gradient_window_m`.
-    gradient_window_m : float [m]
-    cant_m : float [m]
-        Largest absolute cant.
-    """
-
-    mid_chord_m: float = Field(default=0.30, gt=0)
-    spacing_m: float = Field(default=50.0, gt=0)
+    mid_chord_m: float = Field(default=0.30, gt=0)  #: Chord from arc at the middle of a segment (P1 4.1(3): 0.30 m).
+    spacing_m: float = Field(default=50.0, gt=0)  #: Longest segment (P1 2.2(1): some tens of metres on straight track).
+    #: A segment longer than this is a point that does not belong to the line, or a missing piece of it.
     gap_m: float = Field(default=2000.0, gt=0)
-    near_duplicate_m: float = Field(default=0.10, gt=0)
+    near_duplicate_m: float = Field(default=0.10, gt=0)  #: Points nearer than this are the same point measured twice.
+    #: A turn at a point of more than this and sharper than `least_radius_m` is a kink.
     kink_deg: float = Field(default=3.0, gt=0)
-    sharp_kink_deg: float = Field(default=15.0, gt=0)
-    least_radius_m: float = Field(default=60.0, gt=0)
-    gradient_permille: float = Field(default=60.0, gt=0)
+    sharp_kink_deg: float = Field(default=15.0, gt=0)  #: A kink of more than this is an error, else a warning.
+    least_radius_m: float = Field(default=60.0, gt=0)  #: Smallest radius that a railway vehicle can pass.
+    gradient_permille: float = Field(default=60.0, gt=0)  #: Steepest segment.
+    #: Largest deviation of the height of a point from the line through its neighbours.
     height_spike_m: float = Field(default=0.50, gt=0)
+    #: Largest difference of the gradient attribute from the heights, over `gradient_window_m`.
     gradient_difference_permille: float = Field(default=5.0, gt=0)
+
     gradient_window_m: float = Field(default=100.0, gt=0)
-    cant_m: float = Field(default=0.20, gt=0)
+    cant_m: float = Field(default=0.20, gt=0)  #: Largest absolute cant.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One fault of the map at a range of neighbouring points or segments.
-
-    Attributes
-    ----------
-    severity : {"error", "warning"}
-    kind : str
-    first, last : int
-        First and last point of the range.
-    chainage_m, kilometrage_m : float [m]
-        Of the first point; the kilometrage may be NaN.
-    value, limit : float
-        The worst value and its limit; NaN for faults without a number.
-    sentence : str
-    """
+    """One fault of the map at a range of neighbouring points or segments."""
 
     severity: Severity
     kind: str
+    #: First and last point of the range.
     first: int
     last: int
+    #: Of the first point; the kilometrage may be NaN.
     chainage_m: float
     kilometrage_m: float
+    #: The worst value and its limit; NaN for faults without a number.
     value: float
     limit: float
+
     sentence: str
 
 

@@ -33,40 +33,25 @@ class MapReading:
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """Points of one file or feature, with ellipsoidal heights, or NaN where the file has none (`NO_HEIGHTS`).
+    """Points of one file or feature, with ellipsoidal heights, or NaN where the file has none (`NO_HEIGHTS`)."""
 
-    Attributes
-    ----------
-    source : str
-        The file, or the file and the feature in it.
-    file : str
-        The file alone.
-    latitude_deg, longitude_deg, height_m : ndarray, shape (n,)
-    kilometrage_m, cant_m, radius_m, gradient_permille : ndarray, shape (n,)
-        NaN where the file has none.
-    crs, height_datum, geoid : str
-        Of the file, and the geoid used.
-    frame : str
-        Geographic CRS of the coordinates here.
-    metadata : dict of str
-        Name, accuracy and origin, where the file has them.
-    notes : tuple of str
-    """
-
-    source: str
-    file: str
+    source: str  #: The file, or the file and the feature in it.
+    file: str  #: The file alone.
+    #: Shape (n,).
     latitude_deg: Floats
     longitude_deg: Floats
     height_m: Floats
+    #: NaN where the file has none, shape (n,).
     kilometrage_m: Floats
     cant_m: Floats
     radius_m: Floats
     gradient_permille: Floats
+    #: Of the file, and the geoid used.
     crs: str
     height_datum: str
     geoid: str
-    metadata: dict[str, str]
-    frame: str = "EPSG:4979"
+    metadata: dict[str, str]  #: Name, accuracy and origin, where the file has them.
+    frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates here.
     notes: tuple[str, ...] = ()
 
     def reversed(self) -> Segment:

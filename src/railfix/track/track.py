@@ -38,30 +38,16 @@ ANOTHER_PLACE_M = 100_000.0
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """Origin of a track map, copied to every output.
-
-    Attributes
-    ----------
-    files : tuple of str
-    crs : str
-        Coordinate reference system of the files; `UNNAMED` where none is named.
-    frame : str
-        Geographic CRS of the coordinates that were read; see `railfix.track.frames`.
-    height_datum_asked, height_datum_used : str
-        ``"ellipsoidal"`` or ``"orthometric"``; the former empty where none was given.
-    geoid : str
-        Geoid model that turned orthometric into ellipsoidal heights; empty where none was needed.
-    notes : tuple of str
-        Remarks that every result computed with this map must carry.
-    """
+    """Origin of a track map, copied to every output."""
 
     files: tuple[str, ...] = ()
-    crs: str = "EPSG:4979"
-    frame: str = "EPSG:4979"
+    crs: str = "EPSG:4979"  #: Coordinate reference system of the files; `UNNAMED` where none is named.
+    frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates that were read; see `railfix.track.frames`.
+    #: ``"ellipsoidal"`` or ``"orthometric"``; the former empty where none was given.
     height_datum_asked: str = ""
     height_datum_used: str = "ellipsoidal"
-    geoid: str = ""
-    notes: tuple[str, ...] = ()
+    geoid: str = ""  #: Geoid model that turned orthometric into ellipsoidal heights; empty where none was needed.
+    notes: tuple[str, ...] = ()  #: Remarks that every result computed with this map must carry.
 
 
 class TrackFields(TypedDict, total=False):
@@ -157,10 +143,6 @@ class Track(NotebookTable):
             WGS 84, ellipsoidal height.
         **attributes
             See `TrackFields`.
-
-        Returns
-        -------
-        Track
         """
         if unknown := attributes.keys() - TrackFields.__annotations__.keys():
             raise TypeError(f"a track has no {', '.join(sorted(unknown))}")

@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Floats, FrozenArrays, Indices, freeze_arrays, read_only
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.tables import NotebookTable, plural
-from railfix.track.closing import joins_m
-from railfix.track.polyline import NearestOnPolyline
+from railfix.track.polyline import NearestOnPolyline, joins_m
 from railfix.track.track import (
     SIGMA_HEIGHT_M,
     SIGMA_PLAN_M,

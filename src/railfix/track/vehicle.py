@@ -18,8 +18,8 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.settings import Settings, load_settings
-from railfix.track.closing import joins_m
 from railfix.track.from_positions import ANTENNA_PATH
+from railfix.track.polyline import joins_m
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -87,27 +87,17 @@ def read_vehicle(path: str | PathLike[str]) -> Vehicle:
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """Position and attitude of the car body at n chainages, facing rising chainage.
+    """Position and attitude of the car body at n chainages, facing rising chainage."""
 
-    Attributes
-    ----------
-    lower_m, upper_m : ndarray, shape (n,) [m]
-        Chainage of the bogie centres, the lower one first.
-    origin : ndarray, shape (n, 3) [m]
-        Midway between the bogie centres, ECEF.
-    forward, right, up : ndarray, shape (n, 3)
-        Unit vectors of the body.
-    roll_rad : ndarray, shape (n,)
-        Roll to the right.
-    """
-
+    #: Chainage of the bogie centres, the lower one first; shape (n,).
     lower_m: Floats
     upper_m: Floats
-    origin: Floats
+    origin: Floats  #: Midway between the bogie centres, ECEF; shape (n, 3) [m].
+    #: Unit vectors of the body, shape (n, 3).
     forward: Floats
     right: Floats
     up: Floats
-    roll_rad: Floats
+    roll_rad: Floats  #: Roll to the right, shape (n,).
 
 
 class _VehicleLine:

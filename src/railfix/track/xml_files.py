@@ -12,8 +12,7 @@ import numpy as np
 from railfix.core.errors import InputFileError
 from railfix.core.files import read_bytes
 from railfix.track.crs import used_crs
-from railfix.track.design import segment_of_design
-from railfix.track.elements import CantElement, PlanElement, ProfileElement
+from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
 from railfix.track.segment import RINF_NAMES, RINF_SECTIONS, MapReading, Segment
 from railfix.track.vector_file import INSTALL, plan_segment
 
@@ -37,25 +36,16 @@ _SPIRALS: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class Relation:
-    """Connection of two net elements as railML 3 and RailTopoModel have it.
-
-    Attributes
-    ----------
-    name : str
-    first, second : str
-        Names of the elements.
-    first_end, second_end : int
-        0 where the start of the element is meant, 1 where its end.
-    navigable : bool
-        Whether trains pass from one to the other.
-    """
+    """Connection of two net elements as railML 3 and RailTopoModel have it."""
 
     name: str
+    #: Names of the elements.
     first: str
     second: str
+    #: 0 where the start of the element is meant, 1 where its end.
     first_end: int
     second_end: int
-    navigable: bool
+    navigable: bool  #: Whether trains pass from one to the other.
 
 
 def _root(path: str | PathLike[str]) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from railfix.core.arrays import Floats
-from railfix.track.closing import joins_m
+from railfix.track.polyline import joins_m
 from railfix.track.trajectory import Trajectory
 
 

@@ -25,19 +25,11 @@ _SETTINGS: Final = ("config", "cn0_curve", "error_model", "sbas")
 
 
 class OtherPositions(Settings):
-    """Positions of another program: RTKLIB, NMEA, CSV or another kind that `railfix.io.nmea.read_any_positions` reads.
-
-    Attributes
-    ----------
-    file : Path
-    antenna : {"front", "rear"}
-    columns : ColumnNames
-        Of a CSV file with other names.
-    """
+    """Positions of another program: RTKLIB, NMEA, CSV or another kind of `railfix.io.nmea.read_any_positions`."""
 
     file: Path
     antenna: Antenna = "front"
-    columns: ColumnNames = Field(default_factory=ColumnNames)
+    columns: ColumnNames = Field(default_factory=ColumnNames)  #: Of a CSV file with other names.
 
 
 class Scenario(Settings):
@@ -71,31 +63,15 @@ class Scenario(Settings):
 
 
 class CaseFile(Settings):
-    """Content of ``case.toml``; files are relative to its folder.
+    """Content of ``case.toml``; files are relative to its folder."""
 
-    Attributes
-    ----------
-    licence, fetch : str
-        Licence of the data; how to get them.
-    held_out : bool
-        The case is for the benchmark alone: no test reads it and no setting was chosen with it.
-    files : RunInputs
-        As the options of `railfix run`, with the ground truth as `truth`.
-    sha256 : mapping of str to str
-        SHA-256 of every file of `files` and `positions`, by its name there.
-    positions : mapping of str to OtherPositions
-        Positions by the name of the program.
-    scenario : Scenario
-    options : RunOptions
-    evaluation : EvaluationOptions
-    """
-
+    #: Licence of the data; how to get them.
     licence: str = Field(min_length=1)
     fetch: str = Field(min_length=1)
-    held_out: bool
-    files: RunInputs
-    sha256: dict[str, str]
-    positions: dict[str, OtherPositions] = Field(default_factory=dict)
+    held_out: bool  #: The case is for the benchmark alone: no test reads it and no setting was chosen with it.
+    files: RunInputs  #: As the options of `railfix run`, with the ground truth as `truth`.
+    sha256: dict[str, str]  #: SHA-256 of every file of `files` and `positions`, by its name there.
+    positions: dict[str, OtherPositions] = Field(default_factory=dict)  #: Positions by the name of the program.
     scenario: Scenario = Scenario()
     options: RunOptions = RunOptions()
     evaluation: EvaluationOptions = EvaluationOptions()
@@ -108,23 +84,12 @@ class CaseFile(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A case with its files where they are.
+    """A case with its files where they are."""
 
-    Attributes
-    ----------
-    name : str
-        That of its folder.
-    folder : Path
-    content : CaseFile
-    inputs : RunInputs
-        Without the ground truth.
-    truth : Path
-    """
-
-    name: str
+    name: str  #: That of its folder.
     folder: Path
     content: CaseFile
-    inputs: RunInputs
+    inputs: RunInputs  #: Without the ground truth.
     truth: Path
 
     def check_hashes(self) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Strings
 from railfix.core.errors import InputFileError
-from railfix.evaluate.bracket import bracket
+from railfix.evaluate.along_track import bracket
 from railfix.gnss.observations import Observations
 from railfix.io.logs import scan_observations
 from railfix.pipeline.base_station import BaseStation
@@ -20,24 +20,13 @@ from railfix.pipeline.processor import EpochProcessor
 
 @dataclass(frozen=True, kw_only=True)
 class CommonErrors:
-    """Common errors by satellite, B epochs of the station by S satellites.
-
-    Attributes
-    ----------
-    name : str
-    time : ndarray of datetime64[ns], shape (B,)
-    satellite : ndarray of str, shape (S,)
-    error_m : ndarray, shape (B, S) [m]
-        Corrected pseudorange minus range and receiver clock; NaN where not observed.
-    smoothed : bool
-        Whether the pseudoranges were smoothed by carrier phase.
-    """
+    """Common errors by satellite, B epochs of the station by S satellites."""
 
     name: str
-    time: Datetimes
-    satellite: Strings
-    error_m: Floats
-    smoothed: bool
+    time: Datetimes  #: Shape (B,).
+    satellite: Strings  #: Shape (S,).
+    error_m: Floats  #: Corrected pseudorange minus range and receiver clock; NaN where not observed; shape (B, S).
+    smoothed: bool  #: Whether the pseudoranges were smoothed by carrier phase.
 
     def at(self, time: Datetimes, satellite: Strings, *, largest_gap_s: float) -> Floats:
         """Errors at other times, interpolated linearly between the station's epochs, shape (T, K) [m].

@@ -41,45 +41,35 @@ ROTATION: Final[Mapping[str, float]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Orbits:
-    """Orbit elements and time-independent quantities, one row per orbit.
+    """Orbit elements and time-independent quantities, shape (n,), one row per orbit.
 
-    Attributes
-    ----------
-    a, motion, root : ndarray, shape (n,) [m, rad/s, -]
-        Semi-major axis, corrected mean motion, sqrt(1 - e^2).
-    cos_omega, sin_omega, cos_i0, sin_i0 : ndarray, shape (n,)
-        Of the argument of perigee and of the inclination at toe.
-    node : ndarray, shape (n,) [rad]
-        Longitude of the ascending node at toe.
-    node_rate : ndarray, shape (n,) [rad/s]
-    tilted_rate : ndarray, shape (n,) [rad/s]
-        BeiDou GEO: rotation rate of the Earth-fixed frame against the tilted frame of toe; 0 elsewhere.
-    relativity : ndarray, shape (n,) [s]
-        F e sqrt(A), the factor of sin E.
-    eccentricity, m0, i_dot, a_dot, delta_n_dot, cuc, cus, crc, crs, cic, cis : ndarray, shape (n,)
-        As `navigation.KeplerRecords`.
+    Those without a meaning here are as in `navigation.KeplerRecords`.
     """
 
-    a: Floats
-    motion: Floats
+    a: Floats  #: Semi-major axis [m].
+    motion: Floats  #: Corrected mean motion [rad/s].
     eccentricity: Floats
-    root: Floats
+    root: Floats  #: sqrt(1 - e^2).
     m0: Floats
+    #: Of the argument of perigee and of the inclination at toe.
     cos_omega: Floats
     sin_omega: Floats
     cos_i0: Floats
     sin_i0: Floats
+
     i_dot: Floats
-    node: Floats
-    node_rate: Floats
+    node: Floats  #: Longitude of the ascending node at toe [rad].
+    node_rate: Floats  #: [rad/s].
+    #: BeiDou GEO: rotation rate of the Earth-fixed frame against the tilted frame of toe; 0 elsewhere [rad/s].
     tilted_rate: Floats
+
     cuc: Floats
     cus: Floats
     crc: Floats
     crs: Floats
     cic: Floats
     cis: Floats
-    relativity: Floats
+    relativity: Floats  #: F e sqrt(A), the factor of sin E [s].
     a_dot: Floats
     delta_n_dot: Floats
 
@@ -284,18 +274,12 @@ def runge_kutta(position: Floats, velocity: Floats, luni_solar: Floats, step_s: 
 
 @dataclass(frozen=True)
 class GlonassStates:
-    """States of all records at multiples of the step from their reference times.
+    """States of all records at multiples of the step from their reference times."""
 
-    Attributes
-    ----------
-    position, velocity : ndarray, shape (3, records, 2 steps + 1) [m, m/s]
-        The reference time is the middle column.
-    luni_solar : ndarray, shape (3, records) [m/s^2]
-    """
-
+    #: The reference time is the middle column, shape (3, records, 2 steps + 1) [m, m/s].
     position: Floats
     velocity: Floats
-    luni_solar: Floats
+    luni_solar: Floats  #: Shape (3, records) [m/s^2].
 
     @classmethod
     def from_records(cls, records: GlonassRecords, reach_s: float) -> GlonassStates:

@@ -81,7 +81,6 @@ def group_delay_s(
 
     Parameters
     ----------
-    records : KeplerRecords
     signal : str
         RINEX 3 code without its type letter: "1C".
     clock : {"broadcast", "ionosphere_free"}
@@ -171,32 +170,21 @@ _CACHED_SETS: Final = 64
 
 @dataclass(frozen=True)
 class ChannelRecords:
-    """Record rows, group delays and health of a set of channels.
+    """Record rows, group delays and health of a set of channels."""
 
-    Attributes
-    ----------
-    kepler, glonass : ndarray of int, shape (K,), (R,)
-        Channels of the constellations with Keplerian records, and of GLONASS.
-    preferred, other : ndarray of int, shape (K,)
-        Numbers in the lookup: the message with the clock and the group delay of the channel's signal, and another
-        one; -1 for none.
-    any_other : bool
-    signal : ndarray of int, shape (K,)
-        Row of `group_delay_s` and `unhealthy`.
-    group_delay_s : ndarray, shape (signals, records) [s]
-    unhealthy : ndarray of bool, shape (signals, records)
-    glonass_number : ndarray of int, shape (R,)
-    """
-
+    #: Channels of the constellations with Keplerian records, and of GLONASS; shape (K,), (R,).
     kepler: Indices
     glonass: Indices
+    #: Numbers in the lookup: the message with the clock and the group delay of the channel's signal, and another one;
+    #: -1 for none; shape (K,).
     preferred: Integers
     other: Integers
+
     any_other: bool
-    signal: Integers
-    group_delay_s: Floats
-    unhealthy: Masks
-    glonass_number: Integers
+    signal: Integers  #: Row of `group_delay_s` and `unhealthy`, shape (K,).
+    group_delay_s: Floats  #: Shape (signals, records).
+    unhealthy: Masks  #: Shape (signals, records).
+    glonass_number: Integers  #: Shape (R,).
 
 
 class PreparedRecords:

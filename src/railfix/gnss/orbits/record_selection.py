@@ -39,31 +39,20 @@ _MILLISECOND: Final = np.timedelta64(1, "ms")
 
 @dataclass(frozen=True)
 class Lookup:
-    """Records of all satellites in two sorted lists, each searched by bisection.
+    """Records of all satellites in two sorted lists, each searched by bisection."""
 
-    Attributes
-    ----------
-    number : mapping of str to int
-        Number of a satellite (or of its message: "E01 INAV") in the lists.
-    first : ndarray of int, shape (satellites,)
-        First record of each satellite in both lists.
-    sent_key, sent_record : ndarray of int64, shape (n,)
-        Satellite and time of availability [ms since `origin`] as one ascending number, and the row
-        of the record table.
-    toe_key, toe_record : ndarray of int64, shape (n,)
-        The same by reference time: from half-way between the reference time before and its own.
-    origin : datetime64[ns]
-    toe, available : ndarray of datetime64[ns], shape (n,)
-        Reference time, and time from which the record is available, by row of the record table.
-    """
-
-    number: Mapping[str, int]
-    first: Integers
+    number: Mapping[str, int]  #: Number of a satellite (or of its message: "E01 INAV") in the lists.
+    first: Integers  #: First record of each satellite in both lists, shape (satellites,).
+    #: Satellite and time of availability [ms since `origin`] as one ascending number, and the row of the record table;
+    #: shape (n,).
     sent_key: Integers
     sent_record: Integers
+    #: The same by reference time: from half-way between the reference time before and its own; shape (n,).
     toe_key: Integers
     toe_record: Integers
+
     origin: np.datetime64
+    #: Reference time, and time from which the record is available, by row of the record table; shape (n,).
     toe: Datetimes
     available: Datetimes
 
@@ -204,7 +193,6 @@ def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, i
 
     Parameters
     ----------
-    navigation : Navigation
     satellite : ndarray of str, shape (M,)
     time : ndarray of datetime64[ns], shape (T,)
     issue : ndarray of int, shape (T, M)

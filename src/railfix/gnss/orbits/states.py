@@ -129,10 +129,6 @@ def satellite_states(
         of data (`issue_records`). A satellite is unhealthy also where the record of the usual
         selection flags it. Ignored for GLONASS.
 
-    Returns
-    -------
-    SatelliteStates
-
     Raises
     ------
     ValueError
@@ -256,8 +252,6 @@ def kepler_channels(
     time_ns : ndarray of int, shape (T,)
         Time tags since 1970.
     code_m : ndarray, shape (T, M) [m]
-    channels : KeplerChannels
-    records : SelectedKepler
     states : KeplerStates
         Filled in place; its arrays are returned.
     """

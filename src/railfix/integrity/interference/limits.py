@@ -57,87 +57,56 @@ class InterferenceLimits(Settings):
     """Limits of the signs of interference.
 
     On the recordings no sign occurs; their largest statistics are printed by ``tests/studies/interference_trials.py``.
-
-    Attributes
-    ----------
-    use : {"on", "off"}
-    least_satellites : int
-        Satellites that a statement on "all" takes.
-    fall_db : float [dB]
-        Median fall of C/N0 below its recent peak.
-    spread_db : float [dB]
-        Largest standard deviation of the falls: a jammer raises the noise of all channels alike, walls and roofs
-        do not.
-    peak_decay_db_per_min : float [dB/min]
-        How fast a peak is forgotten.
-    known_after_s : float [s]
-        A satellite is compared once it has been tracked for so long.
-    gain_fall : float
-        Fall of the front end's gain as a share of its recent peak; 14 % within a start without interference.
-    equal_db : float [dB]
-        Largest standard deviation of equal C/N0; in open sky 1.2 dB and more.
-    clock_jump_m : float [m]
-        Step of the codes against the Dopplers, whole milliseconds left out. Clocks of phones step by 30 m.
-    drift_jump_mps, speed_jump_mps, position_jump_m, off_map_m : float
-        Least jumps and least distance from the line. A yard is some 100 m wide.
-    jump_sigmas, part_sigmas : float
-        The same in standard deviations; and of the difference of two constellations.
-    acceleration_mps2, max_speed_mps : float
-        Of a train; position jumps are beyond what these allow.
-    longest_gap_s : float [s]
-        Epochs farther apart are not compared.
-    largest_speed_sigma_mps, largest_sigma_m : float
-        Less sure velocities and positions are not compared.
-    hold_s, part_hold_s : float [s]
-        How long a fall, equal C/N0 or distance from the map lasts before it counts; and parted constellations.
-    wheel_window_s, wheel_least_s : float [s]
-        Time over which satellites and wheel are compared, and the shortest one.
-    wheel_m, wheel_sigmas : float [m]
-        Least difference, and the same in standard deviations.
-    wheel_level : {"on", "off"}
-        Whether the level of the filter covers a pull that the wheel has not shown yet: two to four times as large.
-    wheel_level_sigmas : float
-        Standard deviations of the difference in it: 2.1 for a probability of 1e-7 that a pull has begun within the
-        window, and a risk of 1e-9.
-    wheel_scale, wheel_change : float
-        Standard deviation of the wheel's circumference, before positions determine it; and of its change after (creep).
-    wheel_acceleration_mps2 : float
-        A wheel that changes its speed faster has slipped: the comparison begins anew. Adhesion gives 1 to 1.5.
-    jamming_release_s, spoofing_release_s : float [s]
-        How long a suspicion stays after its last sign: a jump is over in one epoch, what it began is not.
     """
 
     use: Literal["on", "off"] = "on"
-    least_satellites: int = Field(default=6, ge=5)
-    fall_db: float = Field(default=5.0, gt=0)
+    least_satellites: int = Field(default=6, ge=5)  #: Satellites that a statement on "all" takes.
+    fall_db: float = Field(default=5.0, gt=0)  #: Median fall of C/N0 below its recent peak.
+    #: Largest standard deviation of the falls: a jammer raises the noise of all channels alike, walls and roofs do not.
     spread_db: float = Field(default=1.5, gt=0)
-    peak_decay_db_per_min: float = Field(default=1.0, gt=0)
-    known_after_s: float = Field(default=10.0, ge=0)
+    peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: How fast a peak is forgotten [dB/min].
+    known_after_s: float = Field(default=10.0, ge=0)  #: A satellite is compared once it has been tracked for so long.
+    #: Fall of the front end's gain as a share of its recent peak; 14 % within a start without interference.
     gain_fall: float = Field(default=0.3, gt=0, lt=1)
+    #: Largest standard deviation of equal C/N0; in open sky 1.2 dB and more.
     equal_db: float = Field(default=0.8, gt=0)
+    #: Step of the codes against the Dopplers, whole milliseconds left out. Clocks of phones step by 30 m.
     clock_jump_m: float = Field(default=60.0, gt=0)
+    #: Least jumps and least distance from the line. A yard is some 100 m wide.
     drift_jump_mps: float = Field(default=10.0, gt=0)
     speed_jump_mps: float = Field(default=5.0, gt=0)
     position_jump_m: float = Field(default=30.0, gt=0)
     off_map_m: float = Field(default=100.0, gt=0)
+    #: The same in standard deviations; and of the difference of two constellations.
     jump_sigmas: float = Field(default=10.0, gt=0)
     part_sigmas: float = Field(default=15.0, gt=0)
+    #: Of a train; position jumps are beyond what these allow.
     acceleration_mps2: float = Field(default=2.0, gt=0)
     max_speed_mps: float = Field(default=100.0, gt=0)
-    longest_gap_s: float = Field(default=10.0, gt=0)
+    longest_gap_s: float = Field(default=10.0, gt=0)  #: Epochs farther apart are not compared.
+    #: Less sure velocities and positions are not compared.
     largest_speed_sigma_mps: float = Field(default=2.0, gt=0)
     largest_sigma_m: float = Field(default=30.0, gt=0)
+    #: How long a fall, equal C/N0 or distance from the map lasts before it counts; and parted constellations.
     hold_s: float = Field(default=3.0, gt=0)
     part_hold_s: float = Field(default=10.0, gt=0)
+    #: Time over which satellites and wheel are compared, and the shortest one.
     wheel_window_s: float = Field(default=120.0, gt=0)
     wheel_least_s: float = Field(default=60.0, gt=0)
+    #: Least difference, and the same in standard deviations [m].
     wheel_m: float = Field(default=20.0, gt=0)
     wheel_sigmas: float = Field(default=6.0, gt=0)
+    #: Whether the level of the filter covers a pull that the wheel has not shown yet: two to four times as large.
     wheel_level: Literal["on", "off"] = "off"
+    #: Standard deviations of the difference in it: 2.1 for a probability of 1e-7 that a pull has begun within the
+    #: window, and a risk of 1e-9.
     wheel_level_sigmas: float = Field(default=2.1, ge=0)
+    #: Standard deviation of the wheel's circumference, before positions determine it; and of its change after (creep).
     wheel_scale: float = Field(default=0.01, gt=0)
     wheel_change: float = Field(default=0.001, gt=0)
+    #: A wheel that changes its speed faster has slipped: the comparison begins anew. Adhesion gives 1 to 1.5.
     wheel_acceleration_mps2: float = Field(default=1.6, gt=0)
+    #: How long a suspicion stays after its last sign: a jump is over in one epoch, what it began is not.
     jamming_release_s: float = Field(default=10.0, ge=0)
     spoofing_release_s: float = Field(default=300.0, ge=0)
 

@@ -27,48 +27,27 @@ _SIZE: Final = 4
 
 
 class MotionInputs(NamedTuple):
-    """Ranges of one antenna: T epochs by K channels.
+    """Ranges of one antenna: T epochs by K channels."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    break_before : ndarray of bool, shape (T,)
-    channel : ndarray of str, shape (K,)
-    group : ndarray of int, shape (K,)
-        Receiver clock of each channel.
-    near_ecef_m : ndarray, shape (T, 3) [m]
-        Position, right to some kilometres; NaN without one.
-    sat_ecef_m, sat_velocity_mps : ndarray, shape (T, K, 3)
-    code_m : ndarray, shape (T, K) [m]
-        As observed.
-    rate_mps : ndarray, shape (T, K) [m/s]
-        ``-lambda D``.
-    corrected_code_m, sigma_m : ndarray, shape (T, K) [m]
-    used : ndarray of bool, shape (T, K)
-        Channels without a reason against them.
-    noise_scale : ndarray, shape (T,)
-    clock_offset_m, clock_sigma_m : ndarray, shape (T, G) [m]
-        Known offsets between the receiver clocks, and their sigmas.
-    off_line_m : ndarray, shape (T,) [m]
-        Distance of the 3-D position from the line across it; NaN beyond an end.
-    """
-
-    time: Datetimes
-    break_before: Masks
-    channel: Strings
-    group: Indices
-    near_ecef_m: Floats
+    time: Datetimes  #: Shape (T,).
+    break_before: Masks  #: Shape (T,).
+    channel: Strings  #: Shape (K,).
+    group: Indices  #: Receiver clock of each channel, shape (K,).
+    near_ecef_m: Floats  #: Position, right to some kilometres; NaN without one; shape (T, 3).
+    #: Shape (T, K, 3).
     sat_ecef_m: Floats
     sat_velocity_mps: Floats
-    code_m: Floats
-    rate_mps: Floats
+    code_m: Floats  #: As observed, shape (T, K).
+    rate_mps: Floats  #: ``-lambda D``, shape (T, K).
+    #: Shape (T, K).
     corrected_code_m: Floats
     sigma_m: Floats
-    used: Masks
-    noise_scale: Floats
+    used: Masks  #: Channels without a reason against them, shape (T, K).
+    noise_scale: Floats  #: Shape (T,).
+    #: Known offsets between the receiver clocks, and their sigmas; shape (T, G).
     clock_offset_m: Floats
     clock_sigma_m: Floats
-    off_line_m: Floats
+    off_line_m: Floats  #: Distance of the 3-D position from the line across it; NaN beyond an end; shape (T,).
 
 
 class Fix(NamedTuple):
@@ -95,58 +74,38 @@ def _no_fix() -> Fix:
 
 @dataclass(frozen=True, kw_only=True)
 class MotionSignState:
-    """State after a chunk.
+    """State after a chunk."""
 
-    Attributes
-    ----------
-    time : datetime64[ns]
-        Last epoch; NaT before the first.
-    channel : ndarray of str, shape (K,)
-    code_m, rate_mps : ndarray, shape (K,)
-        Last ones of each channel.
-    since : ndarray of datetime64[ns], shape (K,)
-        When they were observed.
-    position, velocity : Fix
-        Last ones that were good enough to compare with, one epoch each.
-    on_map : bool
-        A position has been on the map.
-    """
-
+    #: Last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))
+    channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))  #: Shape (K,).
+    #: Last ones of each channel, shape (K,).
     code_m: Floats = field(default_factory=lambda: np.zeros(0))
     rate_mps: Floats = field(default_factory=lambda: np.zeros(0))
+    #: When they were observed, shape (K,).
     since: Datetimes = field(default_factory=lambda: np.zeros(0, dtype="datetime64[ns]"))
+    #: Last ones that were good enough to compare with, one epoch each.
     position: Fix = field(default_factory=_no_fix)
     velocity: Fix = field(default_factory=_no_fix)
-    on_map: bool = False
+    on_map: bool = False  #: A position has been on the map.
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionSigns:
-    """Statistics of T epochs; NaN where there is nothing to compare.
+    """Statistics of T epochs; NaN where there is nothing to compare."""
 
-    Attributes
-    ----------
-    clock_jump_m : ndarray, shape (T,) [m]
-        Median change of the codes against the Dopplers, less whole milliseconds.
-    drift_jump_mps, speed_jump_mps, position_jump_m : ndarray, shape (T,)
-        Changes since the last epoch that was good enough, beyond what train and oscillator allow.
-    drift_jump_sigmas, speed_jump_sigmas, position_jump_sigmas : ndarray, shape (T,)
-    part_sigmas : ndarray, shape (T,)
-        Largest difference of two constellations' own positions and clocks, in standard deviations.
-    off_line_m, off_line_sigmas : ndarray, shape (T,)
-        Distance of the 3-D position from the line, once a position has been on it.
-    """
-
-    clock_jump_m: Floats
+    clock_jump_m: Floats  #: Median change of the codes against the Dopplers, less whole milliseconds; shape (T,).
+    #: Changes since the last epoch that was good enough, beyond what train and oscillator allow, and the same in
+    #: standard deviations; shape (T,).
     drift_jump_mps: Floats
     drift_jump_sigmas: Floats
     speed_jump_mps: Floats
     speed_jump_sigmas: Floats
     position_jump_m: Floats
     position_jump_sigmas: Floats
+    #: Largest difference of two constellations' own positions and clocks, in standard deviations; shape (T,).
     part_sigmas: Floats
+    #: Distance of the 3-D position from the line, once a position has been on it; shape (T,).
     off_line_m: Floats
     off_line_sigmas: Floats
 

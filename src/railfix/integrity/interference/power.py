@@ -1,4 +1,7 @@
-"""Signs of interference in C/N0 and in the gain of the front end."""
+"""Signs of interference in C/N0 and in the gain of the front end.
+
+How long signs last: conditions that must hold for a time, and suspicions that stay for a time.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Strings
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.timescale import GPS_EPOCH, seconds
 from railfix.integrity.interference.limits import InterferenceLimits
 
@@ -20,43 +23,26 @@ _LONGEST_SILENCE_S: Final = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class PowerState:
-    """State after a chunk, by channel ("G01" + "1C").
+    """State after a chunk, by channel ("G01" + "1C")."""
 
-    Attributes
-    ----------
-    channel : ndarray of str, shape (K,)
-    peak_db : ndarray, shape (K,)
-        Peak of C/N0 plus the decay since the GPS epoch; -inf before the first.
-    first_s, last_s : ndarray, shape (K,) [s]
-        When its present time of tracking began, and its last observation, since the GPS epoch; NaN before.
-    gain : float
-        Peak of the gain's logarithm plus the decay since the GPS epoch.
-    """
-
-    channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))
+    channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))  #: Shape (K,).
+    #: Peak of C/N0 plus the decay since the GPS epoch; -inf before the first; shape (K,).
     peak_db: Floats = field(default_factory=lambda: np.zeros(0))
+    #: When its present time of tracking began, and its last observation, since the GPS epoch; NaN before; shape (K,).
     first_s: Floats = field(default_factory=lambda: np.zeros(0))
     last_s: Floats = field(default_factory=lambda: np.zeros(0))
-    gain: float = -np.inf
+    gain: float = -np.inf  #: Peak of the gain's logarithm plus the decay since the GPS epoch.
 
 
 @dataclass(frozen=True, kw_only=True)
 class PowerSigns:
-    """Statistics of T epochs; NaN where too few satellites are compared.
+    """Statistics of T epochs; NaN where too few satellites are compared."""
 
-    Attributes
-    ----------
-    fall_db, spread_db : ndarray, shape (T,) [dB]
-        Median and standard deviation of the falls of C/N0 below the recent peak of each satellite.
-    difference_db : ndarray, shape (T,) [dB]
-        Standard deviation of C/N0 over the satellites.
-    gain_fall : ndarray, shape (T,)
-        Fall of the gain as a share of its recent peak; NaN where the receiver does not give it.
-    """
-
+    #: Median and standard deviation of the falls of C/N0 below the recent peak of each satellite, shape (T,).
     fall_db: Floats
     spread_db: Floats
-    difference_db: Floats
+    difference_db: Floats  #: Standard deviation of C/N0 over the satellites, shape (T,).
+    #: Fall of the gain as a share of its recent peak; NaN where the receiver does not give it; shape (T,).
     gain_fall: Floats
 
 
@@ -81,8 +67,6 @@ def power_signs(
     cn0_dbhz : ndarray, shape (T, K)
     gain : ndarray, shape (T,)
         In the receiver's unit, + for more gain; NaN where unknown.
-    state : PowerState
-    limits : InterferenceLimits
     """
     seen, now = np.isfinite(cn0_dbhz), seconds(time - GPS_EPOCH)[:, None]
     peak, first, last = _arranged(state, channel)
@@ -134,3 +118,58 @@ def _arranged(state: PowerState, channel: Strings) -> tuple[Floats, Floats, Floa
     _, here, there = np.intersect1d(channel, state.channel, return_indices=True)
     peak[here], first[here], last[here] = state.peak_db[there], state.first_s[there], state.last_s[there]
     return peak, first, last
+
+
+_NS = 1e9
+_NEVER = np.datetime64("NaT", "ns")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldState:
+    """State of C conditions after a chunk."""
+
+    time: np.datetime64 = field(default_factory=lambda: _NEVER)  #: Last epoch; NaT before the first.
+    #: How long each condition had held, shape (C,).
+    run_ns: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    #: When it last counted; NaT for never; shape (C,).
+    last: Datetimes = field(default_factory=lambda: np.zeros(0, dtype="datetime64[ns]"))
+
+
+def held(
+    time: Datetimes, signs: Masks, state: HeldState, *, hold_s: Floats, release_s: Floats
+) -> tuple[Masks, Masks, HeldState]:
+    """Return which conditions have held for their time, and which have within their time of release.
+
+    An interval between epochs counts for half the time of holding at most, so that one epoch after a gap proves
+    nothing.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    signs : ndarray of bool, shape (T, C)
+    hold_s, release_s : ndarray, shape (C,) [s]
+        A time of holding of 0 counts at once.
+
+    Returns
+    -------
+    counts, stays : ndarray of bool, shape (T, C)
+    state : HeldState
+    """
+    conditions = signs.shape[1]
+    run, last = state.run_ns, state.last
+    if not len(run):
+        run, last = np.zeros(conditions, dtype=np.int64), np.full(conditions, _NEVER)
+    if not len(time):
+        return signs, signs, state
+    hold = np.round(hold_s * _NS).astype(np.int64)
+    before = time[0] if np.isnat(state.time) else state.time
+    step = np.diff(np.concatenate([[before], time])).astype(np.int64)[:, None]
+    total = np.cumsum(np.minimum(step, np.maximum(hold // 2, 0)), axis=0)
+    # lengths of runs: total so far less the total at the last epoch at which the condition did not hold
+    start = np.maximum.accumulate(np.vstack([-run, np.where(signs, np.iinfo(np.int64).min, total)]), axis=0)[1:]
+    length = total - start
+    counts = signs & (length >= hold)
+    when = np.vstack([last, np.where(counts, time[:, None], _NEVER)])
+    latest = np.fmax.accumulate(when, axis=0)[1:]
+    stays = seconds(time[:, None] - latest) <= release_s
+    return counts, stays, HeldState(time=time[-1], run_ns=np.where(signs[-1], length[-1], 0), last=latest[-1])

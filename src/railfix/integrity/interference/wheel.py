@@ -16,7 +16,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
 from railfix.integrity.interference.limits import InterferenceLimits
-from railfix.integrity.interference.timing import HeldState, held
+from railfix.integrity.interference.power import HeldState, held
 
 #: Least standard deviation of a position: errors of satellites and atmosphere that change over minutes [m].
 _LEAST_M: Final = 1.0
@@ -28,26 +28,15 @@ _SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
 
 @dataclass(frozen=True, kw_only=True)
 class WheelSamples:
-    """Positions and distances once a second, shape (N,).
-
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns]
-    arc_m, sigma_m : ndarray [m]
-        By satellites.
-    way_m : ndarray [m]
-        Of the wheel since its beginning.
-    doubt_m : ndarray [m]
-        What it may have rolled at speeds too slow for it.
-    part : ndarray of int
-        The same where the wheel has turned without slip or a gap.
-    """
+    """Positions and distances once a second, shape (N,)."""
 
     time: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
+    #: By satellites.
     arc_m: Floats = field(default_factory=lambda: np.empty(0))
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
-    way_m: Floats = field(default_factory=lambda: np.empty(0))
-    doubt_m: Floats = field(default_factory=lambda: np.empty(0))
+    way_m: Floats = field(default_factory=lambda: np.empty(0))  #: Of the wheel since its beginning.
+    doubt_m: Floats = field(default_factory=lambda: np.empty(0))  #: What it may have rolled at speeds too slow for it.
+    #: The same where the wheel has turned without slip or a gap.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     def joined(self, later: WheelSamples) -> WheelSamples:
@@ -63,30 +52,20 @@ class WheelSamples:
 
 @dataclass(frozen=True, kw_only=True)
 class WheelState:
-    """State after a chunk.
+    """State after a chunk."""
 
-    Attributes
-    ----------
-    samples : WheelSamples
-        The first one of the present part, and those of the last window.
-    time : datetime64[ns]
-        Of the last epoch.
-    way_m, doubt_m, speed_mps : float
-        Of the wheel there; the speed NaN where unknown.
-    part, second : int
-    held : HeldState
-    difference_m, bound_m, beyond : float, float, bool
-        Of the last sample.
-    """
-
+    #: The first one of the present part, and those of the last window.
     samples: WheelSamples = field(default_factory=WheelSamples)
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Of the last epoch.
+    #: Of the wheel there; the speed NaN where unknown.
     way_m: float = 0.0
     doubt_m: float = 0.0
     speed_mps: float = float("nan")
+
     part: int = 0
     second: int = -1
     held: HeldState = field(default_factory=HeldState)
+    #: Of the last sample.
     difference_m: float = float("nan")
     bound_m: float = float("nan")
     beyond: bool = False
@@ -94,22 +73,16 @@ class WheelState:
 
 @dataclass(frozen=True, kw_only=True)
 class WheelSigns:
-    """Comparison of T epochs.
+    """Comparison of T epochs."""
 
-    Attributes
-    ----------
-    difference_m : ndarray, shape (T,) [m]
-        Distance by satellites over the window less that of the wheel with its diameter; NaN where it is not compared.
-    bound_m : ndarray, shape (T,) [m]
-        Of the error of the position, for a pull that began within the window, be it shorter than `wheel_least_s`: the
-        difference, and `wheel_level_sigmas` of the position at the beginning and of the wheel's distance since.
-    parted : ndarray of bool, shape (T,)
-        It is beyond what noise and diameter allow, or was within the time of release.
-    """
-
+    #: Distance by satellites over the window less that of the wheel with its diameter; NaN where it is not compared;
+    #: shape (T,).
     difference_m: Floats
+    #: Of the error of the position, for a pull that began within the window, be it shorter than `wheel_least_s`: the
+    #: difference, and `wheel_level_sigmas` of the position at the beginning and of the wheel's distance since; shape
+    #: (T,).
     bound_m: Floats
-    parted: Masks
+    parted: Masks  #: It is beyond what noise and diameter allow, or was within the time of release; shape (T,).
 
 
 def wheel_signs(
@@ -131,8 +104,6 @@ def wheel_signs(
         Positions along the line, of single epochs or of the filter; NaN without one.
     wheel_m : ndarray, shape (T,) [m]
         Distance that the wheel has rolled since the epoch before; NaN where it is not known.
-    state : WheelState
-    limits : InterferenceLimits
     signed : bool
         Whether the wheel's distance has the sign of the motion along the line.
     """

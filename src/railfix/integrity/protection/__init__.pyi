@@ -1,8 +1,7 @@
 # The names of `railfix.integrity.protection`, imported at their first use (lazy-loader).
 
-from .level import Cause, ProtectionLevel, along_track_level
+from .level import Cause, LevelStatus, ProtectionLevel, along_track_level, availability
 from .risk import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, SATELLITE_PRIOR, RiskBudget, k_factor
-from .status import LevelStatus, availability
 
 __all__ = [
     "K_H_NPA",

@@ -83,7 +83,6 @@ def allocate(
     model : LinearModel
         T epochs, M channels.
     systems : sequence of str, length M
-    risk : RiskBudget
     out : ndarray of int, shape (T,)
         Satellites excluded.
     sides : ndarray of bool, shape (T, S, M)

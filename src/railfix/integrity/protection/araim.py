@@ -38,58 +38,35 @@ _SINGULAR: Final = 1e-12
 
 
 class AraimBudget(Settings):
-    """Allocation of integrity and continuity risk; defaults of ADD 3.0 for LPV-200, along the track those of vertical.
+    """Allocation of integrity and continuity risk; defaults of ADD 3.0 for LPV-200, along the track of its vertical."""
 
-    Attributes
-    ----------
-    phmi_along, phmi_vertical, phmi_horizontal : float
-        Probability of hazardously misleading information in an approach or a sample.
-    false_alarm_along, false_alarm_vertical, false_alarm_horizontal : float
-        Probability that noise alone makes the separations inconsistent.
-    unmonitored : float
-        Probability up to which fault modes may be left out; more satellites at a time become modes until it is kept.
-    most_faults : int
-        Faulty at a time, at most, in a mode.
-    map_prior : float
-        Probability that the map is wrong; 0: no such mode.
-    """
-
+    #: Probability of hazardously misleading information in an approach or a sample.
     phmi_along: float = Field(default=9.8e-8, gt=0, lt=1)
     phmi_vertical: float = Field(default=9.8e-8, gt=0, lt=1)
     phmi_horizontal: float = Field(default=2e-9, gt=0, lt=1)
+    #: Probability that noise alone makes the separations inconsistent.
     false_alarm_along: float = Field(default=3.9e-6, gt=0, lt=1)
     false_alarm_vertical: float = Field(default=3.9e-6, gt=0, lt=1)
     false_alarm_horizontal: float = Field(default=9e-8, gt=0, lt=1)
+    #: Probability up to which fault modes may be left out; more satellites at a time become modes until it is kept.
     unmonitored: float = Field(default=8e-8, gt=0, lt=1)
-    most_faults: int = Field(default=2, ge=1, le=3)
-    map_prior: float = Field(default=1e-4, ge=0, lt=1)
+    most_faults: int = Field(default=2, ge=1, le=3)  #: Faulty at a time, at most, in a mode.
+    map_prior: float = Field(default=1e-4, ge=0, lt=1)  #: Probability that the map is wrong; 0: no such mode.
 
 
 @dataclass(frozen=True, kw_only=True)
 class AraimGeometry:
-    """Observations of T epochs, N of them: ranges, and with a map its two constraints.
+    """Observations of T epochs, N of them: ranges, and with a map its two constraints."""
 
-    Attributes
-    ----------
-    design : ndarray, shape (T, N, P)
-        Change of each observation with the P unknowns, position first, then a clock a constellation.
-    sigma_int_m, sigma_acc_m : ndarray, shape (T, N) [m]
-        Standard deviations for integrity and accuracy; NaN where not used.
-    bias_m : ndarray, shape (T, N) [m]
-    prior : ndarray, shape (N,)
-        Of a fault of the observation alone; 0: none.
-    together : ndarray of bool, shape (C, N)
-        Observations that one fault makes faulty together: of constellations, of the map.
-    together_prior : ndarray, shape (C,)
-    """
-
+    #: Change of each observation with the P unknowns, position first, then a clock a constellation; shape (T, N, P).
     design: Floats
+    #: Standard deviations for integrity and accuracy; NaN where not used; shape (T, N).
     sigma_int_m: Floats
     sigma_acc_m: Floats
-    bias_m: Floats
-    prior: Floats
-    together: Masks
-    together_prior: Floats
+    bias_m: Floats  #: Shape (T, N).
+    prior: Floats  #: Of a fault of the observation alone; 0: none; shape (N,).
+    together: Masks  #: Observations that one fault makes faulty together: of constellations, of the map; shape (C, N).
+    together_prior: Floats  #: Shape (C,).
 
     @property
     def used(self) -> Masks:
@@ -99,41 +76,24 @@ class AraimGeometry:
 
 @dataclass(frozen=True, kw_only=True)
 class AraimLevels:
-    """Levels of T epochs, for Q components of the position.
+    """Levels of T epochs, for Q components of the position."""
 
-    Attributes
-    ----------
-    level_m : ndarray, shape (T, Q) [m]
-        NaN without a position, infinite where faults that nothing checks are likelier than the risk allows.
-    sigma_int_m, sigma_acc_m : ndarray, shape (T, Q) [m]
-        Of the position with all observations.
-    modes : ndarray of int, shape (T,)
-        Fault modes.
-    unmonitored : ndarray, shape (T,)
-        Probability of what is no mode, or leaves no position.
-    """
-
+    #: NaN without a position, infinite where faults that nothing checks are likelier than the risk allows; shape (T,
+    #: Q).
     level_m: Floats
+    #: Of the position with all observations, shape (T, Q).
     sigma_int_m: Floats
     sigma_acc_m: Floats
-    modes: Integers
-    unmonitored: Floats
+    modes: Integers  #: Fault modes, shape (T,).
+    unmonitored: Floats  #: Probability of what is no mode, or leaves no position; shape (T,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class AraimResult:
-    """ARAIM of T epochs; NaN without a position.
+    """ARAIM of T epochs; NaN without a position."""
 
-    Attributes
-    ----------
-    along : AraimLevels
-        Along the track, with the map as a constraint.
-    space : AraimLevels
-        East, north and up, without the map.
-    """
-
-    along: AraimLevels
-    space: AraimLevels
+    along: AraimLevels  #: Along the track, with the map as a constraint.
+    space: AraimLevels  #: East, north and up, without the map.
 
     @property
     def horizontal_m(self) -> Floats:
@@ -151,10 +111,8 @@ def araim_levels(
 
     Parameters
     ----------
-    geometry : AraimGeometry
     phmi, false_alarm : sequence of float, length Q
         Of each component.
-    budget : AraimBudget
     """
     epochs, count = geometry.sigma_int_m.shape
     events = _events(geometry)
@@ -272,33 +230,19 @@ Satellite = Annotated[str, Field(pattern=r"^[GJECR][0-9]{2}$")]
 
 
 class SatelliteSupport(Settings):
-    """Statement on a satellite.
+    """Statement on a satellite."""
 
-    Attributes
-    ----------
-    sigma_ura_m, sigma_ure_m : float [m]
-        Standard deviation of the error of orbit and clock in the range: for integrity, and for accuracy and continuity.
-    bias_m : float [m]
-        Largest nominal bias of the range (b_nom).
-    prior : float
-        Probability that the satellite is faulty at a time (P_sat).
-    """
-
+    #: Standard deviation of the error of orbit and clock in the range: for integrity, and for accuracy and continuity.
     sigma_ura_m: float = Field(gt=0)
     sigma_ure_m: float = Field(gt=0)
-    bias_m: float = Field(ge=0)
-    prior: float = Field(ge=0, lt=1)
+    bias_m: float = Field(ge=0)  #: Largest nominal bias of the range (b_nom).
+    prior: float = Field(ge=0, lt=1)  #: Probability that the satellite is faulty at a time (P_sat).
 
 
 class ConstellationSupport(SatelliteSupport):
-    """Statement on the satellites of a constellation.
+    """Statement on the satellites of a constellation."""
 
-    Attributes
-    ----------
-    constellation_prior : float
-        Probability that a fault common to the constellation is there at a time (P_const).
-    """
-
+    #: Probability that a fault common to the constellation is there at a time (P_const).
     constellation_prior: float = Field(ge=0, lt=1)
 
 
@@ -313,19 +257,12 @@ class SupportArrays(NamedTuple):
 
 
 class IntegritySupport(Settings):
-    """Integrity support message (EU-U.S. Working Group C, ARAIM milestone 3 report; ADD 3.0, table 2).
-
-    Attributes
-    ----------
-    format : str
-    constellation : mapping of str to ConstellationSupport
-        By letter; one without a statement is not used in the levels.
-    satellite : mapping of str to SatelliteSupport
-        Satellites with statements of their own.
-    """
+    """Integrity support message (EU-U.S. Working Group C, ARAIM milestone 3 report; ADD 3.0, table 2)."""
 
     format: Literal["railfix integrity support 1"]
+    #: By letter; one without a statement is not used in the levels.
     constellation: dict[Letter, ConstellationSupport] = Field(min_length=1)
+    #: Satellites with statements of their own.
     satellite: dict[Satellite, SatelliteSupport] = Field(default_factory=dict)
 
     def arrays(self, satellites: Sequence[str]) -> SupportArrays:

@@ -12,6 +12,8 @@ of three parts, each of which has its share of the risk,
 - no fault: ``K_ff sigma_0 + b_0``;
 - one fault, two faults (and more, where these are hypotheses): the largest ``T_J + K sigma_J + b_J``, the share divided
   in proportion to the priors, so that all hypotheses of a part have one K.
+
+May the position be used? The level against the alarm limit.
 """
 
 from __future__ import annotations
@@ -73,53 +75,32 @@ class Cause(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class ProtectionLevel:
-    """Levels along the track of T epochs; NaN where there is no position.
+    """Levels along the track of T epochs; NaN where there is no position."""
 
-    Attributes
-    ----------
-    level_m : ndarray, shape (T,) [m]
-        Where all tails together keep within the risk; at most the largest of the three parts, which have shares
-        of it that need not be used up. Infinite where `cause` says why.
-    fault_free_m, one_fault_m, two_fault_m : ndarray, shape (T,) [m]
-        The parts. 0 where the part's hypotheses fit into its share of the risk unchecked.
-    sigma_m : ndarray, shape (T,) [m]
-        Standard deviation of the position along the track, without a fault.
-    k_fault_free, k_one_fault, k_two_faults : ndarray, shape (T,)
-        Sigmas of each part; -inf where it is not asked for.
-    k_false_alarm : ndarray, shape (T,)
-        Sigmas of the thresholds.
-    separation : ndarray, shape (T,)
-        The largest ``|x_J - x|/T_J``; 0 where nothing can be left out.
-    consistent : ndarray of bool, shape (T,)
-        It is at most 1. Where not the level does not hold. False where there is no position.
-    worst_one : ndarray of int, shape (T,)
-        Channel that sets `one_fault_m`; -1 where none does (a constellation: `worst_constellation`; a side, the map).
-    worst_two : ndarray of int, shape (T, 2)
-        Channels that set `two_fault_m`; -1 where none do.
-    worst_constellation : ndarray of str, shape (T,)
-        Letter of the constellation that sets `one_fault_m`; empty where none does.
-    unchecked_risk : ndarray, shape (T,)
-        Probability of the faults that are no hypotheses, taken off the risk.
-    cause : ndarray of int8, shape (T,)
-        `Cause`.
-    """
-
+    #: Where all tails together keep within the risk; at most the largest of the three parts, which have shares of it
+    #: that need not be used up. Infinite where `cause` says why; shape (T,).
     level_m: Floats
+    #: The parts. 0 where the part's hypotheses fit into its share of the risk unchecked; shape (T,).
     fault_free_m: Floats
     one_fault_m: Floats
     two_fault_m: Floats
-    sigma_m: Floats
+    sigma_m: Floats  #: Standard deviation of the position along the track, without a fault; shape (T,).
+    #: Sigmas of each part; -inf where it is not asked for; shape (T,).
     k_fault_free: Floats
     k_one_fault: Floats
     k_two_faults: Floats
-    k_false_alarm: Floats
-    separation: Floats
+    k_false_alarm: Floats  #: Sigmas of the thresholds, shape (T,).
+    separation: Floats  #: The largest ``|x_J - x|/T_J``; 0 where nothing can be left out; shape (T,).
+    #: It is at most 1. Where not the level does not hold. False where there is no position; shape (T,).
     consistent: Masks
+    #: Channel that sets `one_fault_m`; -1 where none does (a constellation: `worst_constellation`; a side, the map);
+    #: shape (T,).
     worst_one: Indices
-    worst_two: Indices
+    worst_two: Indices  #: Channels that set `two_fault_m`; -1 where none do; shape (T, 2).
+    #: Letter of the constellation that sets `one_fault_m`; empty where none does; shape (T,).
     worst_constellation: Strings
-    unchecked_risk: Floats
-    cause: Codes
+    unchecked_risk: Floats  #: Probability of the faults that are no hypotheses, taken off the risk; shape (T,).
+    cause: Codes  #: `Cause`, shape (T,).
 
 
 class RangeBounds(NamedTuple):
@@ -130,18 +111,11 @@ class RangeBounds(NamedTuple):
 
 
 class MapDeviation(NamedTuple):
-    """What is known of the map's error across and up besides its sigmas.
+    """What is known of the map's error across and up besides its sigmas."""
 
-    Attributes
-    ----------
-    bias_m : array_like, shape (T, 2) or (2,) [m]
-        Offset that is not within its sigma.
-    seen : tuple of ndarray, shapes (T, 2) [m] and (T, 2, 2) [1/m^2], optional
-        Place of the antenna without the map, and its inverse covariance (0: unknown). With it a wrong map is a
-        hypothesis of prior `RiskBudget.map_prior`.
-    """
-
-    bias_m: ArrayLike = 0.0
+    bias_m: ArrayLike = 0.0  #: Offset that is not within its sigma, shape (T, 2) or (2,).
+    #: Place of the antenna without the map, and its inverse covariance (0: unknown). With it a wrong map is a
+    #: hypothesis of prior `RiskBudget.map_prior`; shapes (T, 2) [m] [1/m^2].
     seen: tuple[Floats, Floats] | None = None
 
 
@@ -174,10 +148,6 @@ def along_track_level(
         Sets of satellites that one reflection can make faulty together, each a hypothesis of `RiskBudget.side_prior`.
     n_excluded : array_like of int, shape (T,) or ()
         Satellites that fault detection left out at this epoch (not: what the screens rejected before).
-
-    Returns
-    -------
-    ProtectionLevel
 
     Raises
     ------
@@ -369,3 +339,39 @@ def _channels(channel: Indices, place: Indices) -> Indices:
 def _sets(n: int, size: int) -> Indices:
     """Return all sets of places, shape (size, K)."""
     return np.array(list(combinations(range(n), size)), dtype=np.intp).reshape(math.comb(n, size), size).T
+
+
+class LevelStatus(IntEnum):
+    """Of an epoch, against an alarm limit."""
+
+    #: The level is within the alarm limit.
+    AVAILABLE = 0
+    #: The level is above the alarm limit, infinite, or there is no position.
+    UNAVAILABLE = 1
+    #: The ranges contradict each other: the level does not hold.
+    ALARM = 2
+
+
+def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayLike = True) -> Codes:
+    """LevelStatus of epochs.
+
+    Parameters
+    ----------
+    level_m : array_like, shape (T,) [m]
+        Protection level; NaN where there is no position.
+    alarm_limit_m : float [m]
+    consistent : array_like of bool, shape (T,) or ()
+        `ProtectionLevel.consistent`. An epoch with a position and without consistency alarms.
+
+    Returns
+    -------
+    ndarray of int8, shape (T,)
+        `LevelStatus`.
+    """
+    if not alarm_limit_m > 0.0:
+        raise ValueError(f"alarm_limit_m must be positive, got {alarm_limit_m}")
+    level = np.asarray(level_m, dtype=np.float64)
+    status = np.full(level.shape, LevelStatus.UNAVAILABLE, dtype=np.int8)
+    status[level <= alarm_limit_m] = LevelStatus.AVAILABLE
+    status[~np.isnan(level) & ~np.asarray(consistent)] = LevelStatus.ALARM
+    return status

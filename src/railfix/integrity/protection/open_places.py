@@ -128,7 +128,6 @@ def without_sides(parts: Compact, design: Floats, none: Forms, sides: Masks, pri
     parts, design, none
         As `whitened` returns them.
     sides : ndarray of bool, shape (T, S, M)
-    prior : float
     """
     n, forms = parts.channel.shape[1], []
     columns = np.concatenate([parts.projector, parts.residual[..., None], design], axis=2)
@@ -228,7 +227,6 @@ def places_beyond_the_level(
 
     Parameters
     ----------
-    antennas : AntennaRows
     arc_m : ndarray, shape (T,) [m]
         Positions.
     model : LinearModel
@@ -239,7 +237,6 @@ def places_beyond_the_level(
         Noise scale, taken as 1 at least.
     systems : sequence of str
         Constellation letter of each channel.
-    risk : RiskBudget
     sides : ndarray of bool, shape (T, S, M)
         Low satellites of each side of the track.
     """

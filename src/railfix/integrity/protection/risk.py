@@ -68,64 +68,47 @@ Probability = Annotated[float, Field(ge=0, lt=1)]
 
 
 class RiskBudget(Settings):
-    """Integrity risk, its shares, and the probabilities of faults.
+    """Integrity risk, its shares, and the probabilities of faults."""
 
-    Attributes
-    ----------
-    risk_per_hour : float
-        Probability that the error exceeds the level without a warning; P1 2.4: 1e-7 an hour.
-    samples_per_hour : float
-        Independent samples in an hour: 3600 s over the correlation time of the errors. 360 takes 10 s:
-        multipath of a moving train changes within seconds, that of a standing one within tens of seconds,
-        SBAS corrections within minutes (DO-229D appendix J counts 10 samples an hour). More samples are
-        the safe side; from 10 to 3600 the fault-free K grows by 0.9.
-    fault_free_share, one_fault_share, two_fault_share : float
-        Shares of the risk of an epoch; together at most 1. They decide the three parts, from the largest of which the
-        level is lowered until all tails together use their sum; a share twice as large lowers a K of 6 by 0.1, one
-        of 3 by 0.2: thirds.
-    unchecked_share : float
-        Of the risk, for faults that are not hypotheses: where they are likelier, further ones
-        become hypotheses, up to four satellites at a time and three shared faults (constellation, side, map).
-    exclusion_share : float
-        Of the risk, for epochs with one, and as much again with two satellites excluded.
-    false_alarm : float
-        Probability in an epoch that noise alone makes the separations inconsistent; P4: 1e-3.
-    satellite_prior : mapping of str to float
-        Probability that a satellite is faulty, by constellation: its own signal.
-    local_prior : float
-        The same of a fault by local causes, on top of that: multipath, interference. An assumption until measured on
-        the line (P1 7).
-    map_prior : float
-        Probability that the map is wrong by more than its stated error: the next track, heights without the geoid,
-        another reference frame. An assumption; 0: no such hypothesis.
-    side_prior : float
-        Probability that low satellites of one side of the track are faulty together: `SUPPORTED_SIDE_PRIOR`. No
-        data supports a smaller one, and every output of the levels then says so; 0: no such hypothesis.
-    side_elevation_deg : float
-        Elevation up to which satellites count as low: of a wall as high as it is away.
-    priors : {"assumed", "measured"}
-        Whether the priors were measured on this line (``railfix error-model``). Levels of assumed priors are
-        called indicative in every output: they carry no risk an hour. "measured" needs `local_prior` and
-        `side_prior` to be given.
-    constellation_prior : mapping of str to float
-        Probability of a fault that many satellites of a constellation share; a constellation that is not
-        named has none, and the level does not cover one.
-    """
-
+    #: Probability that the error exceeds the level without a warning; P1 2.4: 1e-7 an hour.
     risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
+    #: Independent samples in an hour: 3600 s over the correlation time of the errors. 360 takes 10 s: multipath of a
+    #: moving train changes within seconds, that of a standing one within tens of seconds, SBAS corrections within
+    #: minutes (DO-229D appendix J counts 10 samples an hour). More samples are the safe side; from 10 to 3600 the
+    #: fault-free K grows by 0.9.
     samples_per_hour: float = Field(default=360.0, gt=0, allow_inf_nan=False)
+    #: Shares of the risk of an epoch; together at most 1. They decide the three parts, from the largest of which the
+    #: level is lowered until all tails together use their sum; a share twice as large lowers a K of 6 by 0.1, one of 3
+    #: by 0.2: thirds.
     fault_free_share: float = Field(default=1.0 / 3.0, gt=0)
     one_fault_share: float = Field(default=1.0 / 3.0, gt=0)
     two_fault_share: float = Field(default=1.0 / 3.0, gt=0)
+    #: Of the risk, for faults that are not hypotheses: where they are likelier, further ones become hypotheses, up to
+    #: four satellites at a time and three shared faults (constellation, side, map).
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
+    #: Of the risk, for epochs with one, and as much again with two satellites excluded.
     exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)
+    #: Probability in an epoch that noise alone makes the separations inconsistent; P4: 1e-3.
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
+    #: Probability that a satellite is faulty, by constellation: its own signal.
     satellite_prior: dict[str, Probability] = Field(default_factory=lambda: dict(SATELLITE_PRIOR))
+    #: The same of a fault by local causes, on top of that: multipath, interference. An assumption until measured on the
+    #: line (P1 7).
     local_prior: float = Field(default=1e-5, ge=0, lt=1)
+    #: Probability that the map is wrong by more than its stated error: the next track, heights without the geoid,
+    #: another reference frame. An assumption; 0: no such hypothesis.
     map_prior: float = Field(default=1e-4, ge=0, lt=1)
+    #: Probability that low satellites of one side of the track are faulty together: `SUPPORTED_SIDE_PRIOR`. No data
+    #: supports a smaller one, and every output of the levels then says so; 0: no such hypothesis.
     side_prior: float = Field(default=SUPPORTED_SIDE_PRIOR, ge=0, lt=1)
+    #: Elevation up to which satellites count as low: of a wall as high as it is away.
     side_elevation_deg: float = Field(default=45.0, gt=0, le=90.0)
+    #: Whether the priors were measured on this line (``railfix error-model``). Levels of assumed priors are called
+    #: indicative in every output: they carry no risk an hour. "measured" needs `local_prior` and `side_prior` to be
+    #: given.
     priors: Literal["assumed", "measured"] = "assumed"
+    #: Probability of a fault that many satellites of a constellation share; a constellation that is not named has none,
+    #: and the level does not cover one.
     constellation_prior: dict[str, Probability] = Field(default_factory=dict)
 
     @model_validator(mode="after")

@@ -24,51 +24,32 @@ _TABLE_STEP: Final = 64
 
 
 class RaimLimits(Settings):
-    """Limits of detection, exclusion and reliability.
+    """Limits of detection, exclusion and reliability."""
 
-    Attributes
-    ----------
-    mode : {"chi_square", "fixed"}
-        False-alarm rate (P4), or P1's fixed limit.
-    false_alarm : float
-        Probability that noise alone is called a fault; P4: 0.001. An excluded satellite's own
-        error must be over what noise reaches with this probability (chi-square mode).
-    missed_detection : float
-        Probability of missing a fault of the minimal detectable size. P4 gives no value.
-    fixed_limit_m2 : float
-        Mode "fixed": limit on the sum of squared residuals, and on the square of an excluded satellite's error; P1
-        table 6 ("FDE 2 SAT, 100 m2").
-    max_excluded : int
-        Satellites excluded at an epoch at most: 0, 1 or 2 (P1 2.3(4): 2).
-    min_redundancy : int
-        Degrees of freedom left after an exclusion.
-    separation_risk : float
-        Probability that noise makes the true exclusion fit this much worse than another one.
-        Chi-square, one degree of freedom. Another exclusion of as many satellites that passes
-        and fits nearly as well makes the epoch inseparable.
-    same_position_m : float
-        Exclusions with positions nearer than this do not compete: either
-        way the position is the same (the two satellites of a clock of their own). 0: they always do.
-    noise_risk : float
-        Two-sided probability that K sigma leaves to noise in the protection level; 1 gives K = 0,
-        which is P4's ``HSlope sigma0 sqrt(lambda)``.
-    alarm_limit_m : float
-        Protection levels above it alarm. P4 takes an error within a car length, 20 m, as acceptable.
-    faults : int
-        Simultaneous faults that the protection level covers: 1 (P4) or 2.
-    """
-
-    mode: Literal["chi_square", "fixed"] = "chi_square"
+    mode: Literal["chi_square", "fixed"] = "chi_square"  #: False-alarm rate (P4), or P1's fixed limit.
+    #: Probability that noise alone is called a fault; P4: 0.001. An excluded satellite's own error must be over what
+    #: noise reaches with this probability (chi-square mode).
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
+    #: Probability of missing a fault of the minimal detectable size. P4 gives no value.
     missed_detection: float = Field(default=1e-3, gt=0, lt=1)
+    #: Mode "fixed": limit on the sum of squared residuals, and on the square of an excluded satellite's error; P1 table
+    #: 6 ("FDE 2 SAT, 100 m2").
     fixed_limit_m2: float = Field(default=100.0, gt=0)
+    #: Satellites excluded at an epoch at most: 0, 1 or 2 (P1 2.3(4): 2).
     max_excluded: int = Field(default=2, ge=0, le=2)
-    min_redundancy: int = Field(default=1, ge=1)
+    min_redundancy: int = Field(default=1, ge=1)  #: Degrees of freedom left after an exclusion.
+    #: Probability that noise makes the true exclusion fit this much worse than another one. Chi-square, one degree of
+    #: freedom. Another exclusion of as many satellites that passes and fits nearly as well makes the epoch inseparable.
     separation_risk: float = Field(default=1e-3, gt=0, le=1)
+    #: Exclusions with positions nearer than this do not compete: either way the position is the same (the two
+    #: satellites of a clock of their own). 0: they always do.
     same_position_m: float = Field(default=0.0, ge=0)
+    #: Two-sided probability that K sigma leaves to noise in the protection level; 1 gives K = 0, which is P4's ``HSlope
+    #: sigma0 sqrt(lambda)``.
     noise_risk: float = Field(default=1e-3, gt=0, le=1)
+    #: Protection levels above it alarm. P4 takes an error within a car length, 20 m, as acceptable.
     alarm_limit_m: float = Field(default=20.0, gt=0)
-    faults: int = Field(default=1, ge=1, le=2)
+    faults: int = Field(default=1, ge=1, le=2)  #: Simultaneous faults that the protection level covers: 1 (P4) or 2.
 
     @model_validator(mode="after")
     def _rates_below_one(self) -> Self:
@@ -89,28 +70,15 @@ class RaimLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Detection:
-    """Verdict on T epochs.
+    """Verdict on T epochs."""
 
-    Attributes
-    ----------
-    statistic : ndarray, shape (T,)
-        WSSE over the noise scale squared; in fixed mode the sum of squared residuals [m^2].
-        NaN where there is no position.
-    threshold : ndarray, shape (T,)
-        What it is compared with; NaN where not testable.
-    freedom : ndarray of int, shape (T,)
-        Degrees of freedom.
-    detected : ndarray of bool, shape (T,)
-        The statistic is at or over the threshold.
-    testable : ndarray of bool, shape (T,)
-        At least one range is redundant.
-    """
-
+    #: WSSE over the noise scale squared; in fixed mode the sum of squared residuals [m^2]. NaN where there is no
+    #: position; shape (T,).
     statistic: Floats
-    threshold: Floats
-    freedom: Integers
-    detected: Masks
-    testable: Masks
+    threshold: Floats  #: What it is compared with; NaN where not testable; shape (T,).
+    freedom: Integers  #: Degrees of freedom, shape (T,).
+    detected: Masks  #: The statistic is at or over the threshold, shape (T,).
+    testable: Masks  #: At least one range is redundant, shape (T,).
 
 
 def detect(
@@ -139,10 +107,6 @@ def detect(
     scale : array_like, shape (T,) or ()
         Noise scale: standard deviation of this receiver's ranges over the sigmas of the weights.
         Not used in fixed mode.
-
-    Returns
-    -------
-    Detection
     """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)

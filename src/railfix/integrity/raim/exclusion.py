@@ -45,44 +45,25 @@ class Outcome(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Exclusion:
-    """Exclusions of T epochs by M channels.
+    """Exclusions of T epochs by M channels."""
 
-    Attributes
-    ----------
-    outcome : ndarray of int, shape (T,)
-        `Outcome`.
-    excluded : ndarray of bool, shape (T, M)
-        Channels to leave out; none unless the outcome is EXCLUDED_ONE or EXCLUDED_TWO.
-    best : ndarray of int, shape (T, 2)
-        Channels of the subset that leaves the least statistic, of those that pass; -1 where none.
-        Given for INSEPARABLE too.
-    alternative : ndarray of int, shape (T, 2)
-        The next such subset of as many channels: where INSEPARABLE, the closest competing exclusion;
-        -1 where none.
-    own_error_m : ndarray, shape (T, M) [m]
-        Error of the channels of `best` against the rest: + where the range is too long; NaN elsewhere.
-    statistic_after : ndarray, shape (T,)
-        Of the rest without `best`; the statistic itself where there is none.
-    threshold_after : ndarray, shape (T,)
-        What it is compared with.
-    position_change_m : ndarray, shape (T, k) [m]
-        By leaving out `best`: along the line (k = 1), or east and north (k = 2); 0 where there is none.
-    alternative_shift_m : ndarray, shape (T,) [m]
-        Distance between the positions without `best` and without `alternative`; NaN where either is none.
-    detection : Detection
-        The test before any exclusion.
-    """
-
-    outcome: Codes
-    excluded: Masks
+    outcome: Codes  #: `Outcome`, shape (T,).
+    excluded: Masks  #: Channels to leave out; none unless the outcome is EXCLUDED_ONE or EXCLUDED_TWO; shape (T, M).
+    #: Channels of the subset that leaves the least statistic, of those that pass; -1 where none. Given for INSEPARABLE
+    #: too; shape (T, 2).
     best: Indices
+    #: The next such subset of as many channels: where INSEPARABLE, the closest competing exclusion; -1 where none;
+    #: shape (T, 2).
     alternative: Indices
+    #: Error of the channels of `best` against the rest: + where the range is too long; NaN elsewhere; shape (T, M).
     own_error_m: Floats
-    statistic_after: Floats
-    threshold_after: Floats
+    statistic_after: Floats  #: Of the rest without `best`; the statistic itself where there is none; shape (T,).
+    threshold_after: Floats  #: What it is compared with, shape (T,).
+    #: By leaving out `best`: along the line (k = 1), or east and north (k = 2); 0 where there is none; shape (T, k).
     position_change_m: Floats
+    #: Distance between the positions without `best` and without `alternative`; NaN where either is none; shape (T,).
     alternative_shift_m: Floats
-    detection: Detection
+    detection: Detection  #: The test before any exclusion.
 
 
 @dataclass(frozen=True)
@@ -113,10 +94,6 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
     limits : RaimLimits, optional
     scale : array_like, shape (T,) or ()
         Noise scale, as in `detect`.
-
-    Returns
-    -------
-    Exclusion
     """
     limits = limits or RaimLimits()
     epochs, channels = model.root_weight.shape

@@ -46,38 +46,19 @@ class LinearModel:
 
     The three unknowns of the place are, on the line, along, across and up; in space, east, north
     and up. The first `interest` of them are what the position is wanted for.
-
-    Attributes
-    ----------
-    root_weight : ndarray, shape (T, M) [1/m]
-        1/sigma of each range, 0 for what is not used.
-    clock : ndarray of int, shape (M,)
-        Clock of each channel: index into the groups of the ranges.
-    clock_covariance_m2 : ndarray, shape (T, G, G) [m^2]
-        Of the clocks at a known place (K).
-    design : ndarray, shape (T, M, 3) [1/m]
-        Change of the whitened range with the place, clocks taken out (B); 0 where not used.
-    covariance_m2 : ndarray, shape (T, 3, 3) [m^2]
-        Of the place, prior included (Q); NaN where the ranges do not determine it.
-    prior : ndarray, shape (3, 3) [1/m^2]
-        Prior information on the place: the map error across and up.
-    misfit : ndarray, shape (T, M)
-        Whitened code - range at the position, up to a clock (y); 0 where not used.
-    freedom : ndarray of int, shape (T,)
-        Ranges beyond the unknowns; may be negative.
-    interest : int
-        1 on the line, 2 (horizontal) in space.
     """
 
-    root_weight: Floats
-    clock: Indices
-    clock_covariance_m2: Floats
+    root_weight: Floats  #: 1/sigma of each range, 0 for what is not used; shape (T, M) [1/m].
+    clock: Indices  #: Clock of each channel: index into the groups of the ranges; shape (M,).
+    clock_covariance_m2: Floats  #: Of the clocks at a known place (K), shape (T, G, G).
+    #: Change of the whitened range with the place, clocks taken out (B); 0 where not used; shape (T, M, 3) [1/m].
     design: Floats
+    #: Of the place, prior included (Q); NaN where the ranges do not determine it; shape (T, 3, 3).
     covariance_m2: Floats
-    prior: Floats
-    misfit: Floats
-    freedom: Integers
-    interest: int
+    prior: Floats  #: Prior information on the place: the map error across and up; shape (3, 3) [1/m^2].
+    misfit: Floats  #: Whitened code - range at the position, up to a clock (y); 0 where not used; shape (T, M).
+    freedom: Integers  #: Ranges beyond the unknowns; may be negative; shape (T,).
+    interest: int  #: 1 on the line, 2 (horizontal) in space.
 
     def __len__(self) -> int:
         return len(self.root_weight)
@@ -159,28 +140,14 @@ class LinearModel:
 
 @dataclass(frozen=True, kw_only=True)
 class Compact:
-    """Residuals and their projector of the used channels alone, side by side: T epochs by n.
+    """Residuals and their projector of the used channels alone, side by side: T epochs by n."""
 
-    Attributes
-    ----------
-    channel : ndarray of int, shape (T, n)
-        Channel of the model in each place.
-    used : ndarray of bool, shape (T, n)
-        False in the places beyond the epoch's own channels.
-    projector : ndarray, shape (T, n, n)
-        S; 0 beyond.
-    residual : ndarray, shape (T, n)
-    sigma_m : ndarray, shape (T, n) [m]
-        0 beyond.
-    gain_m : ndarray, shape (T, n, interest) [m]
-    """
-
-    channel: Indices
-    used: Masks
-    projector: Floats
-    residual: Floats
-    sigma_m: Floats
-    gain_m: Floats
+    channel: Indices  #: Channel of the model in each place, shape (T, n).
+    used: Masks  #: False in the places beyond the epoch's own channels, shape (T, n).
+    projector: Floats  #: S; 0 beyond; shape (T, n, n).
+    residual: Floats  #: Shape (T, n).
+    sigma_m: Floats  #: 0 beyond, shape (T, n).
+    gain_m: Floats  #: Shape (T, n, interest).
 
     def take(self, epochs: Indices) -> Compact:
         """The parts of some epochs, by index."""
@@ -294,7 +261,6 @@ def linearised(
 
     Parameters
     ----------
-    ranges : RangeArrays
     place_ecef_m : ndarray, shape (T, 3) [m]
         Positions; NaN where there is none.
     axes : ndarray, shape (T, 3, 3)

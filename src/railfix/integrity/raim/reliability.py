@@ -34,47 +34,27 @@ _BLOCK_SIZE: Final = 40_000
 
 @dataclass(frozen=True, kw_only=True)
 class Reliability:
-    """Reliability of T epochs by M channels, for the chi-square test.
+    """Reliability of T epochs by M channels, for the chi-square test."""
 
-    Attributes
-    ----------
-    noncentrality : ndarray, shape (T,)
-        lambda of the epoch's degrees of freedom; NaN where not testable.
-    minimal_detectable_bias_m : ndarray, shape (T, M) [m]
-        Range error that the test misses with the stated probability; infinite where nothing checks
-        the range, NaN where not used or not testable.
-    slope_m : ndarray, shape (T, M) [m]
-        Movement of the position for one unit of the root of the statistic; NaN where not used.
-    pair_slope_m : ndarray, shape (T,) [m]
-        Largest such movement by errors of two satellites; NaN unless two faults are asked for.
-    worst : ndarray of int, shape (T,)
-        Channel of the largest slope; -1 where there is none.
-    position_sigma_m : ndarray, shape (T,) [m]
-        Standard deviation along the line; in space along the longest axis of the horizontal ellipse.
-    fault_level_m : ndarray, shape (T,) [m]
-        Movement by a fault that the test misses with the stated probability: slope sqrt(lambda).
-    noise_level_m : ndarray, shape (T,) [m]
-        K sigma.
-    protection_level_m : ndarray, shape (T,) [m]
-        Their sum; infinite where a satellite is unchecked, or where there is a position but no
-        redundancy; NaN where there is no position.
-    available : ndarray of bool, shape (T,)
-        The protection level is finite.
-    alarm : ndarray of bool, shape (T,)
-        It is not known to be within the alarm limit.
-    """
-
-    noncentrality: Floats
+    noncentrality: Floats  #: lambda of the epoch's degrees of freedom; NaN where not testable; shape (T,).
+    #: Range error that the test misses with the stated probability; infinite where nothing checks the range, NaN where
+    #: not used or not testable; shape (T, M).
     minimal_detectable_bias_m: Floats
+    #: Movement of the position for one unit of the root of the statistic; NaN where not used; shape (T, M).
     slope_m: Floats
+    #: Largest such movement by errors of two satellites; NaN unless two faults are asked for; shape (T,).
     pair_slope_m: Floats
-    worst: Indices
+    worst: Indices  #: Channel of the largest slope; -1 where there is none; shape (T,).
+    #: Standard deviation along the line; in space along the longest axis of the horizontal ellipse; shape (T,).
     position_sigma_m: Floats
+    #: Movement by a fault that the test misses with the stated probability: slope sqrt(lambda); shape (T,).
     fault_level_m: Floats
-    noise_level_m: Floats
+    noise_level_m: Floats  #: K sigma, shape (T,).
+    #: Their sum; infinite where a satellite is unchecked, or where there is a position but no redundancy; NaN where
+    #: there is no position; shape (T,).
     protection_level_m: Floats
-    available: Masks
-    alarm: Masks
+    available: Masks  #: The protection level is finite, shape (T,).
+    alarm: Masks  #: It is not known to be within the alarm limit, shape (T,).
 
 
 def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: ArrayLike = 1.0) -> Reliability:
@@ -88,10 +68,6 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
         Of the chi-square test, whatever the mode.
     scale : array_like, shape (T,) or ()
         Noise scale, as in `detect`; it does not touch the map error in `position_sigma_m`.
-
-    Returns
-    -------
-    Reliability
     """
     limits = limits or RaimLimits()
     scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(model),))

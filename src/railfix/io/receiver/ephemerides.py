@@ -18,8 +18,8 @@ from railfix.core.arrays import Bytes, Datetimes
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.io.receiver import nav_messages
-from railfix.io.receiver.bits import Field, Subframes, fields, packed_words, unsigned
-from railfix.io.receiver.records import (
+from railfix.io.receiver.framing import Field, Subframes, fields, packed_words, unsigned
+from railfix.io.receiver.measurements import (
     Record,
     Values,
     beidou_record,

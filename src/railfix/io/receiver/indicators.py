@@ -2,6 +2,8 @@
 
 Sources: u-blox F9 HPG 1.32 interface description (UBX-22008968), 3.14.5 MON-RF, 3.14.2 MON-HW; u-blox X20 HPG 2.00
 (SEC-SIG, versions 1 and 2; SEC-SIGLOG); Septentrio mosaic-X5 reference guide 4.14, 4.2.14 (RFStatus, ReceiverStatus).
+
+Positions that receivers computed themselves, from their logs: UBX NAV-PVT and NAV-HPPOSLLH, SBF PVT blocks.
 """
 
 from __future__ import annotations
@@ -13,7 +15,11 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Bytes, Floats, Integers
-from railfix.io.receiver.framing import Frames
+from railfix.core.errors import InputFileError
+from railfix.core.files import FilePath, open_stream
+from railfix.io.position_log import PositionLog
+from railfix.io.receiver import sbf, ubx
+from railfix.io.receiver.framing import Frames, find_frames
 
 MON_RF: Final = 0x0A38
 MON_HW: Final = 0x0A09
@@ -55,7 +61,6 @@ def indicators_at(frames: Frames, places: Integers, before: Indicators) -> tuple
 
     Parameters
     ----------
-    frames : Frames
     places : ndarray of int, shape (T,)
         Rising; each has what the messages before it report.
     before : Indicators
@@ -155,3 +160,46 @@ def _receiver_status(data: Bytes) -> tuple[int, float] | None:
         return None
     gain = int(data[_FRONT_ENDS + 1 : _FRONT_ENDS + 2].view(np.int8)[0])
     return 0, np.nan if gain == _NO_GAIN else float(gain)
+
+
+_BLOCK_BYTES = 1 << 22
+
+
+def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None) -> PositionLog:
+    """Positions in a receiver's log, plain or packed, as the receiver computed them; `line` counts the positions.
+
+    SBF PVTGeodetic, or PVTCartesian without it; UBX NAV-HPPOSLLH, or NAV-PVT without it. Qualities as RTKLIB counts
+    them. `date` is some time within half a week, for UBX logs without a NAV-PVT that has a date. InputFileError: the
+    log has no position, or none that can be dated.
+    """
+    parts = []
+    near = np.datetime64("NaT", "ns") if date is None else date.astype("datetime64[ns]")
+    undated, rest = 0, b""
+    with open_stream(path, content="bytes") as stream:
+        while True:
+            block = stream.read(_BLOCK_BYTES)
+            frames = find_frames(np.frombuffer(rest + block, dtype=np.uint8), at_end=not block)
+            rest = frames.data[frames.consumed :].tobytes()
+            day = ubx.date_of(frames)
+            near = near if np.isnat(day) else day
+            of_ubx = ubx.positions(frames, near)
+            undated += len(frames.of("ubx", ubx.NAV_HPPOSLLH, ubx.NAV_PVT)) if np.isnat(near) else 0
+            parts += [part for part in (sbf.positions(frames), of_ubx) if len(part["time"])]
+            if not block:
+                break
+    if not parts:
+        why = (
+            "its positions (UBX) carry no date, and no NAV-PVT with one is in the log; give one with --date"
+            if undated
+            else "holds no position of the receiver (UBX NAV-PVT or NAV-HPPOSLLH, SBF PVTGeodetic or PVTCartesian)"
+        )
+        raise InputFileError(path, why)
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return PositionLog(
+        path=str(path),
+        time=columns["time"],
+        ecef_m=columns["ecef_m"],
+        quality=columns["quality"],
+        sigma_m=columns["sigma_m"],
+        line=np.arange(1, len(columns["time"]) + 1),
+    )

@@ -16,9 +16,8 @@ from railfix.core.files import FilePath, open_stream
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.receiver import rtcm, sbf, ubx
-from railfix.io.receiver.bits import SbasFrames, joined_subframes, sbas_frames
 from railfix.io.receiver.ephemerides import Assembled, Unfinished, assembled, assembled_rtcm, merged, navigation_of
-from railfix.io.receiver.framing import Frames, find_frames
+from railfix.io.receiver.framing import Frames, SbasFrames, find_frames, joined_subframes, sbas_frames
 from railfix.io.receiver.indicators import Indicators, indicators_at
 from railfix.io.receiver.measurements import Measurements, Tracking, observations_of
 

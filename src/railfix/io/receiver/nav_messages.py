@@ -14,8 +14,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Bytes, Floats, Masks
-from railfix.io.receiver.bits import Field, fields
-from railfix.io.receiver.framing import crc24q
+from railfix.io.receiver.framing import Field, crc24q, fields
 
 _PI: Final = np.pi
 

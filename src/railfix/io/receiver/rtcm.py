@@ -15,8 +15,7 @@ from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Mas
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import bdt_to_gpst, gpst_minus_utc, nearest_week
 from railfix.gnss.signals import named_frequency_hz
-from railfix.io.receiver.bits import Field, fields, signed, unsigned
-from railfix.io.receiver.framing import Frames
+from railfix.io.receiver.framing import Field, Frames, fields, signed, unsigned
 from railfix.io.receiver.measurements import Measurements, joined
 
 #: Constellation letter by tens of the message number of an MSM.

@@ -16,8 +16,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week
 from railfix.gnss.signals import named_frequency_hz
-from railfix.io.receiver.bits import Subframes
-from railfix.io.receiver.framing import Frames
+from railfix.io.receiver.framing import Frames, Subframes
 from railfix.io.receiver.measurements import Measurements
 from railfix.io.receiver.ubx import gathered
 

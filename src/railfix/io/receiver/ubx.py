@@ -13,8 +13,7 @@ import numpy as np
 from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, Strings
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week, nearest_week
-from railfix.io.receiver.bits import Subframes
-from railfix.io.receiver.framing import Frames
+from railfix.io.receiver.framing import Frames, Subframes
 from railfix.io.receiver.measurements import Measurements
 
 RXM_RAWX: Final = 0x0215

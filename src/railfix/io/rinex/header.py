@@ -14,7 +14,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import ByteStream
 from railfix.gnss.observations import ObservationHeader
-from railfix.io.rinex.observations_signals import SYSTEMS, SignalColumn, columns_of
+from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, columns_of
 
 #: Time systems of TIME OF FIRST OBS, and the default of files without one by constellation.
 TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
@@ -38,25 +38,16 @@ _FILE_TYPES: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class RinexHeader:
-    """Contents of the header needed to read the lines after it.
-
-    Attributes
-    ----------
-    system : str
-        Constellation letter of the file, "M" when mixed.
-    types : mapping of str to tuple of str
-        Declared types by constellation letter; RINEX 2 has one entry, `ALL`.
-    scale : mapping of (str, str) to float
-        SYS / SCALE FACTOR by constellation and type.
-    public : ObservationHeader
-        The part that becomes `Observations.header`.
-    """
+    """Contents of the header needed to read the lines after it."""
 
     version: float
-    system: str
+    system: str  #: Constellation letter of the file, "M" when mixed.
     time_system: str = "GPS"
+    #: Declared types by constellation letter; RINEX 2 has one entry, `ALL`.
     types: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    #: SYS / SCALE FACTOR by constellation and type.
     scale: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    #: The part that becomes `Observations.header`.
     public: ObservationHeader = field(default_factory=ObservationHeader)
 
     def types_of(self, system: str) -> tuple[str, ...] | None:

@@ -35,7 +35,7 @@ from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import BrokenLines, Paths, listed
 from railfix.gnss.observations import Observations, channels_with_data, concatenate
 from railfix.io.rinex.observations_blocks import BlockReader, Selection
-from railfix.io.rinex.observations_signals import SYSTEMS
+from railfix.io.rinex.observations_lines import SYSTEMS
 
 #: Default number of epochs of a piece.
 DEFAULT_EPOCHS: Final = 3600

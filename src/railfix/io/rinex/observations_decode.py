@@ -24,8 +24,7 @@ from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks, Strings
 from railfix.gnss.observations import channels_with_data
 from railfix.io.rinex.header import RinexHeader
 from railfix.io.rinex.observations_epochs import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, EpochHeads, FaultLog
-from railfix.io.rinex.observations_lines import Lines
-from railfix.io.rinex.observations_signals import KINDS, SYSTEMS, SignalColumn
+from railfix.io.rinex.observations_lines import KINDS, SYSTEMS, Lines, SignalColumn
 
 Words = NDArray[np.uint64]
 
@@ -49,21 +48,11 @@ _KEEP: Final = np.array(
 
 @dataclass(frozen=True)
 class Fields:
-    """Values of fields, shape (n, k): n satellite lines by k observation types.
+    """Values of fields, shape (n, k): n satellite lines by k observation types."""
 
-    Attributes
-    ----------
-    value : ndarray of float64
-        NaN where blank, and where `bad`.
-    lock : ndarray of uint8
-        Loss-of-lock digit, 0 where blank.
-    bad : ndarray of bool
-        The field is neither blank nor a number, or one of its two indicators is no digit.
-    """
-
-    value: Floats
-    lock: Bytes
-    bad: Masks
+    value: Floats  #: NaN where blank, and where `bad`.
+    lock: Bytes  #: Loss-of-lock digit, 0 where blank.
+    bad: Masks  #: The field is neither blank nor a number, or one of its two indicators is no digit.
 
 
 def joined(parts: Sequence[Fields]) -> Fields:

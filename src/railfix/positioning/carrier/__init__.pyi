@@ -1,8 +1,16 @@
 # The names of `railfix.positioning.carrier`, imported at their first use (lazy-loader).
 
 from .ambiguities import ArcAmbiguities, PhaseLimits, PhasePositions, repeats_of
-from .arcs import ArcState, last_arcs, number_arcs
-from .continuity import ContinuityLimits, ContinuityState, TrackedPhases, TrackJumps, track_jumps
+from .continuity import (
+    ArcState,
+    ContinuityLimits,
+    ContinuityState,
+    TrackedPhases,
+    TrackJumps,
+    last_arcs,
+    number_arcs,
+    track_jumps,
+)
 from .filtered import PhaseState, phase_positions
 from .integers import Fixed, IntegerChannels, fix_integers
 from .observation_model import Phases, corrected_phase_m

@@ -33,45 +33,27 @@ FREE_AMBIGUITY_M: Final = 1e4
 
 
 class PhaseLimits(Settings):
-    """Limits of the float ambiguities.
+    """Limits of the float ambiguities."""
 
-    Attributes
-    ----------
-    clocks : {"own", "shared"}
-        Clock of the phases: their own, or that of the codes (P4).
-    drift_m : float
-        [m/sqrt(s)] Random walk of an ambiguity: what ionosphere, satellite orbit and
-        clock, and multipath move a phase against the others. Without it, phases that drift by
-        centimetres while satellites move by hundredths of a radian bias the position by metres.
-        With codes of 1 m at 1 Hz, 0.01 averages over about 100 s. 0 holds ambiguities constant.
-    hop_s : float
-        Steps of the walk.
-    correlation_s : float
-        Correlation time of code errors: epochs nearer
-        to each other than this give the ambiguities no new information. The variance of the
-        ambiguities is multiplied by correlation / interval, up to that of codes alone. The
-        positions do not change. 0 for white noise, such as simulated noise.
-    passes : int
-        Linearisations of `phase_positions`; each has its own state, so that results do not depend on chunks.
-    forget_s : float
-        An arc not observed for this long starts again.
-    integer_risk : float
-        Beside a base station: largest probability of a wrong integer with which ambiguities are fixed.
-    no_integer_prior : float
-        Probability that phases are no whole cycles (multipath, half a cycle).
-    largest_sigma_m : float
-        Epochs with more noise along the line have no position.
-    """
-
-    clocks: PhaseClocks = "own"
+    clocks: PhaseClocks = "own"  #: Clock of the phases: their own, or that of the codes (P4).
+    #: [m/sqrt(s)] Random walk of an ambiguity: what ionosphere, satellite orbit and clock, and multipath move a phase
+    #: against the others. Without it, phases that drift by centimetres while satellites move by hundredths of a radian
+    #: bias the position by metres. With codes of 1 m at 1 Hz, 0.01 averages over about 100 s. 0 holds ambiguities
+    #: constant.
     drift_m: float = Field(default=0.01, ge=0)
-    hop_s: float = Field(default=10.0, gt=0)
+    hop_s: float = Field(default=10.0, gt=0)  #: Steps of the walk.
+    #: Correlation time of code errors: epochs nearer to each other than this give the ambiguities no new information.
+    #: The variance of the ambiguities is multiplied by correlation / interval, up to that of codes alone. The positions
+    #: do not change. 0 for white noise, such as simulated noise.
     correlation_s: float = Field(default=20.0, ge=0)
+    #: Linearisations of `phase_positions`; each has its own state, so that results do not depend on chunks.
     passes: int = Field(default=2, ge=1)
-    forget_s: float = Field(default=600.0, gt=0)
+    forget_s: float = Field(default=600.0, gt=0)  #: An arc not observed for this long starts again.
+    #: Beside a base station: largest probability of a wrong integer with which ambiguities are fixed.
     integer_risk: float = Field(default=1e-4, gt=0, lt=0.5)
+    #: Probability that phases are no whole cycles (multipath, half a cycle).
     no_integer_prior: float = Field(default=1e-2, gt=0, lt=1)
-    largest_sigma_m: float = Field(default=1e3, gt=0)
+    largest_sigma_m: float = Field(default=1e3, gt=0)  #: Epochs with more noise along the line have no position.
 
 
 def hop_of(time: Datetimes, limits: PhaseLimits) -> Integers:
@@ -90,65 +72,43 @@ def repeats_of(time: Datetimes, limits: PhaseLimits) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class ArcAmbiguities:
-    """Ambiguities of A arcs (with a drift over a complete run: of parts of arcs within a hop).
+    """Ambiguities of A arcs (with a drift over a complete run: of parts of arcs within a hop)."""
 
-    Attributes
-    ----------
-    arc_id : ndarray of int64, shape (A,)
-    ambiguity_m : ndarray, shape (A,) [m]
-        Phase less range less clock: whole cycles, phase wind-up and delays of the signal. With
-        clocks of the phases' own, known up to a constant common to all: zero in the mean of the
-        corrections to their first values, and the covariance is against that mean.
-    covariance_m2 : ndarray, shape (A, A) [m^2]
-        From noise alone, without the map error.
-    """
-
-    arc_id: Integers
+    arc_id: Integers  #: Shape (A,).
+    #: Phase less range less clock: whole cycles, phase wind-up and delays of the signal. With clocks of the phases'
+    #: own, known up to a constant common to all: zero in the mean of the corrections to their first values, and the
+    #: covariance is against that mean; shape (A,).
     ambiguity_m: Floats
-    covariance_m2: Floats
+    covariance_m2: Floats  #: From noise alone, without the map error; shape (A, A).
 
 
 @dataclass(frozen=True, kw_only=True)
 class PhasePositions:
-    """Positions along the line from code and phase, T epochs by M channels.
+    """Positions along the line from code and phase, T epochs by M channels."""
 
-    Attributes
-    ----------
-    arc_m : ndarray, shape (T,) [m]
-        Along the trajectory, within its ends; NaN without an initial position, or where the
-        satellites do not determine it.
-    sigma_m, noise_sigma_m : ndarray, shape (T,) [m]
-        Standard deviation with the map's error, and of noise alone.
-    clock_m : ndarray, shape (T, G) [m]
-        Receiver clock of each group; NaN where there is no position.
-    code_residual_m, phase_residual_m : ndarray, shape (T, M) [m]
-        Observed less computed; NaN where not used.
-    ambiguity_m, ambiguity_sigma_m : ndarray, shape (T, M) [m]
-        Of the arc of each used phase, as known at the epoch.
-    n_codes, n_phases : ndarray of int, shape (T,)
-        Used.
-    n_fixed : ndarray of int, shape (T,)
-        Differences of ambiguities fixed to whole cycles.
-    integer_risk : ndarray, shape (T,)
-        Probability that one of these is wrong, or of the best candidates where none is fixed; NaN without any.
-    arcs : ArcAmbiguities or None
-        All arcs of a run, or those alive after the last epoch (`phase_positions`); None in results, row by row.
-    iterations : int
-    """
-
+    #: Along the trajectory, within its ends; NaN without an initial position, or where the satellites do not determine
+    #: it; shape (T,).
     arc_m: Floats
+    #: Standard deviation with the map's error, and of noise alone; shape (T,).
     sigma_m: Floats
     noise_sigma_m: Floats
-    clock_m: Floats
+    clock_m: Floats  #: Receiver clock of each group; NaN where there is no position; shape (T, G).
+    #: Observed less computed; NaN where not used; shape (T, M).
     code_residual_m: Floats
     phase_residual_m: Floats
+    #: Of the arc of each used phase, as known at the epoch; shape (T, M).
     ambiguity_m: Floats
     ambiguity_sigma_m: Floats
+    #: Used, shape (T,).
     n_codes: Integers
     n_phases: Integers
-    n_fixed: Integers
+    n_fixed: Integers  #: Differences of ambiguities fixed to whole cycles, shape (T,).
+    #: Probability that one of these is wrong, or of the best candidates where none is fixed; NaN without any; shape
+    #: (T,).
     integer_risk: Floats
+    #: All arcs of a run, or those alive after the last epoch (`phase_positions`); None in results, row by row.
     arcs: ArcAmbiguities | None
+
     iterations: int
 
 

@@ -4,115 +4,155 @@ Between two epochs the unknowns are the distance moved along a known line and th
 every further satellite is a check, precise to a centimetre at any rate of the log and
 without Dopplers. Where they disagree, the worst channels are rejected one by one until the others agree, and
 channels that then fit are accepted again.
+
+Numbers of phase arcs without a cycle slip.
+
+The number of an arc is unique in a run: the channel's five letters and the count of
+arcs of that channel so far. It does not depend on chunks or on the order of channels.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Masks, Strings, read_only
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, read_only
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
-from railfix.positioning.carrier.arcs import ChannelKeys, channel_keys, rows_before
 from railfix.track.trajectory import Trajectory
+
+#: Bits of the count in an arc's number; the channel's letters are above them.
+COUNT_BITS: Final = 23
+#: No phase, no arc.
+NO_ARC: Final = -1
+
+#: Satellite and signal of each channel.
+ChannelKeys = tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArcState:
+    """Arcs that each channel has had so far, by channel code."""
+
+    count: Mapping[int, int] = field(default_factory=dict)
+
+
+def channel_code(satellite: str, signal: str) -> int:
+    """A channel's letters as one number: ``G05`` on ``1C``."""
+    return int.from_bytes(f"{satellite:<3.3}{signal:<2.2}".encode("ascii"), "big")
+
+
+def channel_keys(satellite: Strings, signal: Strings) -> ChannelKeys:
+    """Satellite and signal of each channel, by which states refer to channels."""
+    return tuple(zip(satellite.tolist(), signal.tolist(), strict=True))
+
+
+def rows_before(before: ChannelKeys, now: ChannelKeys) -> Indices:
+    """Row of each channel among those of the epoch before, -1 for new ones, shape (M,).
+
+    Values of a state with one more for new channels at the end, ``np.append(values, np.nan)``, are indexed with it.
+    """
+    row = {key: i for i, key in enumerate(before)}
+    return np.array([row.get(key, -1) for key in now], dtype=np.intp)
+
+
+def number_arcs(
+    slip: Masks,
+    has_phase: Masks,
+    satellite: Strings,
+    signal: Strings,
+    state: ArcState | None = None,
+) -> tuple[Integers, ArcState]:
+    """Number of the arc of each phase.
+
+    Parameters
+    ----------
+    slip : ndarray of bool, shape (T, M)
+        Where arcs begin (`slips.find_slips`, and what other tests add).
+    has_phase : ndarray of bool, shape (T, M)
+    satellite, signal : ndarray of str, shape (M,)
+    state : ArcState, optional
+
+    Returns
+    -------
+    ndarray of int64, shape (T, M)
+        `NO_ARC` where there is no phase.
+    ArcState
+    """
+    before = dict(state.count) if state else {}
+    codes = [channel_code(str(a), str(b)) for a, b in zip(satellite.tolist(), signal.tolist(), strict=True)]
+    first = np.array([before.get(code, 0) for code in codes], dtype=np.int64)
+    count = first + np.cumsum(slip & has_phase, axis=0, dtype=np.int64)
+    names = np.array(codes, dtype=np.int64) << COUNT_BITS
+    if len(count):
+        before.update({code: int(c) for code, c in zip(codes, count[-1], strict=True)})
+    return np.where(has_phase, names + count, NO_ARC), ArcState(count=before)
+
+
+def last_arcs(satellite: Strings, signal: Strings, state: ArcState | None) -> Integers:
+    """Return the number of the last arc of each channel, shape (M,); `NO_ARC` for channels without one."""
+    count = {} if state is None else state.count
+    codes = [channel_code(str(a), str(b)) for a, b in zip(satellite.tolist(), signal.tolist(), strict=True)]
+    return np.array([(code << COUNT_BITS) + count[code] if code in count else NO_ARC for code in codes], dtype=np.int64)
+
+
+def channel_of(arc_id: Integers) -> Integers:
+    """Channel code of each arc."""
+    return np.asarray(arc_id >> COUNT_BITS)
 
 
 class ContinuityLimits(Settings):
-    """Limits of the test.
+    """Limits of the test."""
 
-    Attributes
-    ----------
-    phase_m, drift_mps : float
-        Standard deviation of a change of phase: at once, and for each second between the epochs
-        (satellite clocks, delays).
-    aside_m : float
-        Standard deviation across and up of a sudden change of place (map points).
-    across_share, up_share : float
-        The same as shares of the distance moved: a position error of 5 m turns the line by 0.017 on a
-        curve of 300 m radius, and by 0.0025 on a vertical curve of 2000 m.
-    sigmas : float
-        Standard deviations of the channel's residual that reject it.
-    max_rejected : int
-        Largest number of channels rejected; where more would be, no channel continues.
-    max_gap_s : float
-        Longest interval that is judged.
-    """
-
+    #: Standard deviation of a change of phase: at once, and for each second between the epochs (satellite clocks,
+    #: delays).
     phase_m: float = Field(default=0.012, gt=0)
     drift_mps: float = Field(default=0.008, gt=0)
+    #: Standard deviation across and up of a sudden change of place (map points).
     aside_m: float = Field(default=0.02, gt=0)
+    #: The same as shares of the distance moved: a position error of 5 m turns the line by 0.017 on a curve of 300 m
+    #: radius, and by 0.0025 on a vertical curve of 2000 m.
     across_share: float = Field(default=0.02, gt=0)
     up_share: float = Field(default=0.003, gt=0)
-    sigmas: float = Field(default=4.5, gt=0)
+    sigmas: float = Field(default=4.5, gt=0)  #: Standard deviations of the channel's residual that reject it.
+    #: Largest number of channels rejected; where more would be, no channel continues.
     max_rejected: int = Field(default=8, ge=0)
-    max_gap_s: float = Field(default=31.0, gt=0)
+    max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is judged.
 
 
 @dataclass(frozen=True, kw_only=True)
 class ContinuityState:
-    """The last epoch of a chunk, by channel.
-
-    Attributes
-    ----------
-    time : datetime64[ns]
-    channels : tuple of (str, str)
-    phase_m : ndarray, shape (M,) [m]
-        Corrected phase; NaN where not used.
-    sat_ecef_m : ndarray, shape (M, 3) [m]
-    arc_m : float
-    """
+    """The last epoch of a chunk, by channel."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     channels: ChannelKeys = ()
-    phase_m: Floats = field(default_factory=lambda: np.empty(0))
-    sat_ecef_m: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    phase_m: Floats = field(default_factory=lambda: np.empty(0))  #: Corrected phase; NaN where not used; shape (M,).
+    sat_ecef_m: Floats = field(default_factory=lambda: np.empty((0, 3)))  #: Shape (M, 3).
     arc_m: float = float("nan")
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackJumps:
-    """Verdict on the change of each phase into its epoch, T epochs by M channels.
+    """Verdict on the change of each phase into its epoch, T epochs by M channels."""
 
-    Attributes
-    ----------
-    jump : ndarray of bool, shape (T, M)
-        True where the phase does not fit: a new arc begins.
-    metric_m : ndarray, shape (T, M) [m]
-        Change of phase less that of the channels kept; NaN where not judged.
-    judged : ndarray of bool, shape (T, M)
-    moved_m : ndarray, shape (T,) [m]
-        Way along the line since the epoch before, from the phases; NaN where not known.
-    moved_sigma_m : ndarray, shape (T,) [m]
-    """
-
-    jump: Masks
-    metric_m: Floats
-    judged: Masks
-    moved_m: Floats
-    moved_sigma_m: Floats
+    jump: Masks  #: True where the phase does not fit: a new arc begins; shape (T, M).
+    metric_m: Floats  #: Change of phase less that of the channels kept; NaN where not judged; shape (T, M).
+    judged: Masks  #: Shape (T, M).
+    moved_m: Floats  #: Way along the line since the epoch before, from the phases; NaN where not known; shape (T,).
+    moved_sigma_m: Floats  #: Shape (T,).
 
 
 class TrackedPhases(NamedTuple):
-    """Phases of T epochs by M channels.
+    """Phases of T epochs by M channels."""
 
-    Attributes
-    ----------
-    phase_m : ndarray, shape (T, M) [m]
-        Corrected phases (`observation_model.corrected_phase_m`), NaN where not used.
-    sat_ecef_m : ndarray, shape (T, M, 3) [m]
-        Satellites where there is a phase.
-    slip : ndarray of bool, shape (T, M)
-        Slips already known: not judged again.
-    """
-
-    phase_m: Floats
-    sat_ecef_m: Floats
-    slip: Masks
+    phase_m: Floats  #: Corrected phases (`observation_model.corrected_phase_m`), NaN where not used; shape (T, M).
+    sat_ecef_m: Floats  #: Satellites where there is a phase, shape (T, M, 3).
+    slip: Masks  #: Slips already known: not judged again; shape (T, M).
 
 
 def track_jumps(

@@ -27,7 +27,7 @@ from railfix.positioning.carrier.ambiguities import (
     repeats_of,
     startable,
 )
-from railfix.positioning.carrier.arcs import channel_of
+from railfix.positioning.carrier.continuity import channel_of
 from railfix.positioning.carrier.integers import IntegerChannels, fix_integers
 from railfix.positioning.carrier.observation_model import (
     Linearised,
@@ -47,26 +47,15 @@ SEGMENT_EPOCHS: Final = 64
 
 @dataclass(frozen=True, kw_only=True)
 class Memory:
-    """Information of the epochs so far on the running arcs, A of them.
+    """Information of the epochs so far on the running arcs, A of them."""
 
-    Attributes
-    ----------
-    time : datetime64[ns]
-        Of the last epoch, NaT before the first.
-    arc_id : ndarray of int64, shape (A,)
-    seen : ndarray of datetime64[ns], shape (A,)
-    first_m : ndarray, shape (A,) [m]
-        First values of the ambiguities.
-    matrix : ndarray, shape (A, A) [1/m^2]
-    right : ndarray, shape (A, 3) [1/m]
-        Of the observations, and of a map off across and in height.
-    """
-
+    #: Of the last epoch, NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    arc_id: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    seen: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
-    first_m: Floats = field(default_factory=lambda: np.empty(0))
-    matrix: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    arc_id: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))  #: Shape (A,).
+    seen: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))  #: Shape (A,).
+    first_m: Floats = field(default_factory=lambda: np.empty(0))  #: First values of the ambiguities, shape (A,).
+    matrix: Floats = field(default_factory=lambda: np.empty((0, 0)))  #: Shape (A, A) [1/m^2].
+    #: Of the observations, and of a map off across and in height; shape (A, 3) [1/m].
     right: Floats = field(default_factory=lambda: np.empty((0, 3)))
 
 

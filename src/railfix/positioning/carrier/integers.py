@@ -26,38 +26,20 @@ _SHARES: Final = (1.0, 0.75, 0.5)
 
 @dataclass(frozen=True, kw_only=True)
 class IntegerChannels:
-    """Which channels have ambiguities that differ by whole cycles.
+    """Which channels have ambiguities that differ by whole cycles."""
 
-    Attributes
-    ----------
-    wavelength_m : ndarray, shape (M,) [m]
-    group : ndarray of int, shape (M,)
-        The same for channels of one clock and signal; -1 for those without integers.
-    """
-
-    wavelength_m: Floats
-    group: Integers
+    wavelength_m: Floats  #: Shape (M,).
+    group: Integers  #: The same for channels of one clock and signal; -1 for those without integers; shape (M,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fixed:
-    """Ambiguities of A arcs with those differences fixed that are certain enough.
+    """Ambiguities of A arcs with those differences fixed that are certain enough."""
 
-    Attributes
-    ----------
-    value_m : ndarray, shape (A, 3) [m]
-        Ambiguities, and their responses to a map 1 m off across and in height.
-    covariance_m2 : ndarray, shape (A, A) [m^2]
-        Of noise alone.
-    count : int
-        Differences fixed; 0: the float ambiguities are returned.
-    risk : float
-        Probability that one of them is wrong, or of the best ones where none is fixed; NaN without any difference.
-    """
-
-    value_m: Floats
-    covariance_m2: Floats
-    count: int
+    value_m: Floats  #: Ambiguities, and their responses to a map 1 m off across and in height; shape (A, 3).
+    covariance_m2: Floats  #: Of noise alone, shape (A, A).
+    count: int  #: Differences fixed; 0: the float ambiguities are returned.
+    #: Probability that one of them is wrong, or of the best ones where none is fixed; NaN without any difference.
     risk: float
 
 

@@ -44,27 +44,18 @@ _LEAST_TIE_M: Final = 1e-2
 
 @dataclass(frozen=True, kw_only=True)
 class Phases:
-    """Corrected phases of an antenna beside its `Ranges`: T epochs by M channels.
+    """Corrected phases of an antenna beside its `Ranges`: T epochs by M channels."""
 
-    Attributes
-    ----------
-    phase_m : ndarray, shape (T, M) [m]
-        Phase times wavelength, corrected like the code: + satellite clock - troposphere +
-        ionosphere (`corrected_phase_m`); any value where the weight is 0.
-    weight : ndarray, shape (T, M) [1/m^2]
-        1/sigma^2, 0 for what is not used. Where it is not 0, `Ranges.sat_ecef_m` must be the
-        satellite, whether its code is used or not.
-    arc_id : ndarray of int64, shape (T, M)
-        The same number along an unbroken stretch of one channel's phase, and nowhere else
-        (`arcs.number_arcs`).
-    integers : IntegerChannels or None
-        None leaves all ambiguities real numbers.
-    """
-
+    #: Phase times wavelength, corrected like the code: + satellite clock - troposphere + ionosphere
+    #: (`corrected_phase_m`); any value where the weight is 0; shape (T, M).
     phase_m: Floats
+    #: 1/sigma^2, 0 for what is not used. Where it is not 0, `Ranges.sat_ecef_m` must be the satellite, whether its code
+    #: is used or not; shape (T, M) [1/m^2].
     weight: Floats
+    #: The same number along an unbroken stretch of one channel's phase, and nowhere else (`arcs.number_arcs`); shape
+    #: (T, M).
     arc_id: Integers
-    integers: IntegerChannels | None = None
+    integers: IntegerChannels | None = None  #: None leaves all ambiguities real numbers.
 
     def take(self, epochs: Masks | Indices | slice) -> Phases:
         """The phases of some epochs."""
@@ -89,44 +80,26 @@ def corrected_phase_m(phase_m: Floats, sat_clock_m: Floats, ionosphere_m: Floats
 
 @dataclass(frozen=True, kw_only=True)
 class Linearised:
-    """Epochs around their places, own unknowns ``x = [along, across, up, clocks]`` (P of them).
+    """Epochs around their places, own unknowns ``x = [along, across, up, clocks]`` (P of them)."""
 
-    Attributes
-    ----------
-    code_design, phase_design : ndarray, shape (T, M, P)
-    groups : int
-        Clocks of the codes; a clock of the phases comes after them.
-    code_weight, phase_weight : ndarray, shape (T, M) [1/m^2]
-    code_m, phase_m : ndarray, shape (T, M) [m]
-        Observed less computed, less `clock_m`.
-    clock_m, phase_clock_m : ndarray, shape (T,) [m]
-        First values of the epoch's clocks, taken off codes and phases.
-    known : ndarray, shape (T, P, P)
-        Prior information: errors of the map, ties between clocks.
-    inverse : ndarray, shape (T, P, P)
-        Inverse of the normal matrix of the own unknowns.
-    right : ndarray, shape (T, P)
-        Right-hand side of the own unknowns.
-    coupling : ndarray, shape (T, P, M)
-        Normal matrix between own unknowns and each channel's ambiguity.
-    prior : ndarray, shape (2,) [1/m^2]
-        Of the map's errors.
-    """
-
+    #: Shape (T, M, P).
     code_design: Floats
     phase_design: Floats
-    groups: int
+    groups: int  #: Clocks of the codes; a clock of the phases comes after them.
+    #: Shape (T, M) [1/m^2].
     code_weight: Floats
     phase_weight: Floats
+    #: Observed less computed, less `clock_m`; shape (T, M).
     code_m: Floats
     phase_m: Floats
+    #: First values of the epoch's clocks, taken off codes and phases; shape (T,).
     clock_m: Floats
     phase_clock_m: Floats
-    known: Floats
-    inverse: Floats
-    right: Floats
-    coupling: Floats
-    prior: Floats
+    known: Floats  #: Prior information: errors of the map, ties between clocks; shape (T, P, P).
+    inverse: Floats  #: Inverse of the normal matrix of the own unknowns, shape (T, P, P).
+    right: Floats  #: Right-hand side of the own unknowns, shape (T, P).
+    coupling: Floats  #: Normal matrix between own unknowns and each channel's ambiguity, shape (T, P, M).
+    prior: Floats  #: Of the map's errors, shape (2,) [1/m^2].
 
 
 def linearise(
@@ -138,8 +111,6 @@ def linearise(
     ----------
     ranges : Ranges
         T epochs.
-    phases : Phases
-    trajectory : Trajectory
     arc_m : ndarray, shape (T,) [m]
         Finite and on the line.
     clocks : {"own", "shared"}
@@ -232,16 +203,10 @@ def shifted(lin: Linearised, first_m: Floats) -> Linearised:
 
 @dataclass(frozen=True, kw_only=True)
 class Reduced:
-    """Return the information of each epoch on the ambiguities of its channels.
+    """Return the information of each epoch on the ambiguities of its channels."""
 
-    Attributes
-    ----------
-    matrix : ndarray, shape (T, M, M) [1/m^2]
-    right : ndarray, shape (T, M, 3) [1/m]
-        Right-hand sides: of the observations, and of a map that is 1 m off across and in height.
-    """
-
-    matrix: Floats
+    matrix: Floats  #: Shape (T, M, M) [1/m^2].
+    #: Right-hand sides: of the observations, and of a map that is 1 m off across and in height; shape (T, M, 3) [1/m].
     right: Floats
 
 
@@ -270,23 +235,14 @@ def reduce(lin: Linearised) -> Reduced:
 
 @dataclass(frozen=True, kw_only=True)
 class OwnUnknowns:
-    """Each epoch's own unknowns, given the ambiguities.
+    """Each epoch's own unknowns, given the ambiguities."""
 
-    Attributes
-    ----------
-    step_m : ndarray, shape (T,) [m]
-        Along the line from the place of linearisation.
-    noise_sigma_m, sigma_m : ndarray, shape (T,) [m]
-        From noise alone, and with the map's error.
-    clock_m : ndarray, shape (T, G) [m]
-    code_residual_m, phase_residual_m : ndarray, shape (T, M) [m]
-        0 where the weight is 0.
-    """
-
-    step_m: Floats
+    step_m: Floats  #: Along the line from the place of linearisation, shape (T,).
+    #: From noise alone, and with the map's error; shape (T,).
     noise_sigma_m: Floats
     sigma_m: Floats
-    clock_m: Floats
+    clock_m: Floats  #: Shape (T, G).
+    #: 0 where the weight is 0, shape (T, M).
     code_residual_m: Floats
     phase_residual_m: Floats
 
@@ -303,11 +259,9 @@ def own_unknowns(
 
     Parameters
     ----------
-    lin : Linearised
     ambiguity_m : ndarray, shape (T, M, 3) [m]
         Of each channel, and its response to a map 1 m off across and in height.
     covariance_m2 : ndarray, shape (T, M, M) [m^2]
-    trajectory : Trajectory
     repeats : ndarray, shape (T,)
         Epochs with the same code errors: the ambiguities' variance is larger by that.
     """

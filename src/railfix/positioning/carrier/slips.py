@@ -26,7 +26,7 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz
-from railfix.positioning.carrier.arcs import ChannelKeys, channel_keys, rows_before
+from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, rows_before
 
 #: One millisecond as a distance [m]: the step of receivers that keep their clock near GPS time.
 MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT
@@ -65,82 +65,47 @@ class CycleSlipLimits(Settings):
     of the phases, noise of the mean Doppler, and what the trapezoid of the Dopplers misses of a
     motion with that jerk. One cycle on L1 (0.19 m) is seen up to intervals of about 1 s, two to
     1.5 s; a test on the track (`continuity.track_jumps`) has no such end.
-
-    Attributes
-    ----------
-    max_gap_s : float
-        Longest interval that is bridged: that of a station's log of 30 s.
-    doppler_m, doppler_mps : float
-        Limit of the phase against its Doppler, constant and by the interval. On real receivers at 1 Hz the median of
-        the metric is 0.01 to 0.04 m.
-    jerk_mps3 : float
-        Of the antenna; passenger trains stay below 0.5.
-    code_m : float
-        Limit of code less phase where Dopplers are absent or less sharp.
     """
 
-    max_gap_s: float = Field(default=31.0, gt=0)
+    max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is bridged: that of a station's log of 30 s.
+    #: Limit of the phase against its Doppler, constant and by the interval. On real receivers at 1 Hz the median of the
+    #: metric is 0.01 to 0.04 m.
     doppler_m: float = Field(default=0.05, gt=0)
     doppler_mps: float = Field(default=0.05, gt=0)
-    jerk_mps3: float = Field(default=0.5, gt=0)
-    code_m: float = Field(default=10.0, gt=0)
+    jerk_mps3: float = Field(default=0.5, gt=0)  #: Of the antenna; passenger trains stay below 0.5.
+    code_m: float = Field(default=10.0, gt=0)  #: Limit of code less phase where Dopplers are absent or less sharp.
 
 
 @dataclass(frozen=True, kw_only=True)
 class CycleSlipState:
-    """The last epoch of a chunk, by channel ("G05", "1C"), and the steps so far.
+    """The last epoch of a chunk, by channel ("G05", "1C"), and the steps so far."""
 
-    Attributes
-    ----------
-    time : datetime64[ns]
-        NaT before the first epoch.
-    channels : tuple of (str, str)
-    code_m, phase_m, doppler_mps : ndarray, shape (M,)
-        The phase as received, without `step_ms`.
-    half_cycle : ndarray of bool, shape (M,)
-    step_ms : int
-        Whole milliseconds that the codes' clock has stepped and the phases' has not.
-    """
-
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
     channels: ChannelKeys = ()
+    #: The phase as received, without `step_ms`; shape (M,).
     code_m: Floats = field(default_factory=lambda: np.empty(0))
     phase_m: Floats = field(default_factory=lambda: np.empty(0))
     doppler_mps: Floats = field(default_factory=lambda: np.empty(0))
-    half_cycle: Masks = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
-    step_ms: int = 0
+    half_cycle: Masks = field(default_factory=lambda: np.empty(0, dtype=np.bool_))  #: Shape (M,).
+    step_ms: int = 0  #: Whole milliseconds that the codes' clock has stepped and the phases' has not.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Slips:
-    """Phases and where their arcs begin, T epochs by M channels.
+    """Phases and where their arcs begin, T epochs by M channels."""
 
-    Attributes
-    ----------
-    slip : ndarray of bool, shape (T, M)
-        True where there is a phase that may not be joined to the epoch before.
-    reason : ndarray of int64, shape (T, M)
-        `SlipReason` bits.
-    phase_m : ndarray, shape (T, M) [m]
-        Phase times wavelength on the clock of the codes: whole milliseconds that only the codes
-        stepped are added. NaN where there is no phase or its wavelength is unknown.
-    doppler_metric_m, code_metric_m : ndarray, shape (T, M) [m]
-        Metrics of the two tests; NaN where they cannot judge.
-    doppler_limit_m : ndarray, shape (T,) [m]
-    clock_step_m : ndarray, shape (T,) [m]
-        Step of the receiver's clock into the epoch as the codes show it; 0 where none is seen.
-    half_cycle : ndarray of bool, shape (T, M)
-        The receiver reports an unresolved half cycle: harmless to a float ambiguity.
-    """
-
-    slip: Masks
-    reason: Integers
+    slip: Masks  #: True where there is a phase that may not be joined to the epoch before, shape (T, M).
+    reason: Integers  #: `SlipReason` bits, shape (T, M).
+    #: Phase times wavelength on the clock of the codes: whole milliseconds that only the codes stepped are added. NaN
+    #: where there is no phase or its wavelength is unknown; shape (T, M).
     phase_m: Floats
+    #: Metrics of the two tests; NaN where they cannot judge; shape (T, M).
     doppler_metric_m: Floats
     code_metric_m: Floats
-    doppler_limit_m: Floats
+    doppler_limit_m: Floats  #: Shape (T,).
+    #: Step of the receiver's clock into the epoch as the codes show it; 0 where none is seen; shape (T,).
     clock_step_m: Floats
-    half_cycle: Masks
+    half_cycle: Masks  #: The receiver reports an unresolved half cycle: harmless to a float ambiguity; shape (T, M).
 
 
 def median_or_zero(values: Floats) -> Floats:

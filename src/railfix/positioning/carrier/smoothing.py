@@ -4,6 +4,8 @@ Code less phase is constant along an arc, but for noise and for the ionosphere, 
 code as much as it advances the phase: it drifts by twice the change of the delay. Its mean over
 the arc so far, put back on the phase, is a code with less noise. The window's end limits the
 drift: with the delay changing at 1 mm/s a window of 100 s leaves up to 0.2 m.
+
+Linear recursions along time without a loop over epochs.
 """
 
 from __future__ import annotations
@@ -17,76 +19,64 @@ from pydantic import Field
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
-from railfix.positioning.carrier.arcs import ChannelKeys, channel_keys, rows_before
-from railfix.positioning.carrier.recursion import linear_recursion
+from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, rows_before
+
+
+def linear_recursion(gain: Floats, drive: Floats) -> Floats:
+    """``x_k = gain_k x_{k-1} + drive_k`` along axis 0 with x_{-1} = 0, without a loop over epochs.
+
+    Pairs (gain, drive) are composed over strides of 1, 2, 4, ...: log2(T) passes over the arrays.
+    No division and no growing product: gains in [0, 1] make it as stable as the recursion itself.
+    """
+    total, factor = drive.copy(), gain.copy()  # gains may have fewer elements, those of `drive` broadcast
+    stride = 1
+    while stride < len(total):
+        total[stride:] = total[stride:] + factor[stride:] * total[:-stride]
+        factor[stride:] = factor[stride:] * factor[:-stride]
+        stride *= 2
+    return total
 
 
 class SmoothingLimits(Settings):
-    """Limits of the smoothing.
+    """Limits of the smoothing."""
 
-    Attributes
-    ----------
-    window_s : float
-        Time constant: each code of an arc counts the same until the arc is this old, from then
-        on older ones fade (DO-229D 2.1.4.1.5 takes 100 s, for the ionosphere's drift).
-    clocks : {"own", "shared"}
-        "own": the codes' mean change against their phases is a clock: subtracted before and added after averaging. For
-        telephones, whose codes jump together by tens of metres (urban 95 % of the error along the line 10.8 to 7.0 m,
-        against 50 m with "shared"); other receivers did not lose by it.
-    """
-
+    #: Time constant: each code of an arc counts the same until the arc is this old, from then on older ones fade
+    #: (DO-229D 2.1.4.1.5 takes 100 s, for the ionosphere's drift).
     window_s: float = Field(default=100.0, gt=0)
+    #: "own": the codes' mean change against their phases is a clock: subtracted before and added after averaging. For
+    #: telephones, whose codes jump together by tens of metres (urban 95 % of the error along the line 10.8 to 7.0 m,
+    #: against 50 m with "shared"); other receivers did not lose by it.
     clocks: Literal["own", "shared"] = "own"
 
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothingState:
-    """The last epoch of a chunk, by channel.
+    """The last epoch of a chunk, by channel."""
 
-    Attributes
-    ----------
-    time : datetime64[ns]
-        NaT before the first epoch.
-    channels : tuple of (str, str)
-    base_m : ndarray, shape (M,) [m]
-        First code less phase of the running arc; NaN where none runs.
-    offset_m : ndarray, shape (M,) [m]
-        Smoothed code less phase, less `base_m`.
-    variance : ndarray, shape (M,)
-        Of the smoothed code, in units of that of a code.
-    count : ndarray of int, shape (M,)
-        Codes of the running arc.
-    last_m : ndarray, shape (M,) [m]
-        Last code less phase, for `clocks="own"`.
-    clock_m : float [m]
-        Mean change of the codes against the phases so far.
-    """
-
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
     channels: ChannelKeys = ()
+    #: First code less phase of the running arc; NaN where none runs; shape (M,).
     base_m: Floats = field(default_factory=lambda: np.empty(0))
+    #: Smoothed code less phase, less `base_m`; shape (M,).
     offset_m: Floats = field(default_factory=lambda: np.empty(0))
+    #: Of the smoothed code, in units of that of a code; shape (M,).
     variance: Floats = field(default_factory=lambda: np.empty(0))
+    #: Codes of the running arc, shape (M,).
     count: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    #: Last code less phase, for `clocks="own"`; shape (M,).
     last_m: Floats = field(default_factory=lambda: np.empty(0))
-    clock_m: float = 0.0
+    clock_m: float = 0.0  #: Mean change of the codes against the phases so far.
 
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothedCodes:
-    """Smoothed codes, T epochs by M channels.
+    """Smoothed codes, T epochs by M channels."""
 
-    Attributes
-    ----------
-    code_m : ndarray, shape (T, M) [m]
-        The raw code where there is no phase, and at the first epoch of an arc; NaN where
-        there is no code, unless the arc of its phase continues: then the smoothed code continues.
-    sigma_factor : ndarray, shape (T, M)
-        Expected standard deviation against that of one code, for noise that is white in time;
-        multipath lasts for tens of seconds and is averaged less. NaN where `code_m` is.
-    """
-
+    #: The raw code where there is no phase, and at the first epoch of an arc; NaN where there is no code, unless the
+    #: arc of its phase continues: then the smoothed code continues; shape (T, M).
     code_m: Floats
+    #: Expected standard deviation against that of one code, for noise that is white in time; multipath lasts for tens
+    #: of seconds and is averaged less. NaN where `code_m` is; shape (T, M).
     sigma_factor: Floats
 
 

@@ -9,9 +9,10 @@ from .curve import (
     CurveFit,
     SourceFile,
     fit_cn0_curve,
+    read_cn0_curve,
     satellite_kind,
+    write_cn0_curve,
 )
-from .file import read_cn0_curve, write_cn0_curve
 from .from_log import Cn0Calibration, cn0_curve_from_log, satellite_elevation_deg
 
 __all__ = [

@@ -8,6 +8,25 @@ Of each bin of elevation the mean is taken without outliers (beyond three robust
 from the median). Between the middles of the bins the curve runs by monotone cubic interpolation
 (PCHIP): it never goes beyond the means on either side. Above the highest bin the last mean holds;
 below the lowest bin there is no curve.
+
+The file of a C/N0 curve: TOML that a person can read and check.
+
+::
+
+    format = "railfix C/N0 curve 1"
+
+    [source]
+    antenna = "NOV703GGG.R2    NONE"
+    receiver = "JAVAD TRE_G3T DELTA"
+    ...
+
+    [[curve]]
+    kind = "G"
+    signal = "1C"
+    elevation_deg = [2.5, 7.5, 12.5]
+    mean_dbhz = [33.1, 36.42, 38.9]
+    spread_db = [2.1, 1.71, 1.4]
+    count = [812, 1204, 1377]
 """
 
 from __future__ import annotations
@@ -16,18 +35,22 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from railfix.core.arrays import Floats, Integers, Masks, Strings, read_only
-from railfix.core.settings import Settings
+from railfix.core.errors import InputFileError
+from railfix.core.files import FilePath
+from railfix.core.settings import Settings, write_toml
 from railfix.gnss.observations import ObservationHeader
+from railfix.ranges.model_file import read_model_file
 
 if TYPE_CHECKING:
     from scipy.interpolate import PchipInterpolator
+
 
 #: Standard deviation of a normal variable against its median absolute deviation.
 _NORMAL_MAD: Final = 1.482_602_218_505_602
@@ -61,49 +84,26 @@ def satellite_kind(satellite: str) -> str:
 
 
 class CurveFit(Settings):
-    """Settings of the fit of a curve.
+    """Settings of the fit of a curve."""
 
-    Attributes
-    ----------
-    bin_deg : float [deg]
-        Width of the bins of elevation.
-    least_samples : int
-        A bin of fewer samples is left out.
-    least_bins : int
-        A kind and signal of fewer bins gets no curve.
-    clip_sigma : float
-        Samples further from their bin's median, in robust standard deviations, are left out.
-    """
-
-    bin_deg: float = Field(default=5.0, ge=0.1, le=30.0)
-    least_samples: int = Field(default=30, ge=1)
-    least_bins: int = Field(default=4, ge=2)
+    bin_deg: float = Field(default=5.0, ge=0.1, le=30.0)  #: Width of the bins of elevation.
+    least_samples: int = Field(default=30, ge=1)  #: A bin of fewer samples is left out.
+    least_bins: int = Field(default=4, ge=2)  #: A kind and signal of fewer bins gets no curve.
+    #: Samples further from their bin's median, in robust standard deviations, are left out.
     clip_sigma: float = Field(default=3.0, gt=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Mean:
-    """Mean C/N0 over elevation of one kind of satellites on one signal, B bins.
+    """Mean C/N0 over elevation of one kind of satellites on one signal, B bins."""
 
-    Attributes
-    ----------
-    kind : str
-        Key of `KINDS`.
-    signal : str
-    elevation_deg : ndarray, shape (B,) [deg]
-        Middles of the bins, rising.
-    mean_dbhz, spread_db : ndarray, shape (B,) [dB-Hz], [dB]
-        Mean and robust standard deviation.
-    count : ndarray of int, shape (B,)
-        Samples of each bin.
-    """
-
-    kind: str
+    kind: str  #: Key of `KINDS`.
     signal: str
-    elevation_deg: Floats
+    elevation_deg: Floats  #: Middles of the bins, rising; shape (B,).
+    #: Mean and robust standard deviation, shape (B,) [dB-Hz] [dB].
     mean_dbhz: Floats
     spread_db: Floats
-    count: Integers
+    count: Integers  #: Samples of each bin, shape (B,).
 
     def __post_init__(self) -> None:
         for name in ("elevation_deg", "mean_dbhz", "spread_db", "count"):
@@ -137,44 +137,27 @@ class SourceFile(Settings):
 
 
 class Cn0CurveSource(Settings):
-    """Log that a curve was made from.
+    """Log that a curve was made from."""
 
-    Attributes
-    ----------
-    antenna, receiver, marker : str
-        From the header of the log, as written.
-    start, end : str
-        First and last epoch used, ISO 8601, GPS time.
-    epochs : int
-    position_ecef_m : tuple of float
-        Position of the antenna.
-    railfix_version : str
-    file : tuple of SourceFile
-    """
-
+    #: From the header of the log, as written.
     antenna: str = ""
     receiver: str = ""
     marker: str = ""
+    #: First and last epoch used, ISO 8601, GPS time.
     start: str = ""
     end: str = ""
+
     epochs: int = Field(default=0, ge=0, strict=True)
-    position_ecef_m: tuple[float, ...] = ()
+    position_ecef_m: tuple[float, ...] = ()  #: Position of the antenna.
     railfix_version: str = ""
     file: tuple[SourceFile, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Curve:
-    """Mean C/N0 over elevation of an antenna and receiver.
+    """Mean C/N0 over elevation of an antenna and receiver."""
 
-    Attributes
-    ----------
-    means : tuple of Cn0Mean
-        One a kind and signal.
-    source : Cn0CurveSource
-    """
-
-    means: tuple[Cn0Mean, ...]
+    means: tuple[Cn0Mean, ...]  #: One a kind and signal.
     source: Cn0CurveSource = field(default_factory=Cn0CurveSource)
 
     def __post_init__(self) -> None:
@@ -313,3 +296,88 @@ def _robust(values: Floats, clip_sigma: float) -> tuple[float, float]:
     # C/N0 is reported in steps of up to 1 dB-Hz, so that the spread of a few samples may vanish
     kept = values[np.abs(values - middle) <= clip_sigma * max(spread, 0.5)]
     return float(kept.mean()), spread
+
+
+FORMAT: Final = "railfix C/N0 curve 1"
+#: Columns of a curve, and the digits that they are written with.
+_DIGITS: Final = {"elevation_deg": 3, "mean_dbhz": 2, "spread_db": 2, "count": 0}
+
+
+def _number(low: float, high: float) -> object:
+    return Field(ge=low, le=high, strict=True, allow_inf_nan=False)
+
+
+class _Curve(Settings):
+    """`Cn0Mean` as columns."""
+
+    kind: str
+    signal: str = Field(min_length=2, max_length=2)
+    elevation_deg: tuple[Annotated[float, _number(0.0, 90.0)], ...]
+    mean_dbhz: tuple[Annotated[float, _number(0.0, 100.0)], ...]
+    spread_db: tuple[Annotated[float, _number(0.0, 50.0)], ...]
+    count: tuple[Annotated[int, Field(ge=1, strict=True)], ...]
+
+    @field_validator("kind")
+    @classmethod
+    def _known_kind(cls, value: str) -> str:
+        if value not in KINDS:
+            raise ValueError(f"one of {', '.join(KINDS)} was expected")
+        return value
+
+
+class _CurveFile(Settings):
+    """Content of the file."""
+
+    format: Literal["railfix C/N0 curve 1"]
+    source: Cn0CurveSource
+    curve: tuple[_Curve, ...] = Field(min_length=1)
+
+
+def write_cn0_curve(curve: Cn0Curve, path: FilePath) -> None:
+    """Write a curve; the file appears whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    curves = [
+        {
+            "kind": mean.kind,
+            "signal": mean.signal,
+            **{name: np.round(getattr(mean, name), digits).tolist() for name, digits in _DIGITS.items()},
+        }
+        for mean in curve.means
+    ]
+    comment = "Mean C/N0 over elevation, measured under open sky; belongs to this antenna and receiver only."
+    source = {**curve.source.model_dump(), "position_ecef_m": np.round(curve.source.position_ecef_m, 3).tolist()}
+    values = {"format": FORMAT, "source": source, "curve": curves}
+    write_toml(path, values, what="curve", comment=comment)
+
+
+def read_cn0_curve(path: FilePath) -> Cn0Curve:
+    """Read a curve.
+
+    Raises
+    ------
+    InputFileError
+        The file is missing, unreadable, no curve, or an entry of it is unknown, missing or out of range.
+    """
+    file = read_model_file(_CurveFile, path, what="a C/N0 curve", format_name=FORMAT, command="railfix cn0-curve")
+    means = tuple(
+        _mean(path, curve, f"curve {i + 1} ({curve.kind} {curve.signal})") for i, curve in enumerate(file.curve)
+    )
+    try:
+        return Cn0Curve(means=means, source=file.source)
+    except ValueError as error:
+        raise InputFileError(path, f"{error}; each kind and signal stands once") from None
+
+
+def _mean(path: FilePath, curve: _Curve, where: str) -> Cn0Mean:
+    columns = {name: np.array(getattr(curve, name)) for name in _DIGITS}
+    if len({len(values) for values in columns.values()}) != 1:
+        raise InputFileError(path, f"{where}: {', '.join(_DIGITS)} must have the same number of values")
+    try:
+        return Cn0Mean(kind=curve.kind, signal=curve.signal, **columns)
+    except ValueError as error:
+        raise InputFileError(path, f"{where}: {error}") from None

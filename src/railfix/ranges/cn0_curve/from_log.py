@@ -43,14 +43,7 @@ _BELOW_SHARE: Final = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Calibration:
-    """A curve with the samples it was fitted to.
-
-    Attributes
-    ----------
-    curve : Cn0Curve
-    samples : Cn0Samples
-    notes : tuple of str
-    """
+    """A curve with the samples it was fitted to."""
 
     curve: Cn0Curve
     samples: Cn0Samples
@@ -99,10 +92,6 @@ def cn0_curve_from_log(
         What to do about broken lines of the log.
     progress : callable, optional
         Called with the part that has been read, 0 to 1.
-
-    Returns
-    -------
-    Cn0Calibration
 
     Raises
     ------

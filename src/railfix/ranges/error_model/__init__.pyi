@@ -1,8 +1,16 @@
 # The names of `railfix.ranges.error_model`, imported at their first use (lazy-loader).
 
-from .fault_rate import fault_rate, faulty_stretches
-from .file import read_error_model, write_error_model
-from .fit import ErrorModelFit, ErrorSamples, Overbound, SummaryRow, fit_bins, gaussian_overbound, summary
+from .fit import (
+    ErrorModelFit,
+    ErrorSamples,
+    Overbound,
+    SummaryRow,
+    fault_rate,
+    faulty_stretches,
+    fit_bins,
+    gaussian_overbound,
+    summary,
+)
 from .model import (
     LARGEST_PRIOR,
     POOLED,
@@ -13,6 +21,8 @@ from .model import (
     ErrorModelSource,
     FaultRate,
     condition_differences,
+    read_error_model,
+    write_error_model,
 )
 
 __all__ = [

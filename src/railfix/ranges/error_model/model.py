@@ -2,12 +2,36 @@
 
 The bins are elevation, azimuth relative to the car body and C/N0. P1 names elevation and azimuth; C/N0
 is the strongest predictor of multipath on recordings, so it can be a third axis.
+
+The file of an error model: TOML with the bins, the conditions, and one array of numbers a column.
+
+::
+
+    format = "railfix error model 2"
+    covers = "local"
+
+    [bins]
+    elevation_deg = [0.0, 15.0, 30.0, 45.0, 60.0, 90.0]
+    sectors = 4
+    cn0_dbhz = [0.0, 30.0, 35.0, 40.0, 45.0, 60.0]
+
+    [conditions]
+    systems = ["G", "E"]
+    codes = "raw"
+    ...
+
+    [before]
+    count = [12, ...]
+    bias_m = [1.25, ...]
+
+The bins are in the order of elevation, then sector, then C/N0. `pooled` counts into `model.POOLED`. Files of
+version 1, which described their conditions by a sentence, are rejected: make them anew.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -15,32 +39,21 @@ from numpy.typing import ArrayLike
 from pydantic import Field, field_validator
 
 from railfix.core.arrays import Floats, Integers
-from railfix.core.settings import Settings, option
+from railfix.core.errors import InputFileError
+from railfix.core.files import FilePath
+from railfix.core.settings import Settings, option, write_toml
+from railfix.ranges.model_file import read_model_file
 
 
 class Conditions(Settings):
-    """Settings of a run that the errors of its corrected pseudoranges depend on.
+    """Settings of a run that the errors of its corrected pseudoranges depend on."""
 
-    Attributes
-    ----------
-    systems : tuple of str
-        Letters of the constellations.
-    signals : dict of str to tuple of str
-        Signals of each constellation in order of preference.
-    screens : tuple of str
-        Active screens.
-    elevation_mask_deg : float [deg]
-    codes : {"raw", "smoothed"}
-        Pseudoranges as received, or smoothed by the carrier phase.
-    ionosphere, troposphere : str
-        Models of the delays: "klobuchar", "saastamoinen", "off", or "sbas".
-    """
-
-    systems: tuple[str, ...]
-    signals: dict[str, tuple[str, ...]]
-    screens: tuple[str, ...]
+    systems: tuple[str, ...]  #: Letters of the constellations.
+    signals: dict[str, tuple[str, ...]]  #: Signals of each constellation in order of preference.
+    screens: tuple[str, ...]  #: Active screens.
     elevation_mask_deg: float = Field(ge=0.0, lt=90.0)
-    codes: Literal["raw", "smoothed"]
+    codes: Literal["raw", "smoothed"]  #: Pseudoranges as received, or smoothed by the carrier phase.
+    #: Models of the delays: "klobuchar", "saastamoinen", "off", or "sbas".
     ionosphere: Literal["klobuchar", "off", "sbas"]
     troposphere: Literal["saastamoinen", "off", "sbas"]
 
@@ -75,23 +88,16 @@ POOLED: Final = ("own", "all azimuths", "all azimuths and C/N0", "all azimuths a
 
 
 class ErrorBins(Settings):
-    """Edges of the bins.
+    """Edges of the bins."""
 
-    Attributes
-    ----------
-    elevation_deg : tuple of float
-        Edges, rising, E + 1 of them.
-    sectors : int
-        Sectors of azimuth relative to the car body, the first one centred ahead, clockwise.
-    cn0_dbhz : tuple of float
-        Edges, rising, C + 1 of them; values beyond the outer ones belong to the outer bins. Observations
-        without C/N0 go into the lowest.
-    """
-
+    #: Edges, rising, E + 1 of them.
     elevation_deg: tuple[Annotated[float, Field(ge=0.0, le=90.0)], ...] = option(
         "Edges of the bins of elevation.", (0.0, 15.0, 30.0, 45.0, 60.0, 90.0), name="--elevations", metavar="DEG,..."
     )
+    #: Sectors of azimuth relative to the car body, the first one centred ahead, clockwise.
     sectors: int = option("Sectors of azimuth, the first centred ahead of the car.", 4, metavar="N", ge=1)
+    #: Edges, rising, C + 1 of them; values beyond the outer ones belong to the outer bins. Observations without C/N0 go
+    #: into the lowest.
     cn0_dbhz: tuple[float, ...] = option(
         "Edges of the bins of C/N0; 0,60 puts all into one.",
         (0.0, 30.0, 35.0, 40.0, 45.0, 60.0),
@@ -136,52 +142,29 @@ class ErrorBins(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class BinStatistics:
-    """Figures of every bin, shape (E, A, C); NaN in bins without samples and without anything to pool.
+    """Figures of every bin, shape (E, A, C); NaN in bins without samples and without anything to pool."""
 
-    Attributes
-    ----------
-    count : ndarray of int
-        Samples of the bin itself.
-    blocks : ndarray of int
-        Passes of a satellite through it, counted once a block of time: samples are correlated.
-    bias_m, sigma_m : ndarray [m]
-        Mean and standard deviation of the samples used for the bin.
-    bound_bias_m, bound_sigma_m : ndarray [m]
-        `overbound.gaussian_overbound` of the same.
-    pooled : ndarray of int
-        Index into `POOLED`: where the bin has too few blocks, the samples of a wider set of bins.
-    """
-
-    count: Integers
-    blocks: Integers
+    count: Integers  #: Samples of the bin itself.
+    blocks: Integers  #: Passes of a satellite through it, counted once a block of time: samples are correlated.
+    #: Mean and standard deviation of the samples used for the bin.
     bias_m: Floats
     sigma_m: Floats
+    #: `overbound.gaussian_overbound` of the same.
     bound_bias_m: Floats
     bound_sigma_m: Floats
-    pooled: Integers
+    pooled: Integers  #: Index into `POOLED`: where the bin has too few blocks, the samples of a wider set of bins.
 
 
 class ErrorModelSource(Settings):
-    """Runs that a model was made from, for its file.
-
-    Attributes
-    ----------
-    runs : tuple of str
-    base : str
-        Marker of the reference station.
-    epochs : int
-    start, end, railfix_version : str
-    files : tuple of (str, str)
-        Names and SHA-256.
-    """
+    """Runs that a model was made from, for its file."""
 
     runs: tuple[str, ...] = ()
-    base: str = ""
+    base: str = ""  #: Marker of the reference station.
     epochs: int = Field(default=0, ge=0)
     start: str = ""
     end: str = ""
     railfix_version: str = ""
-    files: tuple[tuple[str, str], ...] = ()
+    files: tuple[tuple[str, str], ...] = ()  #: Names and SHA-256.
 
 
 #: Measured priors above this come of too few blocks of time to leave a level.
@@ -189,44 +172,30 @@ LARGEST_PRIOR: Final = 0.05
 
 
 class FaultRate(Settings):
-    """Probability that a used range is faulty at a time, measured.
+    """Probability that a used range is faulty at a time, measured."""
 
-    Attributes
-    ----------
-    beyond_sigma : float
-        A range is faulty beyond this many sigmas of the level: 5, which noise passes with 6e-7.
-    ranges, faulty : int
-        Ranges used, and those beyond.
-    blocks, faulty_blocks : int
-        Blocks of time of single satellites, which are independent of each other, and those with a faulty range.
-    prior : float
-        faulty / ranges.
-    upper : float
-        Upper end of the 95 % interval of the prior (Clopper and Pearson, one-sided, by blocks): the `local_prior`
-        to use.
-    together : float
-        Blocks of time with two faulty satellites or more, over what independent satellites give; 0 without any.
-    side_blocks, side_faulty_blocks : int
-        Blocks of time with two low satellites or more on one side of the track, each side counted for itself, and
-        those in which two of these were faulty.
-    side_upper : float
-        Upper end of the 95 % interval of the probability that low satellites of one side are faulty together, by
-        those blocks: the `side_prior` to use, where it is small enough to leave a level. 1 without such blocks.
-    no_level_m : tuple of (float, float) [m]
-        Stretches where local faults are more frequent than on the line (`faulty_stretches`), chainages from and to.
-    """
-
+    #: A range is faulty beyond this many sigmas of the level: 5, which noise passes with 6e-7.
     beyond_sigma: float = Field(gt=0)
+    #: Ranges used, and those beyond.
     ranges: int = Field(ge=0)
     faulty: int = Field(ge=0)
+    #: Blocks of time of single satellites, which are independent of each other, and those with a faulty range.
     blocks: int = Field(ge=0)
     faulty_blocks: int = Field(ge=0)
-    prior: float = Field(ge=0, le=1)
+    prior: float = Field(ge=0, le=1)  #: faulty / ranges.
+    #: Upper end of the 95 % interval of the prior (Clopper and Pearson, one-sided, by blocks): the `local_prior` to
+    #: use.
     upper: float = Field(ge=0, le=1)
+    #: Blocks of time with two faulty satellites or more, over what independent satellites give; 0 without any.
     together: float = Field(ge=0)
+    #: Blocks of time with two low satellites or more on one side of the track, each side counted for itself, and those
+    #: in which two of these were faulty.
     side_blocks: int = Field(default=0, ge=0)
     side_faulty_blocks: int = Field(default=0, ge=0)
+    #: Upper end of the 95 % interval of the probability that low satellites of one side are faulty together, by those
+    #: blocks: the `side_prior` to use, where it is small enough to leave a level. 1 without such blocks.
     side_upper: float = Field(default=1.0, ge=0, le=1)
+    #: Stretches where local faults are more frequent than on the line (`faulty_stretches`), chainages from and to.
     no_level_m: tuple[tuple[float, float], ...] = ()
 
     @property
@@ -237,30 +206,19 @@ class FaultRate(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorModel:
-    """Errors of corrected pseudoranges by bin.
-
-    Attributes
-    ----------
-    bins : ErrorBins
-    before, after : BinStatistics
-        Errors before and after the screens. Weights and protection level use those after them; the
-        difference is the effect of the screens.
-    covers : {"local", "satellite_and_atmosphere"}
-        "local": multipath and receiver noise alone (a reference station took the rest away).
-        "satellite_and_atmosphere": these, too, as they were on those days.
-    conditions : Conditions or None
-        Settings under which it holds; None: unknown, compared with nothing.
-    source : ErrorModelSource
-    faults : FaultRate or None
-        Rate of local faults among the ranges that the model was made of; None: not measured.
-    """
+    """Errors of corrected pseudoranges by bin."""
 
     bins: ErrorBins
+    #: Errors before and after the screens. Weights and protection level use those after them; the difference is the
+    #: effect of the screens.
     before: BinStatistics
     after: BinStatistics
+    #: "local": multipath and receiver noise alone (a reference station took the rest away). "satellite_and_atmosphere":
+    #: these, too, as they were on those days.
     covers: Literal["local", "satellite_and_atmosphere"]
-    conditions: Conditions | None = None
+    conditions: Conditions | None = None  #: Settings under which it holds; None: unknown, compared with nothing.
     source: ErrorModelSource = field(default_factory=ErrorModelSource)
+    #: Rate of local faults among the ranges that the model was made of; None: not measured.
     faults: FaultRate | None = None
 
     def at(
@@ -274,3 +232,97 @@ class ErrorModel:
         inside, safe = index >= 0, np.maximum(index, 0)
         sigma = np.where(inside, self.after.bound_sigma_m.ravel()[safe], np.nan)
         return sigma, np.where(inside, self.after.bound_bias_m.ravel()[safe], np.nan)
+
+
+FORMAT: Final = "railfix error model 2"
+_COLUMNS: Final = tuple(item.name for item in fields(BinStatistics))
+_COUNTS: Final = ("count", "blocks", "pooled")
+_Count = Annotated[int, Field(ge=0)]
+
+
+class _Columns(Settings):
+    """`BinStatistics` as columns, one number a bin; NaN where a bin has none."""
+
+    count: tuple[_Count, ...]
+    blocks: tuple[_Count, ...]
+    bias_m: tuple[float, ...]
+    sigma_m: tuple[float, ...]
+    bound_bias_m: tuple[float, ...]
+    bound_sigma_m: tuple[float, ...]
+    pooled: tuple[Annotated[int, Field(ge=0, lt=len(POOLED))], ...]
+
+
+class _ErrorModelFile(Settings):
+    """Content of the file."""
+
+    format: Literal["railfix error model 2"]
+    covers: Literal["local", "satellite_and_atmosphere"]
+    bins: ErrorBins
+    conditions: Conditions | None = None
+    source: ErrorModelSource = Field(default_factory=ErrorModelSource)
+    faults: FaultRate | None = None
+    before: _Columns
+    after: _Columns
+
+
+def write_error_model(model: ErrorModel, path: FilePath) -> None:
+    """Write a model; the file appears whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    file = _ErrorModelFile(
+        format=FORMAT,
+        covers=model.covers,
+        bins=model.bins,
+        conditions=model.conditions,
+        source=model.source,
+        faults=model.faults,
+        before=_columns(model.before),
+        after=_columns(model.after),
+    )
+    comment = "Errors of corrected pseudoranges by elevation, azimuth from the car's front, and C/N0."
+    write_toml(path, file.model_dump(exclude_none=True), what="error model", comment=comment)
+
+
+def _columns(statistics: BinStatistics) -> _Columns:
+    """Columns to the millimetre."""
+    return _Columns(**{name: tuple(np.round(getattr(statistics, name).ravel(), 3).tolist()) for name in _COLUMNS})
+
+
+def read_error_model(path: FilePath) -> ErrorModel:
+    """Read a model.
+
+    Raises
+    ------
+    InputFileError
+        The file is missing, unreadable, no error model, of version 1, or an entry of it is missing or out of range.
+    """
+    file = read_model_file(
+        _ErrorModelFile, path, what="an error model", format_name=FORMAT, command="railfix error-model"
+    )
+    return ErrorModel(
+        bins=file.bins,
+        before=_statistics(path, "before", file.before, file.bins),
+        after=_statistics(path, "after", file.after, file.bins),
+        covers=file.covers,
+        conditions=file.conditions,
+        source=file.source,
+        faults=file.faults,
+    )
+
+
+def _statistics(path: FilePath, name: str, columns: _Columns, bins: ErrorBins) -> BinStatistics:
+    arrays = {}
+    for column in _COLUMNS:
+        values = np.array(getattr(columns, column), dtype=np.int64 if column in _COUNTS else np.float64)
+        if len(values) != np.prod(bins.shape):
+            raise InputFileError(
+                path, f"entry {name}.{column}: {np.prod(bins.shape)} values were expected, one a bin, got {len(values)}"
+            )
+        if column not in ("bias_m", *_COUNTS) and (values < 0.0).any():
+            raise InputFileError(path, f"entry {name}.{column}: must not be negative, got {np.nanmin(values)}")
+        arrays[column] = values.reshape(bins.shape)
+    return BinStatistics(**arrays)  # type: ignore[arg-type]

@@ -163,10 +163,6 @@ class SbasCorrections:
         navigation : Navigation, optional
             A long-term correction is taken only if a record has its issue of data; the one before
             it, of another issue, is tried next. Without it, the newest is taken as it is.
-
-        Returns
-        -------
-        SatelliteCorrections
         """
         number = np.array([_NUMBER_OF.get(str(name), -1) for name in satellite], dtype=np.int64)
         tables, limits, at = self._tables, self.limits, time[:, None]
@@ -305,10 +301,6 @@ class SbasCorrections:
         time : ndarray of datetime64[ns], shape (T,)
         latitude_deg, longitude_deg : ndarray, shape (T,) [deg]
         elevation_deg, azimuth_deg : ndarray, shape (T, K) [deg]
-
-        Returns
-        -------
-        IonosphereDelays
         """
         return ionosphere(
             self._grid, self._tables, self.limits, time, latitude_deg, longitude_deg, elevation_deg, azimuth_deg
@@ -328,19 +320,11 @@ class SbasState:
         state = state.received(messages)  # whenever some arrive
         fixes = state.corrections.satellites(time, satellite, navigation)
         state = state.kept_from(time[-1])  # what later epochs need
-
-    Attributes
-    ----------
-    prn : int
-        Chosen beforehand: which GEO is best is known only after all messages were received.
-    limits : SbasLimits
-    messages : SbasMessages
-        Of that PRN, in the order of reception.
     """
 
-    prn: int
+    prn: int  #: Chosen beforehand: which GEO is best is known only after all messages were received.
     limits: SbasLimits = field(default_factory=SbasLimits)
-    messages: SbasMessages = field(default_factory=SbasMessages.none)
+    messages: SbasMessages = field(default_factory=SbasMessages.none)  #: Of that PRN, in the order of reception.
 
     def received(self, messages: SbasMessages) -> SbasState:
         """The state after more messages; those of other PRNs, and repeated ones of a second receiver, are left out."""

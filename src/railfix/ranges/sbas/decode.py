@@ -166,7 +166,6 @@ def read_fields(bits: Bytes, layout: Layout, offset: int = 0) -> Decoded:
     ----------
     bits : ndarray of uint8, shape (n, 32)
         As in `SbasMessages.bits`.
-    layout : Layout
     offset : int
         Bit at which the part of the message begins that the layout describes.
 

@@ -105,36 +105,16 @@ class DfmcState(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class DfmcCorrections:
-    """Corrections of T epochs by K satellites.
+    """Corrections of T epochs by K satellites."""
 
-    Attributes
-    ----------
-    state : ndarray of int8, shape (T, K)
-        `DfmcState`.
-    issue : ndarray of int, shape (T, K)
-        Issue of data of the record that the correction belongs to; -1 without one.
-    position_m : ndarray, shape (T, K, 3) [m]
-        Added to the broadcast position.
-    clock_m : ndarray, shape (T, K) [m]
-        Added to c times the broadcast clock, without group delays.
-    sigma_m : ndarray, shape (T, K) [m]
-        Sigma by the indicator and its scale, before covariance and degradation.
-    factor : ndarray, shape (T, K, 4, 4)
-        Upper triangular factor of the covariance.
-    growth_m : ndarray, shape (T, K) [m]
-        Degradation of the correction since it was sent.
-    constant : ndarray, shape (T, K)
-        Added to the factor along a line of sight.
-    """
-
-    state: Integers
-    issue: Integers
-    position_m: Floats
-    clock_m: Floats
-    sigma_m: Floats
-    factor: Floats
-    growth_m: Floats
-    constant: Floats
+    state: Integers  #: `DfmcState`, shape (T, K).
+    issue: Integers  #: Issue of data of the record that the correction belongs to; -1 without one; shape (T, K).
+    position_m: Floats  #: Added to the broadcast position, shape (T, K, 3).
+    clock_m: Floats  #: Added to c times the broadcast clock, without group delays; shape (T, K).
+    sigma_m: Floats  #: Sigma by the indicator and its scale, before covariance and degradation; shape (T, K).
+    factor: Floats  #: Upper triangular factor of the covariance, shape (T, K, 4, 4).
+    growth_m: Floats  #: Degradation of the correction since it was sent, shape (T, K).
+    constant: Floats  #: Added to the factor along a line of sight, shape (T, K).
 
     def sigma_along_m(self, line_of_sight: Floats) -> Floats:
         """Standard deviation of corrected ranges along unit vectors to the satellites, shape (T, K) [m]."""

@@ -16,8 +16,7 @@ from railfix.core.arrays import Bytes, Integers, Masks
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath, read_text_lines
 from railfix.core.timescale import GPS_EPOCH, SECONDS_PER_WEEK
-from railfix.io.receiver.bits import SbasFrames
-from railfix.io.receiver.framing import head_of, is_receiver_log
+from railfix.io.receiver.framing import SbasFrames, head_of, is_receiver_log
 from railfix.io.receiver.log import scan_pieces
 from railfix.ranges.sbas.messages import ROW_BYTES, SbasMessages, carried_parity, message_parity, preamble_number
 from railfix.ranges.sbas.standard import GEO_PRNS

@@ -168,7 +168,6 @@ def distinct_lookups(span: Integers, point: Integers, points: int) -> tuple[Indi
     span : ndarray of int, shape (M,)
     point : ndarray of int, shape (M, 4)
         From -1 to below `points`.
-    points : int
 
     Returns
     -------

@@ -66,50 +66,25 @@ class SatelliteCorrections(_Frozen):
 
     The corrected code is ``code + fast_m``, with the satellite at ``broadcast + position_m`` and
     its clock ``broadcast + clock_s``, both of the record with the issue of data `iode`.
-
-    Attributes
-    ----------
-    state : ndarray of int, shape (T, K)
-        `SatelliteState`.
-    fast_m : ndarray, shape (T, K) [m]
-        To be added to the code; the range-rate part is in it.
-    rate_mps : ndarray, shape (T, K) [m/s]
-        Range-rate correction.
-    position_m : ndarray, shape (T, K, 3) [m]
-    clock_s : ndarray, shape (T, K) [s]
-    iode : ndarray of int, shape (T, K)
-        Issue of data of the long-term correction taken, -1 without one.
-    record : ndarray of int, shape (T, K)
-        Row of `navigation.kepler` with that issue, -1 without navigation data.
-    udrei : ndarray of int, shape (T, K)
-        -1 where none was received.
-    sigma_udre_m : ndarray, shape (T, K) [m]
-    fast_growth_m, rate_growth_m, long_term_growth_m, en_route_m : ndarray, shape (T, K) [m]
-        Degradation terms (DO-229D, A.4.5.1); 0 where `inflated`.
-    inflated : ndarray of bool, shape (T, K)
-        Degradation data are missing: sigma is that of UDRE plus 8 m.
-    rss : ndarray of bool, shape (T, K)
-        The terms are summed as squares (RSS_UDRE of type 10).
-    covariance : ndarray of int, shape (T, K)
-        Row of the covariance (type 28) in force, -1 without.
     """
 
-    state: Integers
-    fast_m: Floats
-    rate_mps: Floats
-    position_m: Floats
-    clock_s: Floats
-    iode: Integers
-    record: Integers
-    udrei: Integers
-    sigma_udre_m: Floats
+    state: Integers  #: `SatelliteState`, shape (T, K).
+    fast_m: Floats  #: To be added to the code; the range-rate part is in it; shape (T, K).
+    rate_mps: Floats  #: Range-rate correction, shape (T, K).
+    position_m: Floats  #: Shape (T, K, 3).
+    clock_s: Floats  #: Shape (T, K).
+    iode: Integers  #: Issue of data of the long-term correction taken, -1 without one; shape (T, K).
+    record: Integers  #: Row of `navigation.kepler` with that issue, -1 without navigation data; shape (T, K).
+    udrei: Integers  #: -1 where none was received, shape (T, K).
+    sigma_udre_m: Floats  #: Shape (T, K).
+    #: Degradation terms (DO-229D, A.4.5.1); 0 where `inflated`; shape (T, K).
     fast_growth_m: Floats
     rate_growth_m: Floats
     long_term_growth_m: Floats
     en_route_m: Floats
-    inflated: Masks
-    rss: Masks
-    covariance: Integers
+    inflated: Masks  #: Degradation data are missing: sigma is that of UDRE plus 8 m; shape (T, K).
+    rss: Masks  #: The terms are summed as squares (RSS_UDRE of type 10), shape (T, K).
+    covariance: Integers  #: Row of the covariance (type 28) in force, -1 without; shape (T, K).
 
     def take_satellites(self, which: Integers) -> SatelliteCorrections:
         """The corrections of some satellites, by index."""
@@ -131,24 +106,12 @@ class SatelliteCorrections(_Frozen):
 
 @dataclass(frozen=True, kw_only=True)
 class IonosphereDelays(_Frozen):
-    """Delays of T epochs by K satellites from the grid.
+    """Delays of T epochs by K satellites from the grid."""
 
-    Attributes
-    ----------
-    state : ndarray of int, shape (T, K)
-        `IonosphereState`.
-    delay_m : ndarray, shape (T, K) [m]
-        Slant delay on L1, to be taken off the code; other carriers scale by (f1/f)^2.
-    sigma_uire_m : ndarray, shape (T, K) [m]
-    latitude_deg, longitude_deg : ndarray, shape (T, K) [deg]
-        Pierce point.
-    points : ndarray of int, shape (T, K)
-        Grid points it was interpolated from: 4, 3, or 0.
-    """
-
-    state: Integers
-    delay_m: Floats
-    sigma_uire_m: Floats
+    state: Integers  #: `IonosphereState`, shape (T, K).
+    delay_m: Floats  #: Slant delay on L1, to be taken off the code; other carriers scale by (f1/f)^2; shape (T, K).
+    sigma_uire_m: Floats  #: Shape (T, K).
+    #: Pierce point, shape (T, K).
     latitude_deg: Floats
     longitude_deg: Floats
-    points: Integers
+    points: Integers  #: Grid points it was interpolated from: 4, 3, or 0; shape (T, K).

@@ -31,39 +31,24 @@ _FACTOR: Final = np.array(SERVICE_FACTOR)
 
 @dataclass(frozen=True, kw_only=True)
 class FastInForce:
-    """Fast corrections in force, all (T, K).
+    """Fast corrections in force, all (T, K)."""
 
-    Attributes
-    ----------
-    missing, timed_out, no_factor, no_rate : ndarray of bool
-        No fast correction at all; too old, or of a mask no longer in force; type 7 is missing; a
-        rate is needed and not available.
-    udrei : ndarray of int
-        -1 without one.
-    correction_m, rate_mps : ndarray
-    growth_m : ndarray [m]
-        Of the fast correction (A.4.5.1.1).
-    rate_growth_mps, rate_span_s : ndarray
-        a Ifc / 4, or its replacement after an alarm, and the time between the two corrections;
-        0 and infinite where the rate does not degrade (A.4.5.1.2).
-    since_s : ndarray [s]
-        Since the time of applicability.
-    aged : ndarray of bool
-        Older than precision approach allows.
-    """
-
+    #: No fast correction at all; too old, or of a mask no longer in force; type 7 is missing; a rate is needed and not
+    #: available.
     missing: Masks
     timed_out: Masks
     no_factor: Masks
     no_rate: Masks
-    udrei: Integers
+    udrei: Integers  #: -1 without one.
     correction_m: Floats
     rate_mps: Floats
-    growth_m: Floats
+    growth_m: Floats  #: Of the fast correction (A.4.5.1.1).
+    #: a Ifc / 4, or its replacement after an alarm, and the time between the two corrections; 0 and infinite where the
+    #: rate does not degrade (A.4.5.1.2).
     rate_growth_mps: Floats
     rate_span_s: Floats
-    since_s: Floats
-    aged: Masks
+    since_s: Floats  #: Since the time of applicability.
+    aged: Masks  #: Older than precision approach allows.
 
 
 def fast_in_force(
@@ -73,8 +58,6 @@ def fast_in_force(
 
     Parameters
     ----------
-    tables : SatelliteTables
-    limits : SbasLimits
     time, stop : ndarray of datetime64[ns], shape (T, 1)
         Epochs, and when the GEO was last stopped.
     number : ndarray of int, shape (1, K)
@@ -191,8 +174,6 @@ def long_term_in_force(
 
     Parameters
     ----------
-    tables : SatelliteTables
-    limits : SbasLimits
     time : ndarray of datetime64[ns], shape (T,)
     satellite, number : ndarray, shape (K,)
         And its number of the PRN mask.

@@ -146,31 +146,17 @@ INFLATION_M: Final = 8.0
 
 
 class SbasLimits(Settings):
-    """How SBAS messages are used.
+    """How SBAS messages are used."""
 
-    Attributes
-    ----------
-    mode : {"precision", "en_route"}
-        Time-outs: those of precision approach (shorter, the default), or of en route to non-precision
-        approach.
-    type0 : {"stop", "as_type2"}
-        Type 0 stops its sender for 60 s, or has fast corrections.
-    range_rate : {"mops", "off"}
-        Fast corrections change with their rate (DO-229D, A.4.4.3).
-    incomplete : {"reject", "inflate"}
-        Without degradation data a satellite is rejected, or has 8 m more (DO-229D, J.2.2) and the shortest time-out.
-    max_udrei : int or None
-        Largest UDREI used; None is 11 for precision approach and 13 en route.
-    message_s : float
-        [s] From the first bit of a message to its reception.
-    """
-
+    #: Time-outs: those of precision approach (shorter, the default), or of en route to non-precision approach.
     mode: Literal["precision", "en_route"] = "precision"
-    type0: Literal["stop", "as_type2"] = "stop"
-    range_rate: Literal["mops", "off"] = "mops"
+    type0: Literal["stop", "as_type2"] = "stop"  #: Type 0 stops its sender for 60 s, or has fast corrections.
+    range_rate: Literal["mops", "off"] = "mops"  #: Fast corrections change with their rate (DO-229D, A.4.4.3).
+    #: Without degradation data a satellite is rejected, or has 8 m more (DO-229D, J.2.2) and the shortest time-out.
     incomplete: Literal["reject", "inflate"] = "reject"
+    #: Largest UDREI used; None is 11 for precision approach and 13 en route.
     max_udrei: int | None = Field(default=None, ge=0, le=13)
-    message_s: float = Field(default=1.0, ge=0.0, le=2.0)
+    message_s: float = Field(default=1.0, ge=0.0, le=2.0)  #: [s] From the first bit of a message to its reception.
 
     def timeout_s(self, kind: str) -> float:
         """Time-out of a kind of message in this mode [s]."""

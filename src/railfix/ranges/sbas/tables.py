@@ -45,24 +45,16 @@ class Series:
     An empty table holds one row of a series that is never used: `columns` can be indexed with the -1 that
     `newest` returns for "none", and the caller masks the value.
 
-    Attributes
-    ----------
-    series : ndarray of int, shape (n,)
-    time : ndarray of datetime64[ns], shape (n,)
-    columns : mapping of str to ndarray, shape (n, ...)
-    key : ndarray of int, shape (n,)
-        Series and time in one rising number.
-
     Notes
     -----
     Times are resolved to the millisecond, a row's rounded up and an instant's rounded down: no row is
     used before it was received.
     """
 
-    series: Integers
-    time: Datetimes
-    columns: Mapping[str, NDArray[Any]]
-    key: Integers
+    series: Integers  #: Shape (n,).
+    time: Datetimes  #: Shape (n,).
+    columns: Mapping[str, NDArray[Any]]  #: Shape (n, ...).
+    key: Integers  #: Series and time in one rising number, shape (n,).
 
     @classmethod
     def of(cls, series: Integers, time: Datetimes, columns: Mapping[str, NDArray[Any]]) -> Series:

@@ -11,8 +11,19 @@ import polars as pl
 
 from railfix.core.arrays import Floats
 from railfix.core.timescale import seconds
-from railfix.report.plots.chart import BLUE, CONSTRAINED, FILTERED, GREY, Chart, Curve, Layer, Points, RangeBars
-from railfix.report.plots.columns import floats, points
+from railfix.report.plots.chart import (
+    BLUE,
+    CONSTRAINED,
+    FILTERED,
+    GREY,
+    Chart,
+    Curve,
+    Layer,
+    Points,
+    RangeBars,
+    floats,
+    points,
+)
 from railfix.report.plots.draw import save_figure
 from railfix.report.plots.line import ECEF, ERROR_CLASSES, LEVEL_CLASSES, LocalFrame, size_classes
 

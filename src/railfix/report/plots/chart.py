@@ -4,7 +4,9 @@ A `Chart` is axes with layers of numbers. The functions of `railfix.report.plots
 arrays; `railfix.report.plots.draw_chart` draws one with matplotlib, and `railfix.report` puts the same one into
 a page, so a notebook and the report show the same numbers.
 
-Long series are thinned when a chart is made (`railfix.report.plots.columns`); the caption has the counts.
+Long series are thinned when a chart is made (`railfix.report.plots.chart`); the caption has the counts.
+
+Columns of the tables as arrays, and long series thinned without changing their appearance.
 """
 
 from __future__ import annotations
@@ -13,8 +15,11 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
+import polars as pl
 
-from railfix.core.arrays import Floats, Integers, Strings
+from railfix.core.arrays import Floats, Indices, Integers, Strings
+from railfix.core.timescale import seconds
+from railfix.evaluate.run_folder import floats
 
 #: Colours distinguishable with colour blindness (Okabe and Ito), with a contrast of 3 to 1 or more on white.
 BLUE, RED, GREEN, PURPLE, BLACK, GREY = "#0072b2", "#d55e00", "#00805e", "#a3487e", "#000000", "#767676"
@@ -47,23 +52,15 @@ class _Layer:
 
 @dataclass(frozen=True, kw_only=True)
 class Points(_Layer):
-    """Points, P of them.
+    """Points, P of them."""
 
-    Attributes
-    ----------
-    x, y : ndarray, shape (P,)
-        NaN is not drawn.
-    shape : {"dot", "square", "cross", "ring"}
-    size : float
-        Width in pixels of a page.
-    epoch_s : ndarray, shape (P,), or None [s]
-        Time since the start of the run; a click on a point shows the sky at that time.
-    """
-
+    #: NaN is not drawn, shape (P,).
     x: Floats
     y: Floats
+
     shape: Shape = "dot"
-    size: float = 3.0
+    size: float = 3.0  #: Width in pixels of a page.
+    #: Time since the start of the run; a click on a point shows the sky at that time; shape (P,).
     epoch_s: Floats | None = None
 
 
@@ -97,17 +94,12 @@ class Bars(_Layer):
 
 @dataclass(frozen=True, kw_only=True)
 class Cells(_Layer):
-    """Numbers of points in the cells of a grid; darker cells have more.
+    """Numbers of points in the cells of a grid; darker cells have more."""
 
-    Attributes
-    ----------
-    x_edges, y_edges : ndarray, shape (A + 1,), (B + 1,)
-    counts : ndarray of int, shape (A, B)
-    """
-
+    #: Shape (A + 1,), (B + 1,).
     x_edges: Floats
     y_edges: Floats
-    counts: Integers
+    counts: Integers  #: Shape (A, B).
 
     def __post_init__(self) -> None:
         if self.counts.shape != (len(self.x_edges) - 1, len(self.y_edges) - 1):
@@ -116,16 +108,10 @@ class Cells(_Layer):
 
 @dataclass(frozen=True, kw_only=True)
 class RangeBars(_Layer):
-    """A bar from minimum to maximum with a mark at the mean for each name, from the top down.
-
-    Attributes
-    ----------
-    names : tuple of str
-    low, mid, high : ndarray, shape (N,)
-        NaN is not drawn.
-    """
+    """A bar from minimum to maximum with a mark at the mean for each name, from the top down."""
 
     names: tuple[str, ...]
+    #: NaN is not drawn, shape (N,).
     low: Floats
     mid: Floats
     high: Floats
@@ -133,21 +119,13 @@ class RangeBars(_Layer):
 
 @dataclass(frozen=True, kw_only=True)
 class Marks(_Layer):
-    """Text at points.
+    """Text at points."""
 
-    Attributes
-    ----------
-    x, y : ndarray, shape (P,)
-    words : tuple of str
-        Lines separated by line feeds.
-    place : {"beside", "on"}
-        Beside a cross at the point, or centred on it without a cross.
-    """
-
+    #: Shape (P,).
     x: Floats
     y: Floats
-    words: tuple[str, ...]
-    place: Literal["beside", "on"] = "beside"
+    words: tuple[str, ...]  #: Lines separated by line feeds.
+    place: Literal["beside", "on"] = "beside"  #: Beside a cross at the point, or centred on it without a cross.
 
 
 Layer = Points | Curve | Band | Bars | Cells | RangeBars | Marks
@@ -155,41 +133,23 @@ Layer = Points | Curve | Band | Bars | Cells | RangeBars | Marks
 
 @dataclass(frozen=True, kw_only=True)
 class Chart:
-    """One chart.
+    """One chart."""
 
-    Attributes
-    ----------
-    name : str
-        Short, for files and anchors: ``error-time``.
-    title, caption : str
-        Heading; explanation with the counts of points left out.
-    x_label, y_label : str
-    layers : tuple of Layer
-        Drawn in this order.
-    start : datetime64[ns] or None
-        `x` is seconds from this time.
-    y_scale, x_scale : {"linear", "symlog", "log"}
-    y_linear : float
-        A symlog axis is linear up to here.
-    x_range, y_range : (float, float) or None
-    equal : bool
-        Equal scales on both axes; a scale bar and north are drawn.
-    width : {"wide", "half"}
-    """
-
-    name: str
+    name: str  #: Short, for files and anchors: ``error-time``.
+    #: Heading; explanation with the counts of points left out.
     title: str
     caption: str
+
     x_label: str
     y_label: str
-    layers: tuple[Layer, ...]
-    start: np.datetime64 | None = None
+    layers: tuple[Layer, ...]  #: Drawn in this order.
+    start: np.datetime64 | None = None  #: `x` is seconds from this time.
     x_scale: Scale = "linear"
     y_scale: Scale = "linear"
-    y_linear: float = 1.0
+    y_linear: float = 1.0  #: A symlog axis is linear up to here.
     x_range: tuple[float, float] | None = None
     y_range: tuple[float, float] | None = None
-    equal: bool = False
+    equal: bool = False  #: Equal scales on both axes; a scale bar and north are drawn.
     width: Literal["wide", "half"] = "wide"
 
     @property
@@ -207,34 +167,22 @@ class Chart:
 
 @dataclass(frozen=True, kw_only=True)
 class SkyEpochs:
-    """Satellites in view of an antenna, R rows over K epochs, for sky plots.
-
-    Attributes
-    ----------
-    name, title, caption : str
-    start : datetime64[ns]
-    epoch_s : ndarray, shape (K,) [s]
-        Rising, from `start`.
-    first : ndarray of int, shape (K + 1,)
-        Rows of epoch k: first[k] to first[k + 1].
-    satellite, signal : ndarray of str, shape (R,)
-    azimuth_deg, elevation_deg, cn0_dbhz : ndarray, shape (R,)
-    reason : ndarray of str, shape (R,)
-        First reason for its rejection, or ``used``.
-    """
+    """Satellites in view of an antenna, R rows over K epochs, for sky plots."""
 
     name: str
     title: str
     caption: str
     start: np.datetime64
-    epoch_s: Floats
-    first: Integers
+    epoch_s: Floats  #: Rising, from `start`; shape (K,).
+    first: Integers  #: Rows of epoch k: first[k] to first[k + 1]; shape (K + 1,).
+    #: Shape (R,).
     satellite: Strings
     signal: Strings
+    #: Shape (R,).
     azimuth_deg: Floats
     elevation_deg: Floats
     cn0_dbhz: Floats
-    reason: Strings = field(repr=False)
+    reason: Strings = field(repr=False)  #: First reason for its rejection, or ``used``; shape (R,).
 
     @property
     def empty(self) -> bool:
@@ -255,3 +203,100 @@ def _draw(layer: Layer) -> bool:
     if isinstance(layer, RangeBars):
         return bool(np.isfinite(layer.mid).any())
     return bool((np.isfinite(layer.x) & np.isfinite(layer.y)).any())
+
+
+__all__ = ["floats", "nice_step", "points", "since", "start_of", "words"]
+
+
+def points(table: pl.DataFrame, *names: str) -> Floats:
+    """Columns side by side, shape (rows, columns)."""
+    return np.stack([floats(table, name) for name in names], axis=1)
+
+
+def words(table: pl.DataFrame, name: str) -> Strings:
+    """A text column, blank where it is null."""
+    return np.array(table[name].cast(pl.String).fill_null("").to_numpy(), dtype=np.str_)
+
+
+def start_of(table: pl.DataFrame) -> np.datetime64:
+    """Earliest time of a table; ValueError where it is empty."""
+    if not len(table):
+        raise ValueError("the table has no rows")
+    return np.datetime64(table["time_gpst"].to_numpy().min(), "ns")
+
+
+def since(table: pl.DataFrame, start: np.datetime64) -> Floats:
+    """Times of a table since a start [s]."""
+    return seconds(table["time_gpst"].to_numpy().astype("datetime64[ns]") - start)
+
+
+def nice_step(rough: float) -> float:
+    """1, 2 or 5 times a power of ten, at least `rough`."""
+    power = 10.0 ** np.floor(np.log10(max(rough, 1e-9)))
+    return float(next(power * k for k in (1.0, 2.0, 5.0, 10.0) if power * k >= rough * (1.0 - 1e-9)))
+
+
+#: Largest number of points in a layer of a chart.
+POINTS: Final = 6000
+_GOLDEN: Final = (5**0.5 - 1.0) / 2.0
+
+
+def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
+    """Rows of the smallest and the largest `y` in each piece of `x`, in rising order; rows with NaN are left out.
+
+    All rows where there are at most `points`, else two of each of `points` / 2 equal pieces of `x` at most.
+    """
+    rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    if len(rows) <= points:
+        return rows
+    pieces = max(points // 2, 1)
+    low, high = float(x[rows].min()), float(x[rows].max())
+    piece = np.minimum((pieces * ((x[rows] - low) / ((high - low) or 1.0))).astype(np.intp), pieces - 1)
+    order = np.argsort(piece.astype(np.uint16 if pieces < 65536 else np.intp), kind="stable")
+    value, owner = y[rows][order], piece[order]
+    first = np.flatnonzero(np.r_[True, np.diff(owner) > 0])
+    of_piece = np.repeat(np.arange(len(first)), np.diff(np.r_[first, len(order)]))
+    kept = []
+    for extreme in (np.minimum.reduceat(value, first), np.maximum.reduceat(value, first)):
+        equal = np.flatnonzero(value == extreme[of_piece])
+        kept.append(equal[np.flatnonzero(np.r_[True, np.diff(of_piece[equal]) > 0])])
+    return np.asarray(np.unique(rows[order[np.concatenate(kept)]]), dtype=np.intp)
+
+
+def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> Indices:
+    """Rows in rising order of which no two lie in one square cell; rows with NaN are left out.
+
+    The cells, at first of width `cell`, grow until at most `points` rows are left.
+    """
+    rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    left, low = (float(v[rows].min()) if len(rows) else 0.0 for v in (x, y))
+    while len(rows) > points:
+        # rows and columns of the grid as one number each cell
+        across, up = ((v[rows] / cell).astype(np.int64) for v in (x - left, y - low))
+        _, first = np.unique(across * (int(up.max()) + 1) + up, return_index=True)
+        rows = rows[np.sort(first)]
+        cell *= 1.5
+    return rows
+
+
+def spread(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
+    """At most `points` rows with the same density as all rows, and the extremes of each piece of `x`, in rising order.
+
+    Rows with NaN are left out, the others are sampled uniformly by the golden-ratio sequence, which has no period in
+    common with satellites or epochs; a fifth of the points are extremes, so that the outline and single outliers stay.
+    """
+    rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    if len(rows) <= points:
+        return rows
+    outline = extremes(x, y, points=points // 5)
+    # the rows of the smallest members of a uniform sequence in [0, 1)
+    order = (np.arange(len(rows)) * _GOLDEN) % 1.0
+    sample = rows[order < (points - len(outline)) / len(rows)]
+    return np.asarray(np.union1d(outline, sample)[:points], dtype=np.intp)
+
+
+def counts_sentence(shown: int, total: int) -> str:
+    """A sentence on the thinning, empty if there was none."""
+    if shown == total:
+        return ""
+    return f" {shown:,} of {total:,} points are shown, the extremes among them."

@@ -36,8 +36,14 @@ from railfix.report.plots.chart import (
     Marks,
     Points,
     RangeBars,
+    counts_sentence,
+    floats,
+    nice_step,
+    since,
+    spread,
+    start_of,
+    words,
 )
-from railfix.report.plots.columns import counts_sentence, floats, nice_step, since, spread, start_of, words
 
 _ERROR_LABEL: Final = "error along the line [m]"
 _SIGN: Final = "+ is toward the end of the line."
@@ -298,7 +304,6 @@ def levels_over_time(positions: pl.DataFrame, alarm_limit_m: float, *, title: st
     positions : polars.DataFrame
         Of one antenna, columns of `railfix.pipeline.result_columns.POSITION_COLUMNS`.
     alarm_limit_m : float [m]
-    title : str
     """
     start = start_of(positions)
     x = since(positions, start)

@@ -26,8 +26,6 @@ from railfix.report.plots.chart import (
     Layer,
     Marks,
     Points,
-)
-from railfix.report.plots.columns import (
     counts_sentence,
     floats,
     nice_step,
@@ -78,7 +76,6 @@ def plan(
         Chainages between which the line runs in a tunnel.
     background : sequence of ndarray, shape (P, 2) [deg]
         Longitude and latitude of lines to draw below, see `railfix.report.encode`.
-    title : str
     """
     ecef, conventional = points(positions, *ECEF), points(positions, *(f"conventional_{name}" for name in ECEF))
     has = np.isfinite(ecef[:, 0])

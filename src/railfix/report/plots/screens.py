@@ -18,8 +18,19 @@ from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
 from railfix.pipeline.config import Config
 from railfix.ranges.cn0_curve import Cn0Curve, Cn0Samples
-from railfix.report.plots.chart import BLACK, RED, Chart, Curve, Layer, Points
-from railfix.report.plots.columns import counts_sentence, extremes, floats, nice_step, spread
+from railfix.report.plots.chart import (
+    BLACK,
+    RED,
+    Chart,
+    Curve,
+    Layer,
+    Points,
+    counts_sentence,
+    extremes,
+    floats,
+    nice_step,
+    spread,
+)
 from railfix.report.plots.draw import draw_chart, save_figure
 from railfix.report.plots.signals import open_sky_chart
 from railfix.report.runs import read_runs
@@ -59,7 +70,6 @@ def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[
 
     Parameters
     ----------
-    picture : ScreenPicture
     time : ndarray of datetime64[ns], shape (T,), or (E,) with `epoch`
     epoch : ndarray of int, shape (T,), optional
         Epoch of each row of the picture, where `time` is that of E epochs.
@@ -248,27 +258,15 @@ def missing_columns(positions: pl.DataFrame, observations: pl.LazyFrame) -> list
 
 @dataclass(frozen=True, kw_only=True)
 class RunScreen:
-    """One screen of a run over one antenna.
+    """One screen of a run over one antenna."""
 
-    Attributes
-    ----------
-    antenna, name : str
-        ``front``, ``doppler``.
-    picture : ScreenPicture
-        A row an epoch, or an observation.
-    epoch : ndarray of int, shape (T,) or None
-        Epoch of each row; None where the rows are the epochs.
-    epoch_time : ndarray of datetime64[ns], shape (E,)
-    epoch_chainage_m : ndarray, shape (E,) [m]
-        Of the position; NaN without one.
-    """
-
+    #: ``front``, ``doppler``.
     antenna: str
     name: str
-    picture: ScreenPicture
-    epoch: NDArray[np.int32] | None
-    epoch_time: Datetimes
-    epoch_chainage_m: Floats
+    picture: ScreenPicture  #: A row an epoch, or an observation.
+    epoch: NDArray[np.int32] | None  #: Epoch of each row; None where the rows are the epochs; shape (T,).
+    epoch_time: Datetimes  #: Shape (E,).
+    epoch_chainage_m: Floats  #: Of the position; NaN without one; shape (E,).
 
     @property
     def time(self) -> Datetimes:

@@ -12,8 +12,23 @@ from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.reasons import Reason, first_reason, reason_names
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean
 from railfix.ranges.cn0_curve.curve import satellite_kind
-from railfix.report.plots.chart import BLACK, BLUE, GREY, PURPLE, RED, Cells, Chart, Curve, Layer, Points, SkyEpochs
-from railfix.report.plots.columns import floats, since, start_of, words
+from railfix.report.plots.chart import (
+    BLACK,
+    BLUE,
+    GREY,
+    PURPLE,
+    RED,
+    Cells,
+    Chart,
+    Curve,
+    Layer,
+    Points,
+    SkyEpochs,
+    floats,
+    since,
+    start_of,
+    words,
+)
 from railfix.screens import Cn0Limits
 
 #: Cells of C/N0 over elevation.
@@ -48,7 +63,6 @@ def cn0_over_elevation(
         Curve of the open sky. Without it, the mean of these observations themselves is drawn.
     mask_deg : float, optional [deg]
         Elevation mask.
-    title : str
 
     Returns
     -------
@@ -174,7 +188,6 @@ def sky_epochs(
         Largest number of epochs, evenly spaced.
     start : datetime64[ns], optional
         Origin of the times; the first epoch if not given.
-    title : str
 
     Returns
     -------

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Complexes, Floats
-from railfix.simulate.environment.diffraction import edge_amplitude, per_metre, strip_field
+from railfix.simulate.environment.correlator import edge_amplitude, per_metre, strip_field
 from railfix.simulate.environment.settings import ElectrificationSettings
 from railfix.simulate.environment.walls import Rays
 
@@ -18,26 +18,19 @@ _LEAST_WEIGHT: Final = 0.005
 
 @dataclass(frozen=True, kw_only=True)
 class Conductor:
-    """One straight conductor for each of N rays.
+    """One straight conductor for each of N rays."""
 
-    Attributes
-    ----------
-    p, q : ndarray, shape (N,) [m]
-        Its axis in the plane perpendicular to it, from the antenna.
-    ray_p, ray_q, ray_axis : ndarray, shape (N,)
-        Direction to the satellite in that plane, and along the conductor.
-    low_m, high_m : ndarray or float [m]
-        Ends along the axis, from the antenna.
-    width_m : float
-    """
-
+    #: Its axis in the plane perpendicular to it, from the antenna; shape (N,) [m].
     p: Floats
     q: Floats
+    #: Direction to the satellite in that plane, and along the conductor; shape (N,).
     ray_p: Floats
     ray_q: Floats
     ray_axis: Floats
+    #: Ends along the axis, from the antenna.
     low_m: Floats | float
     high_m: Floats | float
+
     width_m: float
 
     def obstruction(self, wavelength_m: Floats) -> Complexes:
@@ -82,12 +75,7 @@ class Conductor:
 
 
 class Electrification:
-    """Masts, beams and wires of an electrified line.
-
-    Parameters
-    ----------
-    settings : ElectrificationSettings
-    """
+    """Masts, beams and wires of an electrified line."""
 
     def __init__(self, settings: ElectrificationSettings) -> None:
         self.settings = settings

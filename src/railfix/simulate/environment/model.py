@@ -13,25 +13,31 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.simulate.disturbance import CN0_HORIZON_DBHZ, CN0_RISE_DB, Disturbance, SightGeometry
-from railfix.simulate.environment.correlator import TrackedCode, tracked
-from railfix.simulate.environment.diffraction import (
+from railfix.simulate.environment.correlator import (
+    TrackedCode,
     cross_polar_gain,
     edge_amplitude,
     received_amplitude,
     roughness_loss,
+    tracked,
 )
 from railfix.simulate.environment.masts import Electrification
 from railfix.simulate.environment.settings import EnvironmentSettings
-from railfix.simulate.environment.side_streets import (
+from railfix.simulate.environment.structures import BEYOND_M, build_structures, drawn_sections, tree_rows
+from railfix.simulate.environment.walls import (
+    FREE_V,
+    Rays,
     equipment_amplitude,
     foliage,
     neighbour_clearance,
     neighbour_reflection,
+    reflections,
+    roof_amplitude,
+    second_reflection,
+    shadow,
     side_streets,
     street_reflections,
 )
-from railfix.simulate.environment.structures import BEYOND_M, build_structures, drawn_sections, tree_rows
-from railfix.simulate.environment.walls import FREE_V, Rays, reflections, roof_amplitude, second_reflection, shadow
 
 #: Chips over C/A's, by constellation and band; all others are C/A's (BPSK(1), BOC(1,1)).
 CHIP_RATIO: Final = {"C2": 0.5, "C6": 0.1, "E7": 0.1, "E5": 0.1, "E8": 0.1, "G5": 0.1, "J5": 0.1, "C5": 0.1, "C7": 0.1}
@@ -51,20 +57,11 @@ _LEAST_ELEVATION_DEG: Final = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Paths:
-    """Paths of N signals, the direct one first, shapes (P, N).
+    """Paths of N signals, the direct one first, shapes (P, N)."""
 
-    Attributes
-    ----------
-    field : ndarray of complex
-        Relative to the unobstructed direct signal, without the phase of the extra path.
-    extra_m : ndarray [m]
-    growth : ndarray [m/m]
-        Of the extra path with the antenna's chainage.
-    """
-
-    field: Complexes
+    field: Complexes  #: Relative to the unobstructed direct signal, without the phase of the extra path.
     extra_m: Floats
-    growth: Floats
+    growth: Floats  #: Of the extra path with the antenna's chainage [m/m].
 
 
 class Environment:

@@ -57,68 +57,41 @@ KINDS: Final[tuple[str, ...]] = get_args(Kind)
 
 
 class ElectrificationSettings(ScenarioSettings):
-    """Masts, beams across the tracks, and the wires over the track.
+    """Masts, beams across the tracks, and the wires over the track."""
 
-    Attributes
-    ----------
-    spacing_m, first_m : float
-        Masts stand at chainages first_m + k spacing_m.
-    sides : {"left", "right", "both"}
-    lateral_m, width_m, height_m : float
-        Mast's axis from the track's axis, its width, its top over the rails.
-    beam_every : int
-        A beam at every n-th mast, from mast line to mast line; 0 for none.
-    beam_height_m, beam_depth_m : float
-        Middle of the beam over the rails, and its depth as seen from below.
-    wire_height_m, wire_width_m, messenger_height_m : float
-        Contact wire and messenger wire over the track's axis, always there.
-    """
-
+    #: Masts stand at chainages first_m + k spacing_m.
     spacing_m: Positive = 50.0
     first_m: Finite = 10.0
+
     sides: Sides = "both"
+    #: Mast's axis from the track's axis, its width, its top over the rails.
     lateral_m: Positive = 3.0
     width_m: Positive = 0.35
     height_m: Positive = 9.0
-    beam_every: int = Field(default=1, ge=0)
+    beam_every: int = Field(default=1, ge=0)  #: A beam at every n-th mast, from mast line to mast line; 0 for none.
+    #: Middle of the beam over the rails, and its depth as seen from below.
     beam_height_m: Positive = 7.5
     beam_depth_m: Positive = 0.4
+    #: Contact wire and messenger wire over the track's axis, always there.
     wire_height_m: Positive = 5.1
     wire_width_m: Positive = 0.012
     messenger_height_m: Positive = 6.0
 
 
 class RowSettings(ScenarioSettings):
-    """A row of vertical walls along the line, uniform between the limits: buildings, slopes, mountains.
-
-    Attributes
-    ----------
-    sides : {"left", "right", "both"}
-    distance_m : tuple of float
-        From the track's axis to the wall.
-    height_m : tuple of float
-        Top over the rails.
-    length_m, gap_m : tuple of float
-        Along the line, and to the next.
-    share : float
-        Share of the plots that are built upon.
-    reflection : tuple of float
-        Amplitude reflection coefficient, the antenna's polarisation included (0 nothing, 1 all).
-    roughness_m : tuple of float
-        Standard deviation of the surface height.
-    yaw_deg : tuple of float
-        Rotation of the wall out of the line's direction.
-    """
+    """A row of vertical walls along the line, uniform between the limits: buildings, slopes, mountains."""
 
     sides: Sides = "both"
-    distance_m: Between = (10.0, 30.0)
-    height_m: Between = (6.0, 15.0)
+    distance_m: Between = (10.0, 30.0)  #: From the track's axis to the wall.
+    height_m: Between = (6.0, 15.0)  #: Top over the rails.
+    #: Along the line, and to the next.
     length_m: Between = (10.0, 30.0)
     gap_m: Between = (2.0, 10.0)
-    share: Share = 1.0
+    share: Share = 1.0  #: Share of the plots that are built upon.
+    #: Amplitude reflection coefficient, the antenna's polarisation included (0 nothing, 1 all).
     reflection: Between = (0.2, 0.7)
-    roughness_m: Between = (0.0, 0.02)
-    yaw_deg: AngleBetween = (-4.0, 4.0)
+    roughness_m: Between = (0.0, 0.02)  #: Standard deviation of the surface height.
+    yaw_deg: AngleBetween = (-4.0, 4.0)  #: Rotation of the wall out of the line's direction.
 
     @field_validator("distance_m", "length_m", "reflection", "yaw_deg")
     @classmethod
@@ -132,28 +105,17 @@ class RowSettings(ScenarioSettings):
 
 
 class RoofSettings(ScenarioSettings):
-    """Level roofs along the line: over platforms, or across the tracks (bridges, concourses).
-
-    Attributes
-    ----------
-    sides : {"left", "right", "both"}
-    inner_m, outer_m : float
-        Edges from the track's axis; an inner edge at 0 covers the track.
-    height_m : float
-        Over the rails.
-    length_m, gap_m : tuple of float
-        Along the line, and to the next; uniform.
-    loss_db : float
-        Loss through the roof.
-    """
+    """Level roofs along the line: over platforms, or across the tracks (bridges, concourses)."""
 
     sides: Sides = "both"
+    #: Edges from the track's axis; an inner edge at 0 covers the track.
     inner_m: NotNegative = 1.8
     outer_m: float = Field(default=9.0, gt=0.0, validate_default=True)
-    height_m: Positive = 6.0
+    height_m: Positive = 6.0  #: Over the rails.
+    #: Along the line, and to the next; uniform.
     length_m: Annotated[Between, at_least(1.0)] = (60.0, 120.0)
     gap_m: Between = (10.0, 40.0)
-    loss_db: NotNegative = 25.0
+    loss_db: NotNegative = 25.0  #: Loss through the roof.
 
     @field_validator("outer_m")
     @classmethod
@@ -164,21 +126,12 @@ class RoofSettings(ScenarioSettings):
 
 
 class SectionSettings(ScenarioSettings):
-    """One section of the line.
+    """One section of the line."""
 
-    Attributes
-    ----------
-    from_m, to_m : float
-        Chainages.
-    kind : str
-        One of `KINDS`; the rows and roofs are those of the kind unless given here.
-    rows : tuple of RowSettings, optional
-    roofs : tuple of RoofSettings, optional
-    """
-
+    #: Chainages.
     from_m: Finite
     to_m: Finite
-    kind: Kind
+    kind: Kind  #: One of `KINDS`; the rows and roofs are those of the kind unless given here.
     rows: tuple[RowSettings, ...] | None = None
     roofs: tuple[RoofSettings, ...] | None = None
 
@@ -186,195 +139,109 @@ class SectionSettings(ScenarioSettings):
 
 
 class CorrelatorSettings(ScenarioSettings):
-    """Correlator and tracking loops of the receivers.
+    """Correlator and tracking loops of the receivers."""
 
-    Attributes
-    ----------
-    chip_m : float
-        Length of a C/A chip; faster codes have theirs in proportion.
-    spacing_chips : float
-        Early to late.
-    tracking_cn0_dbhz : float
-        Signals below this C/N0 are lost.
-    code_loop_hz, carrier_loop_hz : float
-        Bandwidths of the loops: faster multipath fading is averaged.
-    backward_db : float
-        Loss of the antenna below the horizon.
-    """
-
-    chip_m: Positive = 293.05
-    spacing_chips: float = Field(default=0.1, gt=0.0, le=1.0)
-    tracking_cn0_dbhz: Finite = 20.0
+    chip_m: Positive = 293.05  #: Length of a C/A chip; faster codes have theirs in proportion.
+    spacing_chips: float = Field(default=0.1, gt=0.0, le=1.0)  #: Early to late.
+    tracking_cn0_dbhz: Finite = 20.0  #: Signals below this C/N0 are lost.
+    #: Bandwidths of the loops: faster multipath fading is averaged.
     code_loop_hz: Positive = 1.0
     carrier_loop_hz: Positive = 10.0
-    backward_db: Finite = 15.0
+    backward_db: Finite = 15.0  #: Loss of the antenna below the horizon.
 
 
 class AntennaSettings(ScenarioSettings):
     """Polarisation of the antenna and material of the walls.
 
     A wall's `reflection` then multiplies the reflection coefficient of its material.
-
-    Attributes
-    ----------
-    cross_polar_zenith_db, cross_polar_horizon_db : float
-        Gain for left-handed below that for right-handed signals, at the zenith and at the horizon.
-    wall_permittivity : float
-        Relative permittivity of the walls: about 6 for concrete and glass.
-    ripple_sigma_db : float
-        Gain variation over azimuth at the horizon, less by the cosine of the elevation above it; each antenna its own.
     """
 
+    #: Gain for left-handed below that for right-handed signals, at the zenith and at the horizon.
     cross_polar_zenith_db: NotNegative = 15.0
     cross_polar_horizon_db: NotNegative = 4.0
+    #: Relative permittivity of the walls: about 6 for concrete and glass.
     wall_permittivity: float = Field(default=6.0, gt=1.0)
+    #: Gain variation over azimuth at the horizon, less by the cosine of the elevation above it; each antenna its own.
     ripple_sigma_db: NotNegative = 0.0
 
 
 class SideStreetSettings(ScenarioSettings):
-    """Side streets with walls square to the line, uniform between the limits.
+    """Side streets with walls square to the line, uniform between the limits."""
 
-    Attributes
-    ----------
-    spacing_m, width_m : tuple of float
-        From one street to the next, and between its walls.
-    front_m, depth_m : tuple of float
-        Distance of the mouth from the track's axis, and length of the street's walls.
-    height_m, opposite_m : tuple of float
-        Height of the walls that reflect, and of those across the street, over the rails.
-    reflection : tuple of float
-        As `RowSettings`.
-    roughness_m : float
-    candidates : int
-        Number of streets that can reflect one satellite at a time.
-    """
-
+    #: From one street to the next, and between its walls.
     spacing_m: Between = (50.0, 150.0)
     width_m: Between = (8.0, 25.0)
+    #: Distance of the mouth from the track's axis, and length of the street's walls.
     front_m: Between = (12.0, 25.0)
     depth_m: Between = (20.0, 80.0)
+    #: Height of the walls that reflect, and of those across the street, over the rails.
     height_m: Between = (15.0, 60.0)
     opposite_m: Between = (5.0, 40.0)
-    reflection: Between = (0.3, 1.0)
+    reflection: Between = (0.3, 1.0)  #: As `RowSettings`.
     roughness_m: NotNegative = 0.01
-    candidates: int = Field(default=2, ge=1, le=6)
+    candidates: int = Field(default=2, ge=1, le=6)  #: Number of streets that can reflect one satellite at a time.
 
 
 class TreeSettings(ScenarioSettings):
-    """A row of trees along the line, uniform between the limits.
-
-    Attributes
-    ----------
-    sides : {"left", "right", "both"}
-    distance_m : tuple of float
-        From the track's axis to the trunks.
-    height_m, crown_m : tuple of float
-        Top and lower edge of the crowns over the rails.
-    length_m, gap_m : tuple of float
-        Width of a crown, and distance to the next.
-    share : float
-        Share of the places with a tree.
-    attenuation_db_per_m, most_db, scatter : float
-        Specific attenuation, largest loss, and share of the lost amplitude that is scattered forward.
-    """
+    """A row of trees along the line, uniform between the limits."""
 
     sides: Sides = "both"
-    distance_m: Between = (6.0, 12.0)
+    distance_m: Between = (6.0, 12.0)  #: From the track's axis to the trunks.
+    #: Top and lower edge of the crowns over the rails.
     height_m: Between = (8.0, 16.0)
     crown_m: Between = (2.5, 4.0)
+    #: Width of a crown, and distance to the next.
     length_m: Between = (4.0, 9.0)
     gap_m: Between = (0.0, 6.0)
-    share: Share = 1.0
+    share: Share = 1.0  #: Share of the places with a tree.
+    #: Specific attenuation, largest loss, and share of the lost amplitude that is scattered forward.
     attenuation_db_per_m: NotNegative = 1.0
     most_db: NotNegative = 12.0
     scatter: Share = 0.5
 
 
 class NeighbourSettings(ScenarioSettings):
-    """Vehicles on a parallel track or lane, following each other at constant speed.
-
-    Attributes
-    ----------
-    side : {"left", "right"}
-    lateral_m, height_m : float
-        Distance of their side from the track's axis, and their top over the rails.
-    length_m, spacing_m : float
-        Of a vehicle, and from front to front.
-    speed_mps : float
-        Toward rising chainage.
-    reflection : float
-        Amplitude that their sides reflect.
-    """
+    """Vehicles on a parallel track or lane, following each other at constant speed."""
 
     side: Literal["left", "right"] = "right"
+    #: Distance of their side from the track's axis, and their top over the rails.
     lateral_m: Positive = 2.5
     height_m: Positive = 4.3
+    #: Of a vehicle, and from front to front.
     length_m: Positive = 100.0
     spacing_m: Positive = 5000.0
-    speed_mps: Finite = -20.0
-    reflection: Share = 0.8
+    speed_mps: Finite = -20.0  #: Toward rising chainage.
+    reflection: Share = 0.8  #: Amplitude that their sides reflect.
 
 
 class RoofEquipment(ScenarioSettings):
-    """Equipment on the vehicle's roof near the antenna: air conditioning, pantograph well.
+    """Equipment on the vehicle's roof near the antenna: air conditioning, pantograph well."""
 
-    Attributes
-    ----------
-    ahead_m : float
-        Distance of its nearest edge in front of the antenna, negative behind.
-    above_antenna_m, half_width_m : float
-    """
-
-    ahead_m: Finite
+    ahead_m: Finite  #: Distance of its nearest edge in front of the antenna, negative behind.
     above_antenna_m: Positive
     half_width_m: Positive = 1.0
 
 
 class EnvironmentSettings(ScenarioSettings):
-    """Structures along the line that block, reflect and scatter signals; by default none.
-
-    Attributes
-    ----------
-    electrification : ElectrificationSettings, optional
-    sections : tuple of SectionSettings
-        Rising, without overlap; between them the line is open.
-    shares : dict of str to float
-        Instead of sections: share of the line's length by kind; the sections are drawn at random.
-    section_length_m : tuple of float
-        Lengths of the drawn sections.
-    antenna_height_m : float
-        Over the rails.
-    ground_reflection : float
-        Amplitude reflection coefficient of the ballast; 0 for none.
-    ground_roughness_m : float
-    receiver : CorrelatorSettings
-    antenna : AntennaSettings or None
-        None: walls reflect with the amplitude `reflection`, whatever the polarisation.
-    second_reflections : {"none", "opposite"}
-        "opposite": signals reflected by both nearest rows, one after the other.
-    side_streets : SideStreetSettings or None
-        All along the line.
-    trees : tuple of TreeSettings
-        All along the line.
-    neighbours : tuple of NeighbourSettings
-    equipment : tuple of RoofEquipment
-        Of both antennas.
-    """
+    """Structures along the line that block, reflect and scatter signals; by default none."""
 
     electrification: ElectrificationSettings | None = None
-    sections: tuple[SectionSettings, ...] = ()
+    sections: tuple[SectionSettings, ...] = ()  #: Rising, without overlap; between them the line is open.
+    #: Instead of sections: share of the line's length by kind; the sections are drawn at random.
     shares: dict[Kind, Share] = Field(default_factory=dict)
-    section_length_m: Annotated[Between, at_least(20.0)] = (150.0, 800.0)
-    antenna_height_m: Positive = 4.0
-    ground_reflection: Share = 0.5
+    section_length_m: Annotated[Between, at_least(20.0)] = (150.0, 800.0)  #: Lengths of the drawn sections.
+    antenna_height_m: Positive = 4.0  #: Over the rails.
+    ground_reflection: Share = 0.5  #: Amplitude reflection coefficient of the ballast; 0 for none.
     ground_roughness_m: NotNegative = 0.05
     receiver: CorrelatorSettings = CorrelatorSettings()
+    #: None: walls reflect with the amplitude `reflection`, whatever the polarisation.
     antenna: AntennaSettings | None = None
+    #: "opposite": signals reflected by both nearest rows, one after the other.
     second_reflections: Literal["none", "opposite"] = "none"
-    side_streets: SideStreetSettings | None = None
-    trees: tuple[TreeSettings, ...] = ()
+    side_streets: SideStreetSettings | None = None  #: All along the line.
+    trees: tuple[TreeSettings, ...] = ()  #: All along the line.
     neighbours: tuple[NeighbourSettings, ...] = ()
-    equipment: tuple[RoofEquipment, ...] = ()
+    equipment: tuple[RoofEquipment, ...] = ()  #: Of both antennas.
 
     @field_validator("sections")
     @classmethod

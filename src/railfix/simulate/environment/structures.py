@@ -119,25 +119,14 @@ SIDES: Final = ("left", "right")
 
 @dataclass(frozen=True, kw_only=True)
 class Strips:
-    """Structures that do not overlap on one side, left ones first, sorted by chainage; n of them.
+    """Structures that do not overlap on one side, left ones first, sorted by chainage; n of them."""
 
-    Attributes
-    ----------
-    start_m, end_m : ndarray, shape (n,) [m]
-        Chainages.
-    border_m : ndarray, shape (n,) [m]
-        Chainage from which the structure is the nearest, as `side * reach_m + chainage`.
-    reach_m : float
-        More than all chainages.
-    value : dict of str to ndarray
-        Properties, each of shape (n,).
-    """
-
+    #: Chainages, shape (n,).
     start_m: Floats
     end_m: Floats
-    border_m: Floats
-    reach_m: float
-    value: dict[str, Floats]
+    border_m: Floats  #: Chainage from which the structure is the nearest, as `side * reach_m + chainage`; shape (n,).
+    reach_m: float  #: More than all chainages.
+    value: dict[str, Floats]  #: Properties, each of shape (n,).
 
     def nearest(self, side: Indices, chainage_m: Floats) -> Indices:
         """Index of the nearest structure on a side (0 left, 1 right); both sides always hold at least one."""
@@ -147,25 +136,14 @@ class Strips:
 
 @dataclass(frozen=True, kw_only=True)
 class Structures:
-    """Walls, roofs and sections of a line.
+    """Walls, roofs and sections of a line."""
 
-    Attributes
-    ----------
-    walls : tuple of Strips
-        Vertical walls, row by row, with `distance_m` (at their middle), `height_m`, `reflection`,
-        `roughness_m`, `slope` (tangent of the yaw).
-    roofs : tuple of Strips
-        With `inner_m`, `outer_m`, `height_m`, `through` (amplitude).
-    borders_m : ndarray, shape (2 S,) [m]
-        From and to of the sections.
-    kinds : ndarray of str, shape (2 S + 1,)
-        Kind before the first border, between, and after the last.
-    """
-
+    #: Vertical walls, row by row, with `distance_m` (at their middle), `height_m`, `reflection`, `roughness_m`, `slope`
+    #: (tangent of the yaw).
     walls: tuple[Strips, ...]
-    roofs: tuple[Strips, ...]
-    borders_m: Floats
-    kinds: Strings
+    roofs: tuple[Strips, ...]  #: With `inner_m`, `outer_m`, `height_m`, `through` (amplitude).
+    borders_m: Floats  #: From and to of the sections, shape (2 S,).
+    kinds: Strings  #: Kind before the first border, between, and after the last; shape (2 S + 1,).
 
     def kind_at(self, chainage_m: Floats) -> Strings:
         """Kind of section at chainages."""

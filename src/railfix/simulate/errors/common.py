@@ -17,9 +17,9 @@ from railfix.core.arrays import Floats
 from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords
+from railfix.simulate.constellation import newest_record, record_state
 from railfix.simulate.errors.processes import GaussMarkov, satellite_key
 from railfix.simulate.errors.settings import ErrorSettings, SatelliteErrorSettings, SatelliteFault
-from railfix.simulate.satellites import newest_record, record_state
 
 #: Radius of the Earth and height of the layer that the residual ionosphere lies in [km] (DO-229D, A.4.4.10).
 _EARTH_KM: Final = 6378.1363

@@ -125,17 +125,10 @@ _COSINES: Final = 64
 
 @dataclass(frozen=True, kw_only=True)
 class RandomFunction:
-    """Realisation of a stationary Gaussian function.
+    """Realisation of a stationary Gaussian function."""
 
-    Attributes
-    ----------
-    amplitude : float
-        Of each cosine.
-    frequency, phase : ndarray, shape (W,)
-        Radians per unit of the variable, and radians.
-    """
-
-    amplitude: float
+    amplitude: float  #: Of each cosine.
+    #: Radians per unit of the variable, and radians; shape (W,).
     frequency: Floats
     phase: Floats
 

@@ -16,8 +16,8 @@ from railfix.core.timescale import seconds, timedelta, to_week
 from railfix.ranges.sbas import SbasMessages
 from railfix.ranges.sbas.grid import BANDS, COLUMNS, POINT_OF_BIT
 from railfix.ranges.sbas.messages import DATA_BITS, PREAMBLES, with_parity
-from railfix.simulate.noise import ionosphere_m
-from railfix.simulate.satellites import newest_record
+from railfix.simulate.constellation import newest_record
+from railfix.simulate.receiver import ionosphere_m
 from railfix.simulate.sbas.settings import SbasSettings
 
 if TYPE_CHECKING:

@@ -10,36 +10,22 @@ from railfix.simulate.setting_types import NotNegative, Positive, ScenarioSettin
 
 
 class SbasSettings(ScenarioSettings):
-    """SBAS that corrects GPS and the ionosphere; QZSS, Galileo and BeiDou are not in its mask.
-
-    Attributes
-    ----------
-    prn : int
-    latency_s : float
-        Corrections are those of so much before the first bit of their message.
-    udrei, givei : int
-        Indicators of the accuracy of all satellites and grid points, as sent.
-    clock_sigma_m, orbit_sigma_m, delay_sigma_m : float
-        Errors of the service's own estimates: white, of each fast correction, each axis, each grid delay.
-    grid_radius_deg : float
-        Grid points so far from the line's first point, in latitude and longitude, are in the mask.
-    alert_m, alert_s : float
-        A fault larger than this sets the satellite to "do not use" after this time.
-    lost_chance : float
-        Probability that a message is not received.
-    lead_s : float
-        The messages begin so long before the run, so that all corrections are there at its start.
-    """
+    """SBAS that corrects GPS and the ionosphere; QZSS, Galileo and BeiDou are not in its mask."""
 
     prn: Annotated[int, Field(ge=120, le=158)] = 137
-    latency_s: NotNegative = 4.0
+    latency_s: NotNegative = 4.0  #: Corrections are those of so much before the first bit of their message.
+    #: Indicators of the accuracy of all satellites and grid points, as sent.
     udrei: Annotated[int, Field(ge=0, le=13)] = 5
     givei: Annotated[int, Field(ge=0, le=14)] = 9
+    #: Errors of the service's own estimates: white, of each fast correction, each axis, each grid delay.
     clock_sigma_m: NotNegative = 0.0
     orbit_sigma_m: NotNegative = 0.0
     delay_sigma_m: NotNegative = 0.0
+    #: Grid points so far from the line's first point, in latitude and longitude, are in the mask.
     grid_radius_deg: Positive = 25.0
+    #: A fault larger than this sets the satellite to "do not use" after this time.
     alert_m: Positive = 10.0
     alert_s: NotNegative = 6.0
-    lost_chance: Share = 0.0
+    lost_chance: Share = 0.0  #: Probability that a message is not received.
+    #: The messages begin so long before the run, so that all corrections are there at its start.
     lead_s: NotNegative = 300.0

@@ -26,19 +26,13 @@ _CORNER_M: Final = 5.0
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceLine:
-    """Points of the line before the adjustment, and the directions in which they move, J points.
+    """Points of the line before the adjustment, and the directions in which they move, J points."""
 
-    Attributes
-    ----------
-    ecef_m, across, up : ndarray, shape (J, 3)
-    closed : bool
-        The last point goes on at the first.
-    """
-
+    #: Shape (J, 3).
     ecef_m: Floats
     across: Floats
     up: Floats
-    closed: bool = False
+    closed: bool = False  #: The last point goes on at the first.
 
     def __len__(self) -> int:
         return len(self.ecef_m)
@@ -46,27 +40,14 @@ class ReferenceLine:
 
 @dataclass(frozen=True, kw_only=True)
 class Equations:
-    """Equations of one kind, n observations of `size` rows each, in units of their standard deviations.
+    """Equations of one kind, n observations of `size` rows each, in units of their standard deviations."""
 
-    Attributes
-    ----------
-    matrix : csr_array, shape (n * size, unknowns)
-    value : ndarray, shape (n * size,)
-    size : int
-    share : ndarray, shape (n,)
-        Share of an observation in an independent one; 1 where none is given.
-    robust : bool
-        Whether outliers lose their weight.
-    scaled : bool
-        Whether the standard deviations are scaled by the residuals.
-    """
-
-    matrix: sp.csr_array
-    value: Floats
+    matrix: sp.csr_array  #: Shape (n * size, unknowns).
+    value: Floats  #: Shape (n * size,).
     size: int
-    share: Floats
-    robust: bool = True
-    scaled: bool = False
+    share: Floats  #: Share of an observation in an independent one; 1 where none is given; shape (n,).
+    robust: bool = True  #: Whether outliers lose their weight.
+    scaled: bool = False  #: Whether the standard deviations are scaled by the residuals.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,21 +29,12 @@ _NEIGHBOURS: Final = 24
 
 @dataclass(frozen=True, kw_only=True)
 class Leg:
-    """Part of a run without a change of direction, m selected rows at least a spacing apart.
-
-    Attributes
-    ----------
-    run : int
-    row : ndarray of int, shape (m,)
-    arc_m : ndarray, shape (m,) [m]
-    point_m : ndarray, shape (m, 3) [m]
-        East, north, up in the frame of the survey.
-    """
+    """Part of a run without a change of direction, m selected rows at least a spacing apart."""
 
     run: int
-    row: Indices
-    arc_m: Floats
-    point_m: Floats
+    row: Indices  #: Shape (m,).
+    arc_m: Floats  #: Shape (m,).
+    point_m: Floats  #: East, north, up in the frame of the survey; shape (m, 3).
 
     def nodes_at(self, arc_m: Floats) -> tuple[Indices, Floats]:
         """Return four rows about each arc length and their weights, shapes (q, 4): cubic, linear at the ends."""
@@ -88,22 +79,13 @@ class Course:
 
 @dataclass(frozen=True, kw_only=True)
 class Pass:
-    """Piece of a leg that lies on the line.
-
-    Attributes
-    ----------
-    leg : int
-    sign : int
-        1 along the line, -1 against it.
-    arc_m : ndarray, shape (p,) [m]
-        Along the leg, rising.
-    place : ndarray, shape (p,)
-        Number of the point of the line with its fraction, monotone; beyond the last point where a closed line goes on.
-    """
+    """Piece of a leg that lies on the line."""
 
     leg: int
-    sign: int
-    arc_m: Floats
+    sign: int  #: 1 along the line, -1 against it.
+    arc_m: Floats  #: Along the leg, rising; shape (p,).
+    #: Number of the point of the line with its fraction, monotone; beyond the last point where a closed line goes on;
+    #: shape (p,).
     place: Floats
 
 
@@ -362,25 +344,13 @@ def without_other_track(
 
 @dataclass(frozen=True, kw_only=True)
 class Ties:
-    """Where runs pass the points of the line, m ties.
+    """Where runs pass the points of the line, m ties."""
 
-    Attributes
-    ----------
-    run : ndarray of int, shape (m,)
-    row : ndarray of int, shape (m, 4)
-        Rows of the run about the point.
-    weight : ndarray, shape (m, 4)
-        Of these rows, with the sum 1.
-    point : ndarray of int, shape (m,)
-    number : ndarray of int, shape (m,)
-        Number of the pass.
-    """
-
-    run: Indices
-    row: Indices
-    weight: Floats
-    point: Indices
-    number: Indices
+    run: Indices  #: Shape (m,).
+    row: Indices  #: Rows of the run about the point, shape (m, 4).
+    weight: Floats  #: Of these rows, with the sum 1; shape (m, 4).
+    point: Indices  #: Shape (m,).
+    number: Indices  #: Number of the pass, shape (m,).
 
 
 def find_ties(course: Course, legs: Sequence[Leg], passes: Sequence[Pass]) -> Ties:

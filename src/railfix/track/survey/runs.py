@@ -25,32 +25,17 @@ _UNKNOWN_QUALITY: Final = 5
 
 
 class SurveyLimits(Settings):
-    """Assumptions of a survey.
+    """Assumptions of a survey."""
 
-    Attributes
-    ----------
-    interval_s : float [s]
-        Least time between the positions used; faster logs are thinned.
-    correlation_s, correlation_m : float
-        Errors of positions repeat over so long at standstill and over so much way: together they count as one.
-    acceleration_mps2, climb_mps2 : float
-        Standard deviation of the change of the horizontal and of the vertical velocity in a second.
-    freedom : float
-        Degrees of freedom of Student's t errors: outliers lose their weight.
-    same_line_m : float [m]
-        Passes so near to each other, in the same or the opposite direction, are on one line.
-    apart_m : float [m]
-        Standard deviation of the distance of a pass from the line: lanes, other antennas.
-    spacing_m : float [m]
-        Distance between points of the map.
-    """
-
-    interval_s: float = Field(default=1.0, gt=0)
+    interval_s: float = Field(default=1.0, gt=0)  #: Least time between the positions used; faster logs are thinned.
+    #: Errors of positions repeat over so long at standstill and over so much way: together they count as one.
     correlation_s: float = Field(default=30.0, ge=0)
     correlation_m: float = Field(default=50.0, ge=0)
+    #: Standard deviation of the change of the horizontal and of the vertical velocity in a second.
     acceleration_mps2: float = Field(default=1.0, gt=0)
     climb_mps2: float = Field(default=0.1, gt=0)
-    freedom: float = Field(default=3.0, gt=0)
+    freedom: float = Field(default=3.0, gt=0)  #: Degrees of freedom of Student's t errors: outliers lose their weight.
+    #: Passes so near to each other, in the same or the opposite direction, are on one line.
     same_line_m: float = option(
         "Passes nearer to each other than this, in the same or the opposite direction, are on one line.",
         20.0,
@@ -58,6 +43,7 @@ class SurveyLimits(Settings):
         metavar="M",
         gt=0,
     )
+    #: Standard deviation of the distance of a pass from the line: lanes, other antennas.
     apart_m: float = option(
         "Standard deviation of the distance of a pass from the line: lanes, antennas on other places of the vehicle.",
         0.5,
@@ -65,6 +51,7 @@ class SurveyLimits(Settings):
         metavar="M",
         gt=0,
     )
+    #: Distance between points of the map.
     spacing_m: float = option(
         "Distance between the points of the map.", 5.0, name="--spacing", metavar="M", gt=0, le=100.0
     )
@@ -72,34 +59,19 @@ class SurveyLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class RunSignals(FrozenArrays):
-    """Ranges of a run and their changes, M ranges and C changes.
+    """Ranges of a run and their changes, M ranges and C changes."""
 
-    Attributes
-    ----------
-    row : ndarray of int, shape (M,)
-        Row of the run.
-    sat_ecef_m : ndarray, shape (M, 3) [m]
-        Satellites at transmission.
-    code_m, sigma_m : ndarray, shape (M,) [m]
-        Corrected pseudoranges, and their standard deviations.
-    clock : ndarray of int, shape (M,)
-        Number of the receiver clock.
-    step : ndarray of int, shape (C,)
-        Row before the change; it ends at the next row.
-    before_ecef_m, after_ecef_m : ndarray, shape (C, 3) [m]
-        The satellite at transmission, at both rows.
-    change_m, change_sigma_m : ndarray, shape (C,) [m]
-        Change of the range by the carrier phase or Dopplers.
-    """
-
-    row: Indices
-    sat_ecef_m: Floats
+    row: Indices  #: Row of the run, shape (M,).
+    sat_ecef_m: Floats  #: Satellites at transmission, shape (M, 3).
+    #: Corrected pseudoranges, and their standard deviations; shape (M,).
     code_m: Floats
     sigma_m: Floats
-    clock: Indices
-    step: Indices
+    clock: Indices  #: Number of the receiver clock, shape (M,).
+    step: Indices  #: Row before the change; it ends at the next row; shape (C,).
+    #: The satellite at transmission, at both rows; shape (C, 3).
     before_ecef_m: Floats
     after_ecef_m: Floats
+    #: Change of the range by the carrier phase or Dopplers, shape (C,).
     change_m: Floats
     change_sigma_m: Floats
 
@@ -109,27 +81,15 @@ class RunSignals(FrozenArrays):
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyRun(FrozenArrays):
-    """Positions of one antenna in one run, n rows in order of time.
-
-    Attributes
-    ----------
-    name : str
-    time : ndarray of datetime64[ns], shape (n,)
-    ecef_m : ndarray, shape (n, 3) [m]
-        NaN where there is no position.
-    sigma_m : ndarray, shape (n, 3) [m]
-        Standard deviations east, north, up.
-    signals : RunSignals or None
-        What the positions come from: used in place of them, with several epochs to judge by.
-    common_sigma_m : tuple of float [m]
-        Standard deviation, plan and height, of the error that all positions share.
-    """
+    """Positions of one antenna in one run, n rows in order of time."""
 
     name: str
-    time: Datetimes
-    ecef_m: Floats
-    sigma_m: Floats
+    time: Datetimes  #: Shape (n,).
+    ecef_m: Floats  #: NaN where there is no position, shape (n, 3).
+    sigma_m: Floats  #: Standard deviations east, north, up; shape (n, 3).
+    #: What the positions come from: used in place of them, with several epochs to judge by.
     signals: RunSignals | None = None
+    #: Standard deviation, plan and height, of the error that all positions share.
     common_sigma_m: tuple[float, float] = COMMON_SIGMA_OF_QUALITY[_UNKNOWN_QUALITY]
 
     def __post_init__(self) -> None:

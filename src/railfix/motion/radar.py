@@ -2,6 +2,8 @@
 
 The speed of a radar that looks down at the angle alpha is wrong by ``tan(alpha)`` times the error of the angle: 1.7 %
 a degree at 45 degrees (P2 3.1). Otherwise there is no moment without a speed while the train moves (P2 3.2).
+
+Two-way ranges to ground units, and speeds of a Doppler radar (P2 3): formulas, and the gate of the ranges.
 """
 
 from __future__ import annotations
@@ -11,8 +13,11 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.motion.samples import RadarSpeeds
 
@@ -36,20 +41,11 @@ _LEAST_SCATTER: Final = 0.001
 
 @dataclass(frozen=True, kw_only=True)
 class RadarAlarm:
-    """What the radar's speeds show against those by satellites.
+    """What the radar's speeds show against those by satellites."""
 
-    Attributes
-    ----------
-    kind : {"mounting", "silent"}
-        A step of the ratio of the speeds; no speed while the train moves.
-    time : datetime64[ns]
-        From when on.
-    before, after : float
-        Ratio less 1 before a step and after it.
-    """
-
-    kind: Literal["mounting", "silent"]
-    time: np.datetime64
+    kind: Literal["mounting", "silent"]  #: A step of the ratio of the speeds; no speed while the train moves.
+    time: np.datetime64  #: From when on.
+    #: Ratio less 1 before a step and after it.
     before: float = float("nan")
     after: float = float("nan")
 
@@ -68,21 +64,12 @@ class RadarAlarm:
 
 @dataclass(kw_only=True)
 class RadarWatch:
-    """Ratios by window of GPS time, taken in order of time; nothing grows with the length of a session.
+    """Ratios by window of GPS time, taken in order of time; nothing grows with the length of a session."""
 
-    Attributes
-    ----------
-    ratio : deque of float
-        Of the last windows.
-    window : deque of int
-        Their numbers since the epoch of the clock.
-    silent : int
-        Windows without a speed, one after the other.
-    """
-
-    ratio: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
+    ratio: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))  #: Of the last windows.
+    #: Their numbers since the epoch of the clock.
     window: deque[int] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
-    silent: int = 0
+    silent: int = 0  #: Windows without a speed, one after the other.
     _open: int = -1
     _sums: Floats = field(default_factory=lambda: np.zeros(4))
 
@@ -145,3 +132,23 @@ class RadarWatch:
             self.ratio.popleft()
             self.window.popleft()
         return [RadarAlarm(kind="mounting", time=begin, before=middle, after=float(np.median(after)))]
+
+
+def two_way_range_m(delay_s: Floats, answer_s: float) -> Floats:
+    """Return the range by the delay of an answer: ``r = (dt_A - dt_B) c / 2`` (P2 3.3, equation 1)."""
+    return np.asarray((delay_s - answer_s) * SPEED_OF_LIGHT / 2.0)
+
+
+def radar_speed_mps(shift_hz: Floats, carrier_hz: float, angle_rad: float) -> Floats:
+    """Return the speed by a Doppler shift: ``v = c f_d / (2 f_0 cos(alpha))`` (P2 3.1, figure 9)."""
+    return np.asarray(SPEED_OF_LIGHT * shift_hz / (2.0 * carrier_hz * np.cos(angle_rad)))
+
+
+class EchoLimits(Settings):
+    """Gate of ranges against the predicted one."""
+
+    #: Least width of the gate toward long ranges: echoes are late, and separate from 0.3 m on (P2, table 3).
+    late_m: float = Field(default=0.6, gt=0)
+    #: Width of the gate on both sides.
+    early_sigmas: float = Field(default=3.0, gt=0)
+    late_sigmas: float = Field(default=3.0, gt=0)

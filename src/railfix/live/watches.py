@@ -1,4 +1,7 @@
-"""Sensors on board of a live session, compared with the satellites: once after ten minutes, the radar always."""
+"""Sensors on board of a live session, compared with the satellites: once after ten minutes, the radar always.
+
+Place of the track against the positions of a live session.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,17 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Datetimes
+from railfix.core.errors import MismatchError
 from railfix.core.reasons import Status
 from railfix.core.timescale import GPS_EPOCH
 from railfix.live.engine import LiveOutput
 from railfix.live.sensor_lines import FOREVER, Sensed
-from railfix.motion.radar_watch import RadarWatch
+from railfix.motion.radar import RadarWatch
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
+from railfix.run.checks import ENOUGH_TO_STOP, check_same_place
 from railfix.run.sensor_checks import SensorChecks
+from railfix.run.tally import AntennaTally, Tally
 from railfix.tracking import Kind
 
 #: The sensors are judged after so long, by places at least so far apart; the radar every so often [ns].
@@ -138,3 +144,32 @@ def _join(parts: list[SensorSamples]) -> SensorSamples:
         pairs = zip(parts[::2], parts[1::2], strict=False)
         parts = [early.joined(late) for early, late in pairs] + parts[len(parts) // 2 * 2 :]
     return parts[0]
+
+
+class PlaceWatch:
+    """Compare 3-D positions with the line until enough were seen, and report once that it lies elsewhere.
+
+    `say` takes the sentence with which `railfix run` ends there.
+    """
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._tally = Tally(min_satellites=3)
+        self._done = False
+
+    def take(self, output: LiveOutput) -> None:
+        """Take an output of the engine."""
+        if self._done or output.result is None:
+            return
+        for name, antenna in output.result.antennas.items():
+            counts = self._tally.antennas.setdefault(name, AntennaTally())
+            offset_m = antenna.conventional_offset_m[-1]
+            if np.isfinite(offset_m):
+                counts.conventional += 1
+                counts.conventional_nearest_m = float(np.fmin(counts.conventional_nearest_m, offset_m))
+        if any(counts.conventional >= ENOUGH_TO_STOP for counts in self._tally.antennas.values()):
+            self._done = True
+            try:
+                check_same_place(self._tally)
+            except MismatchError as error:
+                self._say(str(error))
