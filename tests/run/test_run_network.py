@@ -11,6 +11,7 @@ import polars as pl
 import pytest
 from typer.testing import CliRunner
 
+from network_around import network_around, write_network
 from network_made import made_network, made_run, segment, to_degrees, write_stations
 from railfix.cli import app
 from railfix.core.errors import MismatchError
@@ -25,6 +26,8 @@ from railfix.run.driver import open_inputs
 from railfix.run.inputs import OF_LOG
 from railfix.run.sources import open_line
 from railfix.simulate.demonstration import demo_inputs, demo_truth
+from railfix.simulate.run import write_run
+from railfix.simulate.scenario_file import load_recipe
 from railfix.track import read_track
 from railfix.track.frames import points_at
 from railfix.track.network import Network
@@ -362,3 +365,26 @@ def test_from_the_geopackage_of_an_operator_and_a_log_of_an_hour_to_positions_wi
     near = pl.read_csv(out / "tracks.csv")
     assert set(near["track"]) >= {f"loop {k}" for k in range(2)}
     run("report", out, "--out", tmp_path / "report.html")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["demo", "city"])
+def test_a_simulated_train_beside_a_loop_of_four_metres_keeps_its_route(tmp_path: Path, scenario: str) -> None:
+    """Seed 12 once ended with "no route joins these", 1,046 epochs off the map and 307 m of error."""
+    files = write_run(load_recipe(scenario).scenario().replaced(seed=12), tmp_path / "simulated")
+    around = network_around(read_track(files["track"]), "loop", 12)
+    inputs = RunInputs(
+        front=(files["front"],), nav=(files["nav"],), track=(write_network(around, tmp_path / "net.gpkg"),)
+    )
+    summary = run_files(inputs, Config(filter="track"), out=tmp_path / "results", options=ELLIPSOIDAL)
+    assert json.loads(summary.files["run.json"].read_text())["line"]["route"]["tracks"] == ["line 0", "main", "line 1"]
+    assert "no route joins" not in " ".join(summary.notes)
+    truth = pl.read_csv(files["truth"]).filter(antenna="front")
+    for table, passed in (("positions", "ok"), ("train", "tracking")):
+        rows = pl.read_parquet(summary.files[f"{table}.parquet"])
+        assert "off_map" not in rows["status"]
+        sure = rows.filter((pl.col("status") == passed) | pl.col("protection_level_m").is_finite())
+        assert len(sure) > 0.4 * len(rows)
+        assert sure["track"].is_in(sorted(around.driven)).all()
+        error = (rows["chainage_m"] - truth["chainage_m"]).abs()
+        assert error.quantile(0.95) < (20.0 if table == "positions" and scenario == "city" else 3.0)
