@@ -22,6 +22,8 @@ import pyarrow.parquet
 import pyogrio
 import pytest
 import shapely
+from fastkml.validator import validate as validate_kml
+from lxml import etree
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from pyproj import CRS, Transformer
@@ -259,6 +261,76 @@ def test_gdal_shows_the_positions_as_a_gis_does(results: Path, tmp_path: Path, e
     if ending == ".gpx":  # GDAL has heights of GPX as a field
         place[:, 2] = np.concatenate([values[list(meta["fields"]).index("ele")] for meta, _, _, values in parts])
     np.testing.assert_allclose(place[seen, 2], expected[true, 2], rtol=0.0, atol=1e-3)
+
+
+def test_kml_is_valid_by_its_schema(results: Path, tmp_path: Path) -> None:
+    for table in ("--filter", "--single"):
+        export(results, tmp_path / "run.kml", table, "--overwrite")
+        assert validate_kml(file_to_validate=tmp_path / "run.kml")
+    text = (tmp_path / "run.kml").read_text().replace("<TimeStamp>", "<Time>").replace("</TimeStamp>", "</Time>")
+    (tmp_path / "run.kml").write_text(text)
+    with pytest.raises(AssertionError):
+        validate_kml(file_to_validate=tmp_path / "run.kml")
+
+
+#: Children of each element of GPX 1.1 that is written, in the order of its schema, and its required attributes.
+GPX_ORDER: Final = {
+    "gpx": ("metadata wpt rte trk extensions", "version creator"),
+    "metadata": ("name desc author copyright link time keywords bounds extensions", ""),
+    "trk": ("name cmt desc src link number type extensions trkseg", ""),
+    "trkseg": ("trkpt extensions", ""),
+    "trkpt": ("ele time magvar geoidheight name cmt desc src link sym type fix sat hdop vdop pdop ageofdgpsdata dgpsid "
+              "extensions", "lat lon"),
+}  # fmt: skip
+
+
+def test_gpx_has_the_elements_of_its_schema_in_their_order(results: Path, tmp_path: Path) -> None:
+    export(results, tmp_path / "run.gpx")
+    root = etree.parse(tmp_path / "run.gpx").getroot()
+    assert (root.tag, root.get("version")) == ("{http://www.topografix.com/GPX/1/1}gpx", "1.1")
+    seen = set()
+    for element in root.iter("{http://www.topografix.com/GPX/1/1}*"):
+        name, names = etree.QName(element).localname, [etree.QName(child).localname for child in element]
+        if name not in GPX_ORDER:
+            foreign = {etree.QName(child).namespace for child in element}
+            assert not names or (name == "extensions" and foreign == {"urn:railfix:positions"})
+            continue
+        order, attributes = (text.split() for text in GPX_ORDER[name])
+        places = [order.index(child) for child in names]
+        assert places == sorted(places)
+        assert set(element.attrib) == set(attributes)
+        assert all(names.count(child) < 2 for child in names if child not in ("trk", "trkseg", "trkpt"))
+        seen.add(name)
+    assert seen == set(GPX_ORDER)
+
+
+def test_geopackage_has_the_tables_of_its_standard(results: Path, tmp_path: Path) -> None:
+    """OGC 12-128r18, 1.1: identification, spatial references, contents, geometry columns, and their consistency."""
+    export(results, tmp_path / "run.gpkg")
+    rows = pl.read_parquet(results / "train.parquet").drop_nulls("x_m")
+    with sqlite3.connect(tmp_path / "run.gpkg") as base:
+        assert base.execute("pragma application_id").fetchone() == (int.from_bytes(b"GPKG"),)
+        assert base.execute("pragma user_version").fetchone()[0] >= 10_200
+        assert base.execute("pragma integrity_check").fetchall() == [("ok",)]
+        assert base.execute("pragma foreign_key_check").fetchall() == []
+        systems = {row[0] for row in base.execute("select srs_id from gpkg_spatial_ref_sys")}
+        (contents,) = base.execute(
+            "select table_name, data_type, srs_id, min_x, min_y, max_x, max_y, last_change from gpkg_contents"
+        )
+        columns = base.execute(
+            "select table_name, column_name, geometry_type_name, srs_id, z, m from gpkg_geometry_columns"
+        ).fetchall()
+        key = [row[1] for row in base.execute("pragma table_info(run)") if row[5]]
+    base.close()
+    assert {-1, 0, 4326} < systems
+    assert contents[:2] == ("run", "features")
+    assert contents[2] in systems
+    assert columns == [("run", "geom", "POINT", contents[2], 1, 0)]
+    assert len(key) == 1
+    longitude, latitude = rows["longitude_deg"], rows["latitude_deg"]
+    expected = [longitude.min(), latitude.min(), longitude.max(), latitude.max()]
+    np.testing.assert_allclose(contents[3:7], expected, rtol=0.0, atol=1e-8)
+    assert datetime.fromisoformat(contents[7]).utcoffset() == timedelta(0)
 
 
 def test_geoparquet_and_the_tables_of_a_run_in_pandas_and_xarray(results: Path, tmp_path: Path) -> None:
