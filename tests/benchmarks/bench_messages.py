@@ -1,12 +1,13 @@
 """Times between the messages of a live session in real time, and their age, at 10 Hz with two antennas.
 
-The demonstration's logs go as UBX through two TCP connections at their own pace to `railfix live` in a process of its
-own, over and over with later tags; the messages come back as datagrams::
+The logs of a run like the demonstration's, simulated for so long, go as UBX through two TCP connections at their own
+pace to `railfix live` in a process of its own; the messages come back as datagrams::
 
     python tests/benchmarks/bench_messages.py [--seconds 600] [--filter track|off] [--channels 1|2] [--mqtt]
 
 With --mqtt they come back over a broker (mosquitto) instead.
-Prints percentiles of the time between two messages and how many were missing or too much, for each quarter as well.
+Prints percentiles of the time between two messages, for each quarter as well, how many were missing, and their
+statuses.
 """
 
 from __future__ import annotations
@@ -20,10 +21,11 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +33,6 @@ import numpy as np
 import railfix
 from railfix.gnss.observations import Observations
 from railfix.io.train_message import MessageStatus, decode
-from railfix.simulate.demonstration import demo_files
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 from ubx_made import rawx
@@ -42,18 +43,14 @@ LONGEST_WAIT_S = 300.0
 
 
 async def served(log: Observations, began: float, until: float, ready: asyncio.Queue[int]) -> None:
-    """Serve a log epoch by epoch; each one goes out when it is due, tags rising from lap to lap."""
+    """Serve a log epoch by epoch; each one goes out when it is due."""
 
     async def answer(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        k = 0
         with contextlib.suppress(ConnectionError):
-            while time.monotonic() < until:
+            for k in range(len(log)):
                 await asyncio.sleep(max(0.0, began + PERIOD_S * k - time.monotonic()))
-                lap, epoch = divmod(k, len(log))
-                shift = np.timedelta64(round(lap * len(log) * PERIOD_S * 1e9), "ns")
-                writer.write(rawx(replace(log[epoch : epoch + 1], time=log.time[epoch : epoch + 1] + shift), 0))
+                writer.write(rawx(log, k))
                 await writer.drain()
-                k += 1
         writer.close()
 
     server = await asyncio.start_server(answer, "127.0.0.1", 0)
@@ -62,13 +59,12 @@ async def served(log: Observations, began: float, until: float, ready: asyncio.Q
     server.close()
 
 
-async def both(began: float, until: float, ports: list[int], started: threading.Event) -> None:
-    files, ready = demo_files(), asyncio.Queue[int]()
+async def both(folder: Path, began: float, until: float, ports: list[int], started: threading.Event) -> None:
+    ready = asyncio.Queue[int]()
     tasks = []
     for name in ("front", "rear"):
-        log = railfix.read_observations(files[name])
-        seen = np.isfinite(log.code_m).sum(axis=1) > 0
-        tasks.append(asyncio.create_task(served(log[: int(np.argmin(seen)) or len(log)], began, until, ready)))
+        log = railfix.read_observations(folder / f"{name}.rnx")
+        tasks.append(asyncio.create_task(served(log, began, until, ready)))
         ports.append(await ready.get())
     started.set()
     await asyncio.gather(*tasks)
@@ -110,18 +106,20 @@ def main() -> None:
     parser.add_argument("--mqtt", action="store_true", help="messages over a broker")
     options = parser.parse_args()
     with contextlib.ExitStack() as held:
-        measure(options, *(published(held) if options.mqtt else datagrams()))
+        folder = Path(held.enter_context(tempfile.TemporaryDirectory())) / "run"
+        words = ["simulate", "demo", "--seconds", str(options.seconds), "--out", str(folder), "--plain"]
+        subprocess.run([sys.executable, "-m", "railfix", *words], check=True)
+        measure(options, folder, *(published(held) if options.mqtt else datagrams()))
 
 
-def measure(options: argparse.Namespace, target: str, receive: Callable[[], bytes]) -> None:
+def measure(options: argparse.Namespace, folder: Path, target: str, receive: Callable[[], bytes]) -> None:
     """Run the session and print what arrived."""
-    began = time.monotonic() + 15.0  # after the program has started
+    began = time.monotonic() + 60.0  # after the logs are read and the program has started
     until, ports, started = began + options.seconds, list[int](), threading.Event()
-    threading.Thread(target=lambda: asyncio.run(both(began, until, ports, started)), daemon=True).start()
-    started.wait(30)
-    files = demo_files()
-    words = [sys.executable, "-m", "railfix", "live", "--nav", str(files["nav"])]
-    words += ["--track", str(files["track"]), "--vehicle", str(files["vehicle"])]
+    threading.Thread(target=lambda: asyncio.run(both(folder, began, until, ports, started)), daemon=True).start()
+    started.wait(60)
+    words = [sys.executable, "-m", "railfix", "live", "--nav", str(folder / "nav.rnx")]
+    words += ["--track", str(folder / "track.csv"), "--vehicle", str(folder / "vehicle.toml")]
     words += ["--front", f"tcp://127.0.0.1:{ports[0]}", "--rear", f"tcp://127.0.0.1:{ports[1]}"]
     words += ["--filter", options.filter, "--channels", options.channels]
     words += ["--send", f"cbor@{target}"]
@@ -144,6 +142,7 @@ def measure(options: argparse.Namespace, target: str, receive: Callable[[], byte
     sequence = np.array([message.sequence for message, used in zip(messages, within, strict=True) if used])
     print(f"{len(between) + 1} messages in {at[within][-1] - at[within][0]:.1f} s, {silent} of them without input,")
     print(f"{int(np.sum(np.diff(sequence) - 1))} missing; filter {options.filter}, {options.channels} channel(s)")
+    print(", ".join(f"{kind.name.lower()} {count}" for kind, count in Counter(kinds).most_common()))
     quantiles = (0.1, 1, 50, 99, 99.9)
     for name, part in [("all", between), *((f"quarter {k + 1}", q) for k, q in enumerate(np.array_split(between, 4)))]:
         values = "  ".join(f"p{q:g} {np.percentile(part, q):6.1f}" for q in quantiles)
