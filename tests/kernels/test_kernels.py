@@ -12,8 +12,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 import pytest
 
@@ -26,6 +27,7 @@ from railfix.integrity.protection.level import MapDeviation, RangeBounds
 from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.kernels import compiling
+from railfix.kernels.references import by_reference
 from railfix.kernels.tracking.recursion import advance
 from railfix.kernels.tracking.velocity import fitted_velocities
 from railfix.pipeline.config import Config
@@ -169,6 +171,61 @@ def test_velocities_are_those_of_reweighted_least_squares() -> None:
         found += 1
         np.testing.assert_allclose(velocity[t], solved[:3], atol=1e-8)
     assert found > 15
+
+
+class Numbers(NamedTuple):
+    """Arrays of several types and layouts, and numbers, as those of the filter."""
+
+    turned: np.ndarray
+    marked: np.ndarray
+    degrees: tuple[float, float]
+    doubled: bool
+    count: int
+
+
+class Given(NamedTuple):
+    """A tuple within a tuple, before and behind other fields."""
+
+    cube: np.ndarray
+    numbers: Numbers
+    sums: np.ndarray
+
+
+@compiling.borrowing
+def write_sums(numbers: Numbers, given: Given) -> int:
+    for i in range(numbers.count):
+        for k in range(given.cube.shape[1]):
+            if numbers.marked[i, k]:
+                given.sums[i] += given.cube[i, k, 0] * numbers.turned[k, i] + numbers.degrees[1]
+        given.sums[i] *= 2.0 if numbers.doubled else 1.0
+    return len(given.sums)
+
+
+@numba.njit(**compiling._OPTIONS, **compiling._UNCOUNTED)
+def compute_sums(given: Given) -> int:
+    return write_sums(by_reference(given.numbers), by_reference(given))
+
+
+@numba.njit(**compiling._OPTIONS, **compiling._UNCOUNTED)
+def compute_nested_sums(given: Given) -> int:
+    return write_nested_sums(by_reference(given))
+
+
+@compiling.borrowing
+def write_nested_sums(given: Given) -> int:
+    return write_sums(given.numbers, given)
+
+
+@pytest.mark.requirement("A8")
+@pytest.mark.parametrize("function", [compute_sums, compute_nested_sums])
+def test_tuples_by_reference_have_the_fields_that_they_have(function: Callable[..., int]) -> None:
+    rng = np.random.default_rng(2)
+    cube, turned, marked = rng.normal(size=(4, 3, 2)), rng.normal(size=(4, 6))[:, ::2].T, rng.random((4, 3)) > 0.4
+    for doubled in (False, True):
+        given = Given(cube, Numbers(turned, marked, (1.0, 5.0), doubled, 3), np.zeros(4))
+        assert function(given) == 4
+        expected = ((cube[..., 0] * turned.T + 5.0) * marked).sum(axis=1) * (1 + doubled)
+        np.testing.assert_allclose(given.sums, np.append(expected[:3], 0.0), rtol=1e-13)
 
 
 @pytest.mark.requirement("C2")

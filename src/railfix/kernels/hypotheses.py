@@ -71,8 +71,11 @@ def _leave_out(rows: Floats, member: Masks, every: bool, limit: float, work: Flo
     `gone` becomes what they take with them; `work` the rows of what is left, for all channels where `every` says so.
     """
     n, blind = rows.shape[1], False
-    work[:] = rows
-    gone[:] = 0.0
+    for i in range(n + 4):
+        for k in range(n):
+            work[i, k] = rows[i, k]
+    for c in range(4):
+        gone[c] = 0.0
     for k in range(n):
         if not member[k]:
             continue
@@ -85,7 +88,8 @@ def _leave_out(rows: Floats, member: Masks, every: bool, limit: float, work: Flo
                     ratio = work[i, k] / share
                     for j in range(n):
                         work[i, j] -= ratio * work[k, j]
-            work[k] = 0.0
+            for j in range(n):
+                work[k, j] = 0.0
         elif abs(work[n, k]) > limit:
             blind = True
     return blind
@@ -175,9 +179,14 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
     design, map_prior, scale = model.design, model.prior, errors.scale
     least_sigma_m, bias_m, information = errors.least_sigma_m, errors.bias_m, errors.map_information
     epochs, channels = root_weight.shape
-    n, some_mapped = 0, np.any(asked.wrong_map)
+    n, some_mapped = 0, False
+    for mapped in asked.wrong_map:
+        some_mapped |= mapped
     for t in range(epochs):
-        n = max(n, int(np.count_nonzero(root_weight[t] > 0.0)))
+        count = 0
+        for m in range(channels):
+            count += root_weight[t, m] > 0.0
+        n = max(n, count)
     clocks, width = clock_covariance_m2.shape[1], asked.bounds[-1]
     by_range = bias_m.shape[1] > 0 or least_sigma_m.shape[1] > 0
     channel, separation = np.empty((epochs, n), dtype=np.intp), np.zeros(epochs)
@@ -206,8 +215,10 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
                 used[other] = m
                 other += 1
         # Misfits summed by clock, and the place that they ask for.
-        requested[:] = 0.0
-        pull[:] = 0.0
+        for g in range(clocks):
+            requested[g] = 0.0
+        for a in range(3):
+            pull[a] = 0.0
         for i in range(count):
             m = used[i]
             requested[clock[m]] += root[m] * y[m]
@@ -215,7 +226,9 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
                 pull[a] += y[m] * design[t, m, a]
         for a in range(3):
             step[a] = pull[0] * q[0, a] + pull[1] * q[1, a] + pull[2] * q[2, a]
-        rows[:] = 0.0
+        for i in range(n + 4):
+            for j in range(n):
+                rows[i, j] = 0.0
         for i in range(count):
             m = used[i]
             b = design[t, m]
@@ -264,7 +277,9 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
                     shift[a] += covariance[a, b] * pull[b]
             free[0], free[1], free[7], free[8], free[9] = common[0], covariance[0, 0], np.inf, 1.0, shift[0]
             lost = _NO_EFFECT * math.sqrt(covariance[0, 0])
-            free_rows[:] = 0.0
+            for i in range(n + 4):
+                for j in range(n):
+                    free_rows[i, j] = 0.0
             for i in range(count):
                 m = used[i]
                 for a in range(3):
@@ -294,7 +309,8 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
                 others[i] = 0.0 if member[i] else likely[i]
                 some |= member[i]
             blind = mapped and not determined
-            gone[:] = 0.0
+            for c in range(4):
+                gone[c] = 0.0
             if some:
                 blind |= _leave_out(system, member, by_range or order > 0, nil, work, gone)
                 system = work
@@ -324,7 +340,11 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
                 at += 1
             # Sets of two and more: all but the last channel left out of the system one after the other, `depth` so far.
             depth = 0 if order > 1 else -1
-            start[0], product[0], blinds[0], taken[0], place[:] = 0, of_base, blind, gone, first[2:]
+            start[0], product[0], blinds[0] = 0, of_base, blind
+            for c in range(4):
+                taken[0, c] = gone[c]
+            for k in range(3):
+                place[k] = first[2 + k]
             while depth >= 0:
                 i = start[depth]
                 if i == n:
@@ -343,7 +363,8 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
                     single[i] = True
                     lost_now = _leave_out(rest, single, True, nil, reduced[depth], taken[depth + 1])
                     single[i] = False
-                    taken[depth + 1] += taken[depth]
+                    for c in range(4):
+                        taken[depth + 1, c] += taken[depth, c]
                     start[depth + 1], product[depth + 1] = i + 1, with_first
                     blinds[depth + 1] = lost_now or blinds[depth]
                     depth += 1
@@ -359,14 +380,19 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
 def _without_map(covariance: Floats, prior: Floats, information: Floats, scale: float) -> tuple[Floats, bool]:
     """Return the covariance of the place with other information in place of the map, and whether there is one."""
     normal, regular = _inverse(covariance)
-    normal -= prior
+    for a in range(3):
+        for b in range(3):
+            normal[a, b] -= prior[a, b]
     for a in range(2):
         for b in range(2):
             normal[a + 1, b + 1] += scale**2 * information[a, b]
     inverse, determined = _inverse(normal)
-    if not (regular and determined):
-        return np.eye(3), False
-    return inverse, True
+    if regular and determined:
+        return inverse, True
+    for a in range(3):
+        for b in range(3):
+            inverse[a, b] = 1.0 if a == b else 0.0
+    return inverse, False
 
 
 @inner

@@ -31,7 +31,8 @@ def clear_of_sections(
     clear, first = np.full(len(section), CLEAR_M), 0
     for s in range(len(section)):
         here, length = section[s], length_m[section[s]]
-        for v in vertex[first : first + count[s]]:
+        for at in range(first, first + count[s]):
+            v = vertex[at]
             if v >= len(length_m) or v == here:
                 continue
             off, nearest, low, high = False, np.inf, np.inf, -np.inf
@@ -64,7 +65,9 @@ def _inverse(matrix: Floats) -> Floats:
             k, m = (b + 1) % 3, (b + 2) % 3
             inverse[a, b] = matrix[i, k] * matrix[j, m] - matrix[i, m] * matrix[j, k]
     determinant = matrix[0, 0] * inverse[0, 0] + matrix[0, 1] * inverse[0, 1] + matrix[0, 2] * inverse[0, 2]
-    inverse /= determinant
+    for a in range(3):
+        for b in range(3):
+            inverse[a, b] /= determinant
     return inverse
 
 
@@ -121,7 +124,8 @@ def _of_sides(
     """Return the sum of the tails with the channels of each side left out, one after the other."""
     projector, residual, rows = residuals
     total, n = 0.0, len(used)
-    member = np.empty(n, dtype=np.intp)
+    member, work = np.empty(n, dtype=np.intp), np.empty((n, n + 4))
+    left, s, m = np.empty(3), np.empty(3), np.empty((3, 3))
     for c in range(len(sides)):
         count = 0
         for i in range(n):
@@ -130,7 +134,10 @@ def _of_sides(
                 count += 1
         if count < 2 or side_prior == 0.0:
             continue
-        work, left, s, m = np.empty((count, count + 4)), np.empty(3), slope.copy(), matrix.copy()
+        for a in range(3):
+            s[a] = slope[a]
+            for b in range(3):
+                m[a, b] = matrix[a, b]
         for a in range(count):
             for b in range(count):
                 work[a, b] = projector[max(member[a], member[b]), min(member[a], member[b])]
@@ -210,12 +217,18 @@ def risk_off_tangent(
                 used[n], prior[n] = m, likely[m]
                 n += 1
         # The map error alike in all horizontal directions, and the place that the residuals ask for then.
-        normal = _inverse(covariance_m2[t]) - map_prior
+        normal = _inverse(covariance_m2[t])
         of_map[0] = of_map[1] = (noise / sigma_m[0]) ** 2
         of_map[2] = (noise / sigma_m[1]) ** 2
-        covariance = _inverse(normal + np.diag(of_map))
-        asked[:] = 0.0
-        pull[:] = 0.0
+        for a in range(3):
+            for b in range(3):
+                normal[a, b] -= map_prior[a, b]
+            normal[a, a] += of_map[a]
+        covariance = _inverse(normal)
+        for g in range(clocks):
+            asked[g] = 0.0
+        for a in range(3):
+            pull[a] = slope[a] = 0.0
         for i in range(n):
             m = used[i]
             asked[clock[m]] += root_weight[t, m] * misfit[t, m]
@@ -223,7 +236,6 @@ def risk_off_tangent(
                 pull[a] += misfit[t, m] * design[t, m, a]
         for a in range(3):
             step[a] = pull[0] * covariance[0, a] + pull[1] * covariance[1, a] + pull[2] * covariance[2, a]
-        slope[:] = 0.0
         constant = 0.0
         for i in range(n):
             m = used[i]

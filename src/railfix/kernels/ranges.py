@@ -39,8 +39,11 @@ def reduce_epoch(epoch: _Epoch, place_ecef_m: Floats, equations: _Equations) -> 
     system, means, rows, totals = equations
     channels, groups = len(weight), len(starts)
     x, y, z = place_ecef_m[0], place_ecef_m[1], place_ecef_m[2]
-    system[:] = 0.0
-    rows[:] = 0.0
+    for i in range(4):
+        for j in range(4):
+            system[i, j] = 0.0
+        for m in range(channels):
+            rows[i, m] = 0.0
     for g in range(groups):
         stop = starts[g + 1] if g + 1 < groups else channels
         total, mean_x, mean_y, mean_z, mean_r = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -141,12 +144,15 @@ def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats
     groups, no = len(starts), np.empty(0)
     tied = len(offset_m) == epochs
     system, means = np.empty((epochs, 4, 4)), np.empty((epochs, 4, groups))
-    rows, totals = np.empty((epochs, 4, channels)), np.empty((epochs, groups))
+    rows, totals = np.empty((epochs, 4, channels)), np.empty(groups)
+    seen = np.empty((epochs, groups), dtype=np.bool_)
     for t in range(epochs):
         offset, spread = (offset_m[t], sigma_m[t]) if tied else (no, no)
         epoch = _Epoch(sat_ecef_m[t], code_m[t], weight[t], starts, offset, spread)
-        reduce_epoch(epoch, place_ecef_m[t], _Equations(system[t], means[t], rows[t], totals[t]))
-    return system, means, rows, totals > 0.0
+        reduce_epoch(epoch, place_ecef_m[t], _Equations(system[t], means[t], rows[t], totals))
+        for g in range(groups):
+            seen[t, g] = totals[g] > 0.0
+    return system, means, rows, seen
 
 
 @kernel
@@ -253,7 +259,8 @@ def iterated_points(
     for t in range(epochs):
         if not enough[t]:
             continue
-        current[:] = start_ecef_m[t]
+        for i in range(3):
+            current[i] = start_ecef_m[t, i]
         offset, spread = (offset_m[t], sigma_m[t]) if tied else (no, no)
         epoch = _Epoch(sat_ecef_m[t], code_m[t], weight[t], starts, offset, spread)
         for _ in range(most):
@@ -266,10 +273,14 @@ def iterated_points(
                     step[i] += inverse[i, j] * system[j, 3]
                 gain += step[i] * system[i, 3]
             length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-            current += step
+            for i in range(3):
+                current[i] += step[i]
             if length < tolerance_m:
-                place[t] = current
-                matrix[t], covariance[t], wsse[t] = system[:3, :3], inverse, system[3, 3] - gain
+                wsse[t] = system[3, 3] - gain
+                for i in range(3):
+                    place[t, i] = current[i]
+                    for j in range(3):
+                        matrix[t, i, j], covariance[t, i, j] = system[i, j], inverse[i, j]
                 _settle(step, means, rows, totals, clock[t], residual[t])
                 break
             if not length < 1e8:

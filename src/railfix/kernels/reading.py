@@ -131,7 +131,8 @@ def line_ends(data: Bytes) -> Integers:
                 continue
         if found + 8 > len(ends):
             more = np.empty(2 * len(ends), dtype=np.int64)
-            more[:found] = ends[:found]
+            for i in range(found):
+                more[i] = ends[i]
             ends = more
         for i in range(at, min(at + 8, len(data))):
             if data[i] == 10:

@@ -77,8 +77,10 @@ def reweighted(
                 count += 1
         finite, scale = False, 1.0
         for _ in range(iterations):
-            means[:] = 0.0
-            totals[:] = 0.0
+            for g in range(groups):
+                totals[g] = 0.0
+                for i in range(4):
+                    means[i, g] = 0.0
             for k in range(count):
                 w, g = base[k] * factor[k], group_of[k]
                 totals[g] += w
@@ -90,8 +92,10 @@ def reweighted(
                 if totals[g] > 0.0:
                     for i in range(4):
                         means[i, g] /= totals[g]
-            n[:] = 0.0
-            v[:] = 0.0
+            for i in range(3):
+                v[i] = 0.0
+                for j in range(3):
+                    n[i, j] = 0.0
             for k in range(count):
                 w, g = base[k] * factor[k], group_of[k]
                 if not w > 0.0:

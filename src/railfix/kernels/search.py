@@ -127,10 +127,13 @@ def points_in_balls(
                     kept += 1
             nodes, below, held = below, nodes, kept
         count[t] = held
-        while found + held > len(vertex):
-            vertex = np.concatenate((vertex, np.empty_like(vertex)))
-            values = np.concatenate((values, np.empty_like(values)))
-            unsure = np.concatenate((unsure, np.empty_like(unsure)))
+        if found + held > len(vertex):
+            room, old_vertex, old_values, old_unsure = 2 * (found + held), vertex, values, unsure
+            vertex, values, unsure = np.empty(room, dtype=np.intp), np.empty((room, 6)), np.empty(room, dtype=np.bool_)
+            for at in range(found):
+                vertex[at], unsure[at] = old_vertex[at], old_unsure[at]
+                for k in range(6):
+                    values[at, k] = old_values[at, k]
         best, close = math.inf, 0
         for i in range(held):
             p, at = nodes[i], found + i
@@ -146,8 +149,8 @@ def points_in_balls(
         for at in range(found, found + held):
             unsure[at] = values[at, 4] <= best
             close += unsure[at]
-        if close < 2:
-            unsure[found : found + held] = False
+        for at in range(found, found + held):
+            unsure[at] = unsure[at] and close > 1
         found += held
     return count, vertex[:found], values[:found, 0].copy(), values[:found, 1:4].copy(), unsure[:found]
 
