@@ -25,8 +25,7 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotati
 from railfix.core.settings import Settings
 from railfix.ground.centre import ReferenceCurve
 from railfix.ground.control import ControlCentre, orders_of
-from railfix.ground.link_quality import LinkLimits, LinkName, draw_coverage
-from railfix.ground.links import BEARERS, CentreLinks, TrainLinks, bearers_of
+from railfix.ground.links import BEARERS, CentreLinks, LinkLimits, LinkName, TrainLinks, bearers_of, draw_coverage
 from railfix.ground.monitor import MonitorState
 from railfix.ground.quic import write_keys
 from railfix.ground.station_fixes import StationFixes, fixes_of_ranges

@@ -22,8 +22,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import Field, ValidationError
 
 from railfix.core.settings import Settings, option
-from railfix.ground.link_quality import LinkName
-from railfix.ground.links import Bearer, TrainLinks, first_sequence
+from railfix.ground.links import Bearer, LinkName, TrainLinks, first_sequence
 from railfix.ground.quic import check_keys
 from railfix.io.train_message import MessageError, TrainMessage, encode, from_json
 

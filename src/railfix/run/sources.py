@@ -32,7 +32,7 @@ from railfix.run.route import RouteOfLog
 from railfix.track import Track
 from railfix.track.frames import FrameShift, track_at
 from railfix.track.read import check_heights, read_segments, track_of_segments
-from railfix.track.segment import Segment
+from railfix.track.route import Segment
 from railfix.track.track import HEIGHTS_M
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import Vehicle, antenna_trajectory, read_vehicle
