@@ -1,8 +1,6 @@
-"""Demonstration of the ground side: two trains on a line with a passing loop, real links, and a satellite fault.
+"""Demonstration of the ground side: two trains on a line with a passing loop, disturbed links, a satellite fault.
 
 The centre is that of ``railfix ground centre`` (`railfix.ground.control`), with the clock of the simulated traffic.
-
-Relay of datagrams on loopback addresses with seeded loss, delay, reordering, outages and bit errors.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Ends of the redundant links: a train with two bearers, and a centre.
-
-Response rate and round-trip time of links by window and place, and the choice between normal and spare link.
-"""
+"""Ends of the redundant links: a train with two bearers, and a centre; quality of and choice between the links."""
 
 from __future__ import annotations
 

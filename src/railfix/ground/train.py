@@ -1,7 +1,4 @@
-"""A train's end of the links: positions of ``railfix live`` to the centre, authorities back.
-
-Supervision on board: the newest authority of the centre and its time limit.
-"""
+"""A train's end of the links, and its supervision by the newest authority of the centre and that one's time limit."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A live session from its inputs: what ``railfix live`` does.
-
-Tables of the results of a live session, as ``railfix run`` writes them.
-"""
+"""A live session from its inputs, and the tables of its results: what ``railfix live`` does."""
 
 from __future__ import annotations
 

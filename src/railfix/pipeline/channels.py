@@ -1,8 +1,6 @@
-"""Channels of a log that the settings allow, computed once for each set of channels.
+"""Channels of a log that the settings allow, and the second codes of their satellites.
 
-A log of a day has few sets of channels, and most live epochs have the same one.
-
-Second codes of the satellites, and their combination with the first.
+Computed once for each set of channels: a log of a day has few, and most live epochs have the same one.
 """
 
 from __future__ import annotations

@@ -1,9 +1,6 @@
 """Results as tables: polars for files and analysis, xarray for arrays with names.
 
-Times are GPS time without a time zone, to the nanosecond. Absent values are null in polars and
-NaN in xarray.
-
-Positions of the filter along the track as a table.
+Times are GPS time without a time zone, to the nanosecond. Absent values are null in polars and NaN in xarray.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Pages of charts and tables, and the charts of every page.
-
-A page on a network of tracks: plan with switches, faults and the positions of a run; its tracks as a table.
-"""
+"""Pages of charts and tables: of a run, and of a network of tracks with switches, faults and positions."""
 
 from __future__ import annotations
 

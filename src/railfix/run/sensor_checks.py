@@ -1,6 +1,4 @@
-"""Notes on sensors that contradict the satellites: units, time tags, wheel diameter, position of the ranging unit.
-
-Signs, units, axes and time tags of the sensors on board, compared with the positions of single epochs.
+"""Checks of the sensors on board against the positions of single epochs: signs, units, axes, time tags, diameter.
 
 These do not depend on the sensors, as the speeds of the filter do: a sensor mounted backwards moves the filter too.
 """

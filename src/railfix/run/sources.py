@@ -1,7 +1,4 @@
-"""The readers as a run needs them: the line with its trajectories, navigation, logs.
-
-Logs of several antennas as chunks that cover the same span of time.
-"""
+"""Inputs of a run: the line with its trajectories, navigation, and logs in chunks of the same span of time."""
 
 from __future__ import annotations
 

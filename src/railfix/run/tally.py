@@ -1,7 +1,4 @@
-"""Counts over a run, added up chunk by chunk.
-
-Rows of a run: the tables of each chunk, and the columns of the smoother at the end.
-"""
+"""Counts over a run, and the tables of each chunk."""
 
 from __future__ import annotations
 

@@ -1,12 +1,9 @@
-"""Chainage and speed of the train over time: pieces of constant acceleration.
+"""Chainage and speed of the train over time, and true positions of its antennas.
 
-A shuttle between two points, or a run curve: as fast as the line, its curves and the train allow,
-stopping at stations.
-
-True positions of the antennas: a rigid body with both bogie centres on the continuous line.
-
-Computed independently of `railfix.track.vehicle`, which works on the polyline of the map: here by Newton's method
-on the curve and by rotation about the body's axis (Rodrigues).
+A shuttle between two points, or a run curve: as fast as the line, its curves and the train allow, stopping at
+stations. Antennas are on a rigid body with both bogie centres on the continuous line, independently of
+`railfix.track.vehicle`, which works on the polyline of the map: here by Newton's method on the curve and by rotation
+about the body's axis (Rodrigues).
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Exact nearest points of a polyline for many positions.
-
-Joins of lines that close on themselves: rings, loops at a terminus, courses run several times.
-"""
+"""Exact nearest points of a polyline for many positions, and joins of lines that close on themselves."""
 
 from __future__ import annotations
 

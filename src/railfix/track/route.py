@@ -1,7 +1,4 @@
-"""Joining of segments to a route (P1 4.2(1)).
-
-One segment of a route as read from a file.
-"""
+"""Segments as read from files, and joining them to a route (P1 4.2(1))."""
 
 from __future__ import annotations
 
