@@ -16,6 +16,14 @@ _FIRST_CANDIDATES = 6
 _CHUNK = 2_000_000
 
 
+def short_way_m(difference_m: Floats, turn_m: float) -> Floats:
+    """Difference of places the short way round a closed line of the length `turn_m`; as it is where that is infinite.
+
+    NaN stay NaN.
+    """
+    return difference_m - turn_m * np.round(difference_m / turn_m) if np.isfinite(turn_m) else difference_m
+
+
 def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tuple[Floats, Floats]:
     """Find the nearest point of segments: its fraction of the segment in [0, 1], and the distance.
 
