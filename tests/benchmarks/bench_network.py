@@ -17,7 +17,7 @@ import pyogrio
 import shapely
 
 from railfix.track.network_read import read_network
-from railfix.track.segment import MapReading
+from railfix.track.route import MapReading
 
 LINES, TRACKS, POINTS, STEP_M = 100, 50, 81, 25.0
 

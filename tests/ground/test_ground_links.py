@@ -18,8 +18,17 @@ import pytest
 from railfix.core.errors import OutputError
 from railfix.ground.demo import LinkDisturbance, Relay, RelaySettings
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
-from railfix.ground.link_quality import LinkChoice, LinkLimits, LinkMeter, coverage, round_trips
-from railfix.ground.links import BEARERS, CentreLinks, TrainLinks, bearers_of
+from railfix.ground.links import (
+    BEARERS,
+    CentreLinks,
+    LinkChoice,
+    LinkLimits,
+    LinkMeter,
+    TrainLinks,
+    bearers_of,
+    coverage,
+    round_trips,
+)
 from railfix.ground.quic import LinkProtocol, configuration, connected, write_keys
 
 pytestmark = pytest.mark.requirement("F3")

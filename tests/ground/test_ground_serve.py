@@ -23,8 +23,7 @@ from typer.testing import CliRunner
 from railfix.cli.ground import app
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import HEAD, Interlocking, TrainInterval, from_documents
-from railfix.ground.link_quality import LinkLimits
-from railfix.ground.links import BEARERS, TrainLinks, bearers_of, first_sequence
+from railfix.ground.links import BEARERS, LinkLimits, TrainLinks, bearers_of, first_sequence
 from railfix.ground.monitor import MonitorLimits
 from railfix.ground.quic import write_keys
 from railfix.ground.serve import run_centre

@@ -16,7 +16,7 @@ from pyproj import CRS, Transformer
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.track.network import Link, Network
 from railfix.track.network_match import PlanLog, match
-from railfix.track.segment import ATTRIBUTES, NO_HEIGHTS, Segment
+from railfix.track.route import ATTRIBUTES, NO_HEIGHTS, Segment
 from railfix.track.track import UNNAMED, Track
 from railfix.track.trajectory import Trajectory
 

@@ -15,9 +15,9 @@ from railfix.core.timescale import timedelta
 from railfix.evaluate import interpolate_reference
 from railfix.gnss.orbits.prepared_records import group_delay_s
 from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.channels import NAME, signal_delays
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import AntennaResult
-from railfix.pipeline.second_codes import NAME, signal_delays
 from railfix.positioning.two_frequencies import (
     Combined,
     SecondCodes,

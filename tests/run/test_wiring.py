@@ -20,8 +20,7 @@ from railfix.evaluate.tables import _ERRORS
 from railfix.io.rinex import read_observations, write_observations
 from railfix.pipeline.config import Config
 from railfix.pipeline.results import Result
-from railfix.pipeline.tables import observations_table, positions_table
-from railfix.pipeline.train_table import train_table
+from railfix.pipeline.tables import observations_table, positions_table, train_table
 from railfix.report.runs import ReportedRun
 from railfix.report.tables import budget, summary
 from railfix.run import RunOptions, RunSummary, run_files

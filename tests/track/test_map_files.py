@@ -16,7 +16,7 @@ from railfix.track import read_track
 from railfix.track.ifc_file import read_ifc_segments
 from railfix.track.network_read import read_network
 from railfix.track.read import read_segments
-from railfix.track.segment import MapReading
+from railfix.track.route import MapReading
 
 pyogrio = pytest.importorskip("pyogrio")
 shapely = pytest.importorskip("shapely")

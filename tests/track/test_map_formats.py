@@ -19,7 +19,7 @@ from railfix.track import read_track
 from railfix.track.elements import LAWS, PlanElement, ProfileElement, alignment_at
 from railfix.track.ifc_file import _plan, _profile, _Step, read_ifc_segments
 from railfix.track.read import read_segments
-from railfix.track.segment import MapReading
+from railfix.track.route import MapReading
 from railfix.track.xml_files import read_xml_segments
 
 pyogrio = pytest.importorskip("pyogrio")

@@ -18,7 +18,7 @@ from railfix.track.network import Candidates, Network
 from railfix.track.network_decode import COMMON_S, Residuals, Transitions, decode
 from railfix.track.network_match import PlanLog, match
 from railfix.track.network_read import links_of_ends
-from railfix.track.segment import Segment
+from railfix.track.route import Segment
 
 pytestmark = pytest.mark.requirement("A10")
 #: Every 20 s: positions that count in full.

@@ -20,7 +20,7 @@ from railfix.track.network import Network
 from railfix.track.network_match import PlanLog
 from railfix.track.polyline import NearestOnPolyline
 from railfix.track.read import read_segments
-from railfix.track.segment import MapReading
+from railfix.track.route import MapReading
 
 pytestmark = pytest.mark.requirement("A1")
 

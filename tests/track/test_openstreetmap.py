@@ -20,7 +20,7 @@ from railfix.track.heights import geoid_heights
 from railfix.track.network import Network
 from railfix.track.network_read import read_network
 from railfix.track.read import read_segments, track_of_segments
-from railfix.track.segment import MapReading
+from railfix.track.route import MapReading
 
 pytestmark = pytest.mark.requirement("A1")
 #: Longitude and latitude of the points of each way; the siding leaves the line at its second point.

@@ -12,7 +12,7 @@ from scipy.integrate import cumulative_simpson
 from railfix.core.errors import InputFileError
 from railfix.track.network_read import read_network
 from railfix.track.read import read_segments
-from railfix.track.segment import NO_HEIGHTS, MapReading
+from railfix.track.route import NO_HEIGHTS, MapReading
 
 pytestmark = pytest.mark.requirement("A1")
 

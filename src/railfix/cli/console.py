@@ -1,7 +1,4 @@
-"""Output of the command line: progress bar, summary of a run, notes and files.
-
-The first lines of a command: where, how good, how sure, what is wrong, what to do; at most five.
-"""
+"""Output of the command line: progress bar, summary of a run, notes and files."""
 
 from __future__ import annotations
 

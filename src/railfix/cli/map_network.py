@@ -144,7 +144,7 @@ def network(
         plot_network(tracks, out, quality=quality)
         console.print(f"picture: {out}", markup=False, soft_wrap=True)
     if page is not None:
-        from railfix.report.network_page import write_network_page
+        from railfix.report.charts_page import write_network_page
 
         write_network_page(tracks, quality, page)
         console.print(f"page: {page}", markup=False, soft_wrap=True)
@@ -284,7 +284,7 @@ def match_command(
         plot_network(net, picture, run=(positions, matched))
         console.print(f"picture: {picture}", markup=False, soft_wrap=True)
     if page is not None:
-        from railfix.report.network_page import write_network_page
+        from railfix.report.charts_page import write_network_page
 
         write_network_page(net, check_network(net), page, run=(positions, matched))
         console.print(f"page: {page}", markup=False, soft_wrap=True)

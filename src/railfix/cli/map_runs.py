@@ -1,7 +1,4 @@
-"""``railfix map service``: where satellites can serve on a line.
-
-``railfix map survey``: several runs of ordinary receivers to one track map.
-"""
+"""``railfix map service`` and ``railfix map survey``: where satellites can serve, a map from several runs."""
 
 from __future__ import annotations
 

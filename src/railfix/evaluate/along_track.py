@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.timescale import seconds
+from railfix.track.polyline import short_way_m
 from railfix.track.trajectory import Trajectory
 
 #: Longest gap of a reference that is interpolated over [s].
@@ -149,14 +150,6 @@ def along_track_error(
     straight = np.linalg.norm(trajectory.at_arc(arc_m[at]) - trajectory.at_arc(nearest_arc), axis=1)
     error[at] = np.copysign(np.minimum(np.abs(error[at]), straight), error[at])
     return error
-
-
-def short_way_m(difference_m: Floats, turn_m: float) -> Floats:
-    """Difference of places the short way round a closed line of the length `turn_m`; as it is where that is infinite.
-
-    NaN stay NaN.
-    """
-    return difference_m - turn_m * np.round(difference_m / turn_m) if np.isfinite(turn_m) else difference_m
 
 
 def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory) -> Floats:

@@ -1,6 +1,4 @@
-"""Figures of merit by groups of epochs, constrained beside conventional.
-
-Figures of merit of a series of errors, and their confidence limits.
+"""Figures of merit by groups of epochs, constrained beside conventional, with confidence limits.
 
 Errors of a train are correlated over tens of seconds, so that epochs are not independent samples; blocks
 of a minute nearly are.

@@ -14,11 +14,12 @@ from pydantic import Field
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, RailfixError
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.evaluate.along_track import along_track_error, short_way_m, straight_distance
+from railfix.evaluate.along_track import along_track_error, straight_distance
 from railfix.evaluate.options import Method
 from railfix.evaluate.run_folder import RunFolder
 from railfix.run.options import TrackReading
 from railfix.track import Track, read_track
+from railfix.track.polyline import short_way_m
 from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle

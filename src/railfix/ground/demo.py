@@ -1,8 +1,6 @@
-"""Demonstration of the ground side: two trains on a line with a passing loop, real links, and a satellite fault.
+"""Demonstration of the ground side: two trains on a line with a passing loop, disturbed links, a satellite fault.
 
 The centre is that of ``railfix ground centre`` (`railfix.ground.control`), with the clock of the simulated traffic.
-
-Relay of datagrams on loopback addresses with seeded loss, delay, reordering, outages and bit errors.
 """
 
 from __future__ import annotations
@@ -25,8 +23,7 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotati
 from railfix.core.settings import Settings
 from railfix.ground.centre import ReferenceCurve
 from railfix.ground.control import ControlCentre, orders_of
-from railfix.ground.link_quality import LinkLimits, LinkName, draw_coverage
-from railfix.ground.links import BEARERS, CentreLinks, TrainLinks, bearers_of
+from railfix.ground.links import BEARERS, CentreLinks, LinkLimits, LinkName, TrainLinks, bearers_of, draw_coverage
 from railfix.ground.monitor import MonitorState
 from railfix.ground.quic import write_keys
 from railfix.ground.station_fixes import StationFixes, fixes_of_ranges

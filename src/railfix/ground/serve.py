@@ -26,8 +26,7 @@ from railfix.ground.centre import CentreLimits, ReferenceCurve
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import HEAD, InterlockingLimits, TrainInterval
 from railfix.ground.layout import Layout, LoopStation, PointName, layout_of
-from railfix.ground.link_quality import LinkName
-from railfix.ground.links import BEARERS, CentreLinks
+from railfix.ground.links import BEARERS, CentreLinks, LinkName
 from railfix.ground.monitor import MonitorLimits
 from railfix.ground.quic import check_keys
 from railfix.ground.station_fixes import stream_fixes

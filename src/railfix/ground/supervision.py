@@ -1,15 +1,11 @@
 """Supervision of the trains of a line by the centre: reports in, authorities out, without input or output.
 
 The one path for `railfix.ground.control` (the centre with its store and page) and for simulated traffic
-(`railfix.ground.traffic`).
-
-Checks of a position report against what the interlocking knows of its train.
-
-Nothing here proves a report right: it finds reports that cannot be right together with those before. What stays
-unseen (errors inside the train's own bounds) is assumed away in ``docs/ground.md``.
+(`railfix.ground.traffic`). Nothing here proves a report right: checks find reports that cannot be right together with
+those before. What stays unseen (errors inside the train's own bounds) is assumed away in ``docs/ground.md``.
 
 The safe rear end moves to what two reports in a row confirm, of a complete train of its configured length. A report
-that contradicts what is known of its train (`railfix.ground.supervision`) stops that train and its neighbours.
+that contradicts what is known of its train stops that train and its neighbours.
 """
 
 from __future__ import annotations

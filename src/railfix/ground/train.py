@@ -1,7 +1,4 @@
-"""A train's end of the links: positions of ``railfix live`` to the centre, authorities back.
-
-Supervision on board: the newest authority of the centre and its time limit.
-"""
+"""A train's end of the links, and its supervision by the newest authority of the centre and that one's time limit."""
 
 from __future__ import annotations
 
@@ -22,8 +19,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import Field, ValidationError
 
 from railfix.core.settings import Settings, option
-from railfix.ground.link_quality import LinkName
-from railfix.ground.links import Bearer, TrainLinks, first_sequence
+from railfix.ground.links import Bearer, LinkName, TrainLinks, first_sequence
 from railfix.ground.quic import check_keys
 from railfix.io.train_message import MessageError, TrainMessage, encode, from_json
 

@@ -1,7 +1,4 @@
-"""A live session from its inputs: what ``railfix live`` does.
-
-Tables of the results of a live session, as ``railfix run`` writes them.
-"""
+"""A live session from its inputs, and the tables of its results: what ``railfix live`` does."""
 
 from __future__ import annotations
 
@@ -37,8 +34,7 @@ from railfix.motion.samples import SensorSamples
 from railfix.pipeline.passing_table import balise_notes, passing_table
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
-from railfix.pipeline.tables import positions_table, rounded
-from railfix.pipeline.train_table import train_table
+from railfix.pipeline.tables import positions_table, rounded, train_table
 from railfix.run.driver import time_of
 from railfix.run.output import OutputFolder, Overwrite, check_not_input
 from railfix.run.processor import place_of, processor_of

@@ -1,7 +1,4 @@
-"""Settings of live operation.
-
-Inputs of a live session: each an option of ``railfix live``.
-"""
+"""Settings and inputs of live operation."""
 
 from __future__ import annotations
 

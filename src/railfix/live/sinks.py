@@ -1,9 +1,7 @@
-"""Where messages go: ``FORM@TARGET``.
+"""Where messages go: ``FORM@TARGET``, with queues before slow targets.
 
 Forms: see `railfix.live.forms`. Targets: ``-`` (standard output), a file, ``udp://HOST:PORT`` (a datagram a message),
 ``tcp-server://HOST:PORT`` (everybody who connects), ``mqtt://[USER:PASSWORD@]HOST:PORT/TOPIC``.
-
-Queues before slow targets: a reader that does not keep up never delays the next message.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Bytes of one receiver as single epochs, navigation records and SBAS messages, as they become complete.
-
-What the data of a source complete as they arrive: of a receiver's stream or log, or of a RINEX file.
-"""
+"""Epochs, navigation records and SBAS messages that the data of a source complete as they arrive."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Sensors on board of a live session, compared with the satellites: once after ten minutes, the radar always.
-
-Place of the track against the positions of a live session.
-"""
+"""Checks of a live session: sensors on board against the satellites, the track against the positions."""
 
 from __future__ import annotations
 

@@ -1,9 +1,7 @@
-"""Alarms of the radar, by its speeds against those by satellites: a moved mounting, and an antenna that is covered.
+"""Speeds of a Doppler radar and two-way ranges (P2 3): formulas, gate of the ranges, alarms of the radar.
 
 The speed of a radar that looks down at the angle alpha is wrong by ``tan(alpha)`` times the error of the angle: 1.7 %
 a degree at 45 degrees (P2 3.1). Otherwise there is no moment without a speed while the train moves (P2 3.2).
-
-Two-way ranges to ground units, and speeds of a Doppler radar (P2 3): formulas, and the gate of the ranges.
 """
 
 from __future__ import annotations

@@ -17,84 +17,61 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Str
 SENSORS: Final = ("tachometer", "inertial", "radar", "ranging", "balises")
 
 
-def _times() -> Datetimes:
-    return np.empty(0, dtype="datetime64[ns]")
+@dataclass(frozen=True, kw_only=True)
+class Samples:
+    """N samples: read-only arrays with one row each."""
 
+    #: Instant of each sample, shape (N,).
+    time: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
 
-def _freeze(samples: Any) -> None:
-    """Make every array of a type read-only, and check that all have one row a sample."""
-    for item in fields(samples):
-        value = getattr(samples, item.name)
-        if len(value) != len(samples.time):
-            raise ValueError(f"{item.name} has {len(value)} samples, time has {len(samples.time)}")
-        object.__setattr__(samples, item.name, read_only(value))
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if len(value) != len(self.time):
+                raise ValueError(f"{item.name} has {len(value)} samples, time has {len(self.time)}")
+            object.__setattr__(self, item.name, read_only(value))
+
+    def __len__(self) -> int:
+        return len(self.time)
 
 
 @dataclass(frozen=True, kw_only=True)
-class TachometerPulses:
+class TachometerPulses(Samples):
     """Pulses of a tachometer, N of them."""
 
-    time: Datetimes = field(default_factory=_times)  #: Instant of each pulse, shape (N,).
     #: Number of the pulse: a gap means lost pulses; shape (N,).
     pulse: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     #: 1 when the vehicle moves forward, -1 backward, 0 where the sensor does not report it; shape (N,).
     direction: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
-    def __post_init__(self) -> None:
-        _freeze(self)
-
-    def __len__(self) -> int:
-        return len(self.time)
-
 
 @dataclass(frozen=True, kw_only=True)
-class InertialSamples:
+class InertialSamples(Samples):
     """Samples of an inertial unit fixed to the vehicle body, N of them."""
 
-    time: Datetimes = field(default_factory=_times)  #: Shape (N,).
     #: Specific force forward, right, down; about (0, 0, -9.8) at rest; shape (N, 3).
     force_mps2: Floats = field(default_factory=lambda: np.empty((0, 3)))
     #: Angular rate about forward (roll), right (pitch), down (yaw); shape (N, 3).
     rate_radps: Floats = field(default_factory=lambda: np.empty((0, 3)))
 
-    def __post_init__(self) -> None:
-        _freeze(self)
-
-    def __len__(self) -> int:
-        return len(self.time)
-
 
 @dataclass(frozen=True, kw_only=True)
-class RadarSpeeds:
+class RadarSpeeds(Samples):
     """Speeds over ground of a Doppler radar, N of them."""
 
-    time: Datetimes = field(default_factory=_times)  #: Shape (N,).
     #: Forward positive; NaN without a signal; shape (N,).
     speed_mps: Floats = field(default_factory=lambda: np.empty(0))
 
-    def __post_init__(self) -> None:
-        _freeze(self)
-
-    def __len__(self) -> int:
-        return len(self.time)
-
 
 @dataclass(frozen=True, kw_only=True)
-class StationRanges:
+class StationRanges(Samples):
     """Two-way ranges to radio stations beside the track, N of them."""
 
-    time: Datetimes = field(default_factory=_times)  #: Shape (N,).
     #: Name of the station on the ground, shape (N,).
     station: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))
     range_m: Floats = field(default_factory=lambda: np.empty(0))  #: Shape (N,).
     #: Standard deviation that the device reports; NaN where it reports none; shape (N,).
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
-
-    def __post_init__(self) -> None:
-        _freeze(self)
-
-    def __len__(self) -> int:
-        return len(self.time)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,19 +86,12 @@ class GroundUnits:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaliseReadings:
-    """Balises that the train's reader has passed, N of them; of a group the reading that the list places."""
+class BaliseReadings(Samples):
+    """Balises that the train's reader has passed, at `time`; of a group the reading that the list places."""
 
-    time: Datetimes = field(default_factory=_times)  #: At which the reader was over the balise, shape (N,).
     balise: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))  #: Identity, shape (N,).
     #: Standard deviation along the line that the reader reports; NaN where it reports none; shape (N,).
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
-
-    def __post_init__(self) -> None:
-        _freeze(self)
-
-    def __len__(self) -> int:
-        return len(self.time)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +127,7 @@ class SensorSamples:
     silent: frozenset[str] = frozenset()
 
     @property
-    def tables(self) -> dict[str, TachometerPulses | InertialSamples | RadarSpeeds | StationRanges | BaliseReadings]:
+    def tables(self) -> dict[str, Samples]:
         """Samples by sensor."""
         return {name: getattr(self, name) for name in SENSORS}
 

@@ -5,8 +5,7 @@ from .config import Config, load_config
 from .corrected_ranges import Models
 from .processor import EpochProcessor
 from .results import AntennaResult, AntennaState, Result, State
-from .tables import observations_table, positions_table, to_xarray
-from .train_table import train_table
+from .tables import observations_table, positions_table, to_xarray, train_table
 
 __all__ = [
     "AntennaResult",

@@ -14,10 +14,9 @@ from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states
 from railfix.integrity.protection.araim import IntegritySupport
-from railfix.pipeline.channels import Channels
+from railfix.pipeline.channels import Channels, second_codes
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received
-from railfix.pipeline.second_codes import second_codes
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import Slips
 from railfix.positioning.constrained import SinglePointLimits, single_point

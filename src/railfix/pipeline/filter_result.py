@@ -1,7 +1,4 @@
-"""What the filter along the track takes from single epochs, returns, and passes on to the next chunk.
-
-Smooth the filter along the track over a whole log: replay its chunks backward.
-"""
+"""What the filter along the track takes from single epochs, returns, and passes on; its smoothing over a log."""
 
 from __future__ import annotations
 

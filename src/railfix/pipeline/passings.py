@@ -17,6 +17,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import BaliseReadings, ListedBalises
 from railfix.pipeline.balise_stage import BaliseLimits, arcs_of_balises
+from railfix.track.polyline import short_way_m
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Tracked
 
@@ -123,11 +124,6 @@ def find_passings(
     return tuple(found), replace(state, time=time[-1:], values=values[-1:], right=state.right[-1:])
 
 
-def _nearest(difference_m: Floats, turn_m: float) -> Floats:
-    """Differences of arc lengths; once round a closed line is none."""
-    return difference_m - turn_m * np.round(difference_m / turn_m) if np.isfinite(turn_m) else difference_m
-
-
 def _joined(before: BaliseReadings, after: BaliseReadings) -> BaliseReadings:
     names = [f.name for f in fields(BaliseReadings)]
     return BaliseReadings(**{n: np.concatenate([getattr(before, n), getattr(after, n)]) for n in names})
@@ -161,13 +157,13 @@ def _judge(
         if mark < 0:
             wrong.append(own)
         elif near:
-            error = float(_nearest(arcs_m[mark] - place, turn_m))
+            error = float(short_way_m(arcs_m[mark] - place, turn_m))
             spread = np.sqrt(sigma**2 + np.fmax(readings.sigma_m[k], limits.sigma_m) ** 2 + listed.sigma_m[mark] ** 2)
             if abs(error) <= limits.contradiction_sigmas * spread:
                 read[mark] = at
                 right.append((at, place))
                 continue
-            real = np.where(listed.virtual, np.nan, np.abs(_nearest(arcs_m - place, turn_m)))
+            real = np.where(listed.virtual, np.nan, np.abs(short_way_m(arcs_m - place, turn_m)))
             here = "" if np.isnan(real).all() else str(listed.name[np.nanargmin(real)])
             chainage = float(listed.chainage_m[mark])
             wrong.append(replace(own, verdict=CONTRADICTS, chainage_m=chainage, read_error_m=error, here=here))
@@ -186,7 +182,7 @@ def _pass(
 ) -> tuple[list[Passing], PassingState]:
     """Return the passings that ended, and the state after."""
     level = np.where(np.isfinite(values[:, 3]), values[:, 3], np.inf)[:, None]
-    ahead = _nearest(arcs_m - values[:, :1], turn_m)
+    ahead = short_way_m(arcs_m - values[:, :1], turn_m)
     far = np.abs(ahead) > 0.25 * turn_m
     side = np.where(far, 0, np.where(ahead > level, -1, np.where(ahead < -level, 1, 0)))
     crossed = np.zeros(ahead.shape, dtype=np.bool_)

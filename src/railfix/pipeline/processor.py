@@ -23,7 +23,7 @@ from railfix.pipeline.along_track import along_track, checked, with_passings
 from railfix.pipeline.assemble import antenna_results, with_coordinates
 from railfix.pipeline.base_station import BaseStation, Stations, check_base
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
-from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.channels import ChannelBook, combined
 from railfix.pipeline.compared import AntennaOrder, filter_verdicts, judge_pairs, position_verdicts, with_screens
 from railfix.pipeline.config import SCREEN_NAMES, Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, Models, conditions_of, correct_ranges
@@ -33,7 +33,6 @@ from railfix.pipeline.interference_stage import judge_interference, with_wheel
 from railfix.pipeline.level_stage import with_araim
 from railfix.pipeline.received import Received, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
-from railfix.pipeline.second_codes import combined
 from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples
 from railfix.pipeline.solution import Solution, solve
 from railfix.positioning.antenna_rows import AntennaRows, rows_of, stack_observations

@@ -1,6 +1,4 @@
-"""Columns of the tables of positions and observations.
-
-Columns of the result tables: name, unit, meaning, source of the values and decimals, each stated once.
+"""Columns of the result tables: name, unit, meaning, source of the values and decimals, each stated once.
 
 Tables of positions, observations and the filter (polars, Parquet, CSV), arrays with named axes (xarray) and the
 reference document are made from the same `Column` objects.

@@ -1,9 +1,7 @@
-"""Positions of one antenna: section search, constrained fix, its linear model, validation of the conventional position.
+"""Positions of one antenna: section search, constrained fix, exclusion of faults, conventional position.
 
-The checks that single-point programs make of each position (RTKLIB: `valsol` of pntpos.c). A position that fails one
-keeps its coordinates.
-
-Detect and exclude faulty satellites, then solve again.
+The checks of the conventional position are those of single-point programs (RTKLIB: `valsol` of pntpos.c). A position
+that fails one keeps its coordinates.
 """
 
 from __future__ import annotations

@@ -1,29 +1,37 @@
 """Results as tables: polars for files and analysis, xarray for arrays with names.
 
-Times are GPS time without a time zone, to the nanosecond. Absent values are null in polars and
-NaN in xarray.
+Times are GPS time without a time zone, to the nanosecond. Absent values are null in polars and NaN in xarray.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import polars as pl
 
+from railfix.core.arrays import Floats, Strings
 from railfix.core.reasons import Reason, reason_text
-from railfix.pipeline.filter_result import AlongTrack
+from railfix.motion.slip import MotionState
+from railfix.pipeline.along_track import on_line_m
+from railfix.pipeline.filter_result import AlongTrack, SmoothedTrack
 from railfix.pipeline.result_columns import (
     CHANNEL_COLUMNS,
     OBSERVATION_COLUMNS,
     POSITION_COLUMNS,
     Column,
     Observed,
+    by_name,
     decimals,
+    float_column,
     table_of,
 )
 from railfix.pipeline.results import AntennaResult, Result
+from railfix.pipeline.sensed_motion import CARRIED
+from railfix.track.trajectory import Trajectory
+from railfix.tracking import Kind, TrackStatus
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -176,3 +184,248 @@ def to_xarray(
         "xyz": ["x", "y", "z"],
     }
     return xr.Dataset(data, coords=coordinates, attrs=dict(attributes or {}))
+
+
+def _sources(result: AlongTrack) -> Strings:
+    """Return the kinds of measurements that each epoch used, joined by ``+``, shape (T,)."""
+    used = result.tracked.used
+    kinds = np.array([*(kind.name.lower() for kind in Kind), "carry"])
+    carried = (used[:, Kind.WHEEL] > 0) & np.isin(result.sensed.state, CARRIED)
+    has = np.column_stack([used > 0, carried])
+    has[:, Kind.WHEEL] &= ~carried
+    has[:, Kind.BALISE] |= has[:, Kind.NEXT_BALISE]
+    has[:, Kind.NEXT_BALISE] = False
+    combinations, which = np.unique(has, axis=0, return_inverse=True)
+    return np.array(["+".join(kinds[row]) for row in combinations], dtype=np.str_)[which.reshape(-1)]
+
+
+def _innovation(result: AlongTrack, kind: Kind) -> Floats:
+    return np.asarray(result.tracked.sensed[:, kind - Kind.WHEEL])
+
+
+#: Columns of the table of the filter along the track.
+TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
+    (
+        Column("time_gpst", "time tag of the receiver, GPS time", lambda r: r.time, dtype=pl.Datetime("ns")),
+        Column("antenna", "`front` or `rear`", lambda _: None, dtype=pl.String()),
+        Column(
+            "status",
+            "see `railfix.tracking.TrackStatus`; `tracking` and `coasting` alone have a finite level along the line",
+            lambda r: r.tracked.status,
+            words=tuple(s.text for s in TrackStatus),
+        ),
+        Column("chainage_m", "distance along the line from the first point of the track", lambda r: r.chainage_m),
+        Column("kilometrage_m", "the line's own marking, where the track has one", lambda r: r.kilometrage_m),
+        Column(
+            "along_sigma_m",
+            "standard deviation of the place, with the straight distance to other branches in it",
+            lambda r: r.tracked.sigma_m,
+        ),
+        Column("speed_mps", "along the line, + toward rising chainage", lambda r: r.tracked.speed_mps),
+        Column("speed_sigma_mps", "its standard deviation", lambda r: r.tracked.speed_sigma_mps),
+        Column("acceleration_mps2", "along the line", lambda r: r.tracked.acceleration_mps2),
+        Column(
+            "direction",
+            "`rising` or `falling` chainage, `unknown` where the speed does not tell",
+            lambda r: r.direction + 1,
+            words=("falling", "unknown", "rising"),
+        ),
+        Column("standstill", "slower than 1 km/h with two sigmas", lambda r: r.standstill, dtype=pl.Boolean()),
+        Column(
+            "branch_probability",
+            "probability of the place given against other places of the line",
+            lambda r: r.tracked.probability,
+        ),
+        Column("hypotheses", "places that are possible", lambda r: r.tracked.hypotheses, dtype=pl.Int16()),
+        Column(
+            "protection_level_m",
+            "exceeded by the error along the line with the stated risk; infinite where another place is likelier "
+            "or measurements contradict the place",
+            lambda r: r.tracked.level_m,
+        ),
+        Column(
+            "protection_level_ground_m",
+            "the same of the straight distance on the ground, also on another lap",
+            lambda r: r.tracked.ground_level_m,
+        ),
+        Column("protection_noise_m", "its part by noise without a fault", lambda r: r.tracked.level_noise_m),
+        Column(
+            "protection_separation_m",
+            "largest distance of a sub-filter of the level",
+            lambda r: r.tracked.separation_m,
+        ),
+        Column(
+            "over_reading_m",
+            "how far the train may be behind: the level, at least 2 % of the way since codes were used "
+            "(`L_DOUBTOVER` less `Q_LOCACC`)",
+            lambda r: r.tracked.amount_m,
+        ),
+        Column(
+            "under_reading_m",
+            "how far the train may be ahead, in the same way (`L_DOUBTUNDER`)",
+            lambda r: r.tracked.amount_m,
+        ),
+        Column(
+            "motion",
+            "by tachometer and inertial unit together, see `docs/sensors.md`",
+            lambda r: r.sensed.state,
+            words=tuple(state.name.lower() for state in MotionState),
+        ),
+        Column(
+            "sources",
+            "measurements used with a weight of more than a half: `code` (once a second), `phase`, `doppler`, `wheel`"
+            " (`carry` where inertia takes its place), `radar`, `force`, `place` (by a feature of the line), `balise`, "
+            "`range`",
+            _sources,
+            dtype=pl.String(),
+        ),
+        Column("latitude_deg", "antenna, WGS 84", lambda r: r.latitude_deg),
+        Column("longitude_deg", "antenna, WGS 84", lambda r: r.longitude_deg),
+        Column("height_m", "antenna, above the ellipsoid", lambda r: r.height_m),
+        Column("x_m", "antenna, ECEF", lambda r: r.ecef_m[:, 0]),
+        Column("y_m", "antenna, ECEF", lambda r: r.ecef_m[:, 1]),
+        Column("z_m", "antenna, ECEF", lambda r: r.ecef_m[:, 2]),
+        Column(
+            "code_weight",
+            "mean weight of codes; 1 is that of an error of one standard deviation",
+            lambda r: r.tracked.code_weight,
+        ),
+        Column("motion_weight", "mean weight of Dopplers and phases", lambda r: r.tracked.motion_weight),
+        Column("wheel_scale", "share that its way is too short by, as estimated", lambda r: r.tracked.wheel_scale),
+        Column("radar_scale", "share that its way is too short by, as estimated", lambda r: r.tracked.radar_scale),
+        Column("force_offset_mps2", "offset of the accelerometer, as estimated", lambda r: r.tracked.force_offset_mps2),
+        Column(
+            "map_scale",
+            "factor on `tracking.map_scale_m`: above 1 where pseudoranges keep moving against the map",
+            lambda r: r.tracked.map_scale,
+        ),
+        Column(
+            "measured_chainage_m",
+            "chainage of the vehicle's middle, or the antenna, for the next three: means since the epoch before",
+            lambda r: r.sensed.under_m,
+        ),
+        Column(
+            "measured_gradient_permille",
+            "gradient by tachometer and accelerometer, + where the line rises with chainage; empty in slips and "
+            "below 1 m/s",
+            lambda r: 1e3 * r.sensed.gradient,
+        ),
+        Column(
+            "measured_curvature_1pm",
+            "curvature there by the yaw rate, + to the right in rising chainage",
+            lambda r: r.sensed.curvature_1pm,
+        ),
+        Column(
+            "measured_cant_mm",
+            "cant there by the lean of the body, + with the left rail higher; needs a vehicle file",
+            lambda r: 1e3 * r.sensed.cant_m,
+        ),
+        Column(
+            "metric_antenna_spacing_m",
+            "distance of the two antennas' places less that of the antennas; empty for one antenna",
+            lambda r: r.spacing_error_m,
+        ),
+        Column(
+            "wheel_difference_m",
+            "distance by satellites over the last two minutes less that of the wheel",
+            lambda r: None if r.wheel is None else r.wheel.difference_m,
+        ),
+        Column(
+            "innovation_wheel_m",
+            "measured less predicted: way since the epoch before",
+            lambda r: _innovation(r, Kind.WHEEL),
+        ),
+        Column(
+            "innovation_radar_m",
+            "measured less predicted: way since the epoch before",
+            lambda r: _innovation(r, Kind.RADAR),
+        ),
+        Column(
+            "innovation_force_mps2",
+            "measured less predicted: mean specific force forward",
+            lambda r: _innovation(r, Kind.FORCE),
+        ),
+        Column(
+            "innovation_place_m",
+            "measured less predicted: place by a feature of the line",
+            lambda r: _innovation(r, Kind.PLACE),
+        ),
+        Column(
+            "innovation_balise_m",
+            "measured less predicted: place of a balise",
+            lambda r: np.fmax(_innovation(r, Kind.BALISE), _innovation(r, Kind.NEXT_BALISE)),
+        ),
+        Column(
+            "innovation_range_m",
+            "measured less predicted: range to a ground unit",
+            lambda r: _innovation(r, Kind.RANGE),
+        ),
+    )
+)
+
+
+@dataclass(frozen=True)
+class SmoothedAntenna:
+    """Smoothed places of one antenna, with its trajectory."""
+
+    track: SmoothedTrack
+    trajectory: Trajectory
+
+
+#: Columns that smoothing adds (`railfix run --smooth`).
+SMOOTHED_COLUMNS: Final[Mapping[str, Column[SmoothedAntenna]]] = by_name(
+    (
+        Column(
+            "smoothed_chainage_m",
+            "distance along the line by everything measured before and after the epoch",
+            lambda s: s.trajectory.chainage_at(on_line_m(s.track, s.trajectory)),
+        ),
+        Column("smoothed_sigma_m", "its standard deviation", lambda s: s.track.sigma_m),
+        Column("smoothed_speed_mps", "speed along the line, in the same way", lambda s: s.track.speed_mps),
+    )
+)
+
+
+def train_table(result: Result) -> pl.DataFrame:
+    """Return the positions of the filter along the track, one row per epoch and antenna in order of time.
+
+    Parameters
+    ----------
+    result : Result
+
+    Returns
+    -------
+    polars.DataFrame
+        Columns of `TRAIN_COLUMNS`; without rows where the filter is off.
+    """
+    parts = [antenna_train(name, tracked) for name, tracked in result.fusion.items()]
+    return in_time_order(parts) if parts else pl.DataFrame()
+
+
+def with_smoothed(table: pl.DataFrame, smoothed: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
+    """Return rows of the table with `SMOOTHED_COLUMNS`.
+
+    Parameters
+    ----------
+    table : polars.DataFrame
+        Rows of `train_table`.
+    smoothed : mapping of str to polars.DataFrame
+        By antenna; its rows in the same order.
+    """
+    antenna = table["antenna"].to_numpy()
+    values = {name: np.full(len(table), np.nan) for name in SMOOTHED_COLUMNS}
+    for name, rows in smoothed.items():
+        mine = antenna == name
+        for column, whole in values.items():
+            whole[mine] = rows[column].fill_null(np.nan).to_numpy()
+    return table.with_columns(**{name: float_column(column) for name, column in values.items()})
+
+
+def smoothed_table(result: SmoothedTrack, trajectory: Trajectory) -> pl.DataFrame:
+    """Return `SMOOTHED_COLUMNS` of one antenna, one row per epoch."""
+    return table_of(SMOOTHED_COLUMNS, SmoothedAntenna(result, trajectory), len(result.time))
+
+
+def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
+    """Return the filtered positions of one antenna, one row per epoch."""
+    return table_of(TRAIN_COLUMNS, result, len(result), antenna=name)

@@ -1,4 +1,4 @@
-"""The constrained position: one distance along the line, and the receiver clocks.
+"""The constrained position, one distance along the line and the receiver clocks; and the 3-D single point.
 
 P1 2.2(3): the antenna is at ``R = r_i + d e_i`` on the section between two points of its
 trajectory. Unknown are d and one clock a constellation. The map is not exact: its plan error
@@ -6,10 +6,8 @@ across the track and its height error are common to all satellites of an epoch, 
 carried as an added covariance ``H_m S_m H_m^T`` - computed here as two more unknowns with that
 covariance as their prior, which is the same thing (the matrix inversion lemma).
 
-Conventional positioning: the 3-D single point, without the map.
-
-The reference method of P1 section 5. Weighted least squares in x, y, z and one receiver clock a
-constellation; the nearest point of the trajectory is taken afterwards by the pipeline.
+The 3-D single point is the reference method of P1 section 5: weighted least squares in x, y, z and one receiver clock
+a constellation; the pipeline takes the nearest point of the trajectory afterwards.
 """
 
 from __future__ import annotations

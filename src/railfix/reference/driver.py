@@ -1,7 +1,4 @@
-"""Files in, ``reference.csv``, ``fixes.csv`` and ``reference.json`` out.
-
-Input files of a reference, and options that do not change it.
-"""
+"""Inputs of a reference, and its output: ``reference.csv``, ``fixes.csv`` and ``reference.json``."""
 
 from __future__ import annotations
 

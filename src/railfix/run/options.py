@@ -14,7 +14,7 @@ from railfix.core.settings import Settings, option
 from railfix.io.position_log import column_names
 from railfix.run.output import Overwrite
 from railfix.track.frames import MapMotion
-from railfix.track.segment import MapReading
+from railfix.track.route import MapReading
 from railfix.track.vehicle import Reference
 
 #: Last whole year of times to the nanosecond in 64 bits.

@@ -1,7 +1,4 @@
-"""Epoch processor of a run: the settings' files are read here, the processor opens none.
-
-Observations of a base station, read in step with those of the train.
-"""
+"""Epoch processor of a run, with the files that the settings name and the observations of a base station."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""``run.json``: inputs, settings given and used, and results of a run.
-
-Record of a run (``run.json``) read back, with its inputs where they are now.
-"""
+"""Record of a run (``run.json``): inputs, settings given and used, results; written, and read back."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Notes on sensors that contradict the satellites: units, time tags, wheel diameter, position of the ranging unit.
-
-Signs, units, axes and time tags of the sensors on board, compared with the positions of single epochs.
+"""Checks of the sensors on board against the positions of single epochs: signs, units, axes, time tags, diameter.
 
 These do not depend on the sensors, as the speeds of the filter do: a sensor mounted backwards moves the filter too.
 """
@@ -337,7 +335,7 @@ def range_notes(
 
 
 def doppler_speeds(train: pl.DataFrame) -> pl.DataFrame:
-    """Return times and speeds of filtered positions (`railfix.pipeline.train_table`) for which Dopplers were used."""
+    """Return times and speeds of filtered positions (`railfix.pipeline.tables`) for which Dopplers were used."""
     known = train.filter(pl.col("sources").str.contains("doppler"), pl.col("speed_mps").is_not_null())
     return known.select("time_gpst", "speed_mps")
 

@@ -1,7 +1,4 @@
-"""The readers as a run needs them: the line with its trajectories, navigation, logs.
-
-Logs of several antennas as chunks that cover the same span of time.
-"""
+"""Inputs of a run: the line with its trajectories, navigation, and logs in chunks of the same span of time."""
 
 from __future__ import annotations
 
@@ -32,7 +29,7 @@ from railfix.run.route import RouteOfLog
 from railfix.track import Track
 from railfix.track.frames import FrameShift, track_at
 from railfix.track.read import check_heights, read_segments, track_of_segments
-from railfix.track.segment import Segment
+from railfix.track.route import Segment
 from railfix.track.track import HEIGHTS_M
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import Vehicle, antenna_trajectory, read_vehicle

@@ -1,7 +1,4 @@
-"""Counts over a run, added up chunk by chunk.
-
-Rows of a run: the tables of each chunk, and the columns of the smoother at the end.
-"""
+"""Counts over a run, and the tables of each chunk."""
 
 from __future__ import annotations
 
@@ -23,8 +20,16 @@ from railfix.pipeline.filter_result import AlongTrack, Replay, smooth
 from railfix.pipeline.passing_table import balise_notes, passing_table
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult, Result
-from railfix.pipeline.tables import antenna_positions, observations_table, positions_table, rounded
-from railfix.pipeline.train_table import antenna_train, smoothed_table, train_table, with_smoothed
+from railfix.pipeline.tables import (
+    antenna_positions,
+    antenna_train,
+    observations_table,
+    positions_table,
+    rounded,
+    smoothed_table,
+    train_table,
+    with_smoothed,
+)
 from railfix.run.batch_check import BatchCheck
 from railfix.run.output import OutputFolder
 from railfix.run.sensor_checks import SensorChecks

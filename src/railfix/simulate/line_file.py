@@ -18,12 +18,12 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from railfix.core.arrays import Floats, Masks
+from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate.line_settings import Element, GeneratedLine, Gradient, LineFile, LineSettings, Terrain
 from railfix.track import Track, read_track
 
-_GRAVITY: Final = 9.806_65
 #: Distance between the wheels' contact points of the generated lines [m], for the equilibrium cant.
 _CONTACT_M: Final = 1.137
 #: A generated line turns back when its direction differs from the first by this [rad],
@@ -117,9 +117,9 @@ def _plan(settings: LineSettings, rng: np.random.Generator) -> list[Element]:
         to_right = rng.random() < 0.5 if abs(heading) < _FAR_RAD else heading < 0.0
         side = 1.0 if to_right else -1.0
         # Equilibrium cant; transition of 400 times the cant and of 8 times cant and speed in km/h, m each.
-        cant = min(limits.speed_mps**2 / (_GRAVITY * radius) * _CONTACT_M, limits.largest_cant_m)
+        cant = min(limits.speed_mps**2 / (GRAVITY_MPS2 * radius) * _CONTACT_M, limits.largest_cant_m)
         cant = float(np.round(np.round(cant / _CANT_STEP_M) * _CANT_STEP_M, 3))
-        speed_kmh = 3.6 * min(limits.speed_mps, np.sqrt(_GRAVITY * radius * (cant + 0.06) / _CONTACT_M))
+        speed_kmh = 3.6 * min(limits.speed_mps, np.sqrt(GRAVITY_MPS2 * radius * (cant + 0.06) / _CONTACT_M))
         ramp = float(np.ceil(max(20.0, 400.0 * cant, 8.0 * cant * speed_kmh)))
         turn = (curve + ramp) / radius
         if turn > 2.0 * _FAR_RAD:

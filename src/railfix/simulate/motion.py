@@ -1,12 +1,9 @@
-"""Chainage and speed of the train over time: pieces of constant acceleration.
+"""Chainage and speed of the train over time, and true positions of its antennas.
 
-A shuttle between two points, or a run curve: as fast as the line, its curves and the train allow,
-stopping at stations.
-
-True positions of the antennas: a rigid body with both bogie centres on the continuous line.
-
-Computed independently of `railfix.track.vehicle`, which works on the polyline of the map: here by Newton's method
-on the curve and by rotation about the body's axis (Rodrigues).
+A shuttle between two points, or a run curve: as fast as the line, its curves and the train allow, stopping at
+stations. Antennas are on a rigid body with both bogie centres on the continuous line, independently of
+`railfix.track.vehicle`, which works on the polyline of the map: here by Newton's method on the curve and by rotation
+about the body's axis (Rodrigues).
 """
 
 from __future__ import annotations
@@ -22,6 +19,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import cont2discrete, lfilter
 
 from railfix.core.arrays import Floats
+from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate.alignment import Alignment
 from railfix.simulate.errors.processes import RandomFunction
@@ -115,7 +113,6 @@ def _acceleration_change(motion: Motion, time_s: Floats, duration_s: float) -> F
 
 #: Spacing of the places at which a run curve looks at the limits [m].
 _STEP_M: Final = 2.0
-_GRAVITY: Final = 9.806_65
 #: Contact points of the wheels lie further apart than the gauge [m].
 _RAIL_HEAD_M: Final = 0.070
 
@@ -233,7 +230,7 @@ def _limits(line: Alignment, settings: RunSettings, chainage_m: Floats, contact_
         bend = np.abs(line.curvature_at(chainage_m))
         cant = np.abs(line.lean_at(chainage_m)) + settings.cant_deficiency_m
         # Equilibrium: v^2 curvature / g = cant / distance of the contact points.
-        limit = np.minimum(limit, np.sqrt(_GRAVITY * cant / (contact_m * np.maximum(bend, 1e-9))))
+        limit = np.minimum(limit, np.sqrt(GRAVITY_MPS2 * cant / (contact_m * np.maximum(bend, 1e-9))))
     return limit
 
 

@@ -1,6 +1,4 @@
-"""A simulated receiver: its channels, their constants, and the noise and lock state carried between chunks.
-
-Time-correlated receiver noise, loss of lock and re-acquisition, with the state carried between chunks.
+"""A simulated receiver: channels, time-correlated noise, loss of lock, with the state between chunks.
 
 Klobuchar (IS-GPS-200, 20.3.3.5.2.5) and Saastamoinen with the standard atmosphere and 70 % relative
 humidity: a receiver that applies them corrects the simulated delays exactly, unless a scale changes them.

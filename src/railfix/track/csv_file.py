@@ -15,7 +15,7 @@ from railfix.core.settings import misspelt
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.track.crs import frame_degrees, known_crs, older_datum_note, used_crs
 from railfix.track.heights import check_height_datum, ellipsoidal_heights
-from railfix.track.segment import RINF_NAMES, RINF_SECTIONS, MapReading, Segment
+from railfix.track.route import RINF_NAMES, RINF_SECTIONS, MapReading, Segment
 from railfix.track.track import UNNAMED, Track
 
 #: Attribute of the track, factor, and value of an empty cell, by column of the file.

@@ -18,7 +18,7 @@ from railfix.core.settings import misspelt
 from railfix.track.crs import frame_degrees, known_crs, older_datum_note, unit_of_heights, used_crs
 from railfix.track.csv_file import OPTIONAL_COLUMNS, attributes
 from railfix.track.heights import HEIGHT_DATUMS, ellipsoidal_heights, own_height_datum
-from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
+from railfix.track.route import NO_HEIGHTS, MapReading, Segment
 from railfix.track.vector_file import (
     is_of_openstreetmap,
     metadata_of,

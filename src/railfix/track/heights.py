@@ -22,7 +22,7 @@ from pyproj.transformer import TransformerGroup
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.track.crs import vertical_of
-from railfix.track.segment import MapReading
+from railfix.track.route import MapReading
 
 #: Geoid models of the Geospatial Information Authority of Japan that japan-geoid ships. Heights levelled
 #: before April 2025 belong to GSIGEO2011, those of the later national height system to JPGEO2024.

@@ -13,7 +13,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import read_text
 from railfix.track.crs import LARGEST_SCALE, used_crs
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
-from railfix.track.segment import MapReading, Segment
+from railfix.track.route import MapReading, Segment
 
 _LAWS: Final = {
     "LINE": "linear",

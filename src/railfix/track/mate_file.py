@@ -27,7 +27,7 @@ from railfix.core.mate import read_mate
 from railfix.io.named_columns import read_named_columns
 from railfix.track.crs import used_crs
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
-from railfix.track.segment import MapReading, Segment
+from railfix.track.route import MapReading, Segment
 
 _POSITION: Final = "S_DM_TRACK_SEGMENT_POSITION"
 _GRADIENT: Final = "S_DM_TRACK_SEGMENT_GRADIENT"

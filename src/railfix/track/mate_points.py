@@ -12,7 +12,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.mate import mate_table, read_mate
 from railfix.track.crs import frame_degrees
 from railfix.track.mate_file import read_mate_segments
-from railfix.track.segment import MapReading, Segment
+from railfix.track.route import MapReading, Segment
 
 #: CRS of coordinates in degrees with their ellipsoidal height (ETRS89).
 _ETRS89: Final = "EPSG:4937"

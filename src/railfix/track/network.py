@@ -20,8 +20,7 @@ from railfix.core.arrays import Floats, Indices, read_only
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.polyline import NearestOnPolyline, project_on_segments
-from railfix.track.route import one_frame, stated_sigma
-from railfix.track.segment import Segment
+from railfix.track.route import Segment, one_frame, stated_sigma
 from railfix.track.track import SIGMA_PLAN_M, UNNAMED, interpolate_kilometrage
 
 if TYPE_CHECKING:

@@ -17,12 +17,10 @@ from railfix.core.files import ending, read_text
 from railfix.track.geojson_file import RELATION
 from railfix.track.network import Link, Network, end_points
 from railfix.track.read import read_segments
-from railfix.track.rinf_file import FORMATS as RDF_FORMATS
-from railfix.track.rinf_file import read_rinf_relations
-from railfix.track.route import first_gap, orient
-from railfix.track.segment import MapReading, Segment
+from railfix.track.route import MapReading, Segment, first_gap, orient
 from railfix.track.vector_file import read_layers
-from railfix.track.xml_files import Relation, read_railml_relations
+from railfix.track.xml_files import FORMATS as RDF_FORMATS
+from railfix.track.xml_files import Relation, read_railml_relations, read_rinf_relations
 
 #: Ends nearer than this are one point, where the file states no connection [m].
 TOLERANCE_M: Final = 0.5

@@ -1,7 +1,4 @@
-"""Exact nearest points of a polyline for many positions.
-
-Joins of lines that close on themselves: rings, loops at a terminus, courses run several times.
-"""
+"""Exact nearest points of a polyline for many positions, and joins of lines that close on themselves."""
 
 from __future__ import annotations
 
@@ -17,6 +14,14 @@ from railfix.core.arrays import Floats, Indices, Masks
 _FIRST_CANDIDATES = 6
 #: Positions times candidates processed at once.
 _CHUNK = 2_000_000
+
+
+def short_way_m(difference_m: Floats, turn_m: float) -> Floats:
+    """Difference of places the short way round a closed line of the length `turn_m`; as it is where that is infinite.
+
+    NaN stay NaN.
+    """
+    return difference_m - turn_m * np.round(difference_m / turn_m) if np.isfinite(turn_m) else difference_m
 
 
 def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tuple[Floats, Floats]:

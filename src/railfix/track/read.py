@@ -16,14 +16,13 @@ from railfix.track.csv_file import read_csv_segment
 from railfix.track.geojson_file import read_geojson_segments
 from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
 from railfix.track.heights import GEOIDS, check_height_datum
-from railfix.track.rinf_file import FORMATS as RDF_FORMATS
-from railfix.track.rinf_file import read_rinf_segments
-from railfix.track.route import MAX_GAP_M, join
-from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
+from railfix.track.route import MAX_GAP_M, NO_HEIGHTS, MapReading, Segment, join
 from railfix.track.track import Track
 from railfix.track.vector_file import ENDINGS as VECTOR_ENDINGS
 from railfix.track.vector_file import SIGMA_M as OSM_SIGMA_M
 from railfix.track.vector_file import read_vector_segments
+from railfix.track.xml_files import FORMATS as RDF_FORMATS
+from railfix.track.xml_files import read_rinf_segments
 
 
 def read_track(

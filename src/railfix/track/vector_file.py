@@ -30,7 +30,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import ending, open_stream
 from railfix.track.crs import frame_degrees, older_datum_note, unit_of_heights, used_crs
 from railfix.track.heights import check_height_datum, stated_heights
-from railfix.track.segment import ATTRIBUTES, NO_HEIGHTS, MapReading, Segment
+from railfix.track.route import ATTRIBUTES, NO_HEIGHTS, MapReading, Segment
 from railfix.track.track import UNNAMED
 
 #: Standard deviation in plan of a track of OpenStreetMap where its file states none [m]: drawn from aerial pictures,

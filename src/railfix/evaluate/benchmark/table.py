@@ -1,7 +1,4 @@
-"""Run all cases of a benchmark with one configuration: one table of railfix and of other programs.
-
-Positions of other programs as the table of a run, for `railfix.evaluate.evaluate_runs`; RTKLIB's single point.
-"""
+"""Table of a benchmark: railfix with one configuration and other programs (RTKLIB's single point) on all cases."""
 
 from __future__ import annotations
 

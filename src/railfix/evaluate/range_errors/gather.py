@@ -1,7 +1,4 @@
-"""Pseudorange errors of the train: corrected pseudorange minus reference range, clock and common errors (P1 7).
-
-An error model from runs with references: positions once more, errors of the ranges, bins.
-"""
+"""Pseudorange errors of runs with references, clock and common errors taken off (P1 7), and their error model."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Signs of interference in C/N0 and in the gain of the front end.
-
-How long signs last: conditions that must hold for a time, and suspicions that stay for a time.
-"""
+"""Signs of interference in C/N0 and in the gain of the front end, and how long signs last."""
 
 from __future__ import annotations
 

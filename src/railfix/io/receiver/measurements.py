@@ -1,7 +1,4 @@
-"""Measurements as receivers send them, a row each, and their grid of epochs by channels.
-
-Navigation records from the fields of broadcast messages, whichever way they were received.
-"""
+"""Measurements and navigation records as receivers send them."""
 
 from __future__ import annotations
 

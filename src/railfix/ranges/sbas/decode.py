@@ -27,7 +27,8 @@ BLOCK: Final = 13
 #: Regions of one message of type 27.
 _REGIONS: Final = 5
 _DO_NOT_USE_DELAY_M: Final = 0x1FF * 0.125
-_UPPER: Final = ([0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3])
+#: Rows and columns of the elements above the diagonal of a covariance factor, in the order of the message.
+UPPER: Final = ([0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3])
 
 
 class BitField(NamedTuple):
@@ -314,7 +315,7 @@ def covariance(messages: SbasMessages) -> Decoded:
         scale = np.exp2(part["exponent"] - 5.0)
         factor = np.zeros((len(row), 4, 4))
         factor[:, range(4), range(4)] = part["diagonal"]
-        factor[:, _UPPER[0], _UPPER[1]] = part["upper"]
+        factor[:, UPPER[0], UPPER[1]] = part["upper"]
         slot = part["slot"] - 1
         parts.append({**decoded, "slot": slot, "scale": scale, "factor": factor * scale[:, None, None]})
     return _join(parts)

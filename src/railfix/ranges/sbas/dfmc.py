@@ -19,7 +19,7 @@ import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Integers, Strings
 from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta
-from railfix.ranges.sbas.decode import BitField, Layout, read_fields
+from railfix.ranges.sbas.decode import UPPER, BitField, Layout, read_fields
 from railfix.ranges.sbas.messages import carried_parity, message_parity
 
 #: First four bits of six successive messages.
@@ -84,7 +84,6 @@ LAYOUTS: Final[dict[int, Layout]] = {
         "time": BitField(221, 3),
     },
 }
-_UPPER: Final = ([0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3])
 
 
 class DfmcState(IntEnum):
@@ -236,7 +235,7 @@ class DfmcService:
         own["sigma_m"][good] = np.array(SIGMA_LEAST_M)[dfrei] + code * np.array(SIGMA_STEP_M)[dfrei]
         unit = np.exp2(sent["exponent"] - 5.0)
         factor = np.zeros((len(good), 4, 4))
-        factor[:, range(4), range(4)], factor[:, _UPPER[0], _UPPER[1]] = sent["diagonal"], sent["upper"]
+        factor[:, range(4), range(4)], factor[:, UPPER[0], UPPER[1]] = sent["diagonal"], sent["upper"]
         own["factor"][good] = factor * unit[:, None, None]
         own["constant"][good] = scale["covariance"][ten] * unit
         kind = _DEGRADED.index(name[0])

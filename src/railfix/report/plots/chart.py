@@ -1,12 +1,8 @@
 """Charts: axes with layers of numbers, independent of the drawing program.
 
-A `Chart` is axes with layers of numbers. The functions of `railfix.report.plots` make charts from tables and
-arrays; `railfix.report.plots.draw_chart` draws one with matplotlib, and `railfix.report` puts the same one into
+The functions of `railfix.report.plots` make charts from tables and arrays, long series thinned without changing their
+appearance; `railfix.report.plots.draw_chart` draws one with matplotlib, and `railfix.report` puts the same one into
 a page, so a notebook and the report show the same numbers.
-
-Long series are thinned when a chart is made (`railfix.report.plots.chart`); the caption has the counts.
-
-Columns of the tables as arrays, and long series thinned without changing their appearance.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from railfix.core.timescale import seconds, timedelta, to_week
 from railfix.ranges.sbas import SbasMessages
 from railfix.ranges.sbas.grid import BANDS, COLUMNS, POINT_OF_BIT
 from railfix.ranges.sbas.messages import DATA_BITS, PREAMBLES, with_parity
+from railfix.ranges.sbas.standard import DO_NOT_USE, NOT_MONITORED
 from railfix.simulate.constellation import newest_record
 from railfix.simulate.receiver import ionosphere_m
 from railfix.simulate.sbas.settings import SbasSettings
@@ -29,8 +30,6 @@ LongTerm = tuple[int, int, tuple[float, float, float], float]
 
 #: Resolution of corrections and delays [m].
 STEP_M: Final = 0.125
-#: UDREI and GIVEI of slots and points that are not monitored.
-NOT_MONITORED: Final = 14
 NO_DELAY: Final = 15
 #: Fields of type 10 in their order, with their lengths.
 DEGRADATION: Final = {
@@ -152,7 +151,6 @@ _FAST, _LONG_TERM, _DELAYS = 13, 4, 15
 _MIXED: Final = 6
 #: Largest correction, orbit correction and delay that the fields hold [m].
 _LARGEST_FAST_M, _LARGEST_ORBIT_M, _LARGEST_DELAY_M = 255.0, 31.875, 63.75
-_DO_NOT_USE: Final = 15
 #: Seconds from one fast correction of a satellite to the next.
 _FAST_PERIOD_S: Final = 6
 #: Streams of random numbers: fast corrections, orbits, delays, lost messages.
@@ -187,7 +185,7 @@ class _Service:
         """UDREI of `satellites`: as set, do not use during a fault."""
         settings = self._settings
         fault, _ = self._errors.fault_m(self._instant(second - settings.alert_s + settings.latency_s), self.satellites)
-        return [_DO_NOT_USE if abs(f) > settings.alert_m else settings.udrei for f in fault[0].tolist()]
+        return [DO_NOT_USE if abs(f) > settings.alert_m else settings.udrei for f in fault[0].tolist()]
 
     def orbits(self, second: float) -> list[LongTerm]:
         """Long-term corrections of `satellites`: positions, to the issue of data in force."""

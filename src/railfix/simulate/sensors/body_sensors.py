@@ -1,6 +1,4 @@
-"""Pulse times of a tachometer on one wheel.
-
-Specific force and angular rate of an inertial sensor fixed to the body.
+"""Pulse times of a tachometer; specific force and angular rate of an inertial sensor fixed to the body.
 
 The position and the attitude of the body are those of the antennas' truth (bogies on the curve, cant,
 gradient, sway); specific force and angular rate are their differences in time, in the frame of the

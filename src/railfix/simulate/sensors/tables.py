@@ -1,7 +1,4 @@
-"""All sensors of a run as tables, from the same motion, line and body as the antennas.
-
-Balises read on the way, some of them missed or with another identity, and the list of them.
-"""
+"""Tables of all sensors of a run, balises and their list among them, from the motion of the antennas."""
 
 from __future__ import annotations
 

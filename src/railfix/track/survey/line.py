@@ -1,6 +1,4 @@
-"""Survey of a line: the runs of ordinary receivers to one map with its standard deviations along the line.
-
-Least-squares adjustment of all runs of a survey, and of the line that their passes share.
+"""Survey of a line: all runs of ordinary receivers adjusted to one map with its standard deviations.
 
 Errors follow Student's t distribution: iteratively reweighted least squares (K. Lange, R. Little and J. Taylor, Robust
 statistical modeling using the t distribution, Journal of the American Statistical Association 84, 1989), so that
