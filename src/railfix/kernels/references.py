@@ -21,13 +21,13 @@ _SLOT: Final = ir.IntType(64)
 _KNOWN: Final[dict[Any, int]] = {}
 
 
-class Reference(types.Type):  # type: ignore[misc]
+class Reference(types.Type):
     """Pointer to the numbers of a named tuple, one a slot of 8 bytes, those of a tuple within it among them."""
 
     def __init__(self, values: types.NamedTuple) -> None:
         self.values = values
         number = _KNOWN.setdefault(values, len(_KNOWN))
-        super().__init__(name=f"{values.instance_class.__name__}{number}")  # type: ignore[no-untyped-call]
+        super().__init__(name=f"{values.instance_class.__name__}{number}")
 
 
 register_model(Reference)(models.OpaqueModel)
@@ -70,10 +70,10 @@ def _load(builder: Any, llvm_type: Any, slots: Any, at: int) -> Any:
 
 
 @infer_getattr
-class _Fields(AttributeTemplate):  # type: ignore[misc]
+class _Fields(AttributeTemplate):
     key = Reference
 
-    def generic_resolve(self, reference: Reference, field: str) -> Any:
+    def generic_resolve(self, reference: Reference, field: str) -> Any:  # type: ignore[override]
         """Return the type of a field: of a tuple a reference to it."""
         values = reference.values
         if field not in values.fields:
@@ -82,7 +82,7 @@ class _Fields(AttributeTemplate):  # type: ignore[misc]
         return Reference(kind) if isinstance(kind, types.NamedTuple) else kind
 
 
-@lower_getattr_generic(Reference)  # type: ignore[untyped-decorator]
+@lower_getattr_generic(Reference)  # type: ignore[no-untyped-call, untyped-decorator]
 def _field(context: Any, builder: Any, reference: Reference, slots: Any, field: str) -> Any:
     """Load a field, or compute the address of a tuple."""
     values = reference.values
@@ -94,13 +94,13 @@ def _field(context: Any, builder: Any, reference: Reference, slots: Any, field: 
     return _load(builder, context.get_value_type(values.types[k]), slots, at)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _by_reference(_: Any, values: Any) -> Any:
     """Store a tuple where it is called; the pointer is valid until that function ends."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         (value,) = arguments
-        slots = cgutils.alloca_once(builder, _SLOT, size=_leaves(value.type))
+        slots = cgutils.alloca_once(builder, _SLOT, size=_leaves(value.type))  # type: ignore[no-untyped-call]
         _store(builder, value, slots, 0)
         return builder.bitcast(slots, context.get_value_type(signature.return_type))
 
