@@ -104,7 +104,7 @@ def _excess_m(legs: tuple[Indices, Floats, Floats], way_m: Floats) -> float:
     return abs(float(np.abs(legs[2] - legs[1]).sum()) - float(way_m[-1] - way_m[0]))
 
 
-def _place(matched: Matched, row: int) -> tuple[int, float]:
+def _place(matched: Matched, row: int | np.intp) -> tuple[int, float]:
     return int(matched.track[row]), float(matched.chainage_m[row])
 
 

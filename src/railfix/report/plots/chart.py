@@ -18,13 +18,18 @@ from railfix.core.timescale import seconds
 from railfix.evaluate.run_folder import floats
 
 #: Colours distinguishable with colour blindness (Okabe and Ito), with a contrast of 3 to 1 or more on white.
-BLUE, RED, GREEN, PURPLE, BLACK, GREY = "#0072b2", "#d55e00", "#00805e", "#a3487e", "#000000", "#767676"
+BLUE: Final[str] = "#0072b2"
+RED: Final[str] = "#d55e00"
+GREEN: Final[str] = "#00805e"
+PURPLE: Final[str] = "#a3487e"
+BLACK: Final[str] = "#000000"
+GREY: Final[str] = "#767676"
 #: Positions on the map, of the filter along the track, and conventional, in every chart.
-CONSTRAINED: Final = BLUE
-FILTERED: Final = GREEN
-CONVENTIONAL: Final = RED
+CONSTRAINED: Final[str] = BLUE
+FILTERED: Final[str] = GREEN
+CONVENTIONAL: Final[str] = RED
 #: Ordered classes, from small (dark blue) to large (dark red), none grey as the line is.
-ORDERED: Final = ("#0b559f", "#3d8ec4", "#a88400", "#e0762f", "#b30000")
+ORDERED: Final[tuple[str, ...]] = ("#0b559f", "#3d8ec4", "#a88400", "#e0762f", "#b30000")
 #: Classes without an order.
 CYCLE: Final = (BLUE, RED, GREEN, PURPLE, BLACK, "#8c6d00", "#56b4e9", GREY)
 
