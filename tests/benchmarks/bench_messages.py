@@ -47,7 +47,8 @@ async def served(log: Observations, began: float, until: float, ready: asyncio.Q
 
     async def answer(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(ConnectionError):
-            for k in range(len(log)):
+            late = max(0, int((time.monotonic() - began) / PERIOD_S))  # a receiver sends nothing of the past
+            for k in range(late, len(log)):
                 await asyncio.sleep(max(0.0, began + PERIOD_S * k - time.monotonic()))
                 writer.write(rawx(log, k))
                 await writer.drain()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -361,10 +362,11 @@ def test_one_centre_has_a_database(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "seeds",
-    [range(70), pytest.param(range(100_000), marks=pytest.mark.slow)],
+    # a first report of another line hid a roll-back (742); a rejected report's clock counted for the next (1159, 1362)
+    [[*range(70), 742, 1159, 1362], pytest.param(range(100_000), marks=pytest.mark.slow)],
     ids=["70 sequences", "100,000 sequences"],
 )
-def test_no_sequence_leads_to_an_authority_into_a_train(seeds: range) -> None:
+def test_no_sequence_leads_to_an_authority_into_a_train(seeds: Sequence[int]) -> None:
     violations, seen = Counter[str](), Counter[str]()
     for seed in seeds:
         line = run_sequence(seed)

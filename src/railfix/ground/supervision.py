@@ -114,6 +114,8 @@ def stop_contradicted(
     stopped = replace(
         known, stop=known.stop or reason, sequence=message.sequence, standstill=message.standstill, claimed_m=None
     )
+    if reason.startswith("the report is of line"):  # one wrong report must not hide what the next ones say of the place
+        return replace(stopped, line=None)
     direction = known.direction
     if reason.startswith("the train has changed ends"):
         ends = direction * rear, direction * ahead
@@ -251,20 +253,21 @@ class Supervision:
         record = self.records.get(message.train, TrainRecord(train=message.train))
         self.records[message.train], reason = record_received(record, message, now_s, limits=self.centre)
         if reason is None:
-            self.state = report_received(
-                self.state, message, self.layout, limits=self.limits, latest_ns=self._latest_ns(message, now_s)
-            )
+            latest_ns, clock = self._read_clock(message, now_s)
+            self.state = report_received(self.state, message, self.layout, limits=self.limits, latest_ns=latest_ns)
+            if self.state.trains[message.train].measured_ns == message.time_ns:
+                self._clocks[message.train] = clock  # that of a contradicted report would make ways possible later
             self.state = answer_received(self.state, message)
             self.heard.add(message.train)
         return reason
 
-    def _latest_ns(self, message: TrainMessage, now_s: float) -> int | None:
-        """Return the train's clock at most, by the delays of the reports before; None before the first."""
+    def _read_clock(self, message: TrainMessage, now_s: float) -> tuple[int | None, tuple[float, float]]:
+        """Return the train's clock at most, by the delays of the reports before (None without one), and its delay."""
         before = self._clocks.get(message.train)
         apart_s = now_s - message.sent_ns / 1e9
         least_s = apart_s if before is None else before[0] + CLOCK_DRIFT * (now_s - before[1])
-        self._clocks[message.train] = min(apart_s, least_s), now_s
-        return None if before is None else round((now_s - least_s + CLOCK_TOLERANCE_S) * 1e9)
+        latest_ns = None if before is None else round((now_s - least_s + CLOCK_TOLERANCE_S) * 1e9)
+        return latest_ns, (min(apart_s, least_s), now_s)
 
     def detected(self, point: PointName, track: int | None) -> None:
         """Take what points are detected at: a track, None where they are at neither end."""
