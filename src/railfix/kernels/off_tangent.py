@@ -210,6 +210,7 @@ def risk_off_tangent(
     projector, effect, residual = np.empty((channels, channels)), np.empty((channels, channels)), np.empty(channels)
     rows, spread_of, asked = np.empty((channels, 3)), np.empty((channels, 3)), np.empty(clocks)
     pull, step, slope, of_map, form = np.empty(3), np.empty(3), np.empty(3), np.zeros(3), np.empty(3)
+    with_map = np.empty((3, 3))
     for t in range(epochs):
         n, noise = 0, scale[t]
         for m in range(channels):
@@ -223,8 +224,8 @@ def risk_off_tangent(
         for a in range(3):
             for b in range(3):
                 normal[a, b] -= map_prior[a, b]
-            normal[a, a] += of_map[a]
-        covariance = _inverse(normal)
+                with_map[a, b] = normal[a, b] + (of_map[a] if a == b else 0.0)
+        covariance = _inverse(with_map)
         for g in range(clocks):
             asked[g] = 0.0
         for a in range(3):
