@@ -52,7 +52,7 @@ def prepare_kernels() -> bool:
         return False
     begin = time.monotonic()
     kernels.announced()
-    _say("compiling for this processor, once: about 40 s on two cores")
+    _say("compiling for this processor, once: about a minute on two cores")
     environment = {**os.environ, kernels.FILTER_ALONE: "1"}
     if kernels.FILTER in missing:
         with subprocess.Popen([sys.executable, "-c", _PROGRAM], env=environment, stderr=subprocess.PIPE) as other:
