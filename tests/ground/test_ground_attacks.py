@@ -381,6 +381,12 @@ def test_no_sequence_leads_to_an_authority_into_a_train(seeds: Sequence[int]) ->
     assert seen["assumption broken"] < 0.1 * len(seeds)
 
 
+@pytest.mark.xfail(strict=True, reason="found by random sequences, not mended yet: docs/ground-results.md")
+@pytest.mark.parametrize("seed", [3373, 4342, 5621, 5804, 6032, 6750, 14607, 15332])
+def test_known_sequences_that_break_a_promise(seed: int) -> None:
+    assert run_sequence(seed).violations == Counter()
+
+
 @pytest.mark.parametrize(
     ("rule", "seed", "kind"),
     [
