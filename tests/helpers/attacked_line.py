@@ -157,6 +157,8 @@ class AttackedLine:
         if event < 0.3 and known.stop is not None and as_it_is and train.lies == 0:
             self.centre.state, reason = release_train(self.centre.state, number, LINE)
             self.seen["release"] += reason is None
+            if reason is None:  # what it reported before its stop tells nothing of the way after it
+                self.taken[number].sent_s = None
         elif event < 0.35:
             self.seen["asked back"] += self.centre.ask_route_back(number) is None
         elif event < 0.45 and known.held:
@@ -199,7 +201,7 @@ class AttackedLine:
     def lead(self, train: AttackedTrain, way: float) -> None:
         """Let a train run, and points lead it where they are."""
         before, train.front_m = train.front_m, train.front_m + train.direction * way
-        for point in LINE.points_between(*sorted((before, train.front_m))):
+        for point in LINE.points():
             zone = LINE.zone_m(point)
             entry = zone[0] if train.direction > 0 else zone[1]
             if not train.direction * before < train.direction * entry <= train.direction * train.front_m:

@@ -40,7 +40,8 @@ def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
 def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Interlocking, str | None]:
     """Return the state with the stop of one train released by hand, and the reason of a refusal.
 
-    Points under its interval, which a train that has rolled back has passed, are locked for it again.
+    Points under its interval, which a train that has rolled back has passed, are locked for it again; its next
+    report names its line.
     """
     known = state.trains.get(train)
     if known is None or known.stop is None:
@@ -59,7 +60,7 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
             points[name] = replace(points[name], locked={**points[name].locked, train: None})
     direction = known.direction  # where the train ran too far, its authority now ends there
     end = direction * max(direction * known.end_m, direction * known.front_m)
-    released_state = with_train(replace(state, points=points), replace(known, stop=None, end_m=end))
+    released_state = with_train(replace(state, points=points), replace(known, stop=None, end_m=end, line=None))
     if overlaps_stopped(released_state, layout) != released_state:
         return state, f"the interval of train {train} meets another one"
     return released_state, None

@@ -114,10 +114,9 @@ def stop_contradicted(
     stopped = replace(
         known, stop=known.stop or reason, sequence=message.sequence, standstill=message.standstill, claimed_m=None
     )
-    if reason.startswith("the report is of line"):  # one wrong report must not hide what the next ones say of the place
-        return replace(stopped, line=None)
     direction = known.direction
-    if reason.startswith("the train has changed ends"):
+    # Where the line is wrong, of this report or of the first one, the place may be right.
+    if reason.startswith(("the train has changed ends", "the report is of line")):
         ends = direction * rear, direction * ahead
         back, front = min(*ends, direction * known.rear_m), max(*ends, direction * known.front_m)
         return replace(stopped, rear_m=direction * back, front_m=direction * front)
