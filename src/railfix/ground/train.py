@@ -69,6 +69,8 @@ class Authority(Settings):
             raise MessageError(f"{first['loc'][0]}: {first['msg']}") from None
 
 
+#: Way back of the safe front end that is no error of two places [m].
+ROLLED_M: Final = 50.0
 #: Reports of which the time of sending is remembered.
 REMEMBERED: Final = 600
 
@@ -112,6 +114,7 @@ class OnBoard:
     _newest: int = -1
     _granted: bool = False
     _place_m: float | None = None
+    _front_m: float | None = None
     _sent: OrderedDict[int, float] = field(default_factory=OrderedDict)
 
     def reported(self, sequence: int, now_s: float) -> None:
@@ -122,8 +125,15 @@ class OnBoard:
             self._sent.popitem(last=False)
 
     def moved(self, safe_front_m: float | None, speed_mps: float | None) -> None:
-        """Note where the train's safe front end is, and its speed; one wrong place alone agrees to no shorter end."""
+        """Note where the train's safe front end is, and its speed; one wrong place alone agrees to no shorter end.
+
+        A train that has rolled back brakes: what the centre granted before does not know of it.
+        """
         before, self._place_m, self.stops_at_m = self._place_m, None, None
+        if safe_front_m is not None:
+            if self._front_m is not None and self.direction * (safe_front_m - self._front_m) < -ROLLED_M:
+                self.before_turn, self._granted, self.answered_s = self._newest - 1, False, None
+            self._front_m = safe_front_m
         if safe_front_m is None or speed_mps is None:
             return
         way = speed_mps * self.limits.reaction_s + 0.5 * speed_mps**2 / self.limits.braking_mps2
@@ -181,6 +191,7 @@ class OnBoard:
         """Begin in the other direction, without an authority."""
         self.direction, self.end_m, self.before_turn = direction, front_m, self._newest
         self._granted, self.answered_s, self._place_m, self.stops_at_m = False, None, None, None
+        self._front_m = None
 
 
 #: Time between two reports, and between two looks at the age of the authority [s].
