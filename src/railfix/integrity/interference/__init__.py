@@ -2,14 +2,16 @@
 
 from railfix.integrity.interference.limits import (
     CAUSES,
+    HeldState,
     InterferenceLimits,
     Sign,
     Suspicion,
     cause_text,
+    held,
     suspicion,
 )
 from railfix.integrity.interference.motion import MotionSigns, MotionSignState, motion_signs
-from railfix.integrity.interference.power import HeldState, PowerSigns, PowerState, held, power_signs
+from railfix.integrity.interference.power import PowerSigns, PowerState, power_signs
 from railfix.integrity.interference.wheel import WheelSigns, WheelState, wheel_signs
 
 __all__ = [

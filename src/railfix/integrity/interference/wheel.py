@@ -15,8 +15,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
-from railfix.integrity.interference.limits import InterferenceLimits
-from railfix.integrity.interference.power import HeldState, held
+from railfix.integrity.interference.limits import HeldState, InterferenceLimits, held
 
 #: Least standard deviation of a position: errors of satellites and atmosphere that change over minutes [m].
 _LEAST_M: Final = 1.0

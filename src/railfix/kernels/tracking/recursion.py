@@ -85,7 +85,7 @@ from railfix.kernels.tracking.update import apply_update, first_weights, mean_we
 
 
 @borrowing
-def _go_round(line: LineArrays, state: KernelState, bank: Subfilters) -> None:
+def _wrap_closed_line(line: LineArrays, state: KernelState, bank: Subfilters) -> None:
     """Let places beyond an end of a closed line go on where it closes."""
     for h in range(int(state.scalars[HYPOTHESES])):
         back = on_course(line, state.mean[h, ARC]) - state.mean[h, ARC]
@@ -114,7 +114,7 @@ def _needs_search(epochs: Epochs, t: int, parameters: Parameters, state: KernelS
 
 
 @borrowing
-def _forget(epochs: Epochs, t: int, active: Active, state: KernelState, bank: Subfilters) -> None:
+def _reset_code_errors(epochs: Epochs, t: int, active: Active, state: KernelState, bank: Subfilters) -> None:
     """Make the code errors of satellites that come into view independent of all else."""
     for i in range(epochs.fresh.shape[1]):
         if epochs.fresh[t, i]:
@@ -320,8 +320,8 @@ def _advance(
         if part < REST:
             if epochs.begins[t] or (part == WHOLE and _needs_search(epochs, t, parameters, state)):
                 return t
-            _forget(epochs, t, active, state, bank)
-            _go_round(line, state, bank)
+            _reset_code_errors(epochs, t, active, state, bank)
+            _wrap_closed_line(line, state, bank)
             _predict_all(inputs, t, state, work)
             if part == PREDICTION:
                 return t
