@@ -263,6 +263,7 @@ def _finish(
         scalars[HYPOTHESES] = count
     if scalars[BRANCH_S] > TAKEOVER_AFTER_S and state.log_least[0] < TAKEOVER:
         scalars[ACROSS] = ACROSS_TAKEN
+        scalars[WITHHELD] = max(scalars[WITHHELD], parameters.level_hold_s)
     probability = math.exp(state.log_probability[0])
     sigma = math.sqrt(state.covariance[0, ARC, ARC])
     outputs.hypotheses[t], outputs.probability[t] = count, probability
