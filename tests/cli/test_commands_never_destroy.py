@@ -257,7 +257,7 @@ KILLED: Final = {
 @pytest.mark.parametrize("name", ["run", pytest.param("simulate", marks=pytest.mark.slow)])
 @pytest.mark.every(2)
 def test_the_next_run_works_after_a_kill(desk: Desk, name: str) -> None:
-    _check_kills(desk, KILLED[name], 2, signal.SIGKILL, seed=1)
+    _check_kills(desk, KILLED[name], 1, signal.SIGKILL, seed=1)
 
 
 @pytest.mark.slow

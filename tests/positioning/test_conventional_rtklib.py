@@ -234,7 +234,7 @@ def test_single_point_with_the_same_choices(logs: dict[str, Log], tmp_path: Path
         ("esbc GEC", 1.2, 2.5),
     ],
 )
-@pytest.mark.every(4)
+@pytest.mark.every(5)
 def test_single_point_as_it_comes(logs: dict[str, Log], tmp_path: Path, name: str, p50_m: float, p95_m: float):
     """Each with its own choices: further apart than 0.5 m, as far as these carry, and about as near to the truth.
 

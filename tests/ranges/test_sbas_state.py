@@ -67,6 +67,7 @@ def test_an_hour_in_portions_is_the_whole_hour(recordings: Path, limits: SbasLim
             np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.slow
 def test_forgetting_changes_nothing_over_a_day_of_messages() -> None:
     """The hour repeated: masks, regions of service (type 27, valid for a day) and corrections of each hour."""
     rows: list[tuple[float, int, np.ndarray]] = []

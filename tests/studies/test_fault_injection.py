@@ -93,7 +93,7 @@ def test_two_faults_over_three_detectable_biases_are_excluded(named):
     assert found.wrong == 0
 
 
-@pytest.mark.every(3)
+@pytest.mark.slow
 def test_detection_in_gaussian_noise_is_the_non_central_chi_square(named):
     """The geometry of the recording with noise of known sigma: within the Monte-Carlo bounds of theory."""
     _, case = named
