@@ -11,7 +11,7 @@ Whole recordings first (``--whole``), then a cold start every ``--every`` second
 pairs, few satellites, and sensors on board where there are any, in windows ``--fault-every`` seconds apart.
 ``--verbose`` lists the trials that fail.
 
-An epoch is *exceeded* where its level is finite and the error is larger: by straight distance on the ground, and by
+On a wrong map the straight distance counts against the level on the ground alone. Otherwise an epoch is *exceeded* where its level is finite and the error is larger: by straight distance on the ground, and by
 chainage, where another lap of the same road counts as wrong. *Sure and wrong* are epochs with the status `tracking`
 and an error of more than four standard deviations.
 """
@@ -109,6 +109,10 @@ class Judged:
         """Exceeded by straight distance: the level along the line, or that of the straight distance."""
         either = np.where(self.bounded, self.level_m, self.ground_level_m)
         return np.isfinite(either) & (self.straight_m > either)
+
+    @property
+    def over_ground(self) -> np.ndarray:
+        return np.isfinite(self.ground_level_m) & (self.straight_m > self.ground_level_m)
 
     @property
     def over_chainage(self) -> np.ndarray:
@@ -401,8 +405,9 @@ def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterat
         yield f"{count} satellites after 45 s", replace(case, observations=replace(obs, **some))
     if case.sensors is not None:
         yield from sensor_faults(case, case.sensors)
-    yield "map 20 m aside", moved(case, 20.0)
-    yield "map 5 m aside", moved(case, 5.0)
+    yield "map 20 m to the right", moved(case, 20.0)
+    yield "map 20 m to the left", moved(case, -20.0)
+    yield "map 5 m to the right", moved(case, 5.0)
     yield "map 2 % long", stretched(case, 0.02)
     yield "map wandering by 2 m, stated", roughened(case, 2.0)
 
@@ -431,8 +436,8 @@ def sensor_faults(case: Case, sensors: SensorSamples) -> Iterator[tuple[str, Cas
 
 
 def over(label: str, found: Judged) -> np.ndarray:
-    """Epochs over their level; on a wrong map the chainage of a place is not defined."""
-    return found.over if label.startswith("map") else found.over | found.over_chainage
+    """Epochs over their level; on a wrong map the chainage is not defined, and how far aside it lies is no error of it."""
+    return found.over_ground if label.startswith("map") else found.over | found.over_chainage
 
 
 def first_of(found: Judged, bad: np.ndarray) -> str:

@@ -270,8 +270,8 @@ def write_level(
         outputs.level_m[t] = _solve(state, count, bank, parameters, work, 0, start)
     wrong = len(bank.running) - 1
     if bank.running[wrong]:
-        aside = abs(bank.mean[wrong, RIGHT]) - 2.0 * math.sqrt(bank.covariance[wrong, RIGHT, RIGHT])
-        outputs.ground_level_m[t] += max(aside, 0.0)
+        aside = abs(bank.mean[wrong, RIGHT]) + 2.0 * math.sqrt(bank.covariance[wrong, RIGHT, RIGHT])
+        outputs.ground_level_m[t] = math.hypot(outputs.ground_level_m[t], aside)
 
 
 @borrowing
