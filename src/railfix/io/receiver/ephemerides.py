@@ -1,6 +1,6 @@
 """Ephemerides put together from navigation subframes as they are received.
 
-A record needs several subframes of one issue: GPS and QZSS three, Galileo five words, BeiDou three (D1)
+A record needs several subframes of one issue: GPS and QZSS three, Galileo five words, BeiDou three (D1, B-CNAV2)
 or ten pages (D2), GLONASS four strings. `assembled` takes the subframes of a piece of a stream and what
 earlier pieces left unfinished, so that a stream cut anywhere gives the same records.
 """
@@ -22,6 +22,7 @@ from railfix.io.receiver.framing import Field, Subframes, fields, packed_words, 
 from railfix.io.receiver.measurements import (
     Record,
     Values,
+    bcnav2_record,
     beidou_record,
     cnav_record,
     frame_time,
@@ -41,6 +42,8 @@ _UBX_E5B: Final = (5, 6)
 _UBX_E5A: Final = (3, 4)
 #: Signals with CNAV: L2C and L5.
 _CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}
+#: BeiDou signals with D1 or D2, B-CNAV1 (B1C) and B-CNAV2 (B2a).
+_D_SIGNALS, _B1C, _B2A = (0, 1, 2, 3, 4, 10), (5, 6), (7, 8)
 #: Numbers of F/NAV pages and of CNAV messages among those of a satellite come after these.
 _FNAV_FROM, _CNAV_FROM = 200, 300
 #: Time from the beginning of a GLONASS frame in which its strings 1 to 4 come.
@@ -226,8 +229,11 @@ def _inav(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Val
 
 
 def _beidou(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
-    legacy = np.isin(part.signal, (0, 1, 2, 3, 4, 10))
-    counts["C CNAV"] += int(np.count_nonzero(~legacy))
+    legacy = np.isin(part.signal, _D_SIGNALS)
+    yield from _bcnav2(part, counts)
+    first = np.isin(part.signal, _B1C)
+    counts["C pages of B-CNAV1 (B-CNAV2 of B2a is read, D1 and D2 too)"] += int(np.count_nonzero(first))
+    counts["C pages of other messages"] += int(np.count_nonzero(~legacy & ~first & ~np.isin(part.signal, _B2A)))
     bits = packed_words(part.words, drop=0, keep=30)
     number = np.array([int(name[1:]) for name in part.satellite.tolist()])
     geo = (number <= 5) | (number >= 59)
@@ -243,6 +249,19 @@ def _beidou(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, V
         for row, head in _rows(bits, pages[page[pages] == k], nav_messages.BDS_HEAD):
             packed = int("".join(map(str, bits[row].tolist())), 2)
             yield row, 100 + k, {**head, "page": packed}  # the page whole: its fields go over page ends
+
+
+def _bcnav2(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
+    modern = np.isin(part.signal, _B2A)
+    if not modern.any():
+        return
+    bits = packed_words(part.words, drop=0, keep=32)
+    valid = modern & nav_messages.has_crc(bits, nav_messages.BCNAV2_CHECKED)
+    counts["C B-CNAV2 without valid CRC"] += int(np.count_nonzero(modern & ~valid))
+    kind = unsigned(bits, 6, 6)
+    for k, layout in nav_messages.BCNAV2.items():
+        for row, values in _rows(bits, np.flatnonzero(valid & (kind == k)), nav_messages.BCNAV2_HEAD | layout):
+            yield row, _CNAV_FROM + k, values
 
 
 def _glonass(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
@@ -307,7 +326,7 @@ class _EphemerisBuilder:
     def _maker(self, letter: str, number: int) -> Callable[[str, np.datetime64], Record | None]:
         """Return what makes a record of the message that a subframe is of."""
         if number > _FNAV_FROM:
-            return self._galileo_f if letter == "E" else self._modernised
+            return {"E": self._galileo_f, "C": self._bcnav2}.get(letter, self._modernised)
         if letter == "C":
             return self._d2 if number > 100 else self._d1
         return {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}[letter]
@@ -379,6 +398,19 @@ class _EphemerisBuilder:
             return None
         self.klobuchar.setdefault(letter, np.array([parts[2][f"ion{k}"] for k in range(8)]))
         return cnav_record(satellite, {**parts[2], **parts[1], **parts[0]})
+
+    def _bcnav2(self, satellite: str, _: np.datetime64) -> Record | None:
+        """Record of B-CNAV2: message 11 follows 10, and the clock's issue ends with that of the ephemeris."""
+        parts = self._parts(satellite, tuple(_CNAV_FROM + k for k in nav_messages.BCNAV2))
+        if (
+            parts is None
+            or parts[1]["tow_s"] != parts[0]["tow_s"] + 3
+            or int(parts[2]["iodc"]) & 255 != parts[0]["iode"]
+        ):
+            return None
+        values = {**parts[2], **parts[1], **parts[0]}
+        known = int(values["kind"]) in nav_messages.BCNAV2_AXIS_M and f"C{int(values['number']):02d}" == satellite
+        return bcnav2_record(satellite, values) if known else None
 
     def _d1(self, satellite: str, time: np.datetime64) -> Record | None:
         parts = self._parts(satellite, (1, 2, 3))

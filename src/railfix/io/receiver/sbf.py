@@ -2,7 +2,7 @@
 
 Source: mosaic-X5 reference guide 4.14, sections 4.1.9 (satellites), 4.1.10 (signals), 4.2.1 (MeasEpoch), 4.2.2
 (GPSRawCA, GPSRawL2C, GPSRawL5, GALRawFNAV, GALRawINAV, BDSRaw, GLORawCA, QZSRawL1CA, QZSRawL2C, QZSRawL5, GEORawL1,
-GEORawL5),
+GEORawL5, BDSRawB1C, BDSRawB2a),
 4.2.8 (PVTGeodetic, PVTCartesian).
 """
 
@@ -35,6 +35,8 @@ GAL_RAW_FNAV: Final = 4022
 GAL_RAW_INAV: Final = 4023
 GLO_RAW_CA: Final = 4026
 BDS_RAW: Final = 4047
+BDS_RAW_B1C: Final = 4218
+BDS_RAW_B2A: Final = 4219
 QZS_RAW_L1CA: Final = 4066
 QZS_RAW_L2C: Final = 4067
 QZS_RAW_L5: Final = 4068
@@ -49,6 +51,8 @@ _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
     GAL_RAW_FNAV: ("E", {20: 4}),
     GAL_RAW_INAV: ("E", {17: 1, 21: 5, 22: 5}),
     BDS_RAW: ("C", {28: 0, 29: 2, 30: 4}),
+    BDS_RAW_B1C: ("C", {13: 6}),
+    BDS_RAW_B2A: ("C", {14: 8}),
     GLO_RAW_CA: ("R", None),
     GEO_RAW_L1: ("S", None),
     GEO_RAW_L5: ("S", {25: SBAS_L5}),
