@@ -16,6 +16,7 @@ from railfix.core.geodesy import range_with_rotation
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import concatenate
 from railfix.gnss.orbits import satellite_states
+from railfix.pipeline.base_station import BaseStation
 from railfix.pipeline.config import parse_config
 from railfix.ranges.corrected import DFMC_REASONS
 from railfix.ranges.sbas import SbasMessages, SbasState, read_sbas
@@ -133,6 +134,13 @@ def test_corrected_codes_are_true_ranges() -> None:
     processor = processor_of(config, simulation.navigation, {"front": line})
     messages = sbas_messages(simulation, SbasSettings(band="L5"))
     found = processor.process({"front": observations}, messages=messages)[0].antennas["front"]
+    heard = messages.time <= observations.time[12]
+    first, state = processor.process({"front": observations[:13]}, messages=messages.take(heard))
+    second, _ = processor.process({"front": observations[13:]}, state, messages=messages.take(~heard))
+    pieces = [part.antennas["front"] for part in (first, second)]
+    for name in ("corrected_code_m", "sigma_m", "reason"):
+        whole = np.concatenate([getattr(part, name) for part in pieces])
+        np.testing.assert_allclose(whole, getattr(found, name), rtol=0, atol=1e-6, err_msg=name)
     columns = found.columns[np.isfinite(found.corrected_code_m[:, found.columns]).any(axis=0)]
     satellite, code = found.satellite[columns], observations.code_m[:, columns]
     fixes = DfmcService(messages, prn=137).satellites(found.time, satellite, simulation.navigation)
@@ -158,6 +166,12 @@ def test_every_state_has_a_reason() -> None:
 def test_phases_of_one_frequency_are_refused() -> None:
     with pytest.raises(SettingsError, match="carrier = float takes the phase of one: give carrier = off or smoothed"):
         parse_config({"sbas": "stream", "sbas_prn": 137, "sbas_band": "L5", "carrier": "float"})
+
+
+def test_a_base_station_of_one_frequency_is_refused() -> None:
+    config = parse_config({"sbas": "stream", "sbas_prn": 137, "sbas_band": "L5"})
+    with pytest.raises(SettingsError, match="those of a base station are of one; leave one of the two out"):
+        BaseStation(config, "stream")
 
 
 def test_messages_kept_give_the_same_corrections() -> None:
