@@ -33,7 +33,8 @@ def test_the_record_of_the_issue_is_found() -> None:
     assert rows(0.5, 7, 8) == [0, 3, -1, -1]
     assert rows(0.5, 8, 7) == [1, -1, -1, -1]
     assert rows(0.5, -1, 9) == [-1, -1, -1, -1]
-    assert rows(0.5, 7, 7, 7, 7) == [0, -1, -1, -1]
+    assert rows(0.5, 7, 7, 7, 7) == [0, -1, 4, -1]
+    assert rows(0.5, 256 + 7, 7, 256 + 7) == [0, -1, -1, -1], "10 bits of Galileo, the lower 8 of GPS"
 
 
 def test_of_one_issue_the_nearest_in_its_validity_counts() -> None:

@@ -107,6 +107,42 @@ def fnav_pages(values: Mapping[str, float], number: int) -> list[np.ndarray]:
     return [with_crc(text, tail=6) for text in (one, two, three, four)]
 
 
+def bcnav2_messages(values: Mapping[str, float], number: int) -> list[np.ndarray]:
+    """Messages 10, 11, 30 and 40 of a record as RINEX has it (BDS-SIS-ICD-B2a 1.0, 6.2.3), without parity symbols."""
+    v, axis = values, 27_906_100.0 if values["kind"] == 3 else 42_162_200.0
+    flags: list[Piece] = [(v["flags"], 3), (v["sismai"], 4), (0, 3)]
+
+    def head(kind: int, k: int) -> list[Piece]:
+        return [(number, 6), (kind, 6), (TOW_S // 3 + k, 18)]
+
+    ten = put(
+        [
+            *head(10, 0), (WEEK - 1356, 13), *flags, (v["iode"], 8), (v["toe_sow_s"] / 300, 11), (v["kind"], 2),
+            ((v["sqrt_a"] ** 2 - axis) * 2.0**9, 26), (v["a_dot"] * 2.0**21, 25), (v["delta_n"] / PI * 2.0**44, 17),
+            (v["delta_n_dot"] / PI * 2.0**57, 23), (v["m0"] / PI * 2.0**32, 33), (v["eccentricity"] * 2.0**34, 33),
+            (v["omega"] / PI * 2.0**32, 33),
+        ]
+    )  # fmt: skip
+    eleven = put(
+        [
+            *head(11, 1), (v["health"], 2), *flags, (v["omega0"] / PI * 2.0**32, 33), (v["i0"] / PI * 2.0**32, 33),
+            (v["omega_dot"] / PI * 2.0**44, 19), (v["i_dot"] / PI * 2.0**44, 15), (v["cis"] * 2.0**30, 16),
+            (v["cic"] * 2.0**30, 16), (v["crs"] * 2.0**8, 24), (v["crc"] * 2.0**8, 24), (v["cus"] * 2.0**30, 21),
+            (v["cuc"] * 2.0**30, 21),
+        ]
+    )  # fmt: skip
+    thirty = put(
+        [
+            *head(30, 2), (v["health"], 2), *flags, (v["toc_s"] / 300, 11), (v["af0_s"] * 2.0**34, 25),
+            (v["af1"] * 2.0**50, 22), (v["af2"] * 2.0**66, 11), (v["iodc"], 10), (v["group_delay_2_s"] * 2.0**34, 12),
+            (v["inter_signal_1"] * 2.0**34, 12), (0, 74), (v["group_delay_1_s"] * 2.0**34, 12), (0, 33),
+        ]
+    )  # fmt: skip
+    forty = put([*head(40, 3), (v["health"], 2), *flags, *[(0, 37)] * 6])
+    assert {len(text) for text in (ten, eleven, thirty, forty)} == {264}
+    return [with_crc(text) for text in (ten, eleven, thirty, forty)]
+
+
 def words_of(page: np.ndarray) -> bytes:
     """Bits as big-endian words of 32 bits, the last one filled with zeros."""
     return np.packbits(np.concatenate([page, np.zeros(-len(page) % 32, np.uint8)])).tobytes()
@@ -114,15 +150,16 @@ def words_of(page: np.ndarray) -> bytes:
 
 def ubx_page(page: np.ndarray, system: str, number: int) -> bytes:
     """RXM-SFRBX of a page."""
-    gnss, signal = {"G": (0, 4), "J": (5, 5), "E": (2, 3)}[system]
+    gnss, signal = {"G": (0, 4), "J": (5, 5), "E": (2, 3), "C": (3, 8)}[system]
     words = np.frombuffer(words_of(page), ">u4")
     head = struct.pack("<BBBBBBBB", gnss, number, signal, 0, len(words), 0, 2, 0)
     return frame(0x0213, head + words.astype("<u4").tobytes())
 
 
 def sbf_page(page: np.ndarray, system: str, number: int) -> bytes:
-    """GPSRawL5, QZSRawL5 or GALRawFNAV of a page."""
-    kind, shift, source = {"G": (4019, 0, 4), "J": (4068, 180, 26), "E": (4022, 70, 20)}[system]
+    """GPSRawL5, QZSRawL5, GALRawFNAV, or BDSRawB2a with parity symbols, of a page."""
+    kind, shift, source = {"G": (4019, 0, 4), "J": (4068, 180, 26), "E": (4022, 70, 20), "C": (4219, 140, 14)}[system]
+    page = np.concatenate([page, np.ones(288, np.uint8)]) if system == "C" else page
     words = np.frombuffer(words_of(page), ">u4").astype("<u4").tobytes()
     body = struct.pack("<IHBBBBBB", TOW_S * 1000, WEEK, number + shift, 1, 0, source, 0, 1) + words
     rest = struct.pack("<HH", kind, 8 + len(body)) + body

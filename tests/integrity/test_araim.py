@@ -241,3 +241,41 @@ def test_positions_of_a_run_have_levels_along_the_track_and_in_space_whatever_th
     error = np.abs(found.chainage_m - pipeline_cases.true_chainage("front")[::100])
     assert (error < along)[located].all()
     assert np.median(along[located]) < np.median(space[located])
+
+
+@pytest.mark.requirement("C5")
+@pytest.mark.parametrize(("first", "last"), [(None, 3), (4, 8), (-9, -5), (50, 60)])
+def test_epochs_outside_the_period_of_a_message_have_no_level(tmp_path: Path, first: int | None, last: int) -> None:
+    """In it, expired within the log, before the log, after the log: what is outside is named."""
+    log = pipeline_cases.clean_observations()["front"][::100][:10]
+    second = np.timedelta64(1, "s")
+    since = (log.time - log.time[0]) / second
+    text = "" if first is None else f"valid_from = {(log.time[0] + first * 10 * second).astype('datetime64[s]')}\n"
+    text += f"valid_until = {(log.time[0] + last * 10 * second).astype('datetime64[s]')}\n"
+    path = tmp_path / "ism.toml"
+    path.write_text(text + MESSAGE, encoding="utf-8")
+    processor = EpochProcessor(
+        parse_config({"filter": "off", "systems": ("G", "E")}),
+        {"front": pipeline_cases.clean_trajectories()["front"]},
+        navigation=pipeline_cases.clean_navigation(),
+        models=Models(support=read_integrity_support(path)),
+    )
+    result = processor.process({"front": log})[0]
+    inside = (since >= -np.inf if first is None else since >= first * 10) & (since <= last * 10)
+    assert since[-1] == 90.0
+    for levels in (result["front"].araim.along.level_m, result["front"].araim.space.level_m):
+        np.testing.assert_array_equal(np.isfinite(levels[:, 0]), inside & np.isfinite(result["front"].chainage_m))
+    assert any("epochs outside have no ARAIM level" in note for note in result.notes)
+
+
+@pytest.mark.requirement("C5")
+def test_a_period_is_in_gps_time_and_its_absence_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "ism.toml"
+    path.write_text(MESSAGE, encoding="utf-8")
+    assert "whether it has expired is not known" in read_integrity_support(path).notes(np.empty(0, "datetime64[ns]"))[0]
+    path.write_text("valid_until = 2026-01-01T00:00:00Z\n" + MESSAGE, encoding="utf-8")
+    with pytest.raises(SettingsError, match="GPS time: write them without a time zone"):
+        read_integrity_support(path)
+    path.write_text("valid_from = 2026-01-02T00:00:00\nvalid_until = 2026-01-01T00:00:00\n" + MESSAGE, encoding="utf-8")
+    with pytest.raises(SettingsError, match="must be before valid_until"):
+        read_integrity_support(path)

@@ -1,4 +1,4 @@
-"""CNAV and F/NAV pages of receivers: from broadcast records, against cssrlib's reading, whole and cut streams.
+"""CNAV, F/NAV and B-CNAV2 pages of receivers: from broadcast records, against cssrlib's reading, whole and cut streams.
 
 `tests/references/nav_pages.json` was written by ``python tests/references/make_nav_page_references.py`` with
 cssrlib 1.2.1, which reads the same pages.
@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from conftest import ROOT
-from nav_pages import cnav_pages, fnav_pages, sbf_page, ubx_page
+from nav_pages import bcnav2_messages, cnav_pages, fnav_pages, sbf_page, ubx_page
+from railfix.core.timescale import from_week
 from railfix.gnss.navigation import Navigation
 from railfix.io import read_navigation
 from railfix.io.receiver.ephemerides import merged, navigation_of
@@ -27,6 +28,7 @@ REFERENCE: Final = json.loads((ROOT / "tests" / "references" / "nav_pages.json")
 #: Records that pages are made of; numbers as a receiver of 2025 had them, not whole units of the last place.
 CNAV: Final[dict[str, float]] = REFERENCE["cnav"]["given"]
 FNAV: Final[dict[str, float]] = REFERENCE["fnav"]["given"]
+BCNAV2: Final[dict[str, float]] = REFERENCE["bcnav2"]["given"]
 
 
 def navigation(data: bytes, *, step: int | None = None) -> Navigation:
@@ -74,6 +76,36 @@ def test_fnav_pages_give_the_record_they_are_made_of_and_cssrlibs(protocol: str)
     assert record.data_source[0] == 0b1_0000_0010, "E5a, clock of E5a and E1"
     assert record.accuracy_m[0] == pytest.approx(3.12)
     assert record.health[0] == 1 << 4 | 0 << 3
+
+
+@pytest.mark.parametrize("protocol", ["ubx", "sbf"])
+def test_bcnav2_messages_give_the_record_they_are_made_of_and_cssrlibs(protocol: str) -> None:
+    data = stream(bcnav2_messages(BCNAV2, 27), "C", 27, protocol=protocol)
+    found = navigation(data)
+    record, expected = found.kepler, REFERENCE["bcnav2"]["cssrlib"]
+    assert (record.satellite.tolist(), record.message.tolist()) == (["C27"], ["CNV2"])
+    assert not found.skipped
+    for name, value in expected.items():
+        got = getattr(record, name)[0] if name != "isc_1" else record.inter_signal_s[0, 1]
+        assert float(got) == pytest.approx(value, rel=1e-12, abs=1e-22), name
+    for name, half in {"af0_s": 2.0**-35, "m0": 1e-9, "omega_dot": 2.0**-44, "crs": 2.0**-9, "cuc": 2.0**-31}.items():
+        assert getattr(record, name)[0] == pytest.approx(BCNAV2[name], abs=half * np.pi), name
+    assert (record.health[0], record.iode[0], record.iodc[0]) == (1, 117, 629)
+    # GPS time is 14 s ahead of BeiDou's, and week 997 of that is week 2353
+    assert record.toc[0] == record.toe[0] == from_week(2353, 576_000.0) + np.timedelta64(14, "s")
+    assert record.transmitted[0] == from_week(2353, 576_012.0) + np.timedelta64(14, "s")
+
+
+def test_bcnav2_messages_of_two_issues_damaged_or_of_another_satellite_make_no_record() -> None:
+    pages = bcnav2_messages(BCNAV2, 27)
+    other = bcnav2_messages({**BCNAV2, "iodc": 630.0, "iode": 118.0}, 27)
+    broken = [page.copy() for page in pages]
+    broken[1][77] ^= 1
+    for sent in ([pages[0], pages[1], other[2]], broken, [pages[0], pages[2]]):
+        assert not len(navigation(stream(sent, "C", 27, protocol="sbf")).kepler)
+    assert not len(navigation(stream(pages, "C", 28, protocol="sbf")).kepler)
+    skipped = navigation(stream(broken, "C", 27, protocol="ubx")).skipped
+    assert skipped == {"C B-CNAV2 without valid CRC": 1}
 
 
 def test_a_stream_cut_anywhere_and_with_repeated_pages_gives_the_same_record_once() -> None:

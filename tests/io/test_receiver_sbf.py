@@ -23,6 +23,7 @@ from railfix.io.receiver.log import StreamState, decode
 from railfix.live.stream import ReceiverState, receive_bytes
 from railfix.ranges.sbas import from_receiver
 from railfix.ranges.sbas.messages import with_parity
+from railfix.simulate.sbas import dfmc
 
 pytestmark = pytest.mark.requirement("A8")
 
@@ -144,6 +145,7 @@ PAGE = {
     ("E", 5): (4023, 21),
     ("C", 0): (4047, 28),
     ("R", 0): (4026, 8),
+    ("S", sbf.SBAS_L5): (4021, 25),
     ("S", 0): (4020, 24),
 }
 SVID = {"G": 0, "E": 70, "C": 140, "J": 180, "R": 37, "S": 100}
@@ -294,6 +296,25 @@ def test_sbas_messages_of_pages() -> None:
     assert (messages.prn.tolist(), messages.type.tolist()) == ([136] * 5, [4] * 5)
     assert np.array_equal(messages.bits, bits[:5])
     assert messages.rejected["parity"] == 1
+
+
+def test_sbas_messages_of_l5_are_another_stream() -> None:
+    """GEORawL5 beside GEORawL1: each is read for its own frequency alone."""
+    bits = np.array([dfmc.message(63, k) for k in range(3)])
+    words = np.zeros((3, 10), dtype=np.uint32)
+    words[:, :8] = bits.view(">u4").reshape(3, 8)
+    zero = np.zeros(3, dtype=np.int64)
+    sent = Subframes(
+        satellite=np.full(3, "S36"), signal=zero + sbf.SBAS_L5, glonass_channel=zero, words=words, order=np.arange(3)
+    )
+    start = np.datetime64("2025-05-23T13:59:00", "ns")
+    data = b"".join(page(sent, k, start + np.timedelta64(k, "s")) for k in range(3))
+    read = sbf.navigation_subframes(find_frames(np.frombuffer(data, np.uint8)))
+    frames = sbas_frames(read, start + np.arange(3).astype("timedelta64[s]"))
+    messages = from_receiver(frames, band="L5")
+    assert messages.type.tolist() == [63] * 3
+    assert np.array_equal(messages.bits, bits)
+    assert not len(from_receiver(frames))
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ def made(
     shape = (epochs, satellites)
     codes = SecondCodes(
         code_m=RATIO * error + delay_m + second, noise_m=np.ones(shape), cn0_dbhz=np.full(shape, 45.0),
-        delay_sigma_m=np.zeros(shape), ratio=np.full(shape, RATIO),
+        group_delay_m=np.zeros(shape), delay_sigma_m=np.zeros(shape), ratio=np.full(shape, RATIO),
         pair=np.broadcast_to(np.arange(satellites), shape), column=np.broadcast_to(np.arange(satellites), shape),
     )  # fmt: skip
     return START + timedelta(np.arange(float(epochs))), error + first, codes, np.broadcast_to(error, shape)

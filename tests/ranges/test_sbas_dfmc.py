@@ -1,11 +1,16 @@
 """Dual-frequency SBAS: layouts, corrections in force, integrity, traps."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from railfix.ranges.sbas.dfmc import DfmcService, DfmcState, message_types, residual_ionosphere_m, slot_satellite
-from railfix.ranges.sbas.messages import with_parity
+from railfix.core.errors import InputFileError
+from railfix.ranges.sbas import SbasMessages, read_sbas
+from railfix.ranges.sbas.dfmc import DfmcService, DfmcState, residual_ionosphere_m, slot_satellite
+from railfix.ranges.sbas.messages import message_type, with_parity
 from railfix.simulate.sbas import dfmc
+from railfix.simulate.sbas.stream import write_sbas
 
 pytestmark = pytest.mark.requirement("C5")
 START = np.datetime64("2026-03-01T06:00:00", "ns")
@@ -14,9 +19,17 @@ SLOTS = (5, 12, 77)
 TOD_S = 6 * 3600.0
 
 
-def service(*messages: tuple[float, np.ndarray]) -> DfmcService:
+def log(*messages: tuple[float, np.ndarray]) -> SbasMessages:
     time = START + np.array([round(t * 1e9) for t, _ in messages], dtype="timedelta64[ns]")
-    return DfmcService(time, np.array([bits for _, bits in messages], dtype=np.uint8))
+    bits, rows = np.array([bits for _, bits in messages], dtype=np.uint8), np.arange(len(messages))
+    return SbasMessages(
+        time=time, prn=np.full(len(rows), 137), type=message_type(bits, "L5"), bits=bits, parity_bits=rows * 0 + 24,
+        source=rows * 0, line=rows + 1, sources=("made",), band="L5",
+    )  # fmt: skip
+
+
+def service(*messages: tuple[float, np.ndarray]) -> DfmcService:
+    return DfmcService(log(*messages), prn=137)
 
 
 def standard(*more: tuple[float, np.ndarray], **parameters: object) -> DfmcService:
@@ -28,7 +41,7 @@ def standard(*more: tuple[float, np.ndarray], **parameters: object) -> DfmcServi
 
 
 def at(found: DfmcService, second: float, satellite: str = "G05"):  # type: ignore[no-untyped-def]
-    return found.at(np.array([START + np.timedelta64(round(second * 1e9), "ns")]), np.array([satellite]))
+    return found.satellites(np.array([START + np.timedelta64(round(second * 1e9), "ns")]), np.array([satellite]))
 
 
 def test_slots_name_satellites() -> None:
@@ -46,7 +59,7 @@ def test_a_message_by_hand() -> None:
         2, 5, 77, (-0.0625, 0, 0, 0.0625), time_of_day_s=TOD_S, covariance=(5, np.diag([4.0, 0, 0, 0])), dfrei=3
     )
     assert "".join(f"{b:08b}" for b in written)[:226] == text
-    assert message_types(written[None]).tolist() == [32]
+    assert message_type(written[None], "L5").tolist() == [32]
 
 
 def test_corrections_move_with_their_rates_and_belong_to_an_issue() -> None:
@@ -127,14 +140,22 @@ def test_type_0_stops_the_service_and_what_came_before_it() -> None:
     assert at(again, 67.0).state[0, 0] == DfmcState.NO_CORRECTION  # the correction was sent before the stop
 
 
-def test_broken_and_foreign_messages_are_counted_and_left_out() -> None:
+def test_broken_and_foreign_messages_are_counted_and_left_out(tmp_path: Path) -> None:
     broken, foreign = dfmc.mask(0, SLOTS).copy(), dfmc.mask(0, SLOTS).copy()
     broken[10] ^= 4
-    foreign[0] = 0x53 ^ 0xF0  # no preamble of L5
-    unknown = dfmc.message(61, 3)
-    found = service((0.0, broken), (1.0, foreign), (2.0, unknown), (3.0, dfmc.message(47, 4)))
-    assert found.counts == {"rejected": 2, "type 47 almanac": 1, "type 61 unknown": 1}
-    assert at(found, 4.0).state[0, 0] == DfmcState.NO_MASK
+    foreign[0] = 0x13  # no preamble of L5
+    foreign = with_parity(foreign[None])[0]
+    written = log((0.0, broken), (1.0, foreign), (2.0, dfmc.message(61, 2)), (3.0, dfmc.message(47, 3)))
+    write_sbas(written, tmp_path / "l5.sbs")
+    read = read_sbas(tmp_path / "l5.sbs", band="L5")
+    assert read.account() == {
+        "MSAS 137 type 47 almanac, not decoded": 1, "MSAS 137 type 61 reserved, not decoded": 1,
+        "rejected: duplicate": 0, "rejected: line": 0, "rejected: parity": 1, "rejected: preamble": 1,
+    }  # fmt: skip
+    assert at(DfmcService(read, prn=137), 4.0).state[0, 0] == DfmcState.NO_MASK
+    assert not read.notes
+    with pytest.raises(InputFileError, match=r"type 31 is written, the message on L1 says \d+ \(setting sbas_band\)"):
+        read_sbas(tmp_path / "l5.sbs")
 
 
 def test_residual_ionosphere() -> None:

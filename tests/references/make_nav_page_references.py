@@ -16,7 +16,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "helpers"))
 
-from nav_pages import cnav_pages, fnav_pages, words_of  # noqa: E402
+from nav_pages import bcnav2_messages, cnav_pages, fnav_pages, words_of  # noqa: E402
 
 #: GPS PRN 30 on 2025-02-15, 17:30, as a RINEX 4 file has its CNAV record.
 CNAV = {
@@ -37,6 +37,15 @@ FNAV = {
     "omega_dot": -5.49e-9,
     "eccentricity": 3.21e-4, "sqrt_a": 5440.6123, "omega0": 1.7654, "i_dot": -4.1e-10, "i0": 0.98123, "omega": -1.2345,
     "delta_n": 2.87e-9, "cuc": -5.1e-6, "cus": 9.3e-6, "crc": 151.3, "crs": -109.7, "cic": 3.1e-8, "cis": -6.2e-8,
+}  # fmt: skip
+#: A BeiDou-3 medium orbit, every harmonic different.
+BCNAV2 = {
+    "kind": 3.0, "flags": 0.0, "sismai": 5.0, "health": 1.0, "iode": 117.0, "iodc": 629.0, "toe_sow_s": 576_000.0,
+    "toc_s": 576_000.0, "af0_s": -5.7e-4, "af1": 1.9e-11, "af2": 4e-19, "group_delay_1_s": -3.2e-9,
+    "group_delay_2_s": 1.7e-9, "inter_signal_1": -4.1e-10, "sqrt_a": 5282.6123, "a_dot": -0.0123, "delta_n": 3.7e-9,
+    "delta_n_dot": -2.2e-14, "m0": 1.7321, "eccentricity": 7.31e-4, "omega": -0.9876, "omega0": -2.4567, "i0": 0.95512,
+    "omega_dot": -6.79e-9, "i_dot": 2.6e-10, "cuc": -4.4e-6, "cus": 8.7e-6, "crc": 187.3, "crs": -93.7, "cic": 5.5e-8,
+    "cis": -3.9e-8,
 }  # fmt: skip
 
 
@@ -60,10 +69,17 @@ def main() -> None:
         cnav = raw.decode_gps_cnav(2353, None, prn2sat(uGNSS.GPS, 30), words_of(page)) or cnav
     for kind, page in enumerate(fnav_pages(FNAV, 5), start=1):
         fnav = raw.decode_gal_fnav(2353, None, prn2sat(uGNSS.GAL, 5), kind, words_of(page)) or fnav
+    beidou = None
+    for page in bcnav2_messages(BCNAV2, 27):
+        beidou = raw.decode_bds_b2a(2353, None, prn2sat(uGNSS.BDS, 27), words_of(page)) or beidou
+    of_beidou = named(beidou)
+    of_beidou |= {"a_dot": float(beidou.Adot), "delta_n_dot": float(beidou.delnd)}
+    of_beidou |= {"group_delay_2_s": float(beidou.tgd_b), "isc_1": float(beidou.isc[1])}
     of_cnav = named(cnav)
     of_cnav |= {"a_dot": float(cnav.Adot), "delta_n_dot": float(cnav.delnd)}
     of_cnav |= {f"isc_{k}": float(cnav.isc[k]) for k in range(4)}
     found = {"cnav": {"given": CNAV, "cssrlib": of_cnav}, "fnav": {"given": FNAV, "cssrlib": named(fnav)}}
+    found["bcnav2"] = {"given": BCNAV2, "cssrlib": of_beidou}
     path = ROOT / "tests" / "references" / "nav_pages.json"
     path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 

@@ -15,7 +15,7 @@ from railfix.simulate import Scenario, Simulation, write_run
 from railfix.simulate.errors import SatelliteFault
 from railfix.simulate.receiver import ionosphere_m
 from railfix.simulate.sbas import SbasSettings, service
-from railfix.simulate.sbas.service import sbas_messages, write_sbas
+from railfix.simulate.sbas.stream import sbas_messages, write_sbas
 from railfix.simulate.scenario import ReferenceStation
 from railfix.simulate.scenario_file import load_recipe
 from test_simulate_signals import whole

@@ -2,7 +2,8 @@
 
 ``python tests/studies/wheel_trials.py`` prints tests/references/results/wheel_trials.txt: pulls of 0.5 m/s with C/N0
 and Dopplers as before, which nothing but a wheel shows, on the demonstration's line at 1 Hz with a tachometer; clean
-simulated rides with slip and slide; and, with the recordings beside the checkout, the drive with a wheel.
+simulated rides with slip and slide; and, with the recordings beside the checkout, the drive with a wheel. Last, what
+an inertial unit would leave unseen in the wheel's place.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import recordings_score
 import recordings_truth
 import sensed_ride
 import signal_attacks
+from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference
 from railfix.integrity.interference import InterferenceLimits, WheelState, wheel_signs
@@ -35,6 +37,9 @@ _PULLS: Final = 10
 _FIRST, _LAST = 60, 80
 #: Seeds of the clean rides with drawn slips and slides.
 _RIDES: Final = (1,)
+#: Seconds before a window in which speed and bias of an inertial unit are fitted.
+_FIT_S: Final = 120
+_GRAVITY_MPS2: Final = 9.8
 #: A tachometer on a wheel whose diameter is wrong by 0.2 %.
 _WHEEL: Final = {"tachometer": {"diameter_error_m": 0.002, "jitter_s": 2e-6}, "inertial": None, "radar": None}
 
@@ -93,6 +98,36 @@ def clean(scenario: Scenario, name: str) -> str:
     return f"{name:34} {len(found):6} {compared:9} {int(found.wheel.parted.sum()):7} {largest:12.1f}"
 
 
+def inertial(scenario: Scenario) -> str:
+    """Distance by an inertial unit on a clean ride less the true one, at best: by its forward force less the map's
+    gradient, with speed and bias fitted to the true distances of two minutes before."""
+    ride = sensed_ride.made(scenario)
+    unit, track = ride.samples.inertial, ride.simulation.line.track()
+    assert unit is not None
+    at = seconds(unit.time - ride.observations.time[0])
+    chainage = np.interp(at, ride.time_s, ride.chainage_m)
+    height = geodetic_from_ecef(track.ecef_m)[2]
+    gradient = np.interp(chainage, track.chainage_m, np.gradient(height, track.chainage_m))
+    force = unit.force_mps2[:, 0] - _GRAVITY_MPS2 * gradient
+    speed = np.concatenate([[0.0], np.cumsum(0.5 * (force[1:] + force[:-1]) * np.diff(at))])
+    way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(at))])
+    error = np.interp(ride.time_s, at, way) - ride.chainage_m
+    found = {}
+    for window in (10, 30, 60):
+        left = []
+        for first in range(60, len(error) - _FIT_S - window, 10):
+            fitted = slice(first, first + _FIT_S)
+            line = np.polynomial.Polynomial.fit(ride.time_s[fitted], error[fitted], 2)
+            end = first + _FIT_S + window - 1
+            left.append(abs(error[end] - line(ride.time_s[end])))
+        found[window] = np.array(left)
+    each = "; ".join(
+        f"after {window} s {np.median(left):.1f}, {np.percentile(left, 95):.1f}, {left.max():.1f} (pull {window / 2:g})"
+        for window, left in found.items()
+    )
+    return f"inertial unit alone, error of the distance [m], p50, p95, largest of {len(found[60])}: {each}"
+
+
 def smartloc() -> str:
     """Codes of a deep city with the car's wheel; it brakes as no train does, its positions are off by tens of m."""
     case = filter_score.smartloc_case(paths.DATA)
@@ -128,6 +163,7 @@ def main() -> int:
     for seed in _RIDES:
         run = load_recipe("commercial-run").scenario().replaced(seed=seed, rate_hz=1.0)
         print(clean(run, f"36 km with slip and slide, seed {seed}"), flush=True)
+        print(inertial(run), flush=True)
     return 0
 
 

@@ -47,7 +47,7 @@ class Reason(IntFlag):
     SBAS_TIMED_OUT = 1 << 12
     #: SBAS: do not use, not monitored, UDRE too large, or the GEO sends "do not use" (message type 0).
     SBAS_DO_NOT_USE = 1 << 13
-    #: SBAS: no ionospheric delay at the pierce point.
+    #: SBAS: no ionospheric delay at the pierce point; on L5: no second code.
     SBAS_NO_IONOSPHERE = 1 << 14
     #: C/N0 below the absolute limit.
     CN0_FLOOR = 1 << 15

@@ -74,6 +74,11 @@ class BaseStation:
     """
 
     def __init__(self, config: Config, ecef_m: Floats | Literal["stream"]) -> None:
+        if config.dual_frequency_sbas:
+            raise SettingsError(
+                "SBAS on L5 corrects codes of two frequencies, and those of a base station are of one; "
+                "leave one of the two out, or set sbas_band = L1"
+            )
         self._config = config.replaced(frequencies="one")
         self._ecef_m = None if isinstance(ecef_m, str) else np.asarray(ecef_m, dtype=np.float64)
         self._antenna: tuple[Floats, AntennaRows] | None = None

@@ -5,7 +5,7 @@ Computed once for each set of channels: a log of a day has few, and most live ep
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
@@ -22,9 +22,9 @@ from railfix.gnss.orbits.prepared_records import group_delay_s, group_delay_sigm
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.pipeline.config import Config
 from railfix.positioning.normal_equations import clock_groups
-from railfix.positioning.two_frequencies import SecondCodes, TwoFrequencyState, combine_codes
+from railfix.positioning.two_frequencies import SecondCodes, TwoFrequencyState, combine_codes, ionosphere_free
 from railfix.ranges.atmosphere import thin_shell_obliquity
-from railfix.ranges.weights import PLAUSIBLE_CODE_M, SECOND_SIGNALS, channel_order, code_sigma_m
+from railfix.ranges.weights import DFMC_SIGNALS, PLAUSIBLE_CODE_M, SECOND_SIGNALS, channel_order, code_sigma_m
 from railfix.screens import Screened, Verdict
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def second_codes(
     if not second.size:
         return None
     shape = states.record.shape
-    code, cn0, delay_sigma = np.full((3, *shape), np.nan)
+    code, cn0, delay_m, delay_sigma = np.full((4, *shape), np.nan)
     column, rank = np.full(shape, -1), np.zeros(shape, dtype=np.intp)
     for choice in range(second.shape[1]):
         at = second[:, choice]
@@ -71,7 +71,7 @@ def second_codes(
         here = usable & (column < 0)
         code = np.where(here, observed - delay, code)
         cn0 = np.where(here, obs.cn0_dbhz[:, at], cn0)
-        delay_sigma = np.where(here, sigma, delay_sigma)
+        delay_m, delay_sigma = np.where(here, delay, delay_m), np.where(here, sigma, delay_sigma)
         column, rank = np.where(here, at, column), np.where(here, choice, rank)
     channel = np.arange(shape[1])
     ratio = channels.second_ratio[channel, rank]
@@ -80,6 +80,7 @@ def second_codes(
         code_m=code + states.clock_m - ratio * ionosphere_m - troposphere_m,
         noise_m=noise * channels.second_noise[channel, rank],
         cn0_dbhz=cn0,
+        group_delay_m=delay_m,
         delay_sigma_m=delay_sigma,
         ratio=ratio,
         pair=channel * second.shape[1] + rank,
@@ -100,7 +101,8 @@ def combined(
     if second is None:
         return ranges, state
     usable = ranges.reason == 0
-    noise = np.sqrt(np.maximum(ranges.sigma_m**2 - config.noise.floor_sigma_m**2, 1e-4))
+    known = config.noise.floor_sigma_m**2 + (ranges.nominal_m**2 if config.dual_frequency_sbas else 0.0)
+    noise = np.sqrt(np.maximum(ranges.sigma_m**2 - known, 1e-4))
     vertical = np.hypot(config.nominal.ionosphere_sigma_m, ionosphere_sigma_m)
     found, state = combine_codes(
         ranges.time,
@@ -112,13 +114,21 @@ def combined(
         state,
         config.two_frequencies,
     )
+    local_m, nominal_m = ranges.bound_sigma_m, np.zeros(usable.shape)
+    if config.dual_frequency_sbas:
+        gps = np.char.startswith(ranges.satellite, "G")  # corrections refer to clocks without group delays
+        delays = (np.where(gps, each, 0.0) for each in (ranges.satellites.group_delay_m, second.group_delay_m))
+        code = np.where(usable, ranges.corrected_code_m, np.nan)
+        found = ionosphere_free(code, noise, second, tuple(delays), found)
+        nominal_m = np.where(local_m > 0.0, ranges.nominal_m, 0.0)
+        local_m = np.sqrt(np.maximum(local_m**2 - nominal_m**2, 0.0))
     joint = np.isfinite(found.share)
     magnified = np.where(joint, np.abs(1.0 - found.share) + np.abs(found.share), 1.0)
     ranges = changed(
         ranges,
         corrected_code_m=np.where(joint, found.code_m, ranges.corrected_code_m),
         sigma_m=np.where(joint, np.sqrt(ranges.sigma_m**2 + found.variance_m2), ranges.sigma_m),
-        bound_sigma_m=ranges.bound_sigma_m * magnified,
+        bound_sigma_m=np.hypot(local_m * magnified, nominal_m),
         bias_m=ranges.bias_m * magnified,
         combined=found,
     )
@@ -257,7 +267,9 @@ class ChannelBook:
 
     def _second(self, obs: Observations, columns: Indices, frequency_hz: Floats) -> dict[str, Any]:
         """Return the second signals of the channels (`Channels`)."""
-        wanted = SECOND_SIGNALS if self._config.frequencies == "two" else {}
+        wanted: Mapping[str, Sequence[str]] = SECOND_SIGNALS if self._config.frequencies == "two" else {}
+        if self._config.dual_frequency_sbas:
+            wanted = {letter: second for letter, (_, second) in DFMC_SIGNALS.items()}
         of_satellite: dict[str, dict[str, int]] = {}
         for i, (name, signal) in enumerate(zip(obs.satellite.tolist(), obs.signal.tolist(), strict=True)):
             of_satellite.setdefault(name, {})[signal] = i

@@ -117,7 +117,7 @@ class Config(ScreenSettings):
     exclude: tuple[Annotated[str, Field(pattern=r"^[GJECR]([0-9]{2})?$")], ...] = ()
     #: Signals of each constellation in order of preference; the first one observed is used.
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
-    frequencies: Literal["one", "two"] = "one"  #: Codes of a satellite combined (not with SBAS).
+    frequencies: Literal["one", "two"] = "one"  #: Codes of a satellite combined (not with SBAS on L1).
     two_frequencies: TwoFrequencyLimits = TwoFrequencyLimits()  #: Limits of that.
     #: Screens that are on; health and validity of the satellites are always checked.
     screens: tuple[str, ...] = SCREEN_NAMES
@@ -158,7 +158,10 @@ class Config(ScreenSettings):
     #: Logs of SBAS messages, or "stream" for those of the receivers: their corrections take the place of the models,
     #: and satellites without a valid one are rejected. Empty: no SBAS.
     sbas: tuple[Path, ...] | Literal["stream"] = ()
-    #: GEO whose messages are used; "best" is the one with the most usable fast corrections.
+    #: Messages that count: those of L1 correct GPS L1 C/A, those of L5 (dual-frequency) the ionosphere-free codes of
+    #: GPS L1 C/A and L5, Galileo E1 and E5a. Satellites without both codes are rejected.
+    sbas_band: Literal["L1", "L5"] = "L1"
+    #: GEO whose messages are used; "best" is the one with the most usable fast corrections (L5: most corrections).
     sbas_prn: int | Literal["best"] = "best"
     sbas_limits: SbasLimits = SbasLimits()  #: Time-outs, use of message type 0, treatment of missing degradation data.
     base: BaseLimits = BaseLimits()  #: Limits of the differences with a base station.
@@ -239,6 +242,20 @@ class Config(ScreenSettings):
         if "code" not in value or len(set(value)) != len(value):
             raise ValueError("name each measurement once, code among them: places are sought by codes")
         return tuple(name for name in FILTER_SOURCES if name in value)
+
+    @model_validator(mode="after")
+    def _codes_with_l5(self) -> Self:
+        if self.dual_frequency_sbas and self.carrier in ("float", "fixed"):
+            raise ValueError(
+                f"sbas_band = L5 corrects codes of two frequencies, carrier = {self.carrier} takes the phase of one: "
+                "give carrier = off or smoothed"
+            )
+        return self
+
+    @property
+    def dual_frequency_sbas(self) -> bool:
+        """Whether SBAS on L5 corrects ionosphere-free codes."""
+        return bool(self.sbas) and self.sbas_band == "L5"
 
     @model_validator(mode="after")
     def _support_without_sbas(self) -> Self:

@@ -26,8 +26,16 @@ from railfix.positioning.two_frequencies import Combined, SecondCodes
 from railfix.ranges.atmosphere import SeenFrom, modelled_delays
 from railfix.ranges.base_station import BaseDifferences
 from railfix.ranges.cn0_curve import Cn0Curve
-from railfix.ranges.corrected import SBAS_SIGNAL, corrected_satellites, sbas_delays
+from railfix.ranges.corrected import (
+    SBAS_SIGNAL,
+    corrected_satellites,
+    dfmc_delays,
+    dfmc_satellites,
+    sbas_delays,
+)
 from railfix.ranges.error_model import Conditions, ErrorModel
+from railfix.ranges.sbas import SatelliteCorrections, SbasCorrections
+from railfix.ranges.sbas.dfmc import DfmcCorrections
 from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m, first_available
 from railfix.screens import AntennaRanges, Screened, Verdict, suspicion_sigma_m
 
@@ -150,7 +158,9 @@ def correct_ranges(
         record=None if fixes is None else fixes.record,
     )
     lacking = np.zeros(code.shape, dtype=np.int64)
-    if fixes is not None:
+    if isinstance(fixes, DfmcCorrections):
+        states, lacking = dfmc_satellites(states, fixes, satellite, signal)
+    elif fixes is not None:
         states, lacking = corrected_satellites(states, fixes)
         lacking = np.where(signal == SBAS_SIGNAL, lacking, int(Reason.SBAS_NOT_COVERED))
     for mask, bits in (
@@ -161,11 +171,15 @@ def correct_ranges(
     ):
         reason = np.where(mask, reason | bits, reason)
     clean = code + states.clock_m - states.group_delay_m
-    if fixes is not None:
+    if isinstance(fixes, SatelliteCorrections):
         clean = clean + np.nan_to_num(fixes.fast_m)
     anchor = _anchor(antennas, config, usable_ranges(states, clean, _ANCHOR_WEIGHT, reason, groups))
     seen, frequency = SeenFrom.of(anchor, states.position_ecef_m), channels.frequency_hz
-    if sbas is None or fixes is None:
+    if isinstance(sbas, SbasCorrections) and isinstance(fixes, SatelliteCorrections):
+        delays = sbas_delays(sbas, fixes, obs.time, seen, frequency)
+        beyond = nominal = delays.sigma_m
+        reason = np.where(observed, reason | delays.reason, reason)
+    else:
         delays = modelled_delays(
             obs.time,
             seen,
@@ -176,16 +190,18 @@ def correct_ranges(
         )
         beyond = np.hypot(delays.sigma_m, config.nominal.stated_m(states.accuracy_m))
         nominal = np.hypot(config.nominal.sigma_m(seen.elevation_deg), beyond)
-    else:
-        delays = sbas_delays(sbas, fixes, obs.time, seen, frequency)
-        beyond = nominal = delays.sigma_m
-        reason = np.where(observed, reason | delays.reason, reason)
+        if isinstance(fixes, DfmcCorrections):
+            delays = dfmc_delays(fixes, obs.time, seen, delays)
+            beyond = nominal = delays.sigma_m
     second = base = None
     if received.base is not None:
         base = received.base.at(obs.time, satellite, signal, anchor, config.base)
-    elif sbas is None:
+    elif not isinstance(sbas, SbasCorrections):
         air = delays.ionosphere_m, delays.troposphere_m
         second = second_codes(obs, channels, states, received, seen.elevation_deg, *air, config)
+    if isinstance(fixes, DfmcCorrections):
+        alone = np.isnan(second.code_m) if second is not None else np.ones(code.shape, dtype=bool)
+        reason = np.where((reason == 0) & alone, reason | int(Reason.SBAS_NO_IONOSPHERE), reason)
     clean = clean - delays.ionosphere_m - delays.troposphere_m
     if base is not None:
         differenced = np.isfinite(base.code_m)

@@ -269,7 +269,7 @@ def with_araim(
     noise = level_scale(solution.noise_scale, config)[:, None] * corrected.sigma_m[:, channels]
     if config.error_model is not None:
         noise = np.fmax(noise, corrected.bound_sigma_m[:, channels])
-    used = (corrected.reason[:, channels] == 0) & np.isfinite(place[:, :1])
+    used = (corrected.reason[:, channels] == 0) & np.isfinite(place[:, :1]) & support.holds(corrected.time)[:, None]
     integrity, accuracy = (
         np.where(used, np.sqrt(sigma**2 + air**2 + noise**2), np.nan)
         for sigma in (stated.sigma_ura_m, stated.sigma_ure_m)

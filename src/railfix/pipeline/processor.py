@@ -271,7 +271,13 @@ class EpochProcessor:
             off_map={name: solution.off_map[rows] for name, rows in zip(names, parts, strict=True)},
             pair=pair,
             sensors=sensors,
-            notes=(*_missing_notes(received), *received.notes, *self._lacking, *self._curve_notes(observations)),
+            notes=(
+                *_missing_notes(received),
+                *received.notes,
+                *self._lacking,
+                *self._curve_notes(observations),
+                *(self._support.notes(corrected.time) if self._support is not None else ()),
+            ),
         )
         after = dict(state.antennas)
         for name, part, own in zip(names, observations.values(), own_states, strict=True):

@@ -15,7 +15,7 @@ from railfix.gnss.orbits.record_selection import VALIDITY_S, validity_s
 from railfix.pipeline.config import Config
 from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR
 from railfix.ranges.base_station import BaseErrors
-from railfix.ranges.sbas import SbasCorrections, SbasMessages, SbasState
+from railfix.ranges.sbas import DfmcService, SbasCorrections, SbasMessages, SbasState
 
 Records = TypeVar("Records", KeplerRecords, GlonassRecords)
 
@@ -55,7 +55,7 @@ class Received:
 
     navigation: Navigation = field(default_factory=no_navigation)
     messages: SbasState | None = None  #: SBAS messages of the GEO in use; None: SBAS is not used.
-    sbas: SbasCorrections | None = None  #: Corrections by these messages.
+    sbas: SbasCorrections | DfmcService | None = None  #: Corrections by these messages.
     #: Ionospheric coefficients in use; None leaves the ionosphere uncorrected, or to SBAS; shape (8,).
     klobuchar: Floats | None = None
     #: Standard deviation of the vertical delay by coefficients that were not received; else 0.
@@ -87,10 +87,14 @@ def known_from_start(
     if messages is None:
         return received
     try:
-        sbas = SbasCorrections.from_log(messages, prn=config.sbas_prn, limits=config.sbas_limits)
+        sbas: SbasCorrections | DfmcService = (
+            DfmcService.from_log(messages, prn=config.sbas_prn)
+            if config.sbas_band == "L5"
+            else SbasCorrections.from_log(messages, prn=config.sbas_prn, limits=config.sbas_limits)
+        )
     except ValueError as error:
         raise SettingsError(f"sbas_prn = {config.sbas_prn}: {error}") from None
-    state = SbasState(prn=sbas.prn, limits=config.sbas_limits).received(messages)
+    state = SbasState(prn=sbas.prn, limits=config.sbas_limits, band=config.sbas_band).received(messages)
     return _with_notes(replace(received, messages=state, sbas=sbas), config)
 
 
@@ -146,7 +150,7 @@ def _empty_state(config: Config) -> SbasState:
         raise SettingsError(
             "sbas_prn = best: the best GEO is known only after all messages are received; give its PRN (sbas_prn = 137)"
         )
-    return SbasState(prn=config.sbas_prn, limits=config.sbas_limits)
+    return SbasState(prn=config.sbas_prn, limits=config.sbas_limits, band=config.sbas_band)
 
 
 def _with_notes(received: Received, config: Config) -> Received:
@@ -210,6 +214,13 @@ def _unite(old: Records, new: Records, key: tuple[str, ...]) -> Records:
 
 def _with_ionosphere(received: Received, config: Config) -> Received:
     """Return the data with the Klobuchar coefficients in use, and notes where they are not those asked for."""
+    if isinstance(received.sbas, DfmcService):  # the model helps the screens, and cancels in the combination
+        modelled = _with_ionosphere(replace(received, sbas=None), config)
+        note = (
+            f"ionosphere: {config.ionosphere}, frequencies: {config.frequencies} asked for, ionosphere-free codes used "
+            f"in their place; troposphere: {config.troposphere} asked for, that of SBAS used"
+        )
+        return replace(modelled, sbas=received.sbas, notes=(note,))
     if received.sbas is not None:
         asked = f"ionosphere: {config.ionosphere}, troposphere: {config.troposphere}"
         note = f"{asked} asked for, those of SBAS used in their place"

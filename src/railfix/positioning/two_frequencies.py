@@ -17,7 +17,7 @@ The difference of the epoch itself, less what is predicted, is noise and multipa
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -59,6 +59,7 @@ class SecondCodes:
     code_m: Floats  #: Corrected by the models; NaN where there is none; shape (T, K).
     noise_m: Floats  #: Standard deviation of noise and multipath that the weights assume, shape (T, K).
     cn0_dbhz: Floats  #: Shape (T, K).
+    group_delay_m: Floats  #: That has been subtracted, shape (T, K).
     #: Of a group delay that is not broadcast in full, beside `TwoFrequencyLimits.delay_sigma_m`; shape (T, K).
     delay_sigma_m: Floats
     ratio: Floats  #: Square of the first frequency over the second, shape (T, K).
@@ -187,6 +188,32 @@ def combine_codes(
     )
     last = time[-1] if len(time) else own.last
     return found, TwoFrequencyState(names=own.names, sums=sums, scale=of_scale, last=last, age=age)
+
+
+def ionosphere_free(
+    code_m: Floats, noise_m: Floats, second: SecondCodes, delays_m: tuple[Floats, ...], found: Combined
+) -> Combined:
+    """Return the ionosphere-free combination of two codes, with the test of their difference by `combine_codes`.
+
+    ``P = (ratio P1 - P2) / (ratio - 1)``, whose noise no epoch before makes less.
+
+    Parameters
+    ----------
+    code_m, noise_m : ndarray, shape (T, K) [m]
+        As in `combine_codes`.
+    delays_m : tuple of ndarray, shapes (T, K) [m]
+        Group delays that the corrections contain already, of the first and the second code.
+    """
+    share = np.where(np.isfinite(code_m + second.code_m), -1.0 / (second.ratio - 1.0), np.nan)
+    first, other = code_m + delays_m[0], second.code_m + delays_m[1]
+    return replace(
+        found,
+        code_m=first + share * (other - first),
+        variance_m2=(1.0 - share) ** 2 * noise_m**2 + share**2 * second.noise_m**2 - noise_m**2,
+        share=share,
+        ionosphere_m=-share * (second.code_m - code_m),
+        ionosphere_sigma_m=-share * np.hypot(noise_m, second.noise_m),
+    )
 
 
 def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphere_m2: Floats) -> tuple[Floats, Floats]:

@@ -21,8 +21,10 @@ from railfix.gnss.orbits import SatelliteStates, satellite_states
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.ranges.atmosphere import Delays, SeenFrom, modelled_delays, rtca_troposphere_m, rtca_troposphere_sigma_m
 from railfix.ranges.sbas import IonosphereState, SatelliteCorrections, SatelliteState, SbasCorrections
+from railfix.ranges.sbas.dfmc import DfmcCorrections, DfmcState, residual_ionosphere_m
 from railfix.ranges.weights import (
     DEFAULT_SIGNALS,
+    DFMC_SIGNALS,
     PLAUSIBLE_CODE_M,
     CodeNoise,
     NominalErrors,
@@ -137,6 +139,48 @@ _REASON_OF: Final = {
 }
 #: Reason of each state of a satellite, by its number.
 REASONS: Final = np.array([int(_REASON_OF[state]) for state in sorted(SatelliteState)], dtype=np.int64)
+
+
+_DFMC_REASON_OF: Final = {
+    DfmcState.OK: Reason.USED,
+    DfmcState.STOPPED: Reason.SBAS_DO_NOT_USE,
+    DfmcState.NO_MASK: Reason.SBAS_NO_CORRECTION,
+    DfmcState.NOT_IN_MASK: Reason.SBAS_NOT_COVERED,
+    DfmcState.NO_CORRECTION: Reason.SBAS_NO_CORRECTION,
+    DfmcState.TIMED_OUT: Reason.SBAS_TIMED_OUT,
+    DfmcState.DO_NOT_USE: Reason.SBAS_DO_NOT_USE,
+    DfmcState.NO_DEGRADATION: Reason.SBAS_NO_CORRECTION,
+    DfmcState.NO_RECORD: Reason.SBAS_NO_CORRECTION,
+}
+#: The same of SBAS on L5.
+DFMC_REASONS: Final = np.array([int(_DFMC_REASON_OF[state]) for state in sorted(DfmcState)], dtype=np.int64)
+
+
+def dfmc_satellites(
+    states: SatelliteStates, fixes: DfmcCorrections, satellite: Strings, signal: Strings
+) -> tuple[SatelliteStates, Bits]:
+    """Satellites with the corrections of SBAS on L5 applied, and the reasons of those without, shape (T, K)."""
+    covered = [code in DFMC_SIGNALS.get(name[0], ((),))[0] for name, code in zip(satellite, signal, strict=True)]
+    moved, clock = states.position_ecef_m + fixes.position_m, states.clock_m + fixes.clock_m
+    reason = np.where(covered, DFMC_REASONS[fixes.state], int(Reason.SBAS_NOT_COVERED))
+    return replace(states, position_ecef_m=moved, clock_m=clock), reason
+
+
+def dfmc_delays(fixes: DfmcCorrections, time: Datetimes, seen: SeenFrom, modelled: Delays) -> Delays:
+    """Troposphere of DO-229D, with the sigma of corrected ionosphere-free codes; the modelled ionosphere cancels there.
+
+    ``sigma^2 = sigma_corrections^2 + sigma_ionosphere^2 + sigma_troposphere^2`` (ED-259A), without the receiver's.
+    """
+    sight = seen.satellite_ecef_m - seen.receiver_ecef_m[:, None, :]
+    along = fixes.sigma_along_m(sight / np.linalg.norm(sight, axis=-1, keepdims=True))
+    elevation = seen.elevation_deg
+    variance = along**2 + residual_ionosphere_m(elevation) ** 2 + rtca_troposphere_sigma_m(elevation) ** 2
+    return Delays(
+        ionosphere_m=modelled.ionosphere_m,
+        troposphere_m=rtca_troposphere_m(time, seen.latitude_deg, seen.height_m, elevation),
+        sigma_m=np.where(fixes.state == DfmcState.OK, np.sqrt(variance), np.nan),
+        reason=np.zeros(fixes.state.shape, dtype=np.int64),
+    )
 
 
 def corrected_satellites(states: SatelliteStates, fixes: SatelliteCorrections) -> tuple[SatelliteStates, Bits]:

@@ -39,6 +39,12 @@ SECOND_SIGNALS: Final[Mapping[str, tuple[str, ...]]] = {
     "C": ("7I", "7Q", "7X", "6I", "6Q", "6X", "5P", "5X", "5D"),
 }
 
+#: Signals that SBAS on L5 corrects, first and second, by constellation.
+DFMC_SIGNALS: Final[Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
+    "G": (("1C",), ("5Q", "5X", "5I")),
+    "E": (("1C", "1X", "1B"), ("5Q", "5X", "5I")),
+}
+
 
 class CodeNoise(Settings):
     """Standard deviation of a corrected pseudorange from C/N0 and elevation.

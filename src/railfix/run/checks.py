@@ -10,7 +10,7 @@ import numpy as np
 from railfix.core.errors import MismatchError, NoPositionError
 from railfix.gnss.navigation import Navigation
 from railfix.motion.samples import SensorSamples
-from railfix.ranges.sbas import SbasCorrections
+from railfix.ranges.sbas import DfmcService, SbasCorrections
 from railfix.run.tally import AntennaTally, Tally
 from railfix.track.track import ANOTHER_PLACE_M
 
@@ -83,7 +83,7 @@ def check_same_time(tally: Tally) -> None:
         raise MismatchError(f"{spans_text} (GPS time), expected logs of one run; give logs that overlap")
 
 
-def check_sbas_time(sbas: SbasCorrections | None, tally: Tally) -> None:
+def check_sbas_time(sbas: SbasCorrections | DfmcService | None, tally: Tally) -> None:
     """Raise MismatchError where not one message of the SBAS was received during a log."""
     for name, antenna in tally.antennas.items():
         if sbas is None or antenna.first is None or antenna.last is None:
@@ -112,7 +112,7 @@ def check_whole_run(
     navigation: Navigation,
     tally: Tally,
     *,
-    sbas: SbasCorrections | None = None,
+    sbas: SbasCorrections | DfmcService | None = None,
     sensors: SensorSamples | None = None,
     causes: Mapping[str, str] | None = None,
 ) -> None:

@@ -72,7 +72,7 @@ def processor_of(
     if config.sbas and config.sbas != "stream":
         from railfix.ranges.sbas import read_sbas
 
-        messages = read_sbas(list(config.sbas))
+        messages = read_sbas(list(config.sbas), band=config.sbas_band)
     return EpochProcessor(
         config,
         trajectories,

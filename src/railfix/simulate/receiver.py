@@ -23,7 +23,7 @@ from railfix.simulate.constellation import newest_record
 from railfix.simulate.errors.common import CommonErrors
 from railfix.simulate.errors.processes import ClockWalk, satellite_key
 from railfix.simulate.errors.settings import InterSystemSettings, NoiseSettings, TrackingSettings
-from railfix.simulate.scenario import ANTENNAS, Scenario
+from railfix.simulate.scenario import ANTENNAS, ReceiverSettings, Scenario
 
 
 class CarriedNoise:
@@ -207,8 +207,15 @@ def troposphere_m(latitude_deg: Floats, height_m: Floats, elevation_deg: Floats)
 
 #: Signals of each constellation, the first one first.
 SIGNALS: Final = {"G": ("1C", "2L"), "J": ("1C", "2L"), "E": ("1C", "7Q"), "C": ("2I", "6I")}
+#: With `ReceiverSettings.second` "L5".
+_WITH_L5: Final = {**SIGNALS, "G": ("1C", "5Q"), "J": ("1C", "5Q"), "E": ("1C", "5Q")}
 #: Streams of random numbers: white noise, correlated noise, cycle slips, satellites' power.
 _WHITE, _CARRIED, _SLIPS, _POWER = 2, 3, 4, 6
+
+
+def signals_of(letter: str, settings: ReceiverSettings) -> tuple[str, ...]:
+    """Signals that a receiver observes of a constellation."""
+    return (_WITH_L5 if settings.second == "L5" else SIGNALS)[letter][: settings.signals_per_satellite]
 
 
 class Receiver:
@@ -272,8 +279,9 @@ class Receiver:
 def group_delay_s(records: KeplerRecords, satellite: str, signal: str, time: Datetimes) -> Floats:
     """Group delay of a signal's code against the broadcast clock, shape (T,) [s].
 
-    GPS and QZSS: TGD on L1, scaled by (f1/f)^2 on L2 (IS-GPS-200, 20.3.3.3.3.2). Galileo I/NAV: BGD E5b/E1
-    likewise (OS SIS ICD, 5.1.5). BeiDou: TGD1 on B1I, none on B3I, which the clock refers to.
+    GPS and QZSS: TGD on L1, scaled by (f1/f)^2 on L2 (IS-GPS-200, 20.3.3.3.3.2), TGD on L5, whose ISC LNAV lacks.
+    Galileo I/NAV: BGD E5b/E1 likewise, on E5a that of both BGDs (OS SIS ICD, 5.1.5). BeiDou: TGD1 on B1I, none on B3I,
+    which the clock refers to.
     """
     row = newest_record(records, satellite, time)
     letter = satellite[0]
@@ -281,6 +289,9 @@ def group_delay_s(records: KeplerRecords, satellite: str, signal: str, time: Dat
     if letter == "C":
         return np.where(signal[0] == "2", records.group_delay_1_s[row], 0.0)
     delay = records.group_delay_2_s if letter == "E" else records.group_delay_1_s
+    if signal[0] == "5":
+        scale = (frequency["1"] / frequency["5"]) ** 2
+        return np.asarray(delay[row] - (records.group_delay_1_s[row] * (1.0 - scale) if letter == "E" else 0.0))
     return np.asarray(delay[row] * (frequency["1"] / frequency[signal[0]]) ** 2)
 
 

@@ -18,7 +18,7 @@ from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.io.rinex import write_navigation, write_observations
 from railfix.run.output import CSV_TIME, OutputFolder, Overwrite
-from railfix.simulate.sbas.service import sbas_messages, write_sbas
+from railfix.simulate.sbas.stream import sbas_messages, write_sbas
 from railfix.simulate.scenario import ANTENNAS, Scenario, VehicleSettings
 from railfix.simulate.scenario_file import scenario_table
 from railfix.simulate.sensors.tables import COLUMNS, sensor_tables
@@ -106,7 +106,10 @@ def _list_effects(scenario: Scenario) -> str:
         "No sensors besides the receivers." if scenario.sensors is None else "Sensors besides the receivers.",
     ]
     if scenario.sbas is not None:
-        parts.append("SBAS messages that correct GPS and the ionosphere.")
+        what = (
+            "GPS and the ionosphere" if scenario.sbas.band == "L1" else "ionosphere-free codes of GPS and Galileo (L5)"
+        )
+        parts.append(f"SBAS messages that correct {what}.")
     if scenario.vehicle.sway_sigma_deg:
         parts.append("The body sways.")
     ranging = None if scenario.sensors is None else scenario.sensors.ranging

@@ -155,6 +155,7 @@ class ReceiverSettings(ScenarioSettings):
     """
 
     signals_per_satellite: Literal[1, 2] = 1  #: 1 gives four observables a satellite, 2 gives eight.
+    second: Literal["L2", "L5"] = "L2"  #: Second signals: L2C, E5b, B3I; or L5, E5a, B3I.
     #: 0 switches that noise off.
     code_sigma_m: NotNegative = 0.5
     phase_sigma_m: NotNegative = 0.002
@@ -218,6 +219,14 @@ class Scenario(ScenarioSettings):
         if len(set(names)) < len(names):
             raise ValueError(f"must have different names, none of {', '.join(_FILES)}")
         return stations
+
+    @model_validator(mode="after")
+    def _receivers_of_l5(self) -> Scenario:
+        receiver = self.receiver
+        two = receiver.signals_per_satellite == 2 and receiver.second == "L5"
+        if self.sbas is not None and self.sbas.band == "L5" and not two:
+            raise ValueError('sbas.band = "L5" needs receiver.signals_per_satellite = 2 and receiver.second = "L5"')
+        return self
 
     @model_validator(mode="after")
     def _whole_epochs(self) -> Scenario:

@@ -21,7 +21,7 @@ from railfix.simulate.disturbance import CN0_SECOND_DB, Disturbances, SightGeome
 from railfix.simulate.environment import Environment
 from railfix.simulate.errors.common import CommonErrors, fault_m
 from railfix.simulate.motion import AntennaTruth, BodyMotion, Motion, antenna_truth, build_motion
-from railfix.simulate.receiver import SIGNALS, Receiver, ReceiverClocks, group_delay_s, ionosphere_m, troposphere_m
+from railfix.simulate.receiver import Receiver, ReceiverClocks, group_delay_s, ionosphere_m, signals_of, troposphere_m
 from railfix.simulate.scenario import ANTENNAS, Scenario
 
 #: Receivers report C/N0 in steps [dB-Hz].
@@ -161,8 +161,7 @@ class Simulation:
             elevation, _ = elevation_azimuth(link.satellite_ecef_m[:, None, :], place)
             if elevation.max() > scenario.sky.cutoff_deg - 0.5:
                 names.append(satellite)
-        count = scenario.receiver.signals_per_satellite
-        return tuple((name, signal) for name in names for signal in SIGNALS[name[0]][:count])
+        return tuple((name, signal) for name in names for signal in signals_of(name[0], scenario.receiver))
 
     def header(self, antenna: str) -> ObservationHeader:
         """Header of a receiver's log; the approximate position is rounded to 100 m, that of the station is exact."""

@@ -153,8 +153,8 @@ def validity_s(records: KeplerRecords) -> Floats:
     return np.fmax(base, records.fit_interval_h * 1800.0)
 
 
-#: Number of different issues of data: 8 bits in the records of GPS and QZSS, and in corrections.
-_ISSUES: Final = 256
+#: Number of different issues of data: 10 bits of Galileo; GPS and QZSS have 8.
+_ISSUES: Final = 1024
 #: Time span that a lookup key can hold [ms]: 278 years.
 _ISSUE_SPAN: Final = np.int64(2**43)
 _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
@@ -162,18 +162,21 @@ _MS: Final = np.timedelta64(1, "ms")
 
 
 class _Issues:
-    """Records of GPS and QZSS by satellite and issue, each from half-way between the toe before and its own."""
+    """Records by satellite and issue, each from half-way between the toe before and its own; F/NAV before I/NAV."""
 
     def __init__(self, navigation: Navigation) -> None:
         kepler = navigation.kepler
-        row = np.flatnonzero(kepler.message == "LNAV")
+        row = np.flatnonzero(np.isin(kepler.message, ("LNAV", "INAV", "FNAV")))
+        issue = kepler.iode[row] % np.where(kepler.message[row] == "LNAV", 256, _ISSUES)
         names, number = np.unique(kepler.satellite[row], return_inverse=True)
         self.number = {str(name): i for i, name in enumerate(names)}
-        series = number.astype(np.int64) * _ISSUES + kepler.iode[row] % _ISSUES
+        series = number.astype(np.int64) * _ISSUES + issue
         toe = kepler.toe[row]
-        order = np.lexsort((toe, series))
-        self.series, self.row = series[order], row[order].astype(np.int64)
-        toe = toe[order]
+        order = np.lexsort((kepler.message[row] == "FNAV", toe, series))
+        twice = (series[order][1:] == series[order][:-1]) & (toe[order][1:] == toe[order][:-1])
+        order = order[~np.append(twice, np.zeros(min(len(order), 1), dtype=bool))]
+        row, toe = row[order], toe[order]
+        self.series, self.row = series[order], row.astype(np.int64)
         since = toe.copy()
         same = np.zeros(len(row), dtype=bool)
         same[1:] = self.series[1:] == self.series[:-1]
@@ -196,17 +199,18 @@ def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, i
     satellite : ndarray of str, shape (M,)
     time : ndarray of datetime64[ns], shape (T,)
     issue : ndarray of int, shape (T, M)
-        IODE, 0 to 255; -1 for none.
+        IODE, of Galileo IODnav; -1 for none. Of 10 bits for GPS and QZSS (IODC) the lower 8 count.
 
     Returns
     -------
     ndarray of int, shape (T, M)
         The record of that issue whose reference time is nearest, if the epoch lies in its
-        validity; -1 elsewhere, and for satellites other than GPS and QZSS. The record may
+        validity; -1 elsewhere, and for satellites other than GPS, QZSS and Galileo. The record may
         have been transmitted after the epoch: see `SatelliteStates.future_record`.
     """
     table = _issues_of(navigation)
     number = np.array([table.number.get(str(name), -1) for name in satellite], dtype=np.int64)
+    issue = np.where(np.char.startswith(satellite, "E") | (issue < 0), issue, issue % 256)
     series = np.where((issue >= 0) & (number >= 0), number * _ISSUES + issue, -1)
     if not len(table.key):
         return np.full(series.shape, -1, dtype=np.int64)

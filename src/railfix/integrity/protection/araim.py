@@ -15,14 +15,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from itertools import combinations
-from typing import Annotated, Final, Literal, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 from scipy.special import ndtr
 
-from railfix.core.arrays import Floats, Integers, Masks
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
 from railfix.core.settings import Settings, read_toml, validated
@@ -260,10 +261,41 @@ class IntegritySupport(Settings):
     """Integrity support message (EU-U.S. Working Group C, ARAIM milestone 3 report; ADD 3.0, table 2)."""
 
     format: Literal["railfix integrity support 1"]
+    #: Period in which the message holds [GPS time]; None: not stated. Epochs outside have no ARAIM level.
+    valid_from: datetime | None = None
+    valid_until: datetime | None = None
     #: By letter; one without a statement is not used in the levels.
     constellation: dict[Letter, ConstellationSupport] = Field(min_length=1)
     #: Satellites with statements of their own.
     satellite: dict[Satellite, SatelliteSupport] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _period(self) -> Self:
+        ends = [end for end in (self.valid_from, self.valid_until) if end is not None]
+        if any(end.tzinfo is not None for end in ends):
+            raise ValueError("valid_from and valid_until are GPS time: write them without a time zone")
+        if len(ends) == 2 and not ends[0] < ends[1]:
+            raise ValueError(f"valid_from = {ends[0]} must be before valid_until = {ends[1]}")
+        return self
+
+    def holds(self, time: Datetimes) -> Masks:
+        """Whether the message holds at epochs, shape (T,)."""
+        first, last = (
+            np.datetime64("NaT" if end is None else end, "ns") for end in (self.valid_from, self.valid_until)
+        )
+        return ~((time < first) | (time > last))
+
+    def notes(self, time: Datetimes) -> tuple[str, ...]:
+        """Return a sentence where the message states no end, or does not hold at all of some epochs."""
+        if self.valid_until is None:
+            return ("integrity support message: it states no valid_until; whether it has expired is not known",)
+        if self.holds(time).all():
+            return ()
+        first = "" if self.valid_from is None else f"from {self.valid_from} "
+        return (
+            f"integrity support message: valid {first}until {self.valid_until} (GPS time); epochs outside have no "
+            "ARAIM level, give a message of their time",
+        )
 
     def arrays(self, satellites: Sequence[str]) -> SupportArrays:
         """Return the statements on satellites; NaN for constellations without one."""

@@ -1,6 +1,6 @@
 """Ephemerides put together from navigation subframes as they are received.
 
-A record needs several subframes of one issue: GPS and QZSS three, Galileo five words, BeiDou three (D1)
+A record needs several subframes of one issue: GPS and QZSS three, Galileo five words, BeiDou three (D1, B-CNAV2)
 or ten pages (D2), GLONASS four strings. `assembled` takes the subframes of a piece of a stream and what
 earlier pieces left unfinished, so that a stream cut anywhere gives the same records.
 """
@@ -8,20 +8,21 @@ earlier pieces left unfinished, so that a stream cut anywhere gives the same rec
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes
+from railfix.core.arrays import Datetimes
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.io.receiver import nav_messages
-from railfix.io.receiver.framing import Field, Subframes, fields, packed_words, unsigned
+from railfix.io.receiver.framing import Subframes, fields
 from railfix.io.receiver.measurements import (
     Record,
     Values,
+    bcnav2_record,
     beidou_record,
     cnav_record,
     frame_time,
@@ -29,20 +30,11 @@ from railfix.io.receiver.measurements import (
     glonass_record,
     gps_record,
 )
+from railfix.io.receiver.pages import CNAV_FROM, E1B_SOURCE, E5A_SOURCE, E5B_SOURCE, FNAV_FROM, decoded_pages
 from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_records, kepler_records
 
-#: Galileo data source: I/NAV with clock and group delay E5b/E1, received on E1-B or on E5b-I.
-_E1B_SOURCE, _E5B_SOURCE = 1 << 0 | 1 << 9, 1 << 2 | 1 << 9
-#: Galileo data source: F/NAV with clock and group delay E5a/E1.
-_E5A_SOURCE: Final = 1 << 1 | 1 << 8
 #: Constellation of RTCM ephemeris messages.
 _RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1045: "E", 1046: "E", 1020: "R"}
-_UBX_E5B: Final = (5, 6)
-_UBX_E5A: Final = (3, 4)
-#: Signals with CNAV: L2C and L5.
-_CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}
-#: Numbers of F/NAV pages and of CNAV messages among those of a satellite come after these.
-_FNAV_FROM, _CNAV_FROM = 200, 300
 #: Time from the beginning of a GLONASS frame in which its strings 1 to 4 come.
 _STRINGS_S: Final = 15.0
 #: Longest time from the last epoch to the string that counts as received then.
@@ -98,7 +90,7 @@ def assembled(
     builder = _EphemerisBuilder(state or Unfinished())
     builder.waiting = {name: first if np.isnat(at) else at for name, at in builder.waiting.items()}
     after = np.full(len(time), _NEVER) if after is None else after
-    pages, counts = _pages(subframes)
+    pages, counts = decoded_pages(subframes)
     for row, satellite, number, values in pages:
         builder.settle(time[row])
         builder.add(satellite, number, values, time[row], after[row])
@@ -122,9 +114,9 @@ def _rtcm_record(kind: int, satellite: str, values: Values, time: np.datetime64)
     """Record of one RTCM 3 ephemeris message."""
     match kind:
         case 1045:
-            return galileo_record(satellite, {**values, "source": float(_E5A_SOURCE)}, time)
+            return galileo_record(satellite, {**values, "source": float(E5A_SOURCE)}, time)
         case 1046:
-            return galileo_record(satellite, {**values, "source": float(_E1B_SOURCE | _E5B_SOURCE)}, time)
+            return galileo_record(satellite, {**values, "source": float(E1B_SOURCE | E5B_SOURCE)}, time)
         case 1042:
             return beidou_record(satellite, "", values, time)
         case 1020:
@@ -145,114 +137,8 @@ def navigation_of(parts: Assembled, *, sources: tuple[str, ...] = ()) -> Navigat
     )
 
 
-def _pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], Counter[str]]:
-    """Decoded pages in the order of the stream: row, satellite, number, fields."""
-    counts = Counter(subframes.skipped)
-    pages: list[tuple[int, str, int, Values]] = []
-    letters = subframes.satellite.astype("<U1")
-    for letter, decode in (("G", _lnav), ("J", _lnav), ("E", _inav), ("C", _beidou), ("R", _glonass)):
-        rows = np.flatnonzero(letters == letter)
-        if len(rows):
-            for row, number, values in decode(subframes.take(rows), counts):
-                pages.append((int(rows[row]), str(subframes.satellite[rows[row]]), number, values))
-    pages.sort(key=lambda page: page[0])
-    return pages, counts
-
-
-def _rows(bits: Bytes, rows: np.ndarray, layout: Mapping[str, Field]) -> Iterator[tuple[int, Values]]:
-    """Fields of some rows, a mapping each."""
-    table = fields(bits[rows], layout)
-    for k, row in enumerate(rows.tolist()):
-        yield row, {name: float(values[k]) for name, values in table.items()}
-
-
 def _nonzero(counts: Counter[str]) -> dict[str, int]:
     return {what: number for what, number in counts.items() if number}
-
-
-def _lnav(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
-    letter, civil = str(part.satellite[0][0]), part.signal == 0
-    yield from _cnav(part, letter, counts)
-    bits = packed_words(part.words, drop=6, keep=24)
-    number = unsigned(bits, 43, 3)
-    valid = civil & (unsigned(bits, 0, 8) == 0x8B)
-    for k in (1, 2, 3, 4):
-        for row, values in _rows(
-            bits, np.flatnonzero(valid & (number == k)), nav_messages.LNAV_HEAD | nav_messages.LNAV[k]
-        ):
-            yield row, k, values
-
-
-def _cnav(part: Subframes, letter: str, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
-    cnav = np.isin(part.signal, _CNAV_SIGNALS[letter])
-    counts[f"{letter} pages of other messages"] += int(np.count_nonzero(~cnav & (part.signal != 0)))
-    if not cnav.any():
-        return
-    bits = packed_words(part.words, drop=0, keep=32)
-    valid = cnav & (unsigned(bits, 0, 8) == 0x8B) & nav_messages.has_crc(bits, nav_messages.CNAV_CHECKED)
-    counts[f"{letter} CNAV without valid CRC"] += int(np.count_nonzero(cnav & ~valid))
-    kind = unsigned(bits, 14, 6)
-    for k, layout in nav_messages.CNAV.items():
-        # a message of type 61 of QZSS is one of type 30
-        rows = np.flatnonzero(valid & ((kind == k) | ((kind == 61) & (k == 30) & (letter == "J"))))
-        for row, values in _rows(bits, rows, nav_messages.CNAV_HEAD | layout):
-            yield row, _CNAV_FROM + k, values
-
-
-def _fnav(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
-    fnav = np.isin(part.signal, _UBX_E5A)
-    if not fnav.any():
-        return
-    bits = packed_words(part.words, drop=0, keep=32)
-    valid = fnav & nav_messages.has_crc(bits, nav_messages.FNAV_CHECKED)
-    counts["E pages without valid CRC"] += int(np.count_nonzero(fnav & ~valid))
-    kind = unsigned(bits, 0, 6)
-    for k, layout in nav_messages.FNAV.items():
-        for row, values in _rows(bits, np.flatnonzero(valid & (kind == k)), layout):
-            yield row, _FNAV_FROM + k, values
-
-
-def _inav(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
-    inav = np.isin(part.signal, (1, *_UBX_E5B))
-    yield from _fnav(part, counts)
-    counts["E pages of other messages"] += int(np.count_nonzero(~inav & ~np.isin(part.signal, _UBX_E5A)))
-    bits, valid = nav_messages.inav_words(part.words)
-    counts["E pages without valid CRC"] += int(np.count_nonzero(inav & ~valid))
-    kind = unsigned(bits, 0, 6)
-    e5b = np.isin(part.signal, _UBX_E5B)
-    for k in range(1, 7):
-        for row, values in _rows(bits, np.flatnonzero(inav & valid & (kind == k)), nav_messages.INAV[k]):
-            yield row, k, {**values, "source": float(_E5B_SOURCE if e5b[row] else _E1B_SOURCE)}
-
-
-def _beidou(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
-    legacy = np.isin(part.signal, (0, 1, 2, 3, 4, 10))
-    counts["C CNAV"] += int(np.count_nonzero(~legacy))
-    bits = packed_words(part.words, drop=0, keep=30)
-    number = np.array([int(name[1:]) for name in part.satellite.tolist()])
-    geo = (number <= 5) | (number >= 59)
-    subframe = unsigned(bits, 15, 3)
-    valid = legacy & (unsigned(bits, 0, 11) == 0x712)
-    for k in (1, 2, 3):
-        layout = nav_messages.BDS_HEAD | nav_messages.D1[k]
-        for row, values in _rows(bits, np.flatnonzero(valid & ~geo & (subframe == k)), layout):
-            yield row, k, values
-    pages = np.flatnonzero(valid & geo & (subframe == 1))
-    page = unsigned(bits, 42, 4)
-    for k in range(1, 11):
-        for row, head in _rows(bits, pages[page[pages] == k], nav_messages.BDS_HEAD):
-            packed = int("".join(map(str, bits[row].tolist())), 2)
-            yield row, 100 + k, {**head, "page": packed}  # the page whole: its fields go over page ends
-
-
-def _glonass(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
-    bits = packed_words(part.words[:, :3], drop=0, keep=32)[:, :85]
-    valid = nav_messages.glonass_hamming(bits)
-    counts["R strings without valid code"] += int(np.count_nonzero(~valid))
-    number = unsigned(bits, 1, 4)
-    for k in (1, 2, 3, 4):
-        for row, values in _rows(bits, np.flatnonzero(valid & (number == k)), nav_messages.GLONASS[k]):
-            yield row, k, {**values, "channel": float(part.glonass_channel[row])}
 
 
 class _EphemerisBuilder:
@@ -306,8 +192,8 @@ class _EphemerisBuilder:
 
     def _maker(self, letter: str, number: int) -> Callable[[str, np.datetime64], Record | None]:
         """Return what makes a record of the message that a subframe is of."""
-        if number > _FNAV_FROM:
-            return self._galileo_f if letter == "E" else self._modernised
+        if number > FNAV_FROM:
+            return {"E": self._galileo_f, "C": self._bcnav2}.get(letter, self._modernised)
         if letter == "C":
             return self._d2 if number > 100 else self._d1
         return {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}[letter]
@@ -363,15 +249,15 @@ class _EphemerisBuilder:
         return galileo_record(satellite, values, time) if f"E{int(values['number']):02d}" == satellite else None
 
     def _galileo_f(self, satellite: str, time: np.datetime64) -> Record | None:
-        parts = self._parts(satellite, tuple(range(_FNAV_FROM + 1, _FNAV_FROM + 5)))
+        parts = self._parts(satellite, tuple(range(FNAV_FROM + 1, FNAV_FROM + 5)))
         if parts is None or len({part["iod"] for part in parts}) != 1:
             return None
-        values = {**parts[3], **parts[2], **parts[1], **parts[0], "source": float(_E5A_SOURCE)}
+        values = {**parts[3], **parts[2], **parts[1], **parts[0], "source": float(E5A_SOURCE)}
         return galileo_record(satellite, values, time) if f"E{int(values['number']):02d}" == satellite else None
 
     def _modernised(self, satellite: str, _: np.datetime64) -> Record | None:
         """Record of CNAV; its three messages are of one issue where their reference times are one."""
-        parts = self._parts(satellite, tuple(_CNAV_FROM + k for k in nav_messages.CNAV))
+        parts = self._parts(satellite, tuple(CNAV_FROM + k for k in nav_messages.CNAV))
         if parts is None or not parts[0]["toe_sow_s"] == parts[1]["toe_sow_s"] == parts[2]["toc_s"]:
             return None
         letter, number = satellite[0], f"{int(parts[0]['number']):02d}"
@@ -379,6 +265,19 @@ class _EphemerisBuilder:
             return None
         self.klobuchar.setdefault(letter, np.array([parts[2][f"ion{k}"] for k in range(8)]))
         return cnav_record(satellite, {**parts[2], **parts[1], **parts[0]})
+
+    def _bcnav2(self, satellite: str, _: np.datetime64) -> Record | None:
+        """Record of B-CNAV2: message 11 follows 10, and the clock's issue ends with that of the ephemeris."""
+        parts = self._parts(satellite, tuple(CNAV_FROM + k for k in nav_messages.BCNAV2))
+        if (
+            parts is None
+            or parts[1]["tow_s"] != parts[0]["tow_s"] + 3
+            or int(parts[2]["iodc"]) & 255 != parts[0]["iode"]
+        ):
+            return None
+        values = {**parts[2], **parts[1], **parts[0]}
+        known = int(values["kind"]) in nav_messages.BCNAV2_AXIS_M and f"C{int(values['number']):02d}" == satellite
+        return bcnav2_record(satellite, values) if known else None
 
     def _d1(self, satellite: str, time: np.datetime64) -> Record | None:
         parts = self._parts(satellite, (1, 2, 3))

@@ -354,6 +354,10 @@ def joined_subframes(first: Subframes, second: Subframes) -> Subframes:
     return both.take(np.argsort(both.order, kind="stable"))
 
 
+#: Signal number of SBAS on L5 among subframes; UBX has none.
+SBAS_L5: Final = -5
+
+
 @dataclass(frozen=True, kw_only=True)
 class SbasFrames:
     """SBAS messages as a receiver passes them on, N of them; parity and preamble not checked here."""
@@ -364,6 +368,7 @@ class SbasFrames:
 
     prn: Integers
     octets: Bytes  #: The 250 bits from the first preamble bit on, zero behind; shape (N, 32).
+    on_l5: Masks  #: Sent on L5, not on L1; shape (N,).
 
     def __len__(self) -> int:
         return len(self.time)
@@ -375,7 +380,8 @@ def sbas_frames(subframes: Subframes, time: Datetimes) -> SbasFrames:
     octets = subframes.words[rows, :8].astype(">u4").view(np.uint8).reshape(len(rows), 32).copy()
     octets[:, 31] &= 0xC0
     prn = np.array([100 + int(name[1:]) for name in subframes.satellite[rows].tolist()], dtype=np.int64)
-    return SbasFrames(time=time[rows] + np.timedelta64(1, "ns"), prn=prn, octets=octets)
+    on_l5 = subframes.signal[rows] == SBAS_L5
+    return SbasFrames(time=time[rows] + np.timedelta64(1, "ns"), prn=prn, octets=octets, on_l5=on_l5)
 
 
 def packed_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]], *, drop: int, keep: int) -> Bytes:

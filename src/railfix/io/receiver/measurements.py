@@ -226,6 +226,18 @@ def cnav_record(satellite: str, values: Values) -> Record:
     return _raw(satellite, "CNAV", toc, numbers), _issue(values, "toe_sow_s", "top", "health", "m0", "af0_s")
 
 
+def bcnav2_record(satellite: str, values: Values) -> Record:
+    """Record of BeiDou from the fields of B-CNAV2 messages 10, 11 and 30 (the whole week: no date is needed)."""
+    sent = from_week(int(values["week"]) + _BDS_WEEK_MINUS_GPS, values["tow_s"])
+    numbers = {
+        **values,
+        "sqrt_a": float(np.sqrt(nav_messages.BCNAV2_AXIS_M[int(values["kind"])] + values["delta_a"])),
+        "transmitted": values["tow_s"],
+    }
+    issue = _issue(values, "iodc", "toe_sow_s", "toc_s", "health")
+    return _raw(satellite, "CNV2", nearest_week(values["toc_s"], sent), numbers), issue
+
+
 def galileo_record(satellite: str, values: Values, time: np.datetime64) -> Record:
     """Record of Galileo: I/NAV from the fields of its words 1 to 5 or of RTCM 1046, F/NAV from those of RTCM 1045."""
     week, epoch = _week_and_toc(values, int(values["week"]) + _GALILEO_WEEK_MINUS_GPS, time)

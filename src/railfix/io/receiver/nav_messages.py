@@ -1,10 +1,11 @@
-"""Navigation messages, bit by bit: GPS and QZSS LNAV and CNAV, Galileo I/NAV and F/NAV, BeiDou D1 and D2, GLONASS.
+"""Navigation messages, bit by bit: GPS, QZSS LNAV and CNAV, Galileo I/NAV, F/NAV, BeiDou D1, D2, B-CNAV2, GLONASS.
 
 Each function takes the bits of many messages of one kind and returns their fields, scaled, as arrays.
 Angles are turned from semicircles into radians.
 
 Sources: IS-GPS-200N, 20.3.3 and 30.3.3; IS-QZSS-PNT-005, 4.1.2 and 4.3.2; Galileo OS SIS ICD 2.1, 4.2.3 and 4.3.5;
-BDS-SIS-ICD-B1I 3.0, 5.2 and 5.3; GLONASS ICD L1, L2 5.1, 4.4.
+BDS-SIS-ICD-B1I 3.0, 5.2 and 5.3; BDS-SIS-ICD-B2a 1.0, 6.2 and 7 (as cssrlib
+1.2.1 reads it); GLONASS ICD L1, L2 5.1, 4.4.
 """
 
 from __future__ import annotations
@@ -218,8 +219,52 @@ FNAV: Final[dict[int, dict[str, Field]]] = {
         "cis": (32, 16, 2.0**-29, "s"),
     },
 }
-#: Bits of CNAV messages and F/NAV pages before their CRC.
-CNAV_CHECKED, FNAV_CHECKED = 276, 214
+#: BeiDou B-CNAV2 messages of 288 bits, without preamble and parity symbols; PRN, type and SOW are in all of them.
+BCNAV2_HEAD: Final[dict[str, Field]] = {"number": (0, 6, 1.0, "u"), "tow_s": (12, 18, 3.0, "u")}
+BCNAV2: Final[dict[int, dict[str, Field]]] = {
+    10: {
+        "week": (30, 13, 1.0, "u"),
+        "iode": (53, 8, 1.0, "u"),
+        "toe_sow_s": (61, 11, 300.0, "u"),
+        "kind": (72, 2, 1.0, "u"),
+        "delta_a": (74, 26, 2.0**-9, "s"),
+        "a_dot": (100, 25, 2.0**-21, "s"),
+        "delta_n": (125, 17, 2.0**-44 * _PI, "s"),
+        "delta_n_dot": (142, 23, 2.0**-57 * _PI, "s"),
+        "m0": (165, 33, 2.0**-32 * _PI, "s"),
+        "eccentricity": (198, 33, 2.0**-34, "u"),
+        "omega": (231, 33, 2.0**-32 * _PI, "s"),
+    },
+    11: {
+        "health": (30, 2, 1.0, "u"),
+        "flags": (32, 3, 1.0, "u"),
+        "sismai": (35, 4, 1.0, "u"),
+        "omega0": (42, 33, 2.0**-32 * _PI, "s"),
+        "i0": (75, 33, 2.0**-32 * _PI, "s"),
+        "omega_dot": (108, 19, 2.0**-44 * _PI, "s"),
+        "i_dot": (127, 15, 2.0**-44 * _PI, "s"),
+        "cis": (142, 16, 2.0**-30, "s"),
+        "cic": (158, 16, 2.0**-30, "s"),
+        "crs": (174, 24, 2.0**-8, "s"),
+        "crc": (198, 24, 2.0**-8, "s"),
+        "cus": (222, 21, 2.0**-30, "s"),
+        "cuc": (243, 21, 2.0**-30, "s"),
+    },
+    30: {
+        "toc_s": (42, 11, 300.0, "u"),
+        "af0_s": (53, 25, 2.0**-34, "s"),
+        "af1": (78, 22, 2.0**-50, "s"),
+        "af2": (100, 11, 2.0**-66, "s"),
+        "iodc": (111, 10, 1.0, "u"),
+        "group_delay_2_s": (121, 12, 2.0**-34, "s"),
+        "inter_signal_1": (133, 12, 2.0**-34, "s"),
+        "group_delay_1_s": (219, 12, 2.0**-34, "s"),
+    },
+}
+#: Semi-major axes that B-CNAV2 refers to [m]: medium orbits (kind 3), and those of the period of the Earth.
+BCNAV2_AXIS_M: Final = {1: 42_162_200.0, 2: 42_162_200.0, 3: 27_906_100.0}
+#: Bits of CNAV, F/NAV and B-CNAV2 before their CRC.
+CNAV_CHECKED, FNAV_CHECKED, BCNAV2_CHECKED = 276, 214, 264
 #: BeiDou: seconds of week and subframe number of D1 and D2 (10 words of 30 bits, parity included).
 BDS_HEAD: Final[dict[str, Field]] = {"tow_s": (((18, 8), (30, 12)), 20, 1.0, "u"), "subframe": (15, 3, 1.0, "u")}
 D1: Final[dict[int, dict[str, Field]]] = {

@@ -1,7 +1,8 @@
 """Septentrio SBF blocks as arrays: measurements, navigation pages, the receiver's own positions.
 
 Source: mosaic-X5 reference guide 4.14, sections 4.1.9 (satellites), 4.1.10 (signals), 4.2.1 (MeasEpoch), 4.2.2
-(GPSRawCA, GPSRawL2C, GPSRawL5, GALRawFNAV, GALRawINAV, BDSRaw, GLORawCA, QZSRawL1CA, QZSRawL2C, QZSRawL5, GEORawL1),
+(GPSRawCA, GPSRawL2C, GPSRawL5, GALRawFNAV, GALRawINAV, BDSRaw, GLORawCA, QZSRawL1CA, QZSRawL2C, QZSRawL5, GEORawL1,
+GEORawL5, BDSRawB1C, BDSRawB2a),
 4.2.8 (PVTGeodetic, PVTCartesian).
 """
 
@@ -16,7 +17,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week
 from railfix.gnss.signals import named_frequency_hz
-from railfix.io.receiver.framing import Frames, Subframes
+from railfix.io.receiver.framing import SBAS_L5, Frames, Subframes
 from railfix.io.receiver.measurements import Measurements
 from railfix.io.receiver.ubx import gathered
 
@@ -29,10 +30,13 @@ GPS_RAW_CA: Final = 4017
 GPS_RAW_L2C: Final = 4018
 GPS_RAW_L5: Final = 4019
 GEO_RAW_L1: Final = 4020
+GEO_RAW_L5: Final = 4021
 GAL_RAW_FNAV: Final = 4022
 GAL_RAW_INAV: Final = 4023
 GLO_RAW_CA: Final = 4026
 BDS_RAW: Final = 4047
+BDS_RAW_B1C: Final = 4218
+BDS_RAW_B2A: Final = 4219
 QZS_RAW_L1CA: Final = 4066
 QZS_RAW_L2C: Final = 4067
 QZS_RAW_L5: Final = 4068
@@ -47,8 +51,11 @@ _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
     GAL_RAW_FNAV: ("E", {20: 4}),
     GAL_RAW_INAV: ("E", {17: 1, 21: 5, 22: 5}),
     BDS_RAW: ("C", {28: 0, 29: 2, 30: 4}),
+    BDS_RAW_B1C: ("C", {13: 6}),
+    BDS_RAW_B2A: ("C", {14: 8}),
     GLO_RAW_CA: ("R", None),
     GEO_RAW_L1: ("S", None),
+    GEO_RAW_L5: ("S", {25: SBAS_L5}),
 }
 #: Bits of an even page of Galileo I/NAV without its tail, and of a page of BeiDou.
 _EVEN_BITS, _BDS_BITS = 114, 300

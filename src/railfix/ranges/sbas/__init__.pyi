@@ -1,12 +1,14 @@
 # The names of `railfix.ranges.sbas`, imported at their first use (lazy-loader).
 
 from .corrections import SbasCorrections, SbasState, best_prn
+from .dfmc import DfmcService
 from .files import from_receiver, read_sbas
 from .messages import SbasMessages
 from .results import IonosphereDelays, IonosphereState, SatelliteCorrections, SatelliteState
 from .standard import SbasLimits
 
 __all__ = [
+    "DfmcService",
     "IonosphereDelays",
     "IonosphereState",
     "SatelliteCorrections",

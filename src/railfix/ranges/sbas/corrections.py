@@ -12,9 +12,10 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
+from railfix.ranges.sbas.dfmc import MASK_S, DfmcService
 from railfix.ranges.sbas.grid import GridTables
 from railfix.ranges.sbas.ionosphere import ionosphere
-from railfix.ranges.sbas.messages import SbasMessages
+from railfix.ranges.sbas.messages import Band, SbasMessages
 from railfix.ranges.sbas.results import IonosphereDelays, SatelliteCorrections, SatelliteState
 from railfix.ranges.sbas.satellites import (
     FastInForce,
@@ -325,6 +326,7 @@ class SbasState:
     prn: int  #: Chosen beforehand: which GEO is best is known only after all messages were received.
     limits: SbasLimits = field(default_factory=SbasLimits)
     messages: SbasMessages = field(default_factory=SbasMessages.none)  #: Of that PRN, in the order of reception.
+    band: Band = "L1"  #: Frequency of the messages.
 
     def received(self, messages: SbasMessages) -> SbasState:
         """The state after more messages; those of other PRNs, and repeated ones of a second receiver, are left out."""
@@ -332,13 +334,19 @@ class SbasState:
         return replace(self, messages=joined.take(~joined.repeated()))
 
     @cached_property
-    def corrections(self) -> SbasCorrections:
+    def corrections(self) -> SbasCorrections | DfmcService:
         """Corrections by the messages received so far."""
+        if self.band == "L5":
+            return DfmcService(self.messages, prn=self.prn)
         return SbasCorrections(self.messages, prn=self.prn, limits=self.limits)
 
     def kept_from(self, time: np.datetime64) -> SbasState:
         """The state without the messages that no epoch from `time` on can use."""
         kind, age = self.messages.type, seconds(time - self.messages.time)
+        if self.band == "L5":  # the newest of each type, and corrections with all indicators since
+            newest = len(kind) - 1 - np.unique(kind[::-1], return_index=True)[1]
+            kept = (age <= MASK_S) | np.isin(np.arange(len(kind)), newest)
+            return self if kept.all() else replace(self, messages=self.messages.take(kept))
         oldest = np.where(kind == 27, self.limits.timeout_s("service"), OLDEST_S + 1.0)
         kept = age <= np.where(np.isin(kind, (*LEANT_ON, 27)), 2.0 * oldest, oldest)
         return self if kept.all() else replace(self, messages=self.messages.take(kept))

@@ -13,46 +13,33 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Integers, Strings
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.orbits.record_selection import issue_records
 from railfix.ranges.sbas.decode import UPPER, BitField, Layout, read_fields
-from railfix.ranges.sbas.messages import carried_parity, message_parity
+from railfix.ranges.sbas.messages import SbasMessages
+from railfix.ranges.sbas.standard import system_name
 
-#: First four bits of six successive messages.
-PREAMBLES: Final = (0x5, 0xC, 0x6, 0x9, 0x3, 0xA)
-TYPE_NAMES: Final = {
-    0: "do not use for safety",
-    31: "satellite mask",
-    32: "orbit, clock and covariance",
-    34: "integrity, changes",
-    35: "integrity, first 53 satellites",
-    36: "integrity, the others",
-    37: "degradation and scale",
-    39: "SBAS satellite's orbit, first part",
-    40: "SBAS satellite's orbit, second part",
-    42: "network time",
-    47: "almanac",
-    62: "internal test",
-    63: "null",
-}
 #: Satellites of one mask.
 AUGMENTED: Final = 92
-_FIRST: Final = 53
+#: Of which type 35 has the first ones, type 36 the others.
+FIRST: Final = 53
 #: Indicators without a sigma: not monitored is left out of type 32, 15 is do not use.
 DO_NOT_USE: Final = 15
 #: Sigma by indicator 0 to 14: least value and step [m].
 SIGMA_LEAST_M: Final = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 4.0, 6.0)
 SIGMA_STEP_M: Final = (0.0625, 0.125, 0.125, 0.125, 0.125, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5, 0.5, 1.0, 3.0, 6.0)
+_ONE_MORE: Final = -2
 #: Constellations of type 37 in order.
 _DEGRADED: Final = ("G", "R", "E", "C", "S", "")
 #: A mask, and an indicator, is valid for so long [s]; type 0 stops the sender for so long.
 MASK_S, INDICATOR_S, STOP_S = 600.0, 12.0, 60.0
 
-_HEAD: Final = {"preamble": BitField(0, 4), "type": BitField(4, 6)}
 LAYOUTS: Final[dict[int, Layout]] = {
     31: {"member": BitField(10, 1, number=214), "iodm": BitField(224, 2)},
     32: {
@@ -70,8 +57,8 @@ LAYOUTS: Final[dict[int, Layout]] = {
         "rate_share": BitField(222, 4),
     },
     34: {"change": BitField(10, 2, number=AUGMENTED), "dfrei": BitField(194, 4, number=7), "iodm": BitField(224, 2)},
-    35: {"dfrei": BitField(10, 4, number=_FIRST), "iodm": BitField(224, 2)},
-    36: {"dfrei": BitField(10, 4, number=AUGMENTED - _FIRST), "iodm": BitField(224, 2)},
+    35: {"dfrei": BitField(10, 4, number=FIRST), "iodm": BitField(224, 2)},
+    36: {"dfrei": BitField(10, 4, number=AUGMENTED - FIRST), "iodm": BitField(224, 2)},
     37: {
         "valid_32_s": BitField(10, 6, 6.0),
         "valid_40_s": BitField(16, 6, 6.0),
@@ -100,6 +87,8 @@ class DfmcState(IntEnum):
     DO_NOT_USE = 6
     #: Type 37 is missing: neither scale nor time-outs are known.
     NO_DEGRADATION = 7
+    #: No navigation record has the issue of data of the correction.
+    NO_RECORD = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,6 +97,7 @@ class DfmcCorrections:
 
     state: Integers  #: `DfmcState`, shape (T, K).
     issue: Integers  #: Issue of data of the record that the correction belongs to; -1 without one; shape (T, K).
+    record: Integers  #: Row of `navigation.kepler` with that issue, -1 without; shape (T, K).
     position_m: Floats  #: Added to the broadcast position, shape (T, K, 3).
     clock_m: Floats  #: Added to c times the broadcast clock, without group delays; shape (T, K).
     sigma_m: Floats  #: Sigma by the indicator and its scale, before covariance and degradation; shape (T, K).
@@ -132,11 +122,7 @@ def slot_satellite(slot: int) -> str:
     return f"C{slot - 158:02d}" if 159 <= slot <= 195 else ""
 
 
-def message_types(bits: Bytes) -> Integers:
-    """Types of L5 messages, shape (N,); -1 for those without one of the six preambles or with a wrong parity."""
-    head = read_fields(bits, _HEAD)
-    good = np.isin(head["preamble"], PREAMBLES) & (message_parity(bits) == carried_parity(bits))
-    return np.where(good, head["type"], -1)
+_SLOT_OF: Final = {slot_satellite(slot): slot for slot in range(1, 215) if slot_satellite(slot)}
 
 
 def residual_ionosphere_m(elevation_deg: Floats) -> Floats:
@@ -156,34 +142,63 @@ class DfmcService:
 
     Parameters
     ----------
-    time : ndarray of datetime64[ns], shape (N,)
-        Reception, rising.
-    bits : ndarray of uint8, shape (N, 32)
-        Messages from their first bit on, as `SbasMessages.bits`.
+    messages : SbasMessages
+        Of L5; those of other PRNs are left out.
+    prn : int
+    notes : tuple of str
+        Sentences on the origin of the messages, put before those of the corrections.
 
     Attributes
     ----------
-    counts : dict of str to int
-        Messages by what became of them.
+    span : tuple of datetime64[ns]
+        Reception of the first and the last message; NaT without messages.
     """
 
-    def __init__(self, time: Datetimes, bits: Bytes) -> None:
-        kinds = message_types(bits)
-        self.counts = {
-            "rejected" if kind < 0 else f"type {kind} {TYPE_NAMES.get(kind, 'unknown')}": int(np.sum(kinds == kind))
-            for kind in np.unique(kinds).tolist()
-        }
-        self._time = {kind: time[kinds == kind] for kind in (0, *LAYOUTS)}
-        self._read = {kind: read_fields(bits[kinds == kind], layout) for kind, layout in LAYOUTS.items()}
+    def __init__(self, messages: SbasMessages, *, prn: int, notes: tuple[str, ...] = ()) -> None:
+        own, never = messages.of(prn), np.datetime64("NaT", "ns")
+        self.prn = prn
+        self.span: tuple[np.datetime64, np.datetime64] = (own.time[0], own.time[-1]) if len(own) else (never, never)
+        self.notes = (
+            *notes,
+            f"SBAS on L5 asked for: corrections of {system_name(prn)} PRN {prn} used, for ionosphere-free codes of GPS "
+            "(L1 C/A, L5) and Galileo (E1, E5a); other satellites and signals are rejected",
+        )
+        self._time = {kind: own.time[own.type == kind] for kind in (0, *LAYOUTS)}
+        self._read = {kind: read_fields(own.bits[own.type == kind], layout) for kind, layout in LAYOUTS.items()}
         self._indicators = self._all_indicators()
 
-    def at(self, time: Datetimes, satellite: Strings) -> DfmcCorrections:
+    @classmethod
+    def from_log(cls, messages: SbasMessages, *, prn: int | Literal["best"] = "best") -> DfmcService:
+        """Return the corrections of recorded messages, of the PRN asked for or of that with the most of type 32.
+
+        Raises
+        ------
+        ValueError
+            There is no message of that PRN.
+        """
+        known = ", ".join(str(number) for number in messages.prns)
+        if prn == "best":
+            numbers, count = np.unique(messages.prn[messages.type == 32], return_counts=True)
+            prn = int(numbers[np.argmax(count)]) if len(numbers) else messages.prns[0]
+            choice = f"best SBAS PRN by corrections on L5: {prn} (the log has {known})"
+        elif prn in messages.prns:
+            choice = f"SBAS PRN {prn} was asked for; the log has {known}"
+        else:
+            raise ValueError(f"the log has no SBAS message of PRN {prn}; it has {known}")
+        notes = (*messages.notes, choice)
+        if zeros := int(np.sum(messages.of(prn).type == 0)):
+            notes += (f"PRN {prn} sent {zeros} messages of type 0 (do not use for safety): each stopped it for 60 s",)
+        return cls(messages, prn=prn, notes=notes)
+
+    def satellites(self, time: Datetimes, satellite: Strings, navigation: Navigation | None = None) -> DfmcCorrections:
         """Return the corrections of satellites at epochs.
 
         Parameters
         ----------
         time : ndarray of datetime64[ns], shape (T,)
         satellite : ndarray of str, shape (K,)
+        navigation : Navigation, optional
+            A correction is used only if a record has its issue of data; without it, as it is.
         """
         shape = (len(time), len(satellite))
         names = np.array([slot_satellite(int(slot)) for slot in self._read[32]["slot"]], dtype="<U3")
@@ -215,7 +230,12 @@ class DfmcService:
             good = np.flatnonzero(own["state"] == DfmcState.OK)
             if len(good):
                 self._correct(own, good, (time, row, ten, dfrei), name)
-        return DfmcCorrections(**result)
+        record = np.full(shape, -1)
+        if navigation is not None:
+            record = issue_records(navigation, satellite, time, result["issue"])
+            lost = (result["state"] == DfmcState.OK) & (record < 0)
+            result["state"][lost] = DfmcState.NO_RECORD
+        return DfmcCorrections(**result, record=record)
 
     def _correct(
         self, own: dict[str, Floats], good: Integers, at: tuple[Datetimes, Integers, Integers, Integers], name: str
@@ -250,9 +270,9 @@ class DfmcService:
         row, age = _newest(self._time[kind], time)
         return np.where(age <= longest_s, row, -1)
 
-    def _slots(self, name: str, mask: Integers) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.bool_]], Integers]:
+    def _slots(self, name: str, mask: Integers) -> tuple[Masks, Integers]:
         """Whether a satellite is in the mask in force, and its rank among those that are."""
-        slot = next((s for s in range(1, 215) if slot_satellite(s) == name), 0)
+        slot = _SLOT_OF.get(name, 0)
         if not slot or not len(self._time[31]):
             return np.zeros(len(mask), dtype=np.bool_), np.zeros(len(mask), dtype=np.int64)
         member = self._read[31]["member"][mask]
@@ -261,7 +281,7 @@ class DfmcService:
     def _all_indicators(self) -> tuple[Datetimes, Integers, Integers]:
         """Times, issue of the mask and indicators of all satellites of types 34 to 36; -1 where one says nothing.
 
-        Type 34: 0 nothing new, 1 an indicator of its own, 2 one more than before (-2 here), 3 do not use.
+        Type 34: 0 nothing new, 1 an indicator of its own, 2 one more than before (`_ONE_MORE`), 3 do not use.
         """
         times, issues, values = [], [], []
         for kind in (34, 35, 36):
@@ -271,10 +291,12 @@ class DfmcService:
                 change = fields["change"]
                 rank = np.cumsum(change == 1, axis=1) - 1
                 given = np.take_along_axis(fields["dfrei"], np.clip(rank, 0, 6), axis=1)
-                table = np.select([(change == 1) & (rank < 7), change == 2, change == 3], [given, -2, DO_NOT_USE], -1)
+                table = np.select(
+                    [(change == 1) & (rank < 7), change == 2, change == 3], [given, _ONE_MORE, DO_NOT_USE], -1
+                )
             else:
-                table[:, :_FIRST] = fields["dfrei"] if kind == 35 else -1
-                table[:, _FIRST:] = fields["dfrei"] if kind == 36 else -1
+                table[:, :FIRST] = fields["dfrei"] if kind == 35 else -1
+                table[:, FIRST:] = fields["dfrei"] if kind == 36 else -1
             times.append(self._time[kind])
             issues.append(fields["iodm"])
             values.append(table)
@@ -287,17 +309,23 @@ class DfmcService:
         row, age = sent
         received, issue, values = self._indicators
         result = np.full(len(time), -1, dtype=np.int64)
-        for t in range(len(time)):
-            if mask[t] < 0 or not np.isfinite(age[t]):
-                continue
-            began = self._time[32][row[t]]
-            current, renewed = int(self._read[32]["dfrei"][row[t]]), began
-            first, last = np.searchsorted(received, [began, time[t]], side="right")
-            for i in range(int(first), int(last)):
-                if issue[i] != self._read[31]["iodm"][mask[t]]:
-                    continue
-                value, renewed = int(values[i, rank[t]]), received[i]
-                current = min(current + 1, DO_NOT_USE - 1) if value == -2 and current < DO_NOT_USE else current
-                current = value if value >= 0 else current
-            result[t] = current if seconds(np.array([time[t] - renewed]))[0] <= INDICATOR_S else -1
+        known = np.flatnonzero((mask >= 0) & np.isfinite(age))
+        last = np.searchsorted(received, time[known], side="right")
+        # epochs between two messages have the same one
+        cases, case = np.unique(np.stack([mask[known], row[known], rank[known], last]), axis=1, return_inverse=True)
+        renewed = np.empty(cases.shape[1], dtype="datetime64[ns]")
+        current = np.empty(cases.shape[1], dtype=np.int64)
+        for i, (m, r, of_mask, end) in enumerate(cases.T.tolist()):
+            first = np.searchsorted(received, self._time[32][r], side="right")
+            chosen = first + np.flatnonzero(issue[first:end] == self._read[31]["iodm"][m])
+            renewed[i] = received[chosen[-1]] if len(chosen) else self._time[32][r]
+            grade = int(self._read[32]["dfrei"][r])
+            for value in values[chosen, of_mask].tolist():
+                if value == _ONE_MORE:
+                    grade = min(grade + 1, DO_NOT_USE - 1) if grade < DO_NOT_USE else grade
+                elif value >= 0:
+                    grade = value
+            current[i] = grade
+        fresh = seconds(time[known] - renewed[case]) <= INDICATOR_S
+        result[known] = np.where(fresh, current[case], -1)
         return result

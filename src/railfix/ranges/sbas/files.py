@@ -18,7 +18,16 @@ from railfix.core.files import BrokenLines, FilePath, read_text_lines
 from railfix.core.timescale import GPS_EPOCH, SECONDS_PER_WEEK
 from railfix.io.receiver.framing import SbasFrames, head_of, is_receiver_log
 from railfix.io.receiver.log import scan_pieces
-from railfix.ranges.sbas.messages import ROW_BYTES, SbasMessages, carried_parity, message_parity, preamble_number
+from railfix.ranges.sbas.messages import (
+    PREAMBLES,
+    ROW_BYTES,
+    Band,
+    SbasMessages,
+    carried_parity,
+    message_parity,
+    message_type,
+    preamble_number,
+)
 from railfix.ranges.sbas.standard import GEO_PRNS
 
 _RTKLIB: Final = re.compile(r"(\d+)\s+(\d+(?:\.\d*)?)\s+(\d+)\s+(\d+)\s*:\s*([0-9A-Fa-f]+)")
@@ -71,18 +80,18 @@ def kind_of_file(path: str, lines: Sequence[str]) -> str:
     raise InputFileError(path, "holds no SBAS message")
 
 
-def parse(path: str, kind: str, lines: Sequence[str]) -> Iterator[RawMessage | InputFileError]:
+def parse(path: str, kind: str, lines: Sequence[str], band: Band = "L1") -> Iterator[RawMessage | InputFileError]:
     """Every message of a file in its order; a broken one as the error that describes it."""
     if kind == "rinex":
-        yield from _parse_rinex(path, lines)
+        yield from _parse_rinex(path, lines, band)
         return
     for number, text in enumerate(lines, start=1):
         line = text.strip()
         if line and line[0] not in "#%":
-            yield (_rtklib if kind == "rtklib" else _ems)(path, number, line)
+            yield (_rtklib if kind == "rtklib" else _ems)(path, number, line, band)
 
 
-def _rtklib(path: str, number: int, line: str) -> RawMessage | InputFileError:
+def _rtklib(path: str, number: int, line: str, band: Band) -> RawMessage | InputFileError:
     fields = _RTKLIB.fullmatch(line)
     if fields is None:
         return InputFileError(path, f"{line[:40]!r} is no 'week tow prn type : hexadecimal message'", line=number)
@@ -91,10 +100,10 @@ def _rtklib(path: str, number: int, line: str) -> RawMessage | InputFileError:
     if not (0 < int(week) < 10_000 and 0.0 <= seconds < SECONDS_PER_WEEK):
         return InputFileError(path, f"week {week}, time of week {tow} is no GPS time", line=number)
     time = int(week) * SECONDS_PER_WEEK * 10**9 + round(seconds * 1e9)
-    return _check_line(path, RawMessage(number, time, int(prn), int(kind), digits))
+    return _check_line(path, RawMessage(number, time, int(prn), int(kind), digits), band)
 
 
-def _ems(path: str, number: int, line: str) -> RawMessage | InputFileError:
+def _ems(path: str, number: int, line: str, band: Band) -> RawMessage | InputFileError:
     fields = _EMS.fullmatch(line)
     if fields is None:
         return InputFileError(
@@ -105,10 +114,10 @@ def _ems(path: str, number: int, line: str) -> RawMessage | InputFileError:
         time = _instant(date, second)
     except ValueError:
         return InputFileError(path, f"{date.strip()} {second} is no date and time", line=number)
-    return _check_line(path, RawMessage(number, time, int(prn), int(kind), digits))
+    return _check_line(path, RawMessage(number, time, int(prn), int(kind), digits), band)
 
 
-def _parse_rinex(path: str, lines: Sequence[str]) -> Iterator[RawMessage | InputFileError]:
+def _parse_rinex(path: str, lines: Sequence[str], band: Band) -> Iterator[RawMessage | InputFileError]:
     """Records of RINEX type B: PRN and epoch, then lines of up to 18 bytes, the type before the first."""
     end = next((i for i, text in enumerate(lines) if text[60:].startswith("END OF HEADER")), None)
     if end is None:
@@ -124,7 +133,7 @@ def _parse_rinex(path: str, lines: Sequence[str]) -> Iterator[RawMessage | Input
             while at < len(rest) and _RINEX_HEAD.fullmatch(rest[at][1].strip()) is None:
                 at += 1
             continue
-        prn, date, second, band, length = fields.groups()
+        prn, date, second, sent_on, length = fields.groups()
         count = int(length or 32)
         body = rest[at : at + -(-count // _RINEX_BYTES)]
         digits = "".join("".join(row[7:].split()) for _, row in body)[: 2 * count]
@@ -135,8 +144,8 @@ def _parse_rinex(path: str, lines: Sequence[str]) -> Iterator[RawMessage | Input
                 at += 1
             continue
         at += len(body)
-        if band not in (None, "L1"):
-            yield InputFileError(path, f"the message is of band {band}, L1 was expected", line=number)
+        if sent_on not in (None, band):
+            yield InputFileError(path, f"the message is of band {sent_on}, {band} was expected", line=number)
             continue
         try:
             time = _instant(date, second) + round(_RINEX_SHIFT_S * 1e9)
@@ -145,10 +154,10 @@ def _parse_rinex(path: str, lines: Sequence[str]) -> Iterator[RawMessage | Input
             continue
         # Before 2004 the satellite number was the PRN less 100.
         number_of_geo = int(prn) + (100 if int(prn) < 100 else 0)
-        yield _check_line(path, RawMessage(number, time, number_of_geo, int(head or -1), digits))
+        yield _check_line(path, RawMessage(number, time, number_of_geo, int(head or -1), digits), band)
 
 
-def _check_line(path: str, raw: RawMessage) -> RawMessage | InputFileError:
+def _check_line(path: str, raw: RawMessage, band: Band) -> RawMessage | InputFileError:
     if raw.prn not in GEO_PRNS:
         return InputFileError(
             path, f"PRN {raw.prn} sends no SBAS; 120 to 158 or 183 to 202 was expected", line=raw.line
@@ -161,9 +170,11 @@ def _check_line(path: str, raw: RawMessage) -> RawMessage | InputFileError:
             f"the message has {len(raw.digits)} hexadecimal digits, 58 (226 bits) or 63 or 64 (250 bits) were expected"
         )
         return InputFileError(path, what, line=raw.line)
-    kind = (int(raw.digits[2:4], 16) >> 2) & 0x3F
+    kind = (int(raw.digits[:4], 16) >> (2 if band == "L1" else 6)) & 0x3F
     if raw.kind not in (-1, kind):
-        return InputFileError(path, f"type {raw.kind} is written, the message says {kind}", line=raw.line)
+        return InputFileError(
+            path, f"type {raw.kind} is written, the message on {band} says {kind} (setting sbas_band)", line=raw.line
+        )
     return raw
 
 
@@ -192,18 +203,23 @@ class _Gathered:
     notes: list[str] = field(default_factory=list)
 
 
-def read_sbas(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines = "stop") -> SbasMessages:
+def read_sbas(
+    paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines = "stop", band: Band = "L1"
+) -> SbasMessages:
     """SBAS messages of one or several files.
 
     Parameters
     ----------
     paths : path or sequence of paths
         RTKLIB (.sbs), EGNOS message server (.ems), RINEX broadcast data (type B) or a receiver's log (UBX with
-        RXM-SFRBX of SBAS, SBF with GEORawL1), recognised by their content; plain, gzip or compress.
+        RXM-SFRBX of SBAS, SBF with GEORawL1 or GEORawL5), recognised by their content; plain, gzip or compress.
     broken_lines : {"stop", "count"}
         A line that is no message stops the reading, or is counted under "line" in `rejected` and
         named in `notes`. A message whose parity or preamble is wrong was damaged on its way: it is
         left out and counted in either case.
+
+    band : {"L1", "L5"}
+        Frequency of the messages; those of the other have another preamble, and are left out as such.
 
     Returns
     -------
@@ -221,18 +237,20 @@ def read_sbas(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines
         raise ValueError("at least one SBAS file is needed")
     gathered = _Gathered()
     for number, path in enumerate(files):
-        _read_file(str(path), number, broken_lines, gathered)
+        _read_file(str(path), number, broken_lines, gathered, band)
     sources = tuple(str(path) for path in files)
     if not gathered.raw:
-        raise InputFileError(", ".join(sources), "holds no SBAS message that can be read")
-    log = _check(gathered, sources)
+        raise InputFileError(
+            ", ".join(sources), f"holds no SBAS message of {band} that can be read (setting sbas_band)"
+        )
+    log = _check(gathered, sources, band)
     if not len(log):
         counts = ", ".join(f"{number} by {reason}" for reason, number in sorted(log.rejected.items()))
-        raise InputFileError(", ".join(sources), f"has no SBAS message left: rejected {counts}")
+        raise InputFileError(", ".join(sources), f"has no SBAS message of {band} left: rejected {counts}")
     return log
 
 
-def from_receiver(frames: SbasFrames, *, source: str = "receiver") -> SbasMessages:
+def from_receiver(frames: SbasFrames, *, source: str = "receiver", band: Band = "L1") -> SbasMessages:
     """SBAS messages as a receiver passes them on, parity and preamble checked.
 
     Parameters
@@ -243,28 +261,28 @@ def from_receiver(frames: SbasFrames, *, source: str = "receiver") -> SbasMessag
         Name for notes and counts.
     """
     gathered = _Gathered()
-    _gather_frames(frames, 0, gathered)
-    return _check(gathered, (source,)) if gathered.raw else SbasMessages.none()
+    _gather_frames(frames, 0, gathered, band)
+    return _check(gathered, (source,), band) if gathered.raw else SbasMessages.none()
 
 
-def _gather_frames(frames: SbasFrames, number: int, gathered: _Gathered) -> None:
-    dated = ~np.isnat(frames.time)
-    gathered.rejected["line"] += int(np.count_nonzero(~dated))
+def _gather_frames(frames: SbasFrames, number: int, gathered: _Gathered, band: Band) -> None:
+    dated, here = ~np.isnat(frames.time), frames.on_l5 == (band == "L5")
+    gathered.rejected["line"] += int(np.count_nonzero(~dated & here))
     since = (frames.time - GPS_EPOCH).astype(np.int64)
-    for row in np.flatnonzero(dated).tolist():
+    for row in np.flatnonzero(dated & here).tolist():
         digits = frames.octets[row].tobytes().hex().upper()[:63]
         gathered.raw.append(RawMessage(row + 1, int(since[row]), int(frames.prn[row]), -1, digits))
         gathered.source.append(number)
 
 
-def _read_file(path: str, number: int, broken_lines: BrokenLines, gathered: _Gathered) -> None:
+def _read_file(path: str, number: int, broken_lines: BrokenLines, gathered: _Gathered, band: Band) -> None:
     if is_receiver_log(head_of(path)):
         for piece in scan_pieces(path):
-            _gather_frames(piece.sbas, number, gathered)
+            _gather_frames(piece.sbas, number, gathered, band)
         return
     lines = read_text_lines(path)
     broken = 0
-    for item in parse(path, kind_of_file(path, lines), lines):
+    for item in parse(path, kind_of_file(path, lines), lines, band):
         if isinstance(item, RawMessage):
             gathered.raw.append(item)
             gathered.source.append(number)
@@ -279,7 +297,7 @@ def _read_file(path: str, number: int, broken_lines: BrokenLines, gathered: _Gat
     gathered.rejected["line"] += broken
 
 
-def _check(gathered: _Gathered, sources: tuple[str, ...]) -> SbasMessages:
+def _check(gathered: _Gathered, sources: tuple[str, ...], band: Band) -> SbasMessages:
     """Parity, preamble and order."""
     raw = gathered.raw
     text = "".join(item.digits.ljust(2 * ROW_BYTES, "0")[: 2 * ROW_BYTES] for item in raw)
@@ -288,7 +306,7 @@ def _check(gathered: _Gathered, sources: tuple[str, ...]) -> SbasMessages:
     source = np.array(gathered.source, dtype=np.int64)
     carried = _read_bits(np.array([len(item.digits) for item in raw]), source, bits)
     wrong = _wrong_parity(bits, carried)
-    preamble = preamble_number(bits)
+    preamble = preamble_number(bits, band)
     stray = (preamble < 0) & ~wrong
     gathered.rejected["parity"] += int(wrong.sum())
     gathered.rejected["preamble"] += int(stray.sum())
@@ -296,12 +314,13 @@ def _check(gathered: _Gathered, sources: tuple[str, ...]) -> SbasMessages:
     log = SbasMessages(
         time=np.asarray(GPS_EPOCH + since, dtype="datetime64[ns]"),
         prn=np.array([item.prn for item in raw], dtype=np.int64),
-        type=(bits[:, 1] >> 2).astype(np.int64),
+        type=message_type(bits, band),
         bits=bits,
         parity_bits=carried,
         source=source,
         line=np.array([item.line for item in raw], dtype=np.int64),
         sources=sources,
+        band=band,
     )
     kept = log.take(~(wrong | stray))
     kept = kept.take(np.lexsort((kept.prn, kept.time)))
@@ -352,11 +371,11 @@ def _order_notes(log: SbasMessages) -> list[str]:
     """Preambles follow each other second by second; where they do not, a time tag is wrong."""
     notes = []
     second = log.time.astype("datetime64[s]").astype(np.int64)
-    number = preamble_number(log.bits)
+    number, turn = preamble_number(log.bits, log.band), len(PREAMBLES[log.band])
     for prn in log.prns:
         of_prn = log.prn == prn
-        phase = (number[of_prn] - second[of_prn]) % 3
-        counts = np.bincount(phase, minlength=3)
+        phase = (number[of_prn] - second[of_prn]) % turn
+        counts = np.bincount(phase, minlength=turn)
         if counts.max() < counts.sum():
             notes.append(
                 f"PRN {prn}: the preambles of {int(counts.sum() - counts.max())} of {int(counts.sum())} messages are "

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -13,8 +13,10 @@ from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, read_only
 from railfix.io.receiver.framing import crc24q
 from railfix.ranges.sbas.standard import DECODED, system_name, type_name
 
-#: First eight bits of three successive messages (DO-229D, A.4.3.1).
-PREAMBLES: Final = (0x53, 0x9A, 0xC6)
+#: Frequency that messages are sent on, and corrections made for.
+Band = Literal["L1", "L5"]
+#: First bits of successive messages: eight, three in turn (DO-229D, A.4.3.1); on L5 four, six in turn.
+PREAMBLES: Final[dict[Band, tuple[int, ...]]] = {"L1": (0x53, 0x9A, 0xC6), "L5": (0x5, 0xC, 0x6, 0x9, 0x3, 0xA)}
 #: Preamble, type and data; bytes a message takes in `SbasMessages.bits`.
 DATA_BITS: Final = 226
 ROW_BYTES: Final = 32
@@ -56,12 +58,19 @@ def with_parity(bits: Bytes) -> Bytes:
     return complete
 
 
-def preamble_number(bits: Bytes) -> Integers:
-    """0, 1 or 2 for the three preambles, -1 for anything else, shape (N,)."""
+def preamble_number(bits: Bytes, band: Band = "L1") -> Integers:
+    """Place of each preamble among those in turn, -1 for anything else, shape (N,)."""
     number = np.full(len(bits), -1, dtype=np.int64)
-    for i, preamble in enumerate(PREAMBLES):
-        number[bits[:, 0] == preamble] = i
+    first = bits[:, 0] if band == "L1" else bits[:, 0] >> 4
+    for i, preamble in enumerate(PREAMBLES[band]):
+        number[first == preamble] = i
     return number
+
+
+def message_type(bits: Bytes, band: Band = "L1") -> Integers:
+    """Types, the six bits after the preambles, shape (N,)."""
+    second = bits[:, 1].astype(np.int64)
+    return second >> 2 if band == "L1" else (bits[:, 0].astype(np.int64) & 15) << 2 | second >> 6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +99,7 @@ class SbasMessages:
         Messages left out, by reason: "parity", "preamble", "line", "duplicate".
     notes : tuple of str
         Warnings for the reader of the results, one sentence each.
+    band : {"L1", "L5"}
     """
 
     time: Datetimes
@@ -102,6 +112,7 @@ class SbasMessages:
     sources: tuple[str, ...] = ()
     rejected: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    band: Band = "L1"
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -130,8 +141,8 @@ class SbasMessages:
         """
         counts = Counter(zip(self.prn.tolist(), self.type.tolist(), strict=True))
         rows = {
-            f"{system_name(prn)} {prn} type {kind} {type_name(kind, prn)}"
-            + ("" if kind in DECODED else ", not decoded"): number
+            f"{system_name(prn)} {prn} type {kind} {type_name(kind, prn, self.band)}"
+            + ("" if kind in DECODED[self.band] else ", not decoded"): number
             for (prn, kind), number in sorted(counts.items())
         }
         return rows | {f"rejected: {reason}": number for reason, number in sorted(self.rejected.items())}
@@ -166,6 +177,7 @@ class SbasMessages:
             sources=sources,
             rejected=dict(Counter(self.rejected) + Counter(later.rejected)),
             notes=tuple(dict.fromkeys((*self.notes, *later.notes))),
+            band=later.band,
         )
 
     def repeated(self) -> Masks:
@@ -188,4 +200,6 @@ class SbasMessages:
             for item in fields(self)
             if isinstance(getattr(self, item.name), np.ndarray)
         }
-        return SbasMessages(**arrays, sources=self.sources, rejected=self.rejected, notes=self.notes)
+        return SbasMessages(
+            **arrays, sources=self.sources, rejected=self.rejected, notes=self.notes, band=self.band
+        )  # fmt: skip

@@ -9,7 +9,10 @@ from pydantic import Field
 from railfix.core.settings import Settings
 
 #: Types decoded into corrections or into records.
-DECODED: Final = (0, 1, 2, 3, 4, 5, 6, 7, 10, 12, 18, 24, 25, 26, 27, 28)
+DECODED: Final = {
+    "L1": (0, 1, 2, 3, 4, 5, 6, 7, 10, 12, 18, 24, 25, 26, 27, 28),
+    "L5": (0, 31, 32, 34, 35, 36, 37),
+}
 
 #: Message types of L1 (DO-229D, table A-3).
 TYPE_NAMES: Final = {
@@ -31,6 +34,22 @@ TYPE_NAMES: Final = {
     26: "ionospheric delays",
     27: "service region",
     28: "clock-ephemeris covariance",
+    62: "internal test",
+    63: "null",
+}
+#: Message types of L5 (ICAO Annex 10, 8th edition, appendix B, 3.5.14).
+L5_TYPE_NAMES: Final = {
+    0: "do not use for safety",
+    31: "satellite mask",
+    32: "orbit, clock and covariance",
+    34: "integrity, changes",
+    35: "integrity, first 53 satellites",
+    36: "integrity, the others",
+    37: "degradation and scale",
+    39: "SBAS satellite's orbit, first part",
+    40: "SBAS satellite's orbit, second part",
+    42: "network time",
+    47: "almanac",
     62: "internal test",
     63: "null",
 }
@@ -73,8 +92,10 @@ def system_name(prn: int) -> str:
     return _SYSTEM_OF.get(prn, "SBAS")
 
 
-def type_name(number: int, prn: int) -> str:
+def type_name(number: int, prn: int, band: str = "L1") -> str:
     """Name of a message type as sent by a PRN; "reserved" for a number without meaning."""
+    if band == "L5":
+        return L5_TYPE_NAMES.get(number, "reserved")
     if prn >= 183 and number in QZSS_TYPE_NAMES:
         return QZSS_TYPE_NAMES[number]
     return TYPE_NAMES.get(number, "reserved")

@@ -1,14 +1,20 @@
-"""Messages of dual-frequency SBAS (L5) from their fields: types 0, 31, 32, 34, 35, 36, 37, 63."""
+"""Messages of dual-frequency SBAS (L5) from their fields, and those whose corrections undo the simulated errors."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
+from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Bytes, Floats
-from railfix.ranges.sbas.dfmc import AUGMENTED, PREAMBLES
-from railfix.simulate.sbas.service import Field, packed
+from railfix.core.constants import CARRIER_FREQUENCY, SPEED_OF_LIGHT
+from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta
+from railfix.ranges.sbas.dfmc import AUGMENTED, FIRST, slot_satellite
+from railfix.ranges.sbas.messages import PREAMBLES
+from railfix.ranges.weights import DFMC_SIGNALS
+from railfix.simulate.receiver import group_delay_s, signals_of
+from railfix.simulate.sbas.service import CLOCK, Field, Service, packed
 
 
 def message(kind: int, second: int, *fields: Field) -> Bytes:
@@ -16,7 +22,7 @@ def message(kind: int, second: int, *fields: Field) -> Bytes:
 
     The fields (value, length) lie from bit 10 on, negative values in two's complement. ValueError: one does not fit.
     """
-    return packed(f"{PREAMBLES[second % 6]:04b}{kind:06b}", kind, fields)
+    return packed(f"{PREAMBLES['L5'][second % 6]:04b}{kind:06b}", kind, fields)
 
 
 def mask(second: int, slots: Collection[int], iodm: int = 0) -> Bytes:
@@ -79,3 +85,67 @@ def parameters(
     return message(
         37, second, valid, valid, (0, 6), (round(covariance / 0.1), 7), *(each * 6), *([(scale, 4)] * 15), (0, 3)
     )
+
+
+_SLOT_OF: Final = {slot_satellite(slot): slot for slot in range(1, 215)}
+#: Factor of the covariance that is sent: 1.03 to 1.06 times the indicator's sigma along a line of sight.
+_COVARIANCE: Final = (3, np.diag([1.0, 1.0, 1.0, 4.0]))
+#: Largest correction of a clock that the field holds [m].
+_LARGEST_M: Final = 63.9
+#: Growth of the corrections' errors until the next ones [m/s].
+_GROWTH_MPS: Final = 0.002
+
+
+class DfmcService(Service):
+    """Corrections on L5 of a simulated run: GPS L1 C/A with L5, Galileo E1 with E5a."""
+
+    systems = "".join(DFMC_SIGNALS)
+
+    def clocks_m(self, second: float) -> Floats:
+        """Corrections of the clocks of `satellites` [m] for ionosphere-free codes, group delays included.
+
+        Those of GPS refer to the clock without its group delays, those of Galileo to that of F/NAV.
+        """
+        names, at = self.satellites, self._instant(second)
+        first, other = ([signals_of(name[0], self._simulation.scenario.receiver)[k] for name in names] for k in (0, 1))
+        ratio = np.array([(CARRIER_FREQUENCY[name[0]]["1"] / CARRIER_FREQUENCY[name[0]]["5"]) ** 2 for name in names])
+        delay_m = [self._errors.group_delay_m(names, signals) for signals in (first, other)]
+        time, kepler = self._start + timedelta(at), self._simulation.navigation.kepler
+        for signals, added in zip((first, other), delay_m, strict=True):
+            for k, (name, signal) in enumerate(zip(names, signals, strict=True)):
+                if name[0] == "G":
+                    added[k] += SPEED_OF_LIGHT * group_delay_s(kepler, name, signal, time)[0]
+        clock = self._errors.clock_error_m(at)[0] - (ratio * delay_m[0] - delay_m[1]) / (ratio - 1.0)
+        clock = clock + self._settings.clock_sigma_m * self._rng[CLOCK].standard_normal(len(names))
+        return np.asarray(np.clip(clock, -_LARGEST_M, _LARGEST_M))
+
+    def fast_messages(self) -> list[Callable[[int, int], Bytes]]:
+        """Types 35 and 36, each a function of the second and of an issue that they do not have."""
+
+        def of_kind(kind: int, part: slice) -> Callable[[int, int], Bytes]:
+            return lambda second, _: integrity(second, self.indicators(second)[part], kind=kind)
+
+        later = [of_kind(36, slice(FIRST, AUGMENTED))] if len(self.satellites) > FIRST else []
+        return [of_kind(35, slice(0, FIRST)), *later]
+
+    def slow_messages(self) -> list[Callable[[int], Bytes]]:
+        """Types 31, 37 and 32 of all satellites in turn, each a function of the second."""
+        slots = [_SLOT_OF[name] for name in self.satellites]
+        messages: list[Callable[[int], Bytes]] = [
+            lambda second: mask(second, slots),
+            lambda second: parameters(second, valid_s=240.0, degradation=(0.0, 0.0, _GROWTH_MPS)),
+        ]
+        return messages + [self._correction(k, slot) for k, slot in enumerate(slots)]
+
+    def _correction(self, k: int, slot: int) -> Callable[[int], Bytes]:
+        day_s = float(seconds(self._start - self._start.astype("datetime64[D]")))
+
+        def made(second: int) -> Bytes:
+            _, issue, place, _ = self.orbits(second)[k]
+            moved = (*place, float(self.clocks_m(second)[k]))
+            return correction(
+                second, slot, issue, moved, time_of_day_s=(day_s + second) % SECONDS_PER_DAY,
+                covariance=_COVARIANCE, dfrei=self.indicators(second)[k],
+            )  # fmt: skip
+
+        return made

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from railfix.core.arrays import Bytes, Floats
 from railfix.core.constants import FREQUENCY_L1
-from railfix.core.files import write_whole
-from railfix.core.timescale import seconds, timedelta, to_week
-from railfix.ranges.sbas import SbasMessages
+from railfix.core.timescale import seconds, timedelta
 from railfix.ranges.sbas.grid import BANDS, COLUMNS, POINT_OF_BIT
 from railfix.ranges.sbas.messages import DATA_BITS, PREAMBLES, with_parity
 from railfix.ranges.sbas.standard import DO_NOT_USE, NOT_MONITORED
@@ -45,7 +41,7 @@ def message(kind: int, second: int, *fields: Field) -> Bytes:
     The fields (value, length) lie from bit 14 on, negative values in two's complement. ValueError: when a value does
     not fit its field, or the fields are longer than a message.
     """
-    return packed(f"{PREAMBLES[second % 3]:08b}{kind:06b}", kind, fields)
+    return packed(f"{PREAMBLES['L1'][second % 3]:08b}{kind:06b}", kind, fields)
 
 
 def packed(text: str, kind: int, fields: Sequence[Field]) -> Bytes:
@@ -152,22 +148,26 @@ _MIXED: Final = 6
 #: Largest correction, orbit correction and delay that the fields hold [m].
 _LARGEST_FAST_M, _LARGEST_ORBIT_M, _LARGEST_DELAY_M = 255.0, 31.875, 63.75
 #: Seconds from one fast correction of a satellite to the next.
-_FAST_PERIOD_S: Final = 6
-#: Streams of random numbers: fast corrections, orbits, delays, lost messages.
-_CLOCK, _ORBIT, _DELAY, _LOST = 50, 51, 52, 53
+FAST_PERIOD_S: Final = 6
+#: Streams of random numbers: fast corrections, orbits, delays.
+CLOCK, _ORBIT, _DELAY = 50, 51, 52
 
 
-class _Service:
+class Service:
     """Corrections of a simulated run at any second, and the messages that carry them."""
+
+    systems = "G"  #: Constellations corrected.
 
     def __init__(self, simulation: Simulation, settings: SbasSettings) -> None:
         self._simulation, self._settings = simulation, settings
         scenario = simulation.scenario
-        self.satellites = sorted({str(n) for n in simulation.navigation.kepler.satellite if str(n).startswith("G")})
+        names = {str(name) for name in simulation.navigation.kepler.satellite}
+        # in the order of the mask
+        self.satellites = [name for letter in self.systems for name in sorted(names) if name[0] == letter]
         # All of GPS, not only what the train sees; each satellite's errors are its own, so they are the same.
         self._errors, self._start = simulation.errors_of(self.satellites), scenario.start
         self._group_delay_m = self._errors.group_delay_m(self.satellites, ["1C"] * len(self.satellites))
-        self._rng = {key: np.random.default_rng([scenario.seed, key]) for key in (_CLOCK, _ORBIT, _DELAY)}
+        self._rng = {key: np.random.default_rng([scenario.seed, key]) for key in (CLOCK, _ORBIT, _DELAY)}
         self._last_s = scenario.duration_s
         self.bands = self._grid_points()
 
@@ -178,14 +178,15 @@ class _Service:
     def fast_m(self, second: float) -> Floats:
         """Fast corrections of `satellites` [m]: their clocks, and the group delay of their code."""
         clock = self._errors.clock_error_m(self._instant(second))[0]
-        noise = self._settings.clock_sigma_m * self._rng[_CLOCK].standard_normal(len(self.satellites))
+        noise = self._settings.clock_sigma_m * self._rng[CLOCK].standard_normal(len(self.satellites))
         return np.asarray(np.clip(clock - self._group_delay_m + noise, -_LARGEST_FAST_M, _LARGEST_FAST_M))
 
-    def udrei(self, second: float) -> list[int]:
-        """UDREI of `satellites`: as set, do not use during a fault."""
+    def indicators(self, second: float) -> list[int]:
+        """UDREI (L5: DFREI) of `satellites`: as set, do not use during a fault."""
         settings = self._settings
+        usual = settings.udrei if settings.band == "L1" else settings.dfrei
         fault, _ = self._errors.fault_m(self._instant(second - settings.alert_s + settings.latency_s), self.satellites)
-        return [DO_NOT_USE if abs(f) > settings.alert_m else settings.udrei for f in fault[0].tolist()]
+        return [DO_NOT_USE if abs(f) > settings.alert_m else usual for f in fault[0].tolist()]
 
     def orbits(self, second: float) -> list[LongTerm]:
         """Long-term corrections of `satellites`: positions, to the issue of data in force."""
@@ -195,7 +196,10 @@ class _Service:
         error = np.clip(error, -_LARGEST_ORBIT_M, _LARGEST_ORBIT_M)
         records = self._simulation.navigation.kepler
         time = self._start + timedelta(at)
-        issues = [int(records.iode[newest_record(records, name, time)[0]]) % 256 for name in self.satellites]
+        issues = [
+            int(records.iode[newest_record(records, name, time)[0]]) % (1024 if name[0] == "E" else 256)
+            for name in self.satellites
+        ]
         return [
             (slot, issue, (float(x), float(y), float(z)), 0.0)
             for slot, (issue, (x, y, z)) in enumerate(zip(issues, error, strict=True), 1)
@@ -242,7 +246,7 @@ class _Service:
             part = slice(first, first + _FAST)
 
             def made(second: int, issue: int) -> Bytes:
-                values, grades = self.fast_m(second)[part].tolist(), self.udrei(second)[part]
+                values, grades = self.fast_m(second)[part].tolist(), self.indicators(second)[part]
                 if first > 0 and count - first <= _MIXED:
                     pair = self.orbits(second)[-2:]
                     return mixed(second, values, grades, pair, block=block, iodf=issue)
@@ -260,7 +264,7 @@ class _Service:
             lambda second: mask(second, numbers),
             lambda second: factors(second, [0] * count),
             lambda second: parameters(second, iltc_v0=120, iiono=300),
-            lambda second: integrity(second, self.udrei(second), iodf=(3, 3, 3, 3)),
+            lambda second: integrity(second, self.indicators(second), iodf=(3, 3, 3, 3)),
         ]
         messages += [self._long_term(first) for first in range(0, count, _LONG_TERM)]
         for band, points in self.bands.items():
@@ -279,51 +283,3 @@ class _Service:
         points = self.bands[band][_DELAYS * block : _DELAYS * (block + 1)]
         grades = [self._settings.givei] * len(points)
         return lambda second: grid_delay(second, band, block, self.delays_m(second, points), grades)
-
-
-def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessages:
-    """Messages from `lead_s` before the run to its end, one a second.
-
-    Every 6 s the fast corrections of all satellites (types 2 to 5, 24); in the seconds between, in turn, the masks,
-    long-term corrections, grid, degradation and integrity. All corrections undo the errors that `Scenario.errors` puts
-    into clocks, group delays, orbits and ionosphere, to the messages' resolution (0.125 m); only GPS is corrected.
-    """
-    service, scenario = _Service(simulation, settings), simulation.scenario
-    fast, slow = service.fast_messages(), service.slow_messages()
-    first = -int(np.ceil(settings.lead_s))
-    sent, bits, turn = [], [], 0
-    # The preamble goes by the second of the day, the frame of six seconds too.
-    day = int(seconds(scenario.start - scenario.start.astype("datetime64[D]")))
-    for second in range(first, int(np.ceil(scenario.duration_s))):
-        place = (day + second) % _FAST_PERIOD_S
-        if place < len(fast):
-            message = fast[place](second, ((day + second) // _FAST_PERIOD_S) % 3)
-        else:
-            message = slow[turn % len(slow)](second)
-            turn += 1
-        sent.append(second)
-        bits.append(message)
-    kept = np.random.default_rng([scenario.seed, _LOST]).uniform(size=len(sent)) >= settings.lost_chance
-    table = np.array(bits, dtype=np.uint8).reshape(-1, 32)[kept]
-    # A message has been received completely a second after its first bit.
-    time = scenario.start + timedelta(np.array(sent, dtype=np.float64)[kept] + 1.0)
-    count = len(table)
-    return SbasMessages(
-        time=time.astype("datetime64[ns]"),
-        prn=np.full(count, settings.prn),
-        type=(table[:, 1] >> 2).astype(np.int64),
-        bits=table,
-        parity_bits=np.full(count, 24),
-        source=np.zeros(count, dtype=np.int64),
-        line=np.arange(1, count + 1),
-        sources=("simulated",),
-    )
-
-
-def write_sbas(messages: SbasMessages, path: str | PathLike[str]) -> None:
-    """Write messages as RTKLIB's .sbs, which `railfix run --sbas` reads; OutputError when it cannot be written."""
-    lines = []
-    for time, prn, kind, bits in zip(messages.time, messages.prn, messages.type, messages.bits, strict=True):
-        week, tow = to_week(time)
-        lines.append(f"{int(week)} {float(tow):.0f} {prn} {kind:2d} : {bits[:29].tobytes().hex().upper()}\n")
-    write_whole(Path(path), "".join(lines), what="SBAS messages")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -10,13 +10,15 @@ from railfix.simulate.setting_types import NotNegative, Positive, ScenarioSettin
 
 
 class SbasSettings(ScenarioSettings):
-    """SBAS that corrects GPS and the ionosphere; QZSS, Galileo and BeiDou are not in its mask."""
+    """SBAS that corrects GPS and the ionosphere, or on L5 ionosphere-free codes of GPS and Galileo."""
 
+    band: Literal["L1", "L5"] = "L1"  #: L5 needs receivers with ``signals_per_satellite = 2, second = "L5"``.
     prn: Annotated[int, Field(ge=120, le=158)] = 137
     latency_s: NotNegative = 4.0  #: Corrections are those of so much before the first bit of their message.
     #: Indicators of the accuracy of all satellites and grid points, as sent.
     udrei: Annotated[int, Field(ge=0, le=13)] = 5
     givei: Annotated[int, Field(ge=0, le=14)] = 9
+    dfrei: Annotated[int, Field(ge=0, le=14)] = 5  #: The same on L5.
     #: Errors of the service's own estimates: white, of each fast correction, each axis, each grid delay.
     clock_sigma_m: NotNegative = 0.0
     orbit_sigma_m: NotNegative = 0.0
