@@ -11,9 +11,10 @@ Whole recordings first (``--whole``), then a cold start every ``--every`` second
 pairs, few satellites, and sensors on board where there are any, in windows ``--fault-every`` seconds apart.
 ``--verbose`` lists the trials that fail.
 
-On a wrong map the straight distance counts against the level on the ground alone. Otherwise an epoch is *exceeded* where its level is finite and the error is larger: by straight distance on the ground, and by
-chainage, where another lap of the same road counts as wrong. *Sure and wrong* are epochs with the status `tracking`
-and an error of more than four standard deviations.
+On a wrong map the straight distance counts, against the level on the ground alone. Otherwise an epoch is *exceeded*
+where its level is finite and the error is larger: by straight distance on the ground, and by chainage, where another
+lap of the same road counts as wrong. *Sure and wrong* are epochs with the status `tracking` and an error of more than
+four standard deviations.
 """
 
 from __future__ import annotations
@@ -436,7 +437,7 @@ def sensor_faults(case: Case, sensors: SensorSamples) -> Iterator[tuple[str, Cas
 
 
 def over(label: str, found: Judged) -> np.ndarray:
-    """Epochs over their level; on a wrong map the chainage is not defined, and how far aside it lies is no error of it."""
+    """Epochs over their level; on a wrong map, whose chainage is not defined, that on the ground."""
     return found.over_ground if label.startswith("map") else found.over | found.over_chainage
 
 
