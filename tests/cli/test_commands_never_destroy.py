@@ -272,7 +272,7 @@ def test_a_signal_while_the_results_folder_is_made_leaves_nothing(
     def ended(_: object) -> bool:
         raise SystemExit(128 + signal.SIGTERM)
 
-    monkeypatch.setattr("railfix.run.lock._try_lock", ended)
+    monkeypatch.setattr("railfix.run.output._try_lock", ended)
     with pytest.raises(SystemExit):
         OutputFolder(tmp_path / "new" / "out")
     assert not list(tmp_path.iterdir())

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from broken_bench import Bench, bench_in
 from railfix.cli import app
-from railfix.cli.settings import Choices, settings_of
+from railfix.cli.options import Choices, settings_of
 from railfix.core.errors import SettingsError
 from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, load_config, parse_config
 

@@ -24,14 +24,13 @@ from railfix.cli.ground import app
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import HEAD, Interlocking, TrainInterval, from_documents
 from railfix.ground.links import BEARERS, LinkLimits, TrainLinks, bearers_of, first_sequence
-from railfix.ground.monitor import MonitorLimits
 from railfix.ground.quic import write_keys
 from railfix.ground.serve import run_centre
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
 from railfix.ground.train import Authority, OnBoard, OnBoardLimits, run_train
-from railfix.ground.triangle import TriangleVerdict
+from railfix.ground.triangle import MonitorLimits, TriangleVerdict
 from railfix.io.train_message import MessageStatus, SuspectedInterference, encode, to_json
 
 pytestmark = pytest.mark.requirement("F2")

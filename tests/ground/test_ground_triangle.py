@@ -19,16 +19,21 @@ from railfix.cli.ground import app
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.observations import Observations
 from railfix.ground.demo import PLAN_M, TIME, points_ecef_m, simulated_fixes
-from railfix.ground.monitor import MonitorLimits, MonitorState, Order, advance, monitor_log, release
 from railfix.ground.station_fixes import StationStreams, station_fixes
 from railfix.ground.triangle import (
     SIDES,
     STOPPING,
+    MonitorLimits,
+    MonitorState,
+    Order,
     TriangleLimits,
     TriangleVerdict,
     _verdicts,
+    advance,
     compare_triangle,
     limits_for_false_stops,
+    monitor_log,
+    release,
 )
 from railfix.io import read_navigation, read_observations, write_observations
 from railfix.simulate import write_run

@@ -23,9 +23,9 @@ from railfix.io.train_message import MessageStatus, Source
 from railfix.live import watches
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
 from railfix.live.forms import passing_rows
-from railfix.live.sensor_lines import FOREVER, Sensed, SensorLines
 from railfix.live.settings import LiveSettings
 from railfix.live.state import SavedSession, load_state, write_state
+from railfix.live.stream import FOREVER, Sensed, SensorLines
 from railfix.live.watches import SensorWatch
 from railfix.motion.samples import SENSORS, BaliseReadings, RadarSpeeds, SensorSamples, StationRanges
 from railfix.pipeline.config import parse_config

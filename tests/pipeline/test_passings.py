@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from railfix.motion.samples import BaliseReadings, ListedBalises
-from railfix.pipeline.balise_stage import BaliseLimits
+from railfix.pipeline.balises import VERDICTS, BaliseLimits, Passing, PassingState, find_passings
 from railfix.pipeline.passing_table import balise_notes
-from railfix.pipeline.passings import VERDICTS, Passing, PassingState, find_passings
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Tracked, TrackStatus

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import norm
 
 from railfix.cli.error_model import priors_text
-from railfix.cli.settings import Choices, settings_of
+from railfix.cli.options import Choices, settings_of
 from railfix.core.errors import InputFileError
 from railfix.ranges.error_model import (
     POOLED,

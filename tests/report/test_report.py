@@ -21,7 +21,7 @@ from railfix.evaluate import Evaluation
 from railfix.evaluate.tables import error_tables, evaluation_of, group_tables, level_tables
 from railfix.pipeline.config import parse_config
 from railfix.report import read_runs, report_page, write_report
-from railfix.report.encode import packed, script_json
+from railfix.report.charts_page import packed, script_json
 from railfix.report.figures import NO_LEVELS, NO_OBSERVATIONS, NO_REFERENCE, NO_TIMES
 from railfix.report.runs import ReportedRun
 from railfix.run import RunOptions, RunSummary, run_files

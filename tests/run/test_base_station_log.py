@@ -8,7 +8,7 @@ import pytest
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.observations import ObservationHeader, Observations
-from railfix.run.options import RunOptions
+from railfix.run.inputs import RunOptions
 from railfix.run.processor import BaseLog, base_log
 from railfix.run.sources import Log
 

@@ -10,7 +10,7 @@ import pytest
 
 from broken_bench import Bench, bench_in
 from railfix.run import prepared, sources
-from railfix.run.options import TrackReading
+from railfix.run.inputs import TrackReading
 from railfix.run.sources import OpenedLine, open_line
 
 EPOCH = np.datetime64("2024-03-05T03:00:00", "ns")

@@ -21,8 +21,8 @@ from railfix.io.rinex import read_observations, write_observations
 from railfix.pipeline.config import Config
 from railfix.pipeline.results import Result
 from railfix.pipeline.tables import observations_table, positions_table, train_table
+from railfix.report.page import budget, summary
 from railfix.report.runs import ReportedRun
-from railfix.report.tables import budget, summary
 from railfix.run import RunOptions, RunSummary, run_files
 from railfix.run.processor import processor_of
 from railfix.run.tally import AntennaTally

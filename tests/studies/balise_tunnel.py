@@ -17,7 +17,7 @@ import numpy as np
 
 import paths  # noqa: F401
 from railfix.motion.samples import BaliseReadings
-from railfix.pipeline.passings import VERDICTS
+from railfix.pipeline.balises import VERDICTS
 from railfix.simulate.scenario_file import load_recipe
 from railfix.simulate.sensors import BaliseSettings
 from sensed_ride import Ride, made

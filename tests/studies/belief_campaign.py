@@ -42,7 +42,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.settings import write_toml
 from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference, straight_distance
-from railfix.evaluate.benchmark import read_case
+from railfix.evaluate.cases import read_case
 from railfix.gnss.navigation import Navigation, glonass_channels
 from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz

@@ -16,7 +16,7 @@ from typer.core import TyperGroup
 
 import paths
 from railfix.cli import app
-from railfix.cli.settings import Choices, settings_of
+from railfix.cli.options import Choices, settings_of
 from railfix.core.errors import SettingsError
 
 FENCE: Final = re.compile(r"^```(?:sh|console)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

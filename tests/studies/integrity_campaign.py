@@ -23,8 +23,7 @@ import numpy as np
 
 from railfix.core.reasons import Status
 from railfix.core.settings import write_toml
-from railfix.evaluate.range_errors import range_errors
-from railfix.evaluate.range_errors.gather import joined
+from railfix.evaluate.range_errors import joined, range_errors
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.stanford import Region, stanford
 from railfix.io.reference_log import AntennaReference

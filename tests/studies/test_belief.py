@@ -12,7 +12,7 @@ import belief_campaign
 import recordings_truth
 from belief_campaign import Case, joined, over, run
 from railfix.core.timescale import seconds
-from railfix.evaluate.benchmark import write_case
+from railfix.evaluate.cases import write_case
 from railfix.track import Track
 from railfix.track.csv_file import write_track_csv
 from railfix.track.trajectory import Trajectory

@@ -9,8 +9,8 @@ import polars as pl
 import pytest
 
 from railfix.motion.samples import BaliseReadings
+from railfix.pipeline.balises import VERDICTS
 from railfix.pipeline.filter_result import AlongTrack
-from railfix.pipeline.passings import VERDICTS
 from railfix.simulate.sensors.tables import sensor_tables
 from railfix.tracking import Kind
 from sensed_ride import Ride, ride

@@ -21,7 +21,7 @@ from railfix.pipeline.return_gate import ReturnState, gated_codes
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.positioning.constrained import constrained_position, single_point
 from railfix.positioning.section_search import SearchIndex, SectionLimits, search
-from railfix.run.options import TrackReading
+from railfix.run.inputs import TrackReading
 from railfix.run.sources import open_line
 from railfix.simulate.scenario_file import load_recipe
 from railfix.track import Track, write_track_csv

@@ -41,14 +41,16 @@ class _Program(LazyCommands):
         "map": "Check a track map, make one, or put positions on a network.",
     }
     modules: ClassVar[Mapping[str, str]] = {
-        "doctor": "convert",
-        "export": "convert",
+        "convert": "logs",
+        "doctor": "logs",
+        "export": "logs",
+        "locate": "logs",
+        "which-track": "logs",
         "explain": "report",
         "plot-screens": "report",
         "benchmark": "campaign",
         "ablate": "campaign",
         "reference": "evaluate",
-        "which-track": "locate",
         "cn0-curve": "error_model",
     }
 

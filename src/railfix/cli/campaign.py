@@ -22,17 +22,16 @@ from railfix.cli.console import (
     show_table,
     show_verdict,
 )
-from railfix.cli.options import OutOption, Without, from_models
-from railfix.cli.settings import Choices, settings_of
+from railfix.cli.options import Choices, OutOption, Without, from_models, settings_of
 from railfix.core.errors import MismatchError, NoPositionError, SettingsError
 from railfix.core.tables import Table, number, percent
 from railfix.evaluate import Score
 from railfix.evaluate.ablation import Ablation, Effect, ablate_files
-from railfix.evaluate.benchmark.table import heads, run_benchmark, shown_rows
+from railfix.evaluate.benchmark import heads, run_benchmark, shown_rows
 from railfix.report.campaign import report_campaign, write_campaign_page
 from railfix.run import RunInputs, RunOptions
 from railfix.run.campaign import run_campaign
-from railfix.run.options import ColumnNames
+from railfix.run.inputs import ColumnNames
 
 
 def campaign(

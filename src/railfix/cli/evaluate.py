@@ -24,9 +24,8 @@ from railfix.core.errors import SettingsError
 from railfix.core.tables import Column, listing, number, percent, signed
 from railfix.evaluate import EvaluationOptions, RunAndReference, TrackFiles, evaluate_runs, write_evaluation
 from railfix.evaluate.options import EvaluationInputs
-from railfix.evaluate.output import P1_COMMERCIAL, P1_TABLE_4
 from railfix.evaluate.run_folder import POSITIONS_TABLE, TABLES, tables_of
-from railfix.evaluate.tables import error_tables, group_tables, level_tables
+from railfix.evaluate.tables import P1_COMMERCIAL, P1_TABLE_4, error_tables, group_tables, level_tables
 from railfix.pipeline.level_stage import prior_basis_text
 from railfix.reference import ReferenceInputs, ReferenceOptions, ReferenceSettings, ReferenceSummary, reference_files
 from railfix.run.output import OutputFolder

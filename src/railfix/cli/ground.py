@@ -17,13 +17,12 @@ from railfix.cli.console import console_of_tables, show_files
 from railfix.cli.options import check_outputs, from_models
 from railfix.core.errors import MismatchError, OutputError, SettingsError
 from railfix.core.settings import Settings, option
-from railfix.ground.monitor import MonitorLimits
 from railfix.ground.train import OnBoardLimits
-from railfix.ground.triangle import TriangleLimits
+from railfix.ground.triangle import MonitorLimits, TriangleLimits
 from railfix.run.output import Overwrite
 
 if TYPE_CHECKING:
-    from railfix.ground.monitor import Order
+    from railfix.ground.triangle import Order
 
 app = typer.Typer(
     cls=Commands,
@@ -89,9 +88,8 @@ def monitor(
 
     Exit codes as `railfix --help` says; 5 where the logs have no satellite or no epoch in common.
     """
-    from railfix.ground.monitor import draw_triangle, monitor_log
     from railfix.ground.station_fixes import station_fixes
-    from railfix.ground.triangle import TriangleVerdict
+    from railfix.ground.triangle import TriangleVerdict, draw_triangle, monitor_log
     from railfix.io import read_navigation, read_observations
 
     if len(logs) != 3:
@@ -147,9 +145,8 @@ def _monitor_live(
     import asyncio
     import time
 
-    from railfix.ground.monitor import LiveMonitor
     from railfix.ground.station_fixes import stream_fixes
-    from railfix.ground.triangle import TriangleVerdict
+    from railfix.ground.triangle import LiveMonitor, TriangleVerdict
     from railfix.io import read_navigation
     from railfix.live.sources import check_source, is_file
     from railfix.run.processor import place_of

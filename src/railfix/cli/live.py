@@ -9,8 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from railfix.cli.command import SIGNALLED
-from railfix.cli.options import from_models
-from railfix.cli.settings import Choices, set_value, settings_of
+from railfix.cli.options import Choices, from_models, set_value, settings_of
 from railfix.core.settings import validated
 from railfix.live.settings import LiveInputs, LiveSettings
 

@@ -15,7 +15,7 @@ from railfix.cli.options import OverwriteOption, Without, check_outputs, from_mo
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.run.options import ColumnNames, TrackReading
+from railfix.run.inputs import ColumnNames, TrackReading
 from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network
 from railfix.track.network_check import check_network

@@ -11,13 +11,12 @@ import polars as pl
 import typer
 
 from railfix.cli.console import console_of_tables, show_files, show_notes, show_table, show_verdict
-from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
-from railfix.cli.settings import Choices, settings_of
+from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs, from_models, settings_of
 from railfix.core.errors import SettingsError
 from railfix.core.files import BrokenLines
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.core.tables import Column, Table, count, listing, number, percent
-from railfix.run.options import ColumnNames, LogReading
+from railfix.run.inputs import ColumnNames, LogReading
 from railfix.track.survey.runs import SurveyLimits
 
 #: Share of the epochs of a stretch within the alarm limit from which satellites serve there.

@@ -1,8 +1,9 @@
-"""Command-line options made from `Settings` models, where each is declared once."""
+"""Command-line options made from `Settings` models, where each is declared once; settings from them."""
 
 from __future__ import annotations
 
 import inspect
+import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,8 +17,10 @@ import typer
 from pydantic import ValidationError
 
 from railfix.core.errors import SettingsError
-from railfix.core.settings import Settings
+from railfix.core.settings import INPUTS, Settings, option, read_toml
+from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, parse_config
 from railfix.run.output import FileKind, Overwrite, check_output_file
+from railfix.run.processor import with_measured_priors
 
 _DAY: Final = "%Y-%m-%d"
 _TIMES: Final = ["%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", _DAY]
@@ -177,29 +180,154 @@ def _plain_type(annotation: Any) -> tuple[Any, bool]:
 def _built(model: type[Model], options: list[_Option], given: Mapping[str, Any]) -> Model:
     """Return the model with the values of the command line; SettingsError names the option that is out of range."""
     values: dict[str, Any] = {}
-    for option in options:
-        value = given[option.parameter.name]
+    for chosen in options:
+        value = given[chosen.parameter.name]
         if value is None or value == []:
             continue
-        if option.switch:
-            value = option.switch[int(value)]
-        elif option.numbers:
+        if chosen.switch:
+            value = chosen.switch[int(value)]
+        elif chosen.numbers:
             value = tuple(part.strip() for text in value for part in text.split(","))
-        elif isinstance(value, datetime) and option.path[-1] == "date":
+        elif isinstance(value, datetime) and chosen.path[-1] == "date":
             value = value.date()
-        if value == option.default:
+        if value == chosen.default:
             continue
         place = values
-        for group in option.path[:-1]:
+        for group in chosen.path[:-1]:
             place = place.setdefault(group, {})
-        place[option.path[-1]] = value
+        place[chosen.path[-1]] = value
     try:
         return model.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
         message = first["msg"].removeprefix("Value error, ")
-        names = {option.path: option.name for option in options}
+        names = {own.path: own.name for own in options}
         where = tuple(part for part in first["loc"] if isinstance(part, str))
         if where not in names:
             raise SettingsError(message) from None
         raise SettingsError(f"{names[where]}: {message}, got {first['input']!r}") from None
+
+
+class Choices(Settings):
+    """Settings of a run as the command line gives them; later fields override earlier ones."""
+
+    preset: str | None = option(
+        "Base preset; other settings override it: default; strict, fewer positions of higher integrity; p1, the "
+        "limits of the paper that the screens are from, for geodetic receivers at 10 Hz.",
+        None,
+        metavar="NAME",
+    )
+    config: Path | None = option("Settings file; defaults where it is silent.", None, metavar="TOML")
+    setting: tuple[str, ...] = option(
+        "One setting, overriding the file's: --set elevation.mask_deg=15; may be repeated.",
+        (),
+        name="--set",
+        metavar="KEY=VALUE",
+    )
+    screens: str | None = option(
+        "Screens that are on, of elevation, cn0, doppler, antenna_pair, raim, antenna_spacing; or none.",
+        None,
+        metavar="NAME,NAME",
+    )
+    without: tuple[str, ...] = option("Switch one screen off; may be repeated.", (), metavar="NAME")
+    filter: Literal["track", "off"] | None = option(
+        "Filter along the track over all epochs, into train.csv and train.parquet: track (the default) or off.",
+        None,
+    )
+    cn0_curve: Path | None = option(
+        "Mean C/N0 over elevation of antenna and receiver, from railfix cn0-curve.", None, metavar="TOML"
+    )
+    error_model: Path | None = option(
+        "Pseudorange errors of this line for weights and protection level, from railfix error-model.",
+        None,
+        metavar="TOML",
+    )
+    sbas: tuple[Path, ...] = option(
+        "Log of SBAS messages (RTKLIB .sbs, EMS, RINEX 2 B, UBX, SBF), or the word stream for those in the receivers' "
+        "own logs and streams; their corrections replace the models, and satellites without a valid one are rejected.",
+        (),
+        metavar="FILE",
+        panel=INPUTS,
+    )
+
+
+def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
+    """Return the settings of the file, overridden by those of the command line; and those that were given.
+
+    Raises
+    ------
+    SettingsError
+        A setting is misspelt, out of range, or not written as KEY=VALUE; a screen or preset is unknown.
+    InputFileError
+        The file cannot be read.
+    """
+    values: dict[str, Any] = {}
+    source = "command line"
+    if choices.config is not None:
+        values = read_toml(choices.config, what="a configuration file")
+        parse_config(values, source=str(choices.config))
+    if choices.preset is not None:
+        values["preset"] = _preset(choices.preset)
+    check_set_once(choices.setting)
+    for text in choices.setting:
+        if choices.preset is not None and text.partition("=")[0].strip() == "preset":
+            raise SettingsError(f"the preset is given twice (--preset {choices.preset} and --set {text}); give it once")
+        set_value(values, text)
+        source = "--set"
+    if choices.screens is not None:
+        values["screens"] = [] if choices.screens.strip() == "none" else _screens("--screens", choices.screens)
+    if choices.filter is not None:
+        values["filter"] = choices.filter
+    if choices.cn0_curve is not None:
+        values["cn0_curve"] = str(choices.cn0_curve)
+    if choices.error_model is not None:
+        values["error_model"] = str(choices.error_model)
+    if choices.sbas:
+        words = [str(path) for path in choices.sbas]
+        values["sbas"] = "stream" if words == ["stream"] else words
+    if choices.without:
+        dropped = [name for text in choices.without for name in _screens("--without", text)]
+        values["screens"] = [name for name in parse_config(values, source=source).screens if name not in dropped]
+    return with_measured_priors(parse_config(values, source=source)), values
+
+
+def _preset(name: str) -> str:
+    if name not in PRESETS:
+        raise SettingsError(f"--preset {name}: unknown preset; known are {', '.join(PRESETS)}")
+    return name
+
+
+def _screens(option: str, text: str) -> list[str]:
+    """Names of screens, with commas between them."""
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in SCREEN_NAMES:
+            raise SettingsError(f"{option} {text}: unknown screen {name!r}; known are {', '.join(SCREEN_NAMES)}")
+    if len(set(names)) != len(names):
+        raise SettingsError(f"{option} {text}: name each screen once")
+    return names
+
+
+def check_set_once(settings: tuple[str, ...]) -> None:
+    """Raise SettingsError where one setting is given twice."""
+    keys = [text.partition("=")[0].strip() for text in settings]
+    if repeated := [key for key in keys if keys.count(key) > 1]:
+        raise SettingsError(f"--set {repeated[0]} is given {keys.count(repeated[0])} times; give it once")
+
+
+def set_value(values: dict[str, Any], text: str) -> None:
+    """Put one KEY=VALUE into nested settings; the value is TOML, or a bare word."""
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise SettingsError(f"--set {text}: expected KEY=VALUE, for example elevation.mask_deg=15")
+    try:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        parsed = value.strip()
+    *groups, last = (part.strip() for part in key.split("."))
+    place = values
+    for group in groups:
+        place = place.setdefault(group, {})
+        if not isinstance(place, dict):
+            raise SettingsError(f"--set {text}: {group} is a single setting, not a group")
+    place[last] = parsed

@@ -16,7 +16,7 @@ from railfix.evaluate import EvaluationOptions
 from railfix.report import write_report
 from railfix.report.explain import explain_epoch, time_text, write_explanation
 from railfix.report.plots.screens import draw_run_screens
-from railfix.run.options import ColumnNames
+from railfix.run.inputs import ColumnNames
 from railfix.run.output import OutputFolder
 from railfix.run.record import reading_table
 

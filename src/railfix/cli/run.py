@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 from railfix.cli.console import prepare_kernels, progress_bar, show_summary
-from railfix.cli.options import OutOption, Without, from_models
-from railfix.cli.settings import Choices, settings_of
+from railfix.cli.options import Choices, OutOption, Without, from_models, settings_of
 from railfix.run import RunInputs, RunOptions, run_files
 
 

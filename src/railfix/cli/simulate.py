@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from railfix.cli.console import progress_bar
-from railfix.cli.options import from_models
-from railfix.cli.settings import check_set_once, set_value
+from railfix.cli.options import check_set_once, from_models, set_value
 from railfix.core.errors import SettingsError
 from railfix.core.settings import Settings, option
 from railfix.run.output import Overwrite, check_folder

@@ -15,8 +15,8 @@ import polars as pl
 from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError
 from railfix.core.reasons import Status
-from railfix.evaluate.along_track import along_track_error, interpolate_reference
 from railfix.evaluate.figures import Score, score
+from railfix.evaluate.place import along_track_error, interpolate_reference
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.config import Config, FilterSource
 from railfix.pipeline.filter_result import AlongTrack
@@ -24,8 +24,7 @@ from railfix.pipeline.processor import AntennaResult, State
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.driver import Progress, notes_of, open_inputs, sensors_of
-from railfix.run.inputs import RunInputs
-from railfix.run.options import RunOptions
+from railfix.run.inputs import RunInputs, RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import RunProvenance, package_versions, run_record

@@ -13,12 +13,13 @@ from pydantic import AfterValidator, Field
 from railfix.core.arrays import Floats, Strings
 from railfix.core.errors import InputFileError
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.evaluate.along_track import LARGEST_GAP_S
 from railfix.io.named_columns import read_named_columns
-from railfix.run.options import ColumnNames
+from railfix.run.inputs import ColumnNames
 
 Method = Literal["chainage", "trajectory"]
 
+#: Longest gap of a reference that is interpolated over [s].
+LARGEST_GAP_S: Final = 2.5
 #: Windows of continuity [s]: 15 s is that of an approach in aviation, a minute the run from one station to the next.
 WINDOWS_S: Final = (15.0, 60.0)
 

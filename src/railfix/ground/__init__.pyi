@@ -11,11 +11,20 @@ from .interlocking import (
     route_requested,
 )
 from .layout import Layout, LoopStation
-from .monitor import MonitorLimits, MonitorState, advance, release
 from .station_fixes import StationFixes, station_fixes
 from .supervision import Supervision
 from .train import Authority, OnBoard, OnBoardLimits
-from .triangle import TriangleLimits, TriangleResult, TriangleVerdict, compare_triangle, limits_for_false_stops
+from .triangle import (
+    MonitorLimits,
+    MonitorState,
+    TriangleLimits,
+    TriangleResult,
+    TriangleVerdict,
+    advance,
+    compare_triangle,
+    limits_for_false_stops,
+    release,
+)
 
 __all__ = [
     "Authority",

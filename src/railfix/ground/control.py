@@ -14,12 +14,11 @@ from typing import Any
 from railfix.ground.centre import CentreLimits, ReferenceCurve, TrainRecord, TrainState, time_passed
 from railfix.ground.interlocking import HEAD, Interlocking, from_documents, stopped_trains, to_documents
 from railfix.ground.layout import PointName
-from railfix.ground.monitor import MonitorLimits, MonitorState, advance, release
-from railfix.ground.monitor import Order as MonitorOrder
 from railfix.ground.stops import close_section, open_section, release_train, stop_trains
 from railfix.ground.store import DatabaseError, Store
 from railfix.ground.supervision import Supervision
-from railfix.ground.triangle import STOPPING, TriangleVerdict
+from railfix.ground.triangle import STOPPING, MonitorLimits, MonitorState, TriangleVerdict, advance, release
+from railfix.ground.triangle import Order as MonitorOrder
 from railfix.ground.web import Order
 from railfix.io.train_message import MessageError, SuspectedInterference, TrainMessage, decode
 

@@ -24,14 +24,13 @@ from railfix.core.settings import Settings
 from railfix.ground.centre import ReferenceCurve
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.links import BEARERS, CentreLinks, LinkLimits, LinkName, TrainLinks, bearers_of, draw_coverage
-from railfix.ground.monitor import MonitorState
 from railfix.ground.quic import write_keys
 from railfix.ground.station_fixes import StationFixes, fixes_of_ranges
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start
 from railfix.ground.traffic import SimulatedTrain, Traffic, line_with_loops
 from railfix.ground.train import Authority, OnBoard
-from railfix.ground.triangle import TriangleLimits, TriangleVerdict, compare_triangle
+from railfix.ground.triangle import MonitorState, TriangleLimits, TriangleVerdict, compare_triangle
 from railfix.ground.web import PageServer, Sessions, page_app
 from railfix.io.train_message import TrainMessage, encode
 from railfix.positioning.normal_equations import Ranges

@@ -27,12 +27,11 @@ from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import HEAD, InterlockingLimits, TrainInterval
 from railfix.ground.layout import Layout, LoopStation, PointName, layout_of
 from railfix.ground.links import BEARERS, CentreLinks, LinkName
-from railfix.ground.monitor import MonitorLimits
 from railfix.ground.quic import check_keys
 from railfix.ground.station_fixes import stream_fixes
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
-from railfix.ground.triangle import TriangleLimits, TriangleVerdict, compare_triangle
+from railfix.ground.triangle import MonitorLimits, TriangleLimits, TriangleVerdict, compare_triangle
 from railfix.ground.web import PageServer, Sessions, page_app
 from railfix.io import read_navigation
 from railfix.track.network_read import read_network

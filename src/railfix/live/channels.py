@@ -21,8 +21,8 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.train_message import encode
 from railfix.live.engine import EngineState, LiveEngine, LiveOutput
-from railfix.live.sensor_lines import Sensed
 from railfix.live.settings import LiveSettings
+from railfix.live.stream import Sensed
 from railfix.pipeline.processor import EpochProcessor
 from railfix.ranges.sbas import SbasMessages
 

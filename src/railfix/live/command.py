@@ -22,12 +22,12 @@ from railfix.io.logs import read_navigation
 from railfix.live.channels import TwoChannels
 from railfix.live.console import SessionLog, check_log_file, serve_metrics
 from railfix.live.engine import LiveEngine, LiveOutput
-from railfix.live.sensor_lines import FOREVER, Sensed
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveInputs, LiveSettings
 from railfix.live.sinks import Outlet, file_of, open_sink
 from railfix.live.sources import check_source, is_file
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
+from railfix.live.stream import FOREVER, Sensed
 from railfix.live.warm_up import prepare_kernels
 from railfix.live.watches import PlaceWatch, SensorWatch
 from railfix.motion.samples import SensorSamples

@@ -21,8 +21,8 @@ from railfix.io.train_message import TrainMessage
 from railfix.kernels import load
 from railfix.live.lag import Lag
 from railfix.live.message import message_of, no_input_message
-from railfix.live.sensor_lines import FOREVER, Sensed
 from railfix.live.settings import LiveSettings
+from railfix.live.stream import FOREVER, Sensed
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import merged_navigation

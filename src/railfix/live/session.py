@@ -17,11 +17,19 @@ from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
 from railfix.live.console import Metrics
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
 from railfix.live.forms import gga_sentence
-from railfix.live.sensor_lines import FOREVER, Sensed, SensorLines
 from railfix.live.sinks import Sink
 from railfix.live.sources import Connected, Lost, hidden, is_file, read_source
 from railfix.live.state import SavedSession
-from railfix.live.stream import ReceivedData, ReceiverState, arrivals, fresh_state, next_arrival
+from railfix.live.stream import (
+    FOREVER,
+    ReceivedData,
+    ReceiverState,
+    Sensed,
+    SensorLines,
+    arrivals,
+    fresh_state,
+    next_arrival,
+)
 from railfix.ranges.sbas import from_receiver
 
 #: Items that may wait for the processor before a source is held back.
@@ -72,7 +80,7 @@ async def run_session(
         For recorded files: times as fast as recorded. None: as fast as they go; the clock is then that of the time
         tags (set `LiveSettings.no_input` to "skip" for one message an epoch and no more).
     sensors : mapping of str to str, optional
-        Streams of sensors on board (`railfix.live.sensor_lines`) by name; the engine has tables of files before.
+        Streams of sensors on board (`railfix.live.stream`) by name; the engine has tables of files before.
     date : datetime64, optional
         Some time within half a week of RTCM 3 streams, whose observations carry no week: now where they are live.
     streams : mapping of str to ReceiverState, optional

@@ -9,8 +9,7 @@ from pydantic import Field
 
 from railfix.core.settings import Settings, option
 from railfix.pipeline.config import Config
-from railfix.run.inputs import balise_list_option, input_option, virtual_balises_option
-from railfix.run.options import LogReading, TrackReading
+from railfix.run.inputs import LogReading, TrackReading, balise_list_option, input_option, virtual_balises_option
 from railfix.run.output import Overwrite
 
 

@@ -13,7 +13,7 @@ from railfix.core.errors import MismatchError
 from railfix.core.reasons import Status
 from railfix.core.timescale import GPS_EPOCH
 from railfix.live.engine import LiveOutput
-from railfix.live.sensor_lines import FOREVER, Sensed
+from railfix.live.stream import FOREVER, Sensed
 from railfix.motion.radar import RadarWatch
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor

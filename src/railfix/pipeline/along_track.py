@@ -16,11 +16,10 @@ from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import WheelSigns, WheelState, wheel_signs
 from railfix.motion.samples import BaliseReadings, ListedBalises, SensorSamples
-from railfix.pipeline.balise_stage import BaliseLimits
+from railfix.pipeline.balises import BaliseLimits, find_passings
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.filter_result import AlongTrack, FilterFix, FilterState, Replay, SingleEpochs, SmoothedTrack
-from railfix.pipeline.passings import find_passings
 from railfix.pipeline.return_gate import ReturnState, gated_codes
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import LineReferences, sensor_epochs

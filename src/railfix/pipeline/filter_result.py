@@ -12,7 +12,7 @@ from railfix.core.arrays import Codes, Datetimes, Floats, Masks
 from railfix.core.tables import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import Suspicion, WheelSigns, WheelState
-from railfix.pipeline.passings import Passing, PassingState
+from railfix.pipeline.balises import Passing, PassingState
 from railfix.pipeline.return_gate import ReturnState
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import SensorState

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.pipeline.passings import CONTRADICTS, MISSING, NOT_LISTED, VERDICTS, Passing
+from railfix.pipeline.balises import CONTRADICTS, MISSING, NOT_LISTED, VERDICTS, Passing
 from railfix.pipeline.result_columns import Column, by_name, table_of
 from railfix.pipeline.results import Result
 

@@ -26,7 +26,7 @@ from railfix.motion.samples import (
 )
 from railfix.motion.slip import MotionState, SlipLimits
 from railfix.motion.tachometer import TachometerLimits, faults_until, way_m, window_start
-from railfix.pipeline.balise_stage import BaliseLimits, BaliseState, balise_epochs
+from railfix.pipeline.balises import BaliseLimits, BaliseState, balise_epochs
 from railfix.pipeline.feature_stage import FeatureFix, FeatureState, LineFeatures, RateSeries, ahead_m, feature_fixes
 from railfix.pipeline.sensed_motion import CARRIED, REACH, SensedMotion, SensedState, nothing_sensed, sensed_motion
 from railfix.track.trajectory import Trajectory

@@ -18,13 +18,13 @@ from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.interference_stage import Interference
-from railfix.pipeline.lasting_errors import lasting_errors
 from railfix.pipeline.level_stage import bounding_model, low_sides, protection_levels, unresolved_alternatives
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
 from railfix.pipeline.return_gate import OffMapState, off_map_epochs
 from railfix.pipeline.solve import (
     Place,
     fault_free,
+    lasting_errors,
     line_model,
     place_on_line,
     redundancy_of,

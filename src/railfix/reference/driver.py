@@ -34,14 +34,15 @@ from railfix.reference.fixes import FixRejection
 from railfix.reference.settings import ReferenceSettings
 from railfix.run.inputs import (
     Antenna,
+    ColumnNames,
     InputFiles,
+    TrackReading,
     check_given_once,
     input_option,
     logs_by_antenna,
     track_option,
     vehicle_option,
 )
-from railfix.run.options import ColumnNames, TrackReading
 from railfix.run.output import OutputFolder, Overwrite
 from railfix.run.sources import Log, OpenedLine, open_line
 from railfix.track.trajectory import Trajectory

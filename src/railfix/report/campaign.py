@@ -17,11 +17,10 @@ from railfix.core.files import write_whole
 from railfix.core.tables import Column, Table, count, listing, number, percent, plural, signed
 from railfix.evaluate import RunAndReference, evaluate_runs
 from railfix.evaluate.run_folder import POSITIONS_TABLE, floats, read_table, tables_of
-from railfix.report.charts_page import charts_page
+from railfix.report.charts_page import Block, Notes, Sentence, charts_page
 from railfix.report.explain import explain_epoch, time_text, write_explanation
 from railfix.report.plots.campaign import campaign_bars, campaign_plan
 from railfix.report.plots.chart import Chart
-from railfix.report.tables import Block, Notes, Sentence
 
 #: Epochs that are listed, one at most in so many seconds of a run [s]; pieces of the line that each run is drawn in.
 _WORST: Final = 10

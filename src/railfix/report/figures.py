@@ -17,6 +17,7 @@ from railfix.evaluate.integrity import LEVELS_OF, epochs_diagram, level_name, po
 from railfix.evaluate.run_folder import floats
 from railfix.evaluate.tables import evaluation_of, level_tables
 from railfix.pipeline.level_stage import prior_basis_text
+from railfix.report.charts_page import Absent, Block
 from railfix.report.plots.campaign import processing_time
 from railfix.report.plots.chart import Chart, SkyEpochs, start_of
 from railfix.report.plots.errors import (
@@ -31,7 +32,6 @@ from railfix.report.plots.line import interval_distribution, interval_over_chain
 from railfix.report.plots.screens import missing_columns, screen_over_chainage, screen_over_time, screens_of
 from railfix.report.plots.signals import CN0_COLUMNS, SKY_COLUMNS, SKY_EPOCHS, cn0_over_elevation, sky_epochs
 from railfix.report.runs import ReportedRun
-from railfix.report.tables import Absent, Block
 
 #: Number of listed epochs with an error above the level.
 WORST: Final = 20

@@ -14,8 +14,7 @@ from railfix.core.tables import number, share
 from railfix.evaluate import Evaluation
 from railfix.evaluate.figures import PASSED
 from railfix.evaluate.run_folder import floats
-from railfix.report.runs import ReportedRun
-from railfix.report.tables import figures_of
+from railfix.report.runs import ReportedRun, figures_of
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,25 +1,221 @@
-"""The report: one HTML page with all it shows."""
+"""The report: one HTML page with its tables and charts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import count
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from itertools import count as counter
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from railfix.core.arrays import Floats
 from railfix.core.files import write_whole
+from railfix.core.tables import Table, count, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
-from railfix.report import tables
-from railfix.report.charts_page import PagePart, figure, render
-from railfix.report.encode import read_background
+from railfix.evaluate.run_folder import flattened
+from railfix.evaluate.tables import error_tables, evaluation_of, group_tables
+from railfix.report.charts_page import (
+    Absent,
+    Block,
+    Folded,
+    Notes,
+    PagePart,
+    ReportedCommand,
+    Sentence,
+    figure,
+    read_background,
+    render,
+)
 from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, Group, antenna_groups, overview, protection, run_group
 from railfix.report.headline import Headline, headline
 from railfix.report.plots.errors import error_ranges
 from railfix.report.plots.signals import SKY_EPOCHS
-from railfix.report.runs import ReportedRun, read_runs
-from railfix.report.tables import Absent, Block, Folded
+from railfix.report.runs import ReportedRun, figures_of, read_runs
+
+
+def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table:
+    """One row per run and antenna: rates and, with a reference, errors."""
+    head = ["run", "antenna", "settings", "epochs", "rate", "ok", "sigma p95"]
+    judged = ["mean", "std", "p95", "largest", "conventional p95", "largest"] if evaluation else []
+    rows = []
+    for run in runs:
+        asked = flattened(run.record.get("settings_asked") or {})
+        chosen = [run.config.preset, *(f"{name} {_word(value)}" for name, value in asked.items() if name != "preset")]
+        for antenna, facts in _antennas(run).items():
+            sigma = facts.get("along_sigma_m") or {}
+            row = [
+                run.name,
+                antenna,
+                "; ".join(chosen),
+                count(facts.get("epochs")),
+                share(facts.get("positioning_rate")),
+                share(facts.get("ok_rate")),
+                number(_plain(sigma.get("p95_m"))),
+            ]
+            if evaluation:
+                figures = {p: figures_of(evaluation, run, antenna, p) for p in ("constrained", "conventional")}
+                row += [number(figures["constrained"].get(k)) for k in ("mean_m", "std_m", "p95_m", "max_m")]
+                row += [number(figures["conventional"].get(k)) for k in ("p95_m", "max_m")]
+            rows.append(row)
+    caption = (
+        "settings: preset and changed settings; rate: share of the epochs with observations that have a position; "
+        "sigma p95: stated standard deviation along the line, in metres"
+    )
+    if evaluation:
+        caption += "; errors along the line in metres: mean and std of the signed error, p95 and largest of its size"
+    columns = range(3, len(head) + len(judged))
+    return Table(name="summary", head=[*head, *judged], rows=rows, caption=caption, numeric=columns)
+
+
+def _antennas(run: ReportedRun) -> Mapping[str, Mapping[str, Any]]:
+    known: Mapping[str, Mapping[str, Any]] = run.record.get("antennas") or {}
+    return {name: known.get(name) or {} for name in run.folder.antennas}
+
+
+def provenance(run: ReportedRun) -> list[Block]:
+    """Command, versions, inputs with hashes, line, notes."""
+    record = run.record
+    written = datetime.fromtimestamp((run.folder.path / "run.json").stat().st_mtime, tz=UTC)
+    versions: Mapping[str, Any] = record.get("versions") or {}
+    spans = [
+        f"{name}: {facts.get('first_epoch_gpst')} to {facts.get('last_epoch_gpst')} GPS time"
+        for name, facts in _antennas(run).items()
+    ]
+    track = run.folder.track_facts
+    vehicle = (record.get("line") or {}).get("vehicle") or {}
+    rows = [
+        ("folder", str(run.folder.path)),
+        ("written", written.strftime("%Y-%m-%d %H:%M:%S UTC")),
+        ("epochs", "; ".join(spans)),
+        ("reference", run.reference or "none given"),
+        ("line", f"{run.folder.line_name}, {track.get('length_m', '?')} m, {track.get('points', '?')} points"),
+        ("vehicle", str(vehicle.get("name") or "none; the track is the trajectory of the antenna")),
+        ("versions", ", ".join(f"{name} {value}" for name, value in versions.items())),
+        ("platform", str(record.get("platform", "not recorded"))),
+        ("wall time", f"{record.get('wall_s', '?')} s"),
+    ]
+    inputs = [
+        [str(f["input"]), str(f["path"]), count(f.get("bytes")), str(f.get("sha256", ""))]
+        for f in record.get("inputs") or []
+    ]
+    notes = [*(str(note) for note in record.get("notes") or []), *run.notes]
+    return [
+        Table(name="run", head=["", "run"], rows=rows),
+        ReportedCommand(shlex.join(str(word) for word in record.get("command") or [])),
+        Table(name="inputs", head=["input", "file", "bytes", "SHA-256"], rows=inputs, numeric=[2], code=[1, 3]),
+        Notes("Notes", notes) if notes else Sentence("The run has no notes."),
+    ]
+
+
+def settings(run: ReportedRun) -> list[Block]:
+    """Settings asked for beside those used."""
+    asked = flattened(run.record.get("settings_asked") or {})
+    used = flattened(run.record.get("settings_used") or {})
+    names = [*(name for name in used if name in asked), *(name for name in asked if name not in used)]
+    names += [name for name in used if name not in asked]
+    rows = [[name, _word(asked.get(name, "")), _word(used.get(name, ""))] for name in names]
+    return [
+        Sentence(f"{len(asked)} of {len(used)} settings were asked for; the others are defaults."),
+        Table(name="settings", head=["setting", "asked", "used"], rows=rows, marked=range(len(asked))),
+    ]
+
+
+def budget(run: ReportedRun) -> list[Block]:
+    """Epochs by status, and pseudoranges by the first reason for their rejection."""
+    antennas = _antennas(run)
+    names = list(antennas)
+    statuses = dict.fromkeys(s for facts in antennas.values() for s, n in (facts.get("status") or {}).items() if n)
+    rows = [
+        ["epochs", *(count(antennas[n].get("epochs")) for n in names)],
+        ["with observations", *(count(antennas[n].get("epochs_with_observations")) for n in names)],
+        ["with position", *(count(antennas[n].get("epochs_with_position")) for n in names)],
+        *([f"  {s}", *(count((antennas[n].get("status") or {}).get(s, 0)) for n in names)] for s in statuses),
+        ["positioning rate", *(share(antennas[n].get("positioning_rate")) for n in names)],
+        ["rate of ok", *(share(antennas[n].get("ok_rate")) for n in names)],
+    ]
+    few = dict.fromkeys(r for f in antennas.values() for r in f.get("too_few_satellites_by_first_reason") or {})
+    rows += [
+        [
+            f"too few satellites, by {r}",
+            *(count((antennas[n].get("too_few_satellites_by_first_reason") or {}).get(r, 0)) for n in names),
+        ]
+        for r in few
+    ]
+    first, only = "observations_rejected_by_first_reason", "observations_rejected_by_one_reason_alone"
+    reasons = dict.fromkeys(r for facts in antennas.values() for r in facts.get(first) or {})
+    head = ["", *(word for n in names for word in (n, "share", "only reason"))]
+    observed = {n: antennas[n].get("observations") or 0 for n in names}
+
+    def cells(ranges: Mapping[str, float], alone: Mapping[str, float] | None) -> list[str]:
+        return [
+            word
+            for n in names
+            for word in (
+                count(ranges[n]),
+                share(ranges[n] / observed[n] if observed[n] else None),
+                "" if alone is None else count(alone[n]),
+            )
+        ]
+
+    ranges = [
+        ["observed", *cells(observed, None)],
+        ["used", *cells({n: antennas[n].get("observations_used") or 0 for n in names}, None)],
+    ]
+    for reason in reasons:
+        counts = {n: (antennas[n].get(first) or {}).get(reason, 0) for n in names}
+        alone = {n: (antennas[n].get(only) or {}).get(reason, 0) for n in names}
+        ranges.append([f"  {reason}", *cells(counts, alone)])
+    caption = "Pseudoranges by the first reason for their rejection, and those with this reason only"
+    signs = [
+        [name, sign, count(seen["epochs"]), str(seen["first"])]
+        for name, facts in antennas.items()
+        for sign, seen in (facts.get("interference") or {}).items()
+    ]
+    suspected = [
+        Table(
+            name="interference", head=["antenna", "sign", "epochs", "first, GPS time"], rows=signs, numeric=[2],
+            caption="Signs of jamming and spoofing",
+        )
+    ] if signs else [Sentence("No sign of jamming or spoofing.")]  # fmt: skip
+    return [
+        *suspected,
+        Table(name="epochs", head=["", *names], rows=rows, caption="Epochs by status", numeric=range(1, 9)),
+        Table(name="pseudoranges", head=head, rows=ranges, caption=caption, numeric=range(1, 9)),
+    ]
+
+
+def merits(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
+    """Figures of merit of one run, on the map beside conventional."""
+    return _with_groups(evaluation_of(evaluation, run.name_in(evaluation)))
+
+
+def filter_tables(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
+    """Figures of the filter along the track: all epochs, with and without satellites, outages, probabilities."""
+    name = run.name_in(evaluation, "train")
+    if not name:
+        return [Absent("The run has no filter along the track (railfix run --filter off).")]
+    return _with_groups(evaluation_of(evaluation, name), of="filter-")
+
+
+def _with_groups(evaluation: Evaluation, *, of: str = "") -> list[Block]:
+    tables, groups = (
+        [replace(table, name=f"{of}{table.name}") for table in found]
+        for found in (error_tables(evaluation), group_tables(evaluation))
+    )
+    return [*tables, *(Folded(table.caption.split(";")[0], [table]) for table in groups)]
+
+
+def _plain(value: Any) -> float | None:
+    return float(value) if isinstance(value, int | float) else None
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, Iterable) and not isinstance(value, str):
+        return " ".join(str(v) for v in value)
+    return "none" if value is None else str(value)
+
 
 #: Fewest epochs of the sky plot of an antenna.
 _LEAST_SKY: Final = 200
@@ -69,7 +265,7 @@ def write_report(
     references, conventional : sequence of Path
         See `railfix.report.read_runs`.
     background : Path, optional
-        GeoJSON file with lines to draw below the plan (`railfix.report.encode`).
+        GeoJSON file with lines to draw below the plan (`railfix.report.charts_page`).
     title : str
     options : EvaluationOptions, optional
 
@@ -111,7 +307,7 @@ def report_page(
     title: str = "",
 ) -> str:
     """HTML of the report; `background`: longitude and latitude of lines below the plan, each of shape (P, 2) [deg]."""
-    numbers = count()
+    numbers = counter()
     antennas = max(sum(len(run.folder.antennas) for run in runs), 1)
     # many antennas share the size that two have
     epochs = max(_LEAST_SKY, min(SKY_EPOCHS, 2 * SKY_EPOCHS // antennas))
@@ -128,7 +324,7 @@ def report_page(
 
 def _summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> list[Block]:
     """Table of all runs, and what the page lacks."""
-    blocks: list[Block] = [tables.summary(runs, evaluation)]
+    blocks: list[Block] = [summary(runs, evaluation)]
     if evaluation is None:
         blocks.append(Absent(NO_REFERENCE))
     without = [run.name for run in runs if run.observations is None]
@@ -161,10 +357,10 @@ def _run(
     background: Sequence[Floats],
 ) -> _RunPart:
     anchor, first = f"run{number}", run.folder.antennas[0]
-    merits = []
+    errors: list[Folded] = []
     if evaluation is not None:
-        merits.append(Folded("Figures of merit", tables.merits(run, evaluation)))
-        merits.append(Folded("Filter along the track", tables.filter_tables(run, evaluation)))
+        errors.append(Folded("Figures of merit", merits(run, evaluation)))
+        errors.append(Folded("Filter along the track", filter_tables(run, evaluation)))
 
     def place(i: int) -> str:
         return f"sky{number}-{i}" if run.observations is not None else ""
@@ -176,11 +372,11 @@ def _run(
         headline=headline(run, first, evaluation),
         overview=_part(overview(run, first, background), numbers, place(0), anchor, width="half"),
         tables=(
-            *merits,
-            Folded("Epochs and pseudoranges", tables.budget(run)),
+            *errors,
+            Folded("Epochs and pseudoranges", budget(run)),
             Folded("Protection level", protection(run, evaluation)),
-            Folded("Run, inputs and notes", tables.provenance(run)),
-            Folded("Settings asked for and used", tables.settings(run)),
+            Folded("Run, inputs and notes", provenance(run)),
+            Folded("Settings asked for and used", settings(run)),
         ),
         timing=_part(run_group(run), numbers, "", anchor),
         antennas=[

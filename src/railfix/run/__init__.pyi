@@ -1,8 +1,7 @@
 # The names of `railfix.run`, imported at their first use (lazy-loader).
 
 from .driver import RunSummary, run_files
-from .inputs import RunInputs
-from .options import RunOptions, TrackReading
+from .inputs import RunInputs, RunOptions, TrackReading
 from .record import RunRecord, read_record
 
 __all__ = [

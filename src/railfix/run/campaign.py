@@ -21,8 +21,7 @@ from railfix.core.files import write_whole
 from railfix.core.settings import Settings, load_settings
 from railfix.pipeline.config import Config, load_config
 from railfix.run.driver import run_files
-from railfix.run.inputs import RunInputs
-from railfix.run.options import RunOptions
+from railfix.run.inputs import RunInputs, RunOptions
 from railfix.run.output import check_folder
 from railfix.run.processor import with_measured_priors
 from railfix.run.record import read_record

@@ -19,8 +19,7 @@ from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.locate import locate
 from railfix.pipeline.received import Received, known_from_start
-from railfix.run.inputs import InputFiles, input_option
-from railfix.run.options import LogReading
+from railfix.run.inputs import InputFiles, LogReading, input_option
 from railfix.run.sources import Log
 from railfix.track.trajectory import Trajectory
 

@@ -22,7 +22,7 @@ from railfix.pipeline.corrected_ranges import Models
 from railfix.pipeline.processor import EpochProcessor
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.ranges.error_model import read_error_model
-from railfix.run.options import RunOptions
+from railfix.run.inputs import RunOptions
 from railfix.run.sources import Log
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory

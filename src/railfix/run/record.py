@@ -26,8 +26,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.kernels import numba_version
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.level_stage import level_facts
-from railfix.run.inputs import RunInputs, located
-from railfix.run.options import RunOptions
+from railfix.run.inputs import RunInputs, RunOptions, located
 from railfix.run.output import OutputFolder
 from railfix.run.tally import Tally
 from railfix.tracking import TrackStatus

@@ -24,7 +24,7 @@ from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.locate import locate
 from railfix.pipeline.received import known_from_start
-from railfix.run.options import TrackReading
+from railfix.run.inputs import TrackReading
 from railfix.track import Track
 from railfix.track.frames import in_map_frame
 from railfix.track.network import Network

@@ -234,7 +234,7 @@ def _table(path: Path, kind: str) -> pl.DataFrame:
     falling = np.flatnonzero(np.diff(_times(table)) < np.timedelta64(0, "ns"))
     if len(falling):
         raise InputFileError(path, f"row {int(falling[0]) + 3}: time_gpst falls; sort the table by time")
-    if kind in _SILENT:  # a stream that was recorded has rows with the time alone (`railfix.live.sensor_lines`)
+    if kind in _SILENT:  # a stream that was recorded has rows with the time alone (`railfix.live.stream`)
         table = table.filter(~pl.all_horizontal(_columns_of(table, kind).is_null()))
         if not len(table):
             raise InputFileError(path, f"has no row of the {kind} but its time; leave the file out")

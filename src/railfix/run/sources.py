@@ -22,8 +22,7 @@ from railfix.pipeline.along_track import doubted
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import judged
 from railfix.pipeline.results import Result
-from railfix.run.inputs import OF_LOG, Antenna
-from railfix.run.options import TrackReading
+from railfix.run.inputs import OF_LOG, Antenna, TrackReading
 from railfix.run.prepared import PreparedLines, key_of, track_key
 from railfix.run.route import RouteOfLog
 from railfix.track import Track
@@ -244,7 +243,7 @@ class Log:
     #: First epoch, and the time before which the last one lies.
     start: datetime | None = None
     end: datetime | None = None
-    date: np.datetime64 | None = None  #: Of RTCM 3 logs; see `railfix.run.options.LogReading`.
+    date: np.datetime64 | None = None  #: Of RTCM 3 logs; see `railfix.run.inputs.LogReading`.
     share: float = 0.0  #: Part of the files that has been read, 0 to 1.
     problems: list[str] = field(default_factory=list)  #: Sentences on what was broken and passed over.
     skipped: Counter[str] = field(default_factory=Counter)  #: Skipped items, counted by kind.

@@ -1,13 +1,14 @@
-"""Files of several runs to one surveyed map."""
+"""Files of several runs to one surveyed map, and features of a line as runs measured them (P2 2.3)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+import polars as pl
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError
@@ -17,10 +18,11 @@ from railfix.gnss.navigation import Navigation
 from railfix.io.logs import read_navigation
 from railfix.io.nmea import read_any_positions
 from railfix.io.receiver.framing import head_of, is_receiver_log
+from railfix.motion.features import Feature, FeatureLimits, LineSeries, Quantity, map_features
 from railfix.pipeline.config import Config
+from railfix.pipeline.locate import survey_run
 from railfix.pipeline.received import known_from_start
-from railfix.pipeline.survey_signals import survey_run
-from railfix.run.options import LogReading
+from railfix.run.inputs import LogReading
 from railfix.run.sources import Log
 from railfix.track.survey.line import Survey, survey_line
 from railfix.track.survey.runs import SurveyLimits, SurveyRun, run_of_log
@@ -108,3 +110,123 @@ def _check_together(runs: Sequence[SurveyRun]) -> None:
                 f"{run.name} lies at {latitude:.3f}, {longitude:.3f}, {distance / 1e3:,.0f} km from {runs[0].name}; "
                 "give runs over one line"
             )
+
+
+#: Columns of ``train.parquet`` with what a run has measured of the line, and the unit of the second and third.
+_COLUMNS: Final = ("measured_chainage_m", "measured_gradient_permille", "measured_curvature_1pm")
+#: A change counts when it is so many times its standard deviation, from so many values on either side.
+_SIGMAS: Final = 5.0
+_LEAST_VALUES: Final = 3
+#: Rounds in which the window about a change moves to its middle.
+_CENTRED: Final = 5
+#: A slip is in the gradient for a while before it is found: what is so near to one is left out.
+_BEFORE_SLIP: Final = np.timedelta64(1500, "ms")
+
+
+def read_measured(folder: Path) -> pl.DataFrame:
+    """Read what a run has measured of its line, by chainage; of two antennas the rows of the first.
+
+    InputFileError: the folder has no results of a filter, or these none by wheel and inertial unit.
+    """
+    path = folder / "train.parquet"
+    try:
+        table = pl.read_parquet(path, columns=["time_gpst", "antenna", "motion", *_COLUMNS])
+    except (OSError, pl.exceptions.PolarsError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputFileError(path, f"has no measured line ({reason}); give a folder of railfix run") from None
+    table = table.filter(pl.col("antenna") == pl.col("antenna").first())
+    time = table["time_gpst"].to_numpy().astype("datetime64[ns]")
+    slips = time[(table["motion"] != "normal").to_numpy()]
+    after = np.searchsorted(slips, time + _BEFORE_SLIP)
+    before = np.searchsorted(slips, time - _BEFORE_SLIP)
+    rows = table.filter(pl.Series(after == before)).select(_COLUMNS).drop_nulls().drop_nans()
+    if not len(rows):
+        raise InputFileError(
+            path, "has no measured gradient and curvature; run with --tachometer (with a direction) and --inertial"
+        )
+    return rows.sort("measured_chainage_m")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredFeature:
+    """A feature that runs show together."""
+
+    feature: Feature  #: Its `arc_m` is a chainage.
+    places_m: Floats  #: Its chainage by each of the runs that show it alone, shape (R,).
+    map_m: float  #: Chainage of the same feature of the map; NaN where the map has none.
+
+
+def measured_features(
+    runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = (), *, limits: FeatureLimits | None = None
+) -> list[MeasuredFeature]:
+    """Return the features that all runs together show, in order.
+
+    Parameters
+    ----------
+    runs : sequence of polars.DataFrame
+        See `read_measured`.
+    of_map : sequence of Feature
+        Features of the map, by chainage.
+    """
+    limits = limits or FeatureLimits()
+    alone = [_features(run, limits) for run in runs]
+    found = []
+    for feature in _features(pl.concat(runs).sort(_COLUMNS[0]), limits):
+        places = [place for each in alone if np.isfinite(place := _nearest(feature, each, limits))]
+        at_map = _nearest(feature, of_map, limits)
+        found.append(MeasuredFeature(feature=feature, places_m=np.array(places), map_m=at_map))
+    return found
+
+
+def _nearest(feature: Feature, others: Sequence[Feature], limits: FeatureLimits) -> float:
+    """Place of the nearest one of the same kind and direction; NaN where there is none near."""
+    alike = [f.arc_m for f in others if f.quantity == feature.quantity and f.change * feature.change > 0.0]
+    near = [at for at in alike if abs(at - feature.arc_m) < 2.0 * limits.base_m]
+    return min(near, key=lambda at: abs(at - feature.arc_m), default=float("nan"))
+
+
+def _features(rows: pl.DataFrame, limits: FeatureLimits) -> list[Feature]:
+    """Features of rows by chainage; stretches without values part them."""
+    at = rows[_COLUMNS[0]].to_numpy()
+    grid = np.arange(np.ceil(at[0]), np.floor(at[-1]), limits.step_m)
+    first = np.searchsorted(at, grid - 0.5 * limits.base_m)
+    last = np.searchsorted(at, grid + 0.5 * limits.base_m)
+    count = last - first
+    gradient, gradient_sigma = _means(rows[_COLUMNS[1]].to_numpy() * 1e-3, first, last)
+    curvature, curvature_sigma = _means(rows[_COLUMNS[2]].to_numpy(), first, last)
+    enough = count >= _LEAST_VALUES
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], enough, [False]]).astype(np.int8)))
+    found: list[Feature] = []
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        part = slice(begin, end)
+        series = LineSeries(arc_m=grid[part], gradient=gradient[part], curvature_1pm=curvature[part])
+        sigma: dict[Quantity, Floats] = {"gradient": gradient_sigma[part], "curvature": curvature_sigma[part]}
+        least = {name: _SIGMAS * each for name, each in sigma.items()}
+        found += centred(map_features(series, limits=limits, least=least), series, limits)
+    return found
+
+
+def centred(features: Sequence[Feature], series: LineSeries, limits: FeatureLimits) -> list[Feature]:
+    """Return features at the middle of their change: that of a transition curve is flat, and noise chooses on it."""
+    lag = max(round(limits.base_m / limits.step_m), 1)
+    found = []
+    for feature in features:
+        values = series.of(feature.quantity)
+        change = np.zeros(len(values))
+        change[lag:-lag] = (values[2 * lag :] - values[: -2 * lag]) * np.sign(feature.change)
+        over, middle = np.maximum(change - 0.5 * abs(feature.change), 0.0), feature.arc_m
+        for _ in range(_CENTRED):
+            weight = np.where(np.abs(series.arc_m - middle) <= 2.0 * limits.base_m, over, 0.0)
+            middle = float((weight * series.arc_m).sum() / weight.sum())
+        found.append(replace(feature, arc_m=middle))
+    return found
+
+
+def _means(values: Floats, first: np.ndarray, last: np.ndarray) -> tuple[Floats, Floats]:
+    """Means of values between indices, and their standard deviations."""
+    count = np.maximum(last - first, 1)
+    middle = values - values.mean()
+    sums, squares = (np.concatenate([[0.0], np.cumsum(each)]) for each in (middle, middle**2))
+    mean = (sums[last] - sums[first]) / count
+    spread = np.maximum((squares[last] - squares[first]) / count - mean**2, 0.0)
+    return mean + values.mean(), np.sqrt(spread / np.maximum(count - 1, 1))

@@ -26,8 +26,7 @@ from railfix.gnss.observations import Observations, concatenate
 from railfix.io.logs import read_navigation
 from railfix.pipeline.config import Config
 from railfix.positioning.which_track import NONE, StandstillErrors, TrackPosterior, YardTrack, track_posterior
-from railfix.run.inputs import InputFiles, input_option
-from railfix.run.options import LogReading, TrackReading
+from railfix.run.inputs import InputFiles, LogReading, TrackReading, input_option
 from railfix.run.processor import place_of
 from railfix.run.sources import Log
 from railfix.run.standstill import StandstillBase, StandstillCodes, standstill_codes

@@ -75,7 +75,7 @@ def plan(
     tunnels_m : sequence of (float, float) [m]
         Chainages between which the line runs in a tunnel.
     background : sequence of ndarray, shape (P, 2) [deg]
-        Longitude and latitude of lines to draw below, see `railfix.report.encode`.
+        Longitude and latitude of lines to draw below, see `railfix.report.charts_page`.
     """
     ecef, conventional = points(positions, *ECEF), points(positions, *(f"conventional_{name}" for name in ECEF))
     has = np.isfinite(ecef[:, 0])

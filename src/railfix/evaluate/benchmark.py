@@ -23,7 +23,7 @@ from railfix.core.files import fingerprint, read_bytes, write_whole
 from railfix.core.geodesy import sigma_along
 from railfix.core.reasons import Status
 from railfix.core.timescale import seconds
-from railfix.evaluate.benchmark.cases import Case, check_not_fitted, read_cases
+from railfix.evaluate.cases import Case, check_not_fitted, read_cases
 from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_runs
 from railfix.evaluate.figures import ALL, FIGURE_COLUMNS, positioned
 from railfix.evaluate.integrity import STANFORD_COLUMNS
@@ -276,7 +276,7 @@ def run_benchmark(
     Parameters
     ----------
     folder : Path
-        Folder of cases (`railfix.evaluate.benchmark.read_cases`).
+        Folder of cases (`railfix.evaluate.cases.read_cases`).
     config : Config
         Settings of every case.
     out, executor, progress, lost

@@ -14,8 +14,7 @@ from railfix.core.files import file_sha256, read_text
 from railfix.core.settings import Settings, load_settings, validated, write_toml
 from railfix.evaluate.options import EvaluationOptions
 from railfix.pipeline.config import Config
-from railfix.run.inputs import Antenna, RunInputs
-from railfix.run.options import ColumnNames, RunOptions
+from railfix.run.inputs import Antenna, ColumnNames, RunInputs, RunOptions
 
 #: File that makes a folder a case.
 CASE_FILE: Final = "case.toml"
