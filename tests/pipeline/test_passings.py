@@ -9,7 +9,7 @@ import pytest
 
 from railfix.motion.samples import BaliseReadings, ListedBalises
 from railfix.pipeline.balises import VERDICTS, BaliseLimits, Passing, PassingState, find_passings
-from railfix.pipeline.passing_table import balise_notes
+from railfix.pipeline.tables import balise_notes
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Tracked, TrackStatus

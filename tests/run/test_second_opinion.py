@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 
 from railfix.pipeline.config import Config
-from railfix.pipeline.passing_table import PASSING_COLUMNS
+from railfix.pipeline.tables import PASSING_COLUMNS
 from railfix.run import RunOptions, run_files
 from railfix.run.batch_check import BATCH_COLUMNS
 from railfix.simulate.demonstration import demo_inputs

@@ -29,9 +29,8 @@ from railfix.evaluate import (
 )
 from railfix.evaluate.intervals import BRANCH_COLUMNS, OUTAGE_COLUMNS
 from railfix.pipeline.config import Config
-from railfix.pipeline.passing_table import PASSING_COLUMNS
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS, UNITS, Column
-from railfix.pipeline.tables import SMOOTHED_COLUMNS, TRAIN_COLUMNS
+from railfix.pipeline.tables import PASSING_COLUMNS, SMOOTHED_COLUMNS, TRAIN_COLUMNS
 from railfix.run.batch_check import BATCH_COLUMNS
 from railfix.run.route import ON_TRACK_COLUMNS, TRACK_COLUMNS
 from railfix.tracking import TrackStatus

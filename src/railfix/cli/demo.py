@@ -22,8 +22,7 @@ from railfix.simulate.demonstration import demo_inputs, demo_truth
 def demo(
     *,
     out: Annotated[
-        Path,
-        typer.Option("--out", metavar="DIR", help="Folder for the results; made where absent."),
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the results; made where absent.")
     ] = Path("railfix-demo"),
     overwrite: OverwriteOption = False,
 ) -> None:

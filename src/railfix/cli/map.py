@@ -230,11 +230,7 @@ def from_positions_command(
     check_outputs((out, "csv"), overwrite=overwrite, inputs=[positions])
     log = read_positions(positions, columns=column_names(column)) if column else read_any_positions(positions)
     track, thinned = from_position_log(
-        log,
-        spacing_m=spacing,
-        quality=_qualities(quality),
-        max_sigma_m=max_sigma,
-        name=name or positions.stem,
+        log, spacing_m=spacing, quality=_qualities(quality), max_sigma_m=max_sigma, name=name or positions.stem
     )
     write_track_csv(track, out)
     _print_thinned(track, thinned, len(log), out)

@@ -31,8 +31,7 @@ _SHOWN = 40
 
 Maps = Annotated[list[Path], typer.Argument(metavar="MAP...", help="Map files; all their tracks form the network.")]
 Columns = Annotated[
-    list[str] | None,
-    typer.Option(metavar="NAME=COLUMN", help=str(ColumnNames.model_fields["column"].description)),
+    list[str] | None, typer.Option(metavar="NAME=COLUMN", help=str(ColumnNames.model_fields["column"].description))
 ]
 
 #: Reading of a map by itself: without what a run alone needs.

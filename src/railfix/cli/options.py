@@ -231,8 +231,7 @@ class Choices(Settings):
     )
     without: tuple[str, ...] = option("Switch one screen off; may be repeated.", (), metavar="NAME")
     filter: Literal["track", "off"] | None = option(
-        "Filter along the track over all epochs, into train.csv and train.parquet: track (the default) or off.",
-        None,
+        "Filter along the track over all epochs, into train.csv and train.parquet: track (the default) or off.", None
     )
     cn0_curve: Path | None = option(
         "Mean C/N0 over elevation of antenna and receiver, from railfix cn0-curve.", None, metavar="TOML"

@@ -252,13 +252,7 @@ def _columns(
 
 
 def _effect(choice: str, config: Config, antenna: str, parts: Sequence[Mapping[str, Floats]]) -> Effect:
-    """Effect of one choice on one antenna, from the columns of all chunks.
-
-    Raises
-    ------
-    MismatchError
-        The reference and the log have no time in common.
-    """
+    """Return the effect of one choice on one antenna; MismatchError where reference and log have no time in common."""
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     counts = columns["counted"] > 0
     if not counts.any():

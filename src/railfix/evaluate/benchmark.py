@@ -52,12 +52,7 @@ def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
     """Find the row of a log of positions that is nearest to each epoch, shape (T,); -1 without one near it.
 
     A position belongs to an epoch within 0.4 of the median interval: programs take the receiver's clock out of their
-    time tags.
-
-    Parameters
-    ----------
-    time, found : ndarray of datetime64[ns], shape (T,), (n,)
-        Epochs, rising, at least two; times of the positions.
+    time tags. Epochs rise, and are at least two.
     """
     rows = np.full(len(time), -1, dtype=np.intp)
     known = np.flatnonzero(~np.isnat(found))
@@ -71,20 +66,11 @@ def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
 
 
 def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Trajectory) -> pl.DataFrame:
-    """Return positions of another program as a table of positions of a run: moved to the nearest point of the line.
+    """Return positions of another program as a table of a run, moved to the nearest point of the line.
 
-    Parameters
-    ----------
-    epochs : polars.DataFrame
-        Positions of railfix of one antenna of the same log: the epochs that a rate is counted of.
-    trajectory : Trajectory
-        Path of that antenna.
-
-    Returns
-    -------
-    polars.DataFrame
-        `railfix.evaluate.run_folder.NEEDED`, satellites and conventional position null. The times are those of the
-        positions, where there is one.
+    `epochs` are railfix's positions of the same antenna and log, of which a rate is counted. Columns are
+    `railfix.evaluate.run_folder.NEEDED`, satellites and conventional position null; times are those of the positions,
+    where there is one.
     """
     time = epochs["time_gpst"].to_numpy()
     row = rows_at_epochs(time, log.time)
@@ -114,18 +100,8 @@ def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Traje
 def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) -> None:
     """Write positions of another program as the folder of a run, which `railfix evaluate` reads as well.
 
-    Parameters
-    ----------
-    run : Path
-        Folder of railfix's run on the same receiver log.
-    out : Path
-        Folder to write; what is there is replaced.
-    antenna : {"front", "rear"}
-
-    Raises
-    ------
-    MismatchError
-        The run has no such antenna, or no position of the log lies near one of its epochs.
+    `run` is the folder of railfix's run on the same receiver log; what is in `out` is replaced. MismatchError: the run
+    has no such antenna, or no position of the log lies near one of its epochs.
     """
     own = read_run(run)
     epochs = own.positions.filter(pl.col("antenna") == antenna)
@@ -169,15 +145,10 @@ def _ecef(table: pl.DataFrame) -> Floats:
 
 
 def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> str | None:
-    """Compute RTKLIB's single point of the front antenna's log into a ``.pos`` file.
+    """Compute RTKLIB's single point of the front antenna's log into a ``.pos`` file; return why there is none, or None.
 
     With the elevation mask and the constellations of the settings and the broadcast models; its own checks (chi-square
     test of the residuals, dilution of precision) are its defaults.
-
-    Returns
-    -------
-    str or None
-        A sentence on why there is no file.
     """
     program = shutil.which(RTKLIB_PROGRAM)
     if program is None:
@@ -271,31 +242,12 @@ def run_benchmark(
 
     Into `out` come ``benchmark.csv``, ``benchmark.json`` (with the settings, and hashes, licences and scenarios of the
     cases), ``benchmark.md``, and the folders of the runs: those of railfix in ``runs``, those of others in
-    ``programs``. Runs whose results are there, of the same inputs and settings, are not repeated.
+    ``programs``. Runs whose results are there, of the same inputs and settings, are not repeated. Other parameters and
+    errors are those of `railfix.run.campaign.run_campaign` and `read_cases`. Returns `BENCHMARK_COLUMNS`, by case, then
+    by position, and notes.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of cases (`railfix.evaluate.cases.read_cases`).
-    config : Config
-        Settings of every case.
-    out, executor, progress, lost
-        As `railfix.run.campaign.run_campaign`.
-
-    Returns
-    -------
-    table : polars.DataFrame
-        `BENCHMARK_COLUMNS`, by case, then by position.
-    notes : tuple of str
-
-    Raises
-    ------
-    InputFileError, SettingsError
-        See `read_cases`; a file is not the one that its hash states: nothing is run then.
-    MismatchError
-        The settings were made from files of a held-out case.
-    OutputError
-        See `run_campaign`.
+    InputFileError: a file is not the one that its hash states; nothing is run then. MismatchError: the settings were
+    made from files of a held-out case.
     """
     cases = read_cases(folder)
     check_not_fitted(config, cases)

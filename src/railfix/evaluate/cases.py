@@ -92,14 +92,8 @@ class Case:
     truth: Path
 
     def check_hashes(self) -> None:
-        """Check that every file is the one that the case was made of.
-
-        Raises
-        ------
-        InputFileError
-            A file is missing, or its hash is another.
-        SettingsError
-            ``case.toml`` has no hash of a file.
+        """Raise InputFileError where a file is missing or not the one that the case was made of, SettingsError without
+        a hash.
         """
         for name in self.content.named():
             path, stated = self.folder / name, self.content.sha256.get(str(name))
@@ -115,15 +109,7 @@ class Case:
 
 
 def read_case(folder: Path) -> Case:
-    """Read the case in a folder.
-
-    Raises
-    ------
-    InputFileError
-        ``case.toml`` cannot be read.
-    SettingsError
-        It is not that of a case: a key is missing, misspelt or out of range.
-    """
+    """Read the case in a folder; InputFileError, SettingsError where ``case.toml`` is not that of a case."""
     path = folder / CASE_FILE
     content = load_settings(CaseFile, path, what=_KIND)
     if content.files.truth is None:
@@ -141,13 +127,7 @@ def read_case(folder: Path) -> Case:
 
 
 def read_cases(folder: Path) -> list[Case]:
-    """Read the cases in the folders of a folder, or the one in the folder itself, in order of their names.
-
-    Raises
-    ------
-    InputFileError, SettingsError
-        There is no case, or one is not what it should be (`read_case`).
-    """
+    """Read the cases in the folders of a folder, or the one in itself, in order of their names (`read_case`)."""
     if not folder.is_dir():
         raise InputFileError(folder, "there is no such folder; expected one of folders with a case.toml")
     folders = (
@@ -159,15 +139,7 @@ def read_cases(folder: Path) -> list[Case]:
 
 
 def write_case(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write the ``case.toml`` of a folder from its content without hashes, which are computed.
-
-    Raises
-    ------
-    InputFileError
-        A file that it names cannot be read.
-    SettingsError
-        The content is not that of a case.
-    """
+    """Write the ``case.toml`` of a folder from its content without hashes; errors as `read_case`."""
     case = validated(CaseFile, {**content, "sha256": {}}, source=str(folder / CASE_FILE))
     hashes = {str(name): file_sha256(folder / name) for name in case.named()}
     write_toml(folder / CASE_FILE, {**content, "sha256": hashes}, what=_KIND)

@@ -106,15 +106,9 @@ def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 
 def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
-    """Epochs of a log, rising, and those missing in its gaps: times, which of them are of the log, and its step.
+    """Return the epochs of a log and those missing in its gaps, rising; which are of the log; and its step [s].
 
-    Returns
-    -------
-    time : ndarray of datetime64[ns], shape (N,)
-        With instants at the step of the log (its median step) in every gap of more than 1.5 steps.
-    logged : ndarray of bool, shape (N,)
-    step_s : float [s]
-        NaN with fewer than two epochs.
+    Gaps of more than 1.5 steps have instants at the median step of the log, which is NaN with fewer than two epochs.
     """
     if len(time) < 2:
         return time, np.ones(len(time), dtype=np.bool_), float("nan")
@@ -134,20 +128,11 @@ def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
 def travelled(
     time: Datetimes, step_m: Floats, known: Masks, speed_mps: Floats, *, options: EvaluationOptions
 ) -> Floats:
-    """Distance travelled since the first epoch with a known reference position, shape (T,) [m].
+    """Return the distance travelled since the first epoch with a known reference position, shape (T,) [m].
 
-    A step counts if the train moved: by the mean of the reference speeds at its ends, or by the mean speed of the
-    step where these are unknown or the step is longer than `reference_gap_s`. Interpolated by time between known
-    positions; NaN before the first and after the last.
-
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    step_m : ndarray, shape (K - 1,) [m]
-        Length of the steps between the K epochs with a known position.
-    known : ndarray of bool, shape (T,)
-    speed_mps : ndarray, shape (T,) [m/s]
-        Of the reference; NaN where unknown.
+    A step counts if the train moved: by the mean of the reference speeds at its ends, or by the mean speed of the step
+    where these are unknown or the step is longer than `reference_gap_s`. Interpolated by time between known positions;
+    NaN before the first and after the last. `step_m`: lengths of the steps between the K known epochs, shape (K - 1,).
     """
     at = np.flatnonzero(known)
     moved = np.full(len(time), np.nan)
@@ -179,14 +164,9 @@ def antenna_epochs(
     files: TrackFiles,
     options: EvaluationOptions,
 ) -> AntennaEpochs:
-    """Epochs of one antenna of a run with their errors.
+    """Return the epochs of one antenna of a run with their errors.
 
-    Raises
-    ------
-    MismatchError
-        Reference and run have no time in common, or the errors cannot be worked out as asked.
-    InputFileError
-        A file of the line cannot be read.
+    MismatchError: reference and run have no time in common, or the errors cannot be worked out as asked.
     """
     mine = run.positions.filter(pl.col("antenna") == antenna)
     time, logged, step_s = with_missing(mine["time_gpst"].to_numpy())

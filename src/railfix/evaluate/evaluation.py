@@ -323,13 +323,7 @@ def _part(
 
 
 def reference_beside(run: RunFolder) -> Path:
-    """The reference beside the log of the front antenna.
-
-    Raises
-    ------
-    InputFileError
-        There is none, or more than one.
-    """
+    """Return the reference beside the log of the front antenna; InputFileError unless there is exactly one."""
     logs = run.located("front")
     if not logs:
         raise InputFileError(run.path / "run.json", "names no log of the front antenna; name the reference")

@@ -88,17 +88,11 @@ def block_limits(
     seed: int,
     confidence: float,
 ) -> dict[str, float]:
-    """Percentile limits of mean, rate and percentiles (`LIMIT_COLUMNS`) and number of blocks, by resampling blocks.
+    """Return limits of mean, rate and percentiles (`LIMIT_COLUMNS`) and number of blocks, by resampling blocks.
 
     Blocks are drawn with replacement, as many as the data has. A percentile of a resample is the smallest value that
-    the given share of its values do not exceed. The limits are NaN with fewer than `FEWEST_BLOCKS` blocks.
-
-    Parameters
-    ----------
-    error_m, sigma_m : ndarray, shape (T,) [m]
-        NaN where there is no error, where the standard deviation of the position is not known.
-    observed, positioned : ndarray of bool, shape (T,)
-    block : ndarray of int, shape (T,)
+    the given share of its values do not exceed. The limits are NaN with fewer than `FEWEST_BLOCKS` blocks. Arrays are
+    of shape (T,), NaN where there is no error, or no standard deviation.
     """
     names, member = np.unique(block, return_inverse=True)
     blocks = len(names)

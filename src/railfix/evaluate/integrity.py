@@ -115,26 +115,10 @@ def level_name(kind: str) -> str:
     return f"{kind}_protection_level_m"
 
 
-def counted_levels(
-    level_m: Floats,
-    has: Masks,
-    status: Strings,
-    verdict: Strings,
-    *,
-    levels_of: LevelsOf,
-) -> Floats:
-    """Levels as counted, shape (T,) [m]: infinite where a position has no usable level, NaN without a position.
+def counted_levels(level_m: Floats, has: Masks, status: Strings, verdict: Strings, *, levels_of: LevelsOf) -> Floats:
+    """Return levels as counted, shape (T,) [m]: infinite without a usable level, NaN without a position.
 
-    Parameters
-    ----------
-    level_m : ndarray, shape (T,) [m]
-        NaN where the run gave none.
-    has : ndarray of bool, shape (T,)
-        Epochs with a position.
-    status, verdict : ndarray of str, shape (T,)
-        Of the position (`railfix.core.reasons.Status`, `railfix.tracking.TrackStatus`), of the level
-        (`railfix.integrity.protection.LevelStatus`); blank where there is none.
-    levels_of : {"usable", "all"}
+    `status` of the position and `verdict` of the level are blank where there is none, `level_m` is NaN.
     """
     bound = np.where(np.isnan(level_m), np.inf, level_m)
     if levels_of == "usable":

@@ -138,13 +138,7 @@ class Sections:
 
 
 def read_sections(path: Path) -> Sections:
-    """Read ``from_m,to_m,environment``.
-
-    Raises
-    ------
-    InputFileError
-        No such table, a section without length or name, or one that overlaps another.
-    """
+    """Read ``from_m,to_m,environment``; InputFileError for a section without length or name, or inside another."""
     table = read_named_columns(path)
     for name in ("from_m", "to_m", "environment"):
         if name not in table:
@@ -165,8 +159,5 @@ def read_sections(path: Path) -> Sections:
         row = int(order[over[0] + 1])
         raise table.error(row, f"the section from {first[row]:g} m begins inside another one; make them disjoint")
     return Sections(
-        path=path,
-        from_m=first[order],
-        to_m=last[order],
-        environment=tuple(table.cells["environment"].gather(order)),
+        path=path, from_m=first[order], to_m=last[order], environment=tuple(table.cells["environment"].gather(order))
     )

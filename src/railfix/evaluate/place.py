@@ -54,13 +54,7 @@ class Bracket:
 
 
 def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float = LARGEST_GAP_S) -> Bracket:
-    """Neighbouring instants of a reference, rising and at least two, for each time.
-
-    Raises
-    ------
-    ValueError
-        Fewer than two instants of the reference.
-    """
+    """Return the neighbouring instants of a reference, rising and at least two (ValueError), for each time."""
     if len(reference_time) < 2:
         raise ValueError(f"reference_time has {len(reference_time)} instants, at least two were expected")
     last = len(reference_time) - 1
@@ -81,11 +75,7 @@ def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float 
 
 
 def interpolate_reference(
-    time: Datetimes,
-    reference_time: Datetimes,
-    reference_ecef_m: Floats,
-    *,
-    largest_gap_s: float = LARGEST_GAP_S,
+    time: Datetimes, reference_time: Datetimes, reference_ecef_m: Floats, *, largest_gap_s: float = LARGEST_GAP_S
 ) -> Floats:
     """Reference positions at other times, linearly, shape (T, 3) [m]; NaN outside and in gaps.
 

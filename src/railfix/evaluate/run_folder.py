@@ -23,12 +23,7 @@ NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m"
 #: No columns beside those that every table has.
 NO_MORE: Final = ~cs.all()
 #: Columns of the conventional position.
-CONVENTIONAL: Final = (
-    "conventional_chainage_m",
-    "conventional_x_m",
-    "conventional_y_m",
-    "conventional_z_m",
-)
+CONVENTIONAL: Final = ("conventional_chainage_m", "conventional_x_m", "conventional_y_m", "conventional_z_m")
 #: Table of single-epoch positions. Another table of the same run, such as ``train``, takes `SINGLE_EPOCH` from it.
 POSITIONS_TABLE: Final = "positions"
 TABLES: Final = (POSITIONS_TABLE, "train")
@@ -95,13 +90,7 @@ class RunFolder(RunRecord):
 
     @property
     def level_kind(self) -> str | None:
-        """Kind of the protection levels, `UNKNOWN_KIND` where it is not recorded, None without levels.
-
-        Raises
-        ------
-        InputFileError
-            Positions and ``run.json`` name different kinds.
-        """
+        """Kind of the levels, `UNKNOWN_KIND` where not recorded, None without; InputFileError for several."""
         level = "protection_level_m"
         if level not in self.positions.columns or self.positions[level].null_count() == len(self.positions):
             return self._kind if self.protection and self.table == POSITIONS_TABLE else None
@@ -124,13 +113,7 @@ class RunFolder(RunRecord):
 
     @property
     def alarm_limit_m(self) -> float | None:
-        """Alarm limit of the run [m].
-
-        Raises
-        ------
-        InputFileError
-            It is not a positive number.
-        """
+        """Alarm limit of the run [m]; InputFileError where it is not a positive number."""
         limit = self.protection.get("alarm_limit_m")
         if limit is None:
             return None
@@ -167,30 +150,14 @@ def tables_of(path: Path) -> list[str]:
 
 
 def read_run(
-    path: Path,
-    *,
-    table: str = POSITIONS_TABLE,
-    conventional: Path | None = None,
-    columns: cs.Selector | None = None,
+    path: Path, *, table: str = POSITIONS_TABLE, conventional: Path | None = None, columns: cs.Selector | None = None
 ) -> RunFolder:
     """Read the folder that `railfix run` wrote.
 
-    Parameters
-    ----------
-    table : str
-        Which table of positions. A table other than "positions" takes the satellites used and the conventional
-        position from the single-epoch positions of the same time and antenna.
-    conventional : Path, optional
-        See `railfix.evaluate.RunAndReference`.
-    columns : polars selector, optional
-        Columns to read beside those that every table of positions has; all without.
-
-    Raises
-    ------
-    InputFileError
-        No such folder, or its files are missing or not what they should be.
-    MismatchError
-        `conventional` is a run on another log.
+    A `table` other than "positions" takes the satellites used and the conventional position from the single-epoch
+    positions of the same time and antenna. `conventional`: see `railfix.evaluate.RunAndReference`; `columns`: those to
+    read beside those that every table of positions has, all without. InputFileError: no such folder, or its files are
+    not what they should be. MismatchError: `conventional` is a run on another log.
     """
     record = read_record(path).record
     needed = (*NEEDED, *SINGLE_EPOCH) if table == POSITIONS_TABLE else NEEDED
@@ -224,12 +191,8 @@ def read_table(
 ) -> tuple[Path, pl.DataFrame]:
     """Return the file and the rows of one table of a run, in order of time.
 
-    `needed` are the columns that it must have, `columns` those to read beside them, all without.
-
-    Raises
-    ------
-    InputFileError
-        The table is absent or cannot be read, lacks a column, has no rows, or an antenna twice at one time.
+    `needed` are the columns that it must have, `columns` those to read beside them, all without. InputFileError: the
+    table is absent, lacks a column, has no rows, or an antenna twice at one time.
     """
     file = next((path / f"{name}{end}" for end in _ENDINGS if (path / f"{name}{end}").is_file()), None)
     if file is None:

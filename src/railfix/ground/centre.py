@@ -70,10 +70,7 @@ class ReferenceCurve:
             place.append(origin + direction * covered)
             start += total
         return cls(
-            direction=direction,
-            running_s=np.concatenate(time),
-            chainage_m=np.concatenate(place),
-            stations_m=stations_m,
+            direction=direction, running_s=np.concatenate(time), chainage_m=np.concatenate(place), stations_m=stations_m
         )
 
     def simulated_m(self, from_m: float, elapsed_s: float) -> float:

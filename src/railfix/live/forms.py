@@ -21,8 +21,7 @@ from railfix.io.train_message import MessageStatus, TrainMessage, encode, etcs_r
 from railfix.live.engine import LiveOutput
 from railfix.live.message import antenna_of
 from railfix.live.settings import LiveSettings
-from railfix.pipeline.passing_table import passing_table
-from railfix.pipeline.tables import positions_table, train_table
+from railfix.pipeline.tables import passing_table, positions_table, train_table
 
 Form = Callable[[LiveOutput], bytes]
 #: Longest doubt of a position report, with room for the rounding of the distance [cm].

@@ -62,14 +62,8 @@ def balise_epochs(
     """Return the balises at the epoch after each reading, and the state to pass on.
 
     Balises that are not listed are left out, and so is an identity read again within `AGAIN_S`. Balises take turns in
-    two columns: a sub-filter of the level without one of them is right whichever single balise is wrong.
-
-    Parameters
-    ----------
-    edges : ndarray of datetime64[ns], shape (T + 1,)
-        Epoch before the chunk, and its epochs.
-    trajectory : Trajectory
-        Of the antenna.
+    two columns: a sub-filter of the level without one of them is right whichever single balise is wrong. `edges`: the
+    epoch before the chunk, and its epochs, shape (T + 1,).
     """
     found = BaliseEpochs.none(len(edges) - 1)
     index, arc = listed.index_of(readings.balise), arcs_of_balises(listed, trajectory, limits)
@@ -164,16 +158,7 @@ def find_passings(
 ) -> tuple[tuple[Passing, ...], PassingState]:
     """Return the passings that ended in a chunk and the readings in it that are wrong, and the state to pass on.
 
-    Parameters
-    ----------
-    tracked : Tracked
-        Places of the filter, with levels.
-    listed : ListedBalises
-        Balises and virtual ones.
-    trajectory : Trajectory
-        Of the antenna.
-    readings : BaliseReadings
-        Since the chunk before.
+    `listed` has balises and virtual ones, `readings` are those since the chunk before, `tracked` has levels.
     """
     state = state or PassingState.empty(len(listed))
     own = trajectory.arc_at_chainage(listed.chainage_m)

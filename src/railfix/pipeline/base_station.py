@@ -60,17 +60,12 @@ class BaseState:
 
 
 class BaseStation:
-    """A base station at a known position.
+    """A base station at a known position in the frame of the satellites, shape (3,) [m].
 
-    Its pseudoranges are corrected like those of the train, with the same settings, and smoothed by carrier phase
-    where available, which reduces the station's own noise. The station's own multipath remains.
-
-    Parameters
-    ----------
-    config : Config
-    ecef_m : ndarray, shape (3,) [m], or "stream"
-        In the frame of the satellites; "stream": of the headers of its observations. A station that moves by more
-        than a centimetre (the next virtual one) begins anew.
+    Its pseudoranges are corrected like those of the train, with the same settings, and smoothed by carrier phase where
+    available, which reduces the station's own noise. The station's own multipath remains. With "stream" the position is
+    that of the headers of its observations; a station that moves by more than a centimetre (the next virtual one)
+    begins anew.
     """
 
     def __init__(self, config: Config, ecef_m: Floats | Literal["stream"]) -> None:

@@ -90,19 +90,10 @@ _LEAST_DISTANCE_M: Final = 0.5
 
 
 class AntennaOrder:
-    """Mean distance of the front antenna ahead of the rear one, as the positions have it.
+    """Mean distance of the front antenna ahead of the rear one of a vehicle on one track, as the positions have it.
 
-    Parameters
-    ----------
-    front, rear : Trajectory
-        Of one vehicle on one track.
-    tolerance_s : float [s]
-        Largest difference of the time tags of a pair of epochs.
-
-    Attributes
-    ----------
-    distance_m : float [m]
-        Of the front antenna ahead of the rear one by the vehicle file, in the direction that the vehicle faces.
+    `distance_m` is that by the vehicle file [m], in the direction that the vehicle faces; tags of a pair of epochs
+    differ by `tolerance_s` at most.
     """
 
     def __init__(self, front: Trajectory, rear: Trajectory, *, tolerance_s: float) -> None:
@@ -120,17 +111,10 @@ class AntennaOrder:
         #: By stretch of line: pairs, sum of their distances [m], sum of their variances [m^2].
         self._stretches: dict[int, tuple[float, float, float]] = {}
 
-    def add(
-        self,
-        front: tuple[Datetimes, ArrayLike, ArrayLike],
-        rear: tuple[Datetimes, ArrayLike, ArrayLike],
-    ) -> bool:
+    def add(self, front: tuple[Datetimes, ArrayLike, ArrayLike], rear: tuple[Datetimes, ArrayLike, ArrayLike]) -> bool:
         """Add the positions of more epochs; whether the train is on a stretch not seen before.
 
-        Parameters
-        ----------
-        front, rear : tuple of three arrays, shapes (F,) and (R,)
-            Time tags, chainage [m] and its sigma [m]; NaN where there is no position.
+        Of each antenna time tags, chainage [m] and its sigma [m], shape (F,) and (R,); NaN where there is no position.
         """
         at_front, at_rear = pair_epochs(front[0], rear[0], tolerance_s=self._tolerance_s)
         (place, other), (sigma, other_sigma) = (

@@ -126,22 +126,10 @@ def correct_ranges(
     *,
     error_model: ErrorModel | None = None,
 ) -> CorrectedRanges:
-    """Correct the codes of the channels and compute their sigmas.
+    """Correct the codes of the channels, and compute their sigmas: reasons of codes, satellites and corrections.
 
-    Parameters
-    ----------
-    channels : Channels
-        Of these observations.
-    received : Received
-        Navigation records and coefficients; where SBAS is used, its corrections replace the models, and satellites
-        without a valid one are rejected.
-    error_model : ErrorModel, optional
-        Gives the least sigmas of the protection level; the weights are those of ``config.noise``.
-
-    Returns
-    -------
-    CorrectedRanges
-        With the reasons of codes, satellites and corrections; the screens come after.
+    Where SBAS is received, its corrections replace the models, and satellites without a valid one are rejected. An
+    error model gives the least sigmas of the protection level; the weights are those of ``config.noise``.
     """
     columns, satellite, signal, groups = channels.columns, channels.satellite, channels.signal, channels.groups
     code, cn0 = obs.code_m[:, columns], obs.cn0_dbhz[:, columns]

@@ -132,16 +132,9 @@ def feature_fixes(
     """Return verdicts on the features that were passed, and the state to pass on.
 
     A feature is compared once the body's middle is `half_length_m` beyond it. Only ways without a slip and faster than
-    1 m/s count: heading and pitch are integrals, and a break begins them anew.
-
-    Parameters
-    ----------
-    facing : float
-        1 where the front points to rising arc length, else -1.
-    sigma_m : float [m]
-        Of the place by the wheel.
-    noise : tuple of float
-        Standard deviations of gradient and curvature in one metre.
+    1 m/s count: heading and pitch are integrals, and a break begins them anew. `facing`: 1 where the front points to
+    rising arc length, else -1; `sigma_m`: of the place by the wheel; `noise`: standard deviations of gradient and
+    curvature in one metre.
     """
     ways = np.concatenate([[0.0], rates.way_m]) + state.way_m
     heading, pitch = (

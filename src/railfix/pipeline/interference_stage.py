@@ -86,17 +86,7 @@ def find_interference(
     state: InterferenceState,
     limits: InterferenceLimits,
 ) -> tuple[Interference, InterferenceState]:
-    """Return the interference of the epochs of one antenna, and the state to pass on.
-
-    Parameters
-    ----------
-    corrected : CorrectedRanges
-        With all reasons.
-    solution : Solution
-        Of the same epochs.
-    index : SearchIndex
-        Of the antenna's trajectory.
-    """
+    """Return the interference of the epochs of one antenna, whose ranges have all reasons, and the state to pass on."""
     observations, reason = corrected.observations, corrected.reason
     channel = np.char.add(corrected.satellite, corrected.signal)
     taken = (reason & _NOT_ITS_SIGNAL) == 0

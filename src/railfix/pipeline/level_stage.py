@@ -58,13 +58,7 @@ def basis_of(config: Config) -> str:
 
 
 def prior_basis_text(facts: Mapping[str, Any]) -> str:
-    """Return a sentence on the priors of a run's levels: measured or assumed, and supported by data or not.
-
-    Parameters
-    ----------
-    facts : mapping
-        `level_facts`, or the member ``protection`` of a ``run.json``.
-    """
+    """Return a sentence on the priors of a run's levels (`level_facts`): measured or assumed, supported or not."""
     words = {
         "indicative": "indicative: priors of faults are assumed, not measured on this line; no risk an hour",
         "measured": "priors of local faults measured on this line, risk.map_prior assumed",
@@ -128,20 +122,11 @@ def protection_levels(
     sides: Masks,
     config: Config,
 ) -> ProtectionResult:
-    """Return the protection levels of the positions of a chunk.
+    """Return the protection levels of the positions of a chunk, from their model on the line.
 
-    Parameters
-    ----------
-    model : LinearModel
-        Of the positions on the line.
-    offset : MapOffset
-        What of it lies beyond its own sigma is a bias of the level; what it would not find is covered by the hypothesis
-        of a wrong map.
-    scale : ndarray, shape (T,)
-        The receiver's noise scale. Quiet residuals shrink no level: it is taken as 1 at least, and with an error model
-        the sigma of no range falls below the model's.
-    sides : ndarray of bool, shape (T, 2, K)
-        `low_sides`.
+    What of the map's offset lies beyond its own sigma is a bias of the level; what it would not find is covered by the
+    hypothesis of a wrong map. Quiet residuals shrink no level: the receiver's noise scale, shape (T,), is taken as 1 at
+    least, and with an error model the sigma of no range falls below the model's. `sides`: `low_sides`.
     """
     covariance = np.where(raim.faulty[:, None, None], np.nan, model.covariance_m2)
     level = along_track_level(
@@ -178,14 +163,8 @@ def unresolved_alternatives(
 ) -> Masks:
     """Return the epochs where the ranges leave open, at the risk of a sample, a place beyond the level, shape (T,).
 
-    Parameters
-    ----------
-    corrected, sides, config
-        As for `protection_levels`.
-    place : Place
-        Epochs that are ambiguous already are not looked at.
-    bounding : tuple of LinearModel and ndarray, shape (T,)
-        Of the positions, and the noise scale; `bounding_model` where there is an error model.
+    Epochs that are ambiguous already are not looked at. `bounding`: model of the positions and noise scale, shape (T,);
+    `bounding_model` where there is an error model.
     """
     return places_beyond_the_level(
         antennas,
@@ -211,17 +190,9 @@ def judged(
 ) -> ProtectionResult:
     """Return the levels with the verdicts on the positions applied.
 
-    A level holds at the place where the ranges were linearised. Where another place explains them as well, it
-    is unavailable. Where a check has failed, or ranges and map contradict each other: alarm.
-
-    Parameters
-    ----------
-    status : ndarray of int8, shape (T,)
-        `reasons.Status`.
-    has : ndarray of bool, shape (T,)
-        Epochs that keep their coordinates; the others lose the level, too.
-    chainage_m : ndarray, shape (T,) [m]
-        Positions; where the level reaches a stretch of `Config.no_level_m` it is infinite.
+    A level holds at the place where the ranges were linearised. Where another place explains them as well, it is
+    unavailable. Where a check has failed, or ranges and map contradict each other: alarm. Epochs that lose their
+    coordinates (`has`) lose the level; where it reaches a stretch of `Config.no_level_m` it is infinite.
     """
     values = {}
     kept = has.all()
@@ -253,12 +224,7 @@ def with_araim(
     """Return the positions with ARAIM levels, where there is an integrity support message.
 
     Integrity: URA of the message, atmosphere of `Config.nominal` and the noise of the ranges by its scale; accuracy and
-    thresholds: URE in place of URA.
-
-    Parameters
-    ----------
-    corrected : CorrectedRanges
-        With all reasons.
+    thresholds: URE in place of URA. The ranges have all reasons.
     """
     if support is None:
         return solution
@@ -326,12 +292,7 @@ def _turned(geometry: AraimGeometry, axes: Floats) -> AraimGeometry:
 def with_map(geometry: AraimGeometry, plan_m: float, height_m: float, prior: float) -> AraimGeometry:
     """Return the geometry on a line, axes along, across and up, with the map as two more observations.
 
-    Parameters
-    ----------
-    plan_m, height_m : float [m]
-        Standard deviations of the map across and up.
-    prior : float
-        Probability that both are wrong.
+    `plan_m`, `height_m`: standard deviations of the map across and up [m]; `prior`: probability that both are wrong.
     """
     epochs, ranges, unknowns = geometry.design.shape
     rows = np.zeros((epochs, 2, unknowns))

@@ -242,11 +242,7 @@ class EpochProcessor:
             _check_rising(name, part, state.antennas.get(name))
         began = min((part.time[0] for part in observations.values() if len(part)), default=np.datetime64("NaT", "ns"))
         received = receive(
-            state.received or self.received,
-            self.config,
-            began,
-            navigation=navigation,
-            messages=messages,
+            state.received or self.received, self.config, began, navigation=navigation, messages=messages
         )
         base_state = None
         if self._base is not None:

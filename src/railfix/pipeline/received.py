@@ -69,15 +69,8 @@ def known_from_start(
 ) -> Received:
     """Return what is known before the first epoch: all of it where files are read, nothing where a train runs.
 
-    Parameters
-    ----------
-    messages : SbasMessages, optional
-        Recorded messages, of which the GEO is chosen if the settings ask for the best.
-
-    Raises
-    ------
-    SettingsError
-        SBAS and precise ephemerides together, or no message of the GEO asked for.
+    Of recorded messages the GEO is chosen if the settings ask for the best. SettingsError: SBAS and precise ephemerides
+    together, or no message of the GEO asked for.
     """
     received = Received(navigation=navigation or no_navigation())
     if messages is None and config.sbas == "stream":
@@ -106,28 +99,13 @@ def receive(
     navigation: Navigation | None = None,
     messages: SbasMessages | None = None,
 ) -> Received:
-    """Return what is known after new navigation records and SBAS messages have arrived.
+    """Return what is known after new navigation records and SBAS messages have arrived; `before` where nothing has.
 
-    Parameters
-    ----------
-    time : datetime64[ns]
-        Of the next epoch, NaT where there is none; SBAS messages that neither it nor a later one can use are dropped.
-    navigation : Navigation, optional
-        New records, ionospheric coefficients or precise ephemerides. Records received again are dropped, and so are
-        those that have expired by `time`, but for the newest of a satellite; newer coefficients and precise
-        ephemerides replace the older ones.
-    messages : SbasMessages, optional
-        New messages; without any so far, every satellite is rejected until the corrections are complete.
-
-    Returns
-    -------
-    Received
-        `before` itself where nothing new has arrived.
-
-    Raises
-    ------
-    SettingsError
-        SBAS and precise ephemerides together, or messages while the settings leave the GEO open.
+    `time` is that of the next epoch, NaT where there is none: SBAS messages that neither it nor a later one can use are
+    dropped, and so are records received again, and those that have expired, but for the newest of a satellite. Newer
+    coefficients and precise ephemerides replace the older ones. Without any message so far, every satellite is rejected
+    until the corrections are complete. SettingsError: SBAS and precise ephemerides together, or messages while the
+    settings leave the GEO open.
     """
     if navigation is None and messages is None:
         return before

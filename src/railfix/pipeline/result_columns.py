@@ -45,10 +45,10 @@ class Column(Generic[Source]):
 
     name: str  #: Ends with the unit where there is one: ``along_sigma_m``.
     meaning: str
-    #: Values from the source of a table: an array with epochs on axis 0, one value for all rows, or None where the
-    #: source has none. Words are given by their number.
-    values: Callable[[Source], NDArray[Any] | str | None]
-
+    #: Path of the values in the source of a table (``raim.statistic``), by default the name; or a function of it, or
+    #: None where the source has none. They are an array with epochs on axis 0, or one value for all rows; words are
+    #: given by their number.
+    values: str | Callable[[Source], NDArray[Any] | str | None] | None = ""
     dtype: pl.DataType = field(default=pl.Float64(), kw_only=True)
     words: tuple[str, ...] = field(default=(), kw_only=True)  #: Words that the numbers stand for.
 
@@ -66,6 +66,15 @@ class Column(Generic[Source]):
     def polars_type(self) -> pl.DataType:
         """Type of the column in a table."""
         return pl.Enum(self.words) if self.words else self.dtype
+
+    def of(self, source: Source) -> Any:
+        """Return the values from the source of a table; None where it has none."""
+        if not isinstance(self.values, str):
+            return None if self.values is None else self.values(source)
+        found: Any = source
+        for part in (self.values or self.name).split("."):
+            found = None if found is None else getattr(found, part)
+        return found
 
     def series(self, values: NDArray[Any] | str | None, rows: int) -> pl.Series:
         """Return values as a column of a table; NaN as null."""
@@ -104,7 +113,7 @@ def float_column(values: Floats) -> pl.Series:
 def table_of(columns: Mapping[str, Column[Source]], source: Source, rows: int, **given: str) -> pl.DataFrame:
     """Return a table of columns with one row an epoch; `given` has the value of columns that the source has not."""
     return pl.DataFrame(
-        {name: column.series(given.get(name, column.values(source)), rows) for name, column in columns.items()}
+        {name: column.series(given.get(name, column.of(source)), rows) for name, column in columns.items()}
     )
 
 
@@ -144,58 +153,44 @@ class Observed:
 #: Columns of the table of positions.
 POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
     (
-        Column("time_gpst", "time tag of the receiver, GPS time", lambda r: r.time, dtype=pl.Datetime("ns")),
-        Column("antenna", "`front` or `rear`", lambda _: None, dtype=pl.String()),
-        Column("status", "see `railfix.core.reasons.Status`", lambda r: r.status, words=tuple(s.text for s in Status)),
-        Column("chainage_m", "distance along the line from the first point of the track", lambda r: r.chainage_m),
-        Column("kilometrage_m", "the line's own marking, where the track has one", lambda r: r.kilometrage_m),
-        Column(
-            "along_sigma_m",
-            "standard deviation along the line, other places of an ambiguous epoch included",
-            lambda r: r.along_sigma_m,
-        ),
-        Column(
-            "own_sigma_m",
-            "single-epoch sigma, from the codes of the epoch alone; `uncertain` above its limit",
-            lambda r: r.own_sigma_m,
-        ),
-        Column("latitude_deg", "antenna, WGS 84", lambda r: r.latitude_deg),
-        Column("longitude_deg", "antenna, WGS 84", lambda r: r.longitude_deg),
-        Column("height_m", "antenna, above the ellipsoid", lambda r: r.height_m),
+        Column("time_gpst", "time tag of the receiver, GPS time", "time", dtype=pl.Datetime("ns")),
+        Column("antenna", "`front` or `rear`", None, dtype=pl.String()),
+        Column("status", "see `railfix.core.reasons.Status`", words=tuple(s.text for s in Status)),
+        Column("chainage_m", "distance along the line from the first point of the track"),
+        Column("kilometrage_m", "the line's own marking, where the track has one"),
+        Column("along_sigma_m", "standard deviation along the line, other places of an ambiguous epoch included"),
+        Column("own_sigma_m", "single-epoch sigma, from the codes of the epoch alone; `uncertain` above its limit"),
+        Column("latitude_deg", "antenna, WGS 84"),
+        Column("longitude_deg", "antenna, WGS 84"),
+        Column("height_m", "antenna, above the ellipsoid"),
         Column("x_m", "antenna, ECEF", lambda r: r.ecef_m[:, 0]),
         Column("y_m", "antenna, ECEF", lambda r: r.ecef_m[:, 1]),
         Column("z_m", "antenna, ECEF", lambda r: r.ecef_m[:, 2]),
-        Column("n_used", "satellites used", lambda r: r.n_used, dtype=pl.Int16()),
-        Column(
-            "n_rejected", "satellites with a pseudorange that were not used", lambda r: r.n_rejected, dtype=pl.Int16()
-        ),
-        Column(
-            "noise_scale", "noise of this receiver over that of the weights, estimated so far", lambda r: r.noise_scale
-        ),
+        Column("n_used", "satellites used", dtype=pl.Int16()),
+        Column("n_rejected", "satellites with a pseudorange that were not used", dtype=pl.Int16()),
+        Column("noise_scale", "noise of this receiver over that of the weights, estimated so far"),
         Column(
             "raim_outcome",
             "result of RAIM: `passed`, `excluded_one`, `excluded_two`, `inseparable`, `unresolved`, `untestable`",
-            lambda r: r.raim.outcome,
+            "raim.outcome",
             words=tuple(o.name.lower() for o in Outcome),
         ),
         Column(
             "raim_statistic",
             "sum of squared residuals before any exclusion, in noise variances (m^2 with the fixed limit)",
-            lambda r: r.raim.statistic,
+            "raim.statistic",
         ),
-        Column(
-            "raim_threshold", "threshold of the statistic, above which a fault is detected", lambda r: r.raim.threshold
-        ),
+        Column("raim_threshold", "threshold of the statistic, above which a fault is detected", "raim.threshold"),
         Column(
             "raim_level_m",
             "P4's level: error by a fault that RAIM misses, and noise; infinite with a satellite unchecked, "
             "empty with a fault left",
-            lambda r: r.raim.protection_level_m,
+            "raim.protection_level_m",
         ),
         Column(
             "integers_fixed",
             "differences of carrier phases fixed to whole cycles; 0: float or codes (`carrier = fixed`)",
-            lambda r: None if r.phase is None else r.phase.n_fixed,
+            "phase.n_fixed",
             dtype=pl.Int16(),
         ),
         Column(
@@ -207,53 +202,41 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "protection_level_m",
             "along the line: the error exceeds it with the stated risk; infinite where `protection_cause` says "
             "why, empty where a fault is left",
-            lambda r: None if r.protection is None else r.protection.level.level_m,
+            "protection.level.level_m",
         ),
         Column(
             "protection_fault_free_m",
             "level for noise alone, with its share of the risk; may exceed `protection_level_m`",
-            lambda r: None if r.protection is None else r.protection.level.fault_free_m,
+            "protection.level.fault_free_m",
         ),
         Column(
             "protection_one_fault_m",
             "the same for faults of one satellite, of two; 0 where less likely than its share",
-            lambda r: None if r.protection is None else r.protection.level.one_fault_m,
+            "protection.level.one_fault_m",
         ),
         Column(
             "protection_two_faults_m",
             "the same for faults of one satellite, of two; 0 where less likely than its share",
-            lambda r: None if r.protection is None else r.protection.level.two_fault_m,
+            "protection.level.two_fault_m",
         ),
-        Column(
-            "protection_k_fault_free",
-            "K of each part",
-            lambda r: None if r.protection is None else r.protection.level.k_fault_free,
-        ),
-        Column(
-            "protection_k_one_fault",
-            "K of each part",
-            lambda r: None if r.protection is None else r.protection.level.k_one_fault,
-        ),
-        Column(
-            "protection_k_two_faults",
-            "K of each part",
-            lambda r: None if r.protection is None else r.protection.level.k_two_faults,
-        ),
+        Column("protection_k_fault_free", "K of each part", "protection.level.k_fault_free"),
+        Column("protection_k_one_fault", "K of each part", "protection.level.k_one_fault"),
+        Column("protection_k_two_faults", "K of each part", "protection.level.k_two_faults"),
         Column(
             "protection_separation",
             "largest distance of the position of a hypothesis, over its threshold",
-            lambda r: None if r.protection is None else r.protection.level.separation,
+            "protection.level.separation",
         ),
         Column(
             "protection_kind",
             "basis: `sbas` with local faults, or `separation`, with satellites' own faults as well",
-            lambda r: None if r.protection is None else r.protection.kind,
+            "protection.kind",
             words=KINDS,
         ),
         Column(
             "protection_basis",
             "priors of faults: `measured` on the line, or `indicative`: assumed, the level carries no risk an hour",
-            lambda r: None if r.protection is None else r.protection.basis,
+            "protection.basis",
             words=BASES,
         ),
         Column(
@@ -262,14 +245,14 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "there is none: `unchecked`, `unchecked_constellation`, `unchecked_side`, `unchecked_map`, "
             "`unchecked_together` (faults that nothing checks), `budget`, `unbounded`, "
             "`no_position`",
-            lambda r: None if r.protection is None else r.protection.level.cause,
+            "protection.level.cause",
             words=tuple(c.name.lower() for c in Cause),
         ),
         Column(
             "protection_status",
             "`available` within the alarm limit; `unavailable`, also in doubt about the place; `alarm`: the "
             "ranges contradict the level, or a check has failed",
-            lambda r: None if r.protection is None else r.protection.status,
+            "protection.status",
             words=tuple(s.name.lower() for s in LevelStatus),
         ),
         Column(
@@ -280,37 +263,26 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column(
             "araim_horizontal_m",
             "the same of a 3-D position from these ranges, without the map: horizontal",
-            lambda r: None if r.araim is None else r.araim.horizontal_m,
+            "araim.horizontal_m",
         ),
         Column(
-            "araim_vertical_m",
-            "the same, vertical",
-            lambda r: None if r.araim is None else r.araim.space.level_m[:, 2],
+            "araim_vertical_m", "the same, vertical", lambda r: None if r.araim is None else r.araim.space.level_m[:, 2]
         ),
         *(_position_column(c) for screen in SCREENS for c in screen.columns if c.table == "positions"),
         Column(
             "conventional_status",
             "3-D single point: `valid`, `no_position`, `residuals` beyond noise (chi-square test), "
             "`dilution` over its limit",
-            lambda r: r.conventional_status,
             words=tuple(s.name.lower() for s in PointStatus),
         ),
-        Column(
-            "conventional_chainage_m",
-            "3-D single point, moved to the nearest point of the trajectory",
-            lambda r: r.conventional_chainage_m,
-        ),
-        Column(
-            "conventional_offset_m",
-            "distance of the 3-D single point from that point",
-            lambda r: r.conventional_offset_m,
-        ),
+        Column("conventional_chainage_m", "3-D single point, moved to the nearest point of the trajectory"),
+        Column("conventional_offset_m", "distance of the 3-D single point from that point"),
         Column(
             "map_offset_across_m",
             "mean of the 3-D positions of the last minutes, right of the line with rising chainage",
-            lambda r: r.map_offset.across_m,
+            "map_offset.across_m",
         ),
-        Column("map_offset_up_m", "the same, above the line", lambda r: r.map_offset.up_m),
+        Column("map_offset_up_m", "the same, above the line", "map_offset.up_m"),
         Column(
             "map_detectable_across_m",
             "smallest offset, across and up, that the status `map_offset` names (99 %)",
@@ -324,12 +296,12 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column(
             "map_offset_statistic",
             "square of that offset in its own sigmas; status `map_offset` from 13.8 on",
-            lambda r: r.map_offset.statistic,
+            "map_offset.statistic",
         ),
         Column(
             "interference",
             "`none`, `jamming_suspected` or `spoofing_suspected`, also where the status has another",
-            lambda r: None if r.interference is None else r.interference.suspicion,
+            "interference.suspicion",
             words=tuple(s.name.lower() for s in Suspicion),
         ),
         Column(
@@ -339,9 +311,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             dtype=pl.String(),
         ),
         Column(
-            "cn0_fall_db",
-            "median fall of C/N0 of the satellites below their recent peak",
-            lambda r: None if r.interference is None else r.interference.power.fall_db,
+            "cn0_fall_db", "median fall of C/N0 of the satellites below their recent peak", "interference.power.fall_db"
         ),
         Column("conventional_x_m", "3-D single point, ECEF", lambda r: r.conventional_ecef_m[:, 0]),
         Column("conventional_y_m", "3-D single point, ECEF", lambda r: r.conventional_ecef_m[:, 1]),
@@ -359,22 +329,20 @@ def _second(observed: Observed, values: Callable[[Combined, SecondCodes], Floats
 #: Columns of the table of observations that have a value for each epoch and channel.
 CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
     (
-        Column(
-            "reason", "bits of `railfix.core.reasons.Reason`, 0 = used", lambda o: o.result.reason, dtype=pl.Int32()
-        ),
+        Column("reason", "bits of `railfix.core.reasons.Reason`, 0 = used", "result.reason", dtype=pl.Int32()),
         Column(
             "residual_m",
             "corrected pseudorange minus what the position on the line and the clock explain",
-            lambda o: o.result.residual_m,
+            "result.residual_m",
         ),
-        Column("elevation_deg", "of the satellite, azimuth from north over east", lambda o: o.result.elevation_deg),
-        Column("azimuth_deg", "of the satellite, azimuth from north over east", lambda o: o.result.azimuth_deg),
-        Column("cn0_dbhz", "carrier-to-noise density", lambda o: o.result.cn0_dbhz),
-        Column("sigma_m", "standard deviation that the weights assume", lambda o: o.result.sigma_m),
+        Column("elevation_deg", "of the satellite, azimuth from north over east", "result.elevation_deg"),
+        Column("azimuth_deg", "of the satellite, azimuth from north over east", "result.azimuth_deg"),
+        Column("cn0_dbhz", "carrier-to-noise density", "result.cn0_dbhz"),
+        Column("sigma_m", "standard deviation that the weights assume", "result.sigma_m"),
         Column(
             "corrected_code_m",
             "pseudorange, satellite clock, group delay and atmosphere applied",
-            lambda o: o.result.corrected_code_m,
+            "result.corrected_code_m",
         ),
         *(_observation_column(c) for screen in SCREENS for c in screen.columns if c.table == "observations"),
         Column(
@@ -432,10 +400,10 @@ OBSERVATION_COLUMNS: Final[Mapping[str, Column[Any]]] = by_name(
     (
         POSITION_COLUMNS["time_gpst"],
         POSITION_COLUMNS["antenna"],
-        Column("satellite", "`G01`, `J02`", lambda _: None, dtype=pl.String()),
-        Column("signal", "RINEX 3 code without its type letter, `1C`", lambda _: None, dtype=pl.String()),
+        Column("satellite", "`G01`, `J02`", None, dtype=pl.String()),
+        Column("signal", "RINEX 3 code without its type letter, `1C`", None, dtype=pl.String()),
         _REASON,
-        Column("reason_text", "their names joined by `+`, `used` for 0", lambda _: None, dtype=pl.String()),
+        Column("reason_text", "their names joined by `+`, `used` for 0", None, dtype=pl.String()),
         *(column for column in CHANNEL_COLUMNS.values() if column is not _REASON),
     )
 )

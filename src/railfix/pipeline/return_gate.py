@@ -52,17 +52,8 @@ def gated_codes(
     again with the third in a row that lies within `SensorLimits.return_sigmas` of both standard deviations together,
     and after `SensorLimits.return_s` in any case. Where no sensor gives a way nothing is refused.
 
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    observed : ndarray of bool, shape (T,)
-        Epochs with codes.
-    way_m : ndarray, shape (T,) [m]
-        By the sensors since the epoch before; NaN where there is none.
-    place_m, sigma_m : ndarray, shape (T,) [m]
-        Position of each epoch by itself; NaN where there is none.
-    state : ReturnState
-        With the place of the filter at the epoch before the first.
+    Shape (T,): `observed`, epochs with codes; `way_m`, by the sensors since the epoch before; `place_m`, `sigma_m` of
+    each epoch by itself; NaN where there is none. `state` has the place of the filter at the epoch before the first.
     """
     refused = np.zeros(len(time), dtype=np.bool_)
     ways = state.way_m + np.cumsum(way_m)
@@ -103,17 +94,9 @@ def off_map_epochs(
 ) -> tuple[Masks, OffMapState]:
     """Return the epochs at which the train is off the map, shape (T,), and the state to pass on.
 
-    It leaves the map once all positions of the last `least_s` are off it, and returns once all of that time are on
-    it: a single position can be off the map by reflected signals, or on it by chance. The first position of a log
-    decides alone.
-
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    on_map, off_map : ndarray of bool, shape (T,)
-        Single-epoch positions that the ranges fit, and those that they contradict; both False without a position.
-    least_s : float [s]
-        How long positions contradict the state before it changes.
+    It leaves the map once all positions of the last `least_s` are off it, and returns once all of that time are on it:
+    a single position can be off the map by reflected signals, or on it by chance. The first position of a log decides
+    alone. `on_map`, `off_map`: positions that the ranges fit, and that they contradict, shape (T,).
     """
     off, known, since = state.off, state.known, state.since
     result = np.full(len(time), off)

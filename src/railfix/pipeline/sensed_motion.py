@@ -119,17 +119,9 @@ def sensed_motion(
 ) -> tuple[SensedMotion, RateSeries | None, SensedState]:
     """Return the motion between instants, the rates of the body (None without a sample), and the state to pass on.
 
-    Parameters
-    ----------
-    pulses : TachometerPulses
-        With a direction.
-    inertial : InertialSamples
-        Both from `REACH` before the first instant on.
-    edges : ndarray of datetime64[ns], shape (T + 1,)
-    trajectory : Trajectory
-        Of the antenna: tells which way the front points, and where the body is.
-    sine_at : callable
-        Sine of the gradient in rising arc length at arc lengths.
+    Pulses with a direction and inertial samples are from `REACH` before the first of the T + 1 `edges` on. `sine_at`
+    gives the sine of the gradient in rising arc length at arc lengths; the trajectory of the antenna tells which way
+    the front points, and where the body is.
     """
     facing = trajectory.front_sign
     ends = edges.astype("datetime64[ns]").astype(np.int64)

@@ -120,12 +120,7 @@ def solve(
 ) -> tuple[CorrectedRanges, Solution, list[AntennaState]]:
     """Return the ranges with the reasons of this stage, the positions, and the new state of each antenna.
 
-    Parameters
-    ----------
-    corrected : CorrectedRanges
-        After the screens of the observations.
-    states : sequence of AntennaState
-        By antenna.
+    The ranges are those after the screens of the observations, the states by antenna.
     """
     ranges, time = corrected.ranges(), corrected.time
     point = single_point(ranges, corrected.anchor_ecef_m, limits=config.single_point)

@@ -54,13 +54,7 @@ class Place:
 
 
 def place_on_line(ranges: Ranges, index: SearchIndex, point: SinglePoint, config: Config) -> Place:
-    """Return section and constrained position of the epochs that have `Config.min_satellites`.
-
-    Parameters
-    ----------
-    point : SinglePoint
-        3-D position from the same ranges.
-    """
+    """Return section and position on the line of the epochs that have `Config.min_satellites`."""
     section = search(ranges, index, point, limits=config.section)
     vertex = np.where(ranges.n_used >= config.min_satellites, section.vertex, -1)
     constrained = constrained_position(ranges, index.trajectory, vertex, limits=config.constrained)
@@ -106,16 +100,9 @@ class PointStatus(IntEnum):
 
 
 def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, limits: SinglePointLimits) -> Codes:
-    """Return the `PointStatus` of each position, shape (T,).
+    """Return the `PointStatus` of each position, every constellation with a clock of its own, shape (T,).
 
-    Parameters
-    ----------
-    point : SinglePoint
-        Every constellation with a clock of its own.
-    ranges : Ranges
-        From which it was computed.
-    noise_scale : ndarray, shape (T,)
-        Standard deviation of this receiver's ranges over the sigmas of the weights.
+    `noise_scale`: standard deviation of this receiver's ranges over the sigmas of the weights, shape (T,).
     """
     test = detect(
         point.wsse,
@@ -142,31 +129,14 @@ def position_dilution(ranges: Ranges, ecef_m: Floats) -> Floats:
 
 
 def fault_free(
-    ranges: Ranges,
-    antennas: AntennaRows,
-    place: Place,
-    scale: Floats,
-    agreeing: Masks,
-    config: Config,
+    ranges: Ranges, antennas: AntennaRows, place: Place, scale: Floats, agreeing: Masks, config: Config
 ) -> tuple[Ranges, Place, RaimResult]:
     """Return ranges and positions without the satellites that RAIM excludes, and its verdict on each epoch.
 
     Of two satellites that disagree with the rest, the rest can be the faulty ones: a pair of which the robust fit of
-    the epoch keeps a range is not believed. Where a fault stays unresolved, the position is that of the ranges
-    that the robust fit keeps; its status says that a check has failed.
-
-    Parameters
-    ----------
-    ranges : Ranges
-        T epochs by K channels.
-    place : Place
-        Positions from these ranges.
-    scale : ndarray, shape (T,)
-        Noise scale of the receiver.
-    agreeing : ndarray of bool, shape (T, K)
-        Ranges that the robust fit on the line keeps.
-    config : Config
-        Where "raim" is not among its screens nothing is tested.
+    the epoch keeps a range (`agreeing`, shape (T, K)) is not believed. Where a fault stays unresolved, the position is
+    that of the ranges that the robust fit keeps; its status says that a check has failed. `scale`: noise scale of the
+    receiver, shape (T,). Without "raim" among the screens nothing is tested.
     """
     limits, constrained = config.raim, place.constrained
     test = detect(constrained.wsse, constrained.residual_m, redundancy_of(ranges), limits=limits, scale=scale)
@@ -264,13 +234,7 @@ def _with_exclusion(raim: RaimResult, epochs: Indices, exclusion: Exclusion, row
 
 
 def _second_attempt(
-    ranges: Ranges,
-    index: SearchIndex,
-    place: Place,
-    epochs: Indices,
-    model: LinearModel,
-    scale: Floats,
-    config: Config,
+    ranges: Ranges, index: SearchIndex, place: Place, epochs: Indices, model: LinearModel, scale: Floats, config: Config
 ) -> Exclusion:
     """Return the exclusion of unresolved epochs, linearised at their position without the worst satellite.
 
@@ -308,27 +272,10 @@ def lasting_errors(
     config: Config,
     states: Sequence[LastingErrorState],
 ) -> tuple[Ranges, Place, Masks, list[LastingErrorState]]:
-    """Return what is left without satellites that are wrong for long.
+    """Return ranges and positions without satellites that are wrong for long, these satellites, and the states.
 
-    Returns
-    -------
-    ranges, place
-        Without them.
-    left_out : ndarray of bool, shape (T, K)
-    states : list of LastingErrorState
-
-    Parameters
-    ----------
-    corrected : CorrectedRanges
-        T epochs by K channels.
-    ranges : Ranges
-        Of them.
-    place : Place
-        Positions from these ranges.
-    noise : ndarray, shape (T,)
-        Noise scale of the receiver.
-    states : sequence of LastingErrorState
-        By antenna.
+    The worst satellite is left out, then the worst of the rest, whose residuals are then those without the first.
+    `noise` is the noise scale of the receiver, shape (T,); satellites are of shape (T, K), states by antenna.
     """
     limits, time = config.lasting_errors, corrected.time
     channel = np.char.add(corrected.channels.satellite, corrected.channels.signal)
@@ -365,13 +312,7 @@ def lasting_errors(
             for index, epochs in antennas.split(np.flatnonzero(found.any(axis=1))):
                 place = solved_again(ranges, index, place, epochs, config)
     after_states = [
-        replace(
-            state,
-            time=time[rows][-1],
-            age=float(own[-1]),
-            channel=channel,
-            sums=np.stack(new, axis=1),
-        )
+        replace(state, time=time[rows][-1], age=float(own[-1]), channel=channel, sums=np.stack(new, axis=1))
         if len(time[rows])
         else state
         for rows, own, new, state in zip(antennas.parts, age, sums, states, strict=True)

@@ -5,7 +5,7 @@ Times are GPS time without a time zone, to the nanosecond. Absent values are nul
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,6 +16,7 @@ from railfix.core.arrays import Floats, Strings
 from railfix.core.reasons import Reason, reason_text
 from railfix.motion.slip import MotionState
 from railfix.pipeline.along_track import on_line_m
+from railfix.pipeline.balises import CONTRADICTS, MISSING, NOT_LISTED, VERDICTS, Passing
 from railfix.pipeline.filter_result import AlongTrack, SmoothedTrack
 from railfix.pipeline.result_columns import (
     CHANNEL_COLUMNS,
@@ -38,18 +39,7 @@ if TYPE_CHECKING:
 
 
 def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
-    """Return one row an epoch of one antenna, also where there is no position.
-
-    Parameters
-    ----------
-    name : str
-        Goes into the column ``antenna``.
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of `POSITION_COLUMNS`.
-    """
+    """Return one row an epoch of one antenna, also where there is no position: `POSITION_COLUMNS`."""
     return table_of(POSITION_COLUMNS, result, len(result.time), antenna=name)
 
 
@@ -76,20 +66,7 @@ def positions_table(result: Result) -> pl.DataFrame:
 
 
 def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack | None = None) -> pl.DataFrame:
-    """Return one row an epoch and channel that was observed, of one antenna.
-
-    Parameters
-    ----------
-    name : str
-        Goes into the column ``antenna``.
-    tracked : AlongTrack, optional
-        Of the filter along the track.
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of `OBSERVATION_COLUMNS`.
-    """
+    """Return one row an epoch and channel that was observed, of one antenna: `OBSERVATION_COLUMNS`."""
     source = Observed(result, tracked)
     epoch, channel = np.nonzero((result.reason & Reason.NOT_OBSERVED) == 0)
     reasons, inverse = np.unique(result.reason[epoch, channel], return_inverse=True)
@@ -103,7 +80,7 @@ def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack |
         "reason_text": texts.gather(pl.Series(values=inverse.astype(np.uint32))),
     }
     for column in CHANNEL_COLUMNS.values():
-        values = column.values(source)
+        values = column.of(source)
         columns[column.name] = column.series(values[epoch, channel] if isinstance(values, np.ndarray) else values, rows)
     return pl.DataFrame(columns).select(*OBSERVATION_COLUMNS)
 
@@ -163,11 +140,7 @@ def to_xarray(
     def variables(columns: Mapping[str, Column[Any]], source: Any, axes: tuple[str, ...]) -> dict[str, Any]:
         shape = result.reason.shape[: len(axes)]
         return {
-            name: (
-                axes,
-                column.array(column.values(source), shape),
-                {"units": column.unit, "long_name": column.meaning},
-            )
+            name: (axes, column.array(column.of(source), shape), {"units": column.unit, "long_name": column.meaning})
             for name, column in columns.items()
             if name not in ("time_gpst", "antenna")
         }
@@ -206,69 +179,63 @@ def _innovation(result: AlongTrack, kind: Kind) -> Floats:
 #: Columns of the table of the filter along the track.
 TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
     (
-        Column("time_gpst", "time tag of the receiver, GPS time", lambda r: r.time, dtype=pl.Datetime("ns")),
-        Column("antenna", "`front` or `rear`", lambda _: None, dtype=pl.String()),
+        Column("time_gpst", "time tag of the receiver, GPS time", "time", dtype=pl.Datetime("ns")),
+        Column("antenna", "`front` or `rear`", None, dtype=pl.String()),
         Column(
             "status",
             "see `railfix.tracking.TrackStatus`; `tracking` and `coasting` alone have a finite level along the line",
-            lambda r: r.tracked.status,
+            "tracked.status",
             words=tuple(s.text for s in TrackStatus),
         ),
-        Column("chainage_m", "distance along the line from the first point of the track", lambda r: r.chainage_m),
-        Column("kilometrage_m", "the line's own marking, where the track has one", lambda r: r.kilometrage_m),
+        Column("chainage_m", "distance along the line from the first point of the track"),
+        Column("kilometrage_m", "the line's own marking, where the track has one"),
         Column(
             "along_sigma_m",
             "standard deviation of the place, with the straight distance to other branches in it",
-            lambda r: r.tracked.sigma_m,
+            "tracked.sigma_m",
         ),
-        Column("speed_mps", "along the line, + toward rising chainage", lambda r: r.tracked.speed_mps),
-        Column("speed_sigma_mps", "its standard deviation", lambda r: r.tracked.speed_sigma_mps),
-        Column("acceleration_mps2", "along the line", lambda r: r.tracked.acceleration_mps2),
+        Column("speed_mps", "along the line, + toward rising chainage", "tracked.speed_mps"),
+        Column("speed_sigma_mps", "its standard deviation", "tracked.speed_sigma_mps"),
+        Column("acceleration_mps2", "along the line", "tracked.acceleration_mps2"),
         Column(
             "direction",
             "`rising` or `falling` chainage, `unknown` where the speed does not tell",
             lambda r: r.direction + 1,
             words=("falling", "unknown", "rising"),
         ),
-        Column("standstill", "slower than 1 km/h with two sigmas", lambda r: r.standstill, dtype=pl.Boolean()),
+        Column("standstill", "slower than 1 km/h with two sigmas", dtype=pl.Boolean()),
         Column(
             "branch_probability",
             "probability of the place given against other places of the line",
-            lambda r: r.tracked.probability,
+            "tracked.probability",
         ),
-        Column("hypotheses", "places that are possible", lambda r: r.tracked.hypotheses, dtype=pl.Int16()),
+        Column("hypotheses", "places that are possible", "tracked.hypotheses", dtype=pl.Int16()),
         Column(
             "protection_level_m",
             "exceeded by the error along the line with the stated risk; infinite where another place is likelier "
             "or measurements contradict the place",
-            lambda r: r.tracked.level_m,
+            "tracked.level_m",
         ),
         Column(
             "protection_level_ground_m",
             "the same of the straight distance on the ground, also on another lap",
-            lambda r: r.tracked.ground_level_m,
+            "tracked.ground_level_m",
         ),
-        Column("protection_noise_m", "its part by noise without a fault", lambda r: r.tracked.level_noise_m),
-        Column(
-            "protection_separation_m",
-            "largest distance of a sub-filter of the level",
-            lambda r: r.tracked.separation_m,
-        ),
+        Column("protection_noise_m", "its part by noise without a fault", "tracked.level_noise_m"),
+        Column("protection_separation_m", "largest distance of a sub-filter of the level", "tracked.separation_m"),
         Column(
             "over_reading_m",
             "how far the train may be behind: the level, at least 2 % of the way since codes were used "
             "(`L_DOUBTOVER` less `Q_LOCACC`)",
-            lambda r: r.tracked.amount_m,
+            "tracked.amount_m",
         ),
         Column(
-            "under_reading_m",
-            "how far the train may be ahead, in the same way (`L_DOUBTUNDER`)",
-            lambda r: r.tracked.amount_m,
+            "under_reading_m", "how far the train may be ahead, in the same way (`L_DOUBTUNDER`)", "tracked.amount_m"
         ),
         Column(
             "motion",
             "by tachometer and inertial unit together, see `docs/sensors.md`",
-            lambda r: r.sensed.state,
+            "sensed.state",
             words=tuple(state.name.lower() for state in MotionState),
         ),
         Column(
@@ -279,30 +246,30 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             _sources,
             dtype=pl.String(),
         ),
-        Column("latitude_deg", "antenna, WGS 84", lambda r: r.latitude_deg),
-        Column("longitude_deg", "antenna, WGS 84", lambda r: r.longitude_deg),
-        Column("height_m", "antenna, above the ellipsoid", lambda r: r.height_m),
+        Column("latitude_deg", "antenna, WGS 84"),
+        Column("longitude_deg", "antenna, WGS 84"),
+        Column("height_m", "antenna, above the ellipsoid"),
         Column("x_m", "antenna, ECEF", lambda r: r.ecef_m[:, 0]),
         Column("y_m", "antenna, ECEF", lambda r: r.ecef_m[:, 1]),
         Column("z_m", "antenna, ECEF", lambda r: r.ecef_m[:, 2]),
         Column(
             "code_weight",
             "mean weight of codes; 1 is that of an error of one standard deviation",
-            lambda r: r.tracked.code_weight,
+            "tracked.code_weight",
         ),
-        Column("motion_weight", "mean weight of Dopplers and phases", lambda r: r.tracked.motion_weight),
-        Column("wheel_scale", "share that its way is too short by, as estimated", lambda r: r.tracked.wheel_scale),
-        Column("radar_scale", "share that its way is too short by, as estimated", lambda r: r.tracked.radar_scale),
-        Column("force_offset_mps2", "offset of the accelerometer, as estimated", lambda r: r.tracked.force_offset_mps2),
+        Column("motion_weight", "mean weight of Dopplers and phases", "tracked.motion_weight"),
+        Column("wheel_scale", "share that its way is too short by, as estimated", "tracked.wheel_scale"),
+        Column("radar_scale", "share that its way is too short by, as estimated", "tracked.radar_scale"),
+        Column("force_offset_mps2", "offset of the accelerometer, as estimated", "tracked.force_offset_mps2"),
         Column(
             "map_scale",
             "factor on `tracking.map_scale_m`: above 1 where pseudoranges keep moving against the map",
-            lambda r: r.tracked.map_scale,
+            "tracked.map_scale",
         ),
         Column(
             "measured_chainage_m",
             "chainage of the vehicle's middle, or the antenna, for the next three: means since the epoch before",
-            lambda r: r.sensed.under_m,
+            "sensed.under_m",
         ),
         Column(
             "measured_gradient_permille",
@@ -313,7 +280,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column(
             "measured_curvature_1pm",
             "curvature there by the yaw rate, + to the right in rising chainage",
-            lambda r: r.sensed.curvature_1pm,
+            "sensed.curvature_1pm",
         ),
         Column(
             "measured_cant_mm",
@@ -323,12 +290,12 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column(
             "metric_antenna_spacing_m",
             "distance of the two antennas' places less that of the antennas; empty for one antenna",
-            lambda r: r.spacing_error_m,
+            "spacing_error_m",
         ),
         Column(
             "wheel_difference_m",
             "distance by satellites over the last two minutes less that of the wheel",
-            lambda r: None if r.wheel is None else r.wheel.difference_m,
+            "wheel.difference_m",
         ),
         Column(
             "innovation_wheel_m",
@@ -380,8 +347,8 @@ SMOOTHED_COLUMNS: Final[Mapping[str, Column[SmoothedAntenna]]] = by_name(
             "distance along the line by everything measured before and after the epoch",
             lambda s: s.trajectory.chainage_at(on_line_m(s.track, s.trajectory)),
         ),
-        Column("smoothed_sigma_m", "its standard deviation", lambda s: s.track.sigma_m),
-        Column("smoothed_speed_mps", "speed along the line, in the same way", lambda s: s.track.speed_mps),
+        Column("smoothed_sigma_m", "its standard deviation", "track.sigma_m"),
+        Column("smoothed_speed_mps", "speed along the line, in the same way", "track.speed_mps"),
     )
 )
 
@@ -403,15 +370,7 @@ def train_table(result: Result) -> pl.DataFrame:
 
 
 def with_smoothed(table: pl.DataFrame, smoothed: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
-    """Return rows of the table with `SMOOTHED_COLUMNS`.
-
-    Parameters
-    ----------
-    table : polars.DataFrame
-        Rows of `train_table`.
-    smoothed : mapping of str to polars.DataFrame
-        By antenna; its rows in the same order.
-    """
+    """Return rows of `train_table` with `SMOOTHED_COLUMNS`, given by antenna in the same order."""
     antenna = table["antenna"].to_numpy()
     values = {name: np.full(len(table), np.nan) for name in SMOOTHED_COLUMNS}
     for name, rows in smoothed.items():
@@ -429,3 +388,71 @@ def smoothed_table(result: SmoothedTrack, trajectory: Trajectory) -> pl.DataFram
 def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
     """Return the filtered positions of one antenna, one row per epoch."""
     return table_of(TRAIN_COLUMNS, result, len(result), antenna=name)
+
+
+_TIME: Final = pl.Datetime("ns")
+
+
+def _of(name: str) -> Any:
+    """Return a getter of one field of all passings."""
+    return lambda passings: np.array([getattr(passing, name) for passing in passings])
+
+
+#: Columns of the table of passings.
+PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
+    (
+        Column("time_gpst", "when the place was passed, by the filter; or a reading that is wrong", _of("time"),
+               dtype=_TIME),
+        Column("earliest_gpst", "begin of the interval of the passing, by the level: before, the train was not there",
+               _of("earliest"), dtype=_TIME),
+        Column("latest_gpst", "its end", _of("latest"), dtype=_TIME),
+        Column("antenna", "`front` or `rear`", None, dtype=pl.String()),
+        Column("balise", "name in the list, or as read", _of("balise"), dtype=pl.String()),
+        Column(
+            "verdict",
+            "`virtual`: no balise; `read`, `missing`: passed with and without a reading; `contradicts`: read where the "
+            "filter excludes it; `not_listed`",
+            _of("verdict"), words=VERDICTS,
+        ),
+        Column("chainage_m", "as listed", _of("chainage_m")),
+        Column("read_gpst", "time of the reading", _of("read"), dtype=_TIME),
+        Column("read_error_m", "of a reading that contradicts: listed place less that of the filter",
+               _of("read_error_m")),
+        Column("speed_mps", "at the passing, + toward rising chainage", _of("speed_mps")),
+        Column("protection_level_m", "of the place at the passing", _of("level_m")),
+        Column("doubt_over_m", "how far the train may be behind the place: `L_DOUBTOVER` less `Q_LOCACC`",
+               _of("amount_m")),
+        Column("doubt_under_m", "how far it may be ahead: `L_DOUBTUNDER` less `Q_LOCACC`", _of("amount_m")),
+        Column("odometer_m", "for comparison: 5 m and 5 % of the way since the last balise read (SUBSET-041)",
+               _of("odometer_m")),
+    )
+)  # fmt: skip
+
+
+def passing_table(result: Result) -> pl.DataFrame:
+    """Return the passings of a chunk, with `PASSING_COLUMNS`."""
+    parts = [table_of(PASSING_COLUMNS, own.passings, len(own.passings), antenna=name)
+             for name, own in result.fusion.items()]  # fmt: skip
+    return pl.concat(parts).sort("time_gpst", maintain_order=True) if parts else table_of(PASSING_COLUMNS, (), 0)
+
+
+def balise_notes(antenna: str, passings: Iterable[Passing]) -> list[str]:
+    """Return a sentence on each balise that was missed, or read where it is not."""
+    notes = []
+    for passing in passings:
+        at, name = str(passing.time)[:21], f"{antenna}: balise {passing.balise}"
+        if passing.verdict == MISSING:
+            early, late = str(passing.earliest)[:21], str(passing.latest)[11:21]
+            notes.append(
+                f"{name} at chainage {passing.chainage_m:.1f} m was passed between {early} and {late} without a reading"
+            )
+        elif passing.verdict == CONTRADICTS:
+            which = f", next to {passing.here}" if passing.here and passing.here != passing.balise else ""
+            notes.append(
+                f"{name}, read at {at}, contradicts the filter: it is listed at {passing.chainage_m:.1f} m, the train "
+                f"was {abs(passing.read_error_m):.1f} m from there (sigma {passing.sigma_m:.1f} m){which}; a wrong "
+                "identity, or a wrong place in the list"
+            )
+        elif passing.verdict == NOT_LISTED:
+            notes.append(f"{name}, read at {at}, is not listed on this line; the reading is not used")
+    return notes

@@ -55,19 +55,10 @@ class CampaignReport:
 
 
 def report_campaign(runs: pl.DataFrame, out: Path) -> CampaignReport:
-    """Sum the runs of a campaign up, and explain their worst epochs where the observations were written.
+    """Sum up the runs of a campaign, and explain their worst epochs where the observations were written.
 
-    Parameters
-    ----------
-    runs : polars.DataFrame
-        `railfix.run.campaign.run_campaign`.
-    out : Path
-        Folder of the campaign; explanations go into ``explain`` in it.
-
-    Raises
-    ------
-    InputFileError, OutputError
-        A table of a run cannot be read; an explanation cannot be written.
+    `runs` is the table of `railfix.run.campaign.run_campaign`, `out` its folder; explanations go into ``explain`` in
+    it.
     """
     fields = runs.columns[: runs.columns.index("status")]
     rows, epochs, notes = [], [], []
@@ -101,13 +92,7 @@ def report_campaign(runs: pl.DataFrame, out: Path) -> CampaignReport:
 
 
 def write_campaign_page(report: CampaignReport, path: Path, *, title: str) -> Path:
-    """Write a campaign as one HTML page that opens without a network; return its path.
-
-    Raises
-    ------
-    OutputError
-        The page cannot be written.
-    """
+    """Write a campaign as one HTML page that opens without a network; return its path."""
     runs, *rest = report.tables
     blocks: list[Block] = [*rest[::-1], runs, *([Notes("Notes", report.notes)] if report.notes else [])]
     lead = [Sentence(f"{sentence[0].upper()}{sentence[1:]}.") for sentence in report.sentences]

@@ -146,14 +146,9 @@ _IGNORED: Final = ("Point", "MultiPoint")
 
 
 def read_background(path: Path) -> tuple[Floats, ...]:
-    """Lines and outlines of a GeoJSON file, each of shape (P, 2): longitude and latitude [deg].
+    """Read lines and outlines of a GeoJSON file, each of shape (P, 2): longitude and latitude [deg].
 
-    Points are left out.
-
-    Raises
-    ------
-    InputFileError
-        The file cannot be read, is not GeoJSON, or has no lines.
+    Points are left out; InputFileError where it is not GeoJSON, or has no lines.
     """
     node = read_json_object(path, what="GeoJSON")
     lines = tuple(_lines(path, node))
@@ -320,12 +315,7 @@ def figure(
         axis = f"{anchor}-{chart.shared_axis}" if chart.shared_axis else ""
         width = width or chart.width
     return Figure(
-        number=next(numbers),
-        chart=chart,
-        json=Markup(script_json(values)),
-        width=width,
-        sky=linked,
-        zoomed_with=axis,
+        number=next(numbers), chart=chart, json=Markup(script_json(values)), width=width, sky=linked, zoomed_with=axis
     )
 
 
@@ -336,13 +326,7 @@ _LISTED: Final = 5_000
 def write_network_page(
     network: Network, quality: NetworkQuality, out: Path, *, run: tuple[PlanLog, Matched] | None = None
 ) -> None:
-    """Write a page on a network, with the positions of a run in its frame; it opens without an internet connection.
-
-    Raises
-    ------
-    OutputError
-        The page cannot be written.
-    """
+    """Write a page on a network, with the positions of a run in its frame; it opens without an internet connection."""
     title = f"{quality.tracks:,} tracks, {quality.length_m / 1e3:,.1f} km, {quality.switches:,} switches"
     write_whole(
         out, charts_page(title, [network_plan(network, quality, run)], _tables(network, quality, run)), what="page"

@@ -84,23 +84,9 @@ class Explanation:
 def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanation:
     """Explain the epoch of a run nearest to a time.
 
-    Parameters
-    ----------
-    run : Path
-        Folder that `railfix run --observations` wrote.
-    at : str
-        GPS time as ``hh:mm:ss``, of the first day of the run on which it has epochs, or ``yyyy-mm-dd hh:mm:ss``.
-    antenna : str, optional
-        The first of the run unless given.
-
-    Raises
-    ------
-    InputFileError
-        The folder lacks a table.
-    SettingsError
-        `at` is no time, or `antenna` none of the run's.
-    MismatchError
-        The run has no epoch within a minute of the time.
+    `at` is GPS time as ``hh:mm:ss``, of the first day of the run on which it has epochs, or ``yyyy-mm-dd hh:mm:ss``;
+    the antenna is the first of the run unless given. InputFileError: the folder lacks a table. SettingsError: `at` is
+    no time, or `antenna` none of the run's. MismatchError: the run has no epoch within a minute of the time.
     """
     folder = read_run(run)
     if not (run / "observations.parquet").is_file():
@@ -279,13 +265,7 @@ def _level_of_single(single: Mapping[str, Any]) -> str:
 
 
 def write_explanation(explanation: Explanation, path: Path) -> Path:
-    """Write an explanation as one HTML page with the sky of the epoch; return its path.
-
-    Raises
-    ------
-    OutputError
-        The page cannot be written.
-    """
+    """Write an explanation as one HTML page with the sky of the epoch; return its path."""
     environment = Environment(
         loader=PackageLoader("railfix.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,

@@ -300,11 +300,7 @@ def write_page(
 
 
 def report_page(
-    runs: Sequence[ReportedRun],
-    evaluation: Evaluation | None,
-    *,
-    background: Sequence[Floats] = (),
-    title: str = "",
+    runs: Sequence[ReportedRun], evaluation: Evaluation | None, *, background: Sequence[Floats] = (), title: str = ""
 ) -> str:
     """HTML of the report; `background`: longitude and latitude of lines below the plan, each of shape (P, 2) [deg]."""
     numbers = counter()

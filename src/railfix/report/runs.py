@@ -170,10 +170,7 @@ def read_runs(
 
 
 def _report(
-    name: str,
-    folder: RunFolder,
-    evaluated: Mapping[str, tuple[EvaluatedRun, pl.DataFrame]],
-    conventional: Path | None,
+    name: str, folder: RunFolder, evaluated: Mapping[str, tuple[EvaluatedRun, pl.DataFrame]], conventional: Path | None
 ) -> ReportedRun:
     config = folder.config
     curve, notes = _curve(folder, config)

@@ -4,12 +4,4 @@ from .driver import RunSummary, run_files
 from .inputs import RunInputs, RunOptions, TrackReading
 from .record import RunRecord, read_record
 
-__all__ = [
-    "RunInputs",
-    "RunOptions",
-    "RunRecord",
-    "RunSummary",
-    "TrackReading",
-    "read_record",
-    "run_files",
-]
+__all__ = ["RunInputs", "RunOptions", "RunRecord", "RunSummary", "TrackReading", "read_record", "run_files"]

@@ -39,7 +39,7 @@ BATCH_COLUMNS: Final[Mapping[str, Column[CheckedAntenna]]] = by_name(
             "distance along the line by a robust fit of codes and Dopplers of the whole log",
             lambda c: c.trajectory.chainage_at(c.batch.arc_m),
         ),
-        Column("batch_sigma_m", "its standard deviation, that of the map in it", lambda c: c.batch.sigma_m),
+        Column("batch_sigma_m", "its standard deviation, that of the map in it", "batch.sigma_m"),
     )
 )
 

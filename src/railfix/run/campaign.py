@@ -92,12 +92,8 @@ class CampaignProgress(Protocol):
 def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
     """Read a campaign file and find the files of each run.
 
-    Raises
-    ------
-    InputFileError
-        The file cannot be read, or no log matches its pattern.
-    SettingsError
-        A setting is misspelt, or a pattern has no field or one that the logs of the front antenna lack.
+    InputFileError: no log matches its pattern. SettingsError: a setting is misspelt, or a pattern has no field or one
+    that the logs of the front antenna lack.
     """
     campaign = load_settings(Campaign, path, what="a campaign file")
     folder, out = path.absolute().parent, out.absolute()
@@ -146,33 +142,14 @@ def run_campaign(
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> pl.DataFrame:
-    """Position all logs of a campaign and write one row per run to ``campaign.csv``.
+    """Position all logs of a campaign file and write one row per run to ``campaign.csv``.
 
-    Runs whose results are there, of the same inputs and settings, are not repeated: a campaign that was killed
-    goes on where it was. A run that fails is a row with its error.
+    Runs whose results are there, of the same inputs and settings, are not repeated: a campaign that was killed goes on
+    where it was. A run that fails is a row with its error: the fields, `status` ("done", "failed"), `error`, `epochs`,
+    `positioning_rate`, `ok_rate`, `wall_s`, `reference`, `folder` (below `out`).
 
-    Parameters
-    ----------
-    path : Path
-        Campaign file, see `Campaign`.
-    out : Path
-        Folder for the results; that of an earlier campaign is continued.
-    executor : Executor
-        Of `concurrent.futures`: processes on this machine, or any other with its interface whose workers see the
-        same files.
-    lost : tuple of type
-        Errors by which the executor reports that a worker process is gone.
-
-    Returns
-    -------
-    polars.DataFrame
-        The fields, `status` ("done", "failed"), `error`, `epochs`, `positioning_rate`, `ok_rate`, `wall_s`,
-        `reference`, `folder` (below `out`).
-
-    Raises
-    ------
-    InputFileError, SettingsError, OutputError
-        See `read_campaign`; the folder has other files in it.
+    The executor is of `concurrent.futures`: processes on this machine, or any other with its interface whose workers
+    see the same files; by the errors `lost` it reports that a worker process is gone.
     """
     return position_runs(read_campaign(path, out), out=out, executor=executor, progress=progress, lost=lost)
 

@@ -181,13 +181,7 @@ def run_files(
 def open_inputs(
     inputs: RunInputs, options: RunOptions, config: Config
 ) -> tuple[Navigation, OpenedLine, dict[Antenna, Log]]:
-    """Read navigation and line, and open the logs, by antenna; find the route in a network of tracks.
-
-    Raises
-    ------
-    InputFileError, SettingsError, MismatchError
-        A file is not what it should be, or track and vehicle do not fit.
-    """
+    """Read navigation and line, and open the logs, by antenna; find the route in a network of tracks."""
     navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines, date=options.logs.instant)
     if inputs.sp3:
         from railfix.io.sp3 import read_sp3
@@ -234,13 +228,7 @@ def time_of(navigation: Navigation) -> np.datetime64 | None:
 
 
 def sensors_of(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
-    """Read the samples of the sensors on board, and the ground units that they measured ranges to.
-
-    Raises
-    ------
-    InputFileError, MismatchError
-        A table is not what it should be; ranges to a unit without a surveyed position.
-    """
+    """Read the samples of the sensors on board, and the ground units that they measured ranges to."""
     samples = read_sensors(
         tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar, ranging=inputs.ranging,
         balises=inputs.balises,
@@ -315,11 +303,7 @@ def _causes(
 
 
 def _notes_of_sensors(
-    checks: SensorChecks | None,
-    sensors: SensorSamples,
-    units: GroundUnits | None,
-    line: OpenedLine,
-    config: Config,
+    checks: SensorChecks | None, sensors: SensorSamples, units: GroundUnits | None, line: OpenedLine, config: Config
 ) -> tuple[str, ...]:
     """Return notes on sensors whose settings or tables contradict the satellites; none without sensors."""
     if checks is None:

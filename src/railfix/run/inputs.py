@@ -279,11 +279,7 @@ def check_given_once(files: Iterable[tuple[str, Path]]) -> None:
 
 
 def recorded_path(path: Path, folder: Path) -> str:
-    """Return the path of an input for the record in a results folder.
-
-    Relative paths are recorded relative to the results folder, so that it can be moved together with its
-    inputs; absolute ones stay.
-    """
+    """Return the path of an input for the record: relative to the results folder, unless it is absolute."""
     if path.is_absolute():
         return str(path)
     return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()

@@ -160,11 +160,7 @@ def add_mate_results(folder: OutputFolder, track: Track, log: Path) -> None:
     if not (mate_table(log) and train.exists()):
         return
     passings = folder.staging / "passings.parquet"
-    found = result_tables(
-        pl.read_parquet(train),
-        pl.read_parquet(passings) if passings.exists() else None,
-        track,
-    )
+    found = result_tables(pl.read_parquet(train), pl.read_parquet(passings) if passings.exists() else None, track)
     for name, table in found.items():
         table.write_parquet(folder.staged(f"{name}.parquet"))
 

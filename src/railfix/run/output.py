@@ -147,16 +147,10 @@ _LOOK_S: Final = 0.1
 
 
 class ParquetFile:
-    """A Parquet file to which rows are appended; memory does not grow with their number.
+    """A Parquet file to which tables of one schema are appended; memory does not grow with their number.
 
     polars writes a file from one query. Here the source of the query waits for the next rows, in a thread, and one
     table at most waits for it.
-
-    Parameters
-    ----------
-    path : Path
-    schema : polars.Schema
-        Of every table that is appended.
     """
 
     def __init__(self, path: Path, schema: pl.Schema) -> None:
@@ -229,27 +223,15 @@ _ATTEMPTS: Final = 10
 
 
 class OutputFolder:
-    """A folder that receives all files of a command at once, or none.
+    """A folder that receives all files of a command at once, or none; made where it does not exist.
 
-    Used as a context manager. Inside it, files are written to a hidden staging folder; `commit` moves them in
-    place. Leaving without `commit` (an error) removes what was written, and the folder itself where it had not
-    been there before. What a killed process left behind is cleaned up by the next `OutputFolder` there.
+    Used as a context manager. Inside it, files are written to a hidden staging folder; `commit` moves them in place.
+    Leaving without `commit` (an error) removes what was written, and the folder itself where it had not been there
+    before. What a killed process left behind is cleaned up by the next `OutputFolder` there. With "replace" a folder
+    may have files, those of the same names are replaced at the end; `inputs` are never overwritten.
 
-    Parameters
-    ----------
-    path : Path
-        Made where it does not exist, with its parents.
-    overwrite : {"refuse", "replace"}
-        What to do with a folder that has files in it already: "replace" replaces files of the
-        same names at the end and leaves others alone.
-    inputs : sequence of Path
-        Files that are read: they are never overwritten.
-
-    Raises
-    ------
-    OutputError
-        The folder cannot be made or written, is not empty, is being written by another process, or a file
-        would overwrite an input.
+    OutputError: the folder cannot be made or written, is not empty, is being written by another process, or a file
+    would overwrite an input.
     """
 
     def __init__(self, path: Path, *, overwrite: Overwrite = "refuse", inputs: Sequence[Path] = ()) -> None:
@@ -416,8 +398,7 @@ def check_not_input(target: Path, inputs: Sequence[Path]) -> None:
 def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Path], kind: FileKind = "any") -> None:
     """Raise OutputError where a single file of a kind cannot or must not be written.
 
-    The folder does not exist or cannot be written, the file is there already, or is one of `inputs`, or the ending of
-    its name, which programs go by, is that of another kind of file.
+    Its folder is not there or cannot be written, it exists, is one of `inputs`, or its name ends as another kind does.
     """
     with _writing(target):
         check_not_input(target, inputs)

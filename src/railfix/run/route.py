@@ -249,8 +249,7 @@ class RouteOfLog:
                 pl.Series("track", np.where(track < 0, NONE, names[track]).tolist(), dtype=pl.String),
                 pl.Series("on_route", np.arange(len(row)) < len(own)),
                 pl.Series(
-                    "probability",
-                    np.concatenate([share[own], probability[rows, column], self.unmapped[epoch][off]]),
+                    "probability", np.concatenate([share[own], probability[rows, column], self.unmapped[epoch][off]])
                 ),
                 pl.Series("chainage_m", at, nan_to_null=True),
                 pl.Series("kilometrage_m", self.network.kilometrage_on(track, at), nan_to_null=True),

@@ -120,14 +120,9 @@ def open_line(
 ) -> OpenedLine:
     """Read the track and the vehicle, and compute the path of each antenna.
 
-    With a time `at` the track is moved to the frame of the satellites then (`railfix.track.frames`); without it
-    the coordinates stay in the map's own frame. A single file whose tracks do not join to one route is a network:
-    `log` gives the route through it, and the heights of a map without where `heights` is `OF_LOG`.
-
-    Raises
-    ------
-    InputFileError, SettingsError, MismatchError
-        A file is not what it should be, or track and vehicle do not fit.
+    With a time `at` the track is moved to the frame of the satellites then (`railfix.track.frames`); without it the
+    coordinates stay in the map's own frame. A single file whose tracks do not join to one route is a network: `log`
+    gives the route through it, and the heights of a map without where `heights` is `OF_LOG`.
     """
     prepared = PreparedLines(use=reading.cache == "use")
     key = key_of("line", *track, heights, *vars(reading.of_map).values(), reading.height_sigma)
@@ -165,11 +160,7 @@ def _check_extent(files: tuple[Path, ...], track: Track) -> None:
 
 
 def _read_line(
-    track: tuple[Path, ...],
-    reading: TrackReading,
-    *,
-    heights: Path | None,
-    log: LogPositions | None,
+    track: tuple[Path, ...], reading: TrackReading, *, heights: Path | None, log: LogPositions | None
 ) -> tuple[Track, RouteOfLog | None]:
     """Read the track, and find the route in a network."""
     segments = _segments(track, reading)
@@ -207,11 +198,7 @@ def _segments(track: tuple[Path, ...], reading: TrackReading) -> list[Segment]:
 
 
 def _paths(
-    track: Track,
-    vehicle: Path | None,
-    antennas: tuple[Antenna, ...],
-    reading: TrackReading,
-    prepared: PreparedLines,
+    track: Track, vehicle: Path | None, antennas: tuple[Antenna, ...], reading: TrackReading, prepared: PreparedLines
 ) -> tuple[Vehicle | None, dict[str, Trajectory]]:
     """The vehicle, and the path of each antenna."""
     if vehicle is None:
@@ -282,16 +269,11 @@ def _spacing_ns(time: Datetimes) -> int:
 
 
 def aligned(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Observations]]:
-    """Chunks of observations that cover the same span of time for every antenna.
+    """Yield chunks of observations that cover the same span of time for every antenna seen so far.
 
-    Each antenna keeps its own epochs. A chunk ends where the first of the current parts ends;
-    what the others have beyond waits for the next chunk. Epochs that belong together but are
-    tagged a little apart (`SAME_INSTANT_NS`) stay in one chunk.
-
-    Yields
-    ------
-    dict of str to Observations
-        All antennas that have been seen so far; empty for one without epochs in the span.
+    Each antenna keeps its own epochs, none where it has none in the span. A chunk ends where the first of the current
+    parts ends; what the others have beyond waits for the next chunk. Epochs that belong together but are tagged a
+    little apart (`SAME_INSTANT_NS`) stay in one chunk.
     """
     live = dict(logs)
     waiting: dict[str, Observations] = {}

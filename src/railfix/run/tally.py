@@ -17,13 +17,14 @@ from railfix.integrity.interference import CAUSES
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.pipeline.compared import AntennaOrder
 from railfix.pipeline.filter_result import AlongTrack, Replay, smooth
-from railfix.pipeline.passing_table import balise_notes, passing_table
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.tables import (
     antenna_positions,
     antenna_train,
+    balise_notes,
     observations_table,
+    passing_table,
     positions_table,
     rounded,
     smoothed_table,

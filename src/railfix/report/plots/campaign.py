@@ -42,12 +42,8 @@ _QUANTITIES = {
 def campaign_plan(places: pl.DataFrame, quantity: str) -> Chart:
     """Plan of the places of all runs, coloured by the size of a quantity; the largest are drawn last.
 
-    Parameters
-    ----------
-    places : polars.DataFrame
-        Columns ``x_m``, ``y_m``, ``z_m`` [m, ECEF] and `quantity` [m].
-    quantity : str
-        ``error_m``, ``protection_level_m`` or ``along_sigma_m``.
+    `places` has ``x_m``, ``y_m``, ``z_m`` [ECEF] and `quantity`: ``error_m``, ``protection_level_m``,
+    ``along_sigma_m``.
     """
     named, edges, _ = _QUANTITIES[quantity]
     placed = points(places, *ECEF)
@@ -112,13 +108,7 @@ _GREEN: Final = "#2e7d32"
 
 
 def plot_service(service: pl.DataFrame, path: str | PathLike[str], *, title: str, limit_m: float) -> None:
-    """Draw satellites, reflections, shares and levels of `compute_service` by chainage.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
+    """Draw satellites, reflections, shares and levels of `compute_service` by chainage."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 10), layout="constrained")

@@ -249,20 +249,11 @@ def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:
 
 
 def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
-    """Distance from each position to the previous one while the train moved.
+    """Return the chainage of each position but the first, and its distance from the one before while the train moved
+    [m].
 
-    Parameters
-    ----------
-    table : polars.DataFrame
-        Of one antenna, in order of time: of an evaluation (`railfix.evaluate.EPOCH_COLUMNS`), with distances of the
-        reference; or positions alone (`railfix.pipeline.result_columns.POSITION_COLUMNS`), with their own distances.
-    prefix : {"", "conventional_"}
-        Start of the names of the columns.
-
-    Returns
-    -------
-    ndarray, ndarray, shape (P,) [m]
-        Chainage of each position but the first, and the distance; positions at standstill are left out.
+    From `railfix.evaluate.EPOCH_COLUMNS` of one antenna, with distances of the reference; or from positions alone, with
+    their own. `prefix`, "" or "conventional_", begins the names of the columns.
     """
     if f"{prefix}interval_m" in table.columns:
         chainage, distance = floats(table, "chainage_m"), floats(table, f"{prefix}interval_m")
@@ -273,10 +264,7 @@ def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
     return at[1:], np.abs(np.diff(at))
 
 
-_FIXES: Final = (
-    ("conventional", "conventional_", CONVENTIONAL, "square"),
-    ("on the map", "", CONSTRAINED, "dot"),
-)
+_FIXES: Final = (("conventional", "conventional_", CONVENTIONAL, "square"), ("on the map", "", CONSTRAINED, "dot"))
 
 
 def interval_over_chainage(table: pl.DataFrame, *, title: str = "Positioning interval") -> Chart:

@@ -189,13 +189,7 @@ def _plan(track: Track) -> tuple[Floats, Floats]:
 
 
 def plot_track_quality(quality: TrackQuality, path: str | PathLike[str]) -> None:
-    """Draw plan, mid-chord deviation, spacing, turns, gradient and cant, with the findings marked, as a PNG file.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
+    """Draw plan, mid-chord deviation, spacing, turns, gradient and cant, with the findings marked, as a PNG file."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 14), layout="constrained")
@@ -265,13 +259,7 @@ _RAW: Final = "#c1272d"
 
 
 def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
-    """Draw positions, map and passes in plan, and height and standard deviations along the line.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
+    """Draw positions, map and passes in plan, and height and standard deviations along the line."""
     from matplotlib.figure import Figure
 
     survey, track = surveyed.survey, surveyed.survey.track
@@ -310,13 +298,7 @@ def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
 
 
 def plot_track_decision(decision: TrackDecision, path: str | PathLike[str], *, risk: float) -> None:
-    """Draw the probability of not being each track over time, with the risk allowed.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
+    """Draw the probability of not being each track over time, with the risk allowed."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 6), dpi=120)

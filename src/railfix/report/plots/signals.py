@@ -75,10 +75,7 @@ def cn0_over_elevation(
         pl.col("elevation_deg") >= 0.0,
     )
     counted = taken.group_by(
-        "satellite",
-        "signal",
-        across=_cell("elevation_deg", _ELEVATION_EDGES),
-        up=_cell("cn0_dbhz", _CN0_EDGES),
+        "satellite", "signal", across=_cell("elevation_deg", _ELEVATION_EDGES), up=_cell("cn0_dbhz", _CN0_EDGES)
     ).agg(count=pl.len().cast(pl.Int64), total=pl.col("cn0_dbhz").sum())
     cells_of = counted.collect()
     kinds = {satellite: satellite_kind(satellite) for satellite in cells_of["satellite"].unique()}
