@@ -266,7 +266,9 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
         values = read_toml(choices.config, what="a configuration file")
         parse_config(values, source=str(choices.config))
     if choices.preset is not None:
-        values["preset"] = _preset(choices.preset)
+        if choices.preset not in PRESETS:
+            raise SettingsError(f"--preset {choices.preset}: unknown preset; known are {', '.join(PRESETS)}")
+        values["preset"] = choices.preset
     check_set_once(choices.setting)
     for text in choices.setting:
         if choices.preset is not None and text.partition("=")[0].strip() == "preset":
@@ -288,12 +290,6 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
         dropped = [name for text in choices.without for name in _screens("--without", text)]
         values["screens"] = [name for name in parse_config(values, source=source).screens if name not in dropped]
     return with_measured_priors(parse_config(values, source=source)), values
-
-
-def _preset(name: str) -> str:
-    if name not in PRESETS:
-        raise SettingsError(f"--preset {name}: unknown preset; known are {', '.join(PRESETS)}")
-    return name
 
 
 def _screens(option: str, text: str) -> list[str]:

@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import BrokenExecutor, Executor
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 import polars as pl
 
 from railfix import __version__
-from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.arrays import Datetimes, Indices
 from railfix.core.errors import MismatchError, RailfixError
 from railfix.core.files import fingerprint, read_bytes, write_whole
 from railfix.core.geodesy import sigma_along
@@ -133,15 +133,11 @@ def _trajectory_of(run: RunFolder, antenna: str, epochs: pl.DataFrame) -> Trajec
     answers = Answers(
         chainage_m=floats(epochs, "chainage_m"),
         conventional_chainage_m=unknown,
-        ecef_m=_ecef(epochs),
+        ecef_m=np.stack([floats(epochs, name) for name in ("x_m", "y_m", "z_m")], axis=1),
         reference_chainage_m=unknown,
         reference_ecef_m=np.full((len(epochs), 3), np.nan),
     )
     return find_trajectory(run, antenna, answers, TrackFiles())[0]
-
-
-def _ecef(table: pl.DataFrame) -> Floats:
-    return np.stack([floats(table, name) for name in ("x_m", "y_m", "z_m")], axis=1)
 
 
 def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> str | None:
@@ -338,14 +334,6 @@ def _time_to_first(epochs: pl.DataFrame, kind: str) -> float | None:
     return float(seconds(placed.min() - observed.min())) if len(observed) and len(placed) else None
 
 
-def _cells(row: Mapping[str, Any]) -> Iterator[str]:
-    """Texts of one row of the table that people read."""
-    yield f"{row['case']}{' (held out)' if row['held_out'] else ''}"
-    yield row["position"] or f"failed: {row['error']}"
-    for column, _, _, decimals, factor in _SHOWN:
-        yield "-" if row[column] is None else f"{factor * row[column]:,.{decimals}f}"
-
-
 def heads() -> tuple[list[str], list[str]]:
     """Heads of the table that people read, and the performance feature of EN 16803-1 of each column."""
     return ["case", "position", *(head for _, head, *_ in _SHOWN)], ["", "", *(name for _, _, name, *_ in _SHOWN)]
@@ -353,7 +341,17 @@ def heads() -> tuple[list[str], list[str]]:
 
 def shown_rows(table: pl.DataFrame) -> list[list[str]]:
     """Rows of the table that people read; "-" where a column has no value."""
-    return [list(_cells(row)) for row in table.iter_rows(named=True)]
+    return [
+        [
+            f"{row['case']}{' (held out)' if row['held_out'] else ''}",
+            row["position"] or f"failed: {row['error']}",
+            *(
+                "-" if row[column] is None else f"{factor * row[column]:,.{decimals}f}"
+                for column, _, _, decimals, factor in _SHOWN
+            ),
+        ]
+        for row in table.iter_rows(named=True)
+    ]
 
 
 def markdown_table(table: pl.DataFrame) -> str:

@@ -215,7 +215,8 @@ def evaluate_runs(
     parts = [_part(item, read, sections=sections, files=files, options=options) for item in runs]
     read.clear()
     names = _names([part.folder for part in parts])
-    labels = configurations([_settings(part.folder) for part in parts], [part.configuration for part in parts])
+    settings = [part.folder.settings | {"table": part.folder.table} for part in parts]
+    labels = configurations(settings, [part.configuration for part in parts])
     tables = []
     for number, (part, name, label) in enumerate(zip(parts, names, labels, strict=True)):
         tables += [
@@ -352,11 +353,6 @@ def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str | 
         parts = [f"{key}: {run_settings[key] if run_settings.get(key) not in (None, '') else 'none'}" for key in differ]
         names.append(label or "; ".join([str(run_settings.get("preset", "unknown preset")), *parts]))
     return names
-
-
-def _settings(folder: RunFolder) -> dict[str, Any]:
-    """Settings of a run, with the table."""
-    return folder.settings | {"table": folder.table}
 
 
 def _names(folders: Sequence[RunFolder]) -> list[str]:

@@ -326,15 +326,9 @@ def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
 
 
 def figures_by(parts: Iterable[pl.DataFrame], groupings: Sequence[str], options: EvaluationOptions) -> pl.DataFrame:
-    """Figures (`FIGURE_COLUMNS`), a row for every grouping, group, antenna, kind of position and choice of epochs.
+    """Return `FIGURE_COLUMNS`, a row for every grouping, group, antenna, kind of position and choice of epochs.
 
-    Parameters
-    ----------
-    parts : iterable of polars.DataFrame
-        Epochs, `railfix.evaluate.epochs.EPOCH_COLUMNS`; parts and values of `KEYS` are kept apart. Memory is that of
-        the largest part.
-    groupings : sequence of str
-        Which classes: ``f"{grouping}_group"``.
+    Parts of the epochs and values of `KEYS` are kept apart: memory is that of the largest part.
     """
     kinds = [(position, "own") for position in POSITIONS] + [("constrained", "common"), ("conventional", "common")]
     tables: dict[str, list[list[pl.DataFrame]]] = {grouping: [[] for _ in kinds] for grouping in groupings}

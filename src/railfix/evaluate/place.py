@@ -224,17 +224,11 @@ def errors_of(
     method: Literal["auto", "chainage", "trajectory"],
     files: TrackFiles,
 ) -> PlaceErrors:
-    """Errors of one antenna of a run.
+    """Return the errors of one antenna of a run.
 
-    By chainage if the reference has one at every epoch, the run's chainage is that of the antenna, and both
-    agree with the coordinates to `SAME_MAP_M` at the median; otherwise along the trajectory.
-
-    Raises
-    ------
-    MismatchError
-        `method` is "chainage" and not applicable, or the track is not that of the run.
-    InputFileError
-        The track or the vehicle cannot be read.
+    By chainage if the reference has one at every epoch, the run's chainage is that of the antenna, and both agree with
+    the coordinates to `SAME_MAP_M` at the median; otherwise along the trajectory. MismatchError: `method` is "chainage"
+    and not applicable, or the track is not that of the run.
     """
     _check_same_place(run, antenna, answers)
     against, trusted = _against_chainage(run, antenna, answers)
@@ -330,14 +324,9 @@ def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
 def find_trajectory(
     run: RunFolder, antenna: str, answers: Answers, files: TrackFiles
 ) -> tuple[Trajectory, tuple[tuple[str, Path], ...], tuple[str, ...]]:
-    """Trajectory that the run used, from its track and vehicle; with the files and notes.
+    """Return the trajectory that the run used, from its track and vehicle; with the files and notes.
 
-    Raises
-    ------
-    MismatchError
-        The positions do not lie on it: another track or vehicle, or other reading options.
-    InputFileError
-        The files cannot be read.
+    MismatchError: the positions do not lie on it: another track or vehicle, or other reading options.
     """
     tracks = list(files.track) or run.tracks
     vehicles = [files.vehicle] if files.vehicle is not None else run.located("vehicle")
@@ -382,13 +371,7 @@ def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, s
 
 
 def track_of(run: RunFolder, files: TrackFiles | None = None) -> Track:
-    """Track that the run used.
-
-    Raises
-    ------
-    RailfixError
-        The files cannot be read.
-    """
+    """Return the track that the run used."""
     files = files or TrackFiles()
     paths = list(files.track) or run.tracks
     if not paths:

@@ -55,15 +55,9 @@ class RelaySettings(Settings):
 
 
 class LinkDisturbance:
-    """Seeded disturbance of packets of any kind.
+    """Seeded disturbance of packets of any kind, counted by what happened to them.
 
-    Attributes
-    ----------
-    settings : RelaySettings
-        May be replaced while packets pass.
-    up : bool
-        False: an outage, every packet is lost.
-    counts : Counter of str
+    `settings` may be replaced while packets pass; while `up` is False, an outage, every packet is lost.
     """
 
     def __init__(self, settings: RelaySettings) -> None:

@@ -224,10 +224,9 @@ def bearers_of(addresses: dict[LinkName, tuple[str, int]], local: dict[LinkName,
 
 
 class TrainLinks:
-    """The train's end: two connections, one on each bearer.
+    """The train's end: two connections, one on each bearer, with the keys of `railfix.ground.quic.write_keys`.
 
-    With the keys of `railfix.ground.quic.write_keys`; `received` is called with the payload of each new frame of the
-    centre.
+    `received` is called with the payload of each new frame of the centre.
     """
 
     def __init__(
@@ -322,18 +321,10 @@ class TrainLinks:
 class CentreLinks:
     """The centre's end: listens at one address a bearer, answers every frame, passes each payload on once.
 
-    `received` is called with the train's number and the payload; ports are free ones where none are given.
-    Answers wait up to `wait_s` for a payload to go with.
-
-    Attributes
-    ----------
-    addresses : dict of {"A", "B"} to (str, int)
-    masquerades : int
-        Connections that were rejected for their certificate.
-    heard_s : dict of (int, {"A", "B"}) to float
-        Monotonic clock when a train's last frame came over a bearer.
-    alarm : str or None
-        What is wrong with the list of revoked certificates.
+    `received` is called with the train's number and the payload; ports are free ones where none are given, and stand in
+    `addresses` by bearer. Answers wait up to `wait_s` for a payload to go with. `masquerades` counts connections that
+    were rejected for their certificate, `heard_s` has the monotonic clock of a train's last frame over a bearer, by
+    both, and `alarm` what is wrong with the list of revoked certificates.
     """
 
     def __init__(

@@ -56,12 +56,8 @@ def configuration(folder: Path, name: str, *, is_client: bool, idle_s: float = I
 class LinkProtocol(QuicConnectionProtocol):
     """One end of a connection that carries datagrams.
 
-    Attributes
-    ----------
-    peer : str or None
-        Common name of the other end's certificate, None before it was verified.
-    ends : datetime or None
-        When that certificate ends to be valid.
+    `peer` is the common name of the other end's certificate, None before it was verified; `ends`, when that ends to be
+    valid.
     """
 
     def __init__(

@@ -206,26 +206,12 @@ async def run_centre(
     for_s: float | None = None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Run the centre until SIGINT or SIGTERM, or for a time; return figures of what happened.
+    """Run the centre of a file (`CentreFile`) until SIGINT or SIGTERM, or for a time; return figures of what happened.
 
-    Parameters
-    ----------
-    path : Path
-        File of the centre, `CentreFile`.
-    page : (str, int)
-        Host and port of the page, port 0 takes a free one; beyond loopback addresses it is served by TLS with the
-        centre's certificate.
-    password : str
-        For orders.
-    announce : callable
-        Called with the address of the page once trains can connect.
-
-    Raises
-    ------
-    InputFileError
-        The file, a key or the database cannot be read.
-    SettingsError
-        A setting is wrong, or an address cannot be listened at.
+    The page is at a host and port, port 0 takes a free one; beyond loopback addresses it is served by TLS with the
+    centre's certificate. `password` is for orders; `announce` is called with its address once trains can connect.
+    InputFileError: the file, a key or the database cannot be read. SettingsError: a setting is wrong, or an address
+    cannot be listened at.
     """
     settings = load_settings(CentreFile, path, what="a file of a centre").with_stations(path.parent)
     keys = path.parent / settings.keys

@@ -185,12 +185,8 @@ class StationStreams:
 
     An epoch counts when every receiver has it; older ones that wait are then dropped. A receiver that sends nothing
     therefore gives no fixes at all, which the monitor finds by their lateness. Records from the streams are added to
-    the navigation known from the start; epochs at whole multiples of the period are used.
-
-    Attributes
-    ----------
-    counts : Counter of str
-        Epochs "used", "incomplete", and "without common satellites".
+    the navigation known from the start; epochs at whole multiples of the period are used. `counts`: epochs "used",
+    "incomplete", and "without common satellites".
     """
 
     def __init__(

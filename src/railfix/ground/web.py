@@ -86,8 +86,7 @@ class Sessions:
 
 
 def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *, sessions: Sessions) -> Starlette:
-    """Return the web application: the snapshot's plain values for the page, and orders by the last part of their
-    address.
+    """Return the web application: the snapshot's plain values, and orders by the last part of their address.
 
     ``done`` in the snapshot ends its events.
     """

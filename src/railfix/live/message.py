@@ -43,12 +43,12 @@ def no_input_message(settings: LiveSettings, *, sequence: int, time_ns: int, sen
 
 
 def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns: int) -> TrainMessage:
-    """The message of one processed epoch.
+    """Return the message of one processed epoch.
 
     The place is that of the filter along the track where it runs, else that of the single epoch, of the antenna that
-    `antenna_of` names. The bounds are the filter's over- and under-reading amounts where it
-    has a level (`tracking.level`); else the protection level of the single epoch, widened by the distance of the
-    filter's place from it, so that they hold for both. A doubtful place has none.
+    `antenna_of` names. The bounds are the filter's over- and under-reading amounts where it has a level
+    (`tracking.level`); else the protection level of the single epoch, widened by the distance of the filter's place
+    from it, so that they hold for both. A doubtful place has none.
     """
     name = antenna_of(result)
     antenna = result.antennas[name]

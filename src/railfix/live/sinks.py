@@ -35,14 +35,8 @@ class Outlet(Generic[Item]):
     """A target behind a queue and a thread of its own, in which `send` takes one item.
 
     `full` says what happens to an item for which there is no room: dropped and counted ("drop", live), or waited for
-    ("wait", replay of recorded files, which has the time).
-
-    Attributes
-    ----------
-    dropped, failed : int
-        Items dropped because the target was too slow; items that it refused.
-    failure : str
-        Why the last item was refused; blank where none was, and after one that was taken.
+    ("wait", replay of recorded files, which has the time). `dropped` counts those, `failed` the items that the target
+    refused; `failure` is why the last one was, blank after one that was taken.
     """
 
     def __init__(self, name: str, send: Callable[[Item], None], *, waiting: int, full: str = "drop") -> None:

@@ -60,12 +60,7 @@ class Lost:
 
 
 def check_source(source: str) -> None:
-    """Raise where a source is none of the forms that can be opened.
-
-    Raises
-    ------
-    SettingsError
-    """
+    """Raise SettingsError where a source is none of the forms that can be opened."""
     parts = urlsplit(source)
     if parts.scheme in ("tcp", *_NTRIP):
         try:

@@ -42,10 +42,7 @@ _PROGRAM = "from railfix.live.warm_up import compile_filter; compile_filter()"
 def prepare_kernels() -> bool:
     """Compile the kernels that this machine has no code of, and say so on a terminal; return whether there were any.
 
-    Raises
-    ------
-    InputFileError
-        Neither the package nor the clone has the files of the demonstration, on which they are compiled.
+    InputFileError: neither the package nor the clone has the files of the demonstration, on which they are compiled.
     """
     missing = kernels.missing()
     if not missing:

@@ -34,11 +34,7 @@ _NEVER: Final = np.datetime64("NaT", "ns")
 class SensorWatch:
     """Places and speeds of the first antenna and the samples of the sensors, until they have been judged.
 
-    Parameters
-    ----------
-    processor : EpochProcessor
-    say : callable
-        Takes a sentence on each sensor that contradicts the satellites (`railfix.run.sensor_checks.SensorChecks`).
+    `say` takes a sentence on each sensor that contradicts the satellites (`railfix.run.sensor_checks.SensorChecks`).
     """
 
     def __init__(self, processor: EpochProcessor, say: Callable[[str], None]) -> None:

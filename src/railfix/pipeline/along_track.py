@@ -60,16 +60,10 @@ def along_track(
     samples: SensorSamples | None = None,
     surroundings: LineReferences | None = None,
 ) -> tuple[AlongTrack, FilterState]:
-    """Return the filtered positions of one antenna, and the state to pass on.
+    """Return the filtered positions of one antenna after all screens and exclusions, and the state to pass on.
 
-    Parameters
-    ----------
-    ranges : CorrectedRanges
-        After all screens and exclusions.
-    samples : SensorSamples, optional
-        Of the sensors on board since the chunk before.
-    surroundings : LineReferences, optional
-        Features of the line, ground units and balises that the sensors meet.
+    Samples are those of the sensors on board since the chunk before; they meet features of the line, ground units and
+    balises of `surroundings`.
     """
     epochs, slips = gnss_epochs(ranges, single.noise_scale, config, state.slips)
     epochs = replace(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m)
@@ -349,16 +343,9 @@ def gnss_epochs(
 
 
 def innovations(result: AlongTrack | None, columns: Indices, shape: tuple[int, ...]) -> dict[str, Floats]:
-    """Return innovations of the filter and weights of codes, by column of the table of observations.
+    """Return innovations of the filter and weights of codes, by column of the table of observations; NaN without.
 
-    Parameters
-    ----------
-    result : AlongTrack or None
-        None gives NaN throughout.
-    columns : ndarray of int, shape (K,)
-        Channels of the filter among all.
-    shape : tuple of int
-        Epochs and channels of the table.
+    `columns`: channels of the filter among all, shape (K,); `shape`: epochs and channels of the table.
     """
     names = ("innovation_code_m", "innovation_phase_m", "innovation_doppler_mps", "weight_code")
     full = {name: np.full(shape, np.nan) for name in names}

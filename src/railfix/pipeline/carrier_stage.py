@@ -97,21 +97,10 @@ def code_and_phase(
     config: Config,
     state: CarrierState,
 ) -> tuple[PhasePositions, CarrierState]:
-    """Return positions from code and phase, each from its own and earlier epochs (requirement A5; P4).
+    """Return positions from code and phase, each from its own and earlier epochs, and the state (requirement A5; P4).
 
-    Parameters
-    ----------
-    corrected : CorrectedRanges
-        With their slips (`with_slips`).
-    ranges : Ranges
-        Codes that the position was solved with; a phase is used where its code is.
-    arc_m : ndarray, shape (T,) [m]
-        Positions from the codes alone.
-
-    Returns
-    -------
-    PhasePositions
-    CarrierState
+    The ranges have their slips (`with_slips`); a phase is used where its code is. `arc_m`: positions from the codes
+    alone, shape (T,).
     """
     slips = corrected.slips
     assert slips is not None, "with_slips() comes first"

@@ -64,13 +64,7 @@ class SmoothedTrack:
 
 
 def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> SmoothedTrack:
-    """Return the places of all epochs.
-
-    Parameters
-    ----------
-    backward : iterable of Replay
-        The last one first.
-    """
+    """Return the places of all epochs from what the filter was given, the last first."""
     parts: list[SmoothedTrack] = []
     later: BackwardInformation | None = None
     for replay in backward:

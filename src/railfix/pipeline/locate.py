@@ -57,15 +57,7 @@ class UncorrectedRanges:
 
 
 def uncorrected_ranges(obs: Observations, received: Received, config: Config, book: ChannelBook) -> UncorrectedRanges:
-    """Corrected ranges of one antenna without a track: the approximate place is that of the codes alone.
-
-    Parameters
-    ----------
-    received : Received
-        Navigation records and coefficients.
-    config : Config
-        Constellations, signals, mask, noise and atmosphere.
-    """
+    """Return corrected ranges of one antenna without a track: the approximate place is that of the codes alone."""
     channels = book.of(obs, received.navigation)
     satellite, columns = channels.satellite, channels.columns
     code, cn0 = obs.code_m[:, columns], obs.cn0_dbhz[:, columns]

@@ -132,20 +132,10 @@ def sensor_epochs(
 ) -> tuple[SensorEpochs, SensedMotion, SensorState]:
     """Return ways and forces between the epochs, the motion that wheel and inertia agree on, and the state to keep.
 
-    Parameters
-    ----------
-    samples : SensorSamples or None
-        Received since the chunk before.
-    time : ndarray of datetime64[ns], shape (T,)
-        Epochs of the antenna.
-    trajectory : Trajectory
-        Tells which way the front points.
-    sine_at : callable, optional
-        Sine of the gradient at arc lengths; the line is unknown without.
-    sources : container of str
-        Which of `wheel`, `radar`, `force`, `feature`, `balise` and `range` are wanted.
-    surroundings : LineReferences, optional
-        Features of the line, ground units and listed balises.
+    Samples are those since the chunk before, epochs those of the antenna, shape (T,); the trajectory tells which way
+    the front points, `sine_at` the sine of the gradient at arc lengths (the line is unknown without). `sources` names
+    which of `wheel`, `radar`, `force`, `feature`, `balise` and `range` are wanted, `surroundings` has features of the
+    line, ground units and listed balises.
     """
     if not (samples or state.samples):
         last = time[-1] if len(time) else state.time
@@ -172,7 +162,7 @@ def sensor_epochs(
             inertial,
             edges,
             trajectory,
-            sine_at or _unknown,
+            sine_at or (lambda arc_m: np.full(arc_m.shape, np.nan)),
             motion,
             tachometer=limits.tachometer,
             limits=limits.slip,
@@ -188,7 +178,7 @@ def sensor_epochs(
         known = (
             usable
             & (edges[:-1] >= pulses.time[0])
-            & ~_slow(way, span, limits)
+            & ~(np.abs(way) < limits.tachometer.least_speed_mps * np.maximum(span, 1e-9))
             & (np.diff(faults_until(pulses, edges)) == 0)
         )
         quantum = limits.tachometer.pulse_m / np.sqrt(6.0)
@@ -284,15 +274,6 @@ def _ranges(
     ages[epoch, slot] = seconds(edges[1:][epoch] - ranging.time[rows])
     places[epoch, slot] = units.ecef_m[unit[rows]]
     return RangeEpochs(range_m=values, sigma_m=sigmas, age_s=ages, unit_ecef_m=places, lever_m=lever_m)
-
-
-def _unknown(arc_m: Floats) -> Floats:
-    return np.full(arc_m.shape, np.nan)
-
-
-def _slow(way: Floats, span: Floats, limits: SensorLimits) -> Masks:
-    """Whether the wheel turned too slowly for a distance."""
-    return np.asarray(np.abs(way) < limits.tachometer.least_speed_mps * np.maximum(span, 1e-9))
 
 
 def _find_first_needed(pulses: TachometerPulses, end: np.datetime64, limits: SensorLimits) -> int:

@@ -74,14 +74,7 @@ def alone_on_their_clocks(corrected: CorrectedRanges, ties: ClockTies) -> Masks:
 
 
 def satellites_rejected(member: Integers, reason: Bits) -> Integers:
-    """Return the number of satellites with a code of which no signal was used, shape (T,).
-
-    Parameters
-    ----------
-    member : ndarray of int64, shape (M, S)
-        `Channels.member`.
-    reason : ndarray of int64, shape (T, M)
-    """
+    """Return the number of satellites with a code of which no signal was used, shape (T,) (`Channels.member`)."""
     of_satellite = member.astype(np.float32)  # small counts are exact, and floats are multiplied in blocks
     seen = ((reason & Reason.NOT_OBSERVED) == 0).astype(np.float32) @ of_satellite > 0
     used = (reason == 0).astype(np.float32) @ of_satellite > 0

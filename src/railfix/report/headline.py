@@ -117,7 +117,10 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compare
     own = figures_of(evaluation, run, antenna, "constrained_ok")
     return Headline(
         verdict=verdict,
-        figures=(*(_beside(figure) for figure in figures), _integrity_figure(run, antenna, evaluation, own)),
+        figures=(
+            *(replace(figure, beside=f"conventional {figure.beside}") for figure in figures),
+            _integrity_figure(run, antenna, evaluation, own),
+        ),
         compared=_alike(run, compared, filtered),
         remarks=(
             *(_longest_outage(run, antenna, evaluation) if filtered else ()),
@@ -131,10 +134,6 @@ def _level_name(run: ReportedRun) -> str:
     """Return what the level of a run is called: indicative unless its priors were measured."""
     stated: Mapping[str, Any] = run.record.get("protection") or {}
     return "protection level" if stated.get("basis") == "measured" else "indicative protection level"
-
-
-def _beside(figure: KeyFigure) -> KeyFigure:
-    return replace(figure, beside=f"conventional {figure.beside}")
 
 
 def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, own: Mapping[str, Any]) -> KeyFigure:

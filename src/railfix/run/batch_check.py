@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.arrays import Floats, Masks
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.result_columns import Column, by_name, float_column
 from railfix.run.output import OutputFolder
@@ -92,7 +92,8 @@ def add_batch(checks: Mapping[str, BatchCheck], folder: OutputFolder) -> list[st
         values = {column: np.full(len(table), np.nan) for column in BATCH_COLUMNS}
         for name, own in found.items():
             rows = np.flatnonzero(antenna == name)
-            at, known = _rows_of(own.batch.time, time[rows])
+            at = np.minimum(np.searchsorted(own.batch.time, time[rows]), len(own.batch.time) - 1)
+            known = own.batch.time[at] == time[rows]
             for column, spec in BATCH_COLUMNS.items():
                 values[column][rows[known]] = np.asarray(spec.values(own))[at[known]]
         return table.with_columns(**{column: float_column(value) for column, value in values.items()})
@@ -100,11 +101,6 @@ def add_batch(checks: Mapping[str, BatchCheck], folder: OutputFolder) -> list[st
     if found:
         folder.change("train", widened)
     return notes
-
-
-def _rows_of(times: Datetimes, wanted: Datetimes) -> tuple[np.ndarray, Masks]:
-    at = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
-    return at, times[at] == wanted
 
 
 def _note(name: str, batch: BatchTrack, apart: Floats, wrong: Masks, trajectory: Trajectory) -> Iterator[str]:

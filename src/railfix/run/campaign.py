@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import time as clock
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,7 +114,10 @@ def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
     runs = []
     for key in keys:
         values = dict(zip(fields, key, strict=True))
-        files = {name: tuple(_matching(found[name], values)) for name in found}
+        files = {
+            name: tuple(path for path, own in listed if all(values[field] == value for field, value in own.items()))
+            for name, listed in found.items()
+        }
         for name in _ONE:
             if len(files[name]) > 1:
                 raise SettingsError(f"{path}: {name} has {len(files[name])} files for {values}; one was expected")
@@ -250,10 +253,3 @@ def _check_pattern(path: Path, name: str, pattern: str) -> None:
     for field in _FIELD.findall(pattern):
         if not field.isidentifier():
             raise SettingsError(f"{path}: {name}: the field {{{field}}} has to begin with a letter")
-
-
-def _matching(found: list[tuple[Path, dict[str, str]]], values: Mapping[str, str]) -> Iterator[Path]:
-    """Give the files whose fields have these values."""
-    for path, fields in found:
-        if all(values[name] == value for name, value in fields.items()):
-            yield path

@@ -111,27 +111,12 @@ _APPROXIMATED: Final = 1
 
 
 def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
-    """Write the rows that have coordinates, three topics an antenna; return the number of rows.
+    """Write the rows of a table of positions that have coordinates, three topics an antenna; return their number.
 
     ``/ANTENNA/fix`` is sensor_msgs/NavSatFix, ``/ANTENNA/row`` has every column, and ``/ANTENNA/track``, of the filter
-    alone, is emate_msgs/FusionResultTrack. Stamps are UTC. Absent numbers are NaN, absent texts empty.
-
-    Parameters
-    ----------
-    rows : polars.DataFrame
-        Rows of ``train.parquet`` or ``positions.parquet``.
-    path : Path
-    description : str
-        What the positions are, and the frame of the coordinates; written into the file.
-
-    Raises
-    ------
-    NoPositionError
-        No row has coordinates.
-    OutputError
-        The file cannot be written.
-    ModuleNotFoundError
-        mcap-ros2-support is not installed (``pip install railfix[mcap]``).
+    alone, is emate_msgs/FusionResultTrack. Stamps are UTC. Absent numbers are NaN, absent texts empty. The file has the
+    `description`: what the positions are, and the frame of the coordinates. NoPositionError: no row has coordinates.
+    ModuleNotFoundError: mcap-ros2-support is not installed.
     """
     from mcap_ros2.writer import Writer
 

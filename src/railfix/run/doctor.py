@@ -48,12 +48,8 @@ class Diagnosis:
 
 
 def examine_files(paths: Sequence[Path]) -> Diagnosis:
-    """Read each file as every kind until one fits, and compare them with each other.
-
-    Raises
-    ------
-    InputFileError
-        A file is missing or cannot be opened.
+    """Read each file as every kind until one fits, and compare them with each other; InputFileError where one is
+    missing.
     """
     for path in paths:
         if path.is_dir():

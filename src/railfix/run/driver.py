@@ -331,7 +331,13 @@ def notes_of(
 
     `causes`: why no position of an antenna is on the line, where that is so.
     """
-    notes = [*line.notes, *_map_notes(line), *navigation.notes, *_broken_notes(logs), *tally.all_notes]
+    notes = [
+        *line.notes,
+        *error_note(check_track(line.track)),
+        *navigation.notes,
+        *_broken_notes(logs),
+        *tally.all_notes,
+    ]
     for name, antenna in tally.antennas.items():
         notes += [
             f"{name}: screen {screen.name} has judged nothing; it needs {screen.needs}"
@@ -373,11 +379,6 @@ def _describe_detectable(detectable_m: Floats) -> str:
         f"an error of the map below {across:.0f} m across or {up:.0f} m in height is not excluded; where the ranges "
         f"are worst, below {most_across:.0f} m or {most_up:.0f} m (columns map_detectable_*)"
     )
-
-
-def _map_notes(line: OpenedLine) -> Iterator[str]:
-    """Result of the check of the track map."""
-    yield from error_note(check_track(line.track))
 
 
 def _broken_notes(logs: Mapping[Antenna, Log]) -> Iterator[str]:

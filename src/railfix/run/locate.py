@@ -50,13 +50,7 @@ def locate_files(
     broken_lines: BrokenLines = "stop",
     chunk_epochs: int = 3000,
 ) -> LocateSummary:
-    """Compute positions of a log and write them as an RTKLIB solution file with quality 5 (single).
-
-    Raises
-    ------
-    InputFileError, SettingsError, OutputError, NoPositionError
-        No epoch has a position, or a file is not what it should be.
-    """
+    """Compute positions of a log and write them as an RTKLIB solution file with quality 5 (single)."""
     inputs.check_files()
     date = (reading or LogReading()).instant
     received = known_from_start(config, navigation=read_navigation(inputs.nav, broken_lines=broken_lines, date=date))

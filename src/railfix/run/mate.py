@@ -102,16 +102,10 @@ def _in_gps_time(path: Path, table: pl.DataFrame) -> pl.DataFrame:
 
 
 def result_tables(train: pl.DataFrame, passings: pl.DataFrame | None, track: Track) -> dict[str, pl.DataFrame]:
-    """Return R_TRACK and R_ETCS_TPR of the first antenna of a run.
+    """Return R_TRACK and R_ETCS_TPR of the first antenna of a run, from rows of its tables.
 
-    Parameters
-    ----------
-    train : polars.DataFrame
-        Rows of ``train.parquet``.
-    passings : polars.DataFrame or None
-        Rows of ``passings.parquet``: the last relevant balise group is the one read last; empty before the first.
-    track : Track
-        Track edges are its sections.
+    The last relevant balise group is the one read last, by the passings, empty before the first; track edges are the
+    track's sections.
     """
     rows = train.filter((pl.col("antenna") == pl.col("antenna").first()) & pl.col("chainage_m").is_not_null())
     chainage, speed = rows["chainage_m"].to_numpy(), rows["speed_mps"].to_numpy()

@@ -56,15 +56,9 @@ def processor_of(
     """Return a processor with all navigation records and the contents of the files that the settings name.
 
     `track` is the line itself, for places by its features; `units` are the surveyed stations of two-way ranges,
-    `balises` the places of those that the train reads.
-    `base_ecef_m`: position of a base station; "stream": that of the headers of its observations.
-
-    Raises
-    ------
-    InputFileError
-        A file that the settings name is missing or not what it should be.
-    SettingsError
-        SBAS and precise ephemerides together, or no SBAS message of the GEO asked for.
+    `balises` the places of those that the train reads. `base_ecef_m`: position of a base station; "stream": that of the
+    headers of its observations. InputFileError: a file that the settings name is not what it should be. SettingsError:
+    SBAS and precise ephemerides together, or no SBAS message of the GEO asked for.
     """
     if config.sbas and navigation.precise is not None:
         raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
@@ -104,23 +98,7 @@ def place_of(text: str, option: str) -> Floats:
 
 
 class BaseLog:
-    """Log of a base station.
-
-    Parameters
-    ----------
-    log : Log
-    place : str or None
-        LAT,LON,HEIGHT; None takes the position of the log's header.
-
-    Attributes
-    ----------
-    ecef_m : ndarray, shape (3,) [m]
-
-    Raises
-    ------
-    InputFileError
-        Neither gives a position.
-    """
+    """Log of a base station at LAT,LON,HEIGHT, or the position of the log's header; InputFileError without."""
 
     def __init__(self, log: Log, place: str | None) -> None:
         self._parts = log.parts()

@@ -309,13 +309,7 @@ class LogPositions:
         )
 
     def route(self, network: Network) -> RouteOfLog:
-        """Find the route of the log through a network.
-
-        Raises
-        ------
-        MismatchError
-            The log has no position near a track, or no route leads over the tracks that it passes.
-        """
+        """Find the route of the log through a network; MismatchError where there is none, or no position."""
         if self.time is None:
             raise MismatchError("there is no navigation record, so that no route through the network can be found")
         own = self.positions

@@ -23,7 +23,6 @@ from railfix.motion.samples import (
     RadarSpeeds,
     SensorSamples,
     StationRanges,
-    TachometerPulses,
 )
 from railfix.motion.tachometer import SpeedCheck, TachometerLimits, check_speeds, pulse_speeds
 from railfix.pipeline.sensor_epochs import SensorLimits, ranging_lever_m
@@ -90,12 +89,7 @@ def sign_notes(
 ) -> Iterator[str]:
     """Yield a sentence on each sensor with a wrong sign, unit, axis, or time tags seconds off.
 
-    Parameters
-    ----------
-    places : polars.DataFrame
-        ``time_gpst`` and ``chainage_m`` of single epochs of one antenna that passed every check.
-    trajectory : Trajectory
-        Of that antenna.
+    `places` has ``time_gpst`` and ``chainage_m`` of single epochs of one antenna that passed every check.
     """
     wheel, radar, inertial = samples.tachometer, samples.radar, samples.inertial
     yield from _forces_at_rest(inertial)
@@ -105,7 +99,7 @@ def sign_notes(
     time, forward = motion.time, facing * motion.speed_mps
     if len(wheel):
         directed = "the direction of its pulses is" if wheel.direction.any() else None
-        speeds = partial(_wheel_speeds, wheel, tachometer)
+        speeds = lambda at: pulse_speeds(wheel, at, limits=tachometer).speed_mps  # noqa: E731
         yield from _of_speeds("tachometer", time, forward, speeds, directed)
     if len(radar):
         yield from _of_speeds("radar", time, forward, partial(_radar_speeds, radar), "the sign of its speeds is")
@@ -164,10 +158,6 @@ def _late(name: str, lag_s: float, time: np.datetime64) -> str:
     utc = "they are UTC, GPS time is expected" if abs(lag_s + leap) <= 1.0 else "correct them"
     way = "late" if lag_s > 0 else "early"
     return f"{name}: its time tags are {abs(lag_s):.0f} s {way} against the satellites'; {utc}"
-
-
-def _wheel_speeds(pulses: TachometerPulses, limits: TachometerLimits, time: Datetimes) -> Floats:
-    return pulse_speeds(pulses, time, limits=limits).speed_mps
 
 
 def _radar_speeds(radar: RadarSpeeds, time: Datetimes) -> Floats:
@@ -281,14 +271,7 @@ def range_notes(
 ) -> Iterator[str]:
     """Yield sentences on ranges that are moved along the track, or too long, against the places by satellites.
 
-    Parameters
-    ----------
-    places : polars.DataFrame
-        ``time_gpst`` and ``chainage_m`` of an antenna.
-    trajectory : Trajectory
-        Of that antenna.
-    limits : SensorLimits
-        The place of the vehicle's ranging unit as entered.
+    `places` has ``time_gpst`` and ``chainage_m`` of an antenna, `limits` the place of the vehicle's ranging unit.
     """
     of_unit = {str(name): k for k, name in enumerate(units.name)}
     unit = np.array([of_unit.get(str(name), -1) for name in ranging.station], dtype=np.intp)

@@ -54,12 +54,7 @@ def survey_files(
 ) -> Surveyed:
     """Survey a line from files of positions and logs of observations.
 
-    Raises
-    ------
-    InputFileError
-        A file is not what it should be, or has too few positions.
-    MismatchError
-        The runs lie apart, or have no line in common.
+    MismatchError: the runs lie apart, or have no line in common.
     """
     for path in (*paths, *nav):
         if not path.is_file():
@@ -159,15 +154,7 @@ class MeasuredFeature:
 def measured_features(
     runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = (), *, limits: FeatureLimits | None = None
 ) -> list[MeasuredFeature]:
-    """Return the features that all runs together show, in order.
-
-    Parameters
-    ----------
-    runs : sequence of polars.DataFrame
-        See `read_measured`.
-    of_map : sequence of Feature
-        Features of the map, by chainage.
-    """
+    """Return the features that all runs (`read_measured`) together show, in order; `of_map`: those of the map."""
     limits = limits or FeatureLimits()
     alone = [_features(run, limits) for run in runs]
     found = []

@@ -149,66 +149,33 @@ def _along(chart: Chart, x: Any) -> Any:
 
 
 def _draw(layer: Layer, axes: Axes, chart: Chart) -> None:
+    look: dict[str, Any] = {"color": layer.colour, "label": layer.label}
     match layer:
         case Points():
-            _points(layer, axes, chart)
+            axes.plot(
+                _along(chart, layer.x), layer.y, _MARKERS[layer.shape], ms=layer.size * 0.8,
+                mfc="none" if layer.shape == "ring" else layer.colour, rasterized=len(layer.x) > 1000, **look,
+            )  # fmt: skip
         case Curve():
-            _line(layer, axes, chart)
+            axes.plot(_along(chart, layer.x), layer.y, _DASHES[layer.dash], lw=layer.width, **look)
         case Band():
-            _band(layer, axes, chart)
+            axes.fill_between(_along(chart, layer.x), layer.low, layer.high, alpha=0.25, lw=0, **look)
         case Bars():
-            _bars(layer, axes)
+            axes.bar(layer.left, layer.height, layer.right - layer.left, align="edge", alpha=0.6, **look)
         case Cells():
-            _cells(layer, axes)
+            from matplotlib.colors import LogNorm
+
+            counts = np.ma.masked_equal(layer.counts, 0).T
+            axes.pcolormesh(layer.x_edges, layer.y_edges, counts, cmap="Greys", norm=LogNorm(vmin=0.3), rasterized=True)
         case RangeBars():
-            _ranges(layer, axes)
+            at = np.arange(len(layer.names), dtype=np.float64)
+            axes.hlines(at, layer.low, layer.high, lw=6, alpha=0.4, **look)
+            axes.plot(layer.mid, at, "|", color=layer.colour, ms=14, mew=2.5)
+            axes.set_yticks(at, layer.names)
+            axes.set_ylim(len(layer.names) - 0.5, -0.5)
+            axes.grid(axis="x", alpha=0.3)
         case Marks():
             _marks(layer, axes)
-
-
-def _points(layer: Points, axes: Axes, chart: Chart) -> None:
-    axes.plot(
-        _along(chart, layer.x),
-        layer.y,
-        _MARKERS[layer.shape],
-        ms=layer.size * 0.8,
-        color=layer.colour,
-        mfc="none" if layer.shape == "ring" else layer.colour,
-        label=layer.label,
-        rasterized=len(layer.x) > 1000,
-    )
-
-
-def _line(layer: Curve, axes: Axes, chart: Chart) -> None:
-    style = _DASHES[layer.dash]
-    axes.plot(_along(chart, layer.x), layer.y, style, lw=layer.width, color=layer.colour, label=layer.label)
-
-
-def _band(layer: Band, axes: Axes, chart: Chart) -> None:
-    axes.fill_between(
-        _along(chart, layer.x), layer.low, layer.high, color=layer.colour, alpha=0.25, lw=0, label=layer.label
-    )
-
-
-def _bars(layer: Bars, axes: Axes) -> None:
-    width = layer.right - layer.left
-    axes.bar(layer.left, layer.height, width, align="edge", color=layer.colour, alpha=0.6, label=layer.label)
-
-
-def _cells(layer: Cells, axes: Axes) -> None:
-    from matplotlib.colors import LogNorm
-
-    counts = np.ma.masked_equal(layer.counts, 0)
-    axes.pcolormesh(layer.x_edges, layer.y_edges, counts.T, cmap="Greys", norm=LogNorm(vmin=0.3), rasterized=True)
-
-
-def _ranges(layer: RangeBars, axes: Axes) -> None:
-    at = np.arange(len(layer.names), dtype=np.float64)
-    axes.hlines(at, layer.low, layer.high, color=layer.colour, lw=6, alpha=0.4, label=layer.label)
-    axes.plot(layer.mid, at, "|", color=layer.colour, ms=14, mew=2.5)
-    axes.set_yticks(at, layer.names)
-    axes.set_ylim(len(layer.names) - 0.5, -0.5)
-    axes.grid(axis="x", alpha=0.3)
 
 
 def _marks(layer: Marks, axes: Axes) -> None:
