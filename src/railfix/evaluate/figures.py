@@ -66,6 +66,8 @@ def score(error_m: Floats, observed: Masks) -> Score:
     )
 
 
+#: Limits between the classes of satellites used.
+_SATELLITE_EDGES: Final = (4, 5, 6, 7, 8, 10, 12, 15, 20)
 #: Fewest blocks for confidence limits.
 FEWEST_BLOCKS: Final = 5
 #: Number of values at which the cumulative counts are evaluated at a time.
@@ -241,7 +243,7 @@ def classed(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
     speed = pl.col("speed_mps") * 3.6
     edges = np.array(options.speed_edges_kmh)
     speed_rank = pl.when(pl.col("speed_mps") < options.standing_mps).then(0).otherwise(_rank(speed, edges) + 1)
-    sats = np.array(options.satellite_edges, dtype=np.float64)
+    sats = np.array(_SATELLITE_EDGES, dtype=np.float64)
     ranks = {
         "all": pl.lit(0),
         "section": section,
@@ -259,7 +261,7 @@ def classed(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
         "section": pl.format("{} to {} m", *(_plain(x) for x in (begins, begins + options.section_m))),
         "environment": pl.col("environment"),
         "speed": pl.col("speed_rank").replace_strict(dict(enumerate(_speed_names(options)))),
-        "satellites": pl.col("satellites_rank").replace_strict(dict(enumerate(_satellite_names(options), start=-1))),
+        "satellites": pl.col("satellites_rank").replace_strict(dict(enumerate(_satellite_names(), start=-1))),
         "signals": pl.when(AIDED).then(pl.lit(WITH_SATELLITES)).otherwise(pl.lit(WITHOUT_SATELLITES)),
         "status": pl.col("status"),
         "configuration": pl.col("configuration"),
@@ -289,8 +291,8 @@ def _speed_names(options: EvaluationOptions) -> list[str]:
     return ["standing", f"under {edges[0]:g} km/h", *between, f"over {edges[-1]:g} km/h", "unknown"]
 
 
-def _satellite_names(options: EvaluationOptions) -> list[str]:
-    edges = options.satellite_edges
+def _satellite_names() -> list[str]:
+    edges = _SATELLITE_EDGES
     between = [f"{low}" if high == low + 1 else f"{low} to {high - 1}" for low, high in pairwise(edges)]
     return ["unknown", f"under {edges[0]}", *between, f"{edges[-1]} and more"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Final, Literal, TypeVar
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -24,10 +24,7 @@ LARGEST_GAP_S: Final = 2.5
 WINDOWS_S: Final = (15.0, 60.0)
 
 
-Number = TypeVar("Number", int, float)
-
-
-def _rising(edges: tuple[Number, ...]) -> tuple[Number, ...]:
+def _rising(edges: tuple[float, ...]) -> tuple[float, ...]:
     """The edges themselves; ValueError where they do not rise."""
     if any(high <= low for low, high in pairwise(edges)):
         raise ValueError("rising numbers expected")
@@ -36,7 +33,6 @@ def _rising(edges: tuple[Number, ...]) -> tuple[Number, ...]:
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 RisingEdges = Annotated[tuple[Positive, ...], Field(min_length=1), AfterValidator(_rising)]
-RisingCounts = Annotated[tuple[Annotated[int, Field(gt=0)], ...], Field(min_length=1), AfterValidator(_rising)]
 
 
 class EvaluationInputs(Settings):
@@ -102,7 +98,6 @@ class EvaluationOptions(Settings):
     speed_edges_kmh: RisingEdges = option(
         "Limits between the speed classes.", (20.0, 60.0, 100.0), name="--speed-classes", metavar="KMH,..."
     )
-    satellite_edges: RisingCounts = (4, 5, 6, 7, 8, 10, 12, 15, 20)  #: Limits between the classes of satellites used.
     over_m: RisingEdges = (5.0, 10.0, 20.0, 50.0)  #: Error sizes; the share of errors above each is counted.
     alarm_limits_m: tuple[Positive, ...] = option(
         "Alarm limits that protection levels are compared with, besides the run's own.",

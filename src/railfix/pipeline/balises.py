@@ -32,7 +32,6 @@ class BaliseLimits(Settings):
     ahead_m: float = 0.0  #: Place of the reader ahead of the vehicle's middle, without a vehicle file of the antenna.
     #: Least standard deviation of a reading along the line: SUBSET-036 has 1 m for the vital use of a balise's place.
     sigma_m: float = Field(default=1.0, gt=0)
-    contradiction_sigmas: float = Field(default=5.0, gt=0)  #: A balise further than this from the filter is wrong.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +88,8 @@ VERDICTS: Final = ("virtual", "read", "missing", "contradicts", "not_listed")
 ODOMETER_M, ODOMETER_SHARE = 5.0, 0.05
 #: Epochs further apart have nothing between them [s]; a reading may be so far outside of the interval of its passing.
 _APART_S: Final = 2.0
+#: A balise further than this from the place of the filter is wrong.
+_CONTRADICTION_SIGMAS: Final = 5.0
 _NEVER: Final = np.datetime64("NaT", "ns")
 #: Of the filter, at each epoch.
 _VALUES: Final = ("arc_m", "speed_mps", "sigma_m", "level_m", "amount_m")
@@ -211,7 +212,7 @@ def _judge(
         elif near:
             error = float(short_way_m(arcs_m[mark] - place, turn_m))
             spread = np.sqrt(sigma**2 + np.fmax(readings.sigma_m[k], limits.sigma_m) ** 2 + listed.sigma_m[mark] ** 2)
-            if abs(error) <= limits.contradiction_sigmas * spread:
+            if abs(error) <= _CONTRADICTION_SIGMAS * spread:
                 read[mark] = at
                 right.append((at, place))
                 continue

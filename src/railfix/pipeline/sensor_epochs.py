@@ -36,6 +36,16 @@ from railfix.tracking import RangeEpochs, SensorEpochs
 _LONGEST_S: Final = 5.0
 #: Share of the samples of an interval that must be there for its mean.
 _COMPLETE: Final = 0.9
+#: Standard deviation of the speed that the inertial unit carries through a slip, a stop or a start [m/s].
+_CARRY_SIGMA_MPS: Final = 0.1
+#: Standard deviations in one metre of way: swings of the body of 1 mrad, and of its heading [1/m].
+_GRADIENT_NOISE: Final = 1e-3
+_CURVATURE_NOISE_1PM: Final = 1e-4
+#: Length over which the errors of the map change (as `TrackingLimits.map_correlation_m`) [m]: a map of 0.3 m places no
+#: feature better than some metres, one of 0.05 m to half a metre.
+_MAP_LENGTH_M: Final = 50.0
+#: Least standard deviation of the place of a feature: the map's, and that of the body on its bogies [m].
+_FEATURE_SIGMA_M: Final = 0.5
 
 Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, StationRanges, BaliseReadings)
 
@@ -55,17 +65,7 @@ class SensorLimits(Settings):
     tachometer: TachometerLimits = Field(default_factory=TachometerLimits)
     #: Of the detection of slip and slide by tachometer and inertial unit together.
     slip: SlipLimits = Field(default_factory=SlipLimits)
-    #: Of the speed that the inertial unit carries through a slip, a stop or a start.
-    carry_sigma_mps: float = Field(default=0.1, gt=0)
     feature: FeatureLimits = Field(default_factory=FeatureLimits)  #: Of places by changes of gradient and curvature.
-    #: Standard deviations in one metre of way: swings of the body of 1 mrad, and of its heading.
-    gradient_noise: float = Field(default=1e-3, gt=0)
-    curvature_noise_1pm: float = Field(default=1e-4, gt=0)
-    #: Length over which the errors of the map change (as `TrackingLimits.map_correlation_m`): a map of 0.3 m places no
-    #: feature better than some metres, one of 0.05 m to half a metre.
-    map_length_m: float = Field(default=50.0, gt=0)
-    #: Least standard deviation of such a place: the map's, and that of the body on its bogies.
-    feature_sigma_m: float = Field(default=0.5, gt=0)
     #: Of a two-way range where the device reports none: 0.19 to 0.24 m (P2 3.3), echoes and drifts of the unit's
     #: answering delay beside it.
     range_sigma_m: float = Field(default=0.5, gt=0)
@@ -168,11 +168,11 @@ def sensor_epochs(
             limits=limits.slip,
         )
         if rates is not None and surroundings is not None and surroundings.features is not None:
-            noise = _with_map(limits, trajectory)
+            noise = _with_map(trajectory)
             fixes, passing = feature_fixes(
                 rates, surroundings.features, facing, motion.sigma_m, passing, noise=noise, limits=limits.feature
             )
-            values |= _places(fixes, rates, time, limits)
+            values |= _places(fixes, rates, time, limits.feature)
     if wheel:
         way = np.diff(way_m(pulses, edges, limits=limits.tachometer))
         known = (
@@ -186,9 +186,7 @@ def sensor_epochs(
         carried = np.isin(sensed.state, CARRIED)
         known &= ~carried & (sensed.state != MotionState.EXPIRED)
         rolled = np.where(known, way, np.where(carried & usable, sensed.way_m, np.nan))
-        speed_sigma = np.where(
-            carried, limits.carry_sigma_mps * (sensed.state != MotionState.STANDING), sensed.doubt_mps
-        )
+        speed_sigma = np.where(carried, _CARRY_SIGMA_MPS * (sensed.state != MotionState.STANDING), sensed.doubt_mps)
         values |= {
             "wheel_m": facing * rolled,
             "wheel_sigma_m": np.sqrt(limits.wheel_sigma_m**2 + quantum**2 + (speed_sigma * span) ** 2),
@@ -223,19 +221,18 @@ def sensor_epochs(
     return SensorEpochs(**values), sensed, state
 
 
-def _with_map(limits: SensorLimits, trajectory: Trajectory) -> tuple[float, float]:
+def _with_map(trajectory: Trajectory) -> tuple[float, float]:
     """Noise of gradient and curvature in one metre, the errors of the map in it.
 
     A map off by sigma across the track over a length L has curvatures off by ``sqrt(3) sigma / L^2`` for about L: as
     white noise in one metre times ``sqrt(L)``. Its gradients are off by ``sigma / L`` likewise.
     """
-    length = limits.map_length_m
-    gradient = trajectory.sigma_height_m / np.sqrt(length)
-    curvature = np.sqrt(3.0) * trajectory.sigma_plan_m / length**1.5
-    return float(np.hypot(limits.gradient_noise, gradient)), float(np.hypot(limits.curvature_noise_1pm, curvature))
+    gradient = trajectory.sigma_height_m / np.sqrt(_MAP_LENGTH_M)
+    curvature = np.sqrt(3.0) * trajectory.sigma_plan_m / _MAP_LENGTH_M**1.5
+    return float(np.hypot(_GRADIENT_NOISE, gradient)), float(np.hypot(_CURVATURE_NOISE_1PM, curvature))
 
 
-def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes, limits: SensorLimits) -> dict[str, Floats]:
+def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes, limits: FeatureLimits) -> dict[str, Floats]:
     """Places of the antenna by the accepted features, at the first epoch after each."""
     place, sigma = np.full(len(time), np.nan), np.full(len(time), np.nan)
     at = rates.arc_at(time)
@@ -243,8 +240,8 @@ def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes, limits:
         if fix.located.verdict == "accepted":
             epoch = int(np.searchsorted(time, rates.known[fix.tick]))
             place[epoch] = at[epoch] + fix.correction_m
-            since = limits.feature.scale_sigma * limits.feature.half_length_m
-            sigma[epoch] = np.sqrt(fix.located.sigma_m**2 + since**2 + limits.feature_sigma_m**2)
+            since = limits.scale_sigma * limits.half_length_m
+            sigma[epoch] = np.sqrt(fix.located.sigma_m**2 + since**2 + _FEATURE_SIGMA_M**2)
     return {"place_m": place, "place_sigma_m": sigma}
 
 
