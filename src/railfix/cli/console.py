@@ -16,12 +16,12 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column as TableColumn
-from rich.table import Table
+from rich.table import Table as RichTable
 from rich.text import Text
 
 from railfix import kernels
 from railfix.core.reasons import Status
-from railfix.core.tables import Table as Data
+from railfix.core.tables import Table, listed
 
 if TYPE_CHECKING:
     from railfix.evaluate import Evaluation
@@ -147,14 +147,14 @@ class TableConsole(Console):
     def print(self, *objects: Any, **options: Any) -> None:
         """Print as `rich` does, tables in parts that fit."""
         for item in objects or ("",):
-            if isinstance(item, Table):
+            if isinstance(item, RichTable):
                 for part in split_table(item, self):
                     super().print(part, crop=False, **options)
             else:
                 super().print(item, **options)
 
 
-def split_table(table: Table, console: Console) -> list[Table]:
+def split_table(table: RichTable, console: Console) -> list[RichTable]:
     """Split a table by its columns into tables that fit the console; each begins with the columns of text.
 
     Text may fold, numbers do not: a part with a single number may be wider than the console.
@@ -177,9 +177,9 @@ def split_table(table: Table, console: Console) -> list[Table]:
     return [_with_columns(table, [*text, *part]) for part in [*parts, fitting]]
 
 
-def _with_columns(table: Table, columns: Sequence[TableColumn]) -> Table:
+def _with_columns(table: RichTable, columns: Sequence[TableColumn]) -> RichTable:
     """Return a table of some columns, with the same rows and frame."""
-    part = Table(*(column.copy() for column in columns), box=table.box, show_edge=table.show_edge)
+    part = RichTable(*(column.copy() for column in columns), box=table.box, show_edge=table.show_edge)
     part.padding, part.pad_edge = table.padding, table.pad_edge
     for cells in zip(*(column.cells for column in columns), strict=True):
         part.add_row(*cells)
@@ -194,12 +194,14 @@ def console_of_tables() -> Console:
     return console
 
 
-def show_table(console: Console, table: Data, *, most: int | None = None) -> None:
+def show_table(console: Console, table: Table, *, most: int | None = None) -> None:
     """Print a table of results under its caption, at most so many rows."""
-    console.print(table.caption, markup=False, soft_wrap=True)
+    if table.caption:
+        console.print(table.caption, markup=False, soft_wrap=True)
     if not table.rows:
         return
-    shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    plain = RichTable(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    shown = RichTable() if table.boxed else plain
     for number, head in enumerate(table.head):
         justify: Literal["left", "right"] = "right" if number in table.numeric else "left"
         shown.add_column(head, justify=justify, no_wrap=True, overflow="fold")
@@ -261,12 +263,9 @@ def show_summary(summary: RunSummary) -> None:
     names = list(summary.tally.antennas)
     show_verdict(console, verdict_of_run(summary))
     if summary.tracks:
-        console.print("Filter along the track (train.csv)")
-        console.print(_filter(summary.tracks))
-        console.print("Each epoch by itself (positions.csv)")
-    console.print(_positions(summary, names))
-    console.print("Rejected pseudoranges by their first reason, and by that reason alone")
-    console.print(_reasons(summary, names))
+        show_table(console, _filter(summary.tracks))
+    show_table(console, _positions(summary, names))
+    show_table(console, _reasons(summary, names))
     show_notes(console, summary.notes)
     show_files(console, summary.files.values())
     rate = summary.tally.epochs / summary.wall_s
@@ -274,44 +273,45 @@ def show_summary(summary: RunSummary) -> None:
 
 
 def _positions(summary: RunSummary, names: list[str]) -> Table:
-    tally, sigma = summary.tally.antennas, summary.sigma
-    table = _by_antenna(names)
-    table.add_row("epochs", *(f"{tally[n].epochs:,}" for n in names))
-    table.add_row("with observations", *(f"{tally[n].observed:,}" for n in names))
+    tally, sigma, levels = summary.tally.antennas, summary.sigma, summary.levels
+    rows = [
+        ["epochs", *(f"{tally[n].epochs:,}" for n in names)],
+        ["with observations", *(f"{tally[n].observed:,}" for n in names)],
+    ]
     for head, of_antenna in (
         ("with coordinates", {n: tally[n].status_positioned for n in names}),
         ("without coordinates", {n: _without(tally[n]) for n in names}),
     ):
         if any(of_antenna[n].total() for n in names):
-            table.add_row(head, *(f"{of_antenna[n].total():,}" for n in names))
+            rows.append([head, *(f"{of_antenna[n].total():,}" for n in names)])
         for status in Status:
             if any(of_antenna[n][status.text] for n in names):
-                table.add_row(f"  {status.text}", *(f"{of_antenna[n][status.text]:,}" for n in names))
+                rows.append([f"  {status.text}", *(f"{of_antenna[n][status.text]:,}" for n in names)])
                 if status is Status.TOO_FEW_SATELLITES:
-                    _rows_of_few(table, [tally[n] for n in names])
-    table.add_row("positioning rate", *(_percent(tally[n].positioned, tally[n].observed) for n in names))
-    table.add_row("rate of ok", *(_percent(tally[n].status[Status.OK.text], tally[n].observed) for n in names))
-    _add_metres(table, "sigma along the line", [sigma.get(n) for n in names], _OF_SIGMA)
-    levels = summary.levels
+                    rows += _rows_of_few([tally[n] for n in names])
+    rows.append(["positioning rate", *(_percent(tally[n].positioned, tally[n].observed) for n in names)])
+    rows.append(["rate of ok", *(_percent(tally[n].status[Status.OK.text], tally[n].observed) for n in names)])
+    rows += _metres("sigma along the line", [sigma.get(n) for n in names], _OF_SIGMA)
     if levels:
-        _add_metres(table, f"{summary.level_basis} level", [levels.get(n) for n in names], _OF_LEVEL)
+        rows += _metres(f"{summary.level_basis} level", [levels.get(n) for n in names], _OF_LEVEL)
         for word in ("available", "alarm"):
             shown = [_percent(getattr(levels[n], word), tally[n].observed) if n in levels else "-" for n in names]
-            table.add_row(f"  {word}", *shown)
-    return table
+            rows.append([f"  {word}", *shown])
+    caption = "Each epoch by itself (positions.csv)" if summary.tracks else ""
+    return listed(["", *names], rows, caption, boxed=True)
 
 
 def _filter(tracks: Mapping[str, Filtered]) -> Table:
-    table = _by_antenna(tracks)
+    rows = []
     for status in dict.fromkeys(word for found in tracks.values() for word in found.status):
         if any(found.status[status] for found in tracks.values()):
-            table.add_row(status, *(f"{found.status[status]:,}" for found in tracks.values()))
-    _add_metres(table, "sigma along the line", [found.along_sigma_m for found in tracks.values()], _OF_SIGMA)
+            rows.append([status, *(f"{found.status[status]:,}" for found in tracks.values())])
+    rows += _metres("sigma along the line", [found.along_sigma_m for found in tracks.values()], _OF_SIGMA)
     levels = [found.level for found in tracks.values()]
     if any(levels):
-        _add_metres(table, "indicative protection level", levels, _OF_LEVEL)
-        table.add_row("  with a level", *("-" if level is None else f"{level.finite:,}" for level in levels))
-    return table
+        rows += _metres("indicative protection level", levels, _OF_LEVEL)
+        rows.append(["  with a level", *("-" if level is None else f"{level.finite:,}" for level in levels)])
+    return listed(["", *tracks], rows, "Filter along the track (train.csv)", boxed=True)
 
 
 #: Fields of `AlongSigma`, and of `Levels` and `FilterLevel`, by their names in the tables.
@@ -319,20 +319,11 @@ _OF_SIGMA: Final = {"p50": "p50_m", "p95": "p95_m", "largest": "max_m"}
 _OF_LEVEL: Final = {"p50": "p50_m", "p95": "p95_m"}
 
 
-def _by_antenna(names: Iterable[str]) -> Table:
-    """A table with a column for each antenna, without rows."""
-    table = Table()
-    table.add_column("")
-    for name in names:
-        table.add_column(name, justify="right")
-    return table
-
-
-def _add_metres(table: Table, what: str, found: Sequence[Any], fields: Mapping[str, str]) -> None:
-    """A row for each field of what was found of the antennas, None where nothing was."""
+def _metres(what: str, found: Sequence[Any], fields: Mapping[str, str]) -> Iterator[list[str]]:
+    """Yield a row for each field of what was found of the antennas, None where nothing was."""
     for label, field in fields.items():
         values = [None if of_antenna is None else getattr(of_antenna, field) for of_antenna in found]
-        table.add_row(f"{what}, {label}", *("-" if value is None else f"{value:.2f} m" for value in values))
+        yield [f"{what}, {label}", *("-" if value is None else f"{value:.2f} m" for value in values)]
 
 
 def _without(antenna: AntennaTally) -> Counter[str]:
@@ -342,27 +333,23 @@ def _without(antenna: AntennaTally) -> Counter[str]:
     return counts
 
 
-def _rows_of_few(table: Table, antennas: list[AntennaTally]) -> None:
-    """Epochs with too few satellites: the reason that left too few, and those that it alone did."""
+def _rows_of_few(antennas: list[AntennaTally]) -> Iterator[list[str]]:
+    """Yield epochs with too few satellites: the reason that left too few, and those that it alone did."""
     for reason in dict.fromkeys(name for a in antennas for name, count in a.short_first.most_common() if count):
-        cells = [f"{a.short_first[reason]:,} ({a.short_only[reason]:,} alone)" for a in antennas]
-        table.add_row(f"    by {reason}", *cells)
+        yield [f"    by {reason}", *(f"{a.short_first[reason]:,} ({a.short_only[reason]:,} alone)" for a in antennas)]
 
 
 def _reasons(summary: RunSummary, names: list[str]) -> Table:
     tally = summary.tally.antennas
-    table = Table()
-    table.add_column("")
-    for name in names:
-        table.add_column(name, justify="right")
-        table.add_column("alone", justify="right")
-    table.add_row("observed", *(cell for n in names for cell in (f"{tally[n].observations:,}", "")))
-    table.add_row("used", *(cell for n in names for cell in (f"{tally[n].used:,}", "")))
-    reasons = dict.fromkeys(reason for n in names for reason, _ in tally[n].first_reason.most_common())
-    for reason in reasons:
+    rows = [
+        ["observed", *(cell for n in names for cell in (f"{tally[n].observations:,}", ""))],
+        ["used", *(cell for n in names for cell in (f"{tally[n].used:,}", ""))],
+    ]
+    for reason in dict.fromkeys(reason for n in names for reason, _ in tally[n].first_reason.most_common()):
         cells = [f"{counts[reason]:,}" for n in names for counts in (tally[n].first_reason, tally[n].only_reason)]
-        table.add_row(f"  {reason}", *cells)
-    return table
+        rows.append([f"  {reason}", *cells])
+    caption = "Rejected pseudoranges by their first reason, and by that reason alone"
+    return listed(["", *(head for n in names for head in (n, "alone"))], rows, caption, boxed=True)
 
 
 def _percent(part: int, total: int) -> str:

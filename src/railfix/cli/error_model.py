@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
-from railfix.cli.console import console_of_tables, show_files, show_notes
+from railfix.cli.console import console_of_tables, show_files, show_notes, show_table
 from railfix.cli.options import LenientOption, OverwriteOption, check_outputs, from_models
 from railfix.core.errors import SettingsError
 from railfix.core.settings import validated
+from railfix.core.tables import listed
 from railfix.evaluate.range_errors import ModelInputs, StationBeside, error_model_from_runs
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, CurveFit, cn0_curve_from_log, write_cn0_curve
 from railfix.ranges.error_model import (
@@ -92,14 +92,9 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
         "in metres",
         markup=False,
     )
-    table = Table(show_edge=False, pad_edge=False)
-    table.add_column("before and\nafter screens", no_wrap=True)
-    for when in ("before", "after"):
-        for name in ("count", "bias", "sigma", "bound"):
-            table.add_column(f"{when}\n{name}" if name == "count" else f"\n{name}", justify="right", no_wrap=True)
-    for row in summary(model):
-        table.add_row(row.name, *row.cells)
-    console.print(table)
+    figures = [[f"{when}\ncount", "\nbias", "\nsigma", "\nbound"] for when in ("before", "after")]
+    head = ["before and\nafter screens", *figures[0], *figures[1]]
+    show_table(console, listed(head, [[row.name, *row.cells] for row in summary(model)]))
     if (rate := model.faults) is not None:
         console.print(
             f"local faults: {rate.faulty} of {rate.ranges:,} used ranges beyond {rate.beyond_sigma:g} sigma of the "
@@ -176,22 +171,13 @@ def _print_curve(curve: Cn0Curve, notes: tuple[str, ...]) -> None:
         f"{source.epochs:,} epochs from {source.start[:19]} to {source.end[:19]}; mean C/N0 in dB-Hz over elevation",
         markup=False,
     )
-    table = Table("satellites", "signal", show_edge=False)
-    for name in ("samples", "elevation", "15 deg", "45 deg", "75 deg", "spread"):
-        table.add_column(name, justify="right")
+    rows = []
     for mean in curve.means:
         half = (mean.elevation_deg[1] - mean.elevation_deg[0]) / 2.0
-        table.add_row(
-            KINDS.get(mean.kind, mean.kind),
-            mean.signal,
-            f"{int(mean.count.sum()):,}",
-            f"{mean.elevation_deg[0] - half:.0f}-{mean.elevation_deg[-1] + half:.0f}",
-            *(_number(float(value)) for value in mean.at([15.0, 45.0, 75.0])),
-            f"{float(mean.spread_db.mean()):.1f}",
-        )
-    console.print(table)
+        values = ["-" if value != value else f"{value:.1f}" for value in mean.at([15.0, 45.0, 75.0]).tolist()]
+        span = f"{mean.elevation_deg[0] - half:.0f}-{mean.elevation_deg[-1] + half:.0f}"
+        spread = f"{float(mean.spread_db.mean()):.1f}"
+        rows.append([KINDS.get(mean.kind, mean.kind), mean.signal, f"{int(mean.count.sum()):,}", span, *values, spread])
+    head = ["satellites", "signal", "samples", "elevation", "15 deg", "45 deg", "75 deg", "spread"]
+    show_table(console, listed(head, rows, texts=2))
     show_notes(console, notes)
-
-
-def _number(value: float) -> str:
-    return "-" if value != value else f"{value:.1f}"

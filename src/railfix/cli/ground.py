@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
-from rich.markup import escape
-from rich.table import Table
 
 from railfix.cli.command import Command, Commands
-from railfix.cli.console import console_of_tables, show_files
+from railfix.cli.console import console_of_tables, show_files, show_table
 from railfix.cli.options import check_outputs, from_models
 from railfix.core.errors import MismatchError, OutputError, SettingsError
 from railfix.core.settings import Settings, option
+from railfix.core.tables import listed
 from railfix.ground.train import OnBoardLimits
 from railfix.ground.triangle import MonitorLimits, TriangleLimits
 from railfix.run.output import Overwrite
@@ -126,10 +125,9 @@ def monitor(
     except OSError as error:
         raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
     console = console_of_tables()
-    table = Table("verdict", "epochs")
-    for value, count in zip(*np.unique(result.triangle.verdict, return_counts=True), strict=True):
-        table.add_row(TriangleVerdict(int(value)).name.lower(), str(count))
-    console.print(table)
+    counted = zip(*np.unique(result.triangle.verdict, return_counts=True), strict=True)
+    rows = [[TriangleVerdict(int(value)).name.lower(), str(count)] for value, count in counted]
+    show_table(console, listed(["verdict", "epochs"], rows, texts=2, boxed=True))
     for time, order, cause, receiver in result.orders:
         named = "" if receiver < 0 else f", receiver {receiver}"
         console.print(f"{np.datetime_as_string(time, unit='s')} {order.value}: {cause.name.lower()}{named}")
@@ -198,10 +196,8 @@ def _monitor_live(
             asyncio.run(session())
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
-    table = Table("verdict", "epochs")
-    for name, count in sorted(counts.items()):
-        table.add_row(name, str(count))
-    console.print(table)
+    rows = [[name, str(count)] for name, count in sorted(counts.items())]
+    show_table(console, listed(["verdict", "epochs"], rows, texts=2, boxed=True))
     if not monitor.state.stopped:
         console.print("no stop")
     show_files(console, [path])
@@ -411,8 +407,8 @@ def train(
 
 def _show_figures(figures: dict[str, Any]) -> None:
     """Print a table of what happened."""
-    table = Table("what happened", "")
-    for name, value in figures.items():
-        text = ", ".join(f"{k} {v}" for k, v in value.items()) or "none" if isinstance(value, dict) else str(value)
-        table.add_row(escape(name), text)
-    console_of_tables().print(table)
+    rows = [
+        [name, (", ".join(f"{k} {v}" for k, v in value.items()) or "none") if isinstance(value, dict) else str(value)]
+        for name, value in figures.items()
+    ]
+    show_table(console_of_tables(), listed(["what happened", ""], rows, texts=2, boxed=True))

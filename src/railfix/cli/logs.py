@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 
 import numpy as np
 import typer
-from rich.table import Table
 
-from railfix.cli.console import console_of_tables, show_files, show_notes
+from railfix.cli.console import console_of_tables, show_files, show_notes, show_table
 from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs, from_models, overwriting, settings_of
 from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.tables import listed
 from railfix.evaluate.run_folder import TABLES, read_run, tables_of
 from railfix.io.positions_export import style_file, write_positions
 from railfix.pipeline.tables import rounded
@@ -88,12 +88,12 @@ def which_track(
     console.print(f"track: {decision.track}{decided} (risk {options.risk:g})", markup=False)
     if not last.fits:
         console.print("the codes do not fit the error model (--code-bias-m, --code-noise-m): no decision is taken")
-    table = Table("track", "probability", "facing its direction", show_edge=False)
+    rows = []
     facing = np.append(last.with_rising, np.nan)
     for k in np.argsort(-last.probability):
         share = facing[k] / last.probability[k] if last.probability[k] > 0.0 and np.isfinite(facing[k]) else np.nan
-        table.add_row(last.names[k], f"{last.probability[k]:.6f}", "" if np.isnan(share) else f"{share:.4f}")
-    console.print(table)
+        rows.append([last.names[k], f"{last.probability[k]:.6f}", "" if np.isnan(share) else f"{share:.4f}"])
+    show_table(console, listed(["track", "probability", "facing its direction"], rows, texts=3))
     show_notes(console, decision.notes)
     if save_last is not None:
         write_last_place(last, decision.end, save_last)

@@ -8,14 +8,14 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.table import Table
 
 from railfix.cli.command import Command, Commands
-from railfix.cli.console import console_of_tables, show_notes
+from railfix.cli.console import console_of_tables, show_notes, show_table
 from railfix.cli.map_network import Columns, MapReading, match_command, network, route
 from railfix.cli.map_runs import service, survey
 from railfix.cli.options import OverwriteOption, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
+from railfix.core.tables import listed
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import column_names, read_positions
 from railfix.track import (
@@ -174,15 +174,16 @@ def features(
     if out is not None:
         rows.write_csv(out)
     columns = ["chainage m", "quantity", "change", *(["runs", "spread m", "from the map m"] if run else [])]
-    table = Table(*columns, title=f"{track.name}: {len(found)} features")
+    shown = []
     for chainage, quantity, change, *others in rows.head(_SHOWN).iter_rows():
         unit = f"{1e3 * change:+.1f} permille" if quantity == "gradient" else f"{1e3 * change:+.2f} / km"
         if others:
             runs, spread, there = others
             gap = "not in the map" if there is None else f"{chainage - there:+.1f}"
             others = [f"{runs:.0f} of {len(run or ())}", "" if spread is None else f"{spread:.2f}", gap]
-        table.add_row(f"{chainage:.1f}", quantity, unit, *others)
-    console_of_tables().print(table)
+        shown.append([f"{chainage:.1f}", quantity, unit, *others])
+    caption = f"{track.name}: {len(found)} features"
+    show_table(console_of_tables(), listed(columns, shown, caption, texts=len(columns), boxed=True))
     if len(found) > _SHOWN:
         typer.echo(f"and {len(found) - _SHOWN} more")
 
@@ -276,12 +277,12 @@ def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
     )
     show_notes(console, track.provenance.notes)
     if quality.findings:
-        table = Table("severity", "kind", "points", "kilometrage", "finding", show_edge=False)
+        rows = []
         for finding in quality.findings[:_SHOWN]:
             marking = "" if finding.kilometrage_m != finding.kilometrage_m else f"{finding.kilometrage_m:.0f}"
             points = f"{finding.first}-{finding.last}" if finding.last > finding.first else f"{finding.first}"
-            table.add_row(finding.severity, finding.kind, points, marking, finding.sentence)
-        console.print(table)
+            rows.append([finding.severity, finding.kind, points, marking, finding.sentence])
+        show_table(console, listed(["severity", "kind", "points", "kilometrage", "finding"], rows, texts=5))
     rest = len(quality.findings) - _SHOWN
     if rest > 0:
         console.print(f"... and {rest} more")

@@ -8,13 +8,13 @@ from typing import Annotated, Literal, Self
 import numpy as np
 import typer
 from pydantic import model_validator
-from rich.table import Table
 
-from railfix.cli.console import console_of_tables, show_notes
+from railfix.cli.console import console_of_tables, show_notes, show_table
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.settings import INPUTS, Settings, option
+from railfix.core.tables import listed
 from railfix.run.inputs import ColumnNames, TrackReading
 from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network
@@ -131,10 +131,11 @@ def network(
     )
     show_notes(console, dict.fromkeys([*tracks.notes, *(n for t in tracks.tracks for n in t.notes)]))
     if quality.findings:
-        table = Table("kind", "latitude", "longitude", "finding", show_edge=False)
-        for finding in quality.findings[:_SHOWN]:
-            table.add_row(finding.kind, f"{finding.latitude_deg:.6f}", f"{finding.longitude_deg:.6f}", finding.sentence)
-        console.print(table)
+        rows = [
+            [found.kind, f"{found.latitude_deg:.6f}", f"{found.longitude_deg:.6f}", found.sentence]
+            for found in quality.findings[:_SHOWN]
+        ]
+        show_table(console, listed(["kind", "latitude", "longitude", "finding"], rows, texts=4))
         if len(quality.findings) > _SHOWN:
             console.print(f"... and {len(quality.findings) - _SHOWN} more")
     if out is not None:

@@ -15,7 +15,7 @@ from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs
 from railfix.core.errors import SettingsError
 from railfix.core.files import BrokenLines
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.core.tables import Column, Table, count, listing, number, percent
+from railfix.core.tables import Column, count, listed, listing, number, percent
 from railfix.run.inputs import ColumnNames, LogReading
 from railfix.track.survey.runs import SurveyLimits
 
@@ -169,16 +169,8 @@ def survey(
         for run, ecef, scale in zip(surveyed.runs, result.runs_ecef_m, result.scale, strict=True)
     ]
     head = ["run", "positions", "run m", "sigma / stated"]
-    show_table(
-        console,
-        Table(
-            name="survey",
-            head=head,
-            rows=rows,
-            caption="Runs, with their errors across as a share of the standard deviation that they state",
-            numeric=range(1, 4),
-        ),
-    )
+    caption = "Runs, with their errors across as a share of the standard deviation that they state"
+    show_table(console, listed(head, rows, caption))
     show_notes(console, [*track.provenance.notes, *surveyed.notes])
     if picture is not None:
         console.print(f"picture: {picture}", markup=False, soft_wrap=True)

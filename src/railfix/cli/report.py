@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import ctypes
 import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-from rich.table import Table
 
-from railfix.cli.console import console_of_tables
+from railfix.cli.console import console_of_tables, show_table
 from railfix.cli.options import OverwriteOption, check_outputs, from_models, overwriting
+from railfix.core.tables import Column, digits, listing
 from railfix.evaluate import EvaluationOptions
 from railfix.report import write_report
 from railfix.report.explain import explain_epoch, time_text, write_explanation
@@ -20,6 +23,13 @@ from railfix.run.inputs import ColumnNames
 from railfix.run.output import OutputFolder
 from railfix.run.record import reading_table
 
+#: Columns of the satellites of an explained epoch.
+_SATELLITES: Final[Sequence[Column]] = (
+    ("satellite", "satellite", str), ("signal", "signal", str), ("elevation", "elevation_deg", partial(digits, 1)),
+    ("C/N0", "cn0_dbhz", partial(digits, 1)), ("sigma m", "sigma_m", partial(digits, 2)),
+    ("residual m", "residual_m", partial(digits, 2)), ("without it m", "without_shift_m", partial(digits, 2)),
+    ("sigma then m", "without_sigma_m", partial(digits, 2)), ("fate", "reason_text", str),
+)  # fmt: skip
 #: ``M_MMAP_THRESHOLD`` of ``malloc.h``, and the size from which on an array has pages of its own [bytes].
 _THRESHOLD: Final = (-3, 1 << 17)
 
@@ -128,18 +138,7 @@ def explain(
     console.print(f"{found.antenna} antenna, {time_text(found.time)} GPS time (asked: {at})", markup=False)
     for sentence in found.sentences:
         console.print(sentence, markup=False, soft_wrap=True)
-    table = Table(title="Satellites")
-    columns = {
-        "satellite": ("satellite", None), "signal": ("signal", None), "elevation_deg": ("elevation", 1),
-        "cn0_dbhz": ("C/N0", 1), "sigma_m": ("sigma m", 2), "residual_m": ("residual m", 2),
-        "without_shift_m": ("without it m", 2), "without_sigma_m": ("sigma then m", 2), "reason_text": ("fate", None),
-    }  # fmt: skip
-    for heading, digits in columns.values():
-        table.add_column(heading, justify="left" if digits is None else "right")
-    for row in found.satellites.iter_rows(named=True):
-        values = ((row[name], digits) for name, (_, digits) in columns.items())
-        table.add_row(*("" if v is None else str(v) if digits is None else f"{v:.{digits}f}" for v, digits in values))
-    console.print(table)
+    show_table(console, replace(listing("satellites", found.satellites, _SATELLITES, "Satellites"), boxed=True))
     if html is not None:
         console.print(f"wrote {write_explanation(found, html)}", markup=False, soft_wrap=True)
 

@@ -21,6 +21,11 @@ def number(value: float | None, digits: int = 2, unit: str = "", *, sign: str = 
     return f"{round(value, digits) + 0.0:{sign},.{digits}f}{unit}".replace("-", "−")
 
 
+def digits(places: int, value: float | None) -> str:
+    """A number without separators; blank for None."""
+    return "" if value is None else f"{value:.{places}f}"
+
+
 def share(part: float | None, digits: int = 2) -> str:
     """A share in per cent."""
     return "–" if part is None or part != part else f"{100.0 * part:.{digits}f} %"
@@ -50,6 +55,14 @@ class Table:
     code: Sequence[int] = ()
     marked: Sequence[int] = ()  #: Rows that stand out.
     links: Sequence[str] = ()  #: Address of the page on each row, blank without one; empty where no row has one.
+    boxed: bool = False  #: A terminal draws a frame around it.
+
+
+def listed(
+    head: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "", *, texts: int = 1, boxed: bool = False
+) -> Table:
+    """A table that is printed alone; all columns but the first `texts` are numbers."""
+    return Table(name="", head=head, rows=rows, caption=caption, numeric=range(texts, len(head)), boxed=boxed)
 
 
 #: Head, column and format of a column of a table.
