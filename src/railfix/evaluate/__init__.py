@@ -14,25 +14,8 @@ from railfix.evaluate.place import TrackFiles, along_track_error, interpolate_re
 from railfix.evaluate.tables import write_evaluation
 
 __all__ = [
-    "BEYOND_COLUMNS",
-    "EPOCH_COLUMNS",
-    "FIGURE_COLUMNS",
-    "INTERVAL_COLUMNS",
-    "LEVEL_COLUMNS",
-    "STANFORD_COLUMNS",
-    "WRONG_PLACE_M",
-    "EvaluatedRun",
-    "Evaluation",
-    "EvaluationOptions",
-    "Integrity",
-    "RunAndReference",
-    "Score",
-    "TrackFiles",
-    "along_track_error",
-    "evaluate_run",
-    "evaluate_runs",
-    "interpolate_reference",
-    "score",
-    "straight_distance",
-    "write_evaluation",
-]
+    "BEYOND_COLUMNS", "EPOCH_COLUMNS", "FIGURE_COLUMNS", "INTERVAL_COLUMNS", "LEVEL_COLUMNS", "STANFORD_COLUMNS",
+    "WRONG_PLACE_M", "EvaluatedRun", "Evaluation", "EvaluationOptions", "Integrity", "RunAndReference", "Score",
+    "TrackFiles", "along_track_error", "evaluate_run", "evaluate_runs", "interpolate_reference", "score",
+    "straight_distance", "write_evaluation",
+]  # fmt: skip

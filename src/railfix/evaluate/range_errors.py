@@ -5,7 +5,7 @@ Common errors are those that a nearby reference station has measured; of the err
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Final
@@ -51,18 +51,9 @@ from railfix.run.sources import aligned
 from railfix.track.trajectory import Trajectory
 
 __all__ = [
-    "CommonErrors",
-    "GatherLimits",
-    "ModelInputs",
-    "RangeErrors",
-    "RobustClock",
-    "StationBeside",
-    "base_station",
-    "base_station_from_files",
-    "error_model_from_runs",
-    "range_errors",
-    "robust_clock",
-]
+    "CommonErrors", "GatherLimits", "ModelInputs", "RangeErrors", "RobustClock", "StationBeside", "base_station",
+    "base_station_from_files", "error_model_from_runs", "range_errors", "robust_clock",
+]  # fmt: skip
 
 #: Rejection reasons without a defined range error: no pseudorange, no ephemeris, no correction.
 NO_RANGE: Final = (
@@ -287,10 +278,6 @@ def joined(parts: list[ErrorSamples]) -> ErrorSamples:
     )
 
 
-#: Called after each chunk with the name of the run and the epochs processed so far.
-OnChunk = Callable[[str, int], None]
-
-
 class StationBeside(Settings):
     """Reference positions of runs, and a station beside the line, as the command line names them."""
 
@@ -330,11 +317,7 @@ class _RunErrors:
 
 
 def error_model_from_runs(
-    inputs: Sequence[ModelInputs],
-    *,
-    fit: ErrorModelFit | None = None,
-    limits: GatherLimits | None = None,
-    progress: OnChunk | None = None,
+    inputs: Sequence[ModelInputs], *, fit: ErrorModelFit | None = None, limits: GatherLimits | None = None
 ) -> tuple[ErrorModel, ErrorSamples]:
     """Error model of the pseudoranges of several runs, before and after the screens, and its samples.
 
@@ -353,7 +336,7 @@ def error_model_from_runs(
     with_base = {bool(source.base) for source in inputs}
     if len(with_base) != 1:
         raise MismatchError("give a reference station for every run or for none: the errors are of different kinds")
-    runs = [_run_errors(source, number, fit, limits, progress) for number, source in enumerate(inputs)]
+    runs = [_run_errors(source, number, fit, limits) for number, source in enumerate(inputs)]
     parts = [samples for run in runs for samples in run.samples]
     if not any(len(part.error_m) for part in parts):
         raise MismatchError("no pseudorange error could be computed; do run, reference and station belong together?")
@@ -386,9 +369,7 @@ def error_model_from_runs(
     return model, samples
 
 
-def _run_errors(
-    source: ModelInputs, number: int, fit: ErrorModelFit, limits: GatherLimits, progress: OnChunk | None
-) -> _RunErrors:
+def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit, limits: GatherLimits) -> _RunErrors:
     """Range errors of one run, chunk by chunk."""
     past = read_record(source.run)
     past.check_inputs()
@@ -401,7 +382,7 @@ def _run_errors(
         base = base_station_from_files(source.base, processor, position_ecef_m=source.base_position_ecef_m)
     parts: list[ErrorSamples] = []
     times: list[np.datetime64] = []
-    epochs = processed = 0
+    epochs = 0
     for chunk in aligned({name: log.parts() for name, log in logs.items()}):
         result, state = processor.process(chunk, state)
         for antenna, (name, positions) in enumerate(result.antennas.items()):
@@ -415,9 +396,6 @@ def _run_errors(
             parts.append(replace(errors.samples, block=errors.samples.block + offset))
             epochs += errors.epochs
             times += [positions.time[0], positions.time[-1]]
-            processed += len(positions)
-        if progress is not None:
-            progress(str(source.run), processed)
     files = {str(path): file_sha256(path) for path in (source.reference, *source.base)}
     return _RunErrors(
         samples=tuple(parts),

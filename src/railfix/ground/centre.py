@@ -20,6 +20,9 @@ from railfix.core.arrays import Floats, freeze_arrays
 from railfix.core.settings import Settings
 from railfix.io.train_message import MessageStatus, TrainMessage
 
+#: Acceleration of the reference run curve [m/s^2]; a train this near to a station is at it [m].
+_RUN_MPS2, _AT_STATION_M = 0.5, 25.0
+
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceCurve:
@@ -39,32 +42,23 @@ class ReferenceCurve:
             raise ValueError("running_s rises strictly")
 
     @classmethod
-    def between_stations(
-        cls, stations_m: Floats, *, speed_mps: float, acceleration_mps2: float = 0.5, step_s: float = 1.0
-    ) -> Self:
+    def between_stations(cls, stations_m: Floats, *, speed_mps: float) -> Self:
         """Return the curve of a run that starts and stops at each station with an even acceleration.
 
-        Parameters
-        ----------
-        stations_m : ndarray, shape (K,) [m]
-            In the order of the run.
-        speed_mps : float [m/s]
-            Highest speed; less is reached where the stations are near each other.
-        acceleration_mps2 : float [m/s^2]
-        step_s : float [s]
-            Step of the table.
+        Stations, shape (K,) [m], are in the order of the run; where they are near each other the train does not reach
+        its highest speed [m/s].
         """
         direction = 1 if stations_m[-1] > stations_m[0] else -1
         time, place, start = [np.zeros(1)], [stations_m[:1]], 0.0
         for origin, way in zip(stations_m[:-1], np.abs(np.diff(stations_m)), strict=True):
-            peak = min(speed_mps, float(np.sqrt(acceleration_mps2 * way)))
-            total = peak / acceleration_mps2 + way / peak
-            t = np.append(np.arange(step_s, total - 0.5 * step_s, step_s), total)
-            ramp = peak / acceleration_mps2
+            peak = min(speed_mps, float(np.sqrt(_RUN_MPS2 * way)))
+            ramp = peak / _RUN_MPS2
+            total = ramp + way / peak
+            t = np.append(np.arange(1.0, total - 0.5), total)
             covered = np.select(
                 [t < ramp, t < total - ramp],
-                [0.5 * acceleration_mps2 * t**2, peak * (t - 0.5 * ramp)],
-                way - 0.5 * acceleration_mps2 * (total - t) ** 2,
+                [0.5 * _RUN_MPS2 * t**2, peak * (t - 0.5 * ramp)],
+                way - 0.5 * _RUN_MPS2 * (total - t) ** 2,
             )
             time.append(start + t)
             place.append(origin + direction * covered)
@@ -82,11 +76,11 @@ class ReferenceCurve:
         limit = float(left.min()) if len(left) else 0.0
         return from_m + self.direction * min(max(self.direction * (place - from_m), 0.0), limit)
 
-    def station_at(self, chainage_m: float, *, within_m: float = 25.0) -> int | None:
+    def station_at(self, chainage_m: float) -> int | None:
         """Return the number of the station at a place, None between stations."""
         distance = np.abs(self.stations_m - chainage_m)
         nearest = int(distance.argmin())
-        return nearest if distance[nearest] <= within_m else None
+        return nearest if distance[nearest] <= _AT_STATION_M else None
 
     def progress(self, chainage_m: float) -> tuple[int, float]:
         """Return the section, by its first station, and the progress in it in running direction [%].

@@ -157,12 +157,7 @@ def points_ecef_m() -> Floats:
 
 
 def simulated_fixes(
-    rng: np.random.Generator,
-    *,
-    epochs: int = 60,
-    common_m: Floats | None = None,
-    moved_m: Floats | None = None,
-    noise_m: float = 0.4,
+    rng: np.random.Generator, *, epochs: int = 60, common_m: Floats | None = None, moved_m: Floats | None = None
 ) -> StationFixes:
     """Return fixes, one a second, from simulated ranges of satellites that stand still.
 
@@ -180,7 +175,7 @@ def simulated_fixes(
         shift = np.zeros((epochs, 2)) if moved_m is None else moved_m[:, k]
         antenna = points[k] + shift @ axes[:2]
         distance, _ = range_with_rotation(satellites, antenna[:, None])
-        code = distance + common + rng.normal(0.0, noise_m, shape) + rng.normal(0.0, 1e4)
+        code = distance + common + rng.normal(0.0, 0.4, shape) + rng.normal(0.0, 1e4)
         absent = ~np.isfinite(code)
         ranges.append(
             Ranges(

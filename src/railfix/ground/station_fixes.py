@@ -185,22 +185,14 @@ class StationStreams:
 
     An epoch counts when every receiver has it; older ones that wait are then dropped. A receiver that sends nothing
     therefore gives no fixes at all, which the monitor finds by their lateness. Records from the streams are added to
-    the navigation known from the start; epochs at whole multiples of the period are used. `counts`: epochs "used",
+    the navigation known from the start; epochs at whole seconds are used. `counts`: epochs "used",
     "incomplete", and "without common satellites".
     """
 
-    def __init__(
-        self,
-        points_ecef_m: Floats,
-        *,
-        navigation: Navigation | None = None,
-        config: Config | None = None,
-        period_s: float = 1.0,
-    ) -> None:
+    def __init__(self, points_ecef_m: Floats, *, navigation: Navigation | None = None) -> None:
         self.counts: Counter[str] = Counter()
-        self._points, self._config = points_ecef_m, config or Config()
+        self._points, self._config = points_ecef_m, Config()
         self._known: Known = known_from_start(self._config, navigation=navigation)
-        self._period = round(period_s * 1e9)
         self._waiting: dict[np.datetime64, dict[int, Observations]] = {}
         self._done = np.datetime64("1980-01-06", "ns")
         self._levels = [deque[float](maxlen=_USUAL_EPOCHS) for _ in points_ecef_m]
@@ -213,7 +205,7 @@ class StationStreams:
         """Take one epoch of a receiver; return the fixes where all receivers have sent theirs."""
         tag = rounded(epoch.time)[0]
         tag_ns = int(tag.astype(np.int64))
-        if tag_ns % self._period or tag <= self._done:
+        if tag_ns % 1_000_000_000 or tag <= self._done:
             return None
         for later, epochs in list(self._waiting.items()):
             # the receiver's tags were in the future: they would push out those of the others
@@ -239,7 +231,7 @@ class StationStreams:
             fallen[0, k] = bool(self._levels[k]) and level < float(np.median(self._levels[k])) - FALLEN_DBHZ
             self._levels[k].append(level)
         try:
-            fixes = station_fixes(epochs, self._points, self._known.navigation, config=self._config)
+            fixes = station_fixes(epochs, self._points, self._known.navigation)
             self.counts["used"] += 1
         except MismatchError:
             self.counts["without common satellites"] += 1
@@ -248,25 +240,18 @@ class StationStreams:
 
 
 async def stream_fixes(
-    sources: Sequence[str],
-    points_ecef_m: Floats,
-    *,
-    navigation: Navigation | None = None,
-    config: Config | None = None,
-    settings: LiveSettings | None = None,
-    period_s: float = 1.0,
+    sources: Sequence[str], points_ecef_m: Floats, *, navigation: Navigation | None = None
 ) -> AsyncIterator[StationFixes]:
     """Fixes of one epoch at a time, until every source has ended.
 
     The sources are as of ``railfix live`` (``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receivers' files), and RINEX
     files too. InputFileError: when a source cannot be opened, or breaks and is not opened again.
     """
-    settings = settings or LiveSettings()
-    stations = StationStreams(points_ecef_m, navigation=navigation, config=config, period_s=period_s)
+    stations = StationStreams(points_ecef_m, navigation=navigation)
     queue: asyncio.Queue[tuple[int, ReceivedData | None]] = asyncio.Queue(2 * len(sources))
 
     async def pump(receiver: int, source: str) -> None:
-        async for item in arrivals(source, fresh_state(source), settings):
+        async for item in arrivals(source, fresh_state(source), LiveSettings()):
             if isinstance(item, ReceivedData):
                 await queue.put((receiver, item))
         await queue.put((receiver, None))

@@ -20,12 +20,11 @@ STEP_S: Final = 1.0
 STOP_SHORT_M: Final = 2.0
 
 
-def line_with_loops(stations: int = 6, *, apart_m: float = 1500.0, length_m: float = 500.0) -> Layout:
-    """Return a line of equal stations."""
+def line_with_loops(stations: int = 6) -> Layout:
+    """Return a line of equal stations of 500 m, one every 1,500 m."""
+    begins = [1500.0 * k for k in range(stations)]
     return Layout(
-        stations=tuple(
-            LoopStation(name=chr(65 + k), begin_m=k * apart_m, end_m=k * apart_m + length_m) for k in range(stations)
-        )
+        stations=tuple(LoopStation(name=chr(65 + k), begin_m=b, end_m=b + 500.0) for k, b in enumerate(begins))
     )
 
 

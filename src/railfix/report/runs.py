@@ -83,12 +83,10 @@ class ReportedRun:
         return None if self.train is None else self.train.filter(antenna=antenna)
 
 
-def figures_of(
-    evaluation: Evaluation, run: ReportedRun, antenna: str, position: str, *, epochs_of: str = "own"
-) -> dict[str, Any]:
+def figures_of(evaluation: Evaluation, run: ReportedRun, antenna: str, position: str) -> dict[str, Any]:
     """Figures of merit of one antenna and kind of position; empty where there are none."""
     rows = evaluation.figures.filter(
-        grouping="all", epochs_of=epochs_of, run=run.name_in(evaluation), antenna=antenna, position=position
+        grouping="all", epochs_of="own", run=run.name_in(evaluation), antenna=antenna, position=position
     )
     return rows.row(0, named=True) if len(rows) == 1 else {}
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.errors import NoPositionError
-from railfix.core.files import BrokenLines, write_whole
+from railfix.core.files import write_whole
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
@@ -42,19 +42,13 @@ class LocateSummary:
 
 
 def locate_files(
-    inputs: LocateInputs,
-    config: Config,
-    *,
-    out: Path,
-    reading: LogReading | None = None,
-    broken_lines: BrokenLines = "stop",
-    chunk_epochs: int = 3000,
+    inputs: LocateInputs, config: Config, *, out: Path, reading: LogReading | None = None
 ) -> LocateSummary:
     """Compute positions of a log and write them as an RTKLIB solution file with quality 5 (single)."""
     inputs.check_files()
     date = (reading or LogReading()).instant
-    received = known_from_start(config, navigation=read_navigation(inputs.nav, broken_lines=broken_lines, date=date))
-    log = Log(paths=inputs.log, chunk_epochs=chunk_epochs, broken_lines=broken_lines, date=date)
+    received = known_from_start(config, navigation=read_navigation(inputs.nav, date=date))
+    log = Log(paths=inputs.log, chunk_epochs=_CHUNK_EPOCHS, date=date)
     book = ChannelBook(config)
     parts = [locate(part, received, config, book) for part in log.parts()]
     if not any(np.isfinite(part.ecef_m).any() for part in parts):
@@ -98,6 +92,8 @@ def solution_text(time: Datetimes, ecef_m: Floats, sigma_m: Floats, n_used: Inte
 
 #: Epochs that are tried, and how near the line a position is on it, in plan [m].
 _EPOCHS: Final = 5
+#: Epochs of a log that are positioned together.
+_CHUNK_EPOCHS: Final = 3000
 _ON_LINE_M: Final = 150.0
 #: Positions so far above or below the line have another cause than errors of ranges [m].
 _HEIGHT_M: Final = 30.0

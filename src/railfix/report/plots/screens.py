@@ -170,9 +170,7 @@ def _tightest(x: Floats, limit: Floats) -> tuple[Floats, Floats]:
     return x[order][first], np.minimum.reduceat(limit[order], first)
 
 
-def draw_cn0_curve(
-    path: str | PathLike[str], curve: Cn0Curve, samples: Cn0Samples, *, limits: Cn0Limits | None = None
-) -> Path:
+def draw_cn0_curve(path: str | PathLike[str], curve: Cn0Curve, samples: Cn0Samples) -> Path:
     """Draw C/N0 over elevation with mean and threshold, a panel a constellation and signal (P1 figure 3), as PNG.
 
     Raises
@@ -182,7 +180,7 @@ def draw_cn0_curve(
     """
     from matplotlib.figure import Figure
 
-    charts = [open_sky_chart(mean, *samples.of(mean.kind, mean.signal), limits or Cn0Limits()) for mean in curve.means]
+    charts = [open_sky_chart(mean, *samples.of(mean.kind, mean.signal), Cn0Limits()) for mean in curve.means]
     columns = min(_COLUMNS, len(charts))
     rows = -(-len(charts) // columns)
     figure = Figure(figsize=(4.5 * columns, 3.5 * rows), layout="constrained")
