@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from bad_inputs import Desk
 from railfix.cli import app
-from railfix.run.doctor import examine_files
+from railfix.run.checks import examine_files
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
 pytestmark = pytest.mark.requirement("G4")

@@ -34,9 +34,8 @@ from railfix.evaluate import (
 )
 from railfix.evaluate.epochs import travelled, with_missing
 from railfix.evaluate.figures import block_limits
+from railfix.evaluate.inputs import read_sections, tables_of
 from railfix.evaluate.intervals import BRANCH_COLUMNS, OUTAGE_COLUMNS
-from railfix.evaluate.options import read_sections
-from railfix.evaluate.run_folder import tables_of
 from railfix.io.reference_log import AntennaReference
 from railfix.run import run_files
 from railfix.simulate.demonstration import demo_inputs

@@ -9,8 +9,8 @@ import polars as pl
 import pytest
 
 from railfix.core.errors import MismatchError
-from railfix.evaluate import service
-from railfix.evaluate.run_folder import RunFolder
+from railfix.evaluate import intervals
+from railfix.evaluate.inputs import RunFolder
 from railfix.report.plots.campaign import plot_service
 
 pytestmark = pytest.mark.requirement("G4")
@@ -59,14 +59,14 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> dict[str, RunFolder]:
     def tables(path: Path) -> list[str]:
         return ["positions", "train"] if "filter" in found[path.name].positions.columns else ["positions"]
 
-    monkeypatch.setattr(service, "read_run", read)
-    monkeypatch.setattr(service, "tables_of", tables)
+    monkeypatch.setattr(intervals, "read_run", read)
+    monkeypatch.setattr(intervals, "tables_of", tables)
     return found
 
 
 def test_epochs_are_counted_by_stretch(runs: dict[str, RunFolder], tmp_path: Path) -> None:
     runs["a"], runs["b"] = folder(tmp_path / "a"), folder(tmp_path / "b")
-    found = service.compute_service([Path("a"), Path("b")], stretch_m=100.0, limit_m=20.0)
+    found = intervals.compute_service([Path("a"), Path("b")], stretch_m=100.0, limit_m=20.0)
     assert found["from_m"].to_list() == [0.0, 100.0, 200.0, 300.0]
     assert found["epochs"].to_list() == [200, 200, 200, 200]
     assert found["runs"].to_list() == [2, 2, 2, 2]
@@ -83,7 +83,7 @@ def test_epochs_are_counted_by_stretch(runs: dict[str, RunFolder], tmp_path: Pat
 
 def test_runs_without_a_filter_have_no_levels(runs: dict[str, RunFolder], tmp_path: Path) -> None:
     runs["a"] = folder(tmp_path / "a", filtered=False)
-    found = service.compute_service([Path("a")], stretch_m=200.0)
+    found = intervals.compute_service([Path("a")], stretch_m=200.0)
     assert found["ok_share"].to_list() == [1.0, 0.5]
     assert found["tracking_share"].to_list() == [None, None]
     assert found["within_limit_share"].to_list() == [None, None]
@@ -92,4 +92,4 @@ def test_runs_without_a_filter_have_no_levels(runs: dict[str, RunFolder], tmp_pa
 def test_runs_on_different_maps_are_not_mixed(runs: dict[str, RunFolder], tmp_path: Path) -> None:
     runs["a"], runs["b"] = folder(tmp_path / "a"), folder(tmp_path / "b", length_m=900.0)
     with pytest.raises(MismatchError, match="one map"):
-        service.compute_service([Path("a"), Path("b")])
+        intervals.compute_service([Path("a"), Path("b")])

@@ -27,11 +27,10 @@ from railfix.live.channels import TwoChannels, compare, digests
 from railfix.live.console import Metrics
 from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.forms import nmea_bytes, tpv_bytes
-from railfix.live.lag import Lag
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
 from railfix.live.sources import _Chunks, check_source
-from railfix.live.stream import ReceiverState, receive_bytes, single_epochs
+from railfix.live.stream import Lag, ReceiverState, receive_bytes, single_epochs
 from railfix.simulate.demonstration import demo_files
 
 pytestmark = pytest.mark.requirement("A8")

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from railfix.cli import app
 from railfix.core.errors import InputFileError
 from railfix.motion.features import Feature
-from railfix.run.survey import measured_features, read_measured
+from railfix.run.locate import measured_features, read_measured
 
 pytestmark = pytest.mark.requirement("E3")
 RUNNER = CliRunner(env={"COLUMNS": "160", "TERM": "dumb", "NO_COLOR": "1"})

@@ -13,9 +13,9 @@ from railfix.core.reasons import Status
 from railfix.core.timescale import timedelta
 from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
+from railfix.pipeline.filter_result import OffMapState, off_map_epochs
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.return_gate import OffMapState, off_map_epochs
 from railfix.simulate.demonstration import demo_files
 from railfix.tracking import Tracked, TrackStatus, track
 from test_wrong_map import moved

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from railfix.cli.error_model import priors_text
+from railfix.cli.evaluate import priors_text
 from railfix.cli.options import Choices, settings_of
 from railfix.core.errors import InputFileError
 from railfix.ranges.error_model import (

@@ -14,8 +14,8 @@ from railfix.io.logs import read_observations
 from railfix.io.mate import signal_code
 from railfix.pipeline.config import Config
 from railfix.run import RunInputs, RunOptions, run_files
+from railfix.run.convert import inputs_of
 from railfix.run.inputs import TrackReading
-from railfix.run.mate import inputs_of
 from railfix.run.sensors import read_listed_balises, read_sensors
 from railfix.simulate import Simulation
 from railfix.simulate.mate_tables import write_mate_tables

@@ -17,9 +17,8 @@ from railfix.cli import app
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.evaluate import evaluate_run, interpolate_reference
-from railfix.evaluate.options import EvaluationOptions
+from railfix.evaluate.inputs import EvaluationOptions, read_run
 from railfix.evaluate.place import track_of
-from railfix.evaluate.run_folder import read_run
 from railfix.pipeline.config import Config
 from railfix.run import RunInputs, RunOptions, RunSummary, TrackReading, run_files
 from railfix.run.driver import open_inputs

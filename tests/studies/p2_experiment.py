@@ -26,7 +26,7 @@ from railfix.motion.samples import InertialSamples, SensorSamples, TachometerPul
 from railfix.motion.slip import MotionSamples, MotionState, SlipLimits, SlipResult, find_slips
 from railfix.motion.tachometer import TachometerLimits, pulse_speeds, way_m
 from railfix.pipeline import sensed_motion as stage
-from railfix.run.survey import measured_features
+from railfix.run.locate import measured_features
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario_file import load_recipe

@@ -14,7 +14,7 @@ import paths
 from railfix.core.arrays import Floats
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.pipeline.config import Config
-from railfix.run.survey import survey_files
+from railfix.run.locate import survey_files
 from railfix.track.survey.line import Survey
 from railfix.track.survey.runs import SurveyLimits
 from recordings_truth import Truth, gsdc_truth, japan_truth, urbannav_truth

@@ -51,7 +51,9 @@ class _Program(LazyCommands):
         "benchmark": "campaign",
         "ablate": "campaign",
         "reference": "evaluate",
-        "cn0-curve": "error_model",
+        "error-model": "evaluate",
+        "live": "run",
+        "cn0-curve": "evaluate",
     }
 
 

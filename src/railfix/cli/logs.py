@@ -12,11 +12,11 @@ from railfix.cli.console import console_of_tables, show_files, show_notes, show_
 from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs, from_models, overwriting, settings_of
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.tables import listed
-from railfix.evaluate.run_folder import TABLES, read_run, tables_of
+from railfix.evaluate.inputs import TABLES, read_run, tables_of
 from railfix.io.positions_export import style_file, write_positions
 from railfix.pipeline.tables import rounded
+from railfix.run.checks import examine_files
 from railfix.run.convert import write_mcap
-from railfix.run.doctor import examine_files
 from railfix.run.inputs import LogReading, located
 from railfix.run.locate import LocateInputs, locate_files
 from railfix.run.which_track import WhichTrackInputs, WhichTrackOptions, which_track_files, write_last_place

@@ -141,7 +141,7 @@ def features(
     import polars as pl
 
     from railfix.motion.features import FeatureLimits, line_series, map_features
-    from railfix.run.survey import centred, measured_features, read_measured
+    from railfix.run.locate import centred, measured_features, read_measured
     from railfix.track.trajectory import Trajectory
 
     tables = [folder / "train.parquet" for folder in run or ()]

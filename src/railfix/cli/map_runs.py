@@ -55,7 +55,7 @@ def service(
     Exit codes as `railfix --help` says; 5 where the runs are on different maps.
     """
     from railfix.core.files import write_whole
-    from railfix.evaluate.service import compute_service
+    from railfix.evaluate.intervals import compute_service
 
     if not stretch > 0.0 or not limit > 0.0:
         raise SettingsError("--stretch and --limit must be positive")
@@ -127,7 +127,7 @@ def survey(
 
     Exit codes as `railfix --help` says; 5 where the runs lie apart.
     """
-    from railfix.run.survey import survey_files
+    from railfix.run.locate import survey_files
     from railfix.track import write_track_csv
 
     picture = files.picture

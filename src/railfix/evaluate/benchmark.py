@@ -26,9 +26,9 @@ from railfix.core.timescale import seconds
 from railfix.evaluate.cases import Case, check_not_fitted, read_cases
 from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_runs
 from railfix.evaluate.figures import ALL, FIGURE_COLUMNS, positioned
+from railfix.evaluate.inputs import CONVENTIONAL, POSITIONS_TABLE, RunFolder, floats, read_run, tables_of
 from railfix.evaluate.integrity import STANFORD_COLUMNS
 from railfix.evaluate.place import Answers, TrackFiles, find_trajectory
-from railfix.evaluate.run_folder import CONVENTIONAL, POSITIONS_TABLE, RunFolder, floats, read_run, tables_of
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog
 from railfix.io.receiver.framing import head_of, is_receiver_log
@@ -69,7 +69,7 @@ def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Traje
     """Return positions of another program as a table of a run, moved to the nearest point of the line.
 
     `epochs` are railfix's positions of the same antenna and log, of which a rate is counted. Columns are
-    `railfix.evaluate.run_folder.NEEDED`, satellites and conventional position null; times are those of the positions,
+    `railfix.evaluate.inputs.NEEDED`, satellites and conventional position null; times are those of the positions,
     where there is one.
     """
     time = epochs["time_gpst"].to_numpy()

@@ -12,10 +12,9 @@ import polars as pl
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.errors import MismatchError
 from railfix.core.timescale import seconds
+from railfix.evaluate.inputs import EvaluationOptions, RunFolder, Sections, floats
 from railfix.evaluate.integrity import PARTS, STATED
-from railfix.evaluate.options import EvaluationOptions, Sections
 from railfix.evaluate.place import Answers, PlaceErrors, TrackFiles, bracket, errors_of
-from railfix.evaluate.run_folder import RunFolder, floats
 from railfix.io.reference_log import AntennaReference
 
 #: Status of an epoch missing in the log.

@@ -15,11 +15,19 @@ from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import fingerprint
 from railfix.evaluate.epochs import antenna_epochs, below
 from railfix.evaluate.figures import ALL, KEYS, USED, figures_by
+from railfix.evaluate.inputs import (
+    NO_MORE,
+    POSITIONS_TABLE,
+    TABLES,
+    UNKNOWN_KIND,
+    EvaluationOptions,
+    RunFolder,
+    read_run,
+    read_sections,
+)
 from railfix.evaluate.integrity import Integrity, LevelledRun, integrity_of
 from railfix.evaluate.intervals import branch_table, interval_table, level_table, outage_table
-from railfix.evaluate.options import EvaluationOptions, read_sections
 from railfix.evaluate.place import TrackFiles
-from railfix.evaluate.run_folder import NO_MORE, POSITIONS_TABLE, TABLES, UNKNOWN_KIND, RunFolder, read_run
 from railfix.io.reference_log import AntennaReference, read_reference
 
 #: Names of a reference that is looked for beside the log of a run.
@@ -46,7 +54,7 @@ class RunAndReference:
     configuration : str or None
         Name of its settings; None: composed of the settings that differ between the runs.
     table : str
-        Table of positions (`railfix.evaluate.run_folder.tables_of`): "positions" for single epochs, "train" for
+        Table of positions (`railfix.evaluate.inputs.tables_of`): "positions" for single epochs, "train" for
         the filter along the track.
     conventional : Path or None
         Folder of another run on the same log, whose conventional positions take the place of the run's own: one

@@ -15,8 +15,7 @@ import polars as pl
 
 from railfix.core.arrays import Floats, Masks, Strings
 from railfix.evaluate.figures import ALL, KEYS, PASSED
-from railfix.evaluate.options import WINDOWS_S, EvaluationOptions
-from railfix.evaluate.run_folder import floats
+from railfix.evaluate.inputs import WINDOWS_S, EvaluationOptions, floats
 from railfix.integrity.stanford import Region, Stanford, stanford
 
 LevelsOf = Literal["usable", "all"]

@@ -19,10 +19,9 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io.train_message import TrainMessage
 from railfix.kernels import load
-from railfix.live.lag import Lag
 from railfix.live.message import message_of, no_input_message
 from railfix.live.settings import LiveSettings
-from railfix.live.stream import FOREVER, Sensed
+from railfix.live.stream import FOREVER, Lag, Sensed
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import merged_navigation

@@ -19,8 +19,16 @@ from railfix.motion.samples import BaliseReadings, ListedBalises, SensorSamples
 from railfix.pipeline.balises import BaliseLimits, find_passings
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
-from railfix.pipeline.filter_result import AlongTrack, FilterFix, FilterState, Replay, SingleEpochs, SmoothedTrack
-from railfix.pipeline.return_gate import ReturnState, gated_codes
+from railfix.pipeline.filter_result import (
+    AlongTrack,
+    FilterFix,
+    FilterState,
+    Replay,
+    ReturnState,
+    SingleEpochs,
+    SmoothedTrack,
+    gated_codes,
+)
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import LineReferences, sensor_epochs
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips

@@ -1,9 +1,9 @@
-"""What the filter along the track takes from single epochs, returns, and passes on; its smoothing over a log."""
+"""What the filter along the track takes from single epochs, returns, and passes on; epochs that wait for others."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -13,9 +13,8 @@ from railfix.core.tables import NotebookTable, median_text, plural, time_span_te
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import Suspicion, WheelSigns, WheelState
 from railfix.pipeline.balises import Passing, PassingState
-from railfix.pipeline.return_gate import ReturnState
 from railfix.pipeline.sensed_motion import SensedMotion
-from railfix.pipeline.sensor_epochs import SensorState
+from railfix.pipeline.sensor_epochs import SensorLimits, SensorState
 from railfix.positioning.carrier import CycleSlipState
 from railfix.positioning.map_offset import MapOffsetLimits, beyond_threshold
 from railfix.screens import FilteredMotion
@@ -37,6 +36,109 @@ from railfix.tracking.state import StateIndex
 
 if TYPE_CHECKING:
     from railfix.pipeline.results import AntennaResult
+
+
+#: Without codes for so long the place is that of the sensors [s].
+_OUTAGE_S: Final = 2.0
+#: Positions that must agree before codes count again.
+_AGREEING: Final = 3
+#: Standard deviation of a way by the sensors since the beginning of a stretch, as a share.
+_WAY_SHARE: Final = 0.01
+#: Least standard deviation of a single epoch at the end of a tunnel [m]: multipath of the portal.
+_LEAST_SIGMA_M: Final = 2.0
+_NEVER: Final = np.datetime64("NaT", "ns")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReturnState:
+    """What one chunk leaves to the next."""
+
+    time: np.datetime64 = _NEVER  #: Last epoch whose codes counted; NaT before the first.
+    #: Coasted place at the last epoch and its standard deviation; NaN where no sensor gives a way.
+    place_m: float = float("nan")
+    sigma_m: float = float("nan")
+    way_m: float = 0.0  #: Since the filter's own place.
+    returned: np.datetime64 = _NEVER  #: First epoch with codes after the outage; NaT without.
+    agreeing: int = 0  #: Positions in a row that agreed since.
+
+
+def gated_codes(
+    time: Datetimes,
+    observed: Masks,
+    way_m: Floats,
+    place_m: Floats,
+    sigma_m: Floats,
+    state: ReturnState,
+    line: Line,
+    limits: SensorLimits,
+) -> tuple[Masks, ReturnState]:
+    """Return the epochs whose codes do not count yet, shape (T,), and the state to pass on.
+
+    After an outage the position of each epoch by itself is compared with the place coasted on the sensors: codes count
+    again with the third in a row that lies within `SensorLimits.return_sigmas` of both standard deviations together,
+    and after `SensorLimits.return_s` in any case. Where no sensor gives a way nothing is refused.
+
+    Shape (T,): `observed`, epochs with codes; `way_m`, by the sensors since the epoch before; `place_m`, `sigma_m` of
+    each epoch by itself; NaN where there is none. `state` has the place of the filter at the epoch before the first.
+    """
+    refused = np.zeros(len(time), dtype=np.bool_)
+    ways = state.way_m + np.cumsum(way_m)
+    coasted = state.place_m + np.cumsum(way_m)
+    spread = np.sqrt(state.sigma_m**2 + (_WAY_SHARE * ways) ** 2 + np.maximum(sigma_m, _LEAST_SIGMA_M) ** 2)
+    fits = np.abs(line.nearest_m(place_m, coasted) - coasted) <= limits.return_sigmas * spread
+    last, returned, agreeing = state.time, state.returned, state.agreeing
+    steps = seconds(np.diff(time, prepend=last if not np.isnat(last) else time[:1]))
+    if np.isnat(returned) and observed.all() and steps.max(initial=0.0) < _OUTAGE_S:
+        last, observed = time[-1] if len(time) else last, observed[:0]
+    for k in np.flatnonzero(observed).tolist():
+        out = not np.isnat(last) and (not np.isnat(returned) or float(seconds(time[k] - last)) >= _OUTAGE_S)
+        if out and np.isfinite(coasted[k]):
+            returned = time[k] if np.isnat(returned) else returned
+            agreeing = agreeing + 1 if fits[k] else 0
+            refused[k] = agreeing < _AGREEING and float(seconds(time[k] - returned)) <= limits.return_s
+        if not refused[k]:
+            last, returned, agreeing = time[k], _NEVER, 0
+    if not len(time):
+        return refused, state
+    return refused, replace(
+        state, time=last, place_m=float(coasted[-1]), way_m=float(ways[-1]), returned=returned, agreeing=agreeing
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffMapState:
+    """State of the test after a chunk."""
+
+    off: bool = False  #: The train was off the map at the last epoch.
+    known: bool = False  #: A position has been tested; the first one of a log decides alone.
+    #: First of the last positions in a row that contradict `off`; NaT where the last one agrees with it.
+    since: np.datetime64 = _NEVER
+
+
+def off_map_epochs(
+    time: Datetimes, on_map: Masks, off_map: Masks, state: OffMapState, *, least_s: float
+) -> tuple[Masks, OffMapState]:
+    """Return the epochs at which the train is off the map, shape (T,), and the state to pass on.
+
+    It leaves the map once all positions of the last `least_s` are off it, and returns once all of that time are on it:
+    a single position can be off the map by reflected signals, or on it by chance. The first position of a log decides
+    alone. `on_map`, `off_map`: positions that the ranges fit, and that they contradict, shape (T,).
+    """
+    off, known, since = state.off, state.known, state.since
+    result = np.full(len(time), off)
+    judged = np.flatnonzero(on_map | off_map)
+    runs = np.split(judged, np.flatnonzero(np.diff(off_map[judged])) + 1) if len(judged) else []
+    for run in runs:
+        says = bool(off_map[run[0]])
+        if known and says == off:
+            since = _NEVER
+            continue
+        since = time[run[0]] if np.isnat(since) else since
+        enough = run[seconds(time[run] - since) >= least_s] if known else run
+        if len(enough):
+            result[enough[0] :] = says
+            off, known, since = says, True, _NEVER
+    return result, OffMapState(off=off, known=known, since=since)
 
 
 #: Epochs whose covariances are in memory at a time.
@@ -124,7 +226,7 @@ class SingleEpochs:
     arc_m: Floats
     sigma_m: Floats
     near_ecef_m: Floats  #: 3-D position without the line, shape (T, 3).
-    off_map: Masks  #: The train is away from the line: `railfix.pipeline.return_gate`.
+    off_map: Masks  #: The train is away from the line: `railfix.pipeline.filter_result`.
     map_offset: Masks  #: 3-D positions of the last minutes lie beside or above the line.
     spoofed: Masks  #: Spoofing is suspected.
 

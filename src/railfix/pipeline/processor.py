@@ -20,11 +20,18 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import along_track, checked, with_passings
-from railfix.pipeline.assemble import antenna_results, with_coordinates
+from railfix.pipeline.antennas import (
+    AntennaOrder,
+    antenna_results,
+    filter_verdicts,
+    judge_pairs,
+    position_verdicts,
+    with_coordinates,
+    with_screens,
+)
 from railfix.pipeline.base_station import BaseStation, Stations, check_base
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook, combined
-from railfix.pipeline.compared import AntennaOrder, filter_verdicts, judge_pairs, position_verdicts, with_screens
 from railfix.pipeline.config import SCREEN_NAMES, Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, Models, conditions_of, correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures

@@ -17,10 +17,9 @@ from railfix.integrity.protection.araim import AraimResult
 from railfix.integrity.raim import Outcome
 from railfix.pipeline.base_station import BaseState
 from railfix.pipeline.carrier_stage import CarrierState
-from railfix.pipeline.filter_result import AlongTrack, FilterState
+from railfix.pipeline.filter_result import AlongTrack, FilterState, OffMapState
 from railfix.pipeline.interference_stage import Interference, InterferenceState
 from railfix.pipeline.received import Received
-from railfix.pipeline.return_gate import OffMapState
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.constrained import Constrained, SinglePoint
 from railfix.positioning.forgetting import LastingErrorState

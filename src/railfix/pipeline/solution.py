@@ -17,10 +17,10 @@ from railfix.integrity.raim import LinearModel
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
+from railfix.pipeline.filter_result import OffMapState, off_map_epochs
 from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.level_stage import bounding_model, low_sides, protection_levels, unresolved_alternatives
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
-from railfix.pipeline.return_gate import OffMapState, off_map_epochs
 from railfix.pipeline.solve import (
     Place,
     fault_free,
@@ -101,7 +101,7 @@ class Solution:
     phase: PhasePositions | None
     protection: ProtectionResult | None
     map_offset: MapOffset
-    off_map: Masks  #: The train is away from the line: `railfix.pipeline.return_gate`; shape (T,).
+    off_map: Masks  #: The train is away from the line: `railfix.pipeline.filter_result`; shape (T,).
     #: Of `railfix.pipeline.interference_stage`, which comes after; None where it is off.
     interference: Interference | None = None
     #: Of `railfix.pipeline.level_stage`, which comes after; None without an integrity support message.

@@ -21,7 +21,7 @@ from railfix.core.constants import CLOCK_GROUP
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.geodesy import enu_axes
-from railfix.evaluate.run_folder import RunFolder, read_run
+from railfix.evaluate.inputs import RunFolder, read_run
 from railfix.run.record import reading_table
 from railfix.track import read_track
 

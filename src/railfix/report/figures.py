@@ -13,8 +13,8 @@ from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError
 from railfix.core.tables import Table, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
+from railfix.evaluate.inputs import floats
 from railfix.evaluate.integrity import LEVELS_OF, epochs_diagram, level_name, positions_diagram
-from railfix.evaluate.run_folder import floats
 from railfix.evaluate.tables import evaluation_of, level_tables
 from railfix.pipeline.level_stage import prior_basis_text
 from railfix.report.charts_page import Absent, Block

@@ -13,7 +13,7 @@ from railfix.core.arrays import Floats
 from railfix.core.tables import number, share
 from railfix.evaluate import Evaluation
 from railfix.evaluate.figures import PASSED
-from railfix.evaluate.run_folder import floats
+from railfix.evaluate.inputs import floats
 from railfix.report.runs import ReportedRun, figures_of
 
 

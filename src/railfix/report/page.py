@@ -14,7 +14,7 @@ from railfix.core.arrays import Floats
 from railfix.core.files import write_whole
 from railfix.core.tables import Table, count, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
-from railfix.evaluate.run_folder import flattened
+from railfix.evaluate.inputs import flattened
 from railfix.evaluate.tables import error_tables, evaluation_of, group_tables
 from railfix.report.charts_page import (
     Absent,

@@ -95,7 +95,7 @@ def add_batch(checks: Mapping[str, BatchCheck], folder: OutputFolder) -> list[st
             at = np.minimum(np.searchsorted(own.batch.time, time[rows]), len(own.batch.time) - 1)
             known = own.batch.time[at] == time[rows]
             for column, spec in BATCH_COLUMNS.items():
-                values[column][rows[known]] = np.asarray(spec.values(own))[at[known]]
+                values[column][rows[known]] = np.asarray(spec.of(own))[at[known]]
         return table.with_columns(**{column: float_column(value) for column, value in values.items()})
 
     if found:

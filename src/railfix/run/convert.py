@@ -1,7 +1,7 @@
-"""Receiver logs as RINEX files, and positions of a run as messages of ROS 2 in an MCAP file.
+"""Receiver logs as RINEX files, positions of a run as messages of ROS 2, tables of EGNSS MATE in and out.
 
-Definitions are those of sensor_msgs, and of https://github.com/EGNSS-MATE/emate_ros (MIT), commit 9067868 of
-16 April 2024, written for ROS 1; the third holds the row of the table.
+Definitions of messages in an MCAP file are those of sensor_msgs, and of https://github.com/EGNSS-MATE/emate_ros (MIT),
+commit 9067868 of 16 April 2024, written for ROS 1; the third holds the row of the table.
 """
 
 from __future__ import annotations
@@ -17,16 +17,19 @@ import polars as pl
 import polars.selectors as cs
 
 from railfix import __version__
-from railfix.core.errors import NoPositionError, OutputError
+from railfix.core.errors import InputFileError, NoPositionError, OutputError
 from railfix.core.files import staged_file
-from railfix.core.timescale import gpst_to_utc
+from railfix.core.mate import WRITTEN, mate_table, only_device, read_mate
+from railfix.core.timescale import gpst_to_utc, utc_to_gpst
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.logs import read_navigation, scan_observations
 from railfix.io.positions_export import COORDINATES
 from railfix.io.rinex import write_navigation, write_observations
 from railfix.io.rinex.write_navigation import with_written_messages
 from railfix.run.inputs import LogReading
-from railfix.run.output import Overwrite, check_output_file
+from railfix.run.output import OutputFolder, Overwrite, check_output_file
+from railfix.track import Track
+from railfix.track.track import section_spans
 from railfix.tracking import TrackStatus
 
 
@@ -183,3 +186,162 @@ def _track(row: dict[str, Any], travelled_m: float) -> dict[str, Any]:
         "speed_ci": {"overestimation": nan, "underestimation": nan},
         "cross_track_dist": nan,
     }
+
+
+#: Inputs of a run by the table that gives them; of the two tables of the track the first that is there.
+_INPUTS: Final = {
+    "S_GNSS_SAT": "front", "S_DM_TRACKPOINT": "track", "S_DM_TRACK_SEGMENT_POSITION": "track", "S_IMU": "inertial",
+    "S_SPEEDOMETER": "radar", "S_BALISEREADER": "balises", "S_DM_BALISE": "balise_list",
+}  # fmt: skip
+#: Columns of a table of sensors by those of the schema.
+_COLUMNS: Final[dict[str, dict[str, str]]] = {
+    "S_IMU": {
+        "SPEC_FORCE_X": "force_forward_mps2", "SPEC_FORCE_Y": "force_right_mps2", "SPEC_FORCE_Z": "force_down_mps2",
+        "ANG_RATE_X": "roll_rate_radps", "ANG_RATE_Y": "pitch_rate_radps", "ANG_RATE_Z": "yaw_rate_radps",
+    },
+    "S_SPEEDOMETER": {"SPEED": "speed_mps"},
+}  # fmt: skip
+
+
+def inputs_of(folder: Path) -> dict[str, Any]:
+    """Return the inputs of a run that the tables in a folder give, by the names of `railfix.run.inputs.RunInputs`.
+
+    InputFileError: the folder has no S_GNSS_SAT, or no table of the track.
+    """
+    if not folder.is_dir():
+        raise InputFileError(folder, "--mate expects a folder with tables of EGNSS MATE")
+    tables = {name: path for path in sorted(folder.iterdir()) if (name := mate_table(path))}
+    given: dict[str, Any] = {}
+    for table, name in _INPUTS.items():
+        if table in tables and name not in given:
+            given[name] = (tables[table],) if name in ("front", "track") else tables[table]
+    for name, needed in (("front", "S_GNSS_SAT"), ("track", "S_DM_TRACK_SEGMENT_POSITION or S_DM_TRACKPOINT")):
+        if name not in given:
+            raise InputFileError(folder, f"has no table {needed} (.parquet or .csv) of EGNSS MATE; add it")
+    if not {"balises", "balise_list"} <= given.keys():  # one does not serve without the other
+        given = {name: path for name, path in given.items() if not name.startswith("balise")}
+    return given
+
+
+def sensor_table(path: Path, kind: str) -> pl.DataFrame:
+    """Return a table of the schema with the columns of the tables of sensors (`railfix.run.sensors.COLUMNS`).
+
+    InputFileError: the table is not one of that kind of sensor, or has rows of several devices.
+    """
+    name = mate_table(path)
+    expected = {"inertial": "S_IMU", "radar": "S_SPEEDOMETER", "balises": "S_BALISEREADER"}
+    if name != expected.get(kind, "S_DM_BALISE" if kind == "list of balises" else ""):
+        raise InputFileError(path, f"is the table {name} of EGNSS MATE, which is no table of the {kind}")
+    if name == "S_DM_BALISE":
+        table = read_mate(path, ("NID_C", "NID_BG", "N_PIG", "TRACK_EDGE_ID", "POSITION"))
+        rows = _first_of_group(table).unique(("NID_C", "NID_BG"), keep="last", maintain_order=True)
+        track = pl.col("TRACK_EDGE_ID").cast(pl.String)
+        return rows.select(_group(), chainage_m=pl.col("POSITION").cast(pl.Float64), track=track)
+    if name == "S_BALISEREADER":
+        table = only_device(path, read_mate(path, ("TIMESTAMP_UTC", "NID_C", "NID_BG", "N_PIG")))
+        return _in_gps_time(path, _first_of_group(table)).select("time_gpst", _group())
+    columns = _COLUMNS[name]
+    table = only_device(path, read_mate(path, ("TIMESTAMP_UTC", *columns)))
+    if name == "S_IMU" and table["COMPENSATED"].cast(pl.Boolean).fill_null(False).any():
+        raise InputFileError(path, "has compensated forces, without gravity; give specific forces, or leave it out")
+    codes = [column for column in table.columns if column.endswith("ERROR_CODE")]
+    good = table.filter(pl.all_horizontal(pl.col(column).cast(pl.Int64).fill_null(0) == 0 for column in codes))
+    values = [pl.col(column).cast(pl.Float64).alias(to) for column, to in columns.items()]
+    return _in_gps_time(path, good).select("time_gpst", *values)
+
+
+def _first_of_group(table: pl.DataFrame) -> pl.DataFrame:
+    """Rows of the balise of each group that its place is that of."""
+    return table.filter(pl.col("N_PIG").cast(pl.Int64).fill_null(0) == 0)
+
+
+def _group() -> pl.Expr:
+    """Identity of a balise group: country and group."""
+    parts = [pl.col(name).cast(pl.Int64).cast(pl.String) for name in ("NID_C", "NID_BG")]
+    return pl.concat_str(parts, separator="-").alias("balise")
+
+
+def _in_gps_time(path: Path, table: pl.DataFrame) -> pl.DataFrame:
+    """Rows in order of time, with the time of the schema as GPS time."""
+    column = table["TIMESTAMP_UTC"]
+    utc = column.str.to_datetime(time_unit="ns", strict=False) if column.dtype == pl.String else column
+    if not utc.dtype.is_temporal() or utc.is_null().any():
+        raise InputFileError(path, "TIMESTAMP_UTC has a value that is no time; correct the row")
+    gps = utc_to_gpst(utc.cast(pl.Datetime("ns")).to_numpy())
+    return table.with_columns(time_gpst=pl.Series(gps, dtype=pl.Datetime("ns"))).sort("time_gpst", maintain_order=True)
+
+
+def result_tables(train: pl.DataFrame, passings: pl.DataFrame | None, track: Track) -> dict[str, pl.DataFrame]:
+    """Return R_TRACK and R_ETCS_TPR of the first antenna of a run, from rows of its tables.
+
+    The last relevant balise group is the one read last, by the passings, empty before the first; track edges are the
+    track's sections.
+    """
+    rows = train.filter((pl.col("antenna") == pl.col("antenna").first()) & pl.col("chainage_m").is_not_null())
+    chainage, speed = rows["chainage_m"].to_numpy(), rows["speed_mps"].to_numpy()
+    spans = np.array(section_spans(track))
+    edge = np.clip(np.searchsorted(spans.max(axis=1), chainage), 0, len(spans) - 1)
+    names = [source.removesuffix(")").partition(" (")[2] or Path(source).stem for source in track.sections]
+    statuses = {status.text: int(status) for status in TrackStatus}
+    steps = np.abs(np.diff(chainage, prepend=chainage[:1]))
+    common = {
+        "ALGORITHM_ID": pl.lit(f"railfix {__version__}"),
+        "SENSOR_SET": pl.lit([], dtype=pl.List(pl.Int64)),
+        "PARAMETER_SET": pl.lit(json.dumps({"Reference_System": track.provenance.crs})),
+        "TIMESTAMP_UTC": pl.Series(gpst_to_utc(rows["time_gpst"].to_numpy()), dtype=pl.Datetime("us")),
+        "STATUS": rows["status"].cast(pl.String).replace_strict(statuses, return_dtype=pl.Int64),
+        "TRAVELLED_DISTANCE": _metres(np.cumsum(steps)),
+        "SPEED": _metres(np.abs(speed)),
+        "ACCELERATION": rows["acceleration_mps2"].round(3),
+    }
+    doubt = {"OVER": rows["over_reading_m"].round(3), "UNDER": rows["under_reading_m"].round(3)}
+    rising = rows["direction"].cast(pl.String).replace_strict({"rising": True, "falling": False}, default=None)
+    on_track = common | {
+        "TRACK_ID": pl.Series([[names[k]] for k in edge.tolist()], dtype=pl.List(pl.String)),
+        "MOVEMENT_DIRECTION": rising,
+        "RELATIVE_DISTANCE": _metres(np.abs(chainage - spans[edge, 0])),
+        "OVERESTIMATION_DISTANCE": doubt["OVER"],
+        "UNDERESTIMATION_DISTANCE": doubt["UNDER"],
+    }
+    last = _last_balise(rows, passings)
+    beyond = chainage - last["chainage_m"].to_numpy()
+    to_etcs = common | {
+        "NID_LRBG_C": last["balise"].str.split("-").list.get(0, null_on_oob=True).cast(pl.Int64, strict=False),
+        "NID_LRBG_BG": last["balise"].str.split("-").list.get(1, null_on_oob=True).cast(pl.Int64, strict=False),
+        "NID_LRBG_PIG": pl.when(last["balise"].is_not_null()).then(0),
+        "D_LRBG": _metres(np.abs(beyond)),
+        "Q_DLRBG": pl.Series(np.where(np.isnan(beyond), 2, beyond >= 0.0).astype(np.int64)),
+        "Q_DIRTRAIN": rising.cast(pl.Int64).fill_null(2),
+        "L_DOUBTOVER": doubt["OVER"],
+        "L_DOUBTUNDER": doubt["UNDER"],
+    }
+    return {"R_TRACK": _written("R_TRACK", rows, on_track), "R_ETCS_TPR": _written("R_ETCS_TPR", rows, to_etcs)}
+
+
+def add_mate_results(folder: OutputFolder, track: Track, log: Path) -> None:
+    """Write R_TRACK.parquet and R_ETCS_TPR.parquet from the tables of a run with a filter on a log of EGNSS MATE."""
+    train = folder.staging / "train.parquet"
+    if not (mate_table(log) and train.exists()):
+        return
+    passings = folder.staging / "passings.parquet"
+    found = result_tables(pl.read_parquet(train), pl.read_parquet(passings) if passings.exists() else None, track)
+    for name, table in found.items():
+        table.write_parquet(folder.staged(f"{name}.parquet"))
+
+
+def _metres(values: np.ndarray) -> pl.Series:
+    return pl.Series(values=np.round(values, 3), nan_to_null=True)
+
+
+def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFrame:
+    """The balise read last before each row, with its chainage; null before the first."""
+    empty = pl.DataFrame(schema={"read_gpst": pl.Datetime("ns"), "balise": pl.String, "chainage_m": pl.Float64})
+    read = empty if passings is None else passings.filter(pl.col("verdict") == "read").select(empty.columns)
+    times = rows.select(pl.col("time_gpst").cast(pl.Datetime("ns")))
+    found = times.join_asof(read.sort("read_gpst"), left_on="time_gpst", right_on="read_gpst", strategy="backward")
+    return found.with_columns(pl.col("chainage_m").fill_null(np.nan))
+
+
+def _written(table: str, rows: pl.DataFrame, values: dict[str, Any]) -> pl.DataFrame:
+    """The columns of a table of the schema in their order; those that railfix has not are empty."""
+    return rows.select(**{name: values.get(name, pl.lit(None)) for name in WRITTEN[table]})

@@ -24,8 +24,8 @@ from railfix.pipeline.level_stage import basis_of, level_facts, prior_basis_text
 from railfix.pipeline.processor import EpochProcessor, SolvedChunk, State
 from railfix.run.batch_check import BatchCheck, add_batch
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
+from railfix.run.convert import add_mate_results
 from railfix.run.inputs import Antenna, RunInputs, RunOptions
-from railfix.run.mate import add_mate_results
 from railfix.run.output import OutputFolder
 from railfix.run.processor import Beside, base_log, processor_of
 from railfix.run.record import AlongSigma, Figures, Filtered, Levels, RunProvenance, package_versions, run_record

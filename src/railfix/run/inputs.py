@@ -197,7 +197,7 @@ class RunInputs(InputFiles):
         """Inputs that a folder of tables gives, beside those that are given themselves."""
         if not isinstance(values, dict) or values.get("mate") is None:
             return values
-        from railfix.run.mate import inputs_of
+        from railfix.run.convert import inputs_of
 
         given = {name: value for name, value in values.items() if name != "mate" and value not in (None, ())}
         return {**inputs_of(Path(values["mate"])), **given}

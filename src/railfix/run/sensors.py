@@ -25,7 +25,7 @@ from railfix.motion.samples import (
     TachometerPulses,
 )
 from railfix.pipeline.config import Config
-from railfix.run.mate import sensor_table
+from railfix.run.convert import sensor_table
 from railfix.track import Track
 from railfix.track.track import section_spans
 

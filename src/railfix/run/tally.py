@@ -15,7 +15,7 @@ from railfix.core.arrays import Datetimes, Floats, Masks, Strings
 from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.integrity.interference import CAUSES
 from railfix.integrity.protection import Cause, LevelStatus
-from railfix.pipeline.compared import AntennaOrder
+from railfix.pipeline.antennas import AntennaOrder
 from railfix.pipeline.filter_result import AlongTrack, Replay, smooth
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult, Result

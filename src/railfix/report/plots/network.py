@@ -11,7 +11,7 @@ from railfix.core.arrays import Floats, Indices
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.report.plots.chart import BLACK, BLUE, GREEN, GREY, ORDERED, RED, Chart, Curve, Layer, Marks, Points
 from railfix.report.plots.draw import draw_figure, save_figure
-from railfix.run.survey import Surveyed
+from railfix.run.locate import Surveyed
 from railfix.track import Track, TrackQuality
 from railfix.track.network import Network, end_points
 from railfix.track.network_check import NetworkQuality
