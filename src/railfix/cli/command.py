@@ -111,6 +111,17 @@ class Commands(TyperGroup):
             _end(InputFileError(loop.group(1), "is a symbolic link that leads to itself; link to the file"))
 
 
+#: Of every program: rich formats help alone.
+_TYPER: Final[dict[str, Any]] = {
+    "add_completion": False, "pretty_exceptions_enable": False, "rich_markup_mode": "markdown"
+}  # fmt: skip
+
+
+def command_group(name: str, **options: Any) -> typer.Typer:
+    """Return a group of commands; without one of them it shows its help."""
+    return typer.Typer(name=name, cls=Commands, no_args_is_help=True, **_TYPER, **options)
+
+
 class LazyCommands(Commands):
     """The commands of the program, each imported from its module when it is called; `summaries` are for their list."""
 
@@ -150,7 +161,7 @@ def loaded(name: str, module_name: str | None = None) -> Any:
         gc.enable()
     app = getattr(module, "app", None)
     if app is None:
-        app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="markdown")
+        app = typer.Typer(**_TYPER)
         app.command(name, cls=Command)(getattr(module, word))
     command = typer.main.get_command(app)
     command.name = name

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from railfix.cli.command import Command, Commands
+from railfix.cli.command import Command, command_group
 from railfix.cli.console import console_of_tables, show_files, show_table
 from railfix.cli.options import check_outputs, from_models
 from railfix.core.errors import MismatchError, OutputError, SettingsError
@@ -23,14 +23,7 @@ from railfix.run.output import Overwrite
 if TYPE_CHECKING:
     from railfix.ground.triangle import Order
 
-app = typer.Typer(
-    cls=Commands,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    name="ground",
-    no_args_is_help=True,
-    rich_markup_mode="markdown",
-)
+app = command_group("ground")
 
 
 @app.callback()

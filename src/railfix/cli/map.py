@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from railfix.cli.command import Command, Commands
+from railfix.cli.command import Command, command_group
 from railfix.cli.console import console_of_tables, show_notes, show_table
 from railfix.cli.map_network import Columns, MapReading, match_command, network, route
 from railfix.cli.map_runs import service, survey
@@ -29,14 +29,8 @@ from railfix.track import (
     write_track_csv,
 )
 
-app = typer.Typer(
-    cls=Commands,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    name="map",
-    no_args_is_help=True,
-    rich_markup_mode="markdown",
-    help="Check a track map, make one from positions or of a network, and put positions on a network.",
+app = command_group(
+    "map", help="Check a track map, make one from positions or of a network, and put positions on a network."
 )
 
 TracksArgument = Annotated[

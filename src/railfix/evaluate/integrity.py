@@ -67,9 +67,7 @@ STANFORD_COLUMNS: Final[dict[str, str]] = {
     "windows_15_s": "windows of 15 s from an available epoch on",
     "kept_15_s": "windows with every epoch available",
     "continuity_15_s": "kept / windows; not by environment",
-    "windows_60_s": "the same for 60 s",
-    "kept_60_s": "the same for 60 s",
-    "continuity_60_s": "the same for 60 s",
+    **dict.fromkeys(("windows_60_s", "kept_60_s", "continuity_60_s"), "the same for 60 s"),
 }
 
 #: Columns of the list of epochs beyond, with their unit and meaning; KIND is that of the level.
@@ -81,9 +79,7 @@ BEYOND_COLUMNS: Final[dict[str, str]] = {
     "environment": "of the reference or of the sections, else `unknown`",
     "error_m": "position on the map, + toward the end of the line",
     "KIND_level_m": "protection level",
-    "KIND_fault_free_m": "part of the level",
-    "KIND_one_fault_m": "part of the level",
-    "KIND_two_faults_m": "part of the level",
+    **dict.fromkeys(("KIND_fault_free_m", "KIND_one_fault_m", "KIND_two_faults_m"), "part of the level"),
     "KIND_cause": "cause of the level",
     "KIND_status": "status of the level",
     "status": "status of the epoch",

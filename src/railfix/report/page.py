@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import count as counter
 from pathlib import Path
@@ -29,7 +29,7 @@ from railfix.report.charts_page import (
     render,
 )
 from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, Group, antenna_groups, overview, protection, run_group
-from railfix.report.headline import Headline, headline
+from railfix.report.headline import headline
 from railfix.report.plots.errors import error_ranges
 from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.runs import ReportedRun, figures_of, read_runs
@@ -221,29 +221,6 @@ def _word(value: Any) -> str:
 _LEAST_SKY: Final = 200
 
 
-@dataclass(frozen=True, kw_only=True)
-class _AntennaPart:
-    """Charts of one antenna."""
-
-    name: str
-    anchor: str
-    parts: Sequence[PagePart]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _RunPart:
-    """Everything on one run."""
-
-    name: str
-    anchor: str
-    antenna: str
-    headline: Headline
-    overview: PagePart
-    tables: Sequence[Folded]
-    timing: PagePart
-    antennas: Sequence[_AntennaPart]
-
-
 def write_report(
     runs: Sequence[Path],
     out: Path,
@@ -351,7 +328,8 @@ def _run(
     *,
     sky: int,
     background: Sequence[Floats],
-) -> _RunPart:
+) -> dict[str, Any]:
+    """Return everything on one run, as the template takes it."""
     anchor, first = f"run{number}", run.folder.antennas[0]
     errors: list[Folded] = []
     if evaluation is not None:
@@ -361,32 +339,32 @@ def _run(
     def place(i: int) -> str:
         return f"sky{number}-{i}" if run.observations is not None else ""
 
-    return _RunPart(
-        name=run.name,
-        anchor=anchor,
-        antenna=first,
-        headline=headline(run, first, evaluation),
-        overview=_part(overview(run, first, background), numbers, place(0), anchor, width="half"),
-        tables=(
+    return {
+        "name": run.name,
+        "anchor": anchor,
+        "antenna": first,
+        "headline": headline(run, first, evaluation),
+        "overview": _part(overview(run, first, background), numbers, place(0), anchor, width="half"),
+        "tables": (
             *errors,
             Folded("Epochs and pseudoranges", budget(run)),
             Folded("Protection level", protection(run, evaluation)),
             Folded("Run, inputs and notes", provenance(run)),
             Folded("Settings asked for and used", settings(run)),
         ),
-        timing=_part(run_group(run), numbers, "", anchor),
-        antennas=[
-            _AntennaPart(
-                name=antenna,
-                anchor=f"{anchor}-{i}",
-                parts=[
+        "timing": _part(run_group(run), numbers, "", anchor),
+        "antennas": [
+            {
+                "name": antenna,
+                "anchor": f"{anchor}-{i}",
+                "parts": [
                     _part(group, numbers, place(i), anchor)
                     for group in antenna_groups(run, antenna, sky=sky, background=background)
                 ],
-            )
+            }
             for i, antenna in enumerate(run.folder.antennas)
         ],
-    )
+    }
 
 
 def _part(group: Group, numbers: Iterator[int], sky: str, anchor: str, *, width: str = "") -> PagePart:
