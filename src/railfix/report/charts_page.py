@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from importlib.resources import files
 from itertools import count
 from pathlib import Path
@@ -194,27 +195,16 @@ _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; script-src 'uns
 
 
 @dataclass(frozen=True)
-class Sentence:
-    """A paragraph of text."""
+class Text:
+    """A text of a kind: "sentence", "absent" (why the page does not have something) or "command"."""
 
-    kind: ClassVar[str] = "sentence"
+    kind: str
     text: str
 
 
-@dataclass(frozen=True)
-class Absent:
-    """A sentence on content that the page does not have, with the reason."""
-
-    kind: ClassVar[str] = "absent"
-    text: str
-
-
-@dataclass(frozen=True)
-class ReportedCommand:
-    """A command line."""
-
-    kind: ClassVar[str] = "command"
-    text: str
+Sentence: Final = partial(Text, "sentence")
+Absent: Final = partial(Text, "absent")
+ReportedCommand: Final = partial(Text, "command")
 
 
 @dataclass(frozen=True)
@@ -235,7 +225,7 @@ class Folded:
     blocks: Sequence[Block]
 
 
-Block = Table | Sentence | Absent | ReportedCommand | Notes | Folded
+Block = Table | Text | Notes | Folded
 
 
 @dataclass(frozen=True, kw_only=True)
