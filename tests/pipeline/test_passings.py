@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from railfix.motion.samples import BaliseReadings, ListedBalises
-from railfix.pipeline.balises import VERDICTS, BaliseLimits, Passing, PassingState, find_passings
-from railfix.pipeline.tables import balise_notes
+from railfix.pipeline.balises import VERDICTS, BaliseLimits, Passing, PassingState, balise_notes, find_passings
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Tracked, TrackStatus

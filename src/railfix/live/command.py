@@ -31,9 +31,10 @@ from railfix.live.stream import FOREVER, Sensed
 from railfix.live.warm_up import prepare_kernels
 from railfix.live.watches import PlaceWatch, SensorWatch
 from railfix.motion.samples import SensorSamples
+from railfix.pipeline.balises import balise_notes
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
-from railfix.pipeline.tables import balise_notes, passing_table, positions_table, rounded, train_table
+from railfix.pipeline.tables import passing_table, positions_table, rounded, train_table
 from railfix.run.driver import time_of
 from railfix.run.output import OutputFolder, Overwrite, check_not_input
 from railfix.run.processor import place_of, processor_of

@@ -7,7 +7,7 @@ other, also where it backs.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Final
 
@@ -280,3 +280,25 @@ def _pass(
         if entered:
             sure[mark], over[mark] = entered, _NEVER
     return found, replace(state, side=sure, since=since, over=over, over_values=over_values)
+
+
+def balise_notes(antenna: str, passings: Iterable[Passing]) -> list[str]:
+    """Return a sentence on each balise that was missed, or read where it is not."""
+    notes = []
+    for passing in passings:
+        at, name = str(passing.time)[:21], f"{antenna}: balise {passing.balise}"
+        if passing.verdict == MISSING:
+            early, late = str(passing.earliest)[:21], str(passing.latest)[11:21]
+            notes.append(
+                f"{name} at chainage {passing.chainage_m:.1f} m was passed between {early} and {late} without a reading"
+            )
+        elif passing.verdict == CONTRADICTS:
+            which = f", next to {passing.here}" if passing.here and passing.here != passing.balise else ""
+            notes.append(
+                f"{name}, read at {at}, contradicts the filter: it is listed at {passing.chainage_m:.1f} m, the train "
+                f"was {abs(passing.read_error_m):.1f} m from there (sigma {passing.sigma_m:.1f} m){which}; a wrong "
+                "identity, or a wrong place in the list"
+            )
+        elif passing.verdict == NOT_LISTED:
+            notes.append(f"{name}, read at {at}, is not listed on this line; the reading is not used")
+    return notes

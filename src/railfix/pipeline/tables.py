@@ -5,7 +5,7 @@ Times are GPS time without a time zone, to the nanosecond. Absent values are nul
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,7 +16,7 @@ from railfix.core.arrays import Floats, Strings
 from railfix.core.reasons import Reason, reason_text
 from railfix.motion.slip import MotionState
 from railfix.pipeline.along_track import on_line_m
-from railfix.pipeline.balises import CONTRADICTS, MISSING, NOT_LISTED, VERDICTS, Passing
+from railfix.pipeline.balises import VERDICTS, Passing
 from railfix.pipeline.filter_result import AlongTrack, SmoothedTrack
 from railfix.pipeline.result_columns import (
     CHANNEL_COLUMNS,
@@ -434,25 +434,3 @@ def passing_table(result: Result) -> pl.DataFrame:
     parts = [table_of(PASSING_COLUMNS, own.passings, len(own.passings), antenna=name)
              for name, own in result.fusion.items()]  # fmt: skip
     return pl.concat(parts).sort("time_gpst", maintain_order=True) if parts else table_of(PASSING_COLUMNS, (), 0)
-
-
-def balise_notes(antenna: str, passings: Iterable[Passing]) -> list[str]:
-    """Return a sentence on each balise that was missed, or read where it is not."""
-    notes = []
-    for passing in passings:
-        at, name = str(passing.time)[:21], f"{antenna}: balise {passing.balise}"
-        if passing.verdict == MISSING:
-            early, late = str(passing.earliest)[:21], str(passing.latest)[11:21]
-            notes.append(
-                f"{name} at chainage {passing.chainage_m:.1f} m was passed between {early} and {late} without a reading"
-            )
-        elif passing.verdict == CONTRADICTS:
-            which = f", next to {passing.here}" if passing.here and passing.here != passing.balise else ""
-            notes.append(
-                f"{name}, read at {at}, contradicts the filter: it is listed at {passing.chainage_m:.1f} m, the train "
-                f"was {abs(passing.read_error_m):.1f} m from there (sigma {passing.sigma_m:.1f} m){which}; a wrong "
-                "identity, or a wrong place in the list"
-            )
-        elif passing.verdict == NOT_LISTED:
-            notes.append(f"{name}, read at {at}, is not listed on this line; the reading is not used")
-    return notes

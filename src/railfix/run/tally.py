@@ -16,13 +16,13 @@ from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.integrity.interference import CAUSES
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.pipeline.antennas import AntennaOrder
+from railfix.pipeline.balises import balise_notes
 from railfix.pipeline.filter_result import AlongTrack, Replay, smooth
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.tables import (
     antenna_positions,
     antenna_train,
-    balise_notes,
     observations_table,
     passing_table,
     positions_table,
