@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from railfix.gnss.signals import carrier_frequency_hz
+from railfix.gnss.observations import carrier_frequency_hz
 
 
 @pytest.mark.requirement("A7")

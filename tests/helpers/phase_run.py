@@ -10,12 +10,12 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
 from railfix.positioning.carrier import PhaseLimits, PhasePositions, Phases
 from railfix.positioning.carrier.ambiguities import (
     ArcAmbiguities,
-    assembled,
+    assemble_positions,
     hop_of,
     inverse_of_arcs,
     moved,
+    prepare_start,
     repeats_of,
-    startable,
 )
 from railfix.positioning.carrier.observation_model import (
     Linearised,
@@ -23,7 +23,7 @@ from railfix.positioning.carrier.observation_model import (
     own_clock,
     own_unknowns,
     reduce,
-    shifted,
+    shift_phases,
 )
 from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
@@ -61,7 +61,7 @@ def phase_run(
     """
     limits = limits or PhaseLimits()
     started = np.isfinite(arc_m_start)
-    ranges, phases, arc = startable(ranges, phases, trajectory, arc_m_start)
+    ranges, phases, arc = prepare_start(ranges, phases, trajectory, arc_m_start)
     used = phases.weight > 0
     # Row-major: the first place of an arc is its first epoch.
     walk = _walk(hop_of(time, limits), used, phases.arc_id, limits)
@@ -74,7 +74,7 @@ def phase_run(
         lin = linearise(ranges, phases, trajectory, arc, clocks=limits.clocks)
         if iteration == 0:
             base[:count] = lin.phase_m[used][first]
-        lin = shifted(lin, base[index])
+        lin = shift_phases(lin, base[index])
         value, covariance = _solved(lin, index, walk.links)
         among = covariance[index[:, :, None], index[:, None, :]]
         own = own_unknowns(lin, value[index], among, trajectory, repeats=repeats_of(time, limits))
@@ -87,7 +87,7 @@ def phase_run(
     arcs = ArcAmbiguities(arc_id=walk.arc_id, ambiguity_m=total[:count], covariance_m2=covariance[:count, :count])
     fixes = np.zeros(len(arc), dtype=np.int64), np.full(len(arc), np.nan)
     ambiguity = (total[index], np.diagonal(covariance)[index])
-    return replace(assembled(arc, started, own, lin, ambiguity, arcs, fixes, limits), iterations=iteration)
+    return replace(assemble_positions(arc, started, own, lin, ambiguity, arcs, fixes, limits), iterations=iteration)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,8 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.observations import Observations
+from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.gnss.orbits import satellite_states
-from railfix.gnss.signals import carrier_frequency_hz
 
 #: Path loss at 1 m on L1 [dB]; noise of the receiver [dBm/Hz]; bandwidth of a chirp jammer [dB-Hz].
 _LOSS_1M_DB, _NOISE_DBM, _BANDWIDTH_DBHZ = 36.4, -172.0, 70.0

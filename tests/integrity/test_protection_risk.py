@@ -13,8 +13,7 @@ from scipy.stats import chi2, norm
 import raim_oracle as oracle
 from protection_oracle import Event, hypotheses, kind_of, products
 from railfix.integrity.protection import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, RiskBudget, k_factor
-from railfix.integrity.protection.allocation import allocate
-from railfix.integrity.protection.risk import pair_sum, set_sums
+from railfix.integrity.protection.risk import allocate, pair_sum, set_sums
 
 pytestmark = pytest.mark.requirement("C2")
 

@@ -9,7 +9,7 @@ import pytest
 
 import raim_oracle as oracle
 from railfix.core.geodesy import range_with_rotation
-from railfix.integrity.protection import RiskBudget, allocation, along_track_level
+from railfix.integrity.protection import RiskBudget, along_track_level, risk
 from railfix.integrity.protection.level import MapDeviation
 from railfix.integrity.raim import constrained_model
 from railfix.positioning.normal_equations import Ranges
@@ -93,10 +93,10 @@ def test_faults_together_stay_within_the_level(kind: str, monkeypatch: pytest.Mo
     allowed = RISK.risk_per_sample / likely
     assert found <= allowed + 4.0 * np.sqrt(allowed / EPOCHS)
 
-    def least(classes: allocation._Classes, *_: object) -> np.ndarray:
+    def least(classes: risk._Classes, *_: object) -> np.ndarray:
         return np.where(classes.each > 0.0, classes.least, -1)
 
-    monkeypatch.setattr(allocation._Classes, "chosen", least)
-    monkeypatch.setattr(allocation._Classes, "rest", lambda classes, _: np.zeros(len(classes.each)))
+    monkeypatch.setattr(risk._Classes, "chosen", least)
+    monkeypatch.setattr(risk._Classes, "rest", lambda classes, _: np.zeros(len(classes.each)))
     careless = exceeded(systems, members, wrong_map=wrong_map)
     assert careless > found

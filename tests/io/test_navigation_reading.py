@@ -11,7 +11,7 @@ import pytest
 
 from navigation_text import KEPLER, header, label, number, record, record_2, write
 from railfix.gnss.navigation import Navigation, glonass_channels
-from railfix.gnss.signals import carrier_frequency_hz
+from railfix.gnss.observations import carrier_frequency_hz
 from railfix.io.rinex import read_navigation
 
 pytestmark = pytest.mark.requirement("A7")

@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from railfix.core import files
 from railfix.core.errors import InputFileError
 from railfix.gnss.observations import Observations, concatenate
-from railfix.io.rinex import observations_blocks, observations_decode, read_observations, scan_observations
+from railfix.io.rinex import observations_decode, read_observations, scan_observations
+from railfix.io.rinex.observations import BlockReader, Selection
 from rinex_observations_text import epoch_2, epoch_3, event_2, field, header_2, header_3, record, text_of, write
 
 pytestmark = pytest.mark.requirement("A7")
@@ -102,8 +103,8 @@ def test_pieces_are_the_whole(tmp_path: Path, log: type, epochs: int) -> None:
 @pytest.mark.parametrize("block_bytes", [700, 3000, 20000])
 def test_where_blocks_of_text_end_does_not_matter(tmp_path: Path, log: type, block_bytes: int) -> None:
     path = write(tmp_path / "log", log(), strip=block_bytes != 3000, end="\r\n" if block_bytes == 700 else "\n")
-    wanted = observations_blocks.Selection(broken_lines="count")
-    runs = list(observations_blocks.BlockReader(path, wanted, block_bytes=block_bytes).blocks())
+    wanted = Selection(broken_lines="count")
+    runs = list(BlockReader(path, wanted, block_bytes=block_bytes).blocks())
     assert len(runs) > 2
     joined = concatenate([run for run in runs if len(run)])
     whole = read_observations(path, broken_lines="count")
@@ -127,7 +128,7 @@ def test_a_break_is_kept_where_a_block_ends_after_the_event(tmp_path: Path, flag
     expected = [False, False, True, False, True, False, True, False]
     assert read_observations(path).break_before.tolist() == expected
     for block_bytes in range(60, 160, 7):
-        runs = observations_blocks.BlockReader(path, observations_blocks.Selection(), block_bytes=block_bytes).blocks()
+        runs = BlockReader(path, Selection(), block_bytes=block_bytes).blocks()
         found = [bool(broken) for run in runs for broken in run.break_before]
         assert found == expected, block_bytes
 

@@ -19,8 +19,7 @@ from railfix.core.errors import OutputError
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import ObservationHeader, Observations, concatenate
 from railfix.io.rinex import read_navigation, read_observations, write_navigation, write_observations
-from railfix.io.rinex.packing import packing_of
-from railfix.io.rinex.write import _fixed_3
+from railfix.io.rinex.write import _fixed_3, packing_of
 from railfix.simulate import Scenario, SkySettings, simulated_navigation
 
 START = np.datetime64("2024-03-05T23:59:58.5", "ns")

@@ -15,8 +15,7 @@ from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
-from railfix.positioning.forgetting import ages, decayed_sums
-from railfix.positioning.noise_scale import NoiseScaleLimits, epoch_variance, robust_fit
+from railfix.positioning.noise_scale import NoiseScaleLimits, ages, decayed_sums, epoch_variance, robust_fit
 from railfix.positioning.normal_equations import Ranges
 from railfix.simulate.demonstration import demo_files
 

@@ -13,8 +13,7 @@ from scipy.stats import chi2
 from pipeline_cases import clean_navigation, clean_observations, clean_trajectories, front_alone, only, with_code
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
-from railfix.gnss.observations import Observations
-from railfix.gnss.signals import carrier_frequency_hz
+from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
 from railfix.pipeline import level_stage, solution, solve

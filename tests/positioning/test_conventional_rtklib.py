@@ -26,8 +26,7 @@ import pytest
 import recordings_truth
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.observations import Observations
-from railfix.gnss.signals import carrier_frequency_hz
+from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.io.position_log import read_positions
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import parse_config

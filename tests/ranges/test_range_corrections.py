@@ -22,7 +22,15 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor, Models
 from railfix.positioning.normal_equations import Ranges
 from railfix.ranges.atmosphere import SeenFrom, modelled_delays
-from railfix.ranges.corrected import corrected_satellites, sbas_delays
+from railfix.ranges.corrected import (
+    CodeNoise,
+    NominalErrors,
+    channel_order,
+    code_sigma_m,
+    corrected_satellites,
+    first_available,
+    sbas_delays,
+)
 from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel, FaultRate
 from railfix.ranges.sbas import (
     IonosphereDelays,
@@ -32,7 +40,6 @@ from railfix.ranges.sbas import (
     SbasCorrections,
     read_sbas,
 )
-from railfix.ranges.weights import CodeNoise, NominalErrors, channel_order, code_sigma_m, first_available
 from railfix.run.processor import processor_of
 from recordings_score import straight_line
 

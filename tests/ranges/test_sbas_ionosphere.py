@@ -10,8 +10,15 @@ import pytest
 import sbas_cases as cases
 from railfix.ranges.atmosphere import rtca_troposphere_m, rtca_troposphere_sigma_m
 from railfix.ranges.sbas import IonosphereDelays, IonosphereState, SbasCorrections, SbasLimits
-from railfix.ranges.sbas.grid import BANDS, CELLS_OF_POINT, POINT_OF_BIT, point_number
-from railfix.ranges.sbas.ionosphere import EARTH_RADIUS_KM, LAYER_HEIGHT_KM, pierce_point
+from railfix.ranges.sbas.ionosphere import (
+    BANDS,
+    CELLS_OF_POINT,
+    EARTH_RADIUS_KM,
+    LAYER_HEIGHT_KM,
+    POINT_OF_BIT,
+    pierce_point,
+    point_number,
+)
 
 pytestmark = pytest.mark.requirement("C1")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from railfix.ranges.sbas.grid import Spans, distinct_lookups, looked_up
+from railfix.ranges.sbas.ionosphere import Spans, distinct_lookups, looked_up
 from railfix.ranges.sbas.tables import Series, _with_other
 
 pytestmark = pytest.mark.requirement("C1")

@@ -19,7 +19,7 @@ from railfix.core.timescale import seconds
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.reference import read_acceleration, read_pulses
 from railfix.simulate import Scenario, write_run
-from railfix.simulate.sensors.settings import InertialSettings, SensorSettings, TachometerSettings
+from railfix.simulate.settings import InertialSettings, SensorSettings, TachometerSettings
 
 pytestmark = pytest.mark.requirement("D1")
 

@@ -13,8 +13,8 @@ from railfix.pipeline.config import Config
 from railfix.run.sensors import balises_of, read_listed_balises, read_sensors
 from railfix.simulate import Simulation
 from railfix.simulate.scenario_file import load_recipe
-from railfix.simulate.sensors import Balise, BaliseSettings, SensorSettings
-from railfix.simulate.sensors.tables import COLUMNS, sensor_tables
+from railfix.simulate.sensor_tables import COLUMNS, sensor_tables
+from railfix.simulate.settings import Balise, BaliseSettings, SensorSettings
 from railfix.track import Track, read_track, write_track_csv
 
 HEADER = "balise,chainage_m\n"

@@ -8,20 +8,19 @@ import numpy as np
 import polars as pl
 import pytest
 
+from mate_made import write_mate_tables
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.mate import READ, WRITTEN, mate_table
 from railfix.io.logs import read_observations
-from railfix.io.mate import signal_code
+from railfix.io.mate import READ, WRITTEN, mate_table, signal_code
 from railfix.pipeline.config import Config
 from railfix.run import RunInputs, RunOptions, run_files
 from railfix.run.convert import inputs_of
 from railfix.run.inputs import TrackReading
 from railfix.run.sensors import read_listed_balises, read_sensors
 from railfix.simulate import Simulation
-from railfix.simulate.mate_tables import write_mate_tables
 from railfix.simulate.run import write_run
 from railfix.simulate.scenario_file import load_recipe
-from railfix.simulate.sensors import BaliseSettings, InertialSettings, RadarSettings, SensorSettings
+from railfix.simulate.settings import BaliseSettings, InertialSettings, RadarSettings, SensorSettings
 from railfix.track import read_track
 
 SENSORS = SensorSettings(

@@ -15,9 +15,8 @@ from pipeline_cases import clean_files, clean_observations, processor
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, enu_axes
 from railfix.core.timescale import timedelta
-from railfix.gnss.observations import Observations
+from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.gnss.orbits import satellite_states
-from railfix.gnss.signals import carrier_frequency_hz
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.screens import (
     AntennaPairLimits,

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from conftest import ROOT
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import timedelta
-from railfix.gnss.observations import Observations
-from railfix.gnss.signals import carrier_frequency_hz
+from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.io.rinex import read_observations
 from railfix.screens import DopplerLimits, DopplerScreened, DopplerState, doppler_limit_m, doppler_screen
 from railfix.screens.doppler import DopplerChannels

@@ -30,9 +30,9 @@ from railfix.simulate.environment.walls import (
     second_reflection,
     street_reflections,
 )
-from railfix.simulate.errors.settings import TrackingSettings
 from railfix.simulate.receiver import CodeSmoothing, TrackingNoise
 from railfix.simulate.scenario_file import load_scenario
+from railfix.simulate.settings import TrackingSettings
 from test_simulate_environment import LINE_M, WAVE, rays, section, seen, wall
 from test_simulate_signals import whole
 

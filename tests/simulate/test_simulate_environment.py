@@ -26,7 +26,7 @@ from railfix.simulate.environment import (
     drawn_sections,
 )
 from railfix.simulate.environment.correlator import edge_amplitude, strip_field, tracked
-from railfix.simulate.environment.masts import Electrification
+from railfix.simulate.environment.model import Electrification
 from railfix.simulate.environment.structures import build_structures
 from railfix.simulate.environment.walls import Rays, reflections, shadow
 

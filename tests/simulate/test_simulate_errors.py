@@ -10,8 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
-from railfix.gnss.observations import concatenate
-from railfix.gnss.signals import carrier_frequency_hz
+from railfix.gnss.observations import carrier_frequency_hz, concatenate
 from railfix.simulate import (
     Disturbance,
     Piece,
@@ -24,6 +23,14 @@ from railfix.simulate import (
 )
 from railfix.simulate.constellation import links
 from railfix.simulate.errors import (
+    CommonErrors,
+    GaussMarkov,
+    ionosphere_mapping,
+    pierce_point_km,
+    troposphere_mapping,
+)
+from railfix.simulate.receiver import CarriedNoise, NoiseSettings, TrackingNoise, TrackingSettings
+from railfix.simulate.settings import (
     ClockWalkSettings,
     ErrorSettings,
     InterSystemSettings,
@@ -32,9 +39,6 @@ from railfix.simulate.errors import (
     SatelliteFault,
     TroposphereErrorSettings,
 )
-from railfix.simulate.errors.common import CommonErrors, ionosphere_mapping, pierce_point_km, troposphere_mapping
-from railfix.simulate.errors.processes import GaussMarkov
-from railfix.simulate.receiver import CarriedNoise, NoiseSettings, TrackingNoise, TrackingSettings
 
 pytestmark = pytest.mark.requirement("D4")
 

@@ -39,8 +39,14 @@ from railfix.simulate import (
     write_run,
 )
 from railfix.simulate.environment.settings import ElectrificationSettings, EnvironmentSettings, SectionSettings
-from railfix.simulate.errors.settings import ErrorSettings, SatelliteErrorSettings, SatelliteFault
-from railfix.simulate.sensors.settings import SensorSettings, SlipInterval, TachometerSettings
+from railfix.simulate.settings import (
+    ErrorSettings,
+    SatelliteErrorSettings,
+    SatelliteFault,
+    SensorSettings,
+    SlipInterval,
+    TachometerSettings,
+)
 from test_simulate_signals import corrected, whole
 
 pytestmark = pytest.mark.requirement("D4")

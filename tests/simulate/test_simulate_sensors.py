@@ -14,7 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate import RunSettings, Scenario, Simulation
-from railfix.simulate.sensors import (
+from railfix.simulate.body_sensors import gravity_mps2, wheel_slips
+from railfix.simulate.sensor_tables import COLUMNS, dropouts, sensor_tables
+from railfix.simulate.settings import (
     BaliseSettings,
     DrawnSlips,
     Dropout,
@@ -26,8 +28,6 @@ from railfix.simulate.sensors import (
     SlipInterval,
     TachometerSettings,
 )
-from railfix.simulate.sensors.body_sensors import gravity_mps2, wheel_slips
-from railfix.simulate.sensors.tables import COLUMNS, dropouts, sensor_tables
 
 pytestmark = pytest.mark.requirement("D4")
 

@@ -13,9 +13,8 @@ from pydantic import ValidationError
 
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
-from railfix.gnss.observations import Observations, concatenate
+from railfix.gnss.observations import Observations, carrier_frequency_hz, concatenate
 from railfix.gnss.orbits import satellite_states
-from railfix.gnss.signals import carrier_frequency_hz
 from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
 from railfix.simulate import (
     Disturbance,

@@ -19,7 +19,7 @@ import paths  # noqa: F401
 from railfix.motion.samples import BaliseReadings
 from railfix.pipeline.balises import VERDICTS
 from railfix.simulate.scenario_file import load_recipe
-from railfix.simulate.sensors import BaliseSettings
+from railfix.simulate.settings import BaliseSettings
 from sensed_ride import Ride, made
 from tunnel_score import tunnels
 

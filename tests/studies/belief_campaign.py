@@ -44,8 +44,7 @@ from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference, straight_distance
 from railfix.evaluate.cases import read_case
 from railfix.gnss.navigation import Navigation, glonass_channels
-from railfix.gnss.observations import Observations
-from railfix.gnss.signals import carrier_frequency_hz
+from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.io.reference_log import read_reference
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.motion.samples import SensorSamples

@@ -28,7 +28,7 @@ SOURCE: Final = paths.ROOT / "src" / "railfix"
 #: Test files by the beginning of a module's path, the longest that fits; quick ones first.
 TESTS: Final = {
     "ranges": "range_corrections atmosphere sbas_pipeline pipeline_reasons conventional_rtklib",
-    "ranges/model_file": "error_model cn0_curve",
+    "core/settings": "settings error_model cn0_curve",
     "ranges/sbas": "sbas_corrections sbas_ionosphere sbas_reading sbas_decoding sbas_issues sbas_state sbas_spans "
     "sbas_rtklib sbas_hour",
     "ranges/error_model": "error_model range_corrections range_errors",

@@ -23,7 +23,7 @@ from railfix.pipeline.config import parse_config
 from railfix.run.processor import processor_of
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.environment.settings import EnvironmentSettings
-from railfix.simulate.line_settings import Element, LineSettings
+from railfix.simulate.line_file import Element, LineSettings
 from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario import RunSettings, Station
 from railfix.simulate.scenario_file import load_recipe, whole_run_s

@@ -37,7 +37,7 @@ from railfix.positioning.noise_scale import (
 )
 from railfix.positioning.normal_equations import Ranges, clock_groups
 from railfix.positioning.section_search import SearchIndex, search
-from railfix.ranges.weights import code_sigma_m
+from railfix.ranges.corrected import code_sigma_m
 from railfix.run.processor import processor_of
 from railfix.track import Track, from_positions
 from railfix.track.trajectory import Trajectory

@@ -30,10 +30,9 @@ from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
 from railfix.pipeline.level_stage import risk_of
 from railfix.positioning.normal_equations import Ranges, clock_groups
 from railfix.ranges.atmosphere import rtca_troposphere_sigma_m
-from railfix.ranges.corrected import corrected_satellites
+from railfix.ranges.corrected import CodeNoise, code_sigma_m, corrected_satellites
 from railfix.ranges.error_model import ErrorModel, read_error_model
 from railfix.ranges.sbas import IonosphereState, SatelliteCorrections, SatelliteState, SbasCorrections, read_sbas
-from railfix.ranges.weights import CodeNoise, code_sigma_m
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from sbas_levels import sbas_level

@@ -17,17 +17,17 @@ import numpy as np
 import paths  # noqa: F401
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.simulate import LineSettings, Scenario, SensorSettings, Simulation, SkySettings, sensor_tables, write_run
-from railfix.simulate.errors import (
+from railfix.simulate.errors import ionosphere_mapping, troposphere_mapping
+from railfix.simulate.receiver import NoiseSettings
+from railfix.simulate.settings import (
     ClockWalkSettings,
     ErrorSettings,
     InterSystemSettings,
     IonosphereErrorSettings,
+    RadarSettings,
     SatelliteErrorSettings,
     TroposphereErrorSettings,
 )
-from railfix.simulate.errors.common import ionosphere_mapping, troposphere_mapping
-from railfix.simulate.receiver import NoiseSettings
-from railfix.simulate.sensors import RadarSettings
 from test_simulate_errors import LONG, STANDING, added_m, axes_of, correlation, full, noise_of, on_and_off
 from test_simulate_sensors import FORCES, RATES, difference, radar
 

@@ -25,8 +25,8 @@ from railfix.motion.tachometer import way_m
 from railfix.pipeline import sensed_motion as stage
 from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, sensor_epochs
 from railfix.simulate import Simulation
+from railfix.simulate.body_sensors import wheel_slips
 from railfix.simulate.scenario_file import load_recipe
-from railfix.simulate.sensors.body_sensors import wheel_slips
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
 from sensed_ride import sensors_of

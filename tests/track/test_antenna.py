@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.track import Track
-from railfix.track.polyline import project_on_segments
-from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
+from railfix.track.trajectory import TRACK_AS_PATH, Trajectory, project_on_segments
 
 ORIGIN = (35.0, 139.0, 50.0)
 

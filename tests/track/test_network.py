@@ -18,9 +18,8 @@ from railfix.core.errors import MismatchError, SettingsError
 from railfix.report.charts_page import write_network_page
 from railfix.track import read_track
 from railfix.track.network import Network
-from railfix.track.network_check import check_network
 from railfix.track.network_match import match, read_plan_positions
-from railfix.track.network_read import links_of_ends, read_network
+from railfix.track.network_read import check_network, links_of_ends, read_network
 from railfix.track.network_route import route_of
 from railfix.track.route import MapReading
 from report_page import Page, browser, fetched, opened

@@ -12,9 +12,9 @@ import pytest
 from network_made import made_network
 from network_recordings import COLUMNS
 from railfix.track.network import Candidates, Network
-from railfix.track.network_fill import fill_gaps
 from railfix.track.network_match import Matched, PlanLog, match, read_plan_positions
 from railfix.track.network_read import read_network
+from railfix.track.network_route import fill_gaps
 from route_matcher import matched_track
 
 pytestmark = pytest.mark.requirement("A10")

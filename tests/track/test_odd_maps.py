@@ -18,9 +18,9 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track import Track, check_track, read_track
 from railfix.track.network import Network
 from railfix.track.network_match import PlanLog
-from railfix.track.polyline import NearestOnPolyline
 from railfix.track.read import read_segments
 from railfix.track.route import MapReading
+from railfix.track.trajectory import NearestOnPolyline
 
 pytestmark = pytest.mark.requirement("A1")
 

@@ -18,11 +18,9 @@ from railfix.core.tables import listed
 from railfix.run.inputs import ColumnNames, TrackReading
 from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network
-from railfix.track.network_check import check_network
-from railfix.track.network_fill import Filled, Rows, fill_gaps
 from railfix.track.network_match import Matched, PlanLog, match, read_plan_positions
-from railfix.track.network_read import TOLERANCE_M, read_network
-from railfix.track.network_route import route_of
+from railfix.track.network_read import TOLERANCE_M, check_network, read_network
+from railfix.track.network_route import Filled, Rows, fill_gaps, route_of
 from railfix.track.quality import error_note
 from railfix.track.read import track_of_segments
 

@@ -30,13 +30,7 @@ def version_text() -> str:
 
 
 def checked_out_commit(root: Path) -> str:
-    """Return the commit that is checked out in a folder, read from git's files; "" where there is none.
-
-    Parameters
-    ----------
-    root : Path
-        Folder with ``.git``: a folder, or in a further work tree a file that names one.
-    """
+    """Return the commit that is checked out in a folder (or a further work tree), from git's files; "" without any."""
     git = root / ".git"
     if git.is_file():
         git = root / git.read_text(encoding="utf-8").removeprefix("gitdir:").strip()

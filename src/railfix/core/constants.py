@@ -1,38 +1,28 @@
-"""Physical constants and signal frequencies, each with its unit and source.
-
-Every value here is a definition taken from an interface document; nothing is tuned.
-"""
+"""Physical constants and signal frequencies, each with its unit and source; nothing is tuned."""
 
 from __future__ import annotations
 
 from typing import Final
 
-#: Speed of light in vacuum [m/s] (IS-GPS-200, 20.3.4.3; CGPM 1983).
-SPEED_OF_LIGHT: Final = 299_792_458.0
+SPEED_OF_LIGHT: Final = 299_792_458.0  #: Speed of light in vacuum [m/s] (IS-GPS-200, 20.3.4.3; CGPM 1983).
 
 #: Earth rotation rate [rad/s] (WGS 84; IS-GPS-200 table 20-IV; Galileo OS SIS ICD 5.1.1).
 EARTH_ROTATION_RATE: Final = 7.292_115_146_7e-5
 #: Earth rotation rate of CGCS2000 [rad/s] (BDS-SIS-ICD-B1I 3.0, 5.2.4.12).
 EARTH_ROTATION_RATE_BEIDOU: Final = 7.292_115e-5
-#: Earth rotation rate of PZ-90 [rad/s] (GLONASS ICD 5.1, A.3.1.2).
-EARTH_ROTATION_RATE_GLONASS: Final = 7.292_115e-5
+EARTH_ROTATION_RATE_GLONASS: Final = 7.292_115e-5  #: Earth rotation rate of PZ-90 [rad/s] (GLONASS ICD 5.1, A.3.1.2).
 
-#: Geocentric gravitational constant of GPS and QZSS [m^3/s^2] (IS-GPS-200 table 20-IV).
-GM_GPS: Final = 3.986_005_0e14
+GM_GPS: Final = 3.986_005_0e14  #: Geocentric gravitational constant of GPS and QZSS [m^3/s^2] (IS-GPS-200 table 20-IV).
 #: Geocentric gravitational constant of Galileo and BeiDou [m^3/s^2] (Galileo OS SIS ICD 5.1.1; BDS-SIS-ICD-B1I).
 GM_GALILEO: Final = 3.986_004_418e14
 #: Geocentric gravitational constant of GLONASS [m^3/s^2] (GLONASS ICD 5.1, A.3.1.2).
 GM_GLONASS: Final = 3.986_004_4e14
-#: Semi-major axis of the PZ-90 ellipsoid [m] (GLONASS ICD 5.1, A.3.1.2).
-PZ90_SEMI_MAJOR_AXIS: Final = 6_378_136.0
-#: Second zonal harmonic of the geopotential, PZ-90 [-] (GLONASS ICD 5.1, A.3.1.2).
-PZ90_J2: Final = 1.082_625_7e-3
+PZ90_SEMI_MAJOR_AXIS: Final = 6_378_136.0  #: Semi-major axis of the PZ-90 ellipsoid [m] (GLONASS ICD 5.1, A.3.1.2).
+PZ90_J2: Final = 1.082_625_7e-3  #: Second zonal harmonic of the geopotential, PZ-90 [-] (GLONASS ICD 5.1, A.3.1.2).
 
-#: Standard gravity [m/s2] (CGPM 1901).
-GRAVITY_MPS2: Final = 9.806_65
+GRAVITY_MPS2: Final = 9.806_65  #: Standard gravity [m/s2] (CGPM 1901).
 
-#: BDT - GPST [s]: BeiDou time lags GPS time by a constant (BDS-SIS-ICD-B1I 3.0, 3.3).
-BDT_MINUS_GPST_S: Final = -14.0
+BDT_MINUS_GPST_S: Final = -14.0  #: BDT - GPST [s]: BeiDou time lags GPS time by a constant (BDS-SIS-ICD-B1I 3.0, 3.3).
 
 #: GPS L1 carrier [Hz], the frequency the Klobuchar model is given for (IS-GPS-200, 20.3.3.5.2.5).
 FREQUENCY_L1: Final = 1_575.42e6
@@ -43,14 +33,7 @@ CARRIER_FREQUENCY: Final[dict[str, dict[str, float]]] = {
     "G": {"1": 1_575.42e6, "2": 1_227.60e6, "5": 1_176.45e6},
     "J": {"1": 1_575.42e6, "2": 1_227.60e6, "5": 1_176.45e6, "6": 1_278.75e6},
     "E": {"1": 1_575.42e6, "5": 1_176.45e6, "7": 1_207.140e6, "8": 1_191.795e6, "6": 1_278.75e6},
-    "C": {
-        "1": 1_575.42e6,
-        "2": 1_561.098e6,
-        "5": 1_176.45e6,
-        "7": 1_207.140e6,
-        "8": 1_191.795e6,
-        "6": 1_268.52e6,
-    },
+    "C": {"1": 1_575.42e6, "2": 1_561.098e6, "5": 1_176.45e6, "7": 1_207.140e6, "8": 1_191.795e6, "6": 1_268.52e6},
     "R": {"1": 1_602.0e6, "2": 1_246.0e6, "3": 1_202.025e6, "4": 1_600.995e6, "6": 1_248.06e6},
     "S": {"1": 1_575.42e6, "5": 1_176.45e6},
     "I": {"1": 1_575.42e6, "5": 1_176.45e6, "9": 2_492.028e6},

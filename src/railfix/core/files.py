@@ -1,15 +1,8 @@
 """Files from receivers and archives: plain, gzip, compress (.Z), each also Hatanaka-compressed.
 
-The first bytes of a file decide how it is read, never its name. Memory is bounded whatever the size
-of the file:
-
-=============== ==================================================================================
-plain, gzip     streamed block by block
-compress (.Z)   unpacked to a temporary file by `ncompress` (compiled), then streamed
-Hatanaka (CRX)  piped through the compiled ``crx2rnx`` of the `hatanaka` package, which decodes
-                in a process of its own while its output is read; only a packed CRX file (.gz, .Z)
-                needs the disk, for a temporary file of the unpacked CRX
-=============== ==================================================================================
+The first bytes of a file decide how it is read, never its name. Memory is bounded: plain and gzip are streamed,
+compress is unpacked to a temporary file by `ncompress`, Hatanaka is piped through ``crx2rnx`` (a packed CRX file by a
+temporary file).
 """
 
 from __future__ import annotations
@@ -38,8 +31,7 @@ import ncompress
 from railfix.core.errors import InputFileError, OutputError
 
 FilePath = str | PathLike[str]
-#: One file, or several.
-Paths = FilePath | Sequence[FilePath]
+Paths = FilePath | Sequence[FilePath]  #: One file, or several.
 #: What a reader does with a broken line: stop with an error, or leave it out and count it.
 BrokenLines = Literal["stop", "count"]
 
@@ -58,16 +50,7 @@ _COPY_BYTES: Final = 1 << 20
 
 
 class ByteStream(io.BufferedIOBase):
-    """Stream of the decompressed bytes of one file.
-
-    A context manager. `read` raises `InputFileError` where the compressed data end early or are
-    damaged.
-
-    Attributes
-    ----------
-    path : str
-        The file as it was named.
-    """
+    """Stream of the decompressed bytes of one file; `read` raises `InputFileError` where they end early."""
 
     def __init__(self, path: FilePath, source: IO[bytes], held: ExitStack, *, disk: IO[bytes] | None = None) -> None:
         self.path = str(path)
@@ -146,33 +129,18 @@ def listed(paths: Paths) -> list[str]:
 
 
 def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -> ByteStream:
-    """Open a file as a stream of its decompressed bytes.
+    """Open a file as a stream of its decompressed bytes; with "text" a binary file is an error.
 
-    Parameters
-    ----------
-    path : path-like
-        Plain text, gzip, compress (.Z), or Hatanaka-compressed RINEX plain or in one of these.
-    content : {"text", "bytes"}
-        What the file may hold: with "text" a binary file is an error.
-
-    Returns
-    -------
-    ByteStream
-        A context manager with `read(size)`. Line ends are as in the file (CR LF stays); a byte order mark at the
-        beginning of text is left out.
-
-    Raises
-    ------
-    InputFileError
-        The file is missing, a folder, unreadable, empty, binary, an archive of another kind;
-        while reading: the compressed data end early or are damaged.
+    Line ends are as in the file; a byte order mark at the beginning of text is left out. InputFileError: the file is
+    missing, a folder, unreadable, empty, binary, an archive of another kind.
     """
     held = ExitStack()
     with held:
         source = held.enter_context(closing(_open_plain(path)))
         head = source.read(_HEAD_BYTES)
         source.seek(0)
-        _reject_archive(path, head)
+        if archive := next((name for magic, name in _ARCHIVES.items() if head.startswith(magic)), None):
+            raise InputFileError(path, f"is {archive}; unpack it first (.gz and .Z are read as they are)")
         if head.startswith(_GZIP):
             source = held.enter_context(closing(cast("IO[bytes]", gzip.GzipFile(fileobj=source, mode="rb"))))
             with ByteStream(path, source, ExitStack()) as unpacked:
@@ -182,7 +150,10 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
             source = _unpack_compress(path, source, held)
             head = source.read(_HEAD_BYTES)
             source.seek(0)
-        _reject_content(path, head, content)
+        if not head.strip():
+            raise InputFileError(path, "is empty")
+        if content == "text" and b"\0" in head:
+            raise InputFileError(path, "is binary, a text file was expected")
         if b"COMPACT RINEX" in head[:80]:
             return _decode_hatanaka(path, source, held)
         if content == "text" and head.startswith(codecs.BOM_UTF8):
@@ -191,25 +162,13 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
 
 
 def read_bytes(path: FilePath) -> bytes:
-    """Read the decompressed content of a file; for small files (navigation, SP3).
-
-    Raises
-    ------
-    InputFileError
-        As `open_stream`.
-    """
+    """Read the decompressed content of a small file (navigation, SP3); errors as `open_stream`."""
     with open_stream(path) as stream:
         return stream.read()
 
 
 def read_text(path: FilePath) -> str:
-    """Read the decompressed content of a small UTF-8 file, without a byte order mark.
-
-    Raises
-    ------
-    InputFileError
-        As `open_stream`; not UTF-8.
-    """
+    """Read the decompressed content of a small UTF-8 file, without a byte order mark; errors as `open_stream`."""
     content = read_bytes(path)
     try:
         return content.decode("utf-8")
@@ -219,13 +178,7 @@ def read_text(path: FilePath) -> str:
 
 
 def text_lines(path: FilePath) -> Iterator[str]:
-    """Yield the lines of a decompressed UTF-8 file, without a byte order mark and without their ends.
-
-    Raises
-    ------
-    InputFileError
-        As `open_stream`; not UTF-8.
-    """
+    """Yield the lines of a decompressed UTF-8 file, without a byte order mark and without their ends."""
     number = 0
     with open_stream(path) as stream, io.TextIOWrapper(stream, encoding="utf-8") as text:  # type: ignore[type-var]
         try:
@@ -263,30 +216,13 @@ def file_sha256(path: FilePath) -> str:
 
 
 def fingerprint(kind: str, path: FilePath, *, name: str | None = None) -> dict[str, Any]:
-    """Return kind, path (or the `name` to record), size and SHA-256 of a file, as plain values for JSON.
-
-    Raises
-    ------
-    InputFileError
-        The file cannot be read.
-    """
+    """Return kind, path (or the `name` to record), size and SHA-256 of a file, as plain values for JSON."""
     digest = file_sha256(path)
     return {"input": kind, "path": name or str(path), "bytes": Path(path).stat().st_size, "sha256": digest}
 
 
 def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
-    """Return the object in a JSON file.
-
-    Parameters
-    ----------
-    what : str
-        What the file should be, with its article ("the record of a run").
-
-    Raises
-    ------
-    InputFileError
-        The file is missing, unreadable, not UTF-8, not JSON, nested too deeply, or holds no object.
-    """
+    """Return the object in a JSON file; `what` it should be, with its article ("the record of a run")."""
     try:
         content = json.loads(read_text(path))
     except RecursionError:
@@ -319,13 +255,7 @@ def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
 
 @contextmanager
 def staged_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
-    """Yield a temporary path beside a file, which replaces the file where the block ends without error.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
+    """Yield a temporary path beside a file, which replaces the file where the block ends without error."""
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
@@ -340,15 +270,7 @@ def staged_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
 
 
 def read_text_lines(path: FilePath) -> list[str]:
-    """Read the lines of a small, possibly compressed file, without line ends (LF or CR LF).
-
-    Bytes outside ASCII (names in comments) are read as Latin-1, so that columns stay columns.
-
-    Raises
-    ------
-    InputFileError
-        As `open_stream`.
-    """
+    """Read the lines of a small, possibly compressed file without line ends, as Latin-1: columns stay columns."""
     lines = [line.removesuffix("\r") for line in read_bytes(path).decode("latin-1").split("\n")]
     return lines if lines[-1] else lines[:-1]
 
@@ -365,19 +287,6 @@ def _open_plain(path: FilePath) -> IO[bytes]:
         raise InputFileError(path, "there is no such file; check the name") from error
     except OSError as error:
         raise InputFileError(path, f"cannot be opened ({error.strerror or error})") from error
-
-
-def _reject_archive(path: FilePath, head: bytes) -> None:
-    for magic, name in _ARCHIVES.items():
-        if head.startswith(magic):
-            raise InputFileError(path, f"is {name}; unpack it first (.gz and .Z are read as they are)")
-
-
-def _reject_content(path: FilePath, head: bytes, content: str) -> None:
-    if not head.strip():
-        raise InputFileError(path, "is empty")
-    if content == "text" and b"\0" in head:
-        raise InputFileError(path, "is binary, a text file was expected")
 
 
 def _temporary(held: ExitStack) -> IO[bytes]:

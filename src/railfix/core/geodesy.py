@@ -22,16 +22,7 @@ def _to_geodetic() -> Transformer:
 
 
 def geodetic_from_ecef(ecef_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
-    """Convert ECEF to latitude, longitude and ellipsoidal height.
-
-    Parameters
-    ----------
-    ecef_m : array_like, shape (..., 3) [m]
-
-    Returns
-    -------
-    latitude_deg, longitude_deg, height_m : ndarray, shape (...)
-    """
+    """Convert ECEF, shape (..., 3) [m], to latitude, longitude [deg] and ellipsoidal height [m]."""
     xyz = np.asarray(ecef_m, dtype=np.float64)
     finite = np.asarray(np.isfinite(xyz).all(axis=-1))
     filled = np.where(finite[..., None], xyz, (6_378_137.0, 0.0, 0.0))
@@ -40,18 +31,7 @@ def geodetic_from_ecef(ecef_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
 
 
 def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike) -> Floats:
-    """Convert geodetic coordinates on WGS 84 to ECEF.
-
-    Parameters
-    ----------
-    latitude_deg, longitude_deg : array_like, shape (...) [deg]
-    height_m : array_like, shape (...) [m]
-        Ellipsoidal height.
-
-    Returns
-    -------
-    ndarray, shape (..., 3) [m]
-    """
+    """Convert latitude, longitude [deg] and ellipsoidal height [m] on WGS 84 to ECEF, shape (..., 3) [m]."""
     lat, lon, height = np.broadcast_arrays(
         np.radians(np.asarray(latitude_deg, dtype=np.float64)),
         np.radians(np.asarray(longitude_deg, dtype=np.float64)),
@@ -71,13 +51,7 @@ def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height
 
 
 def enu_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Floats:
-    """Compute the unit vectors east, north, up in ECEF.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-        Rows are east, north and up, so that ``axes @ (ecef - origin)`` is (e, n, u).
-    """
+    """Compute unit vectors east, north, up in ECEF, rows of (..., 3, 3): ``axes @ (ecef - origin)`` is (e, n, u)."""
     lat = np.radians(np.asarray(latitude_deg, dtype=np.float64))
     lon = np.radians(np.asarray(longitude_deg, dtype=np.float64))
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
@@ -89,38 +63,14 @@ def enu_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Floats:
 
 
 def sigma_along(sigma_enu_m: Floats, ecef_m: Floats, direction: Floats) -> Floats:
-    """Compute the standard deviation along a direction from those east, north and up, uncorrelated.
-
-    Parameters
-    ----------
-    sigma_enu_m : ndarray, shape (T, 3) [m]
-    ecef_m : ndarray, shape (T, 3) [m]
-        Place, for the directions of east, north and up.
-    direction : ndarray, shape (T, 3)
-        Unit vectors in ECEF.
-
-    Returns
-    -------
-    ndarray, shape (T,) [m]
-    """
+    """Compute the sigma along unit vectors (T, 3) from those east, north and up, uncorrelated, at places (T, 3)."""
     latitude, longitude, _ = geodetic_from_ecef(ecef_m)
     components = np.einsum("tij,tj->ti", enu_axes(latitude, longitude), direction)
     return np.asarray(np.sqrt(np.sum((components * sigma_enu_m) ** 2, axis=1)))
 
 
 def elevation_azimuth(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tuple[Floats, Floats]:
-    """Compute elevation and azimuth of satellites at receivers.
-
-    Parameters
-    ----------
-    sat_ecef_m : array_like, shape (T, N, 3) [m]
-    receiver_ecef_m : array_like, shape (T, 3) [m]
-
-    Returns
-    -------
-    elevation_deg, azimuth_deg : ndarray, shape (T, N)
-        Azimuth clockwise from north in [0, 360). NaN where either position is NaN.
-    """
+    """Compute elevation and azimuth (clockwise from north) [deg] of satellites (T, N, 3) at receivers (T, 3)."""
     sat = np.asarray(sat_ecef_m, dtype=np.float64)
     receiver = np.asarray(receiver_ecef_m, dtype=np.float64)
     lat, lon, _ = geodetic_from_ecef(receiver)
@@ -128,10 +78,7 @@ def elevation_azimuth(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tupl
 
 
 def angles_of(line_ecef_m: Floats, axes: Floats) -> tuple[Floats, Floats]:
-    """Compute elevation and azimuth of lines from receivers to satellites, shape (T, N, 3) [m].
-
-    With the `enu_axes` of the receivers, shape (T, 3, 3); otherwise as `elevation_azimuth`.
-    """
+    """Compute elevation and azimuth of lines to satellites (T, N, 3) by the `enu_axes` of receivers."""
     enu = np.matmul(axes, line_ecef_m.swapaxes(1, 2))
     east, north, up = enu[:, 0], enu[:, 1], enu[:, 2]
     azimuth = np.degrees(np.arctan2(east, north))
@@ -141,26 +88,12 @@ def angles_of(line_ecef_m: Floats, axes: Floats) -> tuple[Floats, Floats]:
 
 
 def range_with_rotation(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tuple[Floats, Floats]:
-    """Compute the geometric range with the Sagnac correction, and the line of sight.
+    """Compute the geometric range with the Sagnac correction, and the line of sight, shapes (...) and (..., 3).
 
-    The satellite is given in the Earth-fixed frame of its transmit time. To first order in the
-    angle turned during the flight (6e-6 rad), rotating it into the frame of reception adds
-    ``omega / c * (s_x r_y - s_y r_x)`` to the distance (Sagnac; IS-GPS-200, 20.3.3.4.3.4); the
-    neglected terms are below 0.2 mm.
-
-    Parameters
-    ----------
-    sat_ecef_m : array_like, shape (..., 3) [m]
-        Satellite in ECEF at transmit time.
-    receiver_ecef_m : array_like, shape (..., 3) [m]
-        Receiver in ECEF at receive time; broadcasts against `sat_ecef_m`.
-
-    Returns
-    -------
-    range_m : ndarray, shape (...)
-    line_of_sight : ndarray, shape (..., 3)
-        Unit vector from receiver to satellite `u`, such that d(range)/d(receiver) = -u (the
-        gradient of the Sagnac term, 6e-6, is neglected).
+    The satellite is in the Earth-fixed frame of its transmit time. To first order, rotating it into the frame of
+    reception adds ``omega / c * (s_x r_y - s_y r_x)`` to the distance (Sagnac; IS-GPS-200, 20.3.3.4.3.4); the neglected
+    terms are below 0.2 mm. The unit vector from receiver to satellite `u` is such that d(range)/d(receiver) = -u (the
+    gradient of the Sagnac term, 6e-6, is neglected).
     """
     sat = np.asarray(sat_ecef_m, dtype=np.float64)
     receiver = np.asarray(receiver_ecef_m, dtype=np.float64)

@@ -111,21 +111,14 @@ POSITIONED: Final = (
 )  # fmt: skip
 
 
-#: Reasons of screens that are added to the package, by name in lower case.
-_ADDED: dict[str, Reason] = {}
+_ADDED: dict[str, Reason] = {}  #: Reasons of screens that are added to the package, by name in lower case.
 #: First free bit, and the last one of the tables' 32-bit column.
 _FIRST_FREE_BIT: Final = 22
 _LAST_BIT: Final = 30
 
 
 def screen_reason(name: str) -> Reason:
-    """Return the reason of a screen by its name in lower case; the next free bit where `Reason` does not have it.
-
-    Raises
-    ------
-    ValueError
-        All bits are taken.
-    """
+    """Return the reason of a screen by its name in lower case; the next free bit where `Reason` does not have it."""
     if name.upper() in Reason.__members__:
         return Reason[name.upper()]
     if name not in _ADDED:

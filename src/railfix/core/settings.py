@@ -1,8 +1,4 @@
-"""Settings and limits: frozen pydantic models, read from TOML, misspelt keys rejected.
-
-Every set of limits is a `Settings` model beside the function it belongs to. `Config`
-(`railfix.pipeline.config`) puts them side by side; TOML files and ``--set`` are read here alone.
-"""
+"""Settings and limits: frozen pydantic models beside their functions, and model files, read from TOML."""
 
 from __future__ import annotations
 
@@ -68,8 +64,7 @@ class Settings(BaseModel):
 Model = TypeVar("Model", bound=BaseModel)
 
 
-#: Heading of the options that name input files.
-INPUTS: Final = "Inputs"
+INPUTS: Final = "Inputs"  #: Heading of the options that name input files.
 
 
 def option(
@@ -81,39 +76,17 @@ def option(
     panel: str = "Choices",
     **limits: Any,
 ) -> Any:
-    """Return a field of a `Settings` model that is an option of the command line as well.
+    """Return a field of a `Settings` model that is an option of the command line as well; required without `default`.
 
-    Parameters
-    ----------
-    text : str
-        Help text.
-    default : optional
-        Required unless given.
-    name : str, optional
-        The option; ``--field-name`` unless given. A field with two words (`Literal`) and a default becomes a
-        switch where it has a name: without it the default, with it the other word.
-    metavar, panel : str, optional
-        Placeholder of the value, heading of the help text.
-    **limits
-        Of `pydantic.Field`: `gt`, `ge`, ...
+    `name` is ``--field-name`` unless given; a field with two words (`Literal`) and a default becomes a switch where it
+    has a name. `panel` is the heading in the help text; `limits` are those of `pydantic.Field`.
     """
     extra: Any = {"option": name, "metavar": metavar, "panel": panel}
     return Field(default, description=text, json_schema_extra=extra, **limits)
 
 
 def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> Model:
-    """Validate plain values as settings.
-
-    Parameters
-    ----------
-    source : str
-        Where the values come from, for the message: a path, or "--set".
-
-    Raises
-    ------
-    SettingsError
-        A value is invalid; the message names the source, the setting, what was expected and what was given.
-    """
+    """Validate plain values as settings; the SettingsError names the `source`: a path, or "--set"."""
     try:
         return model.model_validate(dict(values))
     except ValidationError as error:
@@ -212,3 +185,25 @@ def write_toml(path: FilePath, values: Mapping[str, Any], *, what: str = "file",
     """
     head = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
     write_whole(path, head + tomli_w.dumps(dict(values)), what=what)
+
+
+ModelFile = TypeVar("ModelFile", bound=Settings)
+
+
+def read_model_file(model: type[ModelFile], path: FilePath, *, what: str, format_name: str, command: str) -> ModelFile:
+    """Read a model file as a `Settings` type with the field `format`; `what` and `command` are for messages."""
+    values = read_toml(path, what=what)
+    written = values.get("format")
+    if written != format_name:
+        name = format_name.rsplit(" ", 1)[0]
+        if isinstance(written, str) and written.startswith(f"{name} "):
+            problem = (
+                f"is {what} of format '{written}', this version reads '{format_name}'; make it anew with {command}"
+            )
+        else:
+            problem = f"is not {what}: format = '{format_name}' was expected; make one with {command}"
+        raise InputFileError(path, problem)
+    try:
+        return validated(model, values, source=str(path))
+    except SettingsError as error:
+        raise InputFileError(path, str(error).removeprefix(f"{path}: ").replace("setting ", "entry ", 1)) from None

@@ -65,8 +65,7 @@ def listed(
     return Table(name="", head=head, rows=rows, caption=caption, numeric=range(texts, len(head)), boxed=boxed)
 
 
-#: Head, column and format of a column of a table.
-Column = tuple[str, str, Callable[[Any], str]]
+Column = tuple[str, str, Callable[[Any], str]]  #: Head, column and format of a column of a table.
 
 
 def listing(

@@ -1,8 +1,4 @@
-"""Time as ``datetime64[ns]`` in GPS time, and the conversions to and from it.
-
-GPS time is the only time scale inside the package. Differences are taken on the integers before
-they become floats, so that a nanosecond survives anywhere in the range of the type.
-"""
+"""Time as ``datetime64[ns]`` in GPS time, the only scale inside, and the conversions to and from it."""
 
 from __future__ import annotations
 
@@ -14,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.constants import BDT_MINUS_GPST_S
 
-#: Origin of GPS time (IS-GPS-200, 3.3.4).
-GPS_EPOCH: Final = np.datetime64("1980-01-06T00:00:00", "ns")
+GPS_EPOCH: Final = np.datetime64("1980-01-06T00:00:00", "ns")  #: Origin of GPS time (IS-GPS-200, 3.3.4).
 #: Origin of BeiDou time, written in BDT (BDS-SIS-ICD-B1I 3.0, 3.3).
 BDT_EPOCH: Final = np.datetime64("2006-01-01T00:00:00", "ns")
 
@@ -36,18 +31,7 @@ _LEAP_UTC: Final = np.array(
 
 
 def seconds(delta: ArrayLike) -> Floats:
-    """Convert time differences to seconds.
-
-    Parameters
-    ----------
-    delta : array_like of timedelta64, any shape
-        Differences; NaT allowed.
-
-    Returns
-    -------
-    ndarray of float64, same shape [s]
-        NaN where `delta` is NaT.
-    """
+    """Convert time differences to seconds; NaN where they are NaT."""
     ns = np.asarray(delta, dtype="timedelta64[ns]")
     count = ns.astype(np.int64)
     result = (count // _NS).astype(np.float64) + (count % _NS) / _NS
@@ -66,14 +50,7 @@ def timedelta(seconds_s: ArrayLike) -> NDArray[np.timedelta64]:
 
 
 def from_week(week: ArrayLike, seconds_of_week: ArrayLike) -> Datetimes:
-    """Convert GPS week and seconds of week to GPS time.
-
-    Parameters
-    ----------
-    week : array_like of int
-        Full GPS week (no roll-over).
-    seconds_of_week : array_like of float [s]
-    """
+    """Convert full GPS week (no roll-over) and seconds of week to GPS time."""
     weeks = np.asarray(week, dtype=np.int64) * SECONDS_PER_WEEK
     result = GPS_EPOCH + weeks.astype("timedelta64[s]") + timedelta(seconds_of_week)
     return np.asarray(result, dtype="datetime64[ns]")
@@ -107,29 +84,14 @@ def utc_to_gpst(utc: ArrayLike) -> Datetimes:
 
 
 def gpst_to_utc(time: ArrayLike) -> Datetimes:
-    """Convert GPS time to UTC by the table of leap seconds.
-
-    The leap second itself, which ``datetime64`` lacks, becomes the second after it.
-    """
+    """Convert GPS time to UTC; the leap second itself becomes the second after it."""
     at = np.asarray(time, dtype="datetime64[ns]")
     leap = np.searchsorted(utc_to_gpst(_LEAP_UTC), at, side="right") - 1
     return np.asarray(at - leap.astype("timedelta64[s]"), dtype="datetime64[ns]")
 
 
 def nearest_week(seconds_of_week: ArrayLike, near: ArrayLike) -> Datetimes:
-    """Resolve the week of seconds of week: the GPS time nearest to another time.
-
-    Parameters
-    ----------
-    seconds_of_week : array_like of float [s]
-    near : array_like of datetime64[ns]
-        A time known to within half a week (for example the clock time of the same record).
-
-    Returns
-    -------
-    ndarray of datetime64[ns]
-        At most half a week from `near`; week numbers written in files are not used.
-    """
+    """Resolve the week of seconds of week: the GPS time nearest to another time, known to within half a week."""
     week, sow = to_week(near)
     shift = np.rint((sow - np.asarray(seconds_of_week, dtype=np.float64)) / SECONDS_PER_WEEK)
     return from_week(week + shift.astype(np.int64), seconds_of_week)

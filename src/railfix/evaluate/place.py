@@ -24,9 +24,8 @@ from railfix.core.timescale import seconds
 from railfix.evaluate.inputs import LARGEST_GAP_S, Method, RunFolder
 from railfix.run.inputs import TrackReading
 from railfix.track import Track, read_track
-from railfix.track.polyline import short_way_m
 from railfix.track.track import ANOTHER_PLACE_M
-from railfix.track.trajectory import Trajectory
+from railfix.track.trajectory import Trajectory, short_way_m
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 

@@ -1,8 +1,7 @@
 """Observations, navigation records, signals and satellite orbits."""
 
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation, PreciseEphemeris
-from railfix.gnss.observations import ObservationHeader, Observations, concatenate
-from railfix.gnss.signals import carrier_frequency_hz
+from railfix.gnss.observations import ObservationHeader, Observations, carrier_frequency_hz, concatenate
 
 __all__ = [
     "GlonassRecords",

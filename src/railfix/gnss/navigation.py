@@ -54,8 +54,7 @@ class KeplerRecords(_NavigationRecords):
     """Keplerian records of GPS, QZSS, Galileo and BeiDou, n rows."""
 
     satellite: Strings  #: Shape (n,).
-    #: "LNAV", "CNAV", "CNV2" (GPS, QZSS), "INAV", "FNAV" (Galileo), "D1", "D2", "CNV1" to "CNV3" (BeiDou; D2 is sent by
-    #: GEO satellites); shape (n,).
+    #: "LNAV", "CNAV", "CNV2" (GPS, QZSS), "INAV", "FNAV" (Galileo), "D1", "D2", "CNV1" to "CNV3" (BeiDou); shape (n,).
     message: Strings
     #: Clock and ephemeris reference times, GPS time. The week is resolved from toc; shape (n,).
     toc: Datetimes
@@ -88,8 +87,7 @@ class KeplerRecords(_NavigationRecords):
     cis: Floats
     #: Toe as seconds of the constellation's own week (BDT for BeiDou): enters the node's longitude; shape (n,).
     toe_sow_s: Floats
-    #: As broadcast: GPS/QZSS 6-bit SV health (CNAV: 3 bits, L1, L2, L5), Galileo 9-bit word, BeiDou SatH1 (CNV: HS);
-    #: shape (n,).
+    #: As broadcast: GPS/QZSS SV health (CNAV: L1, L2, L5), Galileo 9-bit word, BeiDou SatH1 (CNV: HS); shape (n,).
     health: Integers
     #: URA or SISA as written; nominal value of the URA_ED index of CNAV, NaN for CNV1 to CNV3; shape (n,).
     accuracy_m: Floats
@@ -205,9 +203,6 @@ class Navigation(NotebookTable):
 
 @lru_cache(maxsize=8)
 def glonass_channels(navigation: Navigation) -> dict[str, int]:
-    """Return the frequency channel of each GLONASS satellite from its records.
-
-    For logs whose header lacks GLONASS SLOT / FRQ #: the form of `ObservationHeader.glonass_channel`.
-    """
+    """Return the GLONASS channels by records, for logs whose header lacks GLONASS SLOT / FRQ #."""
     records = navigation.glonass
     return dict(zip(records.satellite.tolist(), records.frequency_channel.tolist(), strict=True))

@@ -1,12 +1,12 @@
-"""Observations of one receiver as read-only arrays.
+"""Observations of one receiver as read-only arrays, and carrier frequencies.
 
-Axis 0 is time (epochs), axis 1 is the *channel*: one satellite on one signal. A satellite tracked
-on three signals has three channels, so nothing is padded for signals that a constellation does
-not have. Absent is NaN; 0 is a value.
+Axis 0 is time, axis 1 the *channel*: one satellite on one signal, so nothing is padded for signals that a constellation
+does not have. Absent is NaN; 0 is a value.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
@@ -15,10 +15,51 @@ from typing import Any, Final
 import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, freeze_arrays
+from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP
 from railfix.core.tables import NotebookTable, plural, time_span_text
 
-#: Largest number of messages about single faults; further faults are only counted.
-MAX_PROBLEMS: Final = 50
+
+def carrier_frequency_hz(
+    satellite: Strings, signal: Strings, glonass_channel: Mapping[str, int] | None = None
+) -> Floats:
+    """Carrier frequency of each channel, shape (M,) [Hz].
+
+    Parameters
+    ----------
+    satellite, signal : ndarray of str, shape (M,)
+        "R05" on "1C".
+    glonass_channel : mapping of str to int, optional
+        Frequency channel of GLONASS satellites.
+
+    Returns
+    -------
+    ndarray, shape (M,) [Hz]
+        NaN where the band is not one of the constellation's, or a GLONASS channel is unknown.
+    """
+    channels = glonass_channel or {}
+    result = np.full(len(satellite), np.nan)
+    for i, (name, code) in enumerate(zip(satellite.tolist(), signal.tolist(), strict=True)):
+        letter, band = name[0], code[0]
+        frequency = CARRIER_FREQUENCY.get(letter, {}).get(band, np.nan)
+        if letter == "R" and band in GLONASS_STEP:
+            frequency += channels.get(name, np.nan) * GLONASS_STEP[band]
+        result[i] = frequency
+    return result
+
+
+def named_frequency_hz(name: Strings, glonass_channel: Floats) -> Floats:
+    """Carrier frequency [Hz] of signals ("G1C") and GLONASS channels, shape (..., M); NaN where unknown."""
+    frequency = np.full(glonass_channel.shape, np.nan)
+    for text in np.unique(name).tolist():
+        letter, band = text[:1], text[1:2]
+        chosen = name == text
+        frequency[..., chosen] = CARRIER_FREQUENCY.get(letter, {}).get(band, np.nan)
+        if letter == "R" and band in GLONASS_STEP:
+            frequency[..., chosen] += glonass_channel[..., chosen] * GLONASS_STEP[band]
+    return frequency
+
+
+MAX_PROBLEMS: Final = 50  #: Largest number of messages about single faults; further faults are only counted.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,14 +232,7 @@ class Observations(NotebookTable):
 
 
 def channels_with_data(kinds: Iterable[Floats], loss_of_lock: Bytes) -> Masks:
-    """Return which channels have an observation of any kind or a loss-of-lock digit, shape (M,).
-
-    Parameters
-    ----------
-    kinds : iterable of ndarray, shape (T, M)
-        Observations by kind.
-    loss_of_lock : ndarray of uint8, shape (T, M)
-    """
+    """Return which channels have an observation of any kind (T, M) or a loss-of-lock digit, shape (M,)."""
     used = np.zeros(loss_of_lock.shape[1], dtype=np.bool_)
     for array in kinds:
         used |= ~np.isnan(array[:1]).all(axis=0)  # the first epoch tells it of nearly all
@@ -247,6 +281,9 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
             target[rows, columns] = getattr(part, name)
         lock[rows, columns] = part.loss_of_lock
         row += len(part)
+    count, skipped = sum(p.problem_count for p in parts), Counter[str]()
+    for part in parts:
+        skipped.update(part.skipped)
     return Observations(
         time=np.concatenate([p.time for p in parts]),
         satellite=np.array([k[0] for k in keys], dtype="<U3"),
@@ -256,9 +293,9 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         receiver_alarm=np.concatenate([p.receiver_alarm for p in parts]),
         front_end_gain=np.concatenate([p.front_end_gain for p in parts]),
         header=_join_header(parts),
-        problems=_join_problems(parts),
-        problem_count=sum(p.problem_count for p in parts),
-        skipped=_join_counts(parts),
+        problems=capped_problems(chain.from_iterable(p.problems[:MAX_PROBLEMS] for p in parts), count=count),
+        problem_count=count,
+        skipped=dict(skipped),
         **floats,
     )
 
@@ -275,21 +312,7 @@ def _join_header(parts: Sequence[Observations]) -> ObservationHeader:
     return replace(first, signals=joined, glonass_channel=channels)
 
 
-def _join_problems(parts: Sequence[Observations]) -> tuple[str, ...]:
-    return capped_problems(
-        chain.from_iterable(p.problems[:MAX_PROBLEMS] for p in parts), count=sum(p.problem_count for p in parts)
-    )
-
-
 def capped_problems(messages: Iterable[str], *, count: int) -> tuple[str, ...]:
     """Return the first `MAX_PROBLEMS` messages, and one with the number of the others of `count`."""
     kept = tuple(islice(messages, MAX_PROBLEMS))
     return (*kept, f"and {count - len(kept)} more problems") if count > len(kept) else kept
-
-
-def _join_counts(parts: Sequence[Observations]) -> dict[str, int]:
-    counts: dict[str, int] = {}
-    for part in parts:
-        for kind, number in part.skipped.items():
-            counts[kind] = counts.get(kind, 0) + number
-    return counts

@@ -27,7 +27,7 @@ from railfix.pipeline.received import known_from_start, receive
 from railfix.positioning.constrained import single_point
 from railfix.positioning.normal_equations import Ranges, clock_groups
 from railfix.ranges.atmosphere import SeenFrom, modelled_delays
-from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m
+from railfix.ranges.corrected import PLAUSIBLE_CODE_M, code_sigma_m
 
 #: Median C/N0 over the satellites that is this far below that of the log counts as fallen [dB-Hz].
 FALLEN_DBHZ = 6.0

@@ -8,20 +8,14 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Floats, Strings
 from railfix.integrity.protection.level import ProtectionLevel, along_track_level
 from railfix.integrity.protection.risk import RiskBudget
-from railfix.integrity.raim.detection import RaimLimits
-from railfix.integrity.raim.exclusion import Exclusion, exclude
+from railfix.integrity.raim.exclusion import Exclusion, RaimLimits, exclude
 from railfix.integrity.raim.model import constrained_model
 from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
 
 
 def exclude_faults(
-    ranges: Ranges,
-    trajectory: Trajectory,
-    arc_m: Floats,
-    *,
-    scale: ArrayLike = 1.0,
-    limits: RaimLimits | None = None,
+    ranges: Ranges, trajectory: Trajectory, arc_m: Floats, *, scale: ArrayLike = 1.0, limits: RaimLimits | None = None
 ) -> Exclusion:
     """Test the ranges of each epoch against each other and name up to two faulty satellites.
 

@@ -23,8 +23,7 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Integers, Masks
 
-#: Epochs whose distance is over this many usual intervals stand across a gap.
-_GAP: Final = 1.5
+_GAP: Final = 1.5  #: Epochs whose distance is over this many usual intervals stand across a gap.
 
 
 class Region(IntEnum):
@@ -71,8 +70,7 @@ class Stanford:
     beyond: Indices  #: Indices of the epochs whose error is over the level, the largest excess first.
     continuity: tuple[Continuity, ...]  #: One a window.
     blocks: Blocks
-    #: Of the bins of error and level alike; the last bin holds all that is larger, its upper edge is infinite; shape (N
-    #: + 1,).
+    #: Of the bins of error and level alike; the upper edge of the last one is infinite; shape (N + 1,).
     edges_m: Floats
     histogram: Integers  #: Epochs by bin of the absolute error (axis 0) and of the level (axis 1), shape (N, N).
 
@@ -129,14 +127,7 @@ def stanford(
     bound = np.where(np.isnan(level), np.inf, level)
     beyond, within = judged & (error > bound), bound <= alarm_limit_m
     region = np.select(
-        [
-            ~judged & np.isnan(level),
-            ~judged,
-            ~within & beyond,
-            ~within,
-            beyond & (error > alarm_limit_m),
-            beyond,
-        ],
+        [~judged & np.isnan(level), ~judged, ~within & beyond, ~within, beyond & (error > alarm_limit_m), beyond],
         [
             Region.NO_POSITION,
             Region.UNJUDGED,

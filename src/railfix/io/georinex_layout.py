@@ -1,10 +1,6 @@
 """Observations and navigation records in the xarray layout of georinex, both ways.
 
-georinex (``georinex.load``) holds a log as a dataset over ``time`` and ``sv`` with one variable for
-each RINEX observation type ("C1C", "L1C", "D1C", "S1C", "L1Clli"), and navigation records as a dataset
-over ``time`` (clock reference time in the constellation's own time) and ``sv`` with the names of the
-RINEX tables. A second record of a satellite at the same time (Galileo I/NAV beside F/NAV) is named
-"E01_1".
+A second record of a satellite at the same time (Galileo I/NAV beside F/NAV) is named "E01_1".
 """
 
 from __future__ import annotations
@@ -56,8 +52,7 @@ _NAMES: Final = {
 #: Numbers that RINEX writes in kilometres and georinex holds in metres.
 _KILOMETRES: Final = frozenset("X dX dX2 Y dY dY2 Z dZ dZ2".split())
 _KLOBUCHAR: Final = {"G": "ionospheric_corr_GPS", "C": "ionospheric_corr_BDS", "J": "ionospheric_corr_QZS"}
-#: RINEX writes 0.9999E9 for a number that is not known.
-_UNKNOWN: Final = 0.99e9
+_UNKNOWN: Final = 0.99e9  #: RINEX writes 0.9999E9 for a number that is not known.
 
 
 def observations_to_xarray(observations: Observations) -> xr.Dataset:

@@ -1,8 +1,4 @@
-"""Receiver logs and navigation files of any kind, recognised by their content.
-
-RINEX 2 to 4 (plain, packed, Hatanaka), UBX, RTCM 3 and mixed receiver streams are logs like any other: the
-functions here have the arguments of `railfix.io.rinex` and hand each file to its reader.
-"""
+"""Receiver logs and navigation files of any kind, recognised by their content."""
 
 from __future__ import annotations
 
@@ -17,10 +13,10 @@ import numpy as np
 
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import BrokenLines, Paths, listed
-from railfix.core.mate import mate_table
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io import rinex
+from railfix.io.mate import mate_table
 from railfix.io.receiver.framing import head_of, is_receiver_log
 from railfix.io.rinex.observations import (
     DEFAULT_EPOCHS,

@@ -1,9 +1,4 @@
-"""CSV tables with named columns.
-
-Comma separated, UTF-8 with or without a byte order mark, LF or CR LF, plain or packed (.gz, .Z). Lines
-that begin with ``#`` are comments; those above the header line may carry ``# key: value``. Every error
-names the line.
-"""
+"""CSV tables with named columns; comments above the header line may carry ``# key: value``."""
 
 from __future__ import annotations
 
@@ -19,8 +14,7 @@ from railfix.core.arrays import Floats, Integers
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, text_lines
 
-#: Rows that are read before they become compact.
-_BLOCK: Final = 4096
+_BLOCK: Final = 4096  #: Rows that are read before they become compact.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,11 +40,7 @@ class NamedColumns:
         return InputFileError(self.path, message, line=int(self.line[row]))
 
     def numbers(self, name: str, *, blank: float | None = None) -> Floats:
-        """Parse one column as finite numbers.
-
-        `blank` is the value of an empty cell, and allows ``nan``; without it both are errors. InputFileError: a cell is
-        empty, not a number, or not finite (``inf`` is allowed where `blank` is infinite).
-        """
+        """Parse one column as finite numbers; `blank` is the value of empty cells, and allows ``nan``."""
         given = self.cells[name].str.len_bytes().to_numpy() > 0
         cells = self.cells[name].to_list()
         if blank is not None:
@@ -83,10 +73,7 @@ def _split_comment(line: str) -> tuple[str, str] | None:
 
 
 def read_named_columns(path: FilePath) -> NamedColumns:
-    """Read a comma-separated table with a header line of column names.
-
-    InputFileError: the file is not text, has no header or a repeated column name, or a row has another number of cells.
-    """
+    """Read a comma-separated table with a header line of column names; InputFileError where it is none."""
     return parse_named_columns(text_lines(path), path)
 
 

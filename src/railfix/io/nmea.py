@@ -1,8 +1,4 @@
-"""Positions from an NMEA 0183 log: GGA for the position, RMC or ZDA for the date.
-
-Heights are those of GGA above the geoid plus the geoid separation of the same sentence. Receivers that
-write minutes with five decimals resolve positions to 2 cm only.
-"""
+"""Positions from NMEA 0183 (GGA with RMC or ZDA), GPX and NovAtel logs."""
 
 from __future__ import annotations
 
@@ -29,11 +25,7 @@ _QUALITY: Final = {"INT": 1, "FLOAT": 2, "WAAS": 3, "SBAS": 3, "PSRDIFF": 4, "PP
 
 
 def read_gpx_positions(path: str | PathLike[str]) -> PositionLog:
-    """Read the track points of a GPX 1.0 or 1.1 file; times are UTC there.
-
-    Heights are above the geoid by the standard; the point's ``geoidheight`` is added where it has one, else the height
-    is kept with a note. InputFileError: this is not GPX, or a point has no latitude.
-    """
+    """Read the track points of GPX 1.0 or 1.1 (UTC); heights without ``geoidheight`` are kept, with a note."""
     try:
         root = ElementTree.fromstring(read_text(path))
     except ElementTree.ParseError as error:
@@ -80,10 +72,7 @@ def read_gpx_positions(path: str | PathLike[str]) -> PositionLog:
 
 
 def read_novatel_positions(path: str | PathLike[str]) -> PositionLog:
-    """Read the BESTPOSA, BESTGNSSPOSA and INSPVAA (INSPVASA, INSPVAXA) logs of a NovAtel receiver (SPAN).
-
-    InputFileError: there is no such log in the file, or one is broken.
-    """
+    """Read the BESTPOSA, BESTGNSSPOSA and INSPVAA (INSPVASA, INSPVAXA) logs of a NovAtel receiver (SPAN)."""
     rows: list[tuple[float, ...]] = []
     lines: list[int] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -146,10 +135,7 @@ class _Date:
 
 
 def read_nmea(
-    path: str | PathLike[str],
-    *,
-    broken_lines: BrokenLines = "stop",
-    date: np.datetime64 | None = None,
+    path: str | PathLike[str], *, broken_lines: BrokenLines = "stop", date: np.datetime64 | None = None
 ) -> PositionLog:
     """Read the GGA sentences of an NMEA log.
 
@@ -273,10 +259,7 @@ _DATED: Final[dict[str, Callable[[int, list[str]], _Date | None]]] = {"RMC": _rm
 
 
 def _times(fixes: list[_Gga], dates: list[_Date], *, chained: bool) -> Datetimes:
-    """Compute the GPS time of each fix: the day nearest to the date sentence before it (or the first).
-
-    With one date for the log (`chained`), a day is added at every midnight.
-    """
+    """Compute the GPS time of each fix by the nearest date sentence; with one date (`chained`) count midnights."""
     of_day = np.array([fix.of_day_s for fix in fixes])
     line = np.array([fix.line for fix in fixes])
     if chained:

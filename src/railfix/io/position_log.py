@@ -18,10 +18,8 @@ from railfix.core.settings import misspelt
 from railfix.core.timescale import from_week, timedelta, utc_to_gpst
 from railfix.io.named_columns import NamedColumns, read_named_columns
 
-#: Standard deviations of a CSV log.
-_SIGMAS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")
-#: Columns of a CSV log; the time is GPS time, UTC, Unix time, or GPS week and seconds of it, coordinates are geodetic
-#: or ECEF.
+_SIGMAS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Standard deviations of a CSV log.
+#: Columns of a CSV log; the time is GPS time, UTC, Unix time, or GPS week and seconds; geodetic or ECEF.
 CSV_COLUMNS: Final = (
     "time_gpst", "time_utc", "unix_s", "week", "tow_s", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m",
     "z_m", "quality", "ratio", *_SIGMAS,
@@ -74,21 +72,14 @@ def read_positions(path: str | PathLike[str], *, columns: Mapping[str, str] | No
         `columns` names a column that railfix does not know.
     """
     if ending(path) == ".csv":
-        return _read_csv(path, columns or {})
+        table = rename_columns(read_named_columns(path), columns or {}, known=CSV_COLUMNS)
+        antennas = table.cells["antenna"].unique().sort().to_list() if "antenna" in table else []
+        if len(antennas) > 1:
+            raise InputFileError(path, f"has positions of {' and '.join(antennas)}; give those of one antenna")
+        return positions_of_table(table)
     if columns:
         raise SettingsError(f"{path}: columns can be renamed in a .csv file only")
     return read_rtklib_positions(path)
-
-
-# --- CSV ---------------------------------------------------------------------
-
-
-def _read_csv(path: str | PathLike[str], columns: Mapping[str, str]) -> PositionLog:
-    table = renamed(read_named_columns(path), columns, known=CSV_COLUMNS)
-    antennas = table.cells["antenna"].unique().sort().to_list() if "antenna" in table else []
-    if len(antennas) > 1:
-        raise InputFileError(path, f"has positions of {' and '.join(antennas)}; give those of one antenna")
-    return positions_of_table(table)
 
 
 def positions_of_table(table: NamedColumns) -> PositionLog:
@@ -111,8 +102,9 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
     if not len(table):
         raise InputFileError(path, "there is no position below the header")
     values = np.stack([table.numbers(n, blank=np.nan) for n in (_GEODETIC if geodetic else _CARTESIAN)], axis=-1)
-    if geodetic:
-        _check_latitude(table, values)
+    if geodetic and (outside := np.abs(values[:, 0]) > 90.0).any():
+        row = int(np.argmax(outside))
+        raise table.error(row, f"latitude_deg {values[row, 0]:g} is over 90; are latitude and longitude swapped?")
     quality = table.numbers("quality", blank=-1.0) if "quality" in table else np.full(len(table), -1.0)
     return PositionLog(
         path=str(path),
@@ -146,7 +138,7 @@ def column_names(pairs: Iterable[str]) -> dict[str, str]:
     return columns
 
 
-def renamed(table: NamedColumns, columns: Mapping[str, str], *, known: Collection[str]) -> NamedColumns:
+def rename_columns(table: NamedColumns, columns: Mapping[str, str], *, known: Collection[str]) -> NamedColumns:
     """Give columns of a table the names that railfix has for them; see `read_positions`."""
     if unknown := sorted(set(columns) - set(known)):
         raise SettingsError(f"{table.path}: column {unknown[0]!r} is unknown; expected one of {', '.join(known)}")
@@ -161,18 +153,8 @@ def renamed(table: NamedColumns, columns: Mapping[str, str], *, known: Collectio
     )
 
 
-def _check_latitude(table: NamedColumns, geodetic: Floats) -> None:
-    outside = np.abs(geodetic[:, 0]) > 90.0
-    if outside.any():
-        row = int(np.argmax(outside))
-        raise table.error(row, f"latitude_deg {geodetic[row, 0]:g} is over 90; are latitude and longitude swapped?")
-
-
 def positions_times(table: NamedColumns) -> Datetimes:
-    """Parse the time of each row as GPS time; NaT where it is blank or absent.
-
-    The first of the columns ``time_gpst``, ``time_utc`` (with or without ``Z``), ``unix_s``, ``week`` and ``tow_s``.
-    """
+    """Parse times as GPS time, NaT if blank: ``time_gpst``, ``time_utc``, ``unix_s``, or ``week`` and ``tow_s``."""
     if "time_gpst" not in table and "time_utc" in table:
         return _from_utc(_column_of_times(table, "time_utc"))
     if "time_gpst" not in table and "unix_s" in table:
@@ -251,9 +233,7 @@ def _times(texts: list[str]) -> Datetimes:
 def read_rtklib_positions(path: str | PathLike[str]) -> PositionLog:
     """Read RTKLIB's solution format in any of its time and coordinate forms (manual 2.4.2, appendix B.1).
 
-    Time as week and seconds or as calendar date, in GPST, UTC or JST; coordinates as degrees,
-    as degrees, minutes, seconds, or ECEF. Baselines (e/n/u) and heights above the geoid are
-    rejected, because they do not give an ellipsoidal position.
+    Baselines (e/n/u) and heights above the geoid are rejected: they give no ellipsoidal position.
     """
     lines = read_text(path).splitlines()
     header = [line for line in lines if line.startswith("%")]
@@ -273,15 +253,17 @@ def read_rtklib_positions(path: str | PathLike[str]) -> PositionLog:
     width = min(len(row) for row in fields)
     values = _rtklib_numbers(path, number, [row[2:width] for row in fields])
     coordinates, rest = values[:, : fixed - 2], values[:, fixed - 2 :]
+    after = [name.split("(")[0] for name in names[3:]][: rest.shape[1]]
+    sigmas = [after.index(name) for name in ("sdn", "sde", "sdu") if name in after]
     return PositionLog(
         path=str(path),
         time=time,
         ecef_m=_rtklib_ecef(path, number, coordinates, names),
         quality=rest[:, 0].astype(np.int64),
-        sigma_m=_rtklib_sigma(rest, names),
+        sigma_m=rest[:, sigmas] if len(sigmas) == 3 else np.full((len(rest), 3), np.nan),
         line=number,
         notes=() if scale == "GPST" else (f"{path}: times converted from {scale} to GPS time",),
-        ratio=_rtklib_ratio(rest, names),
+        ratio=rest[:, after.index("ratio")] if "ratio" in after else None,
     )
 
 
@@ -358,17 +340,3 @@ def _rtklib_ecef(path: str | PathLike[str], number: Integers, values: Floats, na
         row = int(np.argmax(outside))
         raise InputFileError(path, f"latitude {latitude[row]:g} is over 90 degrees", line=int(number[row]))
     return ecef_from_geodetic(latitude, longitude, values[:, -1])
-
-
-def _rtklib_sigma(rest: Floats, names: list[str]) -> Floats:
-    """Return standard deviations north, east, up; NaN without the columns sdn, sde, sdu."""
-    after = [name.split("(")[0] for name in names[3:]]
-    if not {"sdn", "sde", "sdu"} <= set(after[: rest.shape[1]]):
-        return np.full((len(rest), 3), np.nan)
-    return rest[:, [after.index(name) for name in ("sdn", "sde", "sdu")]]
-
-
-def _rtklib_ratio(rest: Floats, names: list[str]) -> Floats | None:
-    """Return the column ``ratio``; None where the file has none."""
-    after = [name.split("(")[0] for name in names[3:]]
-    return rest[:, after.index("ratio")] if "ratio" in after[: rest.shape[1]] else None

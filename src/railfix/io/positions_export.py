@@ -1,9 +1,7 @@
 """Write positions of a run as KML, GPX, GeoJSON, GeoPackage or GeoParquet, with a style for QGIS.
 
-Coordinates are longitude and latitude [deg] and height above the ellipsoid [m], WGS 84. GDAL makes GeoJSON and
-GeoPackage. KML and GPX come from templates, because pyogrio can give KML no styles and GPX no description.
-polars writes GeoParquet, of which the wheels of pyogrio have no driver. Every file is made in memory, because GDAL
-does not always report a full disk.
+Templates write KML and GPX, because pyogrio gives KML no styles and GPX no description; polars writes GeoParquet, which
+the wheels of pyogrio cannot. Every file is made in memory, because GDAL does not always report a full disk.
 """
 
 from __future__ import annotations
@@ -66,23 +64,8 @@ def style_file(path: Path) -> Path | None:
 def write_positions(rows: pl.DataFrame, path: Path, *, description: str) -> int:
     """Write the rows that have coordinates in the format of the file's ending, with its style; return their number.
 
-    Parameters
-    ----------
-    rows : polars.DataFrame
-        `COORDINATES`, ``time_gpst``, ``antenna``, ``status`` and any of `ATTRIBUTES`. Infinite values become null.
-    path : Path
-        Ends in ``.kml``, ``.gpx``, ``.geojson``, ``.gpkg`` or ``.parquet``.
-    description : str
-        What the positions are, and the frame of the coordinates; written into the file.
-
-    Raises
-    ------
-    NoPositionError
-        No row has coordinates.
-    OutputError
-        The file or its style cannot be written.
-    ModuleNotFoundError
-        pyogrio or shapely is not installed (``pip install railfix[maps]``).
+    `rows` has `COORDINATES`, ``time_gpst``, ``antenna``, ``status`` and any of `ATTRIBUTES`; `description` is written
+    into the file. NoPositionError: no row has coordinates. OutputError: a file cannot be written.
     """
     points = _points(rows)
     if points.is_empty():
@@ -100,10 +83,9 @@ def _points(rows: pl.DataFrame) -> pl.DataFrame:
     """Return time, attributes and coordinates of the rows that have coordinates."""
     known = rows.drop_nulls(COORDINATES)
     utc = pl.Series(gpst_to_utc(known["time_gpst"].to_numpy())).dt.replace_time_zone("UTC")
-    return known.select(
-        utc.alias("time_utc"),
-        cs.by_name(*ATTRIBUTES, *COORDINATES, require_all=False),
-    ).with_columns(cs.float().replace([math.inf, -math.inf, math.nan], None))
+    return known.select(utc.alias("time_utc"), cs.by_name(*ATTRIBUTES, *COORDINATES, require_all=False)).with_columns(
+        cs.float().replace([math.inf, -math.inf, math.nan], None)
+    )
 
 
 def _content(points: pl.DataFrame, path: Path, description: str) -> bytes:

@@ -1,20 +1,8 @@
-"""Reference positions of each antenna: reference files, ground truth of the simulator, position logs.
+"""Reference positions of each antenna, and tables of tachometer pulses and longitudinal acceleration.
 
-All are one kind of CSV; a row is an antenna at an epoch:
-
-=========== ===============================================================================
-time_gpst   ISO 8601, GPS time
-antenna     ``front``, ``rear``
-chainage_m  along the line at the antenna; empty where unknown
-x_m y_m z_m ECEF
-speed_mps   along the line, + toward rising chainage
-sigma_m     standard deviation along the track
-source      ``rtk`` receiver position, ``bridged`` interpolated, ``truth`` simulated ground truth
-environment surroundings of the train: ``open``, ``cutting``, or any other word
-=========== ===============================================================================
-
-Only time and position are required (geodetic coordinates are accepted). ``truth.csv`` of the simulator
-is such a file without a source, and so are position logs (RTKLIB, CSV, NMEA).
+A reference is a CSV with ``time_gpst``, ``antenna`` (``front``, ``rear``), ``chainage_m``, ``x_m y_m z_m`` (or geodetic
+coordinates), ``speed_mps``, ``sigma_m`` along the track, ``source`` (``rtk``, ``bridged``, ``truth``) and
+``environment`` (``open``, ``cutting`` or any word). Only time and position are required.
 """
 
 from __future__ import annotations
@@ -32,20 +20,26 @@ from numpy.typing import NDArray
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_arrays
 from railfix.core.errors import InputFileError
 from railfix.core.files import ending
-from railfix.io.named_columns import NamedColumns, read_named_columns
+from railfix.core.timescale import seconds
+from railfix.io.named_columns import NamedColumns, parse_named_columns, read_named_columns
 from railfix.io.nmea import read_any_positions
-from railfix.io.position_log import CSV_COLUMNS, PositionLog, positions_of_table, qualities_in_words, renamed
+from railfix.io.position_log import (
+    CSV_COLUMNS,
+    PositionLog,
+    positions_of_table,
+    positions_times,
+    qualities_in_words,
+    rename_columns,
+)
 
 #: Columns of the file, in this order.
 COLUMNS: Final = (
     "time_gpst", "antenna", "chainage_m", "x_m", "y_m", "z_m", "speed_mps", "sigma_m", "source", "environment",
 )  # fmt: skip
-#: Source of a reference position; blank where the file has none.
-SOURCES: Final = ("rtk", "bridged", "truth", "")
+SOURCES: Final = ("rtk", "bridged", "truth", "")  #: Source of a reference position; blank where the file has none.
 #: A CSV with these columns and no source is ground truth of the simulator.
 _OF_TRUTH: Final = ("antenna", "chainage_m", "kilometrage_m", "speed_mps")
-#: RTKLIB's quality of a fixed solution.
-_FIX: Final = 1
+_FIX: Final = 1  #: RTKLIB's quality of a fixed solution.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +131,7 @@ def _table(path: Path, columns: Mapping[str, str]) -> NamedColumns | None:
     """Read the file as a table; None for a file other than CSV."""
     if ending(path) != ".csv":
         return None
-    return renamed(read_named_columns(path), columns, known=dict.fromkeys((*CSV_COLUMNS, *COLUMNS)))
+    return rename_columns(read_named_columns(path), columns, known=dict.fromkeys((*CSV_COLUMNS, *COLUMNS)))
 
 
 def _columns(log: PositionLog, table: NamedColumns | None) -> dict[str, NDArray[np.generic]]:
@@ -197,3 +191,133 @@ def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
     return table.with_columns(
         pl.col(pl.Float64).round(4).fill_nan(None), pl.col("source", "environment").replace("", None)
     )
+
+
+_ISO: Final = "%Y-%m-%dT%H:%M:%S%.9f"  #: Format of times.
+
+LONGEST_STEP_S = 1.0  #: Rows further apart than this are a gap, within which values are unknown [s].
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pulses:
+    """Cumulative pulses of a tachometer, P rows."""
+
+    path: str
+    time: Datetimes
+    count: Floats  #: Falling where the train runs backward, if the table has the direction; shape (P,).
+    kind: str  #: Rows are readings of a counter, single pulses, or distances in metres.
+    signed: bool  #: Whether the count has a direction: it falls somewhere, or the table has the column.
+
+    def at(self, time: Datetimes) -> Floats:
+        """Interpolate the count linearly; NaN outside the table and in gaps during which the train moves."""
+        at, known = seconds(time - self.time[0]), seconds(self.time - self.time[0])
+        count = np.interp(at, known, self.count, left=np.nan, right=np.nan)
+        after = np.clip(np.searchsorted(known, at), 1, len(known) - 1)
+        gap = (known[after] - known[after - 1] > LONGEST_STEP_S) & (self.kind != "pulse")
+        gap &= self.count[after] != self.count[after - 1]
+        gap &= (at != known[after]) & (at != known[after - 1])
+        return np.where(gap, np.nan, count)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Acceleration:
+    """Longitudinal acceleration toward the vehicle's front, A rows [m/s2].
+
+    `kind`: acceleration of the "motion", or "specific_force", which includes gravity on gradients.
+    """
+
+    path: str
+    time: Datetimes
+    acceleration_mps2: Floats
+    kind: str
+
+    def mean_over(self, time: Datetimes) -> Floats:
+        """Compute the mean between consecutive times, shape (len(time) - 1,) [m/s2]; NaN across gaps of the table."""
+        known, at = seconds(self.time - self.time[0]), seconds(time - self.time[0])
+        step = np.diff(known)
+        velocity = np.concatenate(
+            [[0.0], np.cumsum(step * (self.acceleration_mps2[1:] + self.acceleration_mps2[:-1]) / 2.0)]
+        )
+        gaps = np.concatenate([[0], np.cumsum(step > LONGEST_STEP_S)])
+        total = np.interp(at, known, velocity, left=np.nan, right=np.nan)
+        before = gaps[np.clip(np.searchsorted(known, at[:-1], side="right") - 1, 0, len(known) - 1)]
+        after = gaps[np.clip(np.searchsorted(known, at[1:], side="left"), 0, len(known) - 1)]
+        return np.where(before == after, np.diff(total) / np.diff(at), np.nan)
+
+
+def read_pulses(path: str | PathLike[str]) -> Pulses:
+    """Read a tachometer table: CSV (or the same as .parquet) with ``time_gpst`` and the count.
+
+    ``count`` is the reading of a counter (falling when running backward, never wrapping), ``distance_m`` the distance
+    run; with neither, each row is one pulse. A column ``direction`` of 1 and -1 gives the sign. InputFileError: no such
+    table, times that do not rise, a direction other than 1 and -1.
+    """
+    table = _sensor_table(path)
+    time = _rising_times(table)
+    kind = "count" if "count" in table else "distance" if "distance_m" in table else "pulse"
+    if kind == "pulse":
+        count = np.arange(len(table), dtype=np.float64)
+    else:
+        count = table.numbers("count" if kind == "count" else "distance_m")
+    if "direction" in table:
+        direction = table.numbers("direction")
+        wrong = ~np.isin(direction, (-1.0, 1.0))
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise table.error(row, f"direction is {direction[row]:g}; 1 or -1 was expected")
+        count = np.cumsum(np.diff(count, prepend=count[0]) * direction)
+    falling = bool((np.diff(count) < 0).any())
+    return Pulses(path=str(path), time=time, count=count, kind=kind, signed=falling or "direction" in table)
+
+
+def read_acceleration(path: str | PathLike[str]) -> Acceleration:
+    """Read a table of accelerations toward the front: CSV, or .parquet, with ``time_gpst`` and one other column.
+
+    ``specific_force_mps2`` and ``force_forward_mps2`` (of the simulator) are measured by an accelerometer and
+    include gravity on gradients, which is removed with the map; ``acceleration_mps2`` is that of the motion.
+    InputFileError: none or several of the columns, or times that do not rise.
+    """
+    table = _sensor_table(path)
+    kinds = {
+        "specific_force_mps2": "specific_force",
+        "force_forward_mps2": "specific_force",
+        "acceleration_mps2": "motion",
+    }
+    present = [name for name in kinds if name in table]
+    if len(present) != 1:
+        raise InputFileError(
+            path,
+            f"one column of {', '.join(kinds)} was expected; the columns are {', '.join(table.cells)}",
+            line=table.header_line,
+        )
+    return Acceleration(
+        path=str(path), time=_rising_times(table), acceleration_mps2=table.numbers(present[0]), kind=kinds[present[0]]
+    )
+
+
+def _sensor_table(path: str | PathLike[str]) -> NamedColumns:
+    if Path(path).suffix == ".parquet":
+        try:
+            return parse_named_columns(pl.read_parquet(Path(path)).write_csv(datetime_format=_ISO).splitlines(), path)
+        except (OSError, pl.exceptions.PolarsError) as error:
+            raise InputFileError(path, f"cannot be read as a Parquet table ({error})") from None
+    return read_named_columns(path)
+
+
+def _rising_times(table: NamedColumns) -> Datetimes:
+    if "time_gpst" not in table:
+        raise InputFileError(
+            table.path,
+            f"there is no column time_gpst; the columns are {', '.join(table.cells)}",
+            line=table.header_line,
+        )
+    time = positions_times(table)
+    if len(time) < 2:
+        raise InputFileError(table.path, "fewer than two rows")
+    bad = np.isnat(time)
+    if bad.any():
+        raise table.error(int(np.argmax(bad)), "there is no time")
+    bad[1:] = np.diff(time) <= np.timedelta64(0, "ns")
+    if bad.any():
+        raise table.error(int(np.argmax(bad)), "the time does not rise; sort the table and remove duplicates")
+    return time

@@ -18,8 +18,7 @@ from railfix.gnss.orbits.precise import POINTS
 _GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")
 #: Time systems other than GPS time, by the names that files use.
 _TO_GPST: Final = {"UTC": utc_to_gpst, "GLO": utc_to_gpst, "BDT": bdt_to_gpst, "BDS": bdt_to_gpst}
-#: Written where a clock is unknown [us].
-_NO_CLOCK: Final = 999_999.0
+_NO_CLOCK: Final = 999_999.0  #: Written where a clock is unknown [us].
 
 
 @dataclass

@@ -1,10 +1,7 @@
 """The position message of a train: one schema for live positions, supervision and control.
 
-Sent once a period, also without a position. CBOR with integer keys (RFC 8949, canonical order), so that a message
-has about 100 bytes and an older receiver skips keys that it does not know; a JSON view of the same fields; the
-fields of a position report of ETCS (SUBSET-026 v4, 7.4.2, packet 0) as a further view.
-
-Needs the extra ``railfix[live]`` (cbor2).
+CBOR with integer keys (RFC 8949, canonical order): about 100 bytes, and an older receiver skips keys that it does not
+know; a JSON view; and the position report of ETCS (SUBSET-026 v4, 7.4.2, packet 0). Needs ``railfix[live]``.
 """
 
 from __future__ import annotations
@@ -18,10 +15,8 @@ from pydantic import Field, ValidationError, model_validator
 from railfix.core.errors import InputFileError
 from railfix.core.settings import Settings
 
-#: Version of the schema; a receiver rejects other major versions.
-VERSION: Final = 1
-#: Longest encoded message [bytes]; longer input is rejected unread.
-LONGEST: Final = 1024
+VERSION: Final = 1  #: Version of the schema; a receiver rejects other major versions.
+LONGEST: Final = 1024  #: Longest encoded message [bytes]; longer input is rejected unread.
 
 Unsigned = Annotated[int, Field(ge=0, lt=1 << 63)]
 Signed = Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)]
@@ -77,8 +72,7 @@ class TrainMessage(Settings):
     sent_ns: Unsigned  #: Sender's clock when it was sent, GPS time; with the receiver's clock it gives the age.
     line: Unsigned  #: Identity of the line or track.
     chainage_cm: Signed | None = None  #: Front end of the train along the line; None without a position.
-    #: The train's front is at most `under_cm` ahead of and `over_cm` behind `chainage_cm` (SUBSET-026 3.6.4: under- and
-    #: over-reading amount).
+    #: The front is at most `under_cm` ahead of and `over_cm` behind `chainage_cm` (SUBSET-026 3.6.4).
     over_cm: Unsigned | None = None
     under_cm: Unsigned | None = None
     #: Positive with rising chainage; bound of its error [cm/s].
@@ -133,10 +127,7 @@ def encode(message: TrainMessage) -> bytes:
 
 
 def decode(data: bytes) -> TrainMessage:
-    """A message from CBOR; keys that this version does not know are skipped.
-
-    MessageError: the bytes are not CBOR, not a message, of another version, too long, or hold values out of range.
-    """
+    """Decode CBOR, skipping unknown keys; MessageError where it is no message of this version."""
     import cbor2
 
     if len(data) > LONGEST:
@@ -214,26 +205,15 @@ def from_json(line: str) -> TrainMessage:
     return _validate(values)
 
 
-#: Largest value of a length of packet 0; one more means unknown.
-_LARGEST_LENGTH: Final = 32_766
+_LARGEST_LENGTH: Final = 32_766  #: Largest value of a length of packet 0; one more means unknown.
 
 
 def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> dict[str, int]:
-    """Fields of a position report, packet 0 (SUBSET-026 v4, 7.4.2.1), against a reference location of the line.
+    """Return the fields of a position report, packet 0 (SUBSET-026 v4, 7.4.2.1), against a reference location of the
+    line.
 
-    Parameters
-    ----------
-    message : TrainMessage
-        With a position.
-    reference_cm : int [cm]
-        Chainage of the reference location (a balise group, or a virtual one).
-    reference : int
-        Its identity, 0 to 16383 (NID_BG), or with the country (NID_LRBG) up to 2^24 - 1.
-
-    Raises
-    ------
-    ValueError
-        The message has no position, or a distance is outside the packet's range.
+    `reference_cm` is its chainage, `reference` its identity: up to 16383 (NID_BG), or with the country (NID_LRBG) up to
+    2^24 - 1. ValueError: no position, or a distance outside the packet's range.
     """
     if message.chainage_cm is None or message.over_cm is None or message.under_cm is None:
         raise ValueError("a message without a position has no packet 0")

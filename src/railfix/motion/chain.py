@@ -1,16 +1,8 @@
 """Least squares along a chain of instants: the Kalman smoother without a loop over epochs.
 
-A block-tridiagonal information matrix is solved by cyclic reduction: every second instant is eliminated,
-which leaves a chain of half the length, down to one. On the way back each eliminated instant gets its
-value and covariance from its two neighbours. The result is that of a forward-backward
-(Rauch-Tung-Striebel) smoother, in log2(N) passes over the arrays.
-
-References
-----------
-R. A. Sweet, A cyclic reduction algorithm for solving block tridiagonal systems, 1977,
-doi:10.1137/0714050. H. E. Rauch, F. Tung, C. T. Striebel, 1965, doi:10.2514/3.3166.
-
-Motion with an acceleration that is a first-order Gauss-Markov process.
+A block-tridiagonal information matrix is solved by cyclic reduction: every second instant is eliminated, down to one,
+and on the way back gets its value and covariance from its two neighbours, in log2(N) passes (R. A. Sweet 1977,
+doi:10.1137/0714050; the result is that of H. E. Rauch, F. Tung, C. T. Striebel 1965, doi:10.2514/3.3166).
 """
 
 from __future__ import annotations
@@ -42,15 +34,9 @@ class Chain:
         )
 
     def with_observations(self, rows: Indices, coefficients: Floats, value: Floats, weight: Floats) -> Chain:
-        """The chain with scalar observations ``coefficients . x_row = value`` added.
+        """Return the chain with scalar observations ``coefficients . x_row = value`` added, weights inverse variances.
 
-        Parameters
-        ----------
-        rows : ndarray of int, shape (m,)
-            Instants; one may come several times.
-        coefficients : ndarray, shape (n,) or (m, n)
-        value, weight : ndarray, shape (m,)
-            Weight is the inverse variance.
+        `coefficients`, shape (n,) or (m, n); a row may come several times.
         """
         a = np.broadcast_to(coefficients, (len(rows), self.right.shape[1]))
         diagonal, right = self.diagonal.copy(), self.right.copy()
@@ -59,14 +45,9 @@ class Chain:
         return replace(self, diagonal=diagonal, right=right)
 
     def with_steps(self, before: Floats, after: Floats, value: Floats, weight: Floats) -> Chain:
-        """The chain with conditions ``before x_k + after x_{k+1} = value`` on every step added.
+        """Return the chain with conditions ``before x_k + after x_{k+1} = value`` on every step added.
 
-        Parameters
-        ----------
-        before, after : ndarray, shape (N - 1, m, n)
-        value : ndarray, shape (N - 1, m)
-        weight : ndarray, shape (N - 1, m, m)
-            Inverse covariance.
+        Shapes (N - 1, m, n); `weight`, shape (N - 1, m, m), is the inverse covariance.
         """
         weighed_before, weighed_after = (np.swapaxes(a, 1, 2) @ weight for a in (before, after))
         diagonal, right = self.diagonal.copy(), self.right.copy()
@@ -77,13 +58,7 @@ class Chain:
         return replace(self, diagonal=diagonal, upper=self.upper + weighed_before @ after, right=right)
 
     def solve(self) -> tuple[Floats, Floats]:
-        """Values and covariances of every instant, shapes (N, n) and (N, n, n).
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            An unknown is not determined.
-        """
+        """Return values (N, n) and covariances (N, n, n) of every instant; LinAlgError where undetermined."""
         value, covariance, _ = _reduce(self.diagonal, self.upper, self.right)
         return value, covariance
 
@@ -154,21 +129,10 @@ _SERIES: Final = {
 
 
 def singer_steps(dt: Floats, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]:
-    """Compute the transition of position, speed and acceleration, and the covariance of its noise.
+    """Compute the transition of position, speed and acceleration, and the covariance of its noise, shapes (K, 3, 3).
 
-    The acceleration is a first-order Gauss-Markov process (R. A. Singer, Estimating optimal tracking filter
-    performance for manned maneuvering targets, 1970, doi:10.1109/TAES.1970.310128): the noise is the integral of
-    f f' 2 sigma^2 / tau over the step, where f is the response to an impulse of the acceleration.
-
-    Parameters
-    ----------
-    dt : ndarray, shape (K,) [s]
-    sigma_mps2, tau_s : float [m/s2], [s]
-        Standard deviation and correlation time of the acceleration.
-
-    Returns
-    -------
-    step, noise : ndarray, shape (K, 3, 3)
+    The acceleration is a first-order Gauss-Markov process (R. A. Singer 1970, doi:10.1109/TAES.1970.310128): the noise
+    is the integral of f f' 2 sigma^2 / tau over the step, where f is the response to an impulse of the acceleration.
     """
     x = dt / tau_s
     once, twice = np.exp(-x), np.exp(-2.0 * x)

@@ -1,8 +1,7 @@
 """Absolute places from changes of gradient and curvature (P2 2.3): features of a map, and where a measured one lies.
 
-P2 takes the points where gradient or curvature change, not their values: slow biases do not matter then. A place is
-accepted on two conditions of P2 (its distance to the features before agrees with the database; the other quantity
-fits there) and one more: no other place of the window explains the measurement nearly as well.
+P2 takes the points of change, not the values: slow biases do not matter then. A place is accepted where its distance to
+the features before agrees, the other quantity fits, and no other place explains the measurement nearly as well.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Speeds of a Doppler radar and two-way ranges (P2 3): formulas, gate of the ranges, alarms of the radar.
 
-The speed of a radar that looks down at the angle alpha is wrong by ``tan(alpha)`` times the error of the angle: 1.7 %
-a degree at 45 degrees (P2 3.1). Otherwise there is no moment without a speed while the train moves (P2 3.2).
+The speed of a radar that looks down at the angle alpha is wrong by ``tan(alpha)`` times the error of the angle.
 """
 
 from __future__ import annotations
@@ -29,8 +28,7 @@ _MOVING_MPS: Final = 3.0
 _LEAST_BEFORE: Final = 5
 _MOST_BEFORE: Final = 20
 _AFTER: Final = 3
-#: Windows without a speed that are told.
-_SILENT: Final = 2
+_SILENT: Final = 2  #: Windows without a speed that are told.
 #: Least step that is told, and how many times the scatter of the windows.
 _STEP: Final = 0.01
 _SCATTERS: Final = 5.0
@@ -72,14 +70,7 @@ class RadarWatch:
     _sums: Floats = field(default_factory=lambda: np.zeros(4))
 
     def take(self, time: Datetimes, radar_mps: Floats, right_mps: Floats) -> list[RadarAlarm]:
-        """Take speeds of both at the same instants, later than those before; return the alarms that they raise.
-
-        Parameters
-        ----------
-        time : ndarray of datetime64[ns], shape (N,)
-        radar_mps, right_mps : ndarray, shape (N,) [m/s]
-            NaN where nothing was measured.
-        """
+        """Take speeds of both at the same later instants (NaN: not measured); return the alarms that they raise."""
         moving = np.abs(right_mps) > _MOVING_MPS
         heard = np.isfinite(radar_mps[moving])
         radar, right = np.abs(np.nan_to_num(radar_mps[moving])), np.abs(right_mps[moving])

@@ -1,8 +1,4 @@
-"""Samples of the sensors on board, as frozen arrays: inputs beside the observations of the antennas.
-
-Axis 0 is the sample. Times are GPS time, not falling; a value that was not measured is NaN. The columns are those of
-the tables that `railfix simulate` writes.
-"""
+"""Samples of the sensors on board, as frozen arrays; GPS time, not falling; NaN where not measured."""
 
 from __future__ import annotations
 

@@ -1,20 +1,17 @@
 r"""Slip, slide, low speed and rolling away, found by the pitch of the vehicle (P2 2.1), and carried by inertia.
 
-The accelerometer measures motion and the share of gravity along its axis, the tachometer the motion of the wheel
-alone: ``sin(theta_T) = (f_x - a_T) / g`` is the pitch where the wheel rolls. Where it does not, the pitch becomes
+``sin(theta_T) = (f_x - a_T) / g``, by accelerometer and tachometer, is the pitch where the wheel rolls; else it becomes
 one that no line has. Two rules:
 
 * ``"p2"``: ``|sin(theta_T)|`` beyond the steepest line and the pitching of the body. It sees the acceleration of a
-  slip, not its speed: at the top of a slip the wheel's acceleration is that of the train, and the rule is silent.
-* ``"map"``: against the gradient of the line at the present place, with a latch: once found, a slip ends only when
-  the wheel has come back to the speed carried by inertia and the pitch fits.
+  slip, not its speed: at the top of a slip the rule is silent.
+* ``"map"``: against the gradient of the line at the present place, with a latch: a slip ends only when the wheel has
+  come back to the speed carried by inertia and the pitch fits.
 
-While a slip lasts, speed and way come from the accelerometer less the pitch and its offset, which is learnt while
-the wheel rolls; they start `look_back_s` before the detection, for the wheel was off already then.
-
-The pitch is that of the line at the present place where it is known. With a gyro it is the integral of the pitch rate,
-which follows the line slowly and so has the swings of the body on its suspension too; without the line it follows
-the pitch by wheel and accelerometer, and the difference of the two is due to the gyro's bias (P2 2.1(3)).
+While a slip lasts, speed and way come from the accelerometer less the pitch and its offset, learnt while the wheel
+rolls, from `look_back_s` before the detection. The pitch is that of the line where the place is known; with a gyro the
+integral of the pitch rate, which follows the line slowly, or without the line the pitch by wheel and accelerometer (P2
+2.1(3)).
 """
 
 from __future__ import annotations
@@ -105,9 +102,7 @@ class SlipResult:
     way_m: Floats
     #: Sine of the pitch by wheel and accelerometer less the reference pitch; NaN without pulses; shape (N,).
     metric: Floats
-    #: Mean of the metric over `SlipLimits.smoothing_s`, the accelerometer's offset taken off: what is compared; shape
-    #: (N,).
-    smooth: Floats
+    smooth: Floats  #: Mean of the metric over `SlipLimits.smoothing_s` less the accelerometer's offset; shape (N,).
     pitch: Floats  #: Sine of the reference pitch; NaN before it is known; shape (N,).
     gyro_bias_radps: Floats  #: Of the pitch rate, as learnt; 0 without a gyro; shape (N,).
     offset_mps2: Floats  #: Of the accelerometer, as learnt; shape (N,).
@@ -122,17 +117,10 @@ class SlipState:
 
 
 def pitch_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
-    """Return the rate of the pitch from body rates, the roll in curves taken out, shape (N,) [rad/s].
+    """Return the rate of the pitch from body rates (N, 3), the roll in curves taken out, shape (N,) [rad/s].
 
-    The body leans with the cant, so its pitch axis sees a part of the yaw rate: ``w_y cos(phi) - w_z sin(phi)`` with
-    ``sin(phi) = (v w_z - f_y) / g``. Raw it would be wrong by 3.4 mrad/s in a curve of 400 m at 17 m/s.
-
-    Parameters
-    ----------
-    force_mps2, rate_radps : ndarray, shape (N, 3)
-        Forward, right, down (`railfix.motion.samples.InertialSamples`).
-    speed_mps : ndarray, shape (N,) [m/s]
-        Forward.
+    The body leans with the cant: ``w_y cos(phi) - w_z sin(phi)`` with ``sin(phi) = (v w_z - f_y) / g``. Raw it would be
+    wrong by 3.4 mrad/s in a curve of 400 m at 17 m/s.
     """
     sine = roll_sine(force_mps2, rate_radps, speed_mps)
     return np.asarray(rate_radps[:, 1] * np.sqrt(1.0 - sine**2) - rate_radps[:, 2] * sine)
@@ -163,8 +151,7 @@ class MotionSamples(NamedTuple):
     #: at the speed carried through a slip: that of the wheel would lean the body; NaN for none; shape (N, 3) [m/s2,
     #: rad/s, rad/s].
     body: Floats | None = None
-    #: Time since the last pulse: a vehicle that creeps has pulses without a speed. Without it that of the last speed;
-    #: shape (N,).
+    #: Time since the last pulse: who creeps has pulses without a speed; else that of the last speed; shape (N,).
     since_pulse_s: Floats | None = None
 
 

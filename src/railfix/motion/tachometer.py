@@ -1,10 +1,7 @@
 """Speed, acceleration and way from the instants of a tachometer's pulses (P2 2.2), and checks of its settings.
 
-P2 measures the time between pulses instead of counting pulses: a count needs a moving average, which delays and
-blurs the acceleration. Over the pulses k0 to k the mean speed is ``(k - k0) p / (t_k - t_k0)``; where the acceleration
-is even it is the speed at the middle of the interval, and that instant is returned with it.
-
-Tachometer pulses as a signed distance along the track.
+Over the pulses k0 to k the mean speed is ``(k - k0) p / (t_k - t_k0)``; where the acceleration is even it is the speed
+at the middle of the interval, and that instant is returned with it.
 """
 
 from __future__ import annotations
@@ -19,7 +16,7 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.errors import MismatchError
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
-from railfix.io.sensor_log import Pulses
+from railfix.io.reference_log import Pulses
 from railfix.motion.samples import TachometerPulses
 
 #: Ratios of a speed in a wrong unit to one in m/s, and the names of the units.
@@ -160,10 +157,7 @@ def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
 
 
 def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
-    """Return the number of lost and doubled pulses seen up to instants, shape (N,).
-
-    A fault shows with the two pulses after it: an instant cannot know of one that is not over yet.
-    """
+    """Return the number of lost and doubled pulses seen up to instants, two pulses late, shape (N,)."""
     lost, doubled = tooth_faults(pulses)
     total = np.concatenate([[0], np.cumsum((lost & (np.diff(pulses.pulse, prepend=pulses.pulse[:1]) < 2)) | doubled)])
     return np.asarray(total[np.maximum(np.searchsorted(pulses.time, time, side="right") - 2, 0)], dtype=np.int64)
@@ -225,10 +219,8 @@ def check_speeds(
 _WINDOW_S: Final = 10.0
 _LEAST_DISTANCE_M: Final = 30.0
 _LEAST_WINDOWS: Final = 5
-#: Lowest speed that determines a direction [m/s].
-_DIRECTION_MPS: Final = 0.3
-#: Highest plausible speed [m/s].
-_FASTEST_MPS: Final = 150.0
+_DIRECTION_MPS: Final = 0.3  #: Lowest speed that determines a direction [m/s].
+_FASTEST_MPS: Final = 150.0  #: Highest plausible speed [m/s].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,19 +237,10 @@ class Wheel:
         return self.pulse_m / float(np.sqrt(12.0)) if self.pulses.kind == "count" else 0.0
 
     def distance_m(self, time: Datetimes, speed_hint_mps: Floats) -> Floats:
-        """Cumulated distance along rising chainage at instants.
+        """Compute the cumulated distance along rising chainage at instants, shape (N,) [m].
 
-        Parameters
-        ----------
-        time : ndarray of datetime64[ns], shape (N,)
-        speed_hint_mps : ndarray, shape (N,) [m/s]
-            Speeds from another source, for the direction of unsigned pulses; NaN where unknown. Where the
-            direction changes, it is taken to change at the longest standstill.
-
-        Returns
-        -------
-        ndarray, shape (N,) [m]
-            NaN where the table has no reading, and where a turn without a stop leaves the direction open.
+        `speed_hint_mps`, from another source, gives the direction of unsigned pulses; it changes at the longest
+        standstill. NaN where the table has no reading, and where a turn without a stop leaves the direction open.
         """
         run = self.pulse_m * self.pulses.at(time)
         sign = _direction(run, speed_hint_mps)
@@ -312,20 +295,7 @@ def _turn(step: Floats, before: float, after: float) -> Floats:
 
 
 def wheel_of(pulses: Pulses, pulse_m: float | None, time: Datetimes, arc_m: Floats) -> Wheel:
-    """Tachometer with the distance of a pulse as given, or estimated from fixes: the median over windows.
-
-    Parameters
-    ----------
-    pulse_m : float or None [m]
-    time : ndarray of datetime64[ns], shape (F,)
-        Of good fixes.
-    arc_m : ndarray, shape (F,) [m]
-
-    Raises
-    ------
-    MismatchError
-        Too few fixes to estimate it, or pulses that imply an impossible speed.
-    """
+    """Return the wheel with the given distance of a pulse, or the median of estimates from good fixes."""
     source = "given"
     if pulses.kind == "distance":
         pulse_m, source = 1.0, "metres in the table"

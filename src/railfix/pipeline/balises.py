@@ -18,8 +18,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import BaliseReadings, ListedBalises
-from railfix.track.polyline import short_way_m
-from railfix.track.trajectory import Trajectory
+from railfix.track.trajectory import Trajectory, short_way_m
 from railfix.tracking import BaliseEpochs, Tracked
 
 #: An identity read again within this time is the same passing [s]: a second balise of a group, or a train that stands.

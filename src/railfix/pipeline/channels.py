@@ -16,15 +16,14 @@ from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings, chang
 from railfix.core.constants import CLOCK_GROUP, SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.gnss.navigation import Navigation, glonass_channels
-from railfix.gnss.observations import Observations
+from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.gnss.orbits import SatelliteStates
 from railfix.gnss.orbits.prepared_records import group_delay_s, group_delay_sigma_m, unhealthy
-from railfix.gnss.signals import carrier_frequency_hz
 from railfix.pipeline.config import Config
 from railfix.positioning.normal_equations import clock_groups
 from railfix.positioning.two_frequencies import SecondCodes, TwoFrequencyState, combine_codes, ionosphere_free
 from railfix.ranges.atmosphere import thin_shell_obliquity
-from railfix.ranges.weights import DFMC_SIGNALS, PLAUSIBLE_CODE_M, SECOND_SIGNALS, channel_order, code_sigma_m
+from railfix.ranges.corrected import DFMC_SIGNALS, PLAUSIBLE_CODE_M, SECOND_SIGNALS, channel_order, code_sigma_m
 from railfix.screens import Screened, Verdict
 
 if TYPE_CHECKING:

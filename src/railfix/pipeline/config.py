@@ -33,15 +33,14 @@ from railfix.integrity.protection.araim import AraimBudget
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.positioning.carrier import ContinuityLimits, CycleSlipLimits, PhaseLimits, SmoothingLimits
 from railfix.positioning.constrained import ConstrainedLimits, SinglePointLimits
-from railfix.positioning.forgetting import LastingErrorLimits
 from railfix.positioning.intersystem_bias import ClockOffsetLimits
 from railfix.positioning.map_offset import MapOffsetLimits
-from railfix.positioning.noise_scale import NoiseScaleLimits, RobustFitLimits
+from railfix.positioning.noise_scale import LastingErrorLimits, NoiseScaleLimits, RobustFitLimits
 from railfix.positioning.section_search import SectionLimits
 from railfix.positioning.two_frequencies import TwoFrequencyLimits
 from railfix.ranges.base_station import BaseLimits
+from railfix.ranges.corrected import DEFAULT_SIGNALS, CodeNoise, NominalErrors
 from railfix.ranges.sbas import SbasLimits
-from railfix.ranges.weights import DEFAULT_SIGNALS, CodeNoise, NominalErrors
 from railfix.screens import SCREENS
 from railfix.tracking.limits import TrackingLimits
 

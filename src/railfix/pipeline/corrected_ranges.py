@@ -27,16 +27,18 @@ from railfix.ranges.atmosphere import SeenFrom, modelled_delays
 from railfix.ranges.base_station import BaseDifferences
 from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.ranges.corrected import (
+    PLAUSIBLE_CODE_M,
     SBAS_SIGNAL,
+    code_sigma_m,
     corrected_satellites,
     dfmc_delays,
     dfmc_satellites,
+    first_available,
     sbas_delays,
 )
 from railfix.ranges.error_model import Conditions, ErrorModel
 from railfix.ranges.sbas import SatelliteCorrections, SbasCorrections
 from railfix.ranges.sbas.dfmc import DfmcCorrections
-from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m, first_available
 from railfix.screens import AntennaRanges, Screened, Verdict, suspicion_sigma_m
 
 #: Standard deviation given to raw ranges for the approximate place of the antenna [m].

@@ -23,7 +23,7 @@ from railfix.positioning.constrained import single_point
 from railfix.positioning.noise_scale import robust_fit
 from railfix.positioning.normal_equations import Ranges
 from railfix.ranges.atmosphere import SeenFrom, modelled_delays
-from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m, first_available
+from railfix.ranges.corrected import PLAUSIBLE_CODE_M, code_sigma_m, first_available
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, thinned_rows
 
 _EARTH_RADIUS_M: Final = 6.371e6

@@ -39,7 +39,7 @@ from railfix.positioning.constrained import (
     constrained_position,
     single_point,
 )
-from railfix.positioning.forgetting import LastingErrorState, ages, decayed_sums, steps_s
+from railfix.positioning.noise_scale import LastingErrorState, ages, decayed_sums, steps_s
 from railfix.positioning.normal_equations import Ranges, inverse_3x3, normal_equations
 from railfix.positioning.section_search import SearchIndex, Section, search
 

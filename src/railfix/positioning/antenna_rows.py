@@ -1,8 +1,7 @@
 """Epochs of several antennas as the rows of one set of arrays.
 
-An epoch of two antennas is two rows. Stages that know neither the line nor earlier epochs (orbits, 3-D positions,
-robust fits, levels) take all rows in one call; those that do are called for the rows of each antenna, and what they
-return is joined.
+Stages that know neither the line nor earlier epochs take all rows in one call; those that do are called for the rows of
+each antenna, and what they return is joined.
 """
 
 from __future__ import annotations
@@ -23,8 +22,7 @@ Value = TypeVar("Value")
 State = TypeVar("State")
 #: Members that are the same for all rows: of the channels alone.
 _OF_CHANNELS: Final = frozenset({"satellite", "signal", "frequency_hz", "channels", "columns", "header"})
-#: All rows.
-EVERY: Final = slice(None)
+EVERY: Final = slice(None)  #: All rows.
 
 
 @dataclass(frozen=True)
@@ -50,14 +48,8 @@ class AntennaRows:
         return self.indices[0].trajectory.sigma_height_m
 
     def apart(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> list[Value]:
-        """Return what a function returns for each antenna.
-
-        Parameters
-        ----------
-        function : callable
-            Takes the search index, the rows, and one item of each of `of_antennas`.
-        of_antennas : sequence
-            By antenna, for example states.
+        """Return what a function returns for each antenna: of its search index, rows, and one item of each of
+        `of_antennas`.
         """
         return [function(*each) for each in zip(self.indices, self.parts, *of_antennas, strict=True)]
 

@@ -1,13 +1,8 @@
 """The constrained position, one distance along the line and the receiver clocks; and the 3-D single point.
 
-P1 2.2(3): the antenna is at ``R = r_i + d e_i`` on the section between two points of its
-trajectory. Unknown are d and one clock a constellation. The map is not exact: its plan error
-across the track and its height error are common to all satellites of an epoch, so they are
-carried as an added covariance ``H_m S_m H_m^T`` - computed here as two more unknowns with that
-covariance as their prior, which is the same thing (the matrix inversion lemma).
-
-The 3-D single point is the reference method of P1 section 5: weighted least squares in x, y, z and one receiver clock
-a constellation; the pipeline takes the nearest point of the trajectory afterwards.
+P1 2.2(3): the antenna is at ``R = r_i + d e_i`` on the section between two points of its trajectory. The map's plan and
+height errors are two more unknowns with their covariance as prior, the same as an added covariance ``H_m S_m H_m^T``.
+The single point is the reference method of P1 section 5.
 """
 
 from __future__ import annotations
@@ -41,8 +36,7 @@ class Constrained:
     section: Indices  #: Section that the position lies on, -1 where there is none; shape (T,).
     sigma_m: Floats  #: Standard deviation along the line from the weights and the map error, shape (T,).
     exact_map_sigma_m: Floats  #: The part of it that the weights give, as if the map were exact; shape (T,).
-    #: Along-track dilution: sigma along the line for unit, equal weights and an exact map. Infinite where the
-    #: satellites stand across the track; shape (T,).
+    #: Sigma along the line for unit, equal weights and an exact map; infinite where undetermined; shape (T,).
     dilution: Floats
     #: How far beyond an end of the line the ranges pull a position clamped to it; 0 elsewhere; shape (T,).
     overshoot_m: Floats
@@ -55,22 +49,11 @@ class Constrained:
 def constrained_position(
     ranges: Ranges, trajectory: Trajectory, vertex: Indices, *, limits: ConstrainedLimits | None = None
 ) -> Constrained:
-    """Positions along the line of all epochs at once, each started at a point of the trajectory.
+    """Compute positions along the line of all epochs at once, each started at a point of the trajectory (-1: none).
 
-    Newton steps inside a section (P1 2.2(3), algorithm of one unknown after the clocks are
-    eliminated); a step that leaves the section stops at its end and goes on from there in the
-    neighbouring one. Where both neighbours of a point send the step back to it, the point itself
-    is the answer. At an open end of the line the position is clamped and `overshoot_m` is how
-    far beyond it the ranges pull; at one where the line is closed it goes on beyond it.
-
-    Parameters
-    ----------
-    ranges : Ranges
-        T epochs.
-    trajectory : Trajectory
-        V points.
-    vertex : ndarray of int, shape (T,)
-        Point to start from, as `section.search` picks it; -1 leaves the epoch without a position.
+    Newton steps inside a section (P1 2.2(3)); a step that leaves it stops at its end and goes on in the neighbouring
+    one. Where both neighbours of a point send the step back, the point is the answer. At an open end the position is
+    clamped and `overshoot_m` is how far beyond it the ranges pull.
     """
     limits = limits or ConstrainedLimits()
     start = np.where(ranges.n_used - ranges.n_clocks >= 1, vertex, -1)
@@ -149,9 +132,7 @@ class SinglePointLimits(Settings):
 class SinglePoint:
     """3-D positions, T epochs."""
 
-    #: NaN where there is none: fewer than three satellites beyond one a clock, singular geometry, or no convergence;
-    #: shape (T, 3).
-    ecef_m: Floats
+    ecef_m: Floats  #: NaN with too few satellites, singular geometry, or no convergence; shape (T, 3).
     clock_m: Floats  #: Shape (T, G).
     matrix: Floats  #: Normal matrix at the position, shape (T, 3, 3) [1/m^2].
     covariance_m2: Floats  #: Of the position, from the weights; shape (T, 3, 3).
@@ -164,14 +145,8 @@ class SinglePoint:
 
 
 def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLimits | None = None) -> SinglePoint:
-    """Single-point positions of all epochs at once.
-
-    Parameters
-    ----------
-    ranges : Ranges
-        T epochs.
-    start_ecef_m : ndarray, shape (T, 3) [m]
-        Where the iteration starts; anywhere within a few thousand kilometres.
+    """Compute single-point positions of all epochs at once, from starts within a few thousand kilometres, shape (T, 3)
+    [m].
     """
     limits = limits or SinglePointLimits()
     place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterated_points(

@@ -1,15 +1,13 @@
 r"""Speed along the track from carrier Dopplers.
 
-The range that a signal travels (`geodesy.range_with_rotation`) is ``rho = |s - r| + omega / c (s_x r_y - s_y r_x)``
-with the satellite s at ``t - rho / c``. Its derivative, with A the part of the satellite's velocity and
-``g = d rho / d r``, is ``rho' = (A + g . v) / (1 + A / c)``. A receiver at speed v along the unit tangent e of its
-path measures
+The range ``rho = |s - r| + omega / c (s_x r_y - s_y r_x)`` with the satellite s at ``t - rho / c`` has the derivative
+``rho' = (A + g . v) / (1 + A / c)`` with A the part of the satellite's velocity and ``g = d rho / d r``. A receiver at
+speed v along the unit tangent e of its path measures
 
     ``-lambda D = (A + (g . e) v) / (1 + A / c) + d_r - d_s + T'``
 
-with the drifts of the receiver's and the satellite's clock in m/s and the change of the tropospheric delay.
-Unknown are v and d_r: two numbers an epoch, whatever the number of constellations, for one oscillator drives
-all channels. The ionosphere's change (millimetres a second) is left in.
+with the drifts of both clocks in m/s and the change of the tropospheric delay. Unknown are v and d_r, whatever the
+number of constellations. The ionosphere's change (millimetres a second) is left in.
 """
 
 from __future__ import annotations
@@ -26,20 +24,15 @@ from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.core.settings import Settings
 from railfix.gnss.navigation import Navigation, glonass_channels
-from railfix.gnss.observations import Observations
+from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.gnss.orbits import satellite_states
-from railfix.gnss.signals import carrier_frequency_hz
 from railfix.ranges.atmosphere import saastamoinen_delay_m
-from railfix.ranges.weights import PLAUSIBLE_CODE_M, channel_order, first_available
+from railfix.ranges.corrected import PLAUSIBLE_CODE_M, channel_order, first_available
 
-#: Step over which clocks and elevations are differenced [s].
-_STEP_S: Final = 1.0
-#: Median of the absolute value of a standard normal variable.
-_NORMAL_MEDIAN: Final = 0.6745
-#: Fits with the scale of the one before; the first takes the limits' own noise.
-_PASSES: Final = 3
-#: Mean squares of residuals within this many standard deviations of 1 are what noise makes.
-_TELLING: Final = 2.0
+_STEP_S: Final = 1.0  #: Step over which clocks and elevations are differenced [s].
+_NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
+_PASSES: Final = 3  #: Fits with the scale of the one before; the first takes the limits' own noise.
+_TELLING: Final = 2.0  #: Mean squares of residuals within this many standard deviations of 1 are what noise makes.
 
 
 class DopplerSpeedLimits(Settings):
@@ -97,26 +90,12 @@ class DopplerSpeed:
 
 
 def dopplers_of_log(
-    obs: Observations,
-    navigation: Navigation,
-    *,
-    systems: Sequence[str],
-    signals: Mapping[str, Sequence[str]],
+    obs: Observations, navigation: Navigation, *, systems: Sequence[str], signals: Mapping[str, Sequence[str]]
 ) -> Dopplers:
-    """Dopplers of a log with the satellites that they come from; one signal a satellite and epoch.
+    """Return the Dopplers of a log with the satellites that they come from; one signal a satellite and epoch.
 
-    Parameters
-    ----------
-    systems : sequence of str
-        Constellations asked for.
-    signals : mapping of str to sequence of str
-        Signals of each constellation in order of preference.
-
-    Returns
-    -------
-    Dopplers
-        Without Dopplers of unhealthy satellites, of unknown carriers, and of channels without a code, which
-        tells the instant of transmission.
+    Left out are unhealthy satellites, unknown carriers, and channels without a code, which tells the instant of
+    transmission.
     """
     columns = channel_order(obs.satellite, obs.signal, systems=systems, signals=signals)
     satellite, signal = obs.satellite[columns], obs.signal[columns]
@@ -144,19 +123,11 @@ def dopplers_of_log(
 def doppler_speed(
     dopplers: Dopplers, ecef_m: Floats, tangent: Floats, *, limits: DopplerSpeedLimits | None = None
 ) -> DopplerSpeed:
-    """Weighted least squares of speed along the track and clock drift, all epochs at once.
+    """Estimate speed along the track and clock drift by weighted least squares, all epochs at once.
 
-    Outliers go one by one, the largest first, as long as enough satellites are left. What counts as large
-    is measured by the log itself: its residuals' median gives the scale of the noise, so that neither a
-    phone nor a surveying receiver needs settings. An epoch whose residuals are clearly larger than that
-    gets a larger standard deviation.
-
-    Parameters
-    ----------
-    ecef_m : ndarray, shape (T, 3) [m]
-        Where the antenna is; 10 m off change a range rate by 2 mm/s. NaN: no speed.
-    tangent : ndarray, shape (T, 3)
-        Unit vector along the track there.
+    Outliers go one by one, the largest first, as long as enough satellites are left; the median of the log's residuals
+    is the scale. `ecef_m`, shape (T, 3): 10 m off change a range rate by 2 mm/s; NaN: no speed. `tangent`: unit
+    vectors.
     """
     limits = limits or DopplerSpeedLimits()
     shape = (len(dopplers), 3)

@@ -1,11 +1,7 @@
-"""Offsets between the receiver clocks of the constellations, estimated slowly.
+"""Offsets between the receiver clocks of the constellations, stable to a metre over hours, estimated slowly.
 
-Each constellation needs one satellite to determine its clock. The offset between a receiver's clocks
-(inter-system bias) is stable to a metre over hours. Once it is known, a single
-satellite of a constellation contributes, and every satellite is checked against all others.
-
-The offset used at an epoch is estimated from earlier epochs only, so live and post-processed results
-are equal, whatever the chunks.
+Once an offset is known, a single satellite of a constellation contributes, and every satellite is checked against all
+others. It is estimated from earlier epochs only, so that results do not depend on chunks.
 """
 
 from __future__ import annotations
@@ -20,7 +16,7 @@ from railfix.core.arrays import Datetimes, Floats
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import EVERY
 from railfix.positioning.constrained import SinglePoint
-from railfix.positioning.forgetting import correlated_sums
+from railfix.positioning.noise_scale import correlated_sums
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges
 
 
@@ -75,28 +71,10 @@ def tie_clocks(
     parts: Sequence[slice] = (EVERY,),
     limits: ClockOffsetLimits | None = None,
 ) -> tuple[ClockTies, list[OffsetState]]:
-    """Offsets known at each epoch from the epochs before it.
+    """Return the offsets known at each epoch from the epochs before it, and the new states of the receivers.
 
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    clocks : tuple of str, length G
-        Letter of each group of `ranges`.
-    reference : str
-        Letter of the reference clock.
-    ranges : Ranges
-        Without ties; those that agree with each other alone, so that a faulty satellite moves no offset.
-    free : SinglePoint
-        Position from these ranges with every clock on its own, where one range at least is redundant.
-    states : sequence of OffsetState
-        Of each receiver.
-    parts : sequence of slice
-        Rows of each.
-
-    Returns
-    -------
-    ClockTies
-    list of OffsetState
+    `ranges`: without ties, those that agree with each other alone, with the letter of each of its groups in `clocks`;
+    `free`: position with every clock on its own and a redundant range; `parts`: rows of each receiver.
     """
     limits = limits or ClockOffsetLimits()
     epochs = len(time)

@@ -1,9 +1,7 @@
 """Offset of the 3-D positions from the line over minutes: the test of a wrong map.
 
-A map whose heights lack the geoid, a map of the next track or in another reference frame lies beside or
-above the path of the antenna by a constant. Single epochs hide it in their noise; the mean over a window does not. Its
-sigma has three parts: noise, which the window averages; errors of satellites and atmosphere, which it does not; and the
-stated error of the map.
+Single epochs hide a constant offset in their noise; the mean over a window does not. Its sigma has three parts: noise,
+which the window averages; errors of satellites and atmosphere, which it does not; and the stated error of the map.
 """
 
 from __future__ import annotations
@@ -22,12 +20,11 @@ from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.constrained import SinglePoint
-from railfix.positioning.forgetting import correlated_sums
+from railfix.positioning.noise_scale import correlated_sums
 from railfix.positioning.normal_equations import RangeArrays, Ranges
 from railfix.track.trajectory import Trajectory
 
-#: Sums of a window.
-_SUMS: Final = 9
+_SUMS: Final = 9  #: Sums of a window.
 
 
 class MapOffsetLimits(Settings):
@@ -139,22 +136,8 @@ def map_offset(
     *,
     limits: MapOffsetLimits | None = None,
 ) -> tuple[MapOffset, list[MapOffsetState]]:
-    """Compute the mean offset of 3-D positions from the line, each epoch's own position included.
-
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    ranges : Ranges
-        What the 3-D positions were solved with: ranges that agree with each other.
-    point : SinglePoint
-        3-D positions.
-    states : sequence of MapOffsetState
-        By antenna.
-
-    Returns
-    -------
-    MapOffset
-    list of MapOffsetState
+    """Compute the mean offset of 3-D positions from the line, each epoch's own position included; states are by
+    antenna.
     """
     limits, (arc_m, off_map) = limits or MapOffsetLimits(), positions
     usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.n_used - ranges.n_clocks > 3)
@@ -217,18 +200,8 @@ def terms_of_epochs(
 ) -> Floats:
     """Return what each epoch adds to the sums of its window, shape (T, 9): `MapOffsetState.sums`, of one sample.
 
-    Parameters
-    ----------
-    ranges
-        As for `map_offset`.
-    nominal_m, variance
-        Of `OffsetErrors`; `nominal_m` in C order.
-    ecef_m, covariance_m2 : ndarray, shapes (T, 3) [m], (T, 3, 3) [m^2]
-        3-D positions.
-    place_ecef_m : ndarray, shape (T, 3) [m]
-        Positions on the line.
-    axes : ndarray, shape (T, 2, 3)
-        Unit vectors across and up there.
+    3-D positions with covariance (T, 3, 3), places on the line (T, 3), unit vectors across and up there (T, 2, 3);
+    `nominal_m` (in C order) and `variance` of `OffsetErrors`.
     """
     offset = np.einsum("tij,tj->ti", axes, ecef_m - place_ecef_m)
     gain = (axes @ covariance_m2) @ (

@@ -1,20 +1,12 @@
-"""Receiver noise scale, single-epoch variance and single-epoch sigma.
+"""Receiver noise scale, single-epoch variance, single-epoch sigma, and robust clocks at a known position.
 
-Two scales are learnt from earlier epochs, both as root mean squares with exponential forgetting:
+Two scales are learnt from earlier epochs, as root mean squares with exponential forgetting: the robust one, from the
+ranges of each epoch that agree with each other, which RAIM tests with and does not influence; and the stated one, from
+the ranges that RAIM left, under every sigma and level. Epochs that RAIM did not resolve, and epochs off the map, teach
+neither of them.
 
-- the robust one, from the ranges of each epoch that agree with each other (`robust_fit`): RAIM tests with it. It
-  does not depend on what RAIM decides, so that neither one bad satellite from the first epoch on nor a wrong
-  start can settle in it;
-- the stated one, from the ranges that RAIM left, under every sigma and level.
-
-Epochs that RAIM did not resolve, and epochs off the map, teach neither of them.
-
-Iteratively reweighted least squares with the IGG-III weights (Y. Yang, L. Song and T. Xu, Robust estimator for
-correlated observations based on bifactor equivalent weights, Journal of Geodesy 76, 2002) and the median of the
-absolute residuals as scale: a range whose residual passes `reject` scales has no part in the fit at all. No
-noise level is assumed, so that the noise of a receiver can be learnt from what is kept.
-
-Robust receiver clock estimate from residuals at a known position.
+Robust fits are iteratively reweighted least squares with the IGG-III weights (Yang, Song and Xu, Journal of Geodesy 76,
+2002) and the median of the absolute residuals as scale: no noise level is assumed.
 """
 
 from __future__ import annotations
@@ -27,14 +19,113 @@ from pydantic import Field
 from scipy.special import ndtri, stdtrit
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings
 from railfix.core.settings import Settings
-from railfix.positioning.forgetting import ages, decayed_sums
+from railfix.core.timescale import seconds
 from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
 
-#: Median of the absolute value of a standard normal variable.
-_NORMAL_MEDIAN: Final = 0.6745
+#: Windows that one running sum spans; exp(50) = 5e21, so that it overflows nowhere and keeps all digits of its terms.
+_SPAN: Final = 50.0
+
+
+def steps_s(time: Datetimes, last: np.datetime64) -> Floats:
+    """Time since the epoch before, shape (T,) [s]; 0 where there is none (`last` NaT)."""
+    return steps_of(time.astype(np.int64), int(np.asarray(last, dtype="datetime64[ns]").astype(np.int64)))
+
+
+def steps_of(time_ns: Integers, last_ns: int) -> Floats:
+    """Compute `steps_s` of instants as numbers of nanoseconds."""
+    time = np.concatenate([[last_ns], time_ns]).astype("datetime64[ns]")
+    return np.fmax(seconds(np.diff(time)), 0.0)
+
+
+def ages(time: Datetimes, last: np.datetime64, last_age: float, *, window_s: float, least_epochs: float) -> Floats:
+    """Age of each epoch since the start of a log, shape (T,) [windows]; `last` and `last_age` are of the epoch before.
+
+    A window is `window_s` or `least_epochs` epochs, whichever is longer, so that gaps forget no faster than epochs
+    come.
+    """
+    step = np.minimum(steps_s(time, last) / window_s, 1.0 / least_epochs)
+    return np.cumsum(np.concatenate([[last_age], step]))[1:]
+
+
+def decayed_sums(age: Floats, values: Floats, start: Floats, last_age: float) -> tuple[Floats, Floats]:
+    """Sums of the values (T, K) of all earlier epochs, each times ``exp(-difference of the ages)``, and those after the
+    last.
+
+    Running sums (K,) are kept in units of the decay since the start of a span of 50 windows, so that the same numbers
+    are added in the same order wherever a chunk begins.
+    """
+    return decayed(age, np.ascontiguousarray(values), np.asarray(start, dtype=np.float64), float(last_age))
+
+
+def correlated_sums(
+    time: Datetimes,
+    values: Floats,
+    start: Floats,
+    last: np.datetime64,
+    last_age: float,
+    *,
+    window_s: float,
+    correlation_s: float,
+) -> tuple[Floats, Floats, Floats, float]:
+    """Sums over a window of epochs whose errors are alike for `correlation_s`: each counts by the time since the one
+    before.
+
+    Arguments as for `ages` and `decayed_sums`. Returns decayed sums at each epoch, its own values not included (T, K),
+    what each epoch adds (T, K), running sums after the last epoch (K,), and its age.
+    """
+    own = np.minimum(steps_s(time, last) / correlation_s, 1.0)[:, None] * values
+    age = ages(time, last, last_age, window_s=window_s, least_epochs=window_s / correlation_s)
+    before, after = decayed_sums(age, own, start, last_age)
+    return before, own, after, float(age[-1]) if len(time) else last_age
+
+
+def decayed(age: Floats, values: Floats, start: Floats, last_age: float) -> tuple[Floats, Floats]:
+    """Compute `decayed_sums`; arrays in C order."""
+    span = np.floor(age / _SPAN)
+    current, of_current = start, np.floor(last_age / _SPAN)
+    before = np.empty(values.shape)
+    edges = np.flatnonzero(np.concatenate([[True], span[1:] != span[:-1], [True]])) if len(span) else np.zeros(1, int)
+    for first, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        current = current * np.exp(-_SPAN * (span[first] - of_current))
+        of_current = span[first]
+        growth = np.exp(age[first:end] - _SPAN * of_current)[:, None]
+        sums = np.cumsum(np.concatenate([current[None], growth * values[first:end]]), axis=0)
+        before[first:end] = sums[:-1] / growth
+        current = sums[-1]
+    return before, current
+
+
+class LastingErrorLimits(Settings):
+    """When a satellite is wrong for long."""
+
+    #: Time constant of the mean of the residuals: a minute, as reflections on a train that moves last less.
+    memory_s: float = Field(default=60.0, gt=0)
+    #: Standard deviations that a residual counts with at most: those of the weights, or of the receiver's noise where
+    #: that is larger.
+    clipped: float = Field(default=2.0, gt=0)
+    #: Mean from which on a satellite is left out, over `clipped`. On recordings in cities without a fault the largest
+    #: is 0.59, but for satellites seen by reflection alone; 20 m on one satellite reach it after 75 to 115 s.
+    share: float = Field(default=0.62, gt=0, le=1)
+    most_satellites: int = Field(default=2, ge=0, le=4)  #: Satellites left out at a time; 0: none.
+
+
+@dataclass(frozen=True, kw_only=True)
+class LastingErrorState:
+    """Means of the residuals after the last epoch."""
+
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    age: float = 0.0  #: [windows].
+    channel: Strings = field(default_factory=lambda: np.empty(0, dtype="<U6"))  #: Satellite and signal, shape (S,).
+    #: Sums behind the noise of the ranges, those in error included (`NoiseState`); shape (2,).
+    noise: Floats = field(default_factory=lambda: np.zeros(2))
+    #: By turn: of the residuals of all ranges, then of those without the worst satellite, and so on; shape (S, P).
+    sums: Floats = field(default_factory=lambda: np.empty((0, 0)))
+
+
+_NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
 
 
 class RobustFitLimits(Settings):
@@ -51,8 +142,7 @@ class RobustFit:
     """Ranges that agree with each other, T epochs by M channels."""
 
     kept: Masks  #: Used ranges whose residual is below `RobustFitLimits.reject` scales, shape (T, M).
-    #: Weighted sum of the squared residuals of the kept ranges over their degrees of freedom; NaN without any; shape
-    #: (T,).
+    #: Weighted sum of squared residuals of the kept ranges over their freedom; NaN without any; shape (T,).
     variance: Floats
     freedom: Integers  #: Kept ranges beyond clocks and unknowns of the place, shape (T,).
 
@@ -67,22 +157,11 @@ def map_information(trajectory: Trajectory, section: Indices) -> Floats:
 
 
 def robust_fit(
-    ranges: Ranges,
-    place_ecef_m: Floats,
-    *,
-    information: Floats | None = None,
-    limits: RobustFitLimits | None = None,
+    ranges: Ranges, place_ecef_m: Floats, *, information: Floats | None = None, limits: RobustFitLimits | None = None
 ) -> RobustFit:
-    """Fit each epoch with IGG-III weights around a place.
+    """Fit each epoch with IGG-III weights around the solution of the plain fit, shape (T, 3); steps from it are linear.
 
-    Parameters
-    ----------
-    ranges : Ranges
-        T epochs.
-    place_ecef_m : ndarray, shape (T, 3) [m]
-        Solution of the plain fit; steps from it are linear.
-    information : ndarray, shape (T, 3, 3) [1/m^2], optional
-        Known of the place beforehand (`map_information`: one unknown is left); none: three unknowns.
+    `information`, shape (T, 3, 3) [1/m^2]: known beforehand (`map_information`: one unknown is left); none: three.
     """
     limits = limits or RobustFitLimits()
     used = ranges.weight > 0
@@ -147,23 +226,7 @@ def noise_age(time: Datetimes, state: NoiseState, *, limits: NoiseScaleLimits) -
 def robust_scale(
     age: Floats, fit: RobustFit, teaching: Masks, state: NoiseState, *, limits: NoiseScaleLimits
 ) -> tuple[Floats, Floats]:
-    """Standard deviation of the ranges against their weights, from what agreed in the epochs before each.
-
-    Parameters
-    ----------
-    age : ndarray, shape (T,) [windows]
-        `noise_age`.
-    fit : RobustFit
-        On the line.
-    teaching : ndarray of bool, shape (T,)
-        Epochs to learn from: those that are on the map.
-
-    Returns
-    -------
-    scale : ndarray, shape (T,)
-    sums : ndarray, shape (2,)
-        New `NoiseState.robust`.
-    """
+    """Scale of the ranges against their weights (T,) by what agreed before each epoch; and new sums (2,)."""
     use = teaching & (fit.freedom > 0) & np.isfinite(fit.variance)
     return _learnt(age, np.where(use, fit.variance * fit.freedom, 0.0), np.where(use, fit.freedom, 0), state.robust,
                    np.ones(len(age)), state, limits)  # fmt: skip
@@ -179,26 +242,7 @@ def stated_scale(
     *,
     limits: NoiseScaleLimits,
 ) -> tuple[Floats, Floats]:
-    """Standard deviation of the ranges against their weights, from what RAIM left in the epochs before each.
-
-    Parameters
-    ----------
-    age : ndarray, shape (T,) [windows]
-        `noise_age`.
-    wsse : ndarray, shape (T,)
-        Weighted sum of squared residuals after exclusions.
-    redundancy : ndarray of int, shape (T,)
-    teaching : ndarray of bool, shape (T,)
-        Epochs to learn from: resolved, and on the map.
-    robust : ndarray, shape (T,)
-        Robust scale, which takes the place of a scale of 1 as the prior.
-
-    Returns
-    -------
-    scale : ndarray, shape (T,)
-    sums : ndarray, shape (2,)
-        New `NoiseState.remaining`.
-    """
+    """Scale of the ranges against their weights (T,) by what RAIM left before each epoch; and new sums (2,)."""
     use = teaching & (redundancy > 0) & np.isfinite(wsse)
     return _learnt(age, np.where(use, wsse, 0.0), np.where(use, redundancy, 0), state.remaining, robust, state, limits)
 
@@ -225,11 +269,6 @@ def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits:
 
     Posterior mean of a variance that scatters about that of the window with `spread` degrees of freedom (scaled inverse
     chi-square distribution), given the epoch's own residuals.
-
-    Parameters
-    ----------
-    scale, wsse : ndarray, shape (T,)
-    redundancy : ndarray of int, shape (T,)
     """
     freedom = np.where(np.isfinite(wsse), np.maximum(redundancy, 0), 0)
     own = np.where(freedom > 0, np.fmax(wsse, 0.0), 0.0)
@@ -239,13 +278,8 @@ def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits:
 def own_sigma_m(redundancy: Integers, wsse: Floats, sigma_m: Floats, scale: Floats) -> Floats:
     """Single-epoch sigma along the line, shape (T,) [m].
 
-    The standard deviation by the weights, times the larger of the receiver's scale and the one that
-    the epoch's own residuals show, widened as Student's t is where few ranges are redundant.
-
-    Parameters
-    ----------
-    redundancy : ndarray of int, shape (T,)
-    wsse, sigma_m, scale : ndarray, shape (T,)
+    The standard deviation by the weights, times the larger of the receiver's scale and that of the epoch's own
+    residuals, widened as Student's t is where few ranges are redundant.
     """
     freedom = np.maximum(redundancy, 1)
     shown = np.sqrt(np.maximum(wsse, 0.0) / freedom)

@@ -1,14 +1,8 @@
-"""Normal equations of ranges with the receiver clocks eliminated.
+"""Normal equations of ranges with the receiver clocks eliminated: a 3 x 3 system in the place alone.
 
-The single-point position, the constrained position and the section search all solve the same
-problem: how well pseudoranges fit a place, for any receiver clock of each constellation. Subtracting the
-weighted mean of a constellation's satellites from its residuals and design
-rows is the same as solving for that clock (algebraically: the Schur complement of the clock
-block). What is left is a 3 x 3 system in the place alone.
-
-Where the offsets between the clocks are known to some sigma (`ClockTies`), what the means of the
-constellations say about each other is added back: each mean, less its offset, is one more
-observation of a common clock, which is eliminated in the same way.
+Subtracting the weighted mean of a constellation's satellites from its residuals and design rows is the same as solving
+for that clock (the Schur complement of the clock block). Where the offsets between the clocks are known to some sigma
+(`ClockTies`), each mean, less its offset, is one more observation of a common clock, eliminated in the same way.
 """
 
 from __future__ import annotations
@@ -25,8 +19,7 @@ from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings
 from railfix.core.constants import CLOCK_GROUP
 
-#: Sigma of an offset between clocks of which nothing is known [m].
-UNTIED_M: Final = 1e6
+UNTIED_M: Final = 1e6  #: Sigma of an offset between clocks of which nothing is known [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,9 +66,7 @@ class Ranges:
     """Corrected pseudoranges of an antenna, ready to be fitted: T epochs by M channels."""
 
     sat_ecef_m: Floats  #: Satellites in ECEF at transmit time; any finite value where the weight is 0; shape (T, M, 3).
-    #: Corrected pseudorange (satellite clock, group delay, ionosphere, troposphere applied); any finite value where the
-    #: weight is 0; shape (T, M).
-    code_m: Floats
+    code_m: Floats  #: Corrected pseudorange; any finite value where the weight is 0; shape (T, M).
     weight: Floats  #: 1/sigma^2, 0 for what is not used; shape (T, M) [1/m^2].
     groups: tuple[slice, ...]  #: Channels that share one receiver clock stand side by side; one slice a clock.
     ties: ClockTies | None = None  #: Known offsets between these clocks; None: none.
@@ -137,18 +128,7 @@ class NormalEquations:
 
 
 def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
-    """Slices of channels that share a receiver clock.
-
-    Parameters
-    ----------
-    system : sequence of str, length M
-        Constellation letters, those of one clock side by side (QZSS beside GPS).
-
-    Raises
-    ------
-    ValueError
-        When the channels of one clock are not side by side.
-    """
+    """Return slices of channels that share a receiver clock; ValueError where they are not side by side."""
     clocks = [CLOCK_GROUP[str(letter)] for letter in system]
     starts = [i for i, clock in enumerate(clocks) if i == 0 or clock != clocks[i - 1]]
     if len({clocks[i] for i in starts}) != len(starts):
@@ -157,14 +137,7 @@ def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
 
 
 def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
-    """Normal equations of `ranges` linearised at one place an epoch.
-
-    Parameters
-    ----------
-    ranges : Ranges
-        T epochs.
-    place_ecef_m : ndarray, shape (T, 3) [m]
-    """
+    """Return the normal equations of `ranges` linearised at one place an epoch, shape (T, 3) [m]."""
     system, means, rows, seen = kernels.ranges.reduced_equations(
         ranges.arrays, np.ascontiguousarray(place_ecef_m, dtype=np.float64)
     )
@@ -201,11 +174,7 @@ def fit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> 
 
 
 def inverse_3x3(matrix: Floats) -> Floats:
-    """Inverse of symmetric 3 x 3 matrices by their cofactors, shape (..., 3, 3).
-
-    NaN where a matrix is singular: its determinant, against the cube of its mean diagonal, is
-    below 1e-12 (axes whose information differs by more than six orders of magnitude in sigma).
-    """
+    """Invert symmetric 3 x 3 matrices by cofactors; NaN where the scaled determinant is below 1e-12."""
     a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2]
     d, e, f = matrix[..., 1, 1], matrix[..., 1, 2], matrix[..., 2, 2]
     cofactors = np.empty(matrix.shape)

@@ -1,18 +1,10 @@
 """Section search: the point of the trajectory that fits the ranges best.
 
-P1 2.2(2) compares ranges with distances by between-satellite single differences. With their full
-covariance these give the weighted sum of squared residuals after the clock of each constellation
-is eliminated (`normal_equations.fit`), so no reference satellite has to be chosen. `search` returns the
-point with the least such ``q``, in a time that does not grow with the line:
-
-* where a 3-D position exists, ``q`` grows from it as a quadratic form, so the point lies in a ball
-  whose radius follows from the ``q`` of any one point; stretches of line outside it are dropped,
-  long ones first;
-* where it does not (two or three satellites), coarse to fine: the square root of ``q`` cannot
-  change faster than the square root of the summed weights times the distance moved, so a stretch
-  of line whose middle fits too badly is dropped.
-
-Both are exact, not heuristic: tests compare them with ``q`` at every point of the line.
+P1 2.2(2) compares ranges with distances by between-satellite single differences, whose weighted sum of squares is that
+of the residuals after each constellation's clock is eliminated. `search` returns the point with the least such ``q`` in
+a time that does not grow with the line. Where a 3-D position exists, ``q`` grows from it as a quadratic form, so
+stretches outside a ball are dropped. Where it does not, coarse to fine: the root of ``q`` changes at most by the root
+of the summed weights times the distance moved. Both are exact.
 """
 
 from __future__ import annotations
@@ -28,7 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from railfix import kernels
-from railfix.core.arrays import Floats, Indices, Integers, Masks
+from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.settings import Settings
 from railfix.kernels.layout import CLEAR_M, FAN_OUT, ROTATION_GRADIENT
 from railfix.positioning.constrained import SinglePoint
@@ -154,17 +146,7 @@ class SectionCandidates(NamedTuple):
     matrix_of: Indices  #: Which of them belongs to each point, shape (p,).
 
 
-def _searchable(ranges: Ranges) -> Masks:
-    return np.asarray(ranges.n_used > ranges.n_clocks)
-
-
-def search(
-    ranges: Ranges,
-    index: SearchIndex,
-    point: SinglePoint,
-    *,
-    limits: SectionLimits | None = None,
-) -> Section:
+def search(ranges: Ranges, index: SearchIndex, point: SinglePoint, *, limits: SectionLimits | None = None) -> Section:
     """Return the point of the trajectory with the least q at each epoch, and the best other place.
 
     Parameters
@@ -186,7 +168,7 @@ def search(
     if len(in_ball):
         part = _in_ball(ranges, index, point, weight_norm, in_ball, radius[in_ball])
         candidates.append(part)
-    coarse = np.flatnonzero(~np.isfinite(radius) & _searchable(ranges))
+    coarse = np.flatnonzero(~np.isfinite(radius) & (ranges.n_used > ranges.n_clocks))
     if len(coarse):
         part, tried = _coarse_to_fine(ranges, index, weight_norm, freedom, limits, coarse)
         evaluations[coarse] += tried
@@ -220,12 +202,7 @@ def _ball(
 
 
 def _in_ball(
-    ranges: Ranges,
-    index: SearchIndex,
-    point: SinglePoint,
-    weight_norm: Floats,
-    epochs: Indices,
-    radius: Floats,
+    ranges: Ranges, index: SearchIndex, point: SinglePoint, weight_norm: Floats, epochs: Indices, radius: Floats
 ) -> SectionCandidates:
     """Points in the ball of each epoch with q from the quadratic form; exact where that leaves a choice."""
     count, vertex, q, half_gradient, unsure = kernels.search.points_in_balls(
@@ -246,12 +223,7 @@ def _in_ball(
 
 
 def _coarse_to_fine(
-    ranges: Ranges,
-    index: SearchIndex,
-    weight_norm: Floats,
-    freedom: Integers,
-    limits: SectionLimits,
-    epochs: Indices,
+    ranges: Ranges, index: SearchIndex, weight_norm: Floats, freedom: Integers, limits: SectionLimits, epochs: Indices
 ) -> tuple[SectionCandidates, Integers]:
     """Return the points that fit as well as noise allows, by dropping stretches of line that fit too badly."""
     points = index.trajectory.ecef_m

@@ -1,8 +1,4 @@
-"""Positions from plain arrays: 3-D position, section search and constrained fix, each a stage by hand.
-
-Channels of one receiver clock stand side by side, as `railfix.ranges.corrected_ranges` gives them; NaN ranges are
-not used.
-"""
+"""Positions from plain arrays: 3-D position, section search and constrained fix, each a stage by hand."""
 
 from __future__ import annotations
 

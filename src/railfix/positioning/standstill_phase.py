@@ -1,11 +1,8 @@
 """Carrier phases of a train at rest beside a base station: how probable they are for a place known but for its error.
 
-Double differences of the phases have integer ambiguities that stay the same while the train stands. Along a track
-the place is known across but for the error of the map, so that the phases of all satellites together have few
-unknowns, and integers that fit them exist near the true place alone (P1 2.5: carrier phase gives centimetres, at
-rest time may be taken). Each satellite's phase has a constant error, which does not average out.
-
-LAMBDA: decorrelation by integer transformations and a search in a shrinking ellipsoid (Teunissen 1995,
+Double differences have integer ambiguities that stay while the train stands; along a track, integers that fit the
+phases of all satellites exist near the true place alone (P1 2.5). Each satellite's phase has a constant error, which
+does not average out. LAMBDA: decorrelation and a search in a shrinking ellipsoid (Teunissen 1995,
 doi:10.1007/BF00863419; Chang, Yang & Zhou 2005, doi:10.1007/s00190-005-0004-x).
 """
 
@@ -21,20 +18,12 @@ from scipy.special import logsumexp
 
 from railfix.core.arrays import Floats, Integers
 
-#: Vectors whose square exceeds the least by more are not looked for: exp(-20) of its likelihood.
-_WITHIN: Final = 40.0
-#: Exchange of two unknowns must shrink the conditional variance by more than rounding.
-_ROUNDING: Final = 1e-9
+_WITHIN: Final = 40.0  #: Vectors whose square exceeds the least by more are not looked for: exp(-20) of its likelihood.
+_ROUNDING: Final = 1e-9  #: Exchange of two unknowns must shrink the conditional variance by more than rounding.
 
 
 class IntegerSearch:
-    """Search for integer vectors near real ones that have the same covariance.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (n, n) [cycle^2]
-        Positive definite.
-    """
+    """Search for integer vectors near real ones with the same positive definite covariance, shape (n, n) [cycle^2]."""
 
     def __init__(self, covariance: Floats) -> None:
         lower, variance = _lower_factor(covariance)
@@ -43,20 +32,10 @@ class IntegerSearch:
         self._back = np.round(np.linalg.inv(self._transform)).astype(np.int64)
 
     def nearest(self, cycles: Floats, count: int, *, below: float = np.inf) -> tuple[Integers, Floats]:
-        """The nearest integer vectors, nearest first.
+        """Return at most `count` integer vectors (m, n), nearest first, and their squares ``(N - cycles)' inv(Q) (N -
+        cycles)``.
 
-        Parameters
-        ----------
-        cycles : ndarray, shape (n,)
-        below : float
-            Vectors of larger squares are left out.
-
-        Returns
-        -------
-        integers : ndarray of int, shape (m, n)
-            At most `count`, of squares near the least; none where all squares are larger.
-        squares : ndarray, shape (m,)
-            ``(N - cycles)' inv(covariance) (N - cycles)``.
+        None of a square of `below` or more.
         """
         integers, squares = _search(cycles @ self._transform, self._lower, self._variance, count, below)
         return integers @ self._back, squares
@@ -151,9 +130,7 @@ _NEGLIGIBLE: Final = -5.0
 class MeanPhases:
     """Mean double differences of the carrier phases of one antenna, n pairs of satellites."""
 
-    #: Observed less computed for the origin; differs from a multiple of the wavelength by the place and errors; shape
-    #: (n,).
-    difference_m: Floats
+    difference_m: Floats  #: Observed less computed for the origin, but for multiples of the wavelength; shape (n,).
     away: Floats  #: Change of it with the place, east, north, up; shape (n, 3).
     wavelength_m: Floats  #: Shape (n,).
     covariance_m2: Floats  #: Shape (n, n).
@@ -175,23 +152,11 @@ def phase_log_likelihood(
     *,
     fault_prior: float,
 ) -> Floats:
-    """Logarithm of the density of the phases of all antennas, given their codes, for places of the antennas.
+    """Logarithm of the density of the phases of A antennas, given their codes, under U hypotheses of their places,
+    (U,).
 
-    The phases are within a wavelength, as the integers are unknown; with the probability `fault_prior` they follow
-    no model (a slip, half a cycle) and are uniform there.
-
-    Parameters
-    ----------
-    expected_m : ndarray, shape (U, 3 A)
-        Places of the A antennas under each of U hypotheses.
-    prior_m2 : ndarray, shape (3 A, 3 A)
-        Covariance of the places about those: along the track, of the map, of height.
-    codes : sequence of CodePlace, length A
-    phases : sequence of MeanPhases, length A
-
-    Returns
-    -------
-    ndarray, shape (U,)
+    `expected_m` (U, 3 A) and covariance `prior_m2` about it. The phases are within a wavelength, as the integers are
+    unknown; with the probability `fault_prior` they follow no model (a slip, half a cycle) and are uniform there.
     """
     measured = np.concatenate([code.place_m for code in codes])
     of_codes = block_diag(*(code.covariance_m2 for code in codes))

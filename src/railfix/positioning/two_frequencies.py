@@ -5,14 +5,9 @@ The difference of the two corrected codes of a satellite has no geometry. With `
     ``P2 - P1 = B + (ratio - 1) I + e2 - e1``
 
 where I is the error of the modelled ionosphere on the first frequency, and B the delay between the frequencies in the
-receiver, common to all satellites with the same two signals. I changes over minutes: the mean of the differences of a
-satellite measures it, without a phase and its slips. B and I follow from the means of all satellites by best linear
-prediction, with the sigma of the model as the prior; what is common to all satellites stays in B, and the clock
-takes it up. The two codes, less the ionosphere predicted so far, then measure one range with a common error of known
-sigma: least squares in closed form. Where the ionosphere is well known that is the weighted mean of both codes, where
-it is not and the codes are precise, nearly the ionosphere-free combination.
-
-The difference of the epoch itself, less what is predicted, is noise and multipath.
+receiver. B and I follow from the means of all satellites by best linear prediction, with the sigma of the model as the
+prior. The two codes, less the ionosphere predicted so far, then measure one range with a common error of known sigma:
+least squares in closed form.
 """
 
 from __future__ import annotations
@@ -25,14 +20,11 @@ from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.settings import Settings
-from railfix.positioning.forgetting import correlated_sums
+from railfix.positioning.noise_scale import correlated_sums
 
-#: Mean size of a normal deviate, inverted.
-_FROM_MEAN_SIZE: Final = 1.2533
-#: Samples with the noise that the weights assume, which the noise scale begins with.
-_FIRST_SAMPLES: Final = 2.0
-#: Sigmas beyond which the mean difference of a satellite counts as so far off and no further.
-_CLIP: Final = 2.5
+_FROM_MEAN_SIZE: Final = 1.2533  #: Mean size of a normal deviate, inverted.
+_FIRST_SAMPLES: Final = 2.0  #: Samples with the noise that the weights assume, which the noise scale begins with.
+_CLIP: Final = 2.5  #: Sigmas beyond which the mean difference of a satellite counts as so far off and no further.
 #: Satellites that the error of the model is judged by at least, and the least share of its prior variance then.
 _FEWEST: Final = 5
 _LEAST_PRIOR: Final = 0.04
@@ -120,23 +112,11 @@ def combine_codes(
     state: TwoFrequencyState,
     limits: TwoFrequencyLimits,
 ) -> tuple[Combined, TwoFrequencyState]:
-    """Combine the two codes of each satellite, with the ionosphere from the epochs before.
+    """Combine the two codes of each satellite, with the ionosphere from the epochs before, however a log is cut.
 
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    code_m, noise_m : ndarray, shape (T, K) [m]
-        First codes, corrected by the models, NaN where unusable; and the noise that the weights assume.
-    prior_sigma_m : ndarray, shape (T, K) [m]
-        Standard deviation of the modelled ionosphere on the first frequency, along the sight.
-    pairs : tuple of (tuple of str, ndarray of int)
-        Names of the pairs, length Q, and the number of the group of each whose receiver delay is common, shape (Q,).
-
-    Returns
-    -------
-    Combined
-    TwoFrequencyState
-        The same, bit by bit, however a log is cut into chunks.
+    `code_m`, shape (T, K), are corrected first codes, NaN where unusable; `noise_m` is what the weights assume,
+    `prior_sigma_m` that of the modelled ionosphere on the first frequency; `pairs` are the names of the pairs, length
+    Q, and the group of each whose receiver delay is common.
     """
     names, groups = pairs
     own, number = state.with_pairs(names)
@@ -219,14 +199,7 @@ def ionosphere_free(
 def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphere_m2: Floats) -> tuple[Floats, Floats]:
     """Return the weight of the second code in the range by least squares, and the variance of the codes' difference.
 
-    Parameters
-    ----------
-    first_m2, second_m2 : ndarray, any shape [m^2]
-        Variances of both codes, without the ionosphere.
-    ratio : ndarray
-        Square of the first frequency over the second.
-    ionosphere_m2 : ndarray [m^2]
-        Variance of the delay on the first frequency; a large one gives the ionosphere-free combination.
+    Variances of both codes are without the ionosphere; a large `ionosphere_m2` gives the ionosphere-free combination.
     """
     total = first_m2 + second_m2 + (ratio - 1.0) ** 2 * ionosphere_m2
     return (first_m2 - (ratio - 1.0) * ionosphere_m2) / total, total

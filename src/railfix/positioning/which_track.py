@@ -1,14 +1,10 @@
 """Which of several tracks a train stands on, from codes and carrier phases at rest (P1 2.5).
 
-Hypotheses are a track and the way the train faces, and *none*: a track that the map does not have, parallel to the
-nearest at any distance that keeps clear of the others. At rest multipath does not average out: each satellite's code
-has a constant bias, so the covariance of the mean does not fall with the number of epochs, and satellite, orbit and
-atmosphere errors are common to both antennas. Beside a base station the carrier phases count, too
-(`railfix.positioning.standstill_phase`). The posterior probability of a hypothesis is its prior times the
-likelihood integrated over the place along the track. A decision is taken when all others together have less than the
-risk allowed; whatever the time at which that happens, its probability of being wrong is that risk, as far as the error
-model holds (a posterior probability is a martingale; Baum & Veeravalli 1994, doi:10.1109/18.340472, for the sequential
-test).
+Hypotheses are a track and the way the train faces, and *none*: a parallel track that the map does not have. At rest
+each satellite's code has a constant bias, so the covariance of the mean does not fall with the number of epochs. The
+posterior of a hypothesis is its prior times the likelihood integrated over the place along the track. A decision is
+taken when all others together have less than the risk allowed, which is its probability of being wrong as far as the
+error model holds (a posterior is a martingale; Baum & Veeravalli 1994, doi:10.1109/18.340472).
 """
 
 from __future__ import annotations
@@ -23,12 +19,7 @@ from scipy.special import chdtrc, logsumexp
 
 from railfix.core.arrays import Floats, Masks, Strings
 from railfix.core.settings import Settings, option
-from railfix.positioning.standstill_phase import (
-    CodePlace,
-    MeanPhases,
-    phase_log_likelihood,
-    uniform_log_likelihood,
-)
+from railfix.positioning.standstill_phase import CodePlace, MeanPhases, phase_log_likelihood, uniform_log_likelihood
 
 #: Steps of the integrals along and across the track [m].
 _ALONG_M: Final = 0.25
@@ -120,26 +111,10 @@ def standstill_fix(
     errors: StandstillErrors,
     receivers: int = 1,
 ) -> StandstillFix | None:
-    """Place of an antenna at rest from mean code residuals at an origin.
+    """Fix the place of an antenna at rest from mean code residuals at an origin; None where satellites are too few.
 
-    Parameters
-    ----------
-    azimuth_deg, elevation_deg : ndarray, shape (K,)
-    system : ndarray of str, shape (K,)
-        Letter of each satellite's clock.
-    residual_m : ndarray, shape (K,)
-        Mean of observed minus computed code at the origin.
-    seconds : float
-        Time over which it is the mean.
-    common_m : ndarray, shape (K,)
-        Standard deviation of satellite and atmosphere errors, common to both antennas.
-    receivers : int
-        2 where a base station's codes are subtracted, which have such errors too.
-
-    Returns
-    -------
-    StandstillFix or None
-        None where the satellites are too few.
+    Shapes (K,): `system` letters of the clocks, `residual_m` observed minus computed, means over `seconds`, `common_m`
+    sigmas of satellite and atmosphere errors; `receivers` is 2 where a base station's codes are subtracted.
     """
     letters = np.unique(system)
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
@@ -201,18 +176,10 @@ def track_posterior(
     prior: Mapping[str, float] | None = None,
     phases: Sequence[MeanPhases] = (),
 ) -> TrackPosterior:
-    """Probability of each track, and of none, that a train at rest stands on it.
+    """Compute the probability of each track, and of none, that a train at rest stands on it.
 
-    Parameters
-    ----------
-    fixes : sequence of StandstillFix
-        Of one antenna or both.
-    arms_m : sequence of float [m]
-        Place of each antenna along the train from a common point, positive to its front.
-    prior : mapping of str to float, optional
-        Weights of the mapped tracks by name, from the last place or the interlocking; those not named have none.
-    phases : sequence of MeanPhases
-        Of each antenna, beside a base station; empty without.
+    `arms_m`: place of each antenna along the train, positive to its front; `prior`: weights of the mapped tracks by
+    name, those not named have none; `phases`: of each antenna beside a base station; empty without.
     """
     covariance = _covariance(fixes, errors, tracks)
     places = np.concatenate([fix.east_north_m for fix in fixes])
@@ -286,12 +253,7 @@ def _with_phases(
 
 
 def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
-    """Covariance of the antennas' places, shape (3 A, 3 A): along and map common to them, height and mounting not.
-
-    Parameters
-    ----------
-    heading : ndarray, shape (A, 2)
-    """
+    """Covariance of the antennas' places, shape (3 A, 3 A): along and map common to them, height and mounting not."""
     count = len(heading)
     along = np.column_stack([heading, np.zeros(count)])
     right = np.column_stack([heading[:, 1], -heading[:, 0], np.zeros(count)])

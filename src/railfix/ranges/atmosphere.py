@@ -13,8 +13,7 @@ from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.geodesy import angles_of, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import SECONDS_PER_DAY, to_week
 
-#: Latitudes of its tables [deg].
-_RTCA_LATITUDE: Final = np.array([15.0, 30.0, 45.0, 60.0, 75.0])
+_RTCA_LATITUDE: Final = np.array([15.0, 30.0, 45.0, 60.0, 75.0])  #: Latitudes of its tables [deg].
 #: Pressure [mbar], temperature [K], vapour pressure [mbar], lapse of temperature [K/m] and of vapour (table A-2).
 _RTCA_MEAN: Final = np.array(
     [
@@ -62,23 +61,10 @@ def klobuchar_delay_m(
     coefficients: ArrayLike,
     frequency_hz: Floats,
 ) -> Floats:
-    """Ionospheric delay of the broadcast model (IS-GPS-200, 20.3.3.5.2.5, figure 20-4).
+    """Ionospheric delay of the broadcast model (IS-GPS-200, 20.3.3.5.2.5, figure 20-4), shape (T, M) [m].
 
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-        GPS time.
-    latitude_deg, longitude_deg : ndarray, shape (T,) [deg]
-    elevation_deg, azimuth_deg : ndarray, shape (T, M) [deg]
-    coefficients : array_like, shape (8,)
-        alpha 0 to 3, beta 0 to 3 [s, s/semicircle, ...].
-    frequency_hz : ndarray, shape (M,) [Hz]
-        The model is made for L1; other carriers scale by (f1/f)^2.
-
-    Returns
-    -------
-    ndarray, shape (T, M) [m]
-        NaN where an angle, a coordinate or a frequency is NaN, and at or below the horizon.
+    Latitude and longitude (T,), angles (T, M), `coefficients` alpha 0 to 3, beta 0 to 3, `frequency_hz` (M,): carriers
+    other than L1 scale by (f1/f)^2. NaN where an input is NaN, and at or below the horizon.
     """
     _, seconds_of_week = to_week(time)
     alpha, beta = np.array(coefficients, dtype=np.float64).reshape(2, 4)
@@ -107,23 +93,10 @@ def _cubic(coefficients: Floats, x: Floats) -> Floats:
 def saastamoinen_delay_m(
     latitude_deg: Floats, height_m: Floats, elevation_deg: Floats, *, relative_humidity: float = 0.7
 ) -> Floats:
-    """Tropospheric delay of Saastamoinen in the standard atmosphere (J. Saastamoinen, 1972).
+    """Tropospheric delay of Saastamoinen in the standard atmosphere (J. Saastamoinen, 1972), shape (T, M) [m].
 
-    Pressure, temperature and vapour pressure follow the standard atmosphere at the height; both
-    parts are mapped by 1/sin(elevation), as single-point programs do.
-
-    Parameters
-    ----------
-    latitude_deg, height_m : ndarray, shape (T,)
-        Ellipsoidal height; below sea level counts as sea level. NaN delay outside -100 m to 10 km.
-    elevation_deg : ndarray, shape (T, M) [deg]
-    relative_humidity : float
-        0 to 1.
-
-    Returns
-    -------
-    ndarray, shape (T, M) [m]
-        NaN where an input is NaN, and at or below the horizon.
+    Both parts are mapped by 1/sin(elevation). Ellipsoidal heights below sea level count as sea level. NaN where an
+    input is NaN, at or below the horizon, and outside -100 m to 10 km.
     """
     height = np.where((height_m >= -100.0) & (height_m <= 1e4), np.maximum(height_m, 0.0), np.nan)
     pressure = 1013.25 * (1.0 - 2.2557e-5 * height) ** 5.2568
@@ -148,20 +121,10 @@ def rtca_troposphere_sigma_m(elevation_deg: Floats) -> Floats:
 
 
 def rtca_troposphere_m(time: Datetimes, latitude_deg: Floats, height_m: Floats, elevation_deg: Floats) -> Floats:
-    """Tropospheric slant delay of RTCA DO-229D (A.4.2.4): five parameters by latitude and day of year.
+    """Tropospheric slant delay of RTCA DO-229D (A.4.2.4) by latitude and day of year, shape (T, K) [m].
 
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    latitude_deg, height_m : ndarray, shape (T,)
-        Height above mean sea level is meant; the ellipsoidal one differs little for the delay (1 mm
-        in 3 m). NaN delay outside -100 m to 10 km.
-    elevation_deg : ndarray, shape (T, K) [deg]
-
-    Returns
-    -------
-    ndarray, shape (T, K) [m]
-        NaN below 2 degrees.
+    Height above mean sea level is meant; the ellipsoidal one differs by 1 mm in 3 m. NaN below 2 degrees, and outside
+    -100 m to 10 km.
     """
     year = time.astype("datetime64[Y]").astype("datetime64[ns]")
     day = (time - year) / np.timedelta64(1, "D") + 1.0
@@ -217,8 +180,7 @@ class Delays:
     #: On the channel's own carrier; 0 where a model is off, NaN where SBAS has none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
-    #: To be added to that of local errors; 0 by models with received coefficients, NaN where a part of it is unknown;
-    #: shape (T, K).
+    #: To be added to that of local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
     sigma_m: Floats
     reason: Bits  #: Flags of unknown delays (`railfix.core.reasons.Reason`), shape (T, K).
 
@@ -232,18 +194,7 @@ def modelled_delays(
     ionosphere_sigma_m: float = 0.0,
     troposphere: str,
 ) -> Delays:
-    """Delays by the models of Klobuchar and Saastamoinen, 0 by a model that is off.
-
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    frequency_hz : ndarray, shape (K,) [Hz]
-    klobuchar : ndarray, shape (8,), or None
-        None: off.
-    ionosphere_sigma_m : float
-        Standard deviation of the vertical delay at L1 for coefficients that were not received.
-    troposphere : {"saastamoinen", "off"}
-    """
+    """Delays by the models of Klobuchar and Saastamoinen, 0 by a model that is off (`klobuchar` None)."""
     shape = seen.elevation_deg.shape
     ionosphere, troposphere_m, sigma = np.zeros((3, *shape))
     if klobuchar is not None:
@@ -255,8 +206,5 @@ def modelled_delays(
     if troposphere == "saastamoinen":
         troposphere_m = saastamoinen_delay_m(seen.latitude_deg, seen.height_m, seen.elevation_deg)
     return Delays(
-        ionosphere_m=ionosphere,
-        troposphere_m=troposphere_m,
-        sigma_m=sigma,
-        reason=np.zeros(shape, dtype=np.int64),
+        ionosphere_m=ionosphere, troposphere_m=troposphere_m, sigma_m=sigma, reason=np.zeros(shape, dtype=np.int64)
     )

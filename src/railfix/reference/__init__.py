@@ -3,12 +3,11 @@
 `build_references` works on arrays, `reference_files` on files.
 """
 
-from railfix.io.sensor_log import Acceleration, Pulses, read_acceleration, read_pulses
-from railfix.reference.assemble import Built, Gap
+from railfix.io.reference_log import Acceleration, Pulses, read_acceleration, read_pulses
 from railfix.reference.build import ReferenceData, build_references
 from railfix.reference.driver import ReferenceInputs, ReferenceOptions, ReferenceSummary, reference_files
-from railfix.reference.fixes import Fixes, FixRejection
-from railfix.reference.settings import ReferenceSettings
+from railfix.reference.fixes import Fixes, FixRejection, ReferenceSettings
+from railfix.reference.smoother import Built, Gap
 
 __all__ = [
     "Acceleration",

@@ -20,18 +20,18 @@ from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
-from railfix.io.sensor_log import Acceleration, Pulses
+from railfix.io.reference_log import Acceleration, Pulses
 from railfix.motion.tachometer import Wheel, wheel_of
 from railfix.positioning.doppler_speed import Dopplers, DopplerSpeed, doppler_speed
-from railfix.reference.assemble import Built, assembled
-from railfix.reference.fixes import Fixes, judge_alone, judge_pair, judge_place, judge_travel
+from railfix.reference.fixes import Fixes, ReferenceSettings, judge_alone, judge_pair, judge_place, judge_travel
 from railfix.reference.matching import LONGEST_STEP_S, Speeds, fused, instants, nearest
-from railfix.reference.settings import ReferenceSettings
 from railfix.reference.smoother import (
     WINDOWS,
+    Built,
     Closings,
     Evidence,
     SmoothedReference,
+    assemble_reference,
     closings,
     lasting_error_mps,
     slip_m,
@@ -39,12 +39,9 @@ from railfix.reference.smoother import (
 )
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
-#: Rounds of Dopplers and smoother; the first starts from an even run between the fixes.
-_ROUNDS: Final = 3
-#: Fixes show the direction of travel when they are this many standard deviations apart.
-_MOVED: Final = 4.0
-#: Closing errors below this many standard deviations are within the noise.
-_TELLING: Final = 2.0
+_ROUNDS: Final = 3  #: Rounds of Dopplers and smoother; the first starts from an even run between the fixes.
+_MOVED: Final = 4.0  #: Fixes show the direction of travel when they are this many standard deviations apart.
+_TELLING: Final = 2.0  #: Closing errors below this many standard deviations are within the noise.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +109,7 @@ class _ReferenceBuilder:
             place = np.clip(smoothed.arc_m, 0.0, self.trajectory.arc_m[-1])
         facts = self._facts(speeds, wheel, smoothed, calibrated)
         excess = self._excess(speeds, wheel, smoothed, time, fixes, settings)
-        return assembled(
+        return assemble_reference(
             evidence,
             replace(smoothed, arc_m=place),
             fixes,

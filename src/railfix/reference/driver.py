@@ -24,14 +24,12 @@ from railfix.gnss.observations import concatenate
 from railfix.io.logs import read_navigation
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog
-from railfix.io.reference_log import reference_table
-from railfix.io.sensor_log import read_acceleration, read_pulses
+from railfix.io.reference_log import read_acceleration, read_pulses, reference_table
 from railfix.positioning.doppler_speed import Dopplers, dopplers_of_log
-from railfix.ranges.weights import DEFAULT_SIGNALS
-from railfix.reference.assemble import Built
+from railfix.ranges.corrected import DEFAULT_SIGNALS
 from railfix.reference.build import ReferenceData, build_references
-from railfix.reference.fixes import FixRejection
-from railfix.reference.settings import ReferenceSettings
+from railfix.reference.fixes import FixRejection, ReferenceSettings
+from railfix.reference.smoother import Built
 from railfix.run.inputs import (
     Antenna,
     ColumnNames,
@@ -67,9 +65,7 @@ class ReferenceInputs(InputFiles):
     nav: tuple[Path, ...] = input_option("RINEX navigation file, for Doppler speeds; repeat it for several.", ())
 
     pulses: Path | None = input_option(
-        "Tachometer: time_gpst with count, distance_m, or one row per pulse; direction if known.",
-        None,
-        metavar="CSV",
+        "Tachometer: time_gpst with count, distance_m, or one row per pulse; direction if known.", None, metavar="CSV"
     )
     acceleration: Path | None = input_option(
         "Acceleration: time_gpst with specific_force_mps2 (as an accelerometer measures) or acceleration_mps2.",
@@ -124,30 +120,24 @@ class ReferenceOptions(Settings):
 
 
 def fixes_table(name: str, part: Built, trajectory: Trajectory) -> pl.DataFrame:
-    """Rows of fixes.csv of one antenna."""
+    """Rows of fixes.csv of one antenna, rounded to tenths of millimetres."""
     fixes = part.fixes
     words = {int(code): FixRejection(int(code)).text or "good" for code in np.unique(fixes.rejection)}
-    return _round(
-        pl.DataFrame(
-            {
-                "time_gpst": fixes.time,
-                "antenna": np.full(len(fixes), name),
-                "verdict": [words[code] for code in fixes.rejection.tolist()],
-                "quality": fixes.quality,
-                "ratio": fixes.ratio,
-                "chainage_m": trajectory.chainage_at(fixes.arc_m),
-                "lateral_m": fixes.lateral_m,
-                "height_m": fixes.height_m,
-                "spacing_m": fixes.spacing_m,
-                "travel_m": fixes.travel_m,
-                "sigma_m": fixes.sigma_m,
-            }
-        )
+    table = pl.DataFrame(
+        {
+            "time_gpst": fixes.time,
+            "antenna": np.full(len(fixes), name),
+            "verdict": [words[code] for code in fixes.rejection.tolist()],
+            "quality": fixes.quality,
+            "ratio": fixes.ratio,
+            "chainage_m": trajectory.chainage_at(fixes.arc_m),
+            "lateral_m": fixes.lateral_m,
+            "height_m": fixes.height_m,
+            "spacing_m": fixes.spacing_m,
+            "travel_m": fixes.travel_m,
+            "sigma_m": fixes.sigma_m,
+        }
     )
-
-
-def _round(table: pl.DataFrame) -> pl.DataFrame:
-    """Round to tenths of millimetres, blank where there is no number."""
     return table.with_columns(pl.col(pl.Float64).round(4).fill_nan(None))
 
 
@@ -177,12 +167,9 @@ def antenna_record(part: Built) -> dict[str, Any]:
     }
 
 
-#: Constellations whose Dopplers are used.
-SYSTEMS: Final = ("G", "J", "E", "C", "R")
-#: Epochs of an observation log read at once.
-_CHUNK: Final = 3000
-#: Gaps named in the notes at most.
-_NAMED: Final = 5
+SYSTEMS: Final = ("G", "J", "E", "C", "R")  #: Constellations whose Dopplers are used.
+_CHUNK: Final = 3000  #: Epochs of an observation log read at once.
+_NAMED: Final = 5  #: Gaps named in the notes at most.
 
 
 @dataclass(frozen=True, kw_only=True)

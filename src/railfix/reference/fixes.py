@@ -1,26 +1,90 @@
-"""Select the positions for a reference, with the reason for each rejection (P1 3.1(2), 4.2(2), P2 3.3)."""
+"""Settings of a reference, and its positions selected with reasons (P1 3.1(2), 4.2(2), P2 3.3)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntFlag
-from typing import Final
+from typing import Any, Final, Literal
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.geodesy import sigma_along
+from railfix.core.settings import Settings, option
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
-from railfix.reference.matching import MatchedReference, match
-from railfix.reference.settings import ReferenceSettings
+from railfix.positioning.doppler_speed import DopplerSpeedLimits
+from railfix.reference.matching import match
 from railfix.track.trajectory import Trajectory
+
+
+def _positive(default: float) -> Any:
+    return Field(default, gt=0.0, allow_inf_nan=False)
+
+
+def _limit(text: str, default: float | None, metavar: str, name: str) -> Any:
+    return option(text, default, name=name, metavar=metavar, panel="Limits", gt=0.0, allow_inf_nan=False)
+
+
+class ReferenceSettings(Settings):
+    """Limits and noise; all of them are recorded in ``reference.json``."""
+
+    #: Least ratio of the ambiguity test of a fix, where the log has one (RTKLIB's own default is 3).
+    ratio: float = _limit("Least ratio of the ambiguity test, where the log has one.", 3.0, "RATIO", "--ratio")
+    #: Largest difference between the distance of the two antennas' positions and that on the vehicle (P2 3.3: 5 cm).
+    spacing_m: float = _limit(
+        "Largest difference of the antennas' distance from that on the vehicle.", 0.05, "M", "--spacing"
+    )
+    #: Whether a fix is rejected if the other antenna has none at that time, where two logs are given.
+    unpaired: Literal["reject", "keep"] = "reject"
+    #: Largest distance from the antenna's trajectory; about three standard deviations of the map (P1 4.1(3)).
+    lateral_m: float = _limit("Largest distance beside the antenna's trajectory.", 1.0, "M", "--lateral")
+    height_m: float = _limit("Largest distance above or below it.", 2.0, "M", "--height")
+    #: Largest difference between the distance of two fixes and the distance travelled (P2 3.3): constant part, and
+    #: share of the distance [m] [-].
+    travel_m: float = _positive(0.10)
+    travel_share: float = _positive(0.005)
+    #: Fixes that disagree with those before and after are rejected up to twice this long; if they disagree for longer,
+    #: the distance travelled is taken to be wrong.
+    travel_hold_s: float = _positive(10.0)
+    #: Largest speed of a train: of several passes of the line at one place only those within reach are considered.
+    max_speed_mps: float = _positive(100.0)
+    #: Longer gaps between good fixes are not bridged.
+    max_gap_s: float = _limit("Longest gap between good fixes that is bridged.", 60.0, "S", "--max-gap")
+    #: Bridged instants of larger standard deviation are left out.
+    max_sigma_m: float = _limit("Largest standard deviation of a bridged instant.", 1.0, "M", "--max-sigma")
+    #: Standard deviation of a fix along the track where the log has none; and the least one that is used.
+    fix_sigma_m: float = _positive(0.03)
+    fix_floor_m: float = _positive(0.01)
+    #: Standard deviation and correlation time of the train's acceleration (R. A. Singer, 1970): trains accelerate and
+    #: brake by 0.5 to 1 m/s2 for some seconds [m/s2] [s].
+    motion_mps2: float = _positive(0.5)
+    motion_s: float = _positive(5.0)
+
+    doppler: DopplerSpeedLimits = Field(default_factory=DopplerSpeedLimits)
+    #: Standard deviation and correlation time of the time-correlated error of the Doppler speed. The standard deviation
+    #: is estimated from the log's own fixes where there are enough of them; this one is used elsewhere [m/s] [s].
+    doppler_bias_mps: float = _positive(0.02)
+    doppler_bias_s: float = _positive(10.0)
+    #: Distance of one pulse of the tachometer: wheel circumference over pulses per turn. None: from the fixes.
+    pulse_m: float | None = _limit(
+        "Distance of one tachometer pulse (circumference over pulses per turn); estimated from the fixes without it.",
+        None,
+        "M",
+        "--pulse",
+    )
+    wheel_scale: float = _positive(0.01)  #: Standard deviation of that distance, relative.
+    slip_m: float = _positive(0.005)  #: Random error of the wheel's distance [m per square root of m].
+    #: Noise of the accelerometer, and standard deviation of its offset [m/s2 per square root of Hz] [m/s2].
+    acceleration_mps2: float = _positive(0.02)
+    acceleration_bias_mps2: float = _positive(0.05)
+
 
 #: Positions of two antennas that are tagged no further apart belong to one instant [ns].
 SAME_INSTANT_NS: Final = 5_000_000
-#: Runs of agreeing fixes that a run may be joined to, back from it.
-_LOOK_BACK: Final = 60
+_LOOK_BACK: Final = 60  #: Runs of agreeing fixes that a run may be joined to, back from it.
 #: Standard deviations of the travelled distance that a difference may have.
 _TRAVEL_SIGMAS: Final = 3.0
 _FIX: Final = 1
@@ -84,10 +148,7 @@ class Fixes:
 
 
 def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
-    """Check each row of a log by itself: whether it has a position, is a fix, and its ratio.
-
-    Without qualities (a CSV without the column) all rows are taken as fixed.
-    """
+    """Check each row of a log by itself; without qualities (a CSV without the column) all are fixed."""
     timed = np.flatnonzero(~np.isnat(log.time))
     rows = timed[np.argsort(log.time[timed], kind="stable")]
     time, ecef = log.time[rows], log.ecef_m[rows]
@@ -174,7 +235,8 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
             max_speed_mps=settings.max_speed_mps,
         )
         arc[rows], lateral[rows], height[rows] = matched.arc_m, matched.lateral_m, matched.height_m
-        sigma[rows] = _along_sigma(fixes.sigma_enu_m[rows], fixes.ecef_m[rows], trajectory, matched, settings)
+        along = sigma_along(fixes.sigma_enu_m[rows], fixes.ecef_m[rows], trajectory.tangent[matched.section])
+        sigma[rows] = np.where(np.isnan(along), settings.fix_sigma_m, np.maximum(along, settings.fix_floor_m))
         missed = np.isnan(arc) & (rejection == 0)
         _reject(rejection, missed & ~(np.abs(lateral) <= settings.lateral_m), FixRejection.OFF_TRACK)
         _reject(rejection, missed & ~(np.abs(height) <= settings.height_m), FixRejection.OFF_HEIGHT)
@@ -183,26 +245,14 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
     return replace(fixes, rejection=rejection, arc_m=arc, lateral_m=lateral, height_m=height, sigma_m=sigma)
 
 
-def _along_sigma(
-    sigma_enu_m: Floats, ecef_m: Floats, trajectory: Trajectory, matched: MatchedReference, settings: ReferenceSettings
-) -> Floats:
-    """Standard deviation along the track from those east, north and up."""
-    sigma = sigma_along(sigma_enu_m, ecef_m, trajectory.tangent[matched.section])
-    return np.where(np.isnan(sigma), settings.fix_sigma_m, np.maximum(sigma, settings.fix_floor_m))
-
-
 def judge_travel(
-    fixes: Fixes,
-    travelled: Callable[[Datetimes], tuple[Floats, Floats]],
-    settings: ReferenceSettings,
+    fixes: Fixes, travelled: Callable[[Datetimes], tuple[Floats, Floats]], settings: ReferenceSettings
 ) -> Fixes:
-    """The rows by the way between them against the way travelled (P2 3.3).
+    """Reject rows by the way between them against the way travelled (P2 3.3).
 
-    Neighbours that agree make a run; a wrong fix, or a stretch of them on wrong ambiguities, is a run of its own, and
-    so is what follows an error of the sensor. Kept is the chain of runs that holds most fixes, where each joint that
-    does not agree counts against it. So a short stretch that agrees with neither side goes, and where long stretches on
-    both sides stay apart, the sensor is held wrong and both stay. `travelled` gives the way up to instants and its
-    variance since the start, along rising chainage; NaN where unknown.
+    Neighbours that agree make a run; kept is the chain of runs that holds most fixes, where each joint that does not
+    agree counts against it. So a short wrong stretch goes, and where long stretches on both sides stay apart, the
+    sensor is held wrong and both stay. `travelled` gives the way up to instants and its variance; NaN where unknown.
     """
     rows = fixes.good
     if len(rows) < 2:

@@ -14,10 +14,8 @@ from railfix.core.arrays import Datetimes, Floats, Indices
 from railfix.core.timescale import seconds, timedelta
 from railfix.track.trajectory import Trajectory
 
-#: A pass out of reach costs this much more than any other choice [m].
-_OUT_OF_REACH_M = 1e6
-#: Positions may jitter by this much more than the train can run [m].
-_JITTER_M = 2.0
+_OUT_OF_REACH_M = 1e6  #: A pass out of reach costs this much more than any other choice [m].
+_JITTER_M = 2.0  #: Positions may jitter by this much more than the train can run [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,8 +23,7 @@ class MatchedReference:
     """Positions on a trajectory, F of them."""
 
     arc_m: Floats  #: Of the pass chosen; NaN where no pass is near enough; shape (F,).
-    #: To the right of and above the trajectory there; those of the nearest point where no pass is near enough; shape
-    #: (F,).
+    #: To the right of and above the trajectory there, else at the nearest point; shape (F,).
     lateral_m: Floats
     height_m: Floats
     section: Indices  #: Segment of the trajectory, shape (F,).
@@ -44,13 +41,7 @@ class _Passes:
 
 
 def match(
-    time: Datetimes,
-    ecef_m: Floats,
-    trajectory: Trajectory,
-    *,
-    lateral_m: float,
-    height_m: float,
-    max_speed_mps: float,
+    time: Datetimes, ecef_m: Floats, trajectory: Trajectory, *, lateral_m: float, height_m: float, max_speed_mps: float
 ) -> MatchedReference:
     """Put F positions on a trajectory, in order of rising time.
 
@@ -133,8 +124,7 @@ def _chain(passes: _Passes, time_s: Floats, max_speed_mps: float) -> Indices:
     return np.array(chosen[::-1], dtype=np.intp)
 
 
-#: Tags that differ by no more belong to one instant [ns].
-SAME_INSTANT_NS: Final = 20_000_000
+SAME_INSTANT_NS: Final = 20_000_000  #: Tags that differ by no more belong to one instant [ns].
 #: Speeds further apart leave the distance between them unknown [s], with this variance [m2].
 LONGEST_STEP_S: Final = 2.5
 UNKNOWN_M2: Final = 1e8
@@ -186,11 +176,7 @@ def nearest(time: Datetimes, wanted: Datetimes) -> Indices:
 
 
 def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
-    """Return the instants of a reference: rows of the position log, receiver epochs, regular steps elsewhere.
-
-    The rows, at least two, rise strictly; other instants within `SAME_INSTANT_NS` of a row are that row. From the first
-    row to the last no step is longer than one and a half of the rows' usual one.
-    """
+    """Return the instants of a reference: rows of the log, receiver epochs, regular steps elsewhere."""
     merged = rows
     for other in others:
         new = other[(other > rows[0]) & (other < rows[-1])]

@@ -1,24 +1,23 @@
-"""Smooth the distance between fixes: all sensors weighted by their variances, closed on the fixes.
+"""Smooth the distance between fixes, all sensors weighted by their variances, and assemble the reference.
 
-The unknowns of each instant are the place along the track, the speed, and one slow error for each
-kind of sensor: the lasting part of the Doppler speed's error, the difference and the scale of the
-wheel's distance, the accelerometer's offset. A forward-backward smoother over the whole run
-(`chain`) then shares the closing error of a gap back over it, in proportion to what each part of it
-may have contributed, and its standard deviation grows from both ends to the middle. Which sensor
-counts for how much is not chosen: their variances say so at every instant.
+Unknown at each instant are place, speed, and one slow error for each kind of sensor: of the Doppler speed, the
+difference and scale of the wheel's distance, the accelerometer's offset. A forward-backward smoother (`chain`) shares
+the closing error of a gap in proportion to what each part may have contributed.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.timescale import seconds
+from railfix.io.reference_log import AntennaReference
 from railfix.motion.chain import Chain, singer_steps
-from railfix.reference.settings import ReferenceSettings
+from railfix.reference.fixes import Fixes, ReferenceSettings
+from railfix.track.trajectory import Trajectory
 
 #: Standard deviations of what nothing is known of: speed [m/s], difference of the wheel's distance [m].
 _ANY_SPEED_MPS: Final = 100.0
@@ -81,10 +80,7 @@ class _Unknowns:
 
 
 def smooth(evidence: Evidence, settings: ReferenceSettings) -> SmoothedReference:
-    """Estimate position and speed at every instant from all measurements together, at least one fix among them.
-
-    `doppler_bias_mps` and `slip_m` of the settings are those of the log, where it tells them.
-    """
+    """Estimate position and speed at every instant from all measurements, at least one fix among them."""
     t = seconds(evidence.time - evidence.time[0])
     fixed = np.flatnonzero(np.isfinite(evidence.fix_m))
     nominal = np.interp(t, t[fixed], evidence.fix_m[fixed])
@@ -231,18 +227,9 @@ class Closings:
 
 
 def closings(
-    time: Datetimes,
-    way_m: Floats,
-    variance_m2: Floats,
-    fix_m: Floats,
-    fix_sigma_m: Floats,
-    *,
-    window_s: float,
+    time: Datetimes, way_m: Floats, variance_m2: Floats, fix_m: Floats, fix_sigma_m: Floats, *, window_s: float
 ) -> Closings:
-    """Compare a measured distance with that between fixes, over windows of about a length.
-
-    `way_m`, `variance_m2`: way up to each fix, and the variance of its white part since the start; NaN where unknown.
-    """
+    """Compare a measured distance with that between fixes over windows; `way_m` and variance up to each fix."""
     t = seconds(time - time[0])
     end = np.searchsorted(t, t + window_s - 0.5)
     start = np.flatnonzero(end < len(t))
@@ -258,11 +245,7 @@ def closings(
 
 
 def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Standard deviation of the time-correlated Doppler speed error [m/s], from the closing errors.
-
-    What the noise of single speeds and of the fixes does not explain is the lasting part. That of the settings
-    where fewer than `WINDOWS` windows are there.
-    """
+    """Sigma of the time-correlated Doppler speed error [m/s] by what noise leaves of the closing errors."""
     if len(misclosures) < WINDOWS:
         return settings.doppler_bias_mps
     tau = settings.doppler_bias_s
@@ -272,10 +255,7 @@ def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> flo
 
 
 def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Random error of the wheel [m per square root of m], from the closing errors.
-
-    Its scale is taken off first. That of the settings where fewer than `WINDOWS` windows in motion are there.
-    """
+    """Random error of the wheel from the closing errors, its scale taken off [m per square root of m]."""
     moving = np.abs(misclosures.way_m) > 1.0
     if moving.sum() < WINDOWS:
         return settings.slip_m
@@ -286,9 +266,125 @@ def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
     return float(np.sqrt(max(excess, _LEAST_SLIP_M**2)))
 
 
-#: Windows that an estimate needs.
-WINDOWS: Final = 20
+WINDOWS: Final = 20  #: Windows that an estimate needs.
 #: 80th percentile of a squared standard normal variable.
 _CHI2_80: Final = 1.6424
 _LEAST_LASTING_MPS: Final = 1e-3
 _LEAST_SLIP_M: Final = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gap:
+    """Gap between two good fixes that are further apart than the log's usual step."""
+
+    start: np.datetime64
+    end: np.datetime64
+    length_s: float
+    bridged: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Built:
+    """Reference of one antenna, with its fixes and gaps."""
+
+    reference: AntennaReference
+    fixes: Fixes  #: Every row of the position log with its reasons for rejection.
+    gaps: tuple[Gap, ...]
+    #: Instants without a reference by reason: ``before_first_fix``, ``after_last_fix``, ``long_gap``, ``uncertain``.
+    left_out: dict[str, int]
+    bridged_by: dict[str, int]  #: Bridged instants by the sensors that measured there.
+    facts: dict[str, Any]  #: Estimated and used parameters, as plain values.
+
+
+def assemble_reference(
+    evidence: Evidence,
+    smoothed: SmoothedReference,
+    fixes: Fixes,
+    excess: Floats,
+    *,
+    trajectory: Trajectory,
+    settings: ReferenceSettings,
+    facts: dict[str, Any],
+) -> Built:
+    """Return the reference of one antenna from everything known of it.
+
+    At a fix it is the fix's place on the track, between fixes the smoothed one with the errors that fixes have in
+    common on top. `excess`, shape (G - 1,): from each good fix to the next, closing error over its standard deviation,
+    which counts where it is larger.
+    """
+    time, good = evidence.time, fixes.good
+    at = np.flatnonzero(np.isfinite(evidence.fix_m))
+    is_fix = np.zeros(len(time), dtype=np.bool_)
+    is_fix[at] = True
+    after = np.clip(np.searchsorted(at, np.arange(len(time))), 1, len(at) - 1)
+    length = seconds(time[at[after]] - time[at[after - 1]])
+    t = seconds(time - time[0])
+    common = np.interp(t, t[at], evidence.fix_sigma_m[at])
+    sigma = np.where(is_fix, common, np.hypot(smoothed.sigma_m * excess[after - 1], common))
+    arc = np.where(is_fix, evidence.fix_m, smoothed.arc_m)
+    long = ~is_fix & (length > settings.max_gap_s)
+    uncertain = ~is_fix & ~long & (sigma > settings.max_sigma_m)
+    keep = np.flatnonzero(~long & ~uncertain)
+    reference = AntennaReference(
+        time=time[keep],
+        ecef_m=trajectory.at_arc(arc[keep]),
+        chainage_m=trajectory.chainage_at(arc[keep]),
+        speed_mps=smoothed.speed_mps[keep],
+        sigma_m=sigma[keep],
+        source=np.where(is_fix[keep], "rtk", "bridged"),
+        environment=np.full(len(keep), ""),
+    )
+    usual = float(np.median(seconds(np.diff(fixes.time))))
+    step = seconds(np.diff(fixes.time[good]))
+    gaps = tuple(
+        Gap(
+            start=fixes.time[good[i]],
+            end=fixes.time[good[i + 1]],
+            length_s=float(step[i]),
+            bridged=bool(step[i] <= settings.max_gap_s),
+        )
+        for i in np.flatnonzero(step > 1.5 * usual).tolist()
+    )
+    return Built(
+        reference=reference,
+        fixes=fixes,
+        gaps=gaps,
+        left_out={
+            "before_first_fix": int((fixes.time < time[0]).sum()),
+            "after_last_fix": int((fixes.time > time[-1]).sum()),
+            "long_gap": int(long.sum()),
+            "uncertain": int(uncertain.sum()),
+        },
+        bridged_by=_name_bridges(evidence, keep[~is_fix[keep]]),
+        facts=facts,
+    )
+
+
+def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
+    """Bridged instants by the sensors that have a number there, or a second or so from there."""
+    t = seconds(evidence.time - evidence.time[0])
+    measured = {
+        "doppler": np.isfinite(evidence.doppler_mps),
+        "pulses": np.isfinite(evidence.wheel_m),
+        "acceleration": np.append(np.isfinite(evidence.acceleration_mps2), np.False_),
+    }
+    code = np.zeros(len(rows), dtype=np.int64)
+    for i, mask in enumerate(measured.values()):
+        code |= _near(t[mask], t[rows]).astype(np.int64) << i
+    counts = {}
+    for c in np.unique(code).tolist():
+        name = " and ".join(name for i, name in enumerate(measured) if c >> i & 1) or "nothing"
+        counts[name] = int((code == c).sum())
+    return counts
+
+
+def _near(known_s: Floats, at_s: Floats) -> Masks:
+    """Return whether one of the known instants, rising, is within `_NEAR_S` of each."""
+    if not len(known_s):
+        return np.zeros(len(at_s), dtype=np.bool_)
+    after = np.clip(np.searchsorted(known_s, at_s), 0, len(known_s) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.asarray(np.minimum(np.abs(known_s[after] - at_s), np.abs(known_s[before] - at_s)) <= _NEAR_S)
+
+
+_NEAR_S: Final = 1.5  #: Sensors of 1 Hz measure everywhere, up to a missing epoch [s].

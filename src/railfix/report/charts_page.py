@@ -27,8 +27,8 @@ from railfix.core.timescale import seconds
 from railfix.report.plots.chart import Band, Bars, Cells, Chart, Curve, Layer, Marks, Points, RangeBars, SkyEpochs
 from railfix.report.plots.network import network_plan
 from railfix.track.network import Network
-from railfix.track.network_check import NetworkQuality
 from railfix.track.network_match import Matched, PlanLog
+from railfix.track.network_read import NetworkQuality
 
 if TYPE_CHECKING:
     from railfix.report.figures import Group

@@ -19,10 +19,10 @@ import polars.selectors as cs
 from railfix import __version__
 from railfix.core.errors import InputFileError, NoPositionError, OutputError
 from railfix.core.files import staged_file
-from railfix.core.mate import WRITTEN, mate_table, only_device, read_mate
 from railfix.core.timescale import gpst_to_utc, utc_to_gpst
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.logs import read_navigation, scan_observations
+from railfix.io.mate import WRITTEN, mate_table, only_device, read_mate
 from railfix.io.positions_export import COORDINATES
 from railfix.io.rinex import write_navigation, write_observations
 from railfix.io.rinex.write_navigation import with_written_messages

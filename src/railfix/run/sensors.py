@@ -13,7 +13,7 @@ from polars.exceptions import PolarsError
 
 from railfix.core.arrays import Floats, Strings
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
-from railfix.core.mate import mate_table
+from railfix.io.mate import mate_table
 from railfix.motion.samples import (
     BaliseReadings,
     GroundUnits,

@@ -32,8 +32,7 @@ from railfix.screens.base import (
     suspicion_sigma_m,
 )
 from railfix.screens.cn0 import Cn0Limits, Cn0Screened, cn0_screen
-from railfix.screens.doppler import DopplerScreened, DopplerState, doppler_screen
-from railfix.screens.doppler_limits import DopplerLimits, doppler_limit_m
+from railfix.screens.doppler import DopplerLimits, DopplerScreened, DopplerState, doppler_limit_m, doppler_screen
 from railfix.screens.elevation import ElevationLimits, elevation_screen
 from railfix.screens.pairs import pair_channels, pair_epochs
 from railfix.screens.registry import SCREENS, in_order

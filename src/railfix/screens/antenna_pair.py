@@ -1,18 +1,14 @@
 """Pseudorange difference of two antennas against their spacing (P1 2.3(3), figure 5, table 6: 5 m).
 
-The same satellite is further from the rear antenna than from the front one by the part of their
-spacing that points to it: ``L (cos el cos(az - heading) cos gradient + sin el sin gradient)``. A
-difference that does not fit has multipath in one of the two, which one is unknown.
+The same satellite is further from the rear antenna by ``L (cos el cos(az - heading) cos gradient + sin el sin
+gradient)``. A difference that does not fit has multipath in one of the two, which one is unknown.
 
-Clocks. P1 runs both receivers on one frequency standard, with one-pulse-per-second: then the
-difference has no clock in it. Receivers whose ranges differ by `SEPARATE_CLOCKS_M` in the median share none: then
-nothing is judged, as P1 6 had the screen off. Otherwise the clock difference is the median over the satellites of a
-constellation, and an error of that median is common to them all. A clock difference also means that
-the two receivers measured at different instants, and so does a difference of the time tags: with range
-rates given, the satellites' motion in between is removed (1 ms is up to 0.8 m).
+Receivers whose ranges differ by `SEPARATE_CLOCKS_M` in the median share no clock: the screen is inactive, as in P1 6.
+Otherwise the clock difference is the median over the satellites of a constellation; with range rates given, the
+satellites' motion between the two instants is removed (1 ms is up to 0.8 m).
 
-Ambiguity of the angles. Gradient, sway and map leave the elevation uncertain by 3 deg and the azimuth
-relative to the car body by 3.5 deg (P1). Multipath below the difference that these explain is not detected.
+Gradient, sway and map leave the elevation uncertain by 3 deg and the azimuth relative to the car body by 3.5 deg (P1).
+Multipath below the difference that these explain is not detected.
 """
 
 from __future__ import annotations
@@ -78,8 +74,7 @@ class AntennaPairScreened(Screened):
     expected_m: Floats  #: Pseudorange of the rear antenna less that of the front one, from the spacing; shape (P, C).
     #: What the errors of the angles explain; within it nothing is rejected, whatever the limit; shape (P, C).
     ambiguity_m: Floats
-    #: Clock of the rear receiver less that of the front one, as taken out; 0 where common, NaN where it should be;
-    #: shape (P, C).
+    #: Clock of the rear receiver less that of the front one, as taken out; 0 where common; shape (P, C).
     clock_m: Floats
     clocks: str  #: How the clocks were treated, in words.
 

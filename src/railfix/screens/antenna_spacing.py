@@ -1,8 +1,4 @@
-"""Positions of the two antennas against their spacing along the track (P1 2.3(5), table 6: 5 m).
-
-The two positions come from different receivers and antennas, so that their distance is a check on
-both. Where it does not fit, one of them is wrong, which one is unknown, and both are marked.
-"""
+"""Positions of the two antennas against their spacing along the track (P1 2.3(5), table 6: 5 m)."""
 
 from __future__ import annotations
 

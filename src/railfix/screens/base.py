@@ -1,9 +1,7 @@
 """Base classes of the screens: what a screen receives, what it returns, and the hooks that a screen may override.
 
 A screen is one subclass of `ObservationScreen`, `PairScreen` or `PositionScreen`, and one line in
-`railfix.screens.registry` or one entry point of an installed package. The name of the screen, its group of settings,
-the columns of the tables, the reasons in the reports and its pictures follow from the class (docs/screens.md shows an
-example).
+`railfix.screens.registry` or one entry point of an installed package (docs/screens.md shows an example).
 """
 
 from __future__ import annotations
@@ -44,8 +42,7 @@ class AntennaRanges:
     #: Shape (T, K).
     elevation_deg: Floats
     azimuth_deg: Floats
-    #: Pseudoranges with satellite clock, group delay and atmosphere applied, and their standard deviations; shape (T,
-    #: K).
+    #: With satellite clock, group delay and atmosphere applied, and standard deviations; shape (T, K).
     corrected_code_m: Floats
     sigma_m: Floats
     reason: Bits  #: `reasons.Reason` bits so far, 0 = usable; shape (T, K).
@@ -66,8 +63,7 @@ class Verdict:
     name: str  #: Key in `AntennaResult.screens`: the screen's own name, or one a verdict where it has several.
     reason: Reason  #: Given to the rejected observations.
     screened: Screened  #: Shapes (T, K).
-    #: Size of the error that was measured: what fails is weighted down by it and not rejected. None: rejected; shape
-    #: (T, K).
+    #: Size of the measured error: what fails is weighted down by it. None: rejected; shape (T, K).
     error_m: Floats | None = None
 
 
@@ -186,8 +182,7 @@ class PairedEpochs:
     #: Approximate places of the antennas on their trajectories, shape (P, 3).
     front_ecef_m: Floats
     rear_ecef_m: Floats
-    #: Chainage of the front antenna less that of the rear one: negative where the vehicle faces falling chainage; shape
-    #: (P,).
+    #: Chainage of the front antenna less that of the rear one: negative if facing falling chainage; shape (P,).
     along_m: Floats
 
 

@@ -1,9 +1,7 @@
 """Signal strength against what an open sky gives at the elevation, and an absolute floor (P1 2.3(1)).
 
-Reflected, bent and shaded signals are weak. A limit that is the same for all elevations either lets
-bad signals of high satellites pass or loses good ones of low satellites, so P1 measures the mean over
-elevation for the antenna and receiver on a day of open sky (`railfix.ranges.cn0_curve`), and rejects what
-lies 10 dB-Hz below it; and, for all satellites alike, what lies below 30 dB-Hz (table 6).
+P1 measures the mean over elevation for the antenna and receiver on a day of open sky (`railfix.ranges.cn0_curve`), and
+rejects what lies 10 dB-Hz below it; and, for all satellites alike, what lies below 30 dB-Hz (table 6).
 """
 
 from __future__ import annotations
@@ -48,9 +46,7 @@ class Cn0Screened:
     """Verdicts on signal strength, two screens with a reason each."""
 
     floor: Screened  #: The metric is C/N0 [dB-Hz].
-    #: The metric is the deficit, mean at the elevation less C/N0 [dB]; NaN where the curve does not reach: no curve
-    #: given, none for the constellation and signal, elevation unknown or below the lowest of the curve.
-    curve: Screened
+    curve: Screened  #: The metric is the mean at the elevation less C/N0 [dB]; NaN where there is no curve.
 
 
 def cn0_screen(
@@ -99,9 +95,7 @@ class Cn0Screen(ObservationScreen[Cn0Limits]):
     needs = "a curve over elevation (cn0_curve) or a floor"
     columns = (
         ScreenColumn(
-            name="metric_cn0_deficit_dbhz",
-            meaning="screen `cn0`: mean at the elevation less C/N0",
-            verdict="cn0_curve",
+            name="metric_cn0_deficit_dbhz", meaning="screen `cn0`: mean at the elevation less C/N0", verdict="cn0_curve"
         ),
     )
 

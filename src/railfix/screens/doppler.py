@@ -1,28 +1,30 @@
 """Change of the pseudorange against the Doppler (P1 2.3(2), figure 4, table 6: 1.5 m).
 
-Over a short interval the range changes by the mean of the two Dopplers times interval and
-wavelength. The Doppler is little affected by multipath, so a pseudorange that changes otherwise has
-jumped. The screen detects *changes*: it cannot detect a constant multipath error.
+A pseudorange that changes by more than the mean of two Dopplers times interval and wavelength has jumped; a constant
+multipath error is not detected. A step of the receiver clock moves all pseudoranges alike: the median over a
+constellation removes it, and the interval is corrected by it beforehand (4 ms times 800 m/s are 3.2 m).
 
-Receiver clock. A step of the clock moves all pseudoranges alike, and the median over the satellites
-of a constellation removes it. A step also falsifies the interval: time tags are those of the
-receiver's clock, so between two tags ``dt - step`` has really passed, and 4 ms times a range rate of
-800 m/s are 3.2 m that differ from satellite to satellite. The interval is therefore corrected by the
-step that the codes themselves show, before the Doppler is applied.
+P1 ran at 0.1 s. Over longer intervals the limit grows with the noise that two codes do not share, ``sqrt(1 - exp(-dt /
+correlation_s))``, the change of acceleration, ``jerk dt^3 / 12``, and the noise of the Doppler, ``sigma dt``. Its mode
+is "fixed", P1's; "receiver", `factor` times the scale of the receiver's own changes (median over the satellites,
+averaged over the epochs), or "sigma", `factor` times the sigma of each code, which forgives weak satellites most (urban
+recordings at 1 Hz: a quarter of the bad codes found at the same loss); neither is below P1's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, freeze_arrays
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
+from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.screens.base import (
     AntennaRanges,
@@ -34,8 +36,96 @@ from railfix.screens.base import (
     ScreenSetup,
     Verdict,
 )
-from railfix.screens.doppler_limits import DopplerLimits, doppler_limit_m, expected_limit_m, receiver_limit_m
-from railfix.screens.pairs import clock_medians
+from railfix.screens.pairs import clock_medians, row_median
+
+_MEDIAN_NORMAL: Final = 0.674_489_750_196_081_7  #: Median of the absolute value of a unit normal variable.
+_FINEST_M: Final = 1e-3  #: Smallest change used for the receiver's scale [m].
+_LEAST_CHANGES: Final = 5  #: Changes an epoch needs for its scale.
+
+
+class DopplerLimits(Settings):
+    """Limits of the Doppler screen."""
+
+    #: Limit scaled by the receiver's noise, P1's, or by the stated sigmas; see the module.
+    mode: Literal["fixed", "receiver", "sigma"] = "receiver"
+    #: Largest change against the Doppler up to `short_interval_s`; P1 table 6: 1.5.
+    step_m: float = Field(default=1.5, gt=0.0, allow_inf_nan=False)
+    #: P1's interval is 0.1 s; twice that, so that one lost epoch changes nothing.
+    short_interval_s: float = Field(default=0.2, gt=0.0, allow_inf_nan=False)
+    #: Time over which the receiver smooths its codes. 1 s gives 2.9 m at 1 s.
+    correlation_s: float = Field(default=1.0, gt=0.0, allow_inf_nan=False)
+    #: Largest jerk of the vehicle; trains stay below 1 [m/s^3].
+    jerk_mps3: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
+    #: Modes "receiver" and "sigma": standard deviations.
+    factor: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
+    #: Mode "sigma": standard deviation of a range rate from the Doppler.
+    doppler_sigma_mps: float = Field(default=0.1, ge=0.0, allow_inf_nan=False)
+    #: Mode "receiver": weight of the fixed limit in the estimate of the scale, in epochs.
+    prior_epochs: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
+    #: Over a longer interval the screen cannot judge.
+    longest_interval_s: float = Field(default=2.5, gt=0.0, allow_inf_nan=False)
+    #: How long a satellite stays rejected after a jump; 0 rejects only the epochs of the jumps out and back, which is
+    #: exactly P1's test.
+    hold_s: float = Field(default=2.0, ge=0.0, allow_inf_nan=False)
+    least_satellites: int = Field(default=3, ge=3)  #: Satellites of one clock needed to take its step out.
+    #: Treatment of a suspected satellite: its sigma grows by the size of the jump
+    #: (`railfix.screens.suspicion_sigma_m`), or it is rejected, as in P1. Where few satellites are left, the geometry
+    #: without one turns a few metres into a hundred; a weight does not.
+    verdict: Literal["weigh", "reject"] = "weigh"
+
+
+def doppler_limit_m(interval_s: ArrayLike, *, limits: DopplerLimits | None = None) -> Floats:
+    """Limit of mode "fixed" at an interval [m]: 1.50 up to 0.2 s, 2.88 at 1 s, 3.94 at 2 s.
+
+    ``step sqrt((1 - exp(-dt / correlation)) / (1 - exp(-short / correlation))) + jerk dt^3 / 12``,
+    with dt not below `short_interval_s` in the first term and the second one only above it.
+    """
+    limits = limits or DopplerLimits()
+    interval = np.asarray(interval_s, dtype=np.float64)
+    return np.asarray(limits.step_m * _growth(interval, limits) + _jerk_m(interval, limits))
+
+
+def _growth(interval: Floats, limits: DopplerLimits) -> Floats:
+    """Noise of a change against that at the short interval."""
+    long = np.expm1(-np.maximum(interval, limits.short_interval_s) / limits.correlation_s)
+    return np.asarray(np.sqrt(long / np.expm1(-limits.short_interval_s / limits.correlation_s)))
+
+
+def _jerk_m(interval: Floats, limits: DopplerLimits) -> Floats:
+    return np.where(interval > limits.short_interval_s, limits.jerk_mps3 * interval**3 / 12.0, 0.0)
+
+
+def expected_limit_m(interval_s: Floats, sigma_m: Floats, *, limits: DopplerLimits) -> Floats:
+    """Limit of mode "sigma", shape (T, M) [m], from sigmas of the codes with the epoch before, shape (T + 1, M)."""
+    interval = interval_s[:, None]
+    fresh = -np.expm1(-interval / limits.correlation_s)
+    noise = (sigma_m[1:] ** 2 + sigma_m[:-1] ** 2) * fresh + (limits.doppler_sigma_mps * interval) ** 2
+    # a NaN stays one: without its sigma a satellite is not judged
+    return np.asarray(np.maximum(limits.step_m, limits.factor * np.sqrt(noise)) + _jerk_m(interval, limits))
+
+
+def receiver_limit_m(
+    interval_s: Floats, metric_m: Floats, sum_log: float, weight: float, *, limits: DopplerLimits
+) -> tuple[Floats, float, float]:
+    """Limit of mode "receiver", shape (T,) [m], and the sum of the logarithms of the scales and their number to go on
+    with.
+
+    The scale is that of changes at the short interval: what an epoch shows is divided by the growth of the noise. Of a
+    dozen satellites it comes out a tenth to a seventh too small (their own median is taken out; logarithms are
+    averaged, so that an epoch full of multipath does not carry it).
+    """
+    growth = _growth(interval_s, limits)
+    shown = row_median(np.abs(metric_m))[:, 0] / _MEDIAN_NORMAL / growth
+    counts = (np.count_nonzero(np.isfinite(metric_m), axis=1) >= _LEAST_CHANGES) & np.isfinite(shown)
+    logs = np.where(counts, np.log(np.maximum(np.where(counts, shown, 1.0), _FINEST_M)), 0.0)
+    # running sums, one after the other from the carried ones: a cut does not show
+    sums = np.cumsum(np.concatenate([[sum_log], logs]))[1:]
+    weights = np.cumsum(np.concatenate([[weight], counts]))[1:]
+    prior = limits.prior_epochs
+    scale = np.exp((sums + prior * np.log(limits.step_m / limits.factor)) / (weights + prior))
+    limit = np.maximum(limits.step_m, limits.factor * scale) * growth + _jerk_m(interval_s, limits)
+    return limit, float(sums[-1]), float(weights[-1])
+
 
 _NS: Final = 1e9
 
@@ -45,8 +135,7 @@ class DopplerScreened(Screened):
     """Verdict of the Doppler screen; the metric is P1's, from one epoch to the next [m]."""
 
     limit_m: Floats  #: NaN where the metric is, shape (T, M).
-    #: How far a suspected satellite stands from the level it had before its jump, 0 where it is not suspected, NaN
-    #: where the metric is; shape (T, M).
+    #: Distance of a suspected satellite from its level before the jump, else 0, NaN as the metric; shape (T, M).
     level_m: Floats
 
 
@@ -146,11 +235,7 @@ def doppler_screen(
         return empty, state or DopplerState()
     codes, dopplers, sigmas = (
         np.vstack([first, rest])
-        for first, rest in (
-            (before.code_m, code),
-            (before.doppler_hz, doppler),
-            (before.code_sigma_m, sigma),
-        )
+        for first, rest in ((before.code_m, code), (before.doppler_hz, doppler), (before.code_sigma_m, sigma))
     )
     interval = _intervals(when, before.time, break_before, limits)
     rate = -SPEED_OF_LIGHT / np.asarray(frequency_hz, dtype=np.float64) * (dopplers[1:] + dopplers[:-1]) / 2.0
@@ -232,24 +317,9 @@ def suspicions(
 ) -> tuple[Masks, Floats, Integers]:
     """Follow the levels of satellites after jumps; a loop over jumps only.
 
-    Levels are summed from the jump on, one after the other, so that a cut between does not show.
-
-    Parameters
-    ----------
-    time_ns : ndarray of int64, shape (T,)
-    metric, limit : ndarray, shape (T, M) [m], in C order
-    level_before : ndarray, shape (M,) [m]
-        Of the satellites that are under suspicion already.
-    since_before : ndarray of int64, shape (M,) [ns]
-        Start of the suspicion; NaT as a number for none.
-
-    Returns
-    -------
-    reject : ndarray of bool, shape (T, M)
-    level : ndarray, shape (T, M) [m]
-        0 without suspicion, NaN without a metric.
-    since : ndarray of int64, shape (M,) [ns]
-        Start of the suspicions at the end.
+    `metric` and `limit`, shape (T, M), in C order; level and start of suspicions before, shape (M,), NaT as a number
+    for none. Returns the rejections, the levels (0 without suspicion, NaN without a metric), and the starts at the end.
+    Levels are summed from the jump on, so that a cut between does not show.
     """
     never = np.iinfo(np.int64).min
     reject = np.zeros(metric.shape, dtype=bool)

@@ -49,10 +49,7 @@ def _nearest(values: Integers, among: Integers) -> Indices:
 
 
 def pair_channels(
-    satellite_front: Strings,
-    signal_front: Strings,
-    satellite_rear: Strings,
-    signal_rear: Strings,
+    satellite_front: Strings, signal_front: Strings, satellite_rear: Strings, signal_rear: Strings
 ) -> tuple[Indices, Indices]:
     """Return the channels of the same satellite and signal at both receivers, in the order of the front one's."""
     if satellite_front is satellite_rear and signal_front is signal_rear:  # epochs of both are rows of the same arrays
@@ -82,17 +79,7 @@ def pair_antennas(
     *,
     tolerance_s: float,
 ) -> PairedEpochs:
-    """Return the epochs of two antennas matched by their time tags, with the places of both on the line.
-
-    Parameters
-    ----------
-    front_anchor_ecef_m : ndarray, shape (T, 3) [m]
-        Approximate places of the front antenna.
-    front_path, rear_path : Trajectory
-        Of one vehicle on one track (`vehicle.antenna_trajectory`).
-    tolerance_s : float [s]
-        Largest difference of the tags.
-    """
+    """Return the epochs of two antennas matched by their time tags, with the places of both on the line."""
     at_front, at_rear = pair_epochs(front.time, rear.time, tolerance_s=tolerance_s)
     front_arc, _ = front_path.nearest(front_anchor_ecef_m[at_front])
     rear_arc = rear_path.arc_of_body(front_path.body_at(front_arc))
@@ -114,16 +101,7 @@ def row_median(values: Floats) -> Floats:
 
 
 def clock_medians(values: Floats, satellite: Strings, *, least: int = 0) -> Floats:
-    """Median over the channels of one receiver clock (`constants.CLOCK_GROUP`), at each channel, shape (T, M).
-
-    Parameters
-    ----------
-    values : ndarray, shape (T, M)
-        NaN where there is none.
-    satellite : ndarray of str, shape (M,)
-    least : int
-        NaN where fewer satellites of the clock have a finite value.
-    """
+    """Median over the channels of one clock, at each channel (T, M); NaN below `least` satellites."""
     return medians_of_clocks(np.ascontiguousarray(values), *_number(tuple(satellite.tolist())), least)
 
 

@@ -1,7 +1,4 @@
-"""Registry of the screens: those of railfix, one line each, and those of installed packages.
-
-A package names its screens as entry points of the group ``railfix.screens``, each a `Screen` object.
-"""
+"""Registry of the screens: those of railfix, and those that packages name as entry points of ``railfix.screens``."""
 
 from __future__ import annotations
 
@@ -15,14 +12,7 @@ from railfix.screens.base import ObservationScreen, PairScreen, PositionScreen, 
 
 #: Group of entry points.
 GROUP: Final = "railfix.screens"
-_NAMES: Final = (
-    "elevation",
-    "cn0",
-    "doppler",
-    "antenna_pair",
-    "raim",
-    "antenna_spacing",
-)
+_NAMES: Final = ("elevation", "cn0", "doppler", "antenna_pair", "raim", "antenna_spacing")
 
 
 def in_order(screens: Iterable[Screen[Any]]) -> tuple[Screen[Any], ...]:
@@ -36,13 +26,7 @@ def _rank(screen: Screen[Any]) -> int:
 
 
 def _find_installed() -> list[Screen[Any]]:
-    """Load the screens of installed packages.
-
-    Raises
-    ------
-    SettingsError
-        An entry point is no screen, or has the name of another one.
-    """
+    """Load the screens of installed packages; SettingsError where one is no screen, or has the name of another one."""
     found: list[Screen[Any]] = []
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         package = entry.dist.name if entry.dist else "?"

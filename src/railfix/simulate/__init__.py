@@ -12,16 +12,7 @@ from railfix.simulate.alignment import Alignment, build_alignment
 from railfix.simulate.constellation import simulated_navigation
 from railfix.simulate.demonstration import DEMO_FILES, demo_files, demo_folder
 from railfix.simulate.disturbance import Disturbance, Disturbances, SightGeometry
-from railfix.simulate.errors import ErrorSettings
-from railfix.simulate.line_settings import (
-    Element,
-    GeneratedLine,
-    Gradient,
-    LineFile,
-    LineSettings,
-    MapError,
-    Terrain,
-)
+from railfix.simulate.line_file import Element, GeneratedLine, Gradient, LineFile, LineSettings, MapError, Terrain
 from railfix.simulate.motion import AntennaTruth, Motion, antenna_truth, build_motion, run_curve, shuttle
 from railfix.simulate.run import section_table, truth_table, write_run
 from railfix.simulate.scenario import (
@@ -35,8 +26,8 @@ from railfix.simulate.scenario import (
     VehicleSettings,
 )
 from railfix.simulate.scenario_file import Recipe, load_recipe, load_scenario, scenario_table, shipped_scenarios
-from railfix.simulate.sensors import SensorSettings
-from railfix.simulate.sensors.tables import sensor_tables
+from railfix.simulate.sensor_tables import sensor_tables
+from railfix.simulate.settings import ErrorSettings, SensorSettings
 from railfix.simulate.signals import Piece, Simulation
 
 __all__ = [

@@ -1,10 +1,8 @@
 """The continuous line: curvature, cant and gradient as functions of chainage, integrated to a curve in space.
 
-The ground truth is this curve; the track map samples it, with the error `MapError` where set.
-Chainage is the arc length in three dimensions. Curvature changes linearly in transitions (clothoids),
-and with it the cant (ramps); the gradient changes linearly in vertical curves. The curve is laid on
-the ellipsoid, so that a line of 200 km stays at its height and its curves stay curves. A line of a
-track file is the curve of `railfix.simulate.line_file` instead.
+The ground truth is this curve; the track map samples it, with the error `MapError` where set. Chainage is the arc
+length in three dimensions. Curvature changes linearly in transitions (clothoids), and with it the cant (ramps), the
+gradient linearly in vertical curves. The curve is laid on the ellipsoid.
 """
 
 from __future__ import annotations
@@ -19,20 +17,25 @@ from scipy.interpolate import CubicHermiteSpline
 
 from railfix.core.arrays import Floats, read_only
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
-from railfix.simulate.errors.processes import RandomFunction
-from railfix.simulate.line_file import FileLine, Knots, generated_knots, knots_of_elements, line_of_file
-from railfix.simulate.line_settings import PATTERN_LENGTH_M, LineSettings
+from railfix.simulate.errors import RandomFunction
+from railfix.simulate.line_file import (
+    PATTERN_LENGTH_M,
+    FileLine,
+    Knots,
+    LineSettings,
+    generated_knots,
+    knots_of_elements,
+    line_of_file,
+)
 from railfix.track import Track, interpolate_kilometrage
 
 _SEMI_MAJOR_M: Final = 6_378_137.0
 _FLATTENING: Final = 1.0 / 298.257_223_563
 #: Spacing of the points that the curve is integrated to [m]; the spline between them is exact to 1e-6 m.
 _STEP_M: Final = 0.5
-#: Rounds of the integration on the ellipsoid: each gains the factor (length / Earth radius).
-_ROUNDS: Final = 8
+_ROUNDS: Final = 8  #: Rounds of the integration on the ellipsoid: each gains the factor (length / Earth radius).
 
-#: Pattern of the simulated test line: length [m], radius at its end [m] (right positive), cant at its end [m].
-#: Curvature and cant run linearly from the element before.
+#: Pattern of the simulated test line: length [m], radius (right positive) [m] and cant [m] at its end.
 PATTERN: Final = (
     (90.0, np.inf, 0.0),
     (40.0, -160.0, 0.090),

@@ -1,14 +1,8 @@
-"""Broadcast records of simulated satellites.
+"""Broadcast records of simulated satellites, and the signals that arrive at a receiver.
 
-Orbits have the semi-major axis, eccentricity and inclination of the real constellations, the satellites'
-positions in them are invented, and one QZSS satellite is near the zenith of the line at the start of the
-run. All records of a satellite describe the same orbit and clock to within a millimetre; the newer ones of
-the satellites named in `SkySettings.unhealthy` are flagged unhealthy.
-
-The simulated signals follow the newest record transmitted, as receivers use it, so that a change of
-records is a small step in the ranges (decimetres), which a receiver that changes with them does not see.
-
-Signals of satellites that arrive at a receiver: orbits of `railfix.gnss.orbits`, light time, Earth rotation.
+Orbits have the semi-major axis, eccentricity and inclination of the real constellations; one QZSS satellite is near the
+zenith at the start of the run. All records of a satellite describe the same orbit and clock to within a millimetre. The
+signals follow the newest record transmitted, as receivers use it.
 
 `links` computes every instant; `SatelliteTable` computes nodes once, and interpolates all satellites together.
 """
@@ -30,8 +24,9 @@ from railfix.gnss.orbits.kepler import GM, ROTATION, Orbits, kepler_state
 from railfix.io.rinex import read_navigation
 from railfix.simulate.scenario import Scenario
 
-#: Validity of a record about its reference time [s]: half of GPS' and QZSS' least fit interval, Galileo's
-#: and BeiDou's as `railfix.gnss.orbits`.
+#: Health as broadcast: all data bad (GPS, QZSS), E1-B and E5b out of service (Galileo), SatH1 (BeiDou).
+_ILL_HEALTH: Final = {"G": 63, "J": 63, "E": 0b001_000_010 | 0b010_000_000, "C": 1}
+#: Validity of a record about its reference time [s], as `railfix.gnss.orbits`.
 _SERVES_S: Final = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0}
 #: Time from transmission to reference time, where the transmission time is absent or implausible [s].
 _SENT_BEFORE_S: Final = {"G": 7200.0, "J": 3600.0, "E": 600.0, "C": 3600.0}
@@ -39,12 +34,11 @@ _SIGNALS_MESSAGE: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV",), "C": 
 
 
 def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
-    """Records of the scenario's constellations that serve its time.
+    """Read the records of the scenario's constellations that serve its time.
 
-    A satellite takes part when at every moment of the run the newest record transmitted is within its
-    validity. Galileo's are the I/NAV ones. A transmission time that is absent is set to
-    the constellation's usual one. Klobuchar's coefficients are GPS'; they serve all. InputFileError: when it is no
-    navigation file. MismatchError: when the scenario's time is not within its records, or it lacks the coefficients.
+    A satellite takes part when at every moment of the run the newest record transmitted is within its validity.
+    Galileo's are the I/NAV ones, Klobuchar's coefficients GPS' for all. InputFileError: no navigation file.
+    MismatchError: the scenario's time is not within its records, or it lacks the coefficients.
     """
     navigation = read_navigation(path)
     if "G" not in navigation.klobuchar and scenario.sky.ionosphere_scale > 0.0:
@@ -286,16 +280,11 @@ def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Gener
                 "satellite": orbit.name, "message": _MESSAGE[system], "toc": toe, "toe": toe,
                 "inter_signal_s": np.full(6, np.nan),
                 "transmitted": scenario.start + timedelta(sent_sow - start_sow),
-                "health": _ill_health(system) if ill else 0,
+                "health": _ILL_HEALTH[system] if ill else 0,
                 "iode": issue + k, "iodc": issue + k, "data_source": _INAV_SOURCE if system == "E" else 0,
             }
         )  # fmt: skip
     return rows
-
-
-def _ill_health(system: str) -> int:
-    """As broadcast: all navigation data bad (GPS, QZSS), E1-B and E5b out of service (Galileo), SatH1 (BeiDou)."""
-    return {"G": 63, "J": 63, "E": 0b001_000_010 | 0b010_000_000, "C": 1}[system]
 
 
 def _wrap(angle: float) -> float:
@@ -326,10 +315,7 @@ class Links:
 def record_state(
     records: KeplerRecords, row: Indices, since_toe_s: Floats, since_toc_s: Floats
 ) -> tuple[Floats, Floats]:
-    """Position in the Earth-fixed frame of the instant, shape (T, 3) [m], and clock with relativity, shape (T,) [s].
-
-    From one row of the records for each instant, at so many seconds after its times of ephemeris and clock.
-    """
+    """Position (T, 3) [m] and clock with relativity (T,) [s] by one row of the records for each instant."""
     position, _, relativity = kepler_state(Orbits.of_table(Orbits.from_records(records).table[row]), since_toe_s)
     dt = since_toc_s
     clock = records.af0_s[row] + records.af1[row] * dt + records.af2[row] * dt**2 + relativity
@@ -344,10 +330,7 @@ def newest_record(records: KeplerRecords, satellite: str, time: Datetimes) -> In
 
 
 def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
-    """Signals of a satellite that arrive at a receiver at T tags, `late_s` (the receiver clock's bias) before each.
-
-    The light-time equation is solved by iteration, in the Earth-fixed frame of reception.
-    """
+    """Signals of a satellite at a receiver, `late_s` before T tags: the light-time equation by iteration."""
     row = newest_record(records, satellite, tag)
     since_toe = seconds(tag - records.toe[row]) - late_s
     since_toc = seconds(tag - records.toc[row]) - late_s
@@ -365,11 +348,7 @@ def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats
 
 
 class SatelliteTable:
-    """Satellites over a span of time: computed at nodes once, interpolated by polynomials of degree 6.
-
-    The distance differs from that of `links` by less than 1e-6 m. The pieces are fixed for the whole
-    span, so results do not depend on how the instants are cut into chunks.
-    """
+    """Satellites over a span of time: computed at nodes once, interpolated within 1e-6 m by degree 6."""
 
     def __init__(
         self, records: KeplerRecords, satellites: Sequence[str], first: np.datetime64, last: np.datetime64
@@ -402,10 +381,7 @@ class SatelliteTable:
         self._powers = np.einsum("kn,pnsc->kpsc", to_powers, values)
 
     def links(self, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
-        """Signals of all satellites that arrive at a receiver, as `links`, shapes (T, S).
-
-        ValueError: when a tag is outside of the table's span.
-        """
+        """Signals of all satellites, as `links`, shapes (T, S); ValueError outside the table's span."""
         when = seconds(tag - self._start)
         if when.size and (when.min() < 0.0 or when.max() > self._end):
             raise ValueError("tag is outside of the span that the satellite table was made for")

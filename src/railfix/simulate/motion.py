@@ -1,9 +1,8 @@
 """Chainage and speed of the train over time, and true positions of its antennas.
 
-A shuttle between two points, or a run curve: as fast as the line, its curves and the train allow, stopping at
-stations. Antennas are on a rigid body with both bogie centres on the continuous line, independently of
-`railfix.track.vehicle`, which works on the polyline of the map: here by Newton's method on the curve and by rotation
-about the body's axis (Rodrigues).
+A shuttle between two points, or a run curve: as fast as the line, its curves and the train allow, stopping at stations.
+Antennas are on a rigid body with both bogie centres on the continuous line, by Newton's method and Rodrigues' rotation,
+independently of `railfix.track.vehicle`.
 """
 
 from __future__ import annotations
@@ -22,15 +21,14 @@ from railfix.core.arrays import Floats
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate.alignment import Alignment
-from railfix.simulate.errors.processes import RandomFunction
+from railfix.simulate.errors import RandomFunction
 from railfix.simulate.scenario import RunSettings, Scenario, Station, VehicleSettings
 
 if TYPE_CHECKING:
     from railfix.simulate.scenario import Scenario
 
 
-#: Rounds in which the length of the average is lengthened until every change of acceleration fits.
-_ROUNDS: Final = 20
+_ROUNDS: Final = 20  #: Rounds in which the length of the average is lengthened until every change of acceleration fits.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,12 +66,11 @@ class Motion:
 
 
 def limit_jerk(motion: Motion, jerk_mps3: float) -> Motion:
-    """Moving average of a motion of constant accelerations over the time that keeps its jerk within a limit.
+    """Average a motion of constant accelerations over the time T that keeps its jerk within a limit.
 
-    The average of the chainage over [t - T, t] has the speed ``(s(t) - s(t - T)) / T``, the acceleration
-    ``(v(t) - v(t - T)) / T`` and the jerk ``(a(t) - a(t - T)) / T``: it never exceeds the motion's
-    own largest speed and acceleration, stops at the same chainages, and is late by T / 2. A stop shorter than
-    T is not reached.
+    The average over [t - T, t] has the speed ``(s(t) - s(t - T)) / T`` and so on: it never exceeds the motion's own
+    largest speed and acceleration, stops at the same chainages, and is late by T / 2. A stop shorter than T is not
+    reached.
     """
     start = motion.time_s
     duration = float(np.abs(np.diff(motion.acceleration_mps2, prepend=0.0)).max()) / jerk_mps3
@@ -111,10 +108,8 @@ def _acceleration_change(motion: Motion, time_s: Floats, duration_s: float) -> F
     return np.asarray(motion.acceleration_at(after) - motion.acceleration_at(after - duration_s))
 
 
-#: Spacing of the places at which a run curve looks at the limits [m].
-_STEP_M: Final = 2.0
-#: Contact points of the wheels lie further apart than the gauge [m].
-_RAIL_HEAD_M: Final = 0.070
+_STEP_M: Final = 2.0  #: Spacing of the places at which a run curve looks at the limits [m].
+_RAIL_HEAD_M: Final = 0.070  #: Contact points of the wheels lie further apart than the gauge [m].
 
 
 def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
@@ -239,8 +234,7 @@ class AntennaTruth:
     """True positions of one antenna at n positions of the vehicle's middle."""
 
     ecef_m: Floats  #: Shape (n, 3).
-    #: Centreline point in the plane through the antenna perpendicular to the line between the bogie centres, shape
-    #: (n,).
+    #: Centreline point in the plane through the antenna perpendicular to the bogies' line; shape (n,).
     chainage_m: Floats
     forward: Floats  #: Unit vector of the body's long axis, shape (n, 3).
 
@@ -299,13 +293,11 @@ def antenna_truth(
     return AntennaTruth(ecef_m=place, chainage_m=abeam, forward=forward)
 
 
-#: Speed at and above which the random motions of the body have their full size [m/s].
-FULL_SPEED_MPS: Final = 20.0
+FULL_SPEED_MPS: Final = 20.0  #: Speed at and above which the random motions of the body have their full size [m/s].
 #: Step of the response to accelerations [s], and damping ratio of the suspension.
 _STEP_S: Final = 0.01
 _DAMPING: Final = 0.3
-#: Time before the start and after the end of the run over which the motion is given [s].
-_MARGIN_S: Final = 2.0
+_MARGIN_S: Final = 2.0  #: Time before the start and after the end of the run over which the motion is given [s].
 
 
 class BodyMotion:

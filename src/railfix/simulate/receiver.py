@@ -20,10 +20,9 @@ from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIG
 from railfix.gnss.navigation import KeplerRecords
 from railfix.gnss.observations import ObservationHeader
 from railfix.simulate.constellation import newest_record
-from railfix.simulate.errors.common import CommonErrors
-from railfix.simulate.errors.processes import ClockWalk, satellite_key
-from railfix.simulate.errors.settings import InterSystemSettings, NoiseSettings, TrackingSettings
+from railfix.simulate.errors import ClockWalk, CommonErrors, satellite_key
 from railfix.simulate.scenario import ANTENNAS, ReceiverSettings, Scenario
+from railfix.simulate.settings import InterSystemSettings, NoiseSettings, TrackingSettings
 
 
 class CarriedNoise:
@@ -256,19 +255,13 @@ class Receiver:
         # Integer ambiguity of each channel.
         self.ambiguity = self._rng.integers(-2_000_000, 2_000_000, len(channels)).astype(np.float64)
         self.carried = CarriedNoise(
-            errors.noise,
-            key=(scenario.seed, _CARRIED, number),
-            channels=len(channels),
-            interval_s=scenario.interval_s,
+            errors.noise, key=(scenario.seed, _CARRIED, number), channels=len(channels), interval_s=scenario.interval_s
         )
         self.smoothing = CodeSmoothing(
             scenario.receiver.code_smoothing_s, channels=len(channels), interval_s=scenario.interval_s
         )
         self.tracking = TrackingNoise(
-            errors.tracking,
-            key=(scenario.seed, _SLIPS, number),
-            channels=len(channels),
-            interval_s=scenario.interval_s,
+            errors.tracking, key=(scenario.seed, _SLIPS, number), channels=len(channels), interval_s=scenario.interval_s
         )
 
     def white(self, epochs: int) -> Floats:
@@ -295,8 +288,7 @@ def group_delay_s(records: KeplerRecords, satellite: str, signal: str, time: Dat
     return np.asarray(delay[row] * (frequency["1"] / frequency[signal[0]]) ** 2)
 
 
-#: Stream of random numbers of the walks.
-_WALK = 5
+_WALK = 5  #: Stream of random numbers of the walks.
 
 
 class ReceiverClocks:

@@ -1,9 +1,4 @@
-"""Settings of a simulated run.
-
-The defaults resemble P1's experiment: a line about like its test line (table 1: 756 m, 189 points, 2 to
-3 m apart in curves and at most about 20 m on straights), a train of its dimensions (antennas 18.2 m
-apart) and simulated satellites.
-"""
+"""Settings of a simulated run; the defaults resemble P1's experiment (table 1, antennas 18.2 m apart)."""
 
 from __future__ import annotations
 
@@ -17,28 +12,27 @@ from pydantic import Field, field_validator, model_validator
 from railfix.core.errors import SettingsError
 from railfix.simulate.disturbance import CN0_HORIZON_DBHZ, CN0_RISE_DB, Disturbances
 from railfix.simulate.environment.settings import EnvironmentSettings
-from railfix.simulate.errors.settings import ErrorSettings, SatelliteFault
-from railfix.simulate.line_settings import LineSettings
+from railfix.simulate.line_file import LineSettings
 from railfix.simulate.sbas.settings import SbasSettings
-from railfix.simulate.sensors.settings import SensorSettings
-from railfix.simulate.setting_types import (
+from railfix.simulate.settings import (
     SYSTEMS,
+    ErrorSettings,
     Finite,
     GpsTime,
     NotNegative,
     Positive,
+    SatelliteFault,
     ScenarioSettings,
     Seed,
+    SensorSettings,
     Three,
     beyond_start,
 )
 
-#: Antennas of the vehicle, in the order in which they are written.
-ANTENNAS: Final = ("front", "rear")
+ANTENNAS: Final = ("front", "rear")  #: Antennas of the vehicle, in the order in which they are written.
 #: Names of other files of a run.
 _FILES: Final = (*ANTENNAS, "nav", "track", "vehicle", "truth", "sections", "scenario", "readme", "sbas")
-#: Longest run, a hundred days; more epochs than this are many runs [s].
-LONGEST_S: Final = 8.64e6
+LONGEST_S: Final = 8.64e6  #: Longest run, a hundred days; more epochs than this are many runs [s].
 
 
 class Station(ScenarioSettings):

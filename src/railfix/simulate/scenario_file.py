@@ -1,23 +1,9 @@
-"""Scenario files: TOML of one run, or a recipe that lists several.
+"""Scenario files: TOML of one run, the settings of `Scenario` by their names, or a recipe that lists several.
 
-One run holds the settings of `Scenario` by their names::
+``duration_s = "run"`` lasts until the train stands at its last stop. A recipe names a base, another file beside it or a
+shipped one, and for each run what differs::
 
-    description = "what this is"
-    seed = 7
-    start = 2024-03-05T03:10:00
-    duration_s = "run"
-
-    [line]
-    kind = "generated"
-    length_m = 36_000.0
-
-    [run]
-    cruise_mps = 30.0
-
-``duration_s = "run"`` lasts until the train stands at its last stop. A recipe names a base, another
-file beside it or a shipped one, and for each run what differs::
-
-    description = "four runs"
+    description = "two runs"
     base = "p1-commercial"
 
     [[runs]]
@@ -27,13 +13,12 @@ file beside it or a shipped one, and for each run what differs::
     [[runs]]
     name = "02-falling"
     parts = ["back"]
-    seed = 2
 
     [parts.back]
     run.direction = "falling"
 
-Parts are settings that several runs share; a run's own settings override those of its parts, later parts
-override earlier ones, and all override the base. Paths in a file (``sky.nav``, ``line.file.path``) are relative to it.
+A run's own settings override those of its parts, later parts override earlier ones, and all override the base. Paths in
+a file (``sky.nav``, ``line.file.path``) are relative to it.
 """
 
 from __future__ import annotations

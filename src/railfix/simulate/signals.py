@@ -19,19 +19,15 @@ from railfix.simulate.alignment import Alignment, build_alignment
 from railfix.simulate.constellation import SatelliteTable, links, simulated_navigation
 from railfix.simulate.disturbance import CN0_SECOND_DB, Disturbances, SightGeometry
 from railfix.simulate.environment import Environment
-from railfix.simulate.errors.common import CommonErrors, fault_m
+from railfix.simulate.errors import CommonErrors, fault_m
 from railfix.simulate.motion import AntennaTruth, BodyMotion, Motion, antenna_truth, build_motion
 from railfix.simulate.receiver import Receiver, ReceiverClocks, group_delay_s, ionosphere_m, signals_of, troposphere_m
 from railfix.simulate.scenario import ANTENNAS, Scenario
 
-#: Receivers report C/N0 in steps [dB-Hz].
-CN0_STEP_DBHZ: Final = 0.25
-#: Epochs of one chunk.
-CHUNK_EPOCHS: Final = 2000
-#: Spacing of the instants at which satellites above the cutoff are searched [s].
-_LOOK_S: Final = 60.0
-#: Half the interval of the difference that gives range rates [s].
-_RATE_S: Final = 0.005
+CN0_STEP_DBHZ: Final = 0.25  #: Receivers report C/N0 in steps [dB-Hz].
+CHUNK_EPOCHS: Final = 2000  #: Epochs of one chunk.
+_LOOK_S: Final = 60.0  #: Spacing of the instants at which satellites above the cutoff are searched [s].
+_RATE_S: Final = 0.005  #: Half the interval of the difference that gives range rates [s].
 #: C/N0 of the receiver's nominal sigmas, and C/N0 above which the noise no longer falls [dB-Hz].
 _SIGMA_AT_DBHZ: Final = 45.0
 _BEST_DBHZ: Final = 50.0
@@ -46,9 +42,7 @@ class Piece:
     clock_m: Floats  #: Receiver clock times the speed of light, shape (T,).
     code_sigma_m: Floats  #: Standard deviation of the noise in the codes, shape (T, M).
     clean_code_m: Floats  #: The codes without noise and without disturbances, shape (T, M).
-    #: Part of `clean_code_m` that comes from `Scenario.errors` and that no model corrects: satellites, atmosphere,
-    #: faults and inter-system biases; shape (T, M).
-    error_m: Floats
+    error_m: Floats  #: Part of `clean_code_m` by `Scenario.errors` that no model corrects; shape (T, M).
 
 
 class Simulation:
@@ -253,10 +247,7 @@ def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ec
 
 
 def _geometry(simulation: Simulation, antenna: str, time: Datetimes) -> tuple[SightGeometry, _Instant, Floats, Floats]:
-    """Geometry by satellite, the instant of the epochs, and the rates of path and ionosphere [m/s].
-
-    Rates are differences over a hundredth of a second of the true motion; the clock's steps are left out.
-    """
+    """Geometry by satellite, the instant of the epochs, and rates of path and ionosphere over 10 ms [m/s]."""
     late = simulation.clock_s(antenna, tags := seconds(time - simulation.scenario.start))
     truth, speed = simulation.truth(antenna, tags - late)
     now = _instant(simulation, time, late, truth.ecef_m)
@@ -286,7 +277,13 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     scenario, settings = simulation.scenario, simulation.scenario.receiver
     by_satellite, now, path_rate, ionosphere_rate = _geometry(simulation, receiver.antenna, time)
     column, scale, wavelength = receiver.column, receiver.scale, receiver.wavelength_m
-    geometry = _of_channels(by_satellite, receiver)
+    geometry = replace(
+        by_satellite,
+        satellite=receiver.names,
+        signal=receiver.signals,
+        elevation_deg=by_satellite.elevation_deg[:, column],
+        azimuth_deg=by_satellite.azimuth_deg[:, column],
+    )
     tags = seconds(time - scenario.start)
     ionosphere = scale * now.ionosphere_m[:, column]
     clock = SPEED_OF_LIGHT * simulation.clock_s(receiver.antenna, tags)
@@ -340,17 +337,6 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
         code_sigma_m=sigma,
         clean_code_m=code,
         error_m=error + extra + receiver.group_delay_error_m,
-    )
-
-
-def _of_channels(geometry: SightGeometry, receiver: Receiver) -> SightGeometry:
-    """Geometry of a receiver's channels from that of the satellites."""
-    return replace(
-        geometry,
-        satellite=receiver.names,
-        signal=receiver.signals,
-        elevation_deg=geometry.elevation_deg[:, receiver.column],
-        azimuth_deg=geometry.azimuth_deg[:, receiver.column],
     )
 
 

@@ -1,7 +1,6 @@
 """Coordinate reference systems of maps: how each is tied to the Earth, and coordinates in degrees of its frame.
 
-Definitions are those of the EPSG dataset, in the words of each datum's anchor (https://epsg.org). What a country
-moves against its plate is an order of size, for the notes alone: nothing is moved by it.
+Definitions are those of the EPSG dataset (https://epsg.org). Motions against a plate are for the notes alone.
 """
 
 from __future__ import annotations
@@ -176,8 +175,7 @@ REGIONAL: Final = {
     "SIRGAS 2000": "EPSG:4989",
     "Hartebeesthoek94": "EPSG:4941",
 }
-#: Margin about the area of use of a CRS [deg].
-MARGIN_DEG: Final = 0.5
+MARGIN_DEG: Final = 0.5  #: Margin about the area of use of a CRS [deg].
 #: Largest scale of a grid that is the one of a line, less 1: grids of countries have up to 0.005.
 LARGEST_SCALE: Final = 0.01
 #: Projections of web maps and of the world, whose scale is none of a survey.
@@ -187,10 +185,8 @@ _UNEVEN: Final = (
     "Mercator (variant B)",
     "Equidistant Cylindrical",
 )
-#: Share of the area of use of an older datum that a modern frame of its region covers.
-_COVERED: Final = 0.5
-#: Accuracy [m] worse than which a transformation of PROJ is between datums of another age.
-MODERN_M: Final = 0.5
+_COVERED: Final = 0.5  #: Share of the area of use of an older datum that a modern frame of its region covers.
+MODERN_M: Final = 0.5  #: Accuracy [m] worse than which a transformation of PROJ is between datums of another age.
 
 Kind = Literal["wgs84", "moves with its plate", "dynamic", "older datum"]
 
@@ -270,10 +266,7 @@ def geodetic_of(crs: str) -> CRS:
 
 @lru_cache(maxsize=32)
 def operation_of(crs: str) -> Transformer | None:
-    """PROJ's best transformation to the working frame, of a frame or of the one whose coordinates it has.
-
-    None where PROJ has none between modern frames.
-    """
+    """Return PROJ's best transformation to the working frame; None where PROJ has none between modern frames."""
     source = geodetic_of(crs)
     sources = [source] if source.name not in SAME else [source, CRS.from_user_input(SAME[source.name][0])]
     for frame in sources:
@@ -290,25 +283,18 @@ def _operations(source: CRS, target: CRS, *, over: CRS | None = None) -> list[Tr
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # about missing grids: reported by `older_datum_note`
-            group = TransformerGroup(
-                source,
-                target,
-                always_xy=True,
-                allow_ballpark=False,
-                area_of_interest=within,
-            )
+            group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False, area_of_interest=within)
     except (ProjError, IndexError):  # IndexError: pyproj cannot make an operation that is known at one epoch alone
         return []
     return [t for t in group.transformers if t.accuracy >= 0.0]
 
 
 def frame_degrees(crs: str, x: Floats, y: Floats, *, path: str) -> tuple[Floats, Floats, str]:
-    """Latitude and longitude of map coordinates (longitude and latitude, or easting and northing), and their frame's
+    """Latitude and longitude of map coordinates (longitude and latitude, or easting and northing), and the frame's
     code.
 
-    Projected coordinates are turned into degrees of the frame they are based on; nothing is shifted between modern
-    frames. Coordinates of an older datum (Tokyo, Belgian Datum 72) are transformed by PROJ to the modern frame of
-    their region, with the accuracy that PROJ has for it. InputFileError: when the CRS does not reach there.
+    Coordinates of an older datum (Tokyo, Belgian Datum 72) are transformed by PROJ to the modern frame of their region;
+    nothing is shifted between modern frames. InputFileError: when the CRS does not reach there.
     """
     kind = kind_of_frame(crs)
     frame = _modern_frame(crs)[0] if kind == "older datum" else _frame_of(crs)
@@ -390,10 +376,7 @@ def _frame_of(crs: str) -> str:
 
 @lru_cache(maxsize=32)
 def _modern_frame(crs: str) -> tuple[str, float]:
-    """The modern frame of its region to which PROJ transforms an older datum best, and how well [m].
-
-    WGS 84 where there is none, and NaN where PROJ has no transformation at all.
-    """
+    """Return the modern frame that PROJ reaches best (else WGS 84), and how well [m] (NaN without)."""
     whole, source = CRS.from_user_input(crs), geodetic_of(crs).to_2d()
     found = []
     for code in REGIONAL.values():

@@ -35,10 +35,7 @@ KNOWN_METADATA: Final = ("name", "crs", "height_datum", "geoid", "sigma_plan_m",
 
 
 def attributes(count: int, read: Callable[[str, float], Floats | None]) -> dict[str, Floats]:
-    """Optional attributes of a segment's points; `read` gives a column, with a value for blanks, or None without it.
-
-    Radii of 0, a common notation of straight track, become infinite.
-    """
+    """Read optional attributes of points by `read(name, blank)`; radii of 0, straight track, become infinite."""
     found: dict[str, Floats] = {}
     for column, (name, factor, blank) in OPTIONAL_COLUMNS.items():
         values = read(column, blank)
@@ -47,11 +44,7 @@ def attributes(count: int, read: Callable[[str, float], Floats | None]) -> dict[
 
 
 def read_csv_segment(path: str | PathLike[str], reading: MapReading) -> Segment:
-    """Read a CSV track map as one segment of a route.
-
-    The CRS is geographic, where it is not WGS 84 (``EPSG:6668``); the height datum only confirms that of the column
-    name.
-    """
+    """Read a CSV track map as one segment of a route; its CRS is geographic."""
     check_height_datum(reading.height_datum)
     table = read_named_columns(path)
     notes = _check_columns(table)
@@ -63,8 +56,14 @@ def read_csv_segment(path: str | PathLike[str], reading: MapReading) -> Segment:
     heights = table.numbers("height_m" if datum == "ellipsoidal" else "elevation_m")
     if len(table) < 2:
         raise InputFileError(path, f"{len(table)} point(s); a track needs at least two")
-    if reading.duplicates == "reject":
-        _reject_duplicates(table, latitude, longitude, heights)
+    same = (np.diff(latitude) == 0) & (np.diff(longitude) == 0) & (np.diff(heights) == 0)
+    if reading.duplicates == "reject" and same.any():
+        row = int(np.argmax(same)) + 1
+        raise table.error(
+            row,
+            f"the same point as line {table.line[row - 1]} ({int(same.sum())} such in the file); remove it, "
+            "'railfix map check' lists them all",
+        )
     crs = used_crs(path, reading.crs, table.metadata.get("crs"))
     latitude, longitude, frame = _in_frame(crs, latitude, longitude, path=table.path)
     geoid = reading.geoid
@@ -148,17 +147,6 @@ def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floa
         raise table.error(row, f"longitude_deg {longitude_deg[row]:g} is over 360; degrees were expected")
     if len(table) and (np.abs(latitude_deg) <= np.pi / 2).all() and (np.abs(longitude_deg) <= np.pi).all():
         raise table.error(0, "all coordinates lie within a few degrees of 0, 0: radians were given, degrees expected")
-
-
-def _reject_duplicates(table: NamedColumns, latitude: Floats, longitude: Floats, height: Floats) -> None:
-    same = (np.diff(latitude) == 0) & (np.diff(longitude) == 0) & (np.diff(height) == 0)
-    if same.any():
-        row = int(np.argmax(same)) + 1
-        raise table.error(
-            row,
-            f"the same point as line {table.line[row - 1]} ({int(same.sum())} such in the file); remove it, "
-            "'railfix map check' lists them all",
-        )
 
 
 def _in_frame(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> tuple[Floats, Floats, str]:

@@ -1,11 +1,8 @@
-"""Elements of an alignment in plan, profile and cant, as design files have them.
+"""Elements of an alignment in plan, profile and cant, as design files (IFC, LandXML) have them, and their segments.
 
-In plan an element has a curvature that runs from its first to its last value by a law (straight, arc, clothoid,
-Bloss, cosine, sine, Helmert, Viennese); the direction is its integral in closed form, the place that of the direction
-by Gauss-Legendre quadrature. Profile and cant are closed forms. Lengths are those of the plan, directions are
-counter-clockwise from the x axis (easting), curvature is positive to the left, as in IFC 4.3 and LandXML.
-
-Segments of a route from the alignment elements of a design file (IFC, LandXML).
+The direction is the integral of the curvature in closed form, the place that of the direction by Gauss-Legendre
+quadrature. Lengths are those of the plan, directions counter-clockwise from the x axis (easting), curvature positive to
+the left, as in IFC 4.3 and LandXML.
 """
 
 from __future__ import annotations
@@ -24,8 +21,7 @@ from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, frame_degrees, is_in_ar
 from railfix.track.heights import stated_heights
 from railfix.track.route import NO_HEIGHTS, MapReading, Segment
 
-#: Share of the change of curvature or cant at a share t of the element, and its integral from 0 to t (IFC 4.3.2,
-#: IfcAlignmentHorizontalSegmentTypeEnum and IfcAlignmentCantSegmentTypeEnum).
+#: Share of the change of curvature or cant at a share t of the element, and its integral from 0 (IFC 4.3.2).
 LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]]] = {
     "linear": (lambda t: t, lambda t: t**2 / 2.0),
     "bloss": (lambda t: 3.0 * t**2 - 2.0 * t**3, lambda t: t**3 - t**4 / 2.0),
@@ -44,13 +40,11 @@ LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Float
     ),
 }
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
-#: Longest piece of one quadrature [rad of direction]; 12 nodes are exact to rounding below it.
-_PIECE_RAD: Final = 0.5
+_PIECE_RAD: Final = 0.5  #: Longest piece of one quadrature [rad of direction]; 12 nodes are exact to rounding below it.
 #: Steps of points of an alignment: chords stay within 1 cm of arcs down to 100 m radius.
 _CHORD_M: Final = 0.01
 _LONGEST_M: Final = 25.0
-#: Elements that begin further than this from the end of the one before are reported [m].
-_JOINT_M: Final = 0.01
+_JOINT_M: Final = 0.01  #: Elements that begin further than this from the end of the one before are reported [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,8 +223,7 @@ def alignment_points(
     return alignment_at(place, plan, profile, cant), notes
 
 
-#: Longest part of an alignment to which its profile is extended [m].
-_PROFILE_BEYOND_M: Final = 50.0
+_PROFILE_BEYOND_M: Final = 50.0  #: Longest part of an alignment to which its profile is extended [m].
 
 
 def segment_of_design(
@@ -244,12 +237,10 @@ def segment_of_design(
     grid: tuple[float, float, float, float, float, float] | None = None,
     notes: tuple[str, ...] = (),
 ) -> Segment:
-    """The points of one alignment as a segment, without heights where the profile is empty.
+    """Return the points of one alignment as a segment, without heights where the profile is empty.
 
-    The CRS, which is required, is that of the grid, height datum and geoid those of the profile. `grid`: easting,
-    northing, height, cosine and sine of the rotation, and scale that turn the file's coordinates into those of the
-    grid. InputFileError: when the alignment has no element, or no grid. SettingsError: when the height datum is
-    missing.
+    `grid`: easting, northing, height, cosine and sine of the rotation, and scale that turn the file's coordinates into
+    those of the grid. InputFileError: no element, or no grid. SettingsError: no height datum.
     """
     if not plan:
         raise InputFileError(path, f"alignment {name!r} has no element in plan")

@@ -1,10 +1,8 @@
 """Reference frames of track maps, and maps moved to the frame of the satellites.
 
-Broadcast orbits are in WGS 84, which agrees with ITRF2020 at the epoch of observation to centimetres; precise
-orbits are in a realisation of the ITRF. Maps are in a frame that moves with its plate (ETRS89, NAD83(2011),
-GDA2020, JGD2011), or in the ITRF at the epoch of their survey. The transformations are those of PROJ with
-coordinate epoch; where PROJ has none the motion of the plate is used (ITRF2020 plate motion model, Altamimi et al.
-2023, doi:10.1029/2023GL106373, as PROJ ships it), and said.
+Broadcast orbits (WGS 84) agree with ITRF2020 at the epoch of observation to centimetres. Maps are in a frame that moves
+with its plate, or in the ITRF at the epoch of their survey. PROJ transforms with coordinate epoch; where it cannot, the
+motion of the plate is used (Altamimi et al. 2023, doi:10.1029/2023GL106373), and said.
 """
 
 from __future__ import annotations
@@ -82,10 +80,7 @@ class MapMotion(TypedDict, total=False):
 
 
 def track_at(track: Track, time: np.datetime64, **motion: Unpack[MapMotion]) -> tuple[Track, FrameShift]:
-    """The track, moved from the frame that its `Provenance.frame` names to that of the satellites at a time.
-
-    Keywords (`epoch`, `plate`, `parameters`) and errors as for `points_at`.
-    """
+    """Move the track from `Provenance.frame` to the frame of the satellites at a time, as `points_at`."""
     provenance = track.provenance
     moved, shift = points_at(track.ecef_m, provenance.frame, time, named=provenance.crs != UNNAMED, **motion)
     if moved is track.ecef_m:
@@ -98,10 +93,10 @@ def track_at(track: Track, time: np.datetime64, **motion: Unpack[MapMotion]) -> 
 def points_at(
     ecef_m: Floats, crs: str, time: np.datetime64, *, named: bool = True, **motion: Unpack[MapMotion]
 ) -> tuple[Floats, FrameShift]:
-    """Points of a map, shape (n, 3), in the frame of the satellites at a time, and the shift at the middle one.
+    """Move points of a map, shape (n, 3), to the frame of the satellites at a time; return also the shift at the middle
+    one.
 
-    `crs` is their frame: where it is that of the satellites, they are returned as they are. `time` is that of the log.
-    Where the map does not name its frame itself, the size of the doubt is noted. SettingsError: when the plate is
+    Where the map does not name its frame `crs` itself, the size of the doubt is noted. SettingsError: when the plate is
     unknown, or an epoch or plate is given for a frame that does not need it.
     """
     epoch, plate, parameters = motion.get("epoch"), motion.get("plate"), motion.get("parameters")
@@ -148,10 +143,7 @@ def _transform(operation: Transformer, ecef_m: Floats, year: float) -> Floats:
 def in_map_frame(
     ecef_m: Floats, crs: str, time: np.datetime64, *, named: bool = True, **motion: Unpack[MapMotion]
 ) -> tuple[Floats, FrameShift]:
-    """Positions from satellites, NaN where there is none, in the frame of a map: the shift of `points_at` taken off.
-
-    A shift of metres changes by micrometres over its own length, so it is taken at the positions.
-    """
+    """Move positions, or NaN, from the frame of the satellites to that of a map: `points_at` taken off."""
     known = np.flatnonzero(np.isfinite(ecef_m[:, 0]))
     if not len(known):
         raise MismatchError("there is no position to move to the frame of the map")
@@ -213,10 +205,7 @@ def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
 def _by_parameters(
     ecef_m: Floats, path: str | PathLike[str], year: float, epoch: float | None, plate: str
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Coordinates of JGD2011 moved by a semi-dynamic correction, and with the plate from its epoch on, where named.
-
-    The correction changes by millimetres over 100 m, so it is taken once in each cell of a thousandth of a degree.
-    """
+    """Move JGD2011 by a semi-dynamic correction, once in each thousandth of a degree, and with the plate."""
     try:
         import jgdtrans
     except ImportError:

@@ -50,17 +50,12 @@ class Thinned:
     dropped: dict[str, int]  #: Number of rows by reason.
     jumps: Indices  #: Points whose successor is further away than `ThinningLimits.jump_m`, shape (j,).
     jump_m: Floats  #: Distance to the successor, shape (j,).
-    #: Points at which the path turns back by more than 120 degrees: the vehicle reversed, or a position is wrong; shape
-    #: (t,).
+    #: Points at which the path turns by more than 120 degrees: reversals, or wrong positions; shape (t,).
     turns: Indices
 
 
 def stationary(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: float) -> Masks:
-    """Flag the rows at which the antenna is stationary: its horizontal displacement is below speed times window.
-
-    The window lies before and after each row, shorter at the ends and at gaps. Times rise; rows without one are never
-    flagged.
-    """
+    """Flag rows at which the horizontal displacement over the window is below speed times window; times rise."""
     if len(time) < 3 or np.isnat(time).any() or speed_mps == 0.0:
         return np.zeros(len(time), dtype=np.bool_)
     t = seconds(time - time[0])
@@ -75,11 +70,7 @@ def stationary(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: f
 
 
 def thin(
-    time: Datetimes,
-    ecef_m: Floats,
-    *,
-    usable: Masks | None = None,
-    limits: ThinningLimits | None = None,
+    time: Datetimes, ecef_m: Floats, *, usable: Masks | None = None, limits: ThinningLimits | None = None
 ) -> Thinned:
     """Choose the positions that become points of a map.
 
@@ -128,11 +119,7 @@ def thin(
 
 
 def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks:
-    """Rows that one vehicle can have passed: outward from the longest piece without a jump, shape (n,).
-
-    Between neighbours of a piece the speed is possible; a further piece belongs to it where it can be reached
-    from the nearest end of what is kept.
-    """
+    """Flag rows that one vehicle can have passed: outward from the longest piece without a jump, shape (n,)."""
     if len(ecef_m) < 2:
         return np.ones(len(ecef_m), dtype=np.bool_)
     timed = not np.isnat(time).any()
@@ -170,11 +157,7 @@ def _turning_back(points: Floats) -> Indices:
 
 
 def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:
-    """Extend the stationary rows by moves between them that stay within the spacing.
-
-    Such a move ends where the next one begins, so no part of the line is lost, and a start-up transient or
-    a wrong fix while stationary does not bend the line.
-    """
+    """Extend the stationary rows by moves between them that stay within the spacing."""
     if not stands.any():
         return stands
     edges = np.flatnonzero(np.diff(stands)) + 1
@@ -306,11 +289,10 @@ def track_of(
 
 
 def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_sigma_m: float | None = None) -> Masks:
-    """Flag the rows of a log that meet the quality limits.
+    """Flag the rows of a log that meet the quality limits; by default fixes (1) where the log has a quality, else all.
 
-    Accepted quality numbers are by default 1 (fix) where the log has a quality, else all rows; with a largest standard
-    deviation in north, east and up [m], rows without one are rejected. InputFileError: when the log has no column for a
-    filter that is given, or no row of an accepted quality.
+    With a largest standard deviation [m] rows without one are rejected. InputFileError: the log lacks a column for a
+    filter that is given, or has no row of an accepted quality.
     """
     usable = np.ones(len(log), dtype=np.bool_)
     if quality is not None and not log.has_quality:
@@ -339,11 +321,7 @@ SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
 
 
 def _accuracy(log: PositionLog, kept: Indices) -> tuple[float, float, str]:
-    """Standard deviations in plan and height of the positions that a map is made of, and what they rest on.
-
-    The larger of what the log states and what positions of their quality have: a filter's own sigma of a single
-    point is the noise alone.
-    """
+    """Return the sigmas in plan and height of a map's positions, the larger of stated and usual, and their basis."""
     plan, height = SIGMA_PLAN_M, SIGMA_HEIGHT_M
     stated = log.sigma_m[kept]
     reasons = []

@@ -174,11 +174,7 @@ def _in_frame(path: str, crs: str, values: Floats) -> tuple[Floats, Floats, str]
 
 
 def read_geojson_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
-    """Read the lines of a GeoJSON file, in their order, as segments of a route.
-
-    The CRS is that of a file without one (an error where the file names another one); height datum and geoid are used
-    where the file has no such member or property.
-    """
+    """Read the lines of a GeoJSON file as segments; `reading` gives what the file leaves out."""
     text = read_text(path)
     try:
         document = json.loads(text)

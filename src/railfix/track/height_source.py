@@ -20,23 +20,18 @@ from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog
 from railfix.track.from_positions import SIGMA_OF_QUALITY
 from railfix.track.heights import GEOIDS, ellipsoidal_heights, own_height_datum
-from railfix.track.polyline import NearestOnPolyline
 from railfix.track.track import SIGMA_HEIGHT_M, Track
+from railfix.track.trajectory import NearestOnPolyline
 
 #: Endings of rasters, read by GDAL through `rasterio`: GeoTIFF, ESRI ASCII grid with its .prj file, SRTM, DTED, ...
 RASTERS: Final = (
     ".tif", ".tiff", ".asc", ".vrt", ".hgt", ".dt0", ".dt1", ".dt2", ".img", ".bil", ".flt", ".jp2", ".grd", ".xyz",
 )  # fmt: skip
-#: A file, or positions in memory.
-HeightSource = str | PathLike[str] | PositionLog
-#: Largest distance of the points that heights are put on [m].
-_SPACING_M: Final = 50.0
-#: Cells of a raster read at a time.
-_WINDOW_CELLS: Final = 4_000_000
-#: Positions further than this from the line in plan are of another line [m].
-_NEAR_M: Final = 15.0
-#: Points further than this from a height along the line have none [m].
-_REACH_M: Final = 200.0
+HeightSource = str | PathLike[str] | PositionLog  #: A file, or positions in memory.
+_SPACING_M: Final = 50.0  #: Largest distance of the points that heights are put on [m].
+_WINDOW_CELLS: Final = 4_000_000  #: Cells of a raster read at a time.
+_NEAR_M: Final = 15.0  #: Positions further than this from the line in plan are of another line [m].
+_REACH_M: Final = 200.0  #: Points further than this from a height along the line have none [m].
 #: Standard deviation of the weights of positions along the line [m]: of fixed ones, and of single ones, whose errors
 #: last for hundreds of metres; a vertical curve of 2 km radius is then off by up to 5 m.
 _KERNEL_M: Final = 15.0
@@ -71,26 +66,12 @@ def with_heights(
     height_datum: str | None = None,
     sigma_m: float | None = None,
 ) -> Track:
-    """The track with the heights of a second source in place of its own, and their standard deviation.
+    """Return the track with the heights of a second source in place of its own, and their standard deviation.
 
-    Parameters
-    ----------
-    source : path or PositionLog
-        Raster (`RASTERS`); CSV with ``chainage_m`` or ``kilometrage_m`` and ``height_m`` (ellipsoidal) or
-        ``elevation_m`` (orthometric), its accuracy as the column ``sigma_m`` or the line ``# sigma_m:``; or a log of
-        positions as `railfix.io.nmea.read_any_positions` reads it. Positions that are given have the heights between
-        and beyond them, too.
-    geoid, height_datum : str, optional
-        Geoid of orthometric heights; datum of a raster, which needs it.
-    sigma_m : float, optional [m]
-        Standard deviation of the heights, in place of that of the source; a raster needs it.
-
-    Raises
-    ------
-    InputFileError
-        The file has no heights for a part of the line.
-    SettingsError
-        A raster without its height datum or its standard deviation.
+    `source` is a raster (`RASTERS`), which needs `height_datum` and `sigma_m`; a CSV with ``chainage_m`` or
+    ``kilometrage_m``, ``height_m`` (ellipsoidal) or ``elevation_m`` (orthometric), and ``sigma_m`` as a column or
+    comment; or a log of positions. InputFileError: it has no heights for a part of the line. SettingsError: a raster
+    without what it needs.
     """
     track = _dense(track)
     if isinstance(source, PositionLog):
@@ -153,12 +134,7 @@ def _opened(path: str | PathLike[str]) -> Iterator[tuple[Any, CRS]]:
 
 
 def _from_raster(
-    track: Track,
-    path: str | PathLike[str],
-    *,
-    geoid: str | None,
-    height_datum: str | None,
-    sigma_m: float | None,
+    track: Track, path: str | PathLike[str], *, geoid: str | None, height_datum: str | None, sigma_m: float | None
 ) -> Track:
     """Heights of a raster at the points of the track, linear between the middles of its cells."""
     check_raster(path, geoid=geoid, height_datum=height_datum, sigma_m=sigma_m)
@@ -195,10 +171,7 @@ def _from_raster(
 
 
 def _sample(raster: Any, place: Floats) -> Floats:
-    """Values of a raster at rows and columns, shape (2, n), from the middles of its cells; NaN where it has none.
-
-    Read in windows about neighbouring points, so that memory does not grow with the raster.
-    """
+    """Sample a raster at rows and columns, shape (2, n), in windows about neighbouring points; NaN without."""
     from scipy.ndimage import map_coordinates
 
     low = np.floor(place.min(axis=1)).astype(np.int64)

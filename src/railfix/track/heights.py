@@ -1,8 +1,4 @@
-"""Conversion of orthometric to ellipsoidal heights with a named geoid model.
-
-Maps have heights from levelling, satellite positions refer to the ellipsoid (P1 3.1(1)).
-``ellipsoidal = orthometric + geoid``.
-"""
+"""Conversion of orthometric to ellipsoidal heights with a named geoid model (P1 3.1(1))."""
 
 from __future__ import annotations
 
@@ -24,8 +20,7 @@ from railfix.core.errors import InputFileError, SettingsError
 from railfix.track.crs import vertical_of
 from railfix.track.route import MapReading
 
-#: Geoid models of the Geospatial Information Authority of Japan that japan-geoid ships. Heights levelled
-#: before April 2025 belong to GSIGEO2011, those of the later national height system to JPGEO2024.
+#: Geoid models of the GSI of Japan: GSIGEO2011 for heights levelled before April 2025, JPGEO2024 since.
 JAPAN_MODELS: Final = {
     "japan": "JPGEO2024",
     "jpgeo2024": "JPGEO2024",
@@ -37,8 +32,7 @@ _LOADERS: Final = {
     "JPGEO2024+Hrefconv2024": japan_geoid.load_embedded_jpgeo2024_hrefconv2024,
     "GSIGEO2011": japan_geoid.load_embedded_gsigeo2011,
 }
-#: Geoids by name.
-GEOIDS: Final = "egm96 of the world, japan, a grid file, or a vertical CRS such as EPSG:3855"
+GEOIDS: Final = "egm96 of the world, japan, a grid file, or a vertical CRS such as EPSG:3855"  #: Geoids by name.
 #: Advice for orthometric heights without a geoid.
 GEOID_HELP: Final = f"give one (--geoid): {GEOIDS}; or a column geoid_m"
 #: EGM96: the grid of 15' that PROJ knows of, and the error of the one of 1 degree that sidereon ships [m].
@@ -56,10 +50,9 @@ def check_height_datum(height_datum: str | None) -> None:
 def geoid_heights(geoid: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> tuple[Floats, str]:
     """Height of a geoid above the WGS 84 ellipsoid, shape (n,) [m], and the model used.
 
-    The geoid is a key of `JAPAN_MODELS`; ``egm96``, the grid of 15' where PROJ has it, else of 1 degree (0.4 m RMS from
-    the other) by `sidereon`; a file or name of a pyproj grid (``.tif``, ``.gtx``); or a vertical or
-    compound CRS (``EPSG:5773``). SettingsError: when the model is unknown or its grid is not installed. InputFileError:
-    when points of the map lie outside the area of the model.
+    The geoid is a key of `JAPAN_MODELS`; ``egm96``, by PROJ's grid, else by `sidereon` (0.4 m RMS from it); a pyproj
+    grid (``.tif``, ``.gtx``); or a vertical or compound CRS (``EPSG:5773``). SettingsError: unknown or not installed.
+    InputFileError: points outside the area of the model.
     """
     key = geoid.strip().lower()
     if key in JAPAN_MODELS:
@@ -140,12 +133,7 @@ def _proj_transformer(geoid: str) -> tuple[str, Transformer]:
 
 
 def stated_heights(
-    heights_m: Floats,
-    latitude_deg: Floats,
-    longitude_deg: Floats,
-    reading: MapReading,
-    *,
-    path: str,
+    heights_m: Floats, latitude_deg: Floats, longitude_deg: Floats, reading: MapReading, *, path: str
 ) -> tuple[Floats, str, str]:
     """Ellipsoidal heights of a file without a datum of its own, the geoid used, and the datum, which must be given."""
     check_height_datum(reading.height_datum)
@@ -182,11 +170,7 @@ def ellipsoidal_heights(
     geoid_m: Floats | None,
     path: str,
 ) -> tuple[Floats, str]:
-    """Convert heights of a datum ("ellipsoidal", "orthometric") to ellipsoidal heights, and name the geoid used.
-
-    `geoid` is the model, if given, `geoid_m` the geoid heights of the map itself. InputFileError, SettingsError:
-    orthometric heights without a geoid, or with two; ellipsoidal heights with one.
-    """
+    """Convert heights of a datum to ellipsoidal ones, by a model or the map's `geoid_m`; name the geoid used."""
     if datum == "ellipsoidal":
         if geoid is not None:
             raise SettingsError(f"{path}: geoid {geoid!r} was given, but the heights are ellipsoidal already")

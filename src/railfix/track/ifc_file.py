@@ -99,12 +99,10 @@ def _values(text: str) -> list[Any]:
 
 
 def read_ifc_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
-    """Read the alignments of an IFC file, one segment each; the CRS is that of the grid where it has no
-    IfcProjectedCRS.
+    """Read the alignments of an IFC file, one segment each; the CRS is that of the grid without an IfcProjectedCRS.
 
-    The height is that of the middle between the rail tops: the profile and half the sum of both rails' cant (IFC
-    4.3.2, IfcSegmentedReferenceCurve). A constant cant whose two ends differ is taken as a linear transition.
-    InputFileError: when the file has no alignment, or one with elements that are not read.
+    The height is that of the middle between the rail tops: the profile and half the sum of both rails' cant (IFC 4.3.2,
+    IfcSegmentedReferenceCurve). InputFileError: no alignment, or one with elements that are not read.
     """
     step = _Step(path)
     nested = {entity.values[4]: entity.values[5] for _, entity in step.of_kind("IFCRELNESTS")}
@@ -182,10 +180,7 @@ def _units(step: _Step) -> tuple[float, float]:
 def _map_conversion(
     step: _Step, unit: float
 ) -> tuple[tuple[float, float, float, float, float, float] | None, str | None]:
-    """Easting, northing, height, cosine, sine and scale of the IfcMapConversion, and the CRS it names.
-
-    Its scale is of the file's unit of length, in some files of metres.
-    """
+    """Return easting, northing, height, cosine, sine and scale of the IfcMapConversion, and the CRS it names."""
     found = step.of_kind("IFCMAPCONVERSION")
     if not found:
         return None, None

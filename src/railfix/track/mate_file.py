@@ -1,11 +1,9 @@
 """Track tables of EGNSS MATE: edges of lines, circles and clothoids, with gradients and cant.
 
-`S_DM_TRACK_SEGMENT_POSITION` as CSV, and beside it, where they are, `S_DM_TRACK_SEGMENT_GRADIENT` and
-`S_DM_TRACK_SEGMENT_CANT` (https://github.com/EGNSS-MATE/egnss-mate-schematics). A line begins at a point with an
-azimuth; a circle is given by its centre and the arc from its north pole, a clothoid by its point without curvature,
-the azimuth there and the arc from it. The tables do not say which side is positive, nor whether the constant of a
-clothoid is its parameter A, radius times length, or the change of curvature: the form is taken in which a segment
-meets those before and after it on its edge.
+https://github.com/EGNSS-MATE/egnss-mate-schematics. A circle is given by its centre and the arc from its north pole, a
+clothoid by its point without curvature, the azimuth there and the arc from it. The tables do not say which side is
+positive, nor what the constant of a clothoid is: the form is taken in which a segment meets those before and after it
+on its edge.
 """
 
 from __future__ import annotations
@@ -23,11 +21,55 @@ import polars as pl
 
 from railfix.core.errors import InputFileError
 from railfix.core.files import text_lines
-from railfix.core.mate import read_mate
+from railfix.io.mate import mate_table, read_mate
 from railfix.io.named_columns import read_named_columns
-from railfix.track.crs import used_crs
+from railfix.track.crs import frame_degrees, used_crs
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
 from railfix.track.route import MapReading, Segment
+
+#: CRS of coordinates in degrees with their ellipsoidal height (ETRS89).
+_ETRS89: Final = "EPSG:4937"
+_NUMBERS: Final = ("LATITUDE_ETRS89", "LONGITUDE_ETRS89", "ALTITUDE_ETRS89", "RADIUS", "CANT", "GRADIENT")
+_POINT: Final = ("TRACK_EDGE_ID", "POSITION", *_NUMBERS[:3])
+
+
+def read_edges(path: Path, reading: MapReading) -> list[Segment]:
+    """Read the edges of S_DM_TRACKPOINT, or S_DM_TRACK_SEGMENT_POSITION in Parquet, by default in ETRS89."""
+    if mate_table(path) != "S_DM_TRACKPOINT":
+        return read_mate_segments(path, reading)
+    table = read_mate(path, _POINT).sort("TRACK_EDGE_ID", "POSITION", maintain_order=True)
+    edges = table.group_by("TRACK_EDGE_ID", maintain_order=True)
+    return [_segment_of_points(path, str(key[0]), rows, reading) for key, rows in edges]
+
+
+def _segment_of_points(path: Path, edge: str, rows: pl.DataFrame, reading: MapReading) -> Segment:
+    """The points of one track edge; cant in millimetres, a radius of 0 or none is straight."""
+    values = {name: rows[name].cast(pl.Float64).fill_null(np.nan).to_numpy() for name in _NUMBERS}
+    for name in _NUMBERS[:3]:
+        if not np.isfinite(values[name]).all():
+            raise InputFileError(path, f"track edge {edge}: a point has no {name}; complete it")
+    crs = reading.crs or _ETRS89
+    latitude, longitude, frame = frame_degrees(
+        crs, values["LONGITUDE_ETRS89"], values["LATITUDE_ETRS89"], path=f"{path} ({edge})"
+    )
+    radius = np.where(np.nan_to_num(values["RADIUS"]) == 0.0, np.inf, values["RADIUS"])
+    return Segment(
+        source=f"{path} ({edge})",
+        file=str(path),
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=values["ALTITUDE_ETRS89"],
+        kilometrage_m=np.full(len(rows), np.nan),
+        cant_m=values["CANT"] * 1e-3,
+        radius_m=radius,
+        gradient_permille=values["GRADIENT"],
+        crs=crs,
+        frame=frame,
+        height_datum="ellipsoidal",
+        geoid="",
+        metadata={"name": edge},
+    )
+
 
 _POSITION: Final = "S_DM_TRACK_SEGMENT_POSITION"
 _GRADIENT: Final = "S_DM_TRACK_SEGMENT_GRADIENT"
@@ -44,10 +86,7 @@ def is_mate(path: str | PathLike[str]) -> bool:
 
 
 def read_mate_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
-    """Read the edges of the tables as segments, in the order of the file.
-
-    InputFileError: when a row lacks what its type needs, or the segments of an edge do not meet.
-    """
+    """Read the edges of the tables as segments, in the order of the file; InputFileError where they do not meet."""
     gradients, cants = (_rows(path, name) for name in (_GRADIENT, _CANT))
     found = []
     for edge, rows in _rows(path, None).items():

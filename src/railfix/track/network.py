@@ -1,8 +1,7 @@
 """A network of tracks: track centrelines, the connections of their ends, and routes through it (P1 4.2(1)).
 
-Connections are those that the file states (net relations of railML 3 and RailTopoModel, as the Belgian
-infrastructure manager publishes them), else ends nearer to each other than a tolerance. A train passes from one
-track to another only over a connection that is navigable: of a switch the stem and each leg, never the two legs.
+Connections are stated by the file, else ends nearer to each other than a tolerance. Of a switch the stem and each leg
+are navigable, never the two legs.
 """
 
 from __future__ import annotations
@@ -19,27 +18,22 @@ from scipy.spatial import cKDTree
 from railfix.core.arrays import Floats, Indices, read_only
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.track.polyline import NearestOnPolyline, project_on_segments
 from railfix.track.route import Segment, one_frame, stated_sigma
 from railfix.track.track import SIGMA_PLAN_M, UNNAMED, interpolate_kilometrage
+from railfix.track.trajectory import NearestOnPolyline, project_on_segments
 
 if TYPE_CHECKING:
     import networkx as nx
 
-#: Way over which the direction of an end is taken [m].
-_DIRECTION_M: Final = 10.0
-#: Ways searched before the whole network is [m].
-_NEAR_WAY_M: Final = 5_000.0
-#: Spacing of the samples of the spatial index [m].
-_SAMPLE_M: Final = 50.0
+_DIRECTION_M: Final = 10.0  #: Way over which the direction of an end is taken [m].
+_NEAR_WAY_M: Final = 5_000.0  #: Ways searched before the whole network is [m].
+_SAMPLE_M: Final = 50.0  #: Spacing of the samples of the spatial index [m].
 #: Nearest samples examined for each position at first; more where these do not reach as far as asked.
 _SAMPLES: Final = 32
-#: Positions that are looked up together: of each every sample near it is in memory.
-_TOGETHER: Final = 256
+_TOGETHER: Final = 256  #: Positions that are looked up together: of each every sample near it is in memory.
 #: Properties that the connections do not change.
 _OF_POINTS: Final = ("first_point", "points_m", "chainage_m", "length_m", "height_m", "_way", "_index")
-#: Tracks that a message names one by one.
-_NAMED: Final = 8
+_NAMED: Final = 8  #: Tracks that a message names one by one.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,16 +49,7 @@ class Link:
 
 @dataclass(frozen=True, kw_only=True)
 class Candidates:
-    """Tracks near positions, n positions with up to m tracks each, nearest first.
-
-    Attributes
-    ----------
-    track : ndarray of int, shape (n, m)
-        -1 where there are fewer tracks.
-    chainage_m, offset_m : ndarray, shape (n, m)
-        Along the track from its first point, and distance in plan, positive to the right; NaN and infinite where
-        there is no track.
-    """
+    """Tracks near positions (n, m), nearest first, -1 for none; `offset_m` in plan, right positive, else infinite."""
 
     track: Indices
     chainage_m: Floats
@@ -73,16 +58,7 @@ class Candidates:
 
 @dataclass(frozen=True, kw_only=True)
 class Network:
-    """Tracks and their connections.
-
-    Attributes
-    ----------
-    tracks : tuple of Segment
-        Each from one end or switch to the next; heights may be missing (`NO_HEIGHTS`).
-    links : tuple of Link
-    notes : tuple of str
-        How connections were found.
-    """
+    """Tracks, each from one end or switch to the next, their connections, and notes on how these were found."""
 
     tracks: tuple[Segment, ...]
     links: tuple[Link, ...]
@@ -308,10 +284,7 @@ class Network:
         return length, path
 
     def shortest_route(self, stops: Sequence[int]) -> list[int]:
-        """Tracks of the shortest route that passes the given tracks in order, over navigable connections.
-
-        MismatchError: when no route leads from one to the next without turning back.
-        """
+        """Return the shortest route that passes the given tracks in order; MismatchError where there is none."""
         route = self.route_over(stops)
         if route is None:
             first = next(stop for k, stop in enumerate(stops, start=1) if self.route_over(stops[:k]) is None)

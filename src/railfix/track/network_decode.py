@@ -1,11 +1,9 @@
 """Probability of each track at each position of a log, with an error that the positions have in common.
 
 A hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818) whose state is a track near the position, or
-none of the map, and the common error of the positions, that of satellites, atmosphere and map: it lasts for minutes, so
-that positions beside a track are no new evidence each second. The common error is a first-order Gauss-Markov process
-east, north and, where heights tell tracks apart, up, on a lattice (Ehrenfest's urn, which has its mean and correlation
-exactly; Kac 1947, doi:10.2307/2304386). What is left of each position, multipath above all, has heavy tails
-(Student's t) and lasts for `correlation_s`, of which each position has its share.
+none of the map, and the common error of the positions: a first-order Gauss-Markov process east, north and up, on a
+lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). What is left of each position has heavy tails (Student's t)
+and lasts for `correlation_s`, of which each position has its share.
 """
 
 from __future__ import annotations
@@ -23,15 +21,13 @@ from railfix.track.network import Candidates, Network
 #: Negative logarithm of the likelihood of a position on a track that the map does not have, beside one at distance 0:
 #: that of a position 5 standard deviations from its track.
 _UNMAPPED_COST: Final = 5.0
-#: Degrees of freedom of the errors of positions.
-_FREEDOM: Final = 8.0
+_FREEDOM: Final = 8.0  #: Degrees of freedom of the errors of positions.
 #: Negative logarithms of the probability, from a position to the next, of passing to another track without connection,
 #: of leaving the map and of entering it: to a track beside by way of none is as improbable as the jump.
 _JUMP_COST: Final = 17.0
 _LEAVE_COST: Final = 12.0
 _ENTER_COST: Final = 5.0
-#: Way by which the connection between two places may exceed their straight distance [m], and its share of it: a bend
-#: between two positions, as in a tunnel.
+#: Way by which a connection may exceed the straight distance of two places [m], and its share of it: a bend.
 _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2
 #: Difference of way and distance at which a joint is half as probably passed as where they agree [m].
@@ -41,37 +37,21 @@ _PASSING_M: Final = 5.0
 _CHANGE: Final = 0.5
 _CHANGE_AT_JOINT: Final = 0.05
 _AT_JOINT: Final = 0.01
-#: Time over which the common error lasts [s].
-COMMON_S: Final = 600.0
+COMMON_S: Final = 600.0  #: Time over which the common error lasts [s].
 #: Balls of the urn of one horizontal axis, and of the vertical one: a quarter of them is the variance in steps.
 _BALLS: Final = 12
 _BALLS_UP: Final = 8
-#: Positions whose probabilities are in memory at a time, where heights do not count.
-_BLOCK: Final = 1024
+_BLOCK: Final = 1024  #: Positions whose probabilities are in memory at a time, where heights do not count.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Residuals:
     """Positions beside their candidates, n rows with up to m candidates each.
 
-    Attributes
-    ----------
-    across : ndarray, shape (n, m, 2)
-        Unit vector across the track at the nearest point, east and north.
-    offset_m : ndarray, shape (n, m)
-        From the track to the position along it; infinite without a candidate.
-    beyond_m : ndarray, shape (n, m)
-        How far the position lies beyond an end of the track, along it; 0 beside the track.
-    above_m : ndarray, shape (n, m)
-        Height of the position above the track; NaN where one has none.
-    sigma_m, sigma_up_m : ndarray, shape (n,)
-        Standard deviation of one horizontal axis and of the height.
-    weight : ndarray, shape (n,)
-        Share of the correlation time that the position covers.
-    seconds : ndarray, shape (n,)
-        Since the position before.
-    common_m, common_up_m : float
-        Standard deviation of the common error, of one horizontal axis and of the height; 0 where heights count not.
+    `across` (n, m, 2) is the unit vector across the track, east and north; `offset_m` the distance to it, infinite
+    without a candidate; `beyond_m` how far the position lies beyond an end; `above_m` its height above the track, NaN
+    without (n, m). `weight` is the share of the correlation time that a position covers, `seconds` since the one
+    before; `sigma_m` and `common_m` are of one horizontal axis, `common_up_m` is 0 where heights do not count.
     """
 
     across: Floats
@@ -148,10 +128,7 @@ class Transitions:
 
 @lru_cache(maxsize=256)
 def _urn(balls: int, seconds: float) -> tuple[Floats, Floats]:
-    """Shares of the states of an urn in equilibrium, and its passages after a time, from row to column.
-
-    Each ball is put into either side at the rate of the correlation time's inverse, independently of the others.
-    """
+    """Shares of the states of an urn in equilibrium, and its passages after a time, from row to column."""
     change = 0.5 * (1.0 - np.exp(-seconds / COMMON_S))
     passages = [
         np.convolve(_binomial(inside, 1.0 - change), _binomial(balls - inside, change)) for inside in range(balls + 1)
@@ -167,16 +144,7 @@ def _binomial(count: int, share: float) -> Floats:
 
 
 class _CommonError:
-    """The lattice of the common error: C places in plan by U heights.
-
-    Attributes
-    ----------
-    plan_m : ndarray, shape (C, 2)
-    up_m : ndarray, shape (U,)
-        One place where heights do not count.
-    first : ndarray, shape (C, U)
-        Probabilities before any position.
-    """
+    """Lattice of the common error: C places in plan by U heights, and its `first` probabilities (C, U)."""
 
     def __init__(self, residuals: Residuals) -> None:
         self._balls_up = _BALLS_UP if residuals.common_up_m > 0.0 else 0
@@ -231,15 +199,10 @@ def _likelihood(residuals: Residuals, lattice: _CommonError, k: int) -> Floats:
 
 
 def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
-    """Track of each position, and the probability of each track given the whole log.
+    """Return the track of each position, and the probability of each track given the whole log, shape (n, m + 1).
 
-    The tracks are the sequence of which the most pairs of neighbours are expected to be right.
-
-    Returns
-    -------
-    path : ndarray of int, shape (n,)
-        Column of the candidate; m for none.
-    probability : ndarray, shape (n, m + 1)
+    The tracks, shape (n,), are columns of the candidates, m for none: the sequence of which the most pairs of
+    neighbours are expected to be right.
     """
     n, m = residuals.offset_m.shape
     lattice = _CommonError(residuals)

@@ -1,8 +1,4 @@
-"""Positions of a run on a network of tracks: the track of each, and how probable it is.
-
-The states of the model and its probabilities are those of `railfix.track.network_decode`: a train changes to another
-track only over navigable connections whose way fits the distance run.
-"""
+"""Positions of a run on a network of tracks: the track of each, and how probable it is."""
 
 from __future__ import annotations
 
@@ -20,23 +16,19 @@ from railfix.core.files import ending
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.io.named_columns import read_named_columns
 from railfix.io.nmea import read_any_positions
-from railfix.io.position_log import CSV_COLUMNS, positions_times, renamed
+from railfix.io.position_log import CSV_COLUMNS, positions_times, rename_columns
 from railfix.track.crs import kind_of_frame
 from railfix.track.frames import FrameShift, MapMotion, in_map_frame
 from railfix.track.network import Candidates, Network
 from railfix.track.network_decode import Residuals, Transitions, decode
 from railfix.track.track import ANOTHER_PLACE_M
 
-#: Standard deviation of the distance of a position from its track where its log states none [m].
-SIGMA_M: Final = 2.0
-#: Largest standard deviation of the common error of the positions, in plan and in height [m]: satellites, atmosphere,
-#: map and the antenna's height above the rails.
+SIGMA_M: Final = 2.0  #: Standard deviation of the distance of a position from its track where its log states none [m].
+#: Largest standard deviation of the common error of positions [m]: satellites, atmosphere, map, antenna height.
 _COMMON_M: Final = 2.0
 _COMMON_UP_M: Final = 4.0
-#: Share of the stated standard deviation that the common error has where it is smaller.
-_COMMON_SHARE: Final = 0.7
-#: Quantile of the stated standard deviations that the common error has where it is smaller.
-_BEST: Final = 0.1
+_COMMON_SHARE: Final = 0.7  #: Share of the stated standard deviation that the common error has where it is smaller.
+_BEST: Final = 0.1  #: Quantile of the stated standard deviations that the common error has where it is smaller.
 #: Least distance to which tracks are looked for [m], and farther ones in standard deviations and metres.
 _WITHIN_M: Final = 30.0
 _WITHIN_SIGMAS: Final = 5.0
@@ -47,30 +39,14 @@ _WRONG_S: Final = 60.0
 #: Tracks that are looked at from such positions, and what stands where there is none.
 _MOST_FAR: Final = 8
 _NO_TRACK: Final = {"track": -1, "chainage_m": np.nan, "offset_m": np.inf}
-#: Median of the absolute value of a normal variable.
-_NORMAL_MEDIAN: Final = 0.6745
-#: Tracks near a position that are looked at.
-_MOST_TRACKS: Final = 16
-#: Least difference of heights of two tracks near each other for which heights count [m].
-_APART_UP_M: Final = 1.0
+_NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a normal variable.
+_MOST_TRACKS: Final = 16  #: Tracks near a position that are looked at.
+_APART_UP_M: Final = 1.0  #: Least difference of heights of two tracks near each other for which heights count [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLog:
-    """Positions in plan, n rows.
-
-    Attributes
-    ----------
-    path : str
-    time : ndarray of datetime64[ns], shape (n,)
-        NaT where the log has none.
-    latitude_deg, longitude_deg : ndarray, shape (n,)
-        NaN where a row has no position.
-    sigma_m : ndarray, shape (n,) [m]
-        Standard deviation of one horizontal axis; NaN where the log has none.
-    height_m, sigma_up_m : ndarray, shape (n,) [m], or None
-        Ellipsoidal heights and their standard deviation, NaN as above; None where the log has no heights.
-    """
+    """Positions in plan, n rows, NaT or NaN without; `sigma_m` is of one axis; heights are None without any."""
 
     path: str
     time: Datetimes
@@ -86,11 +62,7 @@ class PlanLog:
         return replace(self, **columns)
 
     def in_frame_of(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
-        """The positions, which are in the frame of the satellites, in that of the network.
-
-        MismatchError: when there is no position, no time of the log in a network whose frame moves, or the network is
-        of another region. SettingsError: as for `railfix.track.frames.points_at`.
-        """
+        """Return the positions, in the frame of the satellites, in that of the network; else MismatchError."""
         _check_region(network, self)
         times = self.time[~np.isnat(self.time)]
         if not len(times) and kind_of_frame(network.frame) not in ("wgs84", "older datum"):
@@ -127,20 +99,11 @@ def _check_region(network: Network, log: PlanLog) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Matched:
-    """Positions on a network, n rows.
+    """Positions on a network, n rows; `track` is the most probable sequence, -1 where none fits.
 
-    Attributes
-    ----------
-    track : ndarray of int, shape (n,)
-        The most probable sequence; -1 where no track of the map fits, and where there is no position.
-    chainage_m, offset_m : ndarray, shape (n,)
-        On that track, and distance in plan, positive to its right; NaN without a track.
-    probability : ndarray, shape (n,)
-        Of that track given the whole log; NaN where there is no position, or a wrong one: for less than a minute
-        farther from all tracks than six times `within_m`, and near some before and after.
-    candidates : Candidates
-    probabilities : ndarray, shape (n, m)
-        Of each candidate; the rest to 1 is that of no mapped track. NaN where there is no position.
+    `offset_m` is in plan, positive to the right of the track. `probability` is that of the track given the whole log;
+    NaN where there is no position, or a wrong one: for less than a minute farther from all tracks than six times
+    `within_m`. `probabilities`, shape (n, m), are those of each candidate; the rest to 1 is that of no mapped track.
     """
 
     track: Indices
@@ -158,13 +121,9 @@ class Matched:
 
 
 def read_plan_positions(path: str | PathLike[str], *, columns: Mapping[str, str] | None = None) -> PlanLog:
-    """Read positions in plan: any log of positions, or a CSV of latitude and longitude without heights.
-
-    The columns of a CSV are given by their names in railfix (``latitude_deg``, ``longitude_deg``, ``time_gpst``).
-    InputFileError: when the file is not a log of positions.
-    """
+    """Read positions in plan: any log of positions, or a CSV (`columns` renamed) without heights."""
     if ending(path) == ".csv":
-        table = renamed(read_named_columns(path), columns or {}, known=CSV_COLUMNS)
+        table = rename_columns(read_named_columns(path), columns or {}, known=CSV_COLUMNS)
         if "latitude_deg" in table and "longitude_deg" in table:
             return PlanLog(
                 path=str(path),
@@ -201,26 +160,12 @@ def match(
     within_m: float | None = None,
     correlation_s: float = 20.0,
 ) -> Matched:
-    """Match positions of a run to the tracks of a network.
+    """Match positions of a run, in the order of travel and in the frame of the network, to its tracks.
 
-    Heights count where both the log and all tracks have them, and tracks lie above each other.
-
-    Parameters
-    ----------
-    log : PlanLog
-        In the order of travel, in the frame of the network.
-    sigma_m : float, optional [m]
-        Standard deviation of the distance between position and track, map included; by default that of the log
-        with that of the map, and `SIGMA_M` where the log has none.
-    within_m : float, optional [m]
-        Farthest track considered; by default 30 m, or five standard deviations of nine positions of ten up to 100 m.
-    correlation_s : float [s]
-        Time over which position errors persist that are not common to minutes.
-
-    Raises
-    ------
-    MismatchError
-        There is no position.
+    `sigma_m` is the standard deviation of the distance from the track, map included (by default of the log and the
+    map); `within_m` the farthest track considered (30 m, or five standard deviations up to 100 m); `correlation_s` the
+    time over which errors persist that are not common to minutes. Heights count where both sides have them and tracks
+    lie above each other. MismatchError: there is no position.
     """
     given = np.flatnonzero(np.isfinite(log.latitude_deg))
     if not len(given):
@@ -254,10 +199,7 @@ def match(
 
 
 def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, within_m: float) -> Candidates:
-    """Tracks near each position; farther ones, too, where it lies far from all: the track on which it is still counts.
-
-    Without columns that no row needs.
-    """
+    """Find tracks near each position, and farther ones where it lies far from all."""
     near = network.near(latitude_deg, longitude_deg, within_m=within_m, most=_MOST_TRACKS)
     far = np.abs(near.offset_m[:, 0]) > min(0.5 * within_m, _WITHIN_M)
     if far.any():
@@ -280,10 +222,7 @@ def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
 
 
 def _scale(residuals: Residuals, track: Indices, correlation_s: float) -> float:
-    """How much larger than stated errors are, at least 1.
-
-    By the median change of the distance from the nearest track over the time for which an error persists.
-    """
+    """How much larger than stated errors are, at least 1: by changes of the distance over `correlation_s`."""
     seconds, distance = np.cumsum(residuals.seconds), residuals.offset_m
     rows = np.arange(len(seconds))
     later = np.minimum(np.searchsorted(seconds, seconds + correlation_s), len(rows) - 1)

@@ -1,28 +1,161 @@
-"""The route of a run through a network of tracks, from the tracks on which its positions lie."""
+"""The route of a run through a network of tracks, and gaps of its log filled by the shortest route."""
 
 from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.network import Network
-from railfix.track.network_match import Matched
+from railfix.track.network_match import Matched, PlanLog
+
+#: Rows that are filled: those without position between known places, or also those whose positions lie off the map.
+Rows = Literal["gaps", "off-map"]
+#: Farthest track looked at from a position that drifts, and largest difference of a route from the distance travelled
+#: [m]; and steps of which the speed is the median.
+_DRIFT_M = 500.0
+_STEPS = 15
+
+
+@dataclass(frozen=True, kw_only=True)
+class Filled:
+    """Places of all positions, shapes (n,); `track` is -1 where no place is known and no route was found.
+
+    `bound_m` is the farthest that a train on this route, which does not turn back, can be from the filled place [m];
+    infinite before the first known place and after the last, NaN where the place was known.
+    """
+
+    track: Indices
+    chainage_m: Floats
+    bound_m: Floats
+
+    @property
+    def filled(self) -> Masks:
+        """Rows that were filled."""
+        return ~np.isnan(self.bound_m)
+
+
+def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill: Rows = "gaps") -> Filled:
+    """Fill rows without usable position along the shortest route between known places, at even speed.
+
+    A gap with positions off the map is left, unless `rows_to_fill` is "off-map", as in a tunnel, where positions drift
+    but their steps still tell the speed. Then a route counts whose length differs from the distance travelled by at
+    most `_DRIFT_M`, and rows before the first known place and after the last are filled, too.
+    """
+    filled = Filled(
+        track=matched.track.copy(), chainage_m=matched.chainage_m.copy(), bound_m=np.full(len(matched.track), np.nan)
+    )
+    travelled = _travelled_m(log)
+    known = np.flatnonzero(matched.track >= 0)
+    for first, last in pairwise(known):
+        drifting = not np.isnan(matched.probability[first + 1 : last]).all()
+        if last == first + 1 or (rows_to_fill == "gaps" and drifting):
+            continue
+        legs = _fill_legs(network, *_place(matched, first), *_place(matched, last))
+        rows = np.arange(first, last + 1)
+        at = travelled[rows]
+        if not drifting or np.isnan(at).any():
+            no_time = np.isnat(log.time[rows]).any()
+            at = rows.astype(float) if no_time else (log.time[rows] - log.time[first]) / np.timedelta64(1, "ns")
+        elif legs is not None and _excess_m(legs, at) > _DRIFT_M:
+            continue
+        if legs is not None:
+            _put_on(filled, legs, rows[1:-1], at)
+    if rows_to_fill == "off-map" and len(known):
+        _fill_before(network, matched, log, travelled, np.arange(known[0], -1, -1), filled)
+        _fill_before(network, matched, log, travelled, np.arange(known[-1], len(matched.track)), filled)
+    return filled
+
+
+def _fill_before(
+    network: Network, matched: Matched, log: PlanLog, travelled_m: Floats, rows: Indices, filled: Filled
+) -> None:
+    """Fill rows from a known place outward, as far as they have positions."""
+    rows = rows[: np.argmin([*np.isfinite(travelled_m[rows]), False])]
+    if len(rows) < 2:
+        return
+    outer, way = rows[-1:], np.abs(travelled_m[rows] - travelled_m[rows[0]])
+    near = network.near(log.latitude_deg[outer], log.longitude_deg[outer], within_m=_DRIFT_M)
+    best, route = 2.0 * _DRIFT_M, None
+    for track, chainage, offset in zip(near.track[0], near.chainage_m[0], near.offset_m[0], strict=True):
+        legs = None if track < 0 else _fill_legs(network, *_place(matched, rows[0]), int(track), float(chainage))
+        if legs is not None:
+            cost = abs(offset) + _excess_m(legs, way)
+            best, route = (cost, legs) if cost < best else (best, route)
+    if route is not None:
+        _put_on(filled, route, rows[1:], way, ends_known=False)
+
+
+def _excess_m(legs: tuple[Indices, Floats, Floats], way_m: Floats) -> float:
+    """Difference of a route's length from the distance travelled."""
+    return abs(float(np.abs(legs[2] - legs[1]).sum()) - float(way_m[-1] - way_m[0]))
+
+
+def _place(matched: Matched, row: int | np.intp) -> tuple[int, float]:
+    return int(matched.track[row]), float(matched.chainage_m[row])
+
+
+def _travelled_m(log: PlanLog) -> Floats:
+    """Distance by the steps between positions, each the median of `_STEPS`, as positions jump; NaN without position."""
+    ecef = ecef_from_geodetic(log.latitude_deg, log.longitude_deg, np.zeros(len(log.time)))
+    step = np.linalg.norm(np.diff(ecef, axis=0), axis=1)
+    speed = median_filter(np.nan_to_num(step), _STEPS, mode="nearest")
+    travelled = np.concatenate([[0.0], np.cumsum(speed)])
+    return np.where(np.isfinite(ecef[:, 0]), travelled, np.nan)
+
+
+def _put_on(
+    filled: Filled, legs: tuple[Indices, Floats, Floats], rows: Indices, at: Floats, *, ends_known: bool = True
+) -> None:
+    """Put rows on a route in proportion to `at`, of which the first and, with known ends, the last are its ends."""
+    numbers, enter, leave = legs
+    share = (at - at[0]) / (at[-1] - at[0]) if at[-1] > at[0] else np.full(len(at), 0.5)
+    share = share[1 : len(rows) + 1]
+    ends = np.cumsum(np.abs(leave - enter))
+    way = share * ends[-1]
+    leg = np.minimum(np.searchsorted(ends, way), len(ends) - 1)
+    filled.track[rows] = numbers[leg]
+    filled.chainage_m[rows] = leave[leg] - np.sign(leave - enter)[leg] * (ends[leg] - way)
+    filled.bound_m[rows] = np.maximum(way, ends[-1] - way) if ends_known else np.inf
+
+
+def _fill_legs(
+    network: Network, first: int, from_m: float, last: int, to_m: float
+) -> tuple[Indices, Floats, Floats] | None:
+    """Tracks of the shortest route between two places, and the chainages where each is entered and left."""
+    if first == last:
+        return np.array([first]), np.array([from_m]), np.array([to_m])
+    length = network.length_m
+    best, nodes = np.inf, list[int]()
+    for end, before in ((0, from_m), (1, length[first] - from_m)):
+        ways, paths = network.ways_from(4 * first + 2 * end + 1, last)
+        for entry, after in ((0, to_m), (1, length[last] - to_m)):
+            node = 4 * last + 2 * entry
+            if node in ways and before + ways[node] + after < best:
+                best, nodes = before + ways[node] + after, paths[node]
+    if not nodes:
+        return None
+    # nodes alternate: left, entered, left, ..., entered
+    place = [0.0 if node % 4 < 2 else float(length[node // 4]) for node in nodes]
+    numbers = [first, *(node // 4 for node in nodes[1::2])]
+    return np.array(numbers), np.array([from_m, *place[1::2]]), np.array([*place[0::2], to_m])
 
 
 def route_of(network: Network, matched: Matched) -> tuple[list[int], list[int]]:
-    """Tracks that a run passed, in the order of travel, and those that it may have passed but no route can join to
-    them.
+    """Tracks that a run passed, in the order of travel, and those that no route can join to them.
 
-    Gaps are filled with the shortest way over navigable connections. A train that runs back over tracks it has passed
-    stays on the same route, as one does that goes round several times: each track is passed once, and a closed route
-    ends where it began. Where it runs back over others, the map has a gap, or positions jump to a track beside, the
-    less probable ones are left out. The route is empty where no position is on a track.
+    Each track is passed once: a train that runs back, or round several times, stays on the same route, and a closed
+    route ends where it began. Where it runs back over other tracks, the less probable ones are left out.
     """
     seen = matched.track[matched.track >= 0]
     if not len(seen):

@@ -1,7 +1,6 @@
 """Quality checks of a track map: spacing, mid-chord deviation, kinks, duplicates, kilometrage, gradient, cant.
 
-A map error affects all satellites alike, so no screen of the observations can detect it; it must be
-detected here (P1 2.2(1), 4.1(3)).
+A map error affects all satellites alike, so no screen of the observations detects it (P1 2.2(1), 4.1(3)).
 """
 
 from __future__ import annotations
@@ -15,14 +14,11 @@ from pydantic import Field
 
 from railfix.core.arrays import Floats, Masks
 from railfix.core.settings import Settings
-from railfix.track.geometry import Geometry, geometry_of, windowed_gradients
-from railfix.track.track import HEIGHTS_M, Track, kilometrage_breaks
+from railfix.track.track import HEIGHTS_M, Geometry, Track, geometry_of, kilometrage_breaks, windowed_gradients
 
 Severity = Literal["error", "warning"]
-#: Coordinates rounded to this are up to half of it off [deg]: 0.6 m.
-_COARSE_DEG: Final = 1e-5
-#: Cant of less than this everywhere was meant to be in another unit [m].
-_LEAST_CANT_M: Final = 5e-4
+_COARSE_DEG: Final = 1e-5  #: Coordinates rounded to this are up to half of it off [deg]: 0.6 m.
+_LEAST_CANT_M: Final = 5e-4  #: Cant of less than this everywhere was meant to be in another unit [m].
 
 
 class MapLimits(Settings):

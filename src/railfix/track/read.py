@@ -11,7 +11,7 @@ import numpy as np
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import ending
-from railfix.core.mate import mate_table
+from railfix.io.mate import mate_table
 from railfix.track.csv_file import read_csv_segment
 from railfix.track.geojson_file import read_geojson_segments
 from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
@@ -131,13 +131,7 @@ def check_heights(
     height_datum: str | None,
     sigma_height_m: float | None,
 ) -> None:
-    """Check that segments have heights, or a second source of them with all that it needs.
-
-    Raises
-    ------
-    InputFileError, SettingsError
-        They have none, or both; the message names every option that is missing.
-    """
+    """Check that segments have heights, or a second source of them; the error names every option that is missing."""
     flat = [s for s in segments if s.height_datum == NO_HEIGHTS]
     if flat and heights is None:
         raise InputFileError(
@@ -153,11 +147,7 @@ def check_heights(
 
 
 def read_segments(file: str | PathLike[str], reading: MapReading) -> list[Segment]:
-    """Read the lines of one map file in their order; a file without heights gives segments without.
-
-    Their accuracy in plan is the one asked for, else the file's own, else that of `openstreetmap.SIGMA_M`.
-    InputFileError: when the file is not a map.
-    """
+    """Read the lines of one map file in their order; a file without heights gives segments without."""
     segments = _segments_of(file, reading)
     if (given := reading.sigma_plan_m) is not None:
         return [_with_accuracy(segment, given) for segment in segments]
@@ -175,7 +165,7 @@ def _with_accuracy(segment: Segment, sigma_m: float, *notes: str) -> Segment:
 
 def _segments_of(file: str | PathLike[str], reading: MapReading) -> list[Segment]:
     if mate_table(file) and (mate_table(file) == "S_DM_TRACKPOINT" or ending(file) == ".parquet"):
-        from railfix.track.mate_points import read_edges
+        from railfix.track.mate_file import read_edges
 
         return read_edges(Path(file), reading)
     kind = ending(file)

@@ -13,8 +13,7 @@ from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.track import BACKWARDS, SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 
-#: `Segment.height_datum` of a segment without heights; they are NaN, or come from a second source.
-NO_HEIGHTS = "none"
+NO_HEIGHTS = "none"  #: `Segment.height_datum` of a segment without heights; they are NaN, or come from a second source.
 #: Optional attributes of each point of a map.
 ATTRIBUTES = ("kilometrage_m", "cant_m", "radius_m", "gradient_permille")
 
@@ -66,17 +65,11 @@ class Segment:
             name: getattr(self, name)[::-1] for name in ("latitude_deg", "longitude_deg", "height_m", *ATTRIBUTES)
         }
         turned |= {name: -turned[name] for name in ("radius_m", "gradient_permille")}
-        return replace(
-            self,
-            **turned,
-            notes=(*self.notes, f"{self.source} {BACKWARDS}"),
-        )
+        return replace(self, **turned, notes=(*self.notes, f"{self.source} {BACKWARDS}"))
 
 
-#: Ends of two segments nearer than this are the same point [m].
-SAME_POINT_M = 0.05
-#: Widest gap between the ends of two segments that is bridged by a straight line [m].
-MAX_GAP_M = 1.0
+SAME_POINT_M = 0.05  #: Ends of two segments nearer than this are the same point [m].
+MAX_GAP_M = 1.0  #: Widest gap between the ends of two segments that is bridged by a straight line [m].
 
 
 def _ends(segments: Sequence[Segment]) -> Floats:
@@ -87,11 +80,7 @@ def _ends(segments: Sequence[Segment]) -> Floats:
 
 
 def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list[Segment]:
-    """Orient segments, in the order of the route, so that each begins where the one before ends.
-
-    The first is reversed only where its start, not its end, meets the second. InputFileError: when two neighbours are
-    further apart than `max_gap_m` in any orientation.
-    """
+    """Orient segments in the order of the route so that each begins, within `max_gap_m`, where the last ends."""
     gap = first_gap(segments, max_gap_m=max_gap_m)
     if gap is not None:
         k, size = gap
@@ -135,11 +124,7 @@ def join(
     max_gap_m: float = MAX_GAP_M,
     sigma_height_m: float | None = None,
 ) -> Track:
-    """Join segments in the order of the route to one track; a shared point is kept once.
-
-    The shared point has the attributes of the earlier segment, and those of the later one where the
-    earlier has none.
-    """
+    """Join segments to one track; a shared point is kept once, with the attributes of the earlier segment first."""
     pieces = orient(segments, max_gap_m=max_gap_m)
     ends = _ends(pieces)
     kept: list[dict[str, Floats]] = []

@@ -1,9 +1,7 @@
 """3-D centreline of a railway line with curve attributes (P1 2.2(1), 4.1(3)).
 
-Right is positive: seen in the direction of rising chainage, a curve to the right has a positive
-radius. Cant is the height of the outer rail above the inner one, so it is positive in every
-ordinarily canted curve, left or right, and negative where the outer rail lies lower (the
-diverging track of a turnout on a curve). The height of a point is that of the rail tops' middle.
+Right is positive: seen in the direction of rising chainage, a curve to the right has a positive radius. Cant is the
+height of the outer rail above the inner one. The height of a point is that of the rail tops' middle.
 """
 
 from __future__ import annotations
@@ -16,24 +14,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Floats, Integers, Masks, freeze_arrays, read_only
-from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.tables import NotebookTable, plural
 
-#: Standard deviation of an aerial survey's centreline in plan [m] (P1 4.1(3)).
-SIGMA_PLAN_M = 0.30
-#: Standard deviation of its height [m]: about twice the plan's (P1 4.1(3)).
-SIGMA_HEIGHT_M = 0.60
+SIGMA_PLAN_M = 0.30  #: Standard deviation of an aerial survey's centreline in plan [m] (P1 4.1(3)).
+SIGMA_HEIGHT_M = 0.60  #: Standard deviation of its height [m]: about twice the plan's (P1 4.1(3)).
 #: Note on a section that is joined against the order of its points, after its name.
 BACKWARDS = "is used against the order of its points"
-#: Name of the reference system of a map that names none.
-UNNAMED = "not named (WGS 84 assumed)"
-#: Kilometrage that differs from the length of a segment by more than this, plus a twentieth of
-#: the length, has a break [m]; files give it rounded to the metre.
+UNNAMED = "not named (WGS 84 assumed)"  #: Name of the reference system of a map that names none.
+#: Kilometrage has a break where it differs by more than this and a twentieth of the length [m].
 KILOMETRAGE_BREAK_M = 1.0
-#: Ellipsoidal heights of railways, tunnels below the sea included [m].
-HEIGHTS_M = (-1000.0, 9000.0)
-#: A log further from a map than this is of another place [m].
-ANOTHER_PLACE_M = 100_000.0
+HEIGHTS_M = (-1000.0, 9000.0)  #: Ellipsoidal heights of railways, tunnels below the sea included [m].
+ANOTHER_PLACE_M = 100_000.0  #: A log further from a map than this is of another place [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,11 +43,7 @@ class Provenance:
 
 
 class TrackFields(TypedDict, total=False):
-    """Fields of `Track` beside its coordinates.
-
-    Attributes of points (array_like of shape (V,)), sections, accuracy, which is that of a survey unless given, and
-    where it is from.
-    """
+    """Fields of `Track` beside its coordinates: attributes (V,), sections, accuracy, and origin."""
 
     name: str
     kilometrage_m: ArrayLike | None
@@ -129,11 +117,7 @@ class Track(NotebookTable):
 
     @classmethod
     def from_geodetic(
-        cls,
-        latitude_deg: ArrayLike,
-        longitude_deg: ArrayLike,
-        height_m: ArrayLike,
-        **attributes: Unpack[TrackFields],
+        cls, latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike, **attributes: Unpack[TrackFields]
     ) -> Track:
         """Create a track from geodetic coordinates; attributes not given are NaN.
 
@@ -206,11 +190,7 @@ def section_spans(track: Track) -> list[tuple[float, float]]:
 
 
 def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
-    """Flag the segments in which the kilometrage jumps, shape (V - 1,).
-
-    There its change, in either direction, differs from the length of the segment by more than `KILOMETRAGE_BREAK_M` and
-    a twentieth; False where it is NaN.
-    """
+    """Flag segments (V - 1,) whose kilometrage jumps by more than `KILOMETRAGE_BREAK_M` and a twentieth."""
     return _jumping(np.diff(chainage_m), np.diff(kilometrage_m))
 
 
@@ -247,9 +227,7 @@ def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, kno
         return linear
     left, right = _running_direction(known_kilometrage_m, kilometrage_breaks(known_chainage_m, known_kilometrage_m))
     extrapolated = np.where(
-        at - start < end - at,
-        before + left[index] * (at - start),
-        after - right[index + 1] * (end - at),
+        at - start < end - at, before + left[index] * (at - start), after - right[index + 1] * (end - at)
     )
     return np.where(broken, extrapolated, linear)
 
@@ -266,3 +244,142 @@ def _running_direction(kilometrage_m: Floats, broken: Masks) -> tuple[Floats, Fl
     before = places[np.clip(np.searchsorted(places, points, side="left") - 1, 0, len(places) - 1)]
     after = places[np.clip(np.searchsorted(places, points, side="left"), 0, len(places) - 1)]
     return sign[before], sign[after]
+
+
+_BEND_WINDOW_M = 40.0  #: Length over which the curvature of the points is compared with the radius of the map [m].
+
+
+@dataclass(frozen=True, kw_only=True)
+class Geometry:
+    """Spacing, curvature and gradients of a track of V points."""
+
+    spacing_m: Floats  #: Length of each segment, shape (V - 1,).
+    #: Horizontal turn at each point, positive to the right; NaN at the ends and at duplicates; shape (V,).
+    turn_deg: Floats
+    reach_m: Floats  #: Mean length of the two segments at each point; NaN where `turn_deg` is; shape (V,).
+    #: Arc minus chord at the middle of each segment, ``L^2 / (8 R)``, positive in a right curve; R from the map where
+    #: both ends have it, else from the circle through neighbouring points; shape (V - 1,).
+    mid_chord_m: Floats
+    gradient_permille: Floats  #: Gradient from the heights; NaN at duplicates; shape (V - 1,).
+    height_spike_m: Floats  #: Height over the straight line between the neighbours; NaN at the ends; shape (V,).
+    #: Mean over about 40 m from `Track.radius_m`, NaN where unknown, and from the points; right positive; (V,) [1/m].
+    map_curvature: Floats
+    point_curvature: Floats
+
+
+def geometry_of(track: Track) -> Geometry:
+    """Compute the geometry of a track; duplicate points are skipped."""
+    spacing = np.diff(track.chainage_m)
+    kept = np.concatenate([[0], np.flatnonzero(spacing > 0.0) + 1])
+    if len(kept) < 2:
+        kept = np.array([0, len(track) - 1])
+    plan, climb = _plan_steps(track, kept)
+    length = np.hypot(plan[:, 0], plan[:, 1])
+    length = np.where(length > 0.0, length, np.nan)  # a point straight above another
+    turn, reach = _turns(plan)
+    height = track.height_m[kept]
+    share = length[:-1] / (length[:-1] + length[1:])
+    spike = height[1:-1] - (height[:-2] * (1.0 - share) + height[2:] * share)
+    curvature_of_map = np.where(np.isinf(track.radius_m), 0.0, 1.0 / track.radius_m)
+    circle = _circle_curvature(plan)
+    curvature = np.where(
+        np.isnan(curvature_of_map[kept[:-1]] + curvature_of_map[kept[1:]]),
+        np.nanmean(np.stack([circle[:-1], circle[1:]]), axis=0) if len(kept) > 2 else 0.0,
+        (curvature_of_map[kept[:-1]] + curvature_of_map[kept[1:]]) / 2.0,
+    )
+    segments, points = kept[1:] - 1, kept[1:-1]
+    return Geometry(
+        spacing_m=spacing,
+        turn_deg=_scatter(np.degrees(turn), points, len(track)),
+        reach_m=_scatter(reach, points, len(track)),
+        mid_chord_m=_scatter(length**2 * curvature / 8.0, segments, len(spacing)),
+        gradient_permille=_scatter(1e3 * climb / length, segments, len(spacing)),
+        height_spike_m=_scatter(spike, points, len(track)),
+        map_curvature=_mean_of_map(track, curvature_of_map),
+        point_curvature=_bend(track, kept, turn),
+    )
+
+
+def _scatter(values: Floats, places: Integers, size: int) -> Floats:
+    result = np.full(size, np.nan)
+    result[places] = values
+    return result
+
+
+def _plan_steps(track: Track, kept: Integers) -> tuple[Floats, Floats]:
+    """Compute the steps between points, east and north, shape (n, 2), and their height differences [m]."""
+    latitude, longitude = track.latitude_deg[kept], track.longitude_deg[kept]
+    axes = enu_axes((latitude[1:] + latitude[:-1]) / 2.0, _middle_longitude(longitude))
+    steps = np.einsum("nij,nj->ni", axes, np.diff(track.ecef_m[kept], axis=0))
+    return steps[:, :2], np.diff(track.height_m[kept])
+
+
+def _middle_longitude(longitude_deg: Floats) -> Floats:
+    """Compute the longitude midway between neighbours, also across the date line."""
+    step = (np.diff(longitude_deg) + 180.0) % 360.0 - 180.0
+    return longitude_deg[:-1] + step / 2.0
+
+
+def _turns(plan: Floats) -> tuple[Floats, Floats]:
+    """Compute the right turn between neighbouring steps [rad] and their mean length [m], shapes (n - 1,)."""
+    cross = plan[:-1, 1] * plan[1:, 0] - plan[:-1, 0] * plan[1:, 1]
+    dot = np.einsum("ni,ni->n", plan[:-1], plan[1:])
+    length = np.hypot(plan[:, 0], plan[:, 1])
+    return np.arctan2(cross, dot), (length[:-1] + length[1:]) / 2.0
+
+
+def _circle_curvature(plan: Floats) -> Floats:
+    """Compute the curvature of the circle through each point and its neighbours, shape (n + 1,) [1/m]; NaN at ends."""
+    turn, _ = _turns(plan)
+    across = plan[:-1] + plan[1:]
+    chord = np.hypot(across[:, 0], across[:, 1])
+    curvature = 2.0 * np.sin(turn) / np.where(chord > 0.0, chord, np.nan)
+    inner = np.where(np.isnan(curvature), 0.0, curvature)
+    if not inner.size:
+        return np.full(len(plan) + 1, np.nan)
+    return np.concatenate([[np.nan], inner, [np.nan]])
+
+
+def _mean_of_map(track: Track, curvature: Floats) -> Floats:
+    """Compute the mean of the map's curvature over the same window, shape (V,) [1/m]; NaN where it is not known."""
+    along = track.chainage_m
+    low, high = np.maximum(along - _BEND_WINDOW_M / 2.0, along[0]), np.minimum(along + _BEND_WINDOW_M / 2.0, along[-1])
+    unknown = np.isnan(curvature)
+
+    def between(values: Floats) -> Floats:
+        total = np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2.0 * np.diff(along))])
+        return np.asarray(np.interp(high, along, total) - np.interp(low, along, total))
+
+    whole, without = between(np.where(unknown, 0.0, curvature)), between(unknown.astype(np.float64))
+    return np.where((without > 0.0) | (high <= low), np.nan, whole / np.where(high > low, high - low, 1.0))
+
+
+def _bend(track: Track, kept: Integers, turn: Floats) -> Floats:
+    """Compute the curvature of the points over a window [1/m], shape (V,), to average the noise of single points."""
+    along = track.chainage_m
+    heading = np.concatenate([[0.0], np.cumsum(turn)])
+    middle = (along[kept][1:] + along[kept][:-1]) / 2.0
+    low, high = along - _BEND_WINDOW_M / 2.0, along + _BEND_WINDOW_M / 2.0
+    low, high = np.maximum(low, middle[0]), np.minimum(high, middle[-1])
+    width = high - low
+    change = np.interp(high, middle, heading) - np.interp(low, middle, heading)
+    return np.where(width > 0.0, change / np.where(width > 0.0, width, 1.0), 0.0)
+
+
+def windowed_gradients(track: Track, *, window_m: float) -> tuple[Floats, Floats]:
+    """Mean gradients [permille] of attribute and heights over a window, shapes (V,); NaN where unknown."""
+    along, gradient = track.chainage_m, track.gradient_permille
+    mean = (gradient[1:] + gradient[:-1]) / 2.0
+    unknown = np.concatenate([[0], np.cumsum(np.isnan(mean))])
+    climb = np.concatenate([[0.0], np.cumsum(np.where(np.isnan(mean), 0.0, mean) * np.diff(along))])
+    low = np.maximum(along - window_m / 2.0, along[0])
+    high = np.minimum(along + window_m / 2.0, along[-1])
+    last = np.minimum(np.searchsorted(along, high, side="left"), len(along) - 1)
+    first = np.maximum(np.searchsorted(along, low, side="right") - 1, 0)
+    enough = (high - low >= window_m / 2.0) & (unknown[last] == unknown[first])
+    width = np.where(enough, high - low, np.nan)
+    order = np.concatenate([[True], np.diff(along) > 0.0])
+    attribute = (np.interp(high, along[order], climb[order]) - np.interp(low, along[order], climb[order])) / width
+    height = track.height_m[order]
+    from_heights = 1e3 * (np.interp(high, along[order], height) - np.interp(low, along[order], height)) / width
+    return attribute, from_heights

@@ -1,34 +1,131 @@
-"""Trajectory of an antenna: the 3-D curve to which its position is constrained.
-
-A `Trajectory` is a polyline in ECEF with its own arc length, tied point by point to the line's
-chainage. `Trajectory.from_track` takes the track itself as the antenna's path; with a vehicle,
-`railfix.track.vehicle.antenna_trajectory` computes it from the bogies on the track (P1 3.1(1)).
-"""
+"""Trajectory of an antenna, a polyline in ECEF to which its position is constrained, and nearest points of it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Floats, FrozenArrays, Indices, freeze_arrays, read_only
+from railfix.core.arrays import Floats, FrozenArrays, Indices, Masks, freeze_arrays, read_only
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.tables import NotebookTable, plural
-from railfix.track.polyline import NearestOnPolyline, joins_m
-from railfix.track.track import (
-    SIGMA_HEIGHT_M,
-    SIGMA_PLAN_M,
-    Track,
-    interpolate_kilometrage,
-)
+from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Track, interpolate_kilometrage
+
+_FIRST_CANDIDATES = 6  #: Samples examined in the first round; four times as many for positions not yet proven.
+_CHUNK = 2_000_000  #: Positions times candidates processed at once.
+
+
+def short_way_m(difference_m: Floats, turn_m: float) -> Floats:
+    """Return differences of places the short way round a closed line of length `turn_m` (infinite: open)."""
+    return difference_m - turn_m * np.round(difference_m / turn_m) if np.isfinite(turn_m) else difference_m
+
+
+def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tuple[Floats, Floats]:
+    """Find the nearest point of segments, broadcast (..., 3): fraction in [0, 1], and distance."""
+    offset = points_m - start_m
+    squared = np.einsum("...i,...i->...", step_m, step_m)
+    share = np.clip(np.einsum("...i,...i->...", offset, step_m) / squared, 0.0, 1.0)
+    rest = offset - share[..., None] * step_m
+    return share, np.sqrt(np.einsum("...i,...i->...", rest, rest))
+
+
+class NearestOnPolyline:
+    """Search structure for nearest points of a polyline of V points, shape (V, 3).
+
+    Each point of the polyline is within `reach_m` of a sample of its segment, so the segment sought has a sample within
+    the best distance found plus `reach_m`.
+    """
+
+    def __init__(self, points_m: Floats) -> None:
+        self._start = points_m[:-1]
+        self._step = np.diff(points_m, axis=0)
+        self._length = np.linalg.norm(self._step, axis=1)
+        spacing = max(float(np.median(self._length)), float(self._length.sum()) / (4 * len(points_m)), 1e-3)
+        pieces = np.maximum(np.ceil(self._length / spacing).astype(np.int64), 1)
+        first = np.cumsum(pieces) - pieces
+        self._segment = np.repeat(np.arange(len(pieces)), pieces)
+        share = (np.arange(pieces.sum()) - first[self._segment] + 0.5) / pieces[self._segment]
+        #: Half the spacing of the samples, which lie in the middle of their pieces [m].
+        self.reach_m = float((self._length / pieces).max()) / 2.0 * (1.0 + 1e-9)
+        self._tree = cKDTree(self._start[self._segment] + share[:, None] * self._step[self._segment])
+
+    def __call__(self, ecef_m: ArrayLike) -> tuple[Indices, Floats, Floats]:
+        """Segment, distance along it and distance from it, shapes (n,); -1 and NaN for NaN."""
+        points = np.asarray(ecef_m, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"ecef_m has shape {points.shape}, expected (n, 3)")
+        index = np.full(len(points), -1, dtype=np.intp)
+        along = np.full(len(points), np.nan)
+        offset = np.full(len(points), np.nan)
+        pending = np.flatnonzero(np.isfinite(points).all(axis=1))
+        candidates = min(_FIRST_CANDIDATES, len(self._segment))
+        while pending.size:
+            unproven = []
+            rows = max(1, _CHUNK // candidates)
+            for part in (pending[i : i + rows] for i in range(0, pending.size, rows)):
+                index[part], along[part], offset[part], proven = self._among(points[part], candidates)
+                unproven.append(part[~proven])
+            pending = np.concatenate(unproven)
+            candidates = min(candidates * 4, len(self._segment))
+        return index, along, offset
+
+    def _among(self, points: Floats, candidates: int) -> tuple[Indices, Floats, Floats, Masks]:
+        """Find the best among the segments of the nearest samples, and whether no other can be better."""
+        nearest = self._tree.query(points, k=np.arange(1, candidates + 1))
+        distance, sample = np.asarray(nearest[0], dtype=np.float64), np.asarray(nearest[1], dtype=np.intp)
+        chosen, share, best = nearest_segments(points, self._segment[sample], self._start, self._step)
+        proven = (distance[:, -1] > best + self.reach_m) | (candidates == len(self._segment))
+        return chosen, share * self._length[chosen], best, proven
+
+
+def nearest_segments(
+    points_m: Floats, segment: Indices, start_m: Floats, step_m: Floats
+) -> tuple[Indices, Floats, Floats]:
+    """Find the nearest of some segments (n, C) to each point (n, 3); of equally near ones the one earlier on the line.
+
+    `start_m` and `step_m`, shape (V - 1, 3), are the segments' first points and steps. Returns the segment, the place
+    on it, 0 to 1, and the distance, shapes (n,).
+    """
+    share, offset = project_on_segments(points_m[:, None], start_m[segment], step_m[segment])
+    best = offset.min(axis=1)
+    # independent of the order of the tree that has named the segments
+    place = np.where(offset <= best[:, None] * (1 + 1e-12) + 1e-9, segment + share, np.inf)
+    column = np.argmin(place, axis=1)[:, None]
+    return (np.take_along_axis(segment, column, axis=1)[:, 0], np.take_along_axis(share, column, axis=1)[:, 0], best)
+
+
+#: A line goes on where its end comes this close to another place of it [m]: no other track is as near.
+_CLOSED_M: Final = 3.0
+_SAME_WAY: Final = 0.9  #: In the same direction: cosine of the angle between them.
+_END_M: Final = 100.0  #: Places this near along the line are the end itself [m].
+
+
+def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
+    """Return the arc lengths at which a closed line goes on before its start and after its end; NaN if open."""
+    segment = np.diff(ecef_m, axis=0)
+    segment /= np.linalg.norm(segment, axis=1, keepdims=True)
+    return _beside(arc_m, ecef_m, segment, 0), _beside(arc_m, ecef_m, segment, -1)
+
+
+def _beside(arc_m: Floats, ecef_m: Floats, segment: Floats, end: int) -> float:
+    """Arc length of the nearest other place of the line to one of its ends, in the same direction; NaN without."""
+    from_end = ecef_m[end] - ecef_m[:-1]
+    length = np.diff(arc_m)
+    along = np.clip((from_end * segment).sum(axis=1), 0.0, length)
+    apart = np.linalg.norm(from_end - along[:, None] * segment, axis=1)
+    arc = arc_m[:-1] + along
+    other = np.abs(arc - arc_m[end]) > _END_M
+    other &= (apart < _CLOSED_M) & (segment @ segment[end] > _SAME_WAY)
+    return float(arc[other][np.argmin(apart[other])]) if other.any() else float("nan")
+
 
 #: Note in every output of a run without a vehicle file.
 TRACK_AS_PATH = "no vehicle file: the track is taken as the antenna's own path"
-#: Rounding allowed beyond the ends of a trajectory [m].
-_END_TOLERANCE_M = 1e-6
+_END_TOLERANCE_M = 1e-6  #: Rounding allowed beyond the ends of a trajectory [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,7 +312,7 @@ class Trajectory(FrozenArrays, NotebookTable):
     def _interpolate(self, arc_m: ArrayLike, values: Floats) -> Floats:
         arc = np.array(arc_m, dtype=np.float64)
         rows = values.reshape(len(values), -1)
-        result = interpolated(arc.reshape(-1), self.arc_m, self.length_m, rows, _END_TOLERANCE_M)
+        result = interpolate_values(arc.reshape(-1), self.arc_m, self.length_m, rows, _END_TOLERANCE_M)
         return result.reshape(arc.shape + values.shape[1:])
 
     def at_arc(self, arc_m: ArrayLike) -> Floats:
@@ -274,12 +371,8 @@ class Trajectory(FrozenArrays, NotebookTable):
         return arc, offset
 
 
-def interpolated(arc: Floats, arc_m: Floats, length_m: Floats, values: Floats, tolerance_m: float) -> Floats:
-    """Interpolate values of points of a line, shape (V, C), at arc lengths, shape (n, C); NaN beyond the ends.
-
-    From the arc lengths of the points and the lengths of the segments, shape (V - 1,); an arc length may lie beyond an
-    end by the tolerance.
-    """
+def interpolate_values(arc: Floats, arc_m: Floats, length_m: Floats, values: Floats, tolerance_m: float) -> Floats:
+    """Interpolate values (V, C) of a line at arc lengths (n, C); NaN beyond its ends by the tolerance."""
     index = np.minimum(np.maximum(np.searchsorted(arc_m, arc, side="right") - 1, 0), len(arc_m) - 2)
     share = (arc - arc_m[index]) / length_m[index]
     beyond = tolerance_m / length_m[index]

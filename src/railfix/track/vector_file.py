@@ -1,13 +1,8 @@
-"""Lines of map files of geographic information systems, read through GDAL by `pyogrio`.
+"""Lines of map files of geographic information systems, read through GDAL by `pyogrio`, OpenStreetMap among them.
 
-GeoPackage, Shapefile, FlatGeobuf, GML, GPX, KML, DXF and OpenStreetMap; each line of each layer is a
-segment, without heights where its coordinates have none.
-
-OpenStreetMap: its ways as every exporter writes them, and its own files (OSM XML, Overpass JSON).
-
-Ways are known by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Exporters write the tags as
-columns, as one object or JSON text (`tags`), as hstore text (`other_tags` of GDAL) or as a class (`fclass` of
-Geofabrik's shapefiles), and the id in a dozen forms.
+OpenStreetMap's ways are known by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Exporters write
+the tags as columns, as one object or JSON text (`tags`), as hstore text (`other_tags` of GDAL) or as a class (`fclass`
+of Geofabrik's shapefiles), and the id in a dozen forms.
 """
 
 from __future__ import annotations
@@ -33,11 +28,9 @@ from railfix.track.heights import check_height_datum, stated_heights
 from railfix.track.route import ATTRIBUTES, NO_HEIGHTS, MapReading, Segment
 from railfix.track.track import UNNAMED
 
-#: Standard deviation in plan of a track of OpenStreetMap where its file states none [m]: drawn from aerial pictures,
-#: whose own offset is often metres.
+#: Standard deviation in plan of a track of OpenStreetMap, drawn from aerial pictures, if its file has none [m].
 SIGMA_M: Final = 2.0
-#: Origin of a segment, in its metadata.
-ORIGIN: Final = {"origin": "OpenStreetMap"}
+ORIGIN: Final = {"origin": "OpenStreetMap"}  #: Origin of a segment, in its metadata.
 #: Values of the tag railway that are tracks on which trains run.
 _RAILWAYS: Final = ("rail", "light_rail", "subway", "tram", "narrow_gauge", "preserved", "monorail", "rack")
 #: Values of that tag that are no such tracks, by which a feature of OpenStreetMap is known.
@@ -99,10 +92,7 @@ def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
 
 
 def metadata_of(row: Mapping[str, Any]) -> dict[str, str]:
-    """`ORIGIN` and the name of a way, its id with the name that it is tagged with ("way/7 Main Line").
-
-    Without a name where nothing but the tag railway is that of OpenStreetMap; empty for other features.
-    """
+    """Return `ORIGIN` and the name of an OpenStreetMap way ("way/7 Main Line"); empty for other features."""
     tags = tags_of(row)
     if not is_of_openstreetmap(row):
         return ORIGIN if tags.get("railway") in _RAILWAYS else {}
@@ -198,10 +188,8 @@ def _ways(
 #: Endings of files that are read here.
 ENDINGS: Final = (".gpkg", ".shp", ".fgb", ".gml", ".gpx", ".kml", ".dxf", ".osm", ".pbf")
 INSTALL: Final = "install it with: pip install 'railfix[maps]'"
-#: Bytes of a text file that are looked at before GDAL reads it.
-_LOOKED_AT: Final = 1 << 20
-#: Columns that name a line, in this order.
-_NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")
+_LOOKED_AT: Final = 1 << 20  #: Bytes of a text file that are looked at before GDAL reads it.
+_NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")  #: Columns that name a line, in this order.
 
 
 def read_layers(path: str | PathLike[str], *, geometry: str) -> list[tuple[str | None, list[dict[str, Any]], Any]]:
@@ -278,9 +266,7 @@ def read_vector_segments(path: str | PathLike[str], reading: MapReading) -> list
     return with_left_out(path, segments, left_out)
 
 
-def _features(
-    path: str | PathLike[str],
-) -> Iterator[tuple[str | None, list[dict[str, Any]], list[list[Floats]]]]:
+def _features(path: str | PathLike[str]) -> Iterator[tuple[str | None, list[dict[str, Any]], list[list[Floats]]]]:
     """CRS, columns and lines of the features of each layer; of OSM XML without GDAL, which needs sorted nodes."""
     if ending(path) == ".osm":
         ways = read_osm_xml(path)
@@ -300,10 +286,7 @@ def _accuracy(row: Mapping[str, Any]) -> dict[str, str]:
 def plan_segment(
     coordinates: Floats, reading: MapReading, *, path: str, name: str, stated: Mapping[str, str] | None = None
 ) -> Segment:
-    """A segment of coordinates in map order, shape (n, 2 or 3); points repeated in plan are left out.
-
-    `stated` is the accuracy that the file states.
-    """
+    """Return a segment of coordinates in map order, shape (n, 2 or 3), without points repeated in plan."""
     source = f"{path} ({name})"
     if not np.isfinite(coordinates[:, :2]).all():
         raise InputFileError(source, "a coordinate is not finite")

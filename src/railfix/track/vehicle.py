@@ -1,8 +1,7 @@
 """Vehicle with two bogies and roof antennas, and the trajectories of its antennas (P1 3.1(1)).
 
-Axes of the vehicle: origin midway between the bogie centres at the height of the rail tops;
-``along_m`` toward the vehicle's front, ``across_m`` to the right seen toward the front, ``up_m``
-above the rail tops, perpendicular to the floor.
+Axes: origin midway between the bogie centres at the height of the rail tops; ``along_m`` toward the vehicle's front,
+``across_m`` to the right, ``up_m`` perpendicular to the floor.
 """
 
 from __future__ import annotations
@@ -19,16 +18,14 @@ from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.settings import Settings, load_settings
 from railfix.track.from_positions import ANTENNA_PATH
-from railfix.track.polyline import joins_m
 from railfix.track.track import Track
-from railfix.track.trajectory import Trajectory
+from railfix.track.trajectory import Trajectory, joins_m
 
 Reference = Literal["antenna", "centre", "front_bogie", "rear_bogie"]
 
 #: Distance between the contact points of the wheels minus the gauge [m]: about the width of a rail head.
 RAIL_HEAD_M: Final = 0.070
-#: Largest deviation of the antenna's path from the chord between two points [m].
-PATH_TOLERANCE_M: Final = 0.02
+PATH_TOLERANCE_M: Final = 0.02  #: Largest deviation of the antenna's path from the chord between two points [m].
 #: Shortest segment of the path [m].
 _SHORTEST_M: Final = 1.0
 _MAX_ITERATIONS: Final = 200
@@ -153,11 +150,7 @@ class _VehicleLine:
 
 
 def _sign_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
-    """Return the cant, positive for roll to the right, and notes on assumptions.
-
-    The side follows from the sign of the radius; at a canted point of straight track (the foot of a
-    ramp) from the nearest curve; without radii from the bend of the centreline.
-    """
+    """Return the cant, positive for roll to the right, by the radius or nearest curve, and notes."""
     cant = np.where(np.isnan(track.cant_m), 0.0, track.cant_m)
     canted = cant != 0.0
     notes: list[str] = []
@@ -293,11 +286,7 @@ def _end_halves(line: _VehicleLine, track: Track, vehicle: Vehicle) -> tuple[flo
 
 
 def antenna_trajectory(
-    track: Track,
-    vehicle: Vehicle,
-    antenna: Literal["front", "rear"] = "front",
-    *,
-    reference: Reference = "antenna",
+    track: Track, vehicle: Vehicle, antenna: Literal["front", "rear"] = "front", *, reference: Reference = "antenna"
 ) -> Trajectory:
     """Compute the trajectory of a roof antenna of a vehicle on the track.
 

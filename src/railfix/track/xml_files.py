@@ -1,10 +1,7 @@
-"""Alignments of LandXML 1.2 and track centrelines of railML 3, read with `lxml`.
-
-Topology of the European register of infrastructure (ERA RINF) as RDF: linear elements and their relations.
+"""Alignments of LandXML 1.2, track centrelines of railML 3, and topology of the ERA RINF as RDF.
 
 Its ontology (http://data.europa.eu/949/, version 3) has each `LinearElement` with its geometry (GeoSPARQL, WKT) and a
-`NetRelation` for each pair of ends that meet, as railML 3 has. Turtle, RDF/XML, N-Triples and JSON-LD are read by
-`rdflib`. The register's XML and CSV have sections of line between operational points alone, no geometry of tracks.
+`NetRelation` for each pair of ends that meet, as railML 3 has.
 """
 
 from __future__ import annotations
@@ -251,9 +248,8 @@ def _landxml_profile(path: str, profile: Any, scale: float, start: float) -> lis
 def _landxml_cant(cant: Any, scale: float, start: float) -> tuple[list[CantElement], tuple[str, ...]]:
     """Elements between cant stations, about the rail or the middle that the file names; and notes.
 
-    Without a name the outer rail is raised and the inner one stays at the profile, as track is built. A ramp runs by
-    the transition type of the station that it begins at, linearly without one. The applied cant is in millimetres, in
-    inches where lengths are imperial (LandXML 1.2), in metres in InfraModel.
+    Without a name the outer rail is raised. A ramp runs by the transition type of the station that it begins at. The
+    applied cant is in millimetres, in inches where lengths are imperial (LandXML 1.2), in metres in InfraModel.
     """
     if cant is None:
         return [], ()
@@ -350,10 +346,7 @@ _CODE: Final = re.compile(r".*/crs/(?P<name>OGC|EPSG)/[^/]*/(?P<code>\w+)")
 
 
 def read_rinf_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
-    """Read the linear elements that have a geometry as segments, in the order of their addresses.
-
-    InputFileError: when the file is no RDF, or has no linear element with a line.
-    """
+    """Read the linear elements that have a geometry as segments; InputFileError where there is none."""
     graph, segments = _graph(path), []
     for element in _all(graph, "LinearElement"):
         texts = [
@@ -372,8 +365,7 @@ def read_rinf_segments(path: str | PathLike[str], reading: MapReading) -> list[S
         segments.append(plan_segment(points, of_file, path=str(path), name=_name(graph, element)))
     if not segments:
         raise InputFileError(
-            path,
-            f"no era:LinearElement has a geometry (geosparql:hasGeometry, asWKT LINESTRING); {RINF_SECTIONS}",
+            path, f"no era:LinearElement has a geometry (geosparql:hasGeometry, asWKT LINESTRING); {RINF_SECTIONS}"
         )
     return segments
 

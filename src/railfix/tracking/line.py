@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from railfix.core.arrays import Floats
-from railfix.track.polyline import joins_m
-from railfix.track.trajectory import Trajectory
+from railfix.track.trajectory import Trajectory, joins_m
 
 
 @dataclass(frozen=True, kw_only=True)

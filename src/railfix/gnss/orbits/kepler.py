@@ -23,8 +23,7 @@ from railfix.core.constants import (
 )
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords
 
-#: x, y, z as separate arrays.
-Components = tuple[Floats, Floats, Floats]
+Components = tuple[Floats, Floats, Floats]  #: x, y, z as separate arrays.
 
 #: Inclination of the frame in which BeiDou GEO records are given [rad] (BDS-SIS-ICD-B1I 3.0, 5.2.4.12).
 _GEO_TILT: Final = np.radians(-5.0)
@@ -41,10 +40,7 @@ ROTATION: Final[Mapping[str, float]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Orbits:
-    """Orbit elements and time-independent quantities, shape (n,), one row per orbit.
-
-    Those without a meaning here are as in `navigation.KeplerRecords`.
-    """
+    """Orbit elements and time-independent quantities, shape (n,); others as in `KeplerRecords`."""
 
     a: Floats  #: Semi-major axis [m].
     motion: Floats  #: Corrected mean motion [rad/s].
@@ -112,24 +108,14 @@ _AS_BROADCAST: Final = ("eccentricity", "m0", "i_dot", "a_dot", "delta_n_dot", "
 
 
 def is_beidou_geo(satellite: str) -> bool:
-    """Return whether a satellite is a BeiDou GEO: C01 to C05, C59 to C63 (B1I ICD 3.0, table 4-1).
-
-    Records of GEO satellites refer to a tilted frame. The satellite number decides, not the message
-    name, which converters are known to confuse.
-    """
+    """Return whether a satellite is a BeiDou GEO by its number: C01 to C05, C59 to C63 (B1I ICD, table 4-1)."""
     return satellite[:1] == "C" and (int(satellite[1:]) <= 5 or int(satellite[1:]) >= 59)
 
 
 def eccentric_anomaly(mean_anomaly: Floats, eccentricity: Floats) -> tuple[Floats, Floats, Floats]:
-    """Solve Kepler's equation M = E - e sin E.
+    """Solve Kepler's equation M = E - e sin E; return E, sin E and cos E.
 
-    Three Newton steps, a fixed number so that no result depends on other elements of the array;
-    converged to the last digit for e < 0.2 (the largest of these satellites is 0.17).
-
-    Returns
-    -------
-    anomaly, sine, cosine : ndarray, shape as the inputs
-        E [rad], sin E and cos E.
+    Three Newton steps, converged to the last digit for e < 0.2 (the largest of these satellites is 0.17).
     """
     anomaly = mean_anomaly
     sine, cosine = np.sin(anomaly), np.cos(anomaly)
@@ -151,21 +137,11 @@ def _rotate(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats
 
 
 def kepler_state(orbits: Orbits, since_toe_s: Floats) -> tuple[Components, Components, Floats]:
-    """Compute satellite states at times since toe (IS-GPS-200, tables 20-IV and 30-II).
+    """Compute satellite states at times since toe, shape (n,) [s] (IS-GPS-200, tables 20-IV and 30-II).
 
-    Parameters
-    ----------
-    orbits : Orbits
-        n rows, or one for all times. The harmonic corrections of latitude and inclination are
-        treated as small angles (their broadcast range ends at 1.3e-4 rad).
-    since_toe_s : ndarray, shape (n,) [s]
-
-    Returns
-    -------
-    position_m, velocity_mps : tuple of three ndarray, shape (n,)
-        In the Earth-fixed frame of that time.
-    relativity_s : ndarray, shape (n,) [s]
-        F e sqrt(A) sin E, the same as -2 r.v / c^2.
+    Harmonic corrections of latitude and inclination are small angles (at most 1.3e-4 rad). Returns position [m] and
+    velocity [m/s] in the Earth-fixed frame of that time, and relativity F e sqrt(A) sin E [s], the same as -2 r.v /
+    c^2.
     """
     el, t = orbits, since_toe_s
     motion = el.motion + el.delta_n_dot * t
@@ -226,22 +202,13 @@ def _out_of_tilted_frame(
     return (x, y, z), (vx, vy, vz)
 
 
-#: Step of the integration [s]; the ICD's statement of accuracy is for 60 s.
-STEP_S: Final = 60.0
-#: Rows integrated at once, so that the arrays stay in the cache.
-_BLOCK: Final = 8192
+STEP_S: Final = 60.0  #: Step of the integration [s]; the ICD's statement of accuracy is for 60 s.
+_BLOCK: Final = 8192  #: Rows integrated at once, so that the arrays stay in the cache.
 
 
 def acceleration(position: Floats, velocity: Floats, luni_solar: Floats) -> Floats:
-    """Compute the acceleration in the Earth-fixed frame: central force, J2, rotation, Moon and Sun.
-
-    Parameters
-    ----------
-    position, velocity, luni_solar : ndarray, shape (3, n) [m, m/s, m/s^2]
-
-    Returns
-    -------
-    ndarray, shape (3, n) [m/s^2]
+    """Compute the acceleration in the Earth-fixed frame, shape (3, n) [m/s^2]: central force, J2, rotation, Moon and
+    Sun.
     """
     omega = EARTH_ROTATION_RATE_GLONASS
     x, y, z = position

@@ -17,8 +17,7 @@ from railfix.gnss.navigation import PreciseEphemeris
 POINTS: Final = 13
 #: Epochs further apart than this many times the usual interval are a gap, within which there is no state.
 _GAP: Final = 1.5
-#: Number of states computed at once, so that the arrays stay in the cache.
-_BLOCK: Final = 4096
+_BLOCK: Final = 4096  #: Number of states computed at once, so that the arrays stay in the cache.
 
 
 def precise_clock_s(ephemeris: PreciseEphemeris, column: Indices, time: Datetimes, offset_s: Floats) -> Floats:
@@ -33,25 +32,11 @@ def precise_clock_s(ephemeris: PreciseEphemeris, column: Indices, time: Datetime
 def precise_state(
     ephemeris: PreciseEphemeris, column: Indices, time: Datetimes, offset_s: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Compute the states of satellites at ``time + offset``.
+    """Compute positions and velocities (3, n), and clocks (n,) of satellites at ``time + offset``.
 
-    Parameters
-    ----------
-    ephemeris : PreciseEphemeris
-        At least `POINTS` epochs.
-    column : ndarray of int, shape (n,)
-        Satellite's column; -1 where it is not in the ephemeris.
-    time : ndarray of datetime64[ns], shape (n,)
-        Within the file's first and last epoch.
-    offset_s : ndarray, shape (n,) [s]
-        A fraction of a second (minus the travel time of the signal).
-
-    Returns
-    -------
-    position_ecef_m, velocity_ecef_mps : ndarray, shape (3, n)
-        NaN where a node is missing or the time lies outside the file or in a gap of it.
-    clock_s : ndarray, shape (n,) [s]
-        Of the file, plus the relativistic -2 r.v / c^2 that SP3 clocks do not contain.
+    `column` is -1 where a satellite is not in the ephemeris of at least `POINTS` epochs; `offset_s` a fraction of a
+    second. NaN where a node is missing or the time lies outside the file or in a gap. The clock has the relativistic -2
+    r.v / c^2 that SP3 clocks do not contain.
     """
     if len(ephemeris.time) < POINTS:
         raise ValueError(f"a precise ephemeris needs at least {POINTS} epochs, got {len(ephemeris.time)}")
@@ -65,11 +50,7 @@ def precise_state(
 
 
 def _state(
-    ephemeris: PreciseEphemeris,
-    longest_s: float,
-    column: Indices,
-    time: Datetimes,
-    offset_s: Floats,
+    ephemeris: PreciseEphemeris, longest_s: float, column: Indices, time: Datetimes, offset_s: Floats
 ) -> tuple[Floats, Floats, Floats]:
     nodes = ephemeris.time
     right = np.searchsorted(nodes, time, side="right")

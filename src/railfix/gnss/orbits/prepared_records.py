@@ -37,12 +37,10 @@ _ISC: Final[Mapping[str, list[int]]] = {
 #: 2025-02-15, TGD - ISC less what stands for it has 0.24 m on L2C and 0.55 m on L5Q
 #: (`tests/gnss/test_group_delays.py`).
 _WITHOUT_ISC_M: Final[Mapping[str, float]] = {"2": 0.3, "5": 0.6}
-#: Signals of the P code, to which TGD refers.
-_P_CODES: Final = ("2P", "2W", "2Y", "2D", "2N", "2M")
+_P_CODES: Final = ("2P", "2W", "2Y", "2D", "2N", "2M")  #: Signals of the P code, to which TGD refers.
 #: Bits of the health word of CNAV by band.
 _CNAV_HEALTH: Final[Mapping[str, int]] = {"1": 0b100, "2": 0b010, "5": 0b001}
-#: All bits.
-_ANY: Final = -1
+_ANY: Final = -1  #: All bits.
 
 
 def unhealthy(records: KeplerRecords, signal: str) -> Masks:
@@ -79,13 +77,8 @@ def group_delay_s(
              the data signals. CNV3: TGD_B2bI on B2b. NaN on signals whose delay the message does not contain.
     ======== =====================================================================================
 
-    Parameters
-    ----------
-    signal : str
-        RINEX 3 code without its type letter: "1C".
-    clock : {"broadcast", "ionosphere_free"}
-        Clock of the record, or of SP3 files, which refers to the ionosphere-free pair L1/L2 of GPS and QZSS (the
-        same as broadcast), E1/E5a of Galileo, B1I/B3I of BeiDou.
+    The clock is that of the record ("broadcast"), or of SP3 files ("ionosphere_free": the pairs L1/L2, E1/E5a,
+    B1I/B3I).
     """
     delay = np.full(len(records), np.nan)
     system = records.satellite.astype("<U1")
@@ -100,10 +93,7 @@ def group_delay_s(
 
 
 def group_delay_sigma_m(records: KeplerRecords, signal: str) -> Floats:
-    """Return the standard deviation of a group delay that the record lacks a part of, shape (n,) [m]; 0 for the others.
-
-    L2C and L5 by LNAV, without their ISC.
-    """
+    """Sigma of a group delay that LNAV lacks a part of (L2C and L5 without ISC), shape (n,) [m]; else 0."""
     lacking = np.isin(records.satellite.astype("<U1"), ["G", "J"]) & (records.message == "LNAV")
     return np.where(lacking, _WITHOUT_ISC_M.get(signal[:1], 0.0) * (signal not in _P_CODES), 0.0)
 
@@ -164,8 +154,7 @@ def _is_of(records: KeplerRecords, *messages: str) -> Masks:
     return np.isin(records.message, messages)
 
 
-#: Number of channel sets cached per navigation.
-_CACHED_SETS: Final = 64
+_CACHED_SETS: Final = 64  #: Number of channel sets cached per navigation.
 
 
 @dataclass(frozen=True)
@@ -175,8 +164,7 @@ class ChannelRecords:
     #: Channels of the constellations with Keplerian records, and of GLONASS; shape (K,), (R,).
     kepler: Indices
     glonass: Indices
-    #: Numbers in the lookup: the message with the clock and the group delay of the channel's signal, and another one;
-    #: -1 for none; shape (K,).
+    #: Lookup numbers: the message with clock and delay of the signal, and another; -1 for none; shape (K,).
     preferred: Integers
     other: Integers
 
@@ -266,11 +254,7 @@ _MESSAGE_OF: Final = {
 
 
 def _labels(satellite: str, signal: str) -> tuple[str, str]:
-    """Return the names in the lookup, preferred first: F/NAV has the clock of E1 and E5a, I/NAV of E1 and E5b.
-
-    LNAV, D1 and D2 have the name of the satellite alone. They come first unless another message has the group delay of
-    the signal; CNAV serves where there is no LNAV.
-    """
+    """Return the names in the lookup, preferred first: F/NAV has the clock of E1/E5a, I/NAV of E1/E5b."""
     if satellite[0] == "E":
         messages = ("FNAV", "INAV") if signal[:1] == "5" else ("INAV", "FNAV")
         return f"{satellite} {messages[0]}", f"{satellite} {messages[1]}"

@@ -57,24 +57,11 @@ class Lookup:
     available: Datetimes
 
     def find(self, number: Integers, time: Datetimes, limit: NDArray[np.timedelta64]) -> tuple[Integers, Masks, Masks]:
-        """Select the record of each satellite at each epoch.
+        """Select the record of each satellite at each epoch, shapes (M, T): row of the table, in its validity, not yet
+        sent.
 
-        Parameters
-        ----------
-        number : ndarray of int, shape (M,)
-            Values of `number`; -1 for a satellite without records.
-        time : ndarray of datetime64[ns], shape (T,)
-        limit : ndarray of timedelta64, shape (n,)
-            Longest distance of an epoch from toe, by row of the record table.
-
-        Returns
-        -------
-        record : ndarray of int, shape (M, T)
-            Row of the record table; -1 where the satellite has no record.
-        valid : ndarray of bool, shape (M, T)
-            The epoch lies within the limit of the record.
-        future : ndarray of bool, shape (M, T)
-            The record was transmitted after the epoch.
+        `number`, shape (M,), are values of the lookup's; -1 for a satellite without records. `limit` is the longest
+        distance of an epoch from toe, by row of the record table.
         """
         shape = (len(number), len(time))
         if not len(self.sent_key):
@@ -99,22 +86,8 @@ class Lookup:
         return record, valid, future
 
 
-def make_lookup(
-    label: Strings,
-    toe: Datetimes,
-    transmitted: Datetimes,
-    validity_s: Floats,
-) -> Lookup:
-    """Sort the records of a table for `Lookup.find`.
-
-    Parameters
-    ----------
-    label : ndarray of str, shape (n,)
-        Satellite, or satellite and message.
-    toe, transmitted : ndarray of datetime64[ns], shape (n,)
-    validity_s : ndarray, shape (n,) [s]
-        Longest distance from toe.
-    """
+def make_lookup(label: Strings, toe: Datetimes, transmitted: Datetimes, validity_s: Floats) -> Lookup:
+    """Sort the records of a table by label (satellite, or satellite and message) for `Lookup.find`."""
     empty = np.empty(0, dtype=np.int64)
     if not len(label):
         return Lookup({}, empty, empty, empty, empty, empty, np.datetime64(0, "ns"), toe, toe)
@@ -153,8 +126,7 @@ def validity_s(records: KeplerRecords) -> Floats:
     return np.fmax(base, records.fit_interval_h * 1800.0)
 
 
-#: Number of different issues of data: 10 bits of Galileo; GPS and QZSS have 8.
-_ISSUES: Final = 1024
+_ISSUES: Final = 1024  #: Number of different issues of data: 10 bits of Galileo; GPS and QZSS have 8.
 #: Time span that a lookup key can hold [ms]: 278 years.
 _ISSUE_SPAN: Final = np.int64(2**43)
 _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")

@@ -20,8 +20,7 @@ from railfix.gnss.orbits.prepared_records import ChannelRecords, PreparedRecords
 #: Chunks of fewer epochs are computed with all channels together, longer ones channel by channel: the same
 #: arithmetic on every element, arranged so that single live epochs and complete logs are both fast.
 _SHORT: Final = 96
-#: Epochs of a channel computed at once, so that the arrays stay in the cache.
-_BLOCK: Final = 4096
+_BLOCK: Final = 4096  #: Epochs of a channel computed at once, so that the arrays stay in the cache.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,16 +244,7 @@ class KeplerStates(NamedTuple):
 def kepler_channels(
     time_ns: Integers, code_m: Floats, channels: KeplerChannels, records: SelectedKepler, states: KeplerStates
 ) -> KeplerStates:
-    """Compute the states of channels on Keplerian records.
-
-    Parameters
-    ----------
-    time_ns : ndarray of int, shape (T,)
-        Time tags since 1970.
-    code_m : ndarray, shape (T, M) [m]
-    states : KeplerStates
-        Filled in place; its arrays are returned.
-    """
+    """Compute the states of channels on Keplerian records; `states` is filled in place, its arrays are returned."""
     for k, t, row in _groups(channels.row, channels.usable):
         m, signal = channels.channel[k], channels.signal[k]
         age = seconds((time_ns[t] - records.toe_ns[row]).astype("timedelta64[ns]"))
@@ -272,10 +262,7 @@ def kepler_channels(
 
 
 def _groups(rows: Integers, usable: Masks) -> Iterator[tuple[Any, Any, Integers]]:
-    """Yield the elements to compute together: channels, epochs (as indices) and record rows.
-
-    All elements of a short chunk; else the consecutive epochs of one channel on one record, in blocks.
-    """
+    """Yield channels, epochs and record rows to compute together: all of a short chunk, else by channel."""
     if rows.shape[1] < _SHORT:
         k, t = np.nonzero(usable)
         if len(k):
@@ -333,12 +320,7 @@ def _fill_glonass(
 
 
 def _fill_precise(
-    navigation: Navigation,
-    satellite: Strings,
-    time: Datetimes,
-    code_m: Floats,
-    observed: Masks,
-    states: _Arrays,
+    navigation: Navigation, satellite: Strings, time: Datetimes, code_m: Floats, observed: Masks, states: _Arrays
 ) -> None:
     """Replace broadcast positions and clocks by those of the precise ephemeris."""
     precise = navigation.precise

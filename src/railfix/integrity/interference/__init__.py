@@ -4,14 +4,16 @@ from railfix.integrity.interference.limits import (
     CAUSES,
     HeldState,
     InterferenceLimits,
+    PowerSigns,
+    PowerState,
     Sign,
     Suspicion,
     cause_text,
     held,
+    power_signs,
     suspicion,
 )
 from railfix.integrity.interference.motion import MotionSigns, MotionSignState, motion_signs
-from railfix.integrity.interference.power import PowerSigns, PowerState, power_signs
 from railfix.integrity.interference.wheel import WheelSigns, WheelState, wheel_signs
 
 __all__ = [

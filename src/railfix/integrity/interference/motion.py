@@ -10,20 +10,15 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
-from railfix.integrity.interference.limits import InterferenceLimits
-from railfix.integrity.interference.power import _median
+from railfix.integrity.interference.limits import InterferenceLimits, _median
 
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 #: Steps of receiver clocks by whole milliseconds are none of interference [m].
 _MILLISECOND_M: Final = SPEED_OF_LIGHT * 1e-3
-#: Redundant ranges or Dopplers that their noise is taken from: fewer can agree by chance.
-_LEAST_FREEDOM: Final = 3
-#: Least noise of Dopplers [m/s].
-_LEAST_MPS: Final = 0.05
-#: Weight of the unknowns by themselves, for what a satellite is missing for.
-_RIDGE: Final = 1e-9
-#: Unknowns that two constellations give by themselves: position and clock.
-_SIZE: Final = 4
+_LEAST_FREEDOM: Final = 3  #: Redundant ranges or Dopplers that their noise is taken from: fewer can agree by chance.
+_LEAST_MPS: Final = 0.05  #: Least noise of Dopplers [m/s].
+_RIDGE: Final = 1e-9  #: Weight of the unknowns by themselves, for what a satellite is missing for.
+_SIZE: Final = 4  #: Unknowns that two constellations give by themselves: position and clock.
 
 
 class MotionInputs(NamedTuple):
@@ -95,8 +90,7 @@ class MotionSigns:
     """Statistics of T epochs; NaN where there is nothing to compare."""
 
     clock_jump_m: Floats  #: Median change of the codes against the Dopplers, less whole milliseconds; shape (T,).
-    #: Changes since the last epoch that was good enough, beyond what train and oscillator allow, and the same in
-    #: standard deviations; shape (T,).
+    #: Changes beyond what train and oscillator allow, and the same in standard deviations; shape (T,).
     drift_jump_mps: Floats
     drift_jump_sigmas: Floats
     speed_jump_mps: Floats
@@ -151,11 +145,7 @@ def motion_signs(
 
 
 def fixes_of(inputs: MotionInputs) -> Fix:
-    """Return positions and velocities by least squares from all ranges together, no satellite excluded.
-
-    One reflected signal widens the standard deviations, so that nothing is compared; the signals of one transmitter
-    agree.
-    """
+    """Return positions and velocities by least squares from all ranges together, no satellite excluded."""
     near, sight, misfit = _misfit(inputs)
     groups = np.arange(inputs.group.max(initial=-1) + 1)
     clocks = (inputs.group[:, None] == groups).astype(np.float64)
@@ -189,10 +179,7 @@ def _misfit(inputs: MotionInputs) -> tuple[Floats, Floats, Floats]:
 
 
 def _fit(design: Floats, value: Floats, weight: Floats, *, least: int) -> tuple[Floats, Floats, Floats]:
-    """Return solutions (T, P), covariances (T, P, P) and noise scales (T,) of weighted least squares.
-
-    NaN where fewer than `least` values are redundant. Unknowns without a value are 0.
-    """
+    """Return solutions, covariances and noise scales of weighted least squares; NaN below `least` redundant."""
     has = (weight > 0) & np.isfinite(value) & np.isfinite(design).all(axis=2)
     rows = np.where(has[..., None], design, 0.0)
     y, w = np.where(has, value, 0.0), np.where(has, weight, 0.0)
@@ -253,10 +240,7 @@ def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimit
 def _clock_jump(
     inputs: MotionInputs, state: MotionSignState, limits: InterferenceLimits
 ) -> tuple[Floats, tuple[Floats, Floats, Datetimes]]:
-    """Return the median change of the codes against the Dopplers, less whole milliseconds, shape (T,) [m].
-
-    Since the last code of each channel; and these codes, Dopplers and times after the last epoch.
-    """
+    """Return the median change of codes against Dopplers, less whole milliseconds (T,) [m], and the new state."""
     channels = len(inputs.channel)
     code, rate = np.full(channels, np.nan), np.full(channels, np.nan)
     since = np.full(channels, np.datetime64("NaT", "ns"))

@@ -1,9 +1,7 @@
 """Distance by satellites against that of a wheel: a pull along the track that nothing else sees.
 
-Over a window of one to two minutes both distances differ by the noise of two positions and by the error of the wheel's
-diameter. That error is taken from the time before the window, as far as positions there determine it: a pull that
-begins later changes the ratio of the two. One that was there from the beginning, or is as slow as the diameter is
-uncertain, is not seen.
+Over a window both differ by the noise of two positions and by the wheel's scale error, which is taken from the time
+before the window. A pull from the beginning, or as slow as the diameter is uncertain, is not seen.
 """
 
 from __future__ import annotations
@@ -74,8 +72,7 @@ class WheelState:
 class WheelSigns:
     """Comparison of T epochs."""
 
-    #: Distance by satellites over the window less that of the wheel with its diameter; NaN where it is not compared;
-    #: shape (T,).
+    #: Distance by satellites over the window less that of the wheel; NaN where not compared; shape (T,).
     difference_m: Floats
     #: Of the error of the position, for a pull that began within the window, be it shorter than `wheel_least_s`: the
     #: difference, and `wheel_level_sigmas` of the position at the beginning and of the wheel's distance since; shape
@@ -135,11 +132,7 @@ def wheel_signs(
 def _rolled(
     time: Datetimes, wheel_m: Floats, state: WheelState, limits: InterferenceLimits
 ) -> tuple[WheelSamples, WheelState]:
-    """Return the wheel's distance so far at epochs, and the state after them; without positions.
-
-    An unknown distance after slow rolling is none, with a doubt; after another one, and where the speed changes faster
-    than wheels do that hold the rail, a new part begins.
-    """
+    """Return the wheel's distance at epochs, and the state; after slips and unknown distances a part begins."""
     span = seconds(np.diff(np.concatenate([[time[0] if np.isnat(state.time) else state.time], time])))
     known = np.isfinite(wheel_m) & (span > 0.0)
     speed = np.where(known, wheel_m / np.where(span > 0.0, span, 1.0), np.nan)

@@ -32,8 +32,7 @@ from railfix.integrity.protection.risk import one_sided_k, set_sums
 #: Halvings of the interval of a level: 1e4 m to less than a tenth of a micrometre.
 _HALVINGS: Final = 48
 _LONGEST_M: Final = 1e4
-#: Numbers of the largest array that a block of epochs holds.
-_BLOCK_SIZE: Final = 4_000_000
+_BLOCK_SIZE: Final = 4_000_000  #: Numbers of the largest array that a block of epochs holds.
 #: Determinants below this share of the product of the diagonal are those of singular matrices.
 _SINGULAR: Final = 1e-12
 
@@ -79,8 +78,7 @@ class AraimGeometry:
 class AraimLevels:
     """Levels of T epochs, for Q components of the position."""
 
-    #: NaN without a position, infinite where faults that nothing checks are likelier than the risk allows; shape (T,
-    #: Q).
+    #: NaN without a position, infinite where unchecked faults are likelier than the risk; shape (T, Q).
     level_m: Floats
     #: Of the position with all observations, shape (T, Q).
     sigma_int_m: Floats
@@ -103,18 +101,9 @@ class AraimResult:
 
 
 def araim_levels(
-    geometry: AraimGeometry,
-    phmi: Sequence[float],
-    false_alarm: Sequence[float],
-    budget: AraimBudget,
+    geometry: AraimGeometry, phmi: Sequence[float], false_alarm: Sequence[float], budget: AraimBudget
 ) -> AraimLevels:
-    """Return the levels of the first Q unknowns.
-
-    Parameters
-    ----------
-    phmi, false_alarm : sequence of float, length Q
-        Of each component.
-    """
+    """Return the levels of the first Q unknowns; `phmi` and `false_alarm` are of each component."""
     epochs, count = geometry.sigma_int_m.shape
     events = _events(geometry)
     sets = [list(s) for size in range(1, budget.most_faults + 1) for s in combinations(range(len(events)), size)]
@@ -308,13 +297,7 @@ class IntegritySupport(Settings):
 
 
 def read_integrity_support(path: FilePath) -> IntegritySupport:
-    """Read an integrity support message from TOML.
-
-    Raises
-    ------
-    InputFileError
-        The file is missing, of another format, or an entry is unknown, missing or out of range.
-    """
+    """Read an integrity support message from TOML."""
     values = read_toml(path, what="an integrity support message")
     if values.get("format") != FORMAT:
         raise InputFileError(path, f"is not an integrity support message: format = '{FORMAT}' was expected")

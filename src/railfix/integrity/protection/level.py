@@ -1,19 +1,12 @@
 """Protection level along the track with fault hypotheses: solution separation over sets of faults.
 
-While ``|x_J - x| <= T_J`` the position x is that far at most from x_J, in which a fault of the subset J has no
-part, and whose own error has the Gaussian tail of ``sigma_J``. The level L is where the tails of all
-hypotheses together use up the risk (EU-U.S. WG-C ARAIM, in one dimension):
+While ``|x_J - x| <= T_J`` the position x is that far at most from x_J, in which a fault of the subset J has no part.
+The level L is where the tails of all hypotheses together use up the risk (EU-U.S. WG-C ARAIM, in one dimension):
 
     ``2 Q((L - b_0)/sigma_0) + sum_J p_J Q((L - T_J - b_J)/sigma_J) = risk``
 
-Thresholds ``T_J = K_fa sigma(x_J - x)`` divide the false alarms evenly. The level is found from above: from the largest
-of three parts, each of which has its share of the risk,
-
-- no fault: ``K_ff sigma_0 + b_0``;
-- one fault, two faults (and more, where these are hypotheses): the largest ``T_J + K sigma_J + b_J``, the share divided
-  in proportion to the priors, so that all hypotheses of a part have one K.
-
-May the position be used? The level against the alarm limit.
+Thresholds ``T_J = K_fa sigma(x_J - x)`` divide the false alarms evenly. It is found from above: from the largest of
+``K_ff sigma_0 + b_0`` without fault and, for one fault and for two and more, the largest ``T_J + K sigma_J + b_J``.
 """
 
 from __future__ import annotations
@@ -32,16 +25,12 @@ from scipy.special import comb
 
 from railfix import kernels
 from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings
-from railfix.integrity.protection.allocation import FEW, Allocation, allocate
-from railfix.integrity.protection.risk import MOST_TOGETHER, RiskBudget
+from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, Allocation, RiskBudget, allocate
 from railfix.integrity.raim import LinearModel
 
-#: Numbers of a pair array that a block of epochs holds.
-_BLOCK_SIZE: Final = 80_000
-#: Number of the tails of three faults and more among those of all kinds.
-_OF_MORE: Final = 3
-#: Separation, over the sigma of the position, below which the two positions are the same.
-_SAME: Final = 1e-9
+_BLOCK_SIZE: Final = 80_000  #: Numbers of a pair array that a block of epochs holds.
+_OF_MORE: Final = 3  #: Number of the tails of three faults and more among those of all kinds.
+_SAME: Final = 1e-9  #: Separation, over the sigma of the position, below which the two positions are the same.
 
 
 class Cause(IntEnum):
@@ -93,8 +82,7 @@ class ProtectionLevel:
     separation: Floats  #: The largest ``|x_J - x|/T_J``; 0 where nothing can be left out; shape (T,).
     #: It is at most 1. Where not the level does not hold. False where there is no position; shape (T,).
     consistent: Masks
-    #: Channel that sets `one_fault_m`; -1 where none does (a constellation: `worst_constellation`; a side, the map);
-    #: shape (T,).
+    #: Channel that sets `one_fault_m`; -1 where none does (`worst_constellation`, a side, the map); shape (T,).
     worst_one: Indices
     worst_two: Indices  #: Channels that set `two_fault_m`; -1 where none do; shape (T, 2).
     #: Letter of the constellation that sets `one_fault_m`; empty where none does; shape (T,).

@@ -1,12 +1,8 @@
 """Other places of the line that the hypotheses of a level leave open.
 
-A level is linear: it bounds the error along the tangent at the position. Where the line turns away, passes itself or
-branches, a satellite left out can move the position to a place that no tangent leads to. Under each hypothesis
-of the level (no fault, one faulty satellite, two, those of a side) the sum of squared residuals (`off_tangent.Forms`)
-is evaluated along the line around the position, where a bound does not rule such places out.
-
-Under each hypothesis of the level (no fault, one faulty satellite, two, those of a side) the weighted sum of squared
-residuals is a quadratic form in the place.
+A level bounds the error along the tangent. Where the line turns away, passes itself or branches, a satellite left out
+can move the position to a place that no tangent leads to. Under each hypothesis of the level the sum of squared
+residuals, a quadratic form in the place, is evaluated along the line where a bound does not rule such places out.
 """
 
 from __future__ import annotations
@@ -29,10 +25,8 @@ from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.normal_equations import inverse_3x3
 from railfix.positioning.section_search import SearchIndex
 
-#: Furthest places looked at [m]: the linear model of a range is off by 0.7 m there.
-_FURTHEST_M: Final = 5000.0
-#: Share of the risk of a sample below which places are not looked for.
-_NEGLIGIBLE: Final = 0.01
+_FURTHEST_M: Final = 5000.0  #: Furthest places looked at [m]: the linear model of a range is off by 0.7 m there.
+_NEGLIGIBLE: Final = 0.01  #: Share of the risk of a sample below which places are not looked for.
 
 
 @dataclass(frozen=True)
@@ -63,10 +57,7 @@ class Forms:
         return np.stack([self.constant, *np.moveaxis(-2.0 * self.slope, 2, 0), *of_squares, *of_products], axis=1)
 
     def radius_m(self, risk: float) -> Floats:
-        """Return the distance from the position within which all open places lie, shape (T,); `_FURTHEST_M` at most.
-
-        Places further away have a hundredth of the risk at most.
-        """
+        """Return the distance within which all open places lie, but for 1 % of the risk, shape (T,)."""
         covariance = inverse_3x3(self.matrix)
         centre = np.einsum("tkij,tkj->tki", covariance, self.slope)
         form = np.maximum(np.einsum("tki,tki->tk", centre, self.slope), 0.0)
@@ -79,28 +70,12 @@ class Forms:
         return np.asarray(np.minimum(radius.max(axis=1), _FURTHEST_M))
 
 
-def whitened(model: LinearModel, plan: float, height: float, scale: Floats) -> tuple[Compact, Floats, Forms]:
-    """Return the residuals with the map error in the noise, their change with the place, and the form without fault.
+def whiten_residuals(model: LinearModel, plan: float, height: float, scale: Floats) -> tuple[Compact, Floats, Forms]:
+    """Return the residuals of n channels with the map error in the noise, their design, and the form without fault (K =
+    1).
 
-    The map error is taken alike in all horizontal directions: another place has another tangent.
-
-    Parameters
-    ----------
-    model : LinearModel
-        T epochs, on the line.
-    plan, height : float [m]
-        Sigmas of the map.
-    scale : ndarray, shape (T,)
-        Noise scale of the ranges.
-
-    Returns
-    -------
-    parts : Compact
-        n channels side by side.
-    design : ndarray, shape (T, n, 3) [1/m]
-        Decrease of their residuals by a step along, across and up.
-    none : Forms
-        K = 1.
+    The map error is taken alike in all horizontal directions: another place has another tangent. The design, shape (T,
+    n, 3) [1/m], is the decrease of the residuals by a step along, across and up.
     """
     normal = np.linalg.inv(model.covariance_m2) - model.prior
     prior = scale[:, None, None] ** 2 * np.diag([plan**-2.0, plan**-2.0, height**-2.0])
@@ -121,13 +96,8 @@ def whitened(model: LinearModel, plan: float, height: float, scale: Floats) -> t
 
 
 def without_sides(parts: Compact, design: Floats, none: Forms, sides: Masks, prior: float) -> Forms:
-    """Return the forms with the channels of each side left out, K = S; prior 0 where fewer than two are in use.
-
-    Parameters
-    ----------
-    parts, design, none
-        As `whitened` returns them.
-    sides : ndarray of bool, shape (T, S, M)
+    """Return the forms with the channels of each side (T, S, M) left out, K = S; prior 0 where fewer than two are in
+    use.
     """
     n, forms = parts.channel.shape[1], []
     columns = np.concatenate([parts.projector, parts.residual[..., None], design], axis=2)
@@ -150,18 +120,9 @@ def without_sides(parts: Compact, design: Floats, none: Forms, sides: Masks, pri
 def one_after_the_other(columns: Floats, members: Masks) -> tuple[Floats, Floats, Masks]:
     """Leave out a group of channels, each from what those before it leave.
 
-    Parameters
-    ----------
-    columns : ndarray, shape (T, n, n + c)
-        Projector of the residuals, and beside it what changes alike.
-    members : ndarray of bool, shape (T, n)
-
-    Returns
-    -------
-    rows, scaled : ndarray, shape (T, m, n + c)
-        Row of each member, and that over its part of the projector; 0 where nothing checks it. Without the group the
-        columns are less by ``rows[..., :n]^T scaled``.
-    checked : ndarray of bool, shape (T, m)
+    `columns`, shape (T, n, n + c): projector of the residuals, and what changes alike. Returns the row of each member
+    and that over its part of the projector, shapes (T, m, n + c), 0 where nothing checks it, and which are checked.
+    Without the group the columns are less by ``rows[..., :n]^T scaled``.
     """
     at = np.arange(len(columns))
     place = np.argsort(~members, axis=1, kind="stable")[:, : int(np.count_nonzero(members, axis=1).max(initial=0))]
@@ -178,8 +139,7 @@ def one_after_the_other(columns: Floats, members: Masks) -> tuple[Floats, Floats
 
 #: Numbers that a block of epochs by pairs of satellites, or of sections by hypotheses holds.
 _BLOCK_SIZE: Final = 300_000
-#: Numbers that a block of epochs by channels squared holds.
-_BOUND_SIZE: Final = 100_000
+_BOUND_SIZE: Final = 100_000  #: Numbers that a block of epochs by channels squared holds.
 
 
 @dataclass(frozen=True)
@@ -220,25 +180,10 @@ def places_beyond_the_level(
 ) -> Masks:
     """Return the epochs with places of the line that are open beyond the level, shape (T,).
 
-    Under a hypothesis J, a place that fits worse than the best place of the line by x variances is the true one with a
-    probability of ``Q(sqrt(x))`` at most. An epoch is returned where these probabilities, of the best place beyond
-    the level, times the prior of J, add up to more than the risk of a sample. Where the line is straight, the level
-    keeps this sum within the risk.
-
-    Parameters
-    ----------
-    arc_m : ndarray, shape (T,) [m]
-        Positions.
-    model : LinearModel
-        Of the positions.
-    level_m : ndarray, shape (T,) [m]
-        Epochs without a finite level are not looked at.
-    scale : ndarray, shape (T,)
-        Noise scale, taken as 1 at least.
-    systems : sequence of str
-        Constellation letter of each channel.
-    sides : ndarray of bool, shape (T, S, M)
-        Low satellites of each side of the track.
+    Under a hypothesis J, a place that fits worse than the best by x variances is the true one with a probability of
+    ``Q(sqrt(x))`` at most. An epoch is returned where these probabilities, of the best place beyond the level, times
+    the prior of J, add up to more than the risk of a sample. `scale` is taken as 1 at least; `sides`, shape (T, S, M),
+    are the low satellites of each side.
     """
     result = np.zeros(len(arc_m), dtype=bool)
     rows = np.flatnonzero(np.isfinite(level_m) & np.isfinite(arc_m) & np.isfinite(model.wsse))
@@ -266,7 +211,7 @@ def places_beyond_the_level(
         near = block[bound > risk.risk_per_sample]
         for index, own in antennas.split(near):
             for some in np.array_split(own, 1 + 9 * len(own) // size):
-                parts, design, none = whitened(model.take(some), *sigmas, np.maximum(scale[some], 1.0))
+                parts, design, none = whiten_residuals(model.take(some), *sigmas, np.maximum(scale[some], 1.0))
                 prior = np.where(parts.used, likely[parts.channel], 0.0)
                 forms = [
                     _without_one(parts, design, none, prior),
@@ -320,10 +265,7 @@ def _without_two(parts: Compact, design: Floats, none: Forms, prior: Floats) -> 
 
 
 def _around(index: SearchIndex, arc_m: Floats, level_m: Floats, radius_m: Floats) -> _Sections:
-    """Sections of the line within a radius of each position that has any off the tangent beyond its level.
-
-    Sections that the level cuts are divided there.
-    """
+    """Sections within a radius of each position that have any off the tangent beyond its level, divided there."""
     line = index.trajectory
     here, place = line.segment_at(arc_m)[0], line.at_arc(arc_m)
     axes = line.axes_of(here)

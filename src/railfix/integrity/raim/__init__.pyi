@@ -1,7 +1,6 @@
 # The names of `railfix.integrity.raim`, imported at their first use (lazy-loader).
 
-from .detection import Detection, RaimLimits, detect, threshold
-from .exclusion import Exclusion, Outcome, exclude, worst_channel
+from .exclusion import Detection, Exclusion, Outcome, RaimLimits, detect, exclude, threshold, worst_channel
 from .model import LinearModel, constrained_model
 from .reliability import Reliability, noncentrality, reliability
 

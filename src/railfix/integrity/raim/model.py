@@ -1,17 +1,10 @@
 """One linear model for RAIM on the line and in space.
 
-P4 writes the observations as ``y = H x + v`` and tests the residuals ``nu = y - H x`` of the least
-squares solution. Here every range is divided by its sigma, and what is not asked for is taken out
-of the model beforehand: the receiver clocks (with what is known of them against each other,
-`ClockTies`), and the map error across and up, unknowns with a prior. What is left is a
-residual projector
-
-    ``S = I - R K R^T - B Q B^T``
-
-(R: 1/sigma in the column of the satellite's clock, K: covariance of the clocks at a known place,
-B: design of the place with the clocks taken out, Q: its covariance), with ``nu = S y`` and
-``WSSE = y^T S y``, chi-square distributed with `LinearModel.freedom` degrees of freedom. P4's
-``nu^T M^-1 nu`` with the singular covariance M of the residuals is the same number.
+P4 tests the residuals of ``y = H x + v``. Here every range is divided by its sigma, and the receiver clocks and the map
+error across and up, unknowns with a prior, are taken out beforehand. What is left is a residual projector ``S = I - R K
+R^T - B Q B^T`` (R: 1/sigma in the column of the satellite's clock, K: covariance of the clocks at a known place, B:
+design with the clocks taken out, Q: its covariance), with ``nu = S y`` and ``WSSE = y^T S y``, chi-square distributed
+with `LinearModel.freedom` degrees of freedom.
 """
 
 from __future__ import annotations
@@ -228,10 +221,7 @@ def constrained_model(
 def model_on_line(
     ranges: Ranges, place_ecef_m: Floats, axes: Floats, sigma_plan_m: float, sigma_height_m: float
 ) -> LinearModel:
-    """Return the same model from the places themselves, shape (T, 3) [m], and the axes there, shape (T, 3, 3).
-
-    The axes are unit vectors along, across and up (`Trajectory.axes_of`).
-    """
+    """Return the model from places (T, 3) [m] and axes along, across and up there, shape (T, 3, 3)."""
     prior = np.diag([0.0, 1.0 / sigma_plan_m**2, 1.0 / sigma_height_m**2])
     return _model(ranges, place_ecef_m, axes, prior, unknowns=1)
 
@@ -257,19 +247,10 @@ def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *,
 def linearised(
     ranges: RangeArrays, place_ecef_m: Floats, axes: Floats, prior: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Compute fields of `LinearModel`.
+    """Compute root_weight, clock_covariance_m2, design, covariance_m2 and misfit of `LinearModel`.
 
-    Parameters
-    ----------
-    place_ecef_m : ndarray, shape (T, 3) [m]
-        Positions; NaN where there is none.
-    axes : ndarray, shape (T, 3, 3)
-        Unit vectors of the three unknowns there.
-    prior : ndarray, shape (3, 3) [1/m^2]
-
-    Returns
-    -------
-    root_weight, clock_covariance_m2, design, covariance_m2, misfit
+    `axes`, shape (T, 3, 3): unit vectors of the unknowns at positions (T, 3), NaN without; `prior`, shape (3, 3)
+    [1/m^2].
     """
     weight, groups = ranges.weight, len(ranges.starts)
     distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])

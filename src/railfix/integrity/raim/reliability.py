@@ -1,12 +1,9 @@
 """Reliability: what stays undetected, and how far it moves the position.
 
-P4: with noncentrality lambda the test misses a fault with the stated probability; the bias in the
-test statistic is then ``sigma0 sqrt(lambda)``, which P4 calls MDB. In the range of satellite i it is
-``sigma_i sqrt(lambda / r_ii)``, because only the share r_ii of its square reaches the statistic.
-``slope_i`` is what the position moves for each unit of the statistic's root; the protection level
-is the largest slope times ``sigma0 sqrt(lambda)`` (P4: ``HPL = HSlope_max sigma0 sqrt(lambda)``),
-and K sigma for the noise of the position. P4's slides vary the direction of a bias of latitude,
-longitude and height; a fault is in a satellite, so the satellites are gone through.
+With noncentrality lambda the test misses a fault with the stated probability (P4). In the range of satellite i that is
+``sigma_i sqrt(lambda / r_ii)``, because only the share r_ii of its square reaches the statistic. ``slope_i`` is what
+the position moves for each unit of the statistic's root; the level is the largest slope times ``sigma0 sqrt(lambda)``
+(P4), and K sigma for the noise of the position.
 """
 
 from __future__ import annotations
@@ -22,14 +19,12 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri, chndtrinc, ndtri
 
 from railfix.core.arrays import Floats, Indices, Masks
-from railfix.integrity.raim.detection import RaimLimits
+from railfix.integrity.raim.exclusion import RaimLimits
 from railfix.integrity.raim.model import LinearModel, compact
 from railfix.kernels.layout import LEAST_REDUNDANCY
 
-#: Effect on the position, in its own sigmas, below which a satellite has none.
-_NO_EFFECT: Final = 1e-6
-#: Numbers of a pair array that a block of epochs holds.
-_BLOCK_SIZE: Final = 40_000
+_NO_EFFECT: Final = 1e-6  #: Effect on the position, in its own sigmas, below which a satellite has none.
+_BLOCK_SIZE: Final = 40_000  #: Numbers of a pair array that a block of epochs holds.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,8 +32,7 @@ class Reliability:
     """Reliability of T epochs by M channels, for the chi-square test."""
 
     noncentrality: Floats  #: lambda of the epoch's degrees of freedom; NaN where not testable; shape (T,).
-    #: Range error that the test misses with the stated probability; infinite where nothing checks the range, NaN where
-    #: not used or not testable; shape (T, M).
+    #: Range error missed with that probability; infinite unchecked, NaN if unused; shape (T, M).
     minimal_detectable_bias_m: Floats
     #: Movement of the position for one unit of the root of the statistic; NaN where not used; shape (T, M).
     slope_m: Floats
@@ -50,8 +44,7 @@ class Reliability:
     #: Movement by a fault that the test misses with the stated probability: slope sqrt(lambda); shape (T,).
     fault_level_m: Floats
     noise_level_m: Floats  #: K sigma, shape (T,).
-    #: Their sum; infinite where a satellite is unchecked, or where there is a position but no redundancy; NaN where
-    #: there is no position; shape (T,).
+    #: Their sum; infinite where a satellite is unchecked; NaN without a position; shape (T,).
     protection_level_m: Floats
     available: Masks  #: The protection level is finite, shape (T,).
     alarm: Masks  #: It is not known to be within the alarm limit, shape (T,).
@@ -91,7 +84,9 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
         largest = np.fmax(largest, pair)
     # No redundancy: nothing is detected, whatever the size.
     fault = np.where(located & (model.freedom < 1), np.inf, largest * root)
-    noise = _noise_factor(limits.noise_risk, model.interest) * sigma
+    # K: two-sided Gaussian along the line, Rayleigh with the longest axis (an upper bound) in the plane
+    risk = limits.noise_risk
+    noise = sigma * (float(-ndtri(risk / 2.0)) if model.interest == 1 else math.sqrt(-2.0 * math.log(risk)))
     level = fault + noise
     return Reliability(
         noncentrality=root**2,
@@ -132,11 +127,6 @@ def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Fl
 def _noncentrality(freedom: int, false_alarm: float, missed_detection: float) -> float:
     """The lambda with ``P(noncentral chi-square < T_CS) = missed_detection``."""
     return float(chndtrinc(chdtri(freedom, false_alarm), freedom, missed_detection))
-
-
-def _noise_factor(risk: float, components: int) -> float:
-    """K: two-sided Gaussian along the line, Rayleigh with the longest axis (an upper bound) in the plane."""
-    return float(-ndtri(risk / 2.0)) if components == 1 else math.sqrt(-2.0 * math.log(risk))
 
 
 def _longest_axis(covariance: Floats) -> Floats:

@@ -35,10 +35,8 @@ from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_
 
 #: Constellation of RTCM ephemeris messages.
 _RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1045: "E", 1046: "E", 1020: "R"}
-#: Time from the beginning of a GLONASS frame in which its strings 1 to 4 come.
-_STRINGS_S: Final = 15.0
-#: Longest time from the last epoch to the string that counts as received then.
-_EPOCH_BEFORE_S: Final = 5.0
+_STRINGS_S: Final = 15.0  #: Time from the beginning of a GLONASS frame in which its strings 1 to 4 come.
+_EPOCH_BEFORE_S: Final = 5.0  #: Longest time from the last epoch to the string that counts as received then.
 #: Time from one GLONASS frame to the next.
 _FRAME_S: Final = 30.0
 _NEVER: Final = np.datetime64("NaT", "ns")
@@ -74,7 +72,7 @@ class Assembled:
     undated: frozenset[str] = frozenset()
 
 
-def assembled(
+def assemble_records(
     subframes: Subframes,
     time: Datetimes,
     state: Unfinished | None = None,

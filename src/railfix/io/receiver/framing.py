@@ -1,13 +1,7 @@
 """Frames of UBX, RTCM 3, SBF and NMEA in a stream of bytes, protocols mixed, checksums verified.
 
-All frames of a buffer are found in one pass over arrays: candidates by their sync bytes, lengths by
-gathering, checksums of all candidates together. Bytes that belong to no frame with a valid checksum
-are counted, never guessed at.
-
-Sources: u-blox F9 HPG interface description (UBX-20033635), section 3; RTCM 10403.3, section 4;
-Septentrio mosaic-X5 reference guide, section 4.1 (SBF); NMEA 0183, section 5.3.
-
-Bit fields of many messages at once.
+Sources: u-blox F9 HPG interface description (UBX-20033635), section 3; RTCM 10403.3, section 4; Septentrio mosaic-X5
+reference guide, section 4.1 (SBF); NMEA 0183, section 5.3.
 """
 
 from __future__ import annotations
@@ -45,9 +39,7 @@ class Frames:
     start: Indices
     end: Indices
     frame_start: Indices  #: First byte of the frame, its sync included; shape (N,).
-    #: Bytes of the buffer that are dealt with; the rest may be the start of a frame, and belongs before the next
-    #: buffer.
-    consumed: int
+    consumed: int  #: Bytes of the buffer that are dealt with; the rest may be the start of a frame.
     skipped_bytes: int  #: Of those, bytes outside frames.
     bad_checksums: int  #: Complete candidates (sync and length plausible) outside frames whose checksum failed.
 
@@ -79,10 +71,7 @@ class _FrameCandidates:
 
 
 def find_frames(data: Bytes, *, at_end: bool = True) -> Frames:
-    """Frames in a buffer of uint8.
-
-    `at_end`: nothing follows, so that an incomplete frame at the end is skipped, not kept for the next buffer.
-    """
+    """Find the frames in a buffer of uint8; with `at_end` an incomplete frame at its end is skipped."""
     data = np.asarray(data, dtype=np.uint8)
     candidates = [_ubx(data), _rtcm(data), _sbf(data), _nmea(data, at_end=at_end)]
     incomplete = [c.frame[c.frame_end > len(data)] for c in candidates]
@@ -256,8 +245,7 @@ def _hex(digit: Bytes) -> Integers:
     return value[digit]
 
 
-#: Bytes in which a log must show a frame with a valid checksum to be taken for one.
-_HEAD_BYTES: Final = 1 << 16
+_HEAD_BYTES: Final = 1 << 16  #: Bytes in which a log must show a frame with a valid checksum to be taken for one.
 
 
 def is_receiver_log(head: bytes) -> bool:
@@ -354,16 +342,14 @@ def joined_subframes(first: Subframes, second: Subframes) -> Subframes:
     return both.take(np.argsort(both.order, kind="stable"))
 
 
-#: Signal number of SBAS on L5 among subframes; UBX has none.
-SBAS_L5: Final = -5
+SBAS_L5: Final = -5  #: Signal number of SBAS on L5 among subframes; UBX has none.
 
 
 @dataclass(frozen=True, kw_only=True)
 class SbasFrames:
     """SBAS messages as a receiver passes them on, N of them; parity and preamble not checked here."""
 
-    #: 1 ns after the receiver's epoch before the message, because that epoch came too early to use it; NaT before the
-    #: receiver knew the time; shape (N,).
+    #: 1 ns after the receiver's epoch before the message; NaT before the receiver knew the time; shape (N,).
     time: Datetimes
 
     prn: Integers

@@ -1,9 +1,7 @@
-"""Receivers' own indicators of jamming and spoofing, and the gain of their front ends.
+"""Receivers' indicators of jamming and spoofing, the gain of their front ends, and the positions they computed.
 
 Sources: u-blox F9 HPG 1.32 interface description (UBX-22008968), 3.14.5 MON-RF, 3.14.2 MON-HW; u-blox X20 HPG 2.00
 (SEC-SIG, versions 1 and 2; SEC-SIGLOG); Septentrio mosaic-X5 reference guide 4.14, 4.2.14 (RFStatus, ReceiverStatus).
-
-Positions that receivers computed themselves, from their logs: UBX NAV-PVT and NAV-HPPOSLLH, SBF PVT blocks.
 """
 
 from __future__ import annotations
@@ -28,16 +26,14 @@ SEC_SIGLOG: Final = 0x2710
 RF_STATUS: Final = 4092
 RECEIVER_STATUS: Final = 4014
 
-#: Bits of `Observations.receiver_alarm`.
-JAMMING, SPOOFING = 1, 2
+JAMMING, SPOOFING = 1, 2  #: Bits of `Observations.receiver_alarm`.
 #: u-blox states that count: jamming is critical, spoofing is affirmed. State 2 (warning, indicated) was sent for 571 of
 #: 581 s of a recording without interference.
 _CERTAIN: Final = 3
 #: Septentrio: a band with interference that is not cancelled.
 _NOT_MITIGATED: Final = 8
 _MON_HW_BYTES: Final = 60
-#: u-blox: bytes of a block of MON-RF after the four of the head.
-_BLOCK: Final = 24
+_BLOCK: Final = 24  #: u-blox: bytes of a block of MON-RF after the four of the head.
 #: Septentrio: first block of bands or front ends after the time stamp (6 bytes).
 _BANDS, _FRONT_ENDS = 12, 24
 _NO_GAIN: Final = -128
@@ -57,15 +53,7 @@ class Indicators:
 
 
 def indicators_at(frames: Frames, places: Integers, before: Indicators) -> tuple[Bytes, Floats, Indicators]:
-    """Return alarm bits and gain at places of the stream, shape (T,) each, and the last indicators of all.
-
-    Parameters
-    ----------
-    places : ndarray of int, shape (T,)
-        Rising; each has what the messages before it report.
-    before : Indicators
-        Of the bytes before these.
-    """
+    """Return alarm bits and gain at rising `places` of the stream, shape (T,) each, and the last indicators of all."""
     found = sorted(_messages(frames))
     alarm, gain = dict(before.alarm), before.gain
     alarms, gains = np.zeros(len(places), dtype=np.uint8), np.full(len(places), np.nan)
@@ -166,11 +154,11 @@ _BLOCK_BYTES = 1 << 22
 
 
 def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None) -> PositionLog:
-    """Positions in a receiver's log, plain or packed, as the receiver computed them; `line` counts the positions.
+    """Read the positions that a receiver computed from its log, plain or packed; `line` counts the positions.
 
-    SBF PVTGeodetic, or PVTCartesian without it; UBX NAV-HPPOSLLH, or NAV-PVT without it. Qualities as RTKLIB counts
-    them. `date` is some time within half a week, for UBX logs without a NAV-PVT that has a date. InputFileError: the
-    log has no position, or none that can be dated.
+    SBF PVTGeodetic, or PVTCartesian without it; UBX NAV-HPPOSLLH, or NAV-PVT without it. `date` is some time within
+    half a week, for UBX logs without a dated NAV-PVT. InputFileError: the log has no position, or none that can be
+    dated.
     """
     parts = []
     near = np.datetime64("NaT", "ns") if date is None else date.astype("datetime64[ns]")

@@ -16,7 +16,14 @@ from railfix.core.files import FilePath, open_stream
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.receiver import rtcm, sbf, ubx
-from railfix.io.receiver.ephemerides import Assembled, Unfinished, assembled, assembled_rtcm, merged, navigation_of
+from railfix.io.receiver.ephemerides import (
+    Assembled,
+    Unfinished,
+    assemble_records,
+    assembled_rtcm,
+    merged,
+    navigation_of,
+)
 from railfix.io.receiver.framing import Frames, SbasFrames, find_frames, joined_subframes, sbas_frames
 from railfix.io.receiver.indicators import Indicators, indicators_at
 from railfix.io.receiver.measurements import Measurements, Tracking, observations_of
@@ -30,10 +37,7 @@ _MSM: Final = "RTCM 3 MSM"
 
 @dataclass(frozen=True, kw_only=True)
 class LogPiece:
-    """What one block of a receiver log holds, with bytes outside frames, failed checksums, and bytes read.
-
-    `station`: position of a base station known by its end.
-    """
+    """One block of a receiver log, its bytes outside frames, failed checksums, and a base station's position."""
 
     measurements: Measurements
     ephemerides: Assembled
@@ -48,10 +52,9 @@ class LogPiece:
 class StreamState:
     """What the bytes so far left: the start of a frame, unfinished ephemerides, the last known time.
 
-    `glonass_channels` are the frequency channels by satellite number that 1020 messages gave; `observed`: whether there
-    was an epoch of the receiver's own format; `kind`: the messages that the observations are taken from; `clock`: the
-    last time that it gave, of an epoch or another message; `indicators`: the last ones of jamming and spoofing;
-    `station`: position of a base station (RTCM 1005, 1006).
+    `kind`: the messages that the observations are taken from; `observed`: whether there was an epoch of the receiver's
+    own format; `clock`: the last time of an epoch or another message; `station`: position of a base station (RTCM 1005,
+    1006).
     """
 
     rest: bytes = b""
@@ -67,11 +70,7 @@ class StreamState:
 
 
 def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[LogPiece, StreamState]:
-    """Measurements and ephemerides of a block of bytes; a stream cut anywhere gives the same.
-
-    The `time` of the state that the block before left (of the last epoch, or a date known otherwise) resolves the week
-    that RTCM 3 leaves out. `at_end`: nothing follows.
-    """
+    """Decode a block of bytes; a stream cut anywhere gives the same. `state.time` resolves the week of RTCM 3."""
     buffer = np.frombuffer(state.rest + data, dtype=np.uint8)
     frames = find_frames(buffer, at_end=at_end)
     if not at_end:
@@ -141,10 +140,7 @@ def _places(frames: Frames, kind: str) -> Integers:
 
 
 def _first_kind(frames: Frames, own: Mapping[str, Measurements], msm_places: Integers) -> str:
-    """Return the kind of the first epoch that has a date, empty without any: a receiver sends its ranges once.
-
-    Two kinds of one instant would be one epoch or two by how the stream is cut.
-    """
+    """Return the kind of the first epoch with a date, empty without any: a receiver sends its ranges once."""
     begins = {kind: _places(frames, kind)[-len(part.time)] for kind, part in own.items() if len(part.time)}
     if len(msm_places):
         begins[_MSM] = msm_places[0]
@@ -197,7 +193,7 @@ def _navigation(
     received = dated.last_before(subframes.order, state.time if np.isnat(state.clock) else state.clock)
     after = dated.first_after(subframes.order)
     start = dated.first_after(np.zeros(1, dtype=np.int64))[0]
-    first, unfinished = assembled(subframes, received, state.subframes, after=after, first=start)
+    first, unfinished = assemble_records(subframes, received, state.subframes, after=after, first=start)
     messages = sorted(rtcm.ephemeris_fields(frames))
     places = np.array([place for place, _, _ in messages], dtype=np.int64)
     before = state.clock if np.isnat(state.time) else state.time
@@ -210,11 +206,7 @@ def _navigation(
 def scan_pieces(
     path: FilePath, *, date: np.datetime64 | None = None, progress: Callable[[float], None] | None = None
 ) -> Iterator[LogPiece]:
-    """Pieces of a receiver log, plain or packed, block by block.
-
-    `date` is some time within half a week of the log's beginning, for RTCM 3, whose observations carry no week;
-    `progress` is called with the part of the file that has been read.
-    """
+    """Yield pieces of a receiver log; `date` within half a week is for RTCM 3, `progress` gets the share read."""
     state = StreamState() if date is None else StreamState(time=date.astype("datetime64[ns]"))
     with open_stream(path, content="bytes") as stream:
         while True:
@@ -237,10 +229,7 @@ def at_station(observations: Observations, station: tuple[float, float, float] |
 def scan_receiver_log(
     path: FilePath, *, date: np.datetime64 | None = None, progress: Callable[[float], None] | None = None
 ) -> Iterator[Observations]:
-    """Observations of a receiver log in pieces of one block.
-
-    InputFileError: no frame has a valid checksum, or no observation can be dated.
-    """
+    """Yield the observations of a receiver log by blocks; InputFileError where none can be dated."""
     tracking = Tracking()
     epochs = frames_seen = undated = 0
     old: Counter[str] = Counter()
@@ -268,11 +257,7 @@ def scan_receiver_log(
 
 
 def read_receiver_navigation(paths: Iterable[FilePath], *, date: np.datetime64 | None = None) -> Navigation:
-    """Navigation records of receiver logs; InputFileError where no log holds a whole ephemeris.
-
-    `date` is as in `scan_pieces`, within half a day for GLONASS. Without it, and without other messages that are dated,
-    satellites whose ephemerides carry no full date (GPS, QZSS, GLONASS) are left out and named in a note.
-    """
+    """Return navigation records of receiver logs; without `date`, satellites without a full date are noted."""
     names = tuple(str(Path(path)) for path in paths)
     parts = [piece.ephemerides for name in names for piece in scan_pieces(name, date=date)]
     whole = merged(parts)

@@ -16,8 +16,7 @@ from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.io.receiver import nav_messages
 from railfix.io.rinex.navigation_records import RawRecord, fields_of
 
-#: RINEX loss-of-lock bits: lock lost since the epoch before; half-cycle ambiguity possible.
-_SLIP, _HALF_CYCLE = 1, 2
+_SLIP, _HALF_CYCLE = 1, 2  #: RINEX loss-of-lock bits: lock lost since the epoch before; half-cycle ambiguity possible.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,11 +56,7 @@ class Tracking:
 
 
 def observations_of(measurements: Measurements, tracking: Tracking | None = None) -> tuple[Observations, Tracking]:
-    """Observations on the grid of epochs by channels, sorted by satellite, then signal, and the state that they leave.
-
-    An epoch that is not after the one before it (a repeated message, a receiver that was restarted
-    with an older time) is passed over and counted.
-    """
+    """Return observations by epoch and sorted channel, and the state after; epochs that do not rise are counted."""
     tracking = tracking or Tracking()
     rising = rising_epochs(measurements.time, None if np.isnat(tracking.last) else tracking.last)
     known = (measurements.satellite != "") & (measurements.signal != "")
@@ -182,8 +177,7 @@ def joined(parts: Sequence[Measurements]) -> Measurements:
 
 
 Values = Mapping[str, float]
-#: A record, and what tells it from the satellite's next one.
-Record = tuple[RawRecord, tuple[float, ...]]
+Record = tuple[RawRecord, tuple[float, ...]]  #: A record, and what tells it from the satellite's next one.
 
 _GALILEO_WEEK_MINUS_GPS: Final = 1024
 _BDS_WEEK_MINUS_GPS: Final = 1356
@@ -193,10 +187,7 @@ _MOSCOW_S: Final = 3 * 3600.0
 
 
 def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record:
-    """Record of GPS or QZSS from the fields of LNAV subframes 1 to 3, or of RTCM 1019 or 1044.
-
-    `time`, when it was received to within some years, resolves the week.
-    """
+    """Return the record of GPS or QZSS (LNAV 1 to 3, RTCM 1019, 1044); `time` of reception resolves the week."""
     week, epoch = _week_and_toc(values, _near_week(values["week"], 1024, time), time)
     numbers = {
         **values,

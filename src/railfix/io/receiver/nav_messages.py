@@ -172,8 +172,7 @@ CNAV: Final[dict[int, dict[str, Field]]] = {
         "week_top": (256, 8, 1.0, "u"),
     },
 }
-#: A group delay of CNAV that is not available (IS-GPS-200N, 30.3.3.3.1.1).
-CNAV_NO_DELAY_S: Final = -4096 * 2.0**-35
+CNAV_NO_DELAY_S: Final = -4096 * 2.0**-35  #: A group delay of CNAV that is not available (IS-GPS-200N, 30.3.3.3.1.1).
 #: Semi-major axes [m] that CNAV refers to, and rate of the node [rad/s] (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
 CNAV_AXIS_M: Final = {"G": 26_559_710.0, "J": 42_164_200.0}
 CNAV_OMEGA_DOT: Final = -2.6e-9 * _PI
@@ -213,11 +212,7 @@ FNAV: Final[dict[int, dict[str, Field]]] = {
         "crs": (144, 16, 2.0**-5, "s"),
         "toe_sow_s": (160, 14, 60.0, "u"),
     },
-    4: {
-        "iod": (6, 10, 1.0, "u"),
-        "cic": (16, 16, 2.0**-29, "s"),
-        "cis": (32, 16, 2.0**-29, "s"),
-    },
+    4: {"iod": (6, 10, 1.0, "u"), "cic": (16, 16, 2.0**-29, "s"), "cis": (32, 16, 2.0**-29, "s")},
 }
 #: BeiDou B-CNAV2 messages of 288 bits, without preamble and parity symbols; PRN, type and SOW are in all of them.
 BCNAV2_HEAD: Final[dict[str, Field]] = {"number": (0, 6, 1.0, "u"), "tow_s": (12, 18, 3.0, "u")}
@@ -263,8 +258,7 @@ BCNAV2: Final[dict[int, dict[str, Field]]] = {
 }
 #: Semi-major axes that B-CNAV2 refers to [m]: medium orbits (kind 3), and those of the period of the Earth.
 BCNAV2_AXIS_M: Final = {1: 42_162_200.0, 2: 42_162_200.0, 3: 27_906_100.0}
-#: Bits of CNAV, F/NAV and B-CNAV2 before their CRC.
-CNAV_CHECKED, FNAV_CHECKED, BCNAV2_CHECKED = 276, 214, 264
+CNAV_CHECKED, FNAV_CHECKED, BCNAV2_CHECKED = 276, 214, 264  #: Bits of CNAV, F/NAV and B-CNAV2 before their CRC.
 #: BeiDou: seconds of week and subframe number of D1 and D2 (10 words of 30 bits, parity included).
 BDS_HEAD: Final[dict[str, Field]] = {"tow_s": (((18, 8), (30, 12)), 20, 1.0, "u"), "subframe": (15, 3, 1.0, "u")}
 D1: Final[dict[int, dict[str, Field]]] = {

@@ -19,8 +19,7 @@ E1B_SOURCE, E5B_SOURCE = 1 << 0 | 1 << 9, 1 << 2 | 1 << 9
 E5A_SOURCE: Final = 1 << 1 | 1 << 8
 _UBX_E5B: Final = (5, 6)
 _UBX_E5A: Final = (3, 4)
-#: Signals with CNAV: L2C and L5.
-_CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}
+_CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}  #: Signals with CNAV: L2C and L5.
 #: BeiDou signals with D1 or D2, B-CNAV1 (B1C) and B-CNAV2 (B2a).
 _D_SIGNALS, _B1C, _B2A = (0, 1, 2, 3, 4, 10), (5, 6), (7, 8)
 #: Numbers of F/NAV pages and of CNAV messages among those of a satellite come after these.

@@ -14,7 +14,7 @@ import numpy as np
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import bdt_to_gpst, gpst_minus_utc, nearest_week
-from railfix.gnss.signals import named_frequency_hz
+from railfix.gnss.observations import named_frequency_hz
 from railfix.io.receiver.framing import Field, Frames, fields, signed, unsigned
 from railfix.io.receiver.measurements import Measurements, joined
 
@@ -93,11 +93,11 @@ def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
 
 
 def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews) -> tuple[Measurements, Integers]:
-    """Measurements of all MSM4 to MSM7 messages, and where in the stream each epoch begins.
+    """Decode all MSM4 to MSM7 messages, and find where in the stream each epoch begins.
 
-    Messages of one instant make one epoch. They carry the time of week only: `near` is a time within half a week of the
-    first message, GPS time; NaT gives none. Every other message is within half a week of the one before it.
-    Phases of GLONASS are in metres: without a channel in the message, or before it, they have no cycles.
+    Messages of one instant make one epoch. `near` is a time within half a week of the first message, GPS time (NaT:
+    none); every other message is within half a week of the one before it. Phases of GLONASS have no cycles where no
+    channel is known.
     """
     messages = frames.of("rtcm3", *MSM_NUMBERS)
     parts = [
@@ -138,10 +138,7 @@ def _count_unused(frames: Frames, messages: Indices, used: int) -> dict[str, int
 
 
 def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
-    """Move each time by whole weeks to within half a week of the message before.
-
-    GLONASS messages, which may lack the day, count only in a log without others.
-    """
+    """Move times by whole weeks to within half a week of the one before; GLONASS only in a log of its own."""
     counted = np.flatnonzero(~glonass) if not glonass.all() else np.arange(len(time))
     week = np.timedelta64(7, "D").astype("timedelta64[ns]")
     moved = time.copy()
@@ -151,10 +148,7 @@ def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
 
 
 def _glonass_days(time: Datetimes, glonass: Masks) -> Datetimes:
-    """Move times of GLONASS messages by whole days to those of the message before (the first: after) them.
-
-    They carry the day of the week, which some encoders leave at 0 and the standard lets be unknown (DF416 is 7).
-    """
+    """Move GLONASS times, whose day some encoders leave at 0 (DF416), by whole days to the message before."""
     others = np.flatnonzero(~glonass)
     if not len(others) or not glonass.any():
         return time
@@ -212,10 +206,7 @@ def completes_epoch(frames: Frames, chosen: Indices) -> Masks:
 
 
 def unfinished_epoch(frames: Frames) -> int | None:
-    """Place of the first message of the last epoch, where more messages of that epoch are to follow (DF393).
-
-    An epoch whose last message is missing ends where a message of the same number has another time.
-    """
+    """Return the place of the first message of a last epoch of which more messages are to follow (DF393)."""
     chosen = frames.of("rtcm3", *MSM_NUMBERS)
     if not len(chosen):
         return None
@@ -276,10 +267,7 @@ def _decode(
     near: np.datetime64,
     known: Integers,
 ) -> Measurements:
-    """Measurements of N messages with equal masks: every field is an array (N, satellites) or (N, cells).
-
-    `known` are frequency channels of GLONASS, for messages that carry none.
-    """
+    """Decode N messages with equal masks; `known` are GLONASS channels for messages that carry none."""
     system = SYSTEMS[number // 10]
     code_bits, code_step, phase_bits, phase_step, lock_bits, cn0_bits, cn0_step, with_rate = _LAYOUT[number % 10]
     n_satellites, n_cells = len(satellites), int(mask.sum())

@@ -16,7 +16,7 @@ from railfix.core.arrays import Bytes, Datetimes, Indices, Integers, Strings
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week
-from railfix.gnss.signals import named_frequency_hz
+from railfix.gnss.observations import named_frequency_hz
 from railfix.io.receiver.framing import SBAS_L5, Frames, Subframes
 from railfix.io.receiver.measurements import Measurements
 from railfix.io.receiver.ubx import gathered
@@ -57,8 +57,7 @@ _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
     GEO_RAW_L1: ("S", None),
     GEO_RAW_L5: ("S", {25: SBAS_L5}),
 }
-#: Bits of an even page of Galileo I/NAV without its tail, and of a page of BeiDou.
-_EVEN_BITS, _BDS_BITS = 114, 300
+_EVEN_BITS, _BDS_BITS = 114, 300  #: Bits of an even page of Galileo I/NAV without its tail, and of a page of BeiDou.
 #: Constellation and RINEX signal by signal number.
 SIGNALS: Final = {
     0: "G1C", 1: "G1W", 2: "G2W", 3: "G2L", 4: "G5Q", 5: "G1L", 6: "J1C", 7: "J2L", 8: "R1C", 9: "R1P", 10: "R2P",
@@ -107,12 +106,9 @@ _PVT: Final = np.dtype(
 _QUALITY: Final = {1: 5, 2: 4, 3: 1, 4: 1, 5: 2, 6: 3, 7: 1, 8: 2, 10: 6}
 _NO_TIME: Final = 0xFFFFFFFF
 _NO_WEEK: Final = 0xFFFF
-#: Time of a block.
-_TIME: Final = np.dtype([("tow_ms", "<u4"), ("week", "<u2")])
-#: Flag of MeasEpoch: measurements are encrypted.
-_SCRAMBLED: Final = 0x80
-#: Signals whose C/N0 has no offset of 10 dB-Hz: GPS L1P(Y) and L2P(Y).
-_WITHOUT_OFFSET: Final = (1, 2)
+_TIME: Final = np.dtype([("tow_ms", "<u4"), ("week", "<u2")])  #: Time of a block.
+_SCRAMBLED: Final = 0x80  #: Flag of MeasEpoch: measurements are encrypted.
+_WITHOUT_OFFSET: Final = (1, 2)  #: Signals whose C/N0 has no offset of 10 dB-Hz: GPS L1P(Y) and L2P(Y).
 
 
 def _names() -> Strings:
@@ -137,10 +133,7 @@ _SIGNAL_NAMES: Final = _signal_names()
 
 
 def meas_epoch_measurements(frames: Frames) -> Measurements:
-    """Measurements of all MeasEpoch blocks.
-
-    Blocks whose length does not fit their counts, or without time, are skipped and counted.
-    """
+    """Return the measurements of all MeasEpoch blocks; malformed ones are skipped and counted."""
     chosen = frames.of("sbf", MEAS_EPOCH)
     length = frames.end[chosen] - frames.start[chosen]
     head = gathered(frames.data, frames.start[chosen][length >= _HEAD.itemsize], _HEAD)

@@ -23,8 +23,7 @@ RXM_SFRBX: Final = 0x0213
 NAV_PVT: Final = 0x0107
 NAV_HPPOSLLH: Final = 0x0114
 
-#: Constellation letter by gnssId.
-SYSTEMS: Final = {0: "G", 1: "S", 2: "E", 3: "C", 5: "J", 6: "R", 7: "I"}
+SYSTEMS: Final = {0: "G", 1: "S", 2: "E", 3: "C", 5: "J", 6: "R", 7: "I"}  #: Constellation letter by gnssId.
 #: RINEX signal by gnssId and sigId (section 1.5.4 of the interface description, "Signal identifiers").
 SIGNALS: Final[Mapping[int, Mapping[int, str]]] = {
     0: {0: "1C", 3: "2L", 4: "2S", 6: "5I", 7: "5Q"},
@@ -122,10 +121,7 @@ _NAMES: Final = _name_table()
 
 
 def rawx_measurements(frames: Frames) -> Measurements:
-    """Raw measurements of all RXM-RAWX messages.
-
-    Messages whose length does not fit their count of measurements are passed over and counted.
-    """
+    """Return the raw measurements of all RXM-RAWX messages; malformed ones are counted."""
     chosen = frames.of("ubx", RXM_RAWX)
     length = frames.end[chosen] - frames.start[chosen]
     header = gathered(frames.data, frames.start[chosen][length >= 16], _RAWX_HEADER)
@@ -141,7 +137,8 @@ def rawx_measurements(frames: Frames) -> Measurements:
     within = np.arange(len(epoch)) - np.repeat(np.cumsum(count) - count, count)
     rows = gathered(frames.data, frames.start[chosen][epoch] + 16 + 32 * within, _MEASUREMENT)
     system, tracking = rows["gnss"].astype(np.int64), rows["tracking"].astype(np.int64)
-    signal = _signal_table()[np.minimum(system, 7), np.minimum(rows["signal"], 15)]
+    names = np.array([[SIGNALS.get(g, {}).get(s, "") for s in range(16)] for g in range(8)], dtype="<U2")
+    signal = names[np.minimum(system, 7), np.minimum(rows["signal"], 15)]
     phase_valid = (tracking & _PHASE_VALID != 0) & (rows["phase"] != 0) & (rows["phase"] != -0.5)
     phase_valid &= rows["phase_std"] & 15 <= _LARGEST_PHASE_STD
     code_valid = (tracking & _CODE_VALID != 0) & (rows["code"] > 0)
@@ -170,13 +167,6 @@ def rawx_measurements(frames: Frames) -> Measurements:
     )
 
 
-def _signal_table() -> Strings:
-    table = np.full((8, 16), "", dtype="<U2")
-    for system, names in SIGNALS.items():
-        table[system, list(names)] = list(names.values())
-    return table
-
-
 def gathered(data: Bytes, start: np.ndarray, layout: np.dtype) -> np.ndarray:
     """Structures of one layout at many places of a buffer, shape (N,)."""
     block = data[start[:, None] + np.arange(layout.itemsize)] if len(start) else np.zeros((0, layout.itemsize), "u1")
@@ -184,11 +174,7 @@ def gathered(data: Bytes, start: np.ndarray, layout: np.dtype) -> np.ndarray:
 
 
 def sfrbx_subframes(frames: Frames) -> Subframes:
-    """Navigation subframes of all RXM-SFRBX messages, words as received (32 bits, right-aligned as u-blox has them).
-
-    Those of GPS and QZSS L1 C/A with a wrong parity are left out and counted: the checksum of the message is of its
-    bytes alone.
-    """
+    """Return the subframes of all RXM-SFRBX messages; L1 C/A ones of wrong parity are counted."""
     chosen = frames.of("ubx", RXM_SFRBX)
     length = frames.end[chosen] - frames.start[chosen]
     chosen, length = chosen[length >= 8], length[length >= 8]
@@ -217,10 +203,9 @@ def sfrbx_subframes(frames: Frames) -> Subframes:
 
 
 def has_lnav_parity(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> Masks:
-    """Whether the parity of all ten words of LNAV subframes is right, shape (N,) (IS-GPS-200, table 20-XIV; also QZSS).
+    """Whether the parity of all ten words of LNAV subframes is right, shape (N,) (IS-GPS-200, table 20-XIV).
 
-    u-blox inverts a word whose predecessor ends in 1, data and parity, as if it ended in 0; the bit before that one is
-    then the exclusive or of the predecessor's last two.
+    u-blox inverts a word whose predecessor ends in 1; the bit before is then the exclusive or of its last two.
     """
     data, parity = words >> np.uint32(6) & np.uint32(0xFFFFFF), words & np.uint32(63)
     before = np.zeros_like(parity)
@@ -235,11 +220,10 @@ def has_lnav_parity(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> 
 
 
 def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
-    """The receiver's own positions: of NAV-HPPOSLLH where it is sent, else of NAV-PVT.
+    """Read the receiver's own positions: of NAV-HPPOSLLH where it is sent, else of NAV-PVT.
 
-    ``time``, ``ecef_m`` (shape (N, 3)), ``quality`` (as RTKLIB counts, of the NAV-PVT of the same instant; 5 without
-    one), ``sigma_m`` (shape (N, 3), north, east, up). `near` is a time within half a week where no NAV-PVT with a date
-    comes before (`date_of`); with NaT there is no position.
+    ``time``, ``ecef_m`` and ``sigma_m`` (east, north, up) of shape (N, 3), ``quality`` as RTKLIB counts, 5 without
+    NAV-PVT. `near` is a time within half a week where no dated NAV-PVT comes before; with NaT there is no position.
     """
     coarse = frames.of("ubx", NAV_PVT)
     coarse = coarse[frames.end[coarse] - frames.start[coarse] >= _PVT.itemsize]

@@ -19,8 +19,7 @@ from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, columns_o
 #: Time systems of TIME OF FIRST OBS, and the default of files without one by constellation.
 TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
 _DEFAULT_TIME: Final = {"G": "GPS", "R": "GLO", "E": "GAL", "C": "BDT", "J": "QZS", "I": "IRN", "S": "GPS", "M": "GPS"}
-#: Key of the types of a RINEX 2 file, which hold for all constellations.
-ALL: Final = ""
+ALL: Final = ""  #: Key of the types of a RINEX 2 file, which hold for all constellations.
 #: Longest header; a longer file without END OF HEADER is no RINEX file.
 _MAX_HEADER_BYTES: Final = 4 << 20
 _FILE_TYPES: Final = {
@@ -60,10 +59,7 @@ class RinexHeader:
 
 
 def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
-    """Read the lines of the header up to END OF HEADER, and the bytes read after it.
-
-    InputFileError: the file is no RINEX observation file, or its header does not end.
-    """
+    """Read the header of an observation file, and the bytes read after it; InputFileError where it does not end."""
     data = b""
     found = -1
     while found < 0:
@@ -101,19 +97,15 @@ def _check_kind(path: str, line: str) -> None:
 def parse_header(path: str, lines: Sequence[str], *, notes: list[str] | None = None) -> RinexHeader:
     """Parse the header of an observation file, its lines up to END OF HEADER.
 
-    Unreadable records that do not affect how the file is read (INTERVAL, APPROX POSITION XYZ, ...) are skipped and put
-    into `notes` where that is given, else raised. InputFileError: version not supported, types missing or miscounted,
-    or an invalid number.
+    Unreadable records that do not affect how the file is read are put into `notes` where that is given, else raised.
+    InputFileError: version not supported, types missing or miscounted, or an invalid number.
     """
     version = _version(path, lines[0])
     system = lines[0][40:41].strip().upper() or ("G" if version < 3.0 else "M")
     if system not in SYSTEMS + "M":
         raise InputFileError(path, f"satellite system '{system}' is none of {', '.join(SYSTEMS)} or M", line=1)
     start = RinexHeader(
-        version=version,
-        system=system,
-        time_system=_DEFAULT_TIME[system],
-        public=ObservationHeader(version=version),
+        version=version, system=system, time_system=_DEFAULT_TIME[system], public=ObservationHeader(version=version)
     )
     header = apply_records(path, start, lines[1:], first_line=2, notes=notes)
     if not header.types:
@@ -136,10 +128,7 @@ def _version(path: str, line: str) -> float:
 def apply_records(
     path: str, header: RinexHeader, lines: Sequence[str], *, first_line: int, notes: list[str] | None = None
 ) -> RinexHeader:
-    """Apply further header records, as epoch flags 2 to 4 bring them in the middle of a file.
-
-    Parameters are those of `parse_header`; `first_line` is the 1-based number of ``lines[0]``.
-    """
+    """Apply header records in the middle of a file (epoch flags 2 to 4); `first_line` is the number of the first."""
     reader = _HeaderRecords(path, header, notes)
     for number, line in enumerate(lines, start=first_line):
         reader.read(line, number)
@@ -191,12 +180,7 @@ class _HeaderRecords:
         changes = dict(self._changes)
         time_system = str(changes.pop("time_system", self._header.time_system))
         header = replace(self._header, types=self._types, scale=self._scale, time_system=time_system)
-        public = replace(
-            header.public,
-            signals=_signals(header),
-            glonass_channel=self._channels,
-            **changes,
-        )
+        public = replace(header.public, signals=_signals(header), glonass_channel=self._channels, **changes)
         return replace(header, public=public)
 
     def _fail(self, message: str) -> InputFileError:

@@ -1,8 +1,4 @@
-"""RINEX navigation files of versions 2, 3 and 4: broadcast orbits, clocks and ionosphere.
-
-GPS, QZSS, Galileo, BeiDou and GLONASS records are read (LNAV, CNAV, CNAV-2, I/NAV, F/NAV, D1, D2, CNAV-1 to
-CNAV-3, FDMA); everything else is passed over and counted.
-"""
+"""RINEX navigation files of versions 2, 3 and 4: broadcast orbits, clocks and ionosphere."""
 
 from __future__ import annotations
 
@@ -34,11 +30,7 @@ _ION_LETTER: Final = {"GPS": "G", "BDS": "C", "QZS": "J"}
 
 @dataclass
 class NavigationContent:
-    """Records and header content collected from one or several files.
-
-    `klobuchar` has eight coefficients by constellation, as received; `seen` the content of the records, to find
-    duplicates.
-    """
+    """Records and headers of one or several files; `seen` finds duplicates, `klobuchar` has eight coefficients each."""
 
     broken_lines: BrokenLines
     records: list[RawRecord] = field(default_factory=list)
@@ -83,10 +75,7 @@ class NavigationContent:
 
 
 def read_header(path: FilePath, lines: list[str], content: NavigationContent) -> tuple[float, str, int]:
-    """Read version, file type letter and index of the first line after the header.
-
-    InputFileError: the file is not a RINEX navigation file of version 2, 3 or 4, or its header is broken.
-    """
+    """Read version, file type letter and index of the first line after the header of a navigation file."""
     version, kind = _version(path, lines[0] if lines else "")
     for i, line in enumerate(lines):
         label = line[60:80].strip()
@@ -141,10 +130,8 @@ _MESSAGES: Final = {
     "G": ("LNAV", "CNAV", "CNV2"), "J": ("LNAV", "CNAV", "CNV2"), "E": ("INAV", "FNAV"),
     "C": ("D1", "D2", "CNV1", "CNV2", "CNV3"), "R": ("FDMA",),
 }  # fmt: skip
-#: Constellations whose records are skipped: SBAS, NavIC.
-_SKIPPED: Final = ("S", "I")
-#: Width of a number.
-_WIDTH: Final = 19
+_SKIPPED: Final = ("S", "I")  #: Constellations whose records are skipped: SBAS, NavIC.
+_WIDTH: Final = 19  #: Width of a number.
 #: ``> EPH G01 LNAV`` (RINEX 4.02, table A7); time offsets (STO) may name a constellation alone: ``> STO E   IFNV``.
 _TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z](?:[ \d]\d)?) *(\S*)")
 
@@ -291,7 +278,7 @@ def _record(path: FilePath, block: _Block, version: float, content: NavigationCo
     first = block.text[0]
     lettered = version >= 3.0 or first[:1].isalpha()  # RINEX 2.12: a letter before the number shifts all by a column
     try:
-        epoch = _epoch_3(first) if version >= 3.0 else _epoch_2(first[lettered:])
+        epoch = _instant(first[4:], 4) if version >= 3.0 else _instant(first[2 + lettered :], 3)
     except ValueError:
         what = f"epoch {first[3 : 23 if lettered else 22].strip()!r} of {satellite} is not a date and time"
         raise InputFileError(path, what, line=block.line) from None
@@ -321,19 +308,13 @@ def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> li
     return numbers
 
 
-def _epoch_2(line: str) -> np.datetime64:
-    year = int(line[2:5])
-    year += 1900 if 80 <= year < 100 else 2000 if year < 80 else 0
-    return _instant(year, line[5:8], line[8:11], line[11:14], line[14:17], line[17:22])
-
-
-def _epoch_3(line: str) -> np.datetime64:
-    return _instant(int(line[4:8]), line[8:11], line[11:14], line[14:17], line[17:20], line[20:23])
-
-
-def _instant(year: int, month: str, day: str, hour: str, minute: str, second: str) -> np.datetime64:
-    seconds = float(second)
+def _instant(text: str, digits: int) -> np.datetime64:
+    """Parse a time that begins with a year of a number of digits; RINEX 2 has seconds with a decimal."""
+    year, rest = int(text[:digits]), text[digits:]
+    if digits < 4:
+        year += 1900 if 80 <= year < 100 else 2000 if year < 80 else 0
+    seconds = float(rest[12:15] if digits == 4 else rest[12:17])
     if not (1980 <= year < 2100 and 0.0 <= seconds <= 60.0):
-        raise ValueError(year, second)
-    minute_start = datetime(year, int(month), int(day), int(hour), int(minute))
-    return np.datetime64(minute_start, "ns") + np.timedelta64(round(seconds * 1e9), "ns")
+        raise ValueError(year, seconds)
+    month, day, hour, minute = (int(rest[at : at + 3]) for at in range(0, 12, 3))
+    return np.datetime64(datetime(year, month, day, hour, minute), "ns") + np.timedelta64(round(seconds * 1e9), "ns")

@@ -75,15 +75,12 @@ _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
         for name in names.split()
     },
 }
-#: Limits of all other numbers.
-_OTHERS_BETWEEN: Final = (-1e10, 1e10)
+_OTHERS_BETWEEN: Final = (-1e10, 1e10)  #: Limits of all other numbers.
 #: Distance of a satellite from the Earth's centre [km]: above its surface.
 _RADIUS_KM: Final = (6_400.0, 70_000.0)
 _BLANK: Final = float("nan")
-#: RINEX writes 0.9999E9 for a number that is not known.
-_UNKNOWN: Final = 0.99e9
-#: Transmission times further than this from toe are invalid [s].
-_TRANSMISSION_S: Final = 2 * 86_400.0
+_UNKNOWN: Final = 0.99e9  #: RINEX writes 0.9999E9 for a number that is not known.
+_TRANSMISSION_S: Final = 2 * 86_400.0  #: Transmission times further than this from toe are invalid [s].
 
 
 @dataclass(frozen=True)
@@ -109,10 +106,7 @@ def fields_of(system: str, message: str) -> Sequence[str]:
 
 
 def number(text: str) -> float:
-    """Parse one FORTRAN number; blank and 0.9999E9 are the same NaN object, so that equal records compare equal.
-
-    ValueError: the text is not a finite number.
-    """
+    """Parse a FORTRAN number; blank and 0.9999E9 are the same NaN object, so that equal records compare equal."""
     text = text.strip()
     if not text:
         return _BLANK
@@ -139,10 +133,7 @@ def first_fault(record: RawRecord) -> tuple[int, str] | None:
 
 
 def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
-    """Convert records of GPS, QZSS, Galileo and BeiDou.
-
-    Blank rates, corrections, health and issues are 0, as RINEX defines; group delays and accuracies are NaN.
-    """
+    """Convert Keplerian records; blank rates, corrections, health and issues are 0, as RINEX defines."""
     column = _columns(raw)
     satellite = np.array([r.satellite for r in raw], dtype="<U3")
     system = satellite.astype("<U1")

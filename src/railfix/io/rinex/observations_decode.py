@@ -1,12 +1,9 @@
 """Decoding of satellite lines to dense arrays over epochs and channels, without loops over either.
 
-A field of RINEX is sixteen characters: ten of sign and digits, a point, three decimals, the
-loss-of-lock digit and the signal-strength digit. Two 64-bit words hold it, and eight digits in
-one integer become their value in three multiplications (the "SIMD within a register" of
-L. Lamport, "Multiple byte processing with full-word instructions", CACM 18(8), 1975,
-doi:10.1145/360933.360994). The value is an exact integer of thousandths divided by 1000, hence
-the double nearest to the text: the same as ``float(text)``. Fields of any other form (other
-decimals, an exponent, letters) are marked and read one at a time with `float`.
+Two 64-bit words hold a field of sixteen characters, and eight digits in one integer become their value in three
+multiplications (L. Lamport, "Multiple byte processing with full-word instructions", CACM 18(8), 1975,
+doi:10.1145/360933.360994). The exact integer of thousandths divided by 1000 is the same as ``float(text)``. Fields of
+any other form are read one at a time with `float`.
 """
 
 from __future__ import annotations
@@ -28,8 +25,7 @@ from railfix.io.rinex.observations_lines import KINDS, SYSTEMS, Lines, SignalCol
 
 Words = NDArray[np.uint64]
 
-#: Characters of one field.
-FIELD_WIDTH: Final = 16
+FIELD_WIDTH: Final = 16  #: Characters of one field.
 #: Blank characters that must follow the last character of a block, so that loads may run over it.
 PADDING: Final = 2048
 
@@ -62,22 +58,10 @@ def joined(parts: Sequence[Fields]) -> Fields:
 
 
 def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
-    """Gather fields of lines as pairs of 64-bit words; characters beyond the end of a line are blank.
+    """Gather `count` fields of lines as pairs of little-endian 64-bit words, shape (n, count, 2).
 
-    Parameters
-    ----------
-    data : ndarray of uint8
-        Text, followed by at least `PADDING` bytes.
-    start, length : ndarray of int64, shape (n,)
-        Where the first field of each line starts, and how many characters the line has from there
-        (less than zero counts as none).
-    count : int
-        Number of fields of a line.
-
-    Returns
-    -------
-    ndarray of uint64, shape (n, count, 2)
-        Little-endian words: the first character is the lowest byte.
+    `start` and `length`, shape (n,), are of the first field and of the rest of the line; beyond its end is blank.
+    `data` ends with `PADDING` bytes.
     """
     width = FIELD_WIDTH * count
     if width > PADDING:
@@ -95,10 +79,7 @@ def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
 
 
 def read_fields(data: Bytes, start: Integers, length: Integers, index: Indices, divisor: Floats) -> Fields:
-    """Read some fields of lines (`index`, shape (k,)); `data`, `start` and `length` are as for `gather`.
-
-    Values are divided by `divisor`, shape (k,) (SYS / SCALE FACTOR; 1 where there is none).
-    """
+    """Read fields `index` of lines, divided by `divisor` (SYS / SCALE FACTOR), both shape (k,); rest as `gather`."""
     value, lock, odd = kernels.reading.decoded_fields(data, start, length, index, divisor)
     bad = np.zeros(value.shape, dtype=np.bool_)
     row, column = np.nonzero(odd)
@@ -140,11 +121,7 @@ _LETTERS: Final = range(ord("A"), ord("Z") + 1)
 
 @dataclass(frozen=True)
 class DecodedRows:
-    """Satellites of a run of epochs, shape (n,) each.
-
-    Index of the epoch, constellation letter (uint8), satellite number (-1 where the name cannot be read), and index of
-    the (first) line of observations.
-    """
+    """Satellites of a run of epochs, shape (n,): epoch, constellation, number (-1: unreadable), first line."""
 
     epoch: Integers
     letter: Bytes

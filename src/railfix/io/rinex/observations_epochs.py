@@ -105,10 +105,7 @@ _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 
 @dataclass(frozen=True)
 class EpochHeads:
-    """Epochs and events of a block in the order of the file, shape (n,) each.
-
-    `line` is the index of the epoch line, `time_ns` the tag since 1970 in the file's time system (0 for events).
-    """
+    """Epochs and events of a block, shape (n,); `line` of each, `time_ns` in the file's time system (events: 0)."""
 
     line: Integers
     flag: Integers
@@ -175,11 +172,7 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
 
 
 def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log: FaultLog) -> tuple[EpochHeads, int]:
-    """Find epochs of RINEX 2 by the decimal point of their seconds and the end of the epoch before.
-
-    Column 19 of a line of observations lies among the leading digits of its second field, so that only
-    epoch lines have a point there (and records of events, which are skipped).
-    """
+    """Find epochs of RINEX 2 by the point of their seconds, which no line of observations has in that column."""
     n = len(lines)
     long = np.flatnonzero(lines.length >= epoch_width(2.0))
     likely = long[lines.data[lines.start[long] + 18] == ord(".")]

@@ -1,31 +1,9 @@
-"""Lines of a block of text, and parsing of epoch lines.
+"""Lines of a block of text, epoch lines, and the signals and observables of RINEX observation types.
 
-Assignment of RINEX observation types to signals and kinds of observable.
-
-RINEX 3 and 4 name the signal themselves ("C1C" is the code of "1C"). RINEX 2 names it by band, and
-the phase of a band may have come with either of two codes; the signals used are (RINEX 2.11,
-table A1; RINEX 3.05, tables 4 to 11):
-
-======= ===== ===== ===== ===== ===== ===== ===== ===== =====
-type    GPS   GLO   GAL   BDS   QZSS  SBAS  IRNSS
-======= ===== ===== ===== ===== ===== ===== ===== ===== =====
-C1      1C    1C    1X    2I    1C    1C    --
-P1      1W    1P    --    2I    --    --    --
-C2      2X    2C    --    2I    2X    --    --
-P2      2W    2P    --    2I    --    --    --
-C5      5X    --    5X    5X    5X    5X    5A
-C6      --    --    6X    6I    6X    --    --
-C7      --    --    7X    7I    --    --    --
-C8      --    --    8X    8X    --    --    --
-C9      --    --    --    --    --    --    9A
-CA CB   1C 1X 1C -- -- --  -- --  1C 1X 1C -- -- --           (RINEX 2.12)
-CC CD   2X -- -- 2C -- --  -- --  2X --  -- -- -- --          (RINEX 2.12)
-======= ===== ===== ===== ===== ===== ===== ===== ===== =====
-
-L1, D1 and S1 belong to C1's signal where C1 is declared, else to P1's; L2, D2 and S2 to P2's
-where P2 is declared (the carrier then comes from the P code or is codeless), else to C2's; where
-no code of the band is declared, to those of C1 and P2. BeiDou of RINEX 3.02 calls B1I band 1 ("C1I"):
-it is read as "2I", as are 1I and 1Q of any version, which have no other meaning.
+RINEX 3 and 4 name the signal themselves ("C1C" is the code of "1C"). RINEX 2 names it by band (RINEX 2.11, table A1;
+RINEX 3.05, tables 4 to 11); L1, D1 and S1 belong to C1's signal where C1 is declared, else to P1's; L2, D2 and S2 to
+P2's where P2 is declared, else to C2's; where no code of the band is declared, to those of C1 and P2. BeiDou of RINEX
+3.02 calls B1I band 1 ("C1I"): it is read as "2I", as are 1I and 1Q of any version, which have no other meaning.
 """
 
 from __future__ import annotations
@@ -78,10 +56,7 @@ class Lines:
 
 
 def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
-    """Split a block, followed by `PADDING` blanks, into lines; what follows its last line end belongs to none.
-
-    Empty lines are kept for RINEX 2, where they are satellites without observations.
-    """
+    """Split a block, followed by `PADDING` blanks, into lines; empty ones are kept for RINEX 2."""
     data = np.frombuffer(text, dtype=np.uint8)
     end = kernels.reading.line_ends(data)
     start = np.concatenate([np.zeros(min(len(end), 1), dtype=np.int64), end[:-1] + 1])
@@ -97,11 +72,7 @@ def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
 
 @dataclass(frozen=True)
 class EpochLines:
-    """Numbers of epoch lines, shape (n,) each.
-
-    Epoch flag and number of satellites (or of records, for events), -1 where unreadable; time tag since 1970 in the
-    file's time system, 0 where unreadable; index into `FLAWS`, 0 for a valid line.
-    """
+    """Numbers of epoch lines, shape (n,); -1 or time 0 where unreadable; index into `FLAWS`, 0 for a valid line."""
 
     flag: Integers
     count: Integers
@@ -134,11 +105,7 @@ def epoch_width(version: float) -> int:
 
 
 def read_epoch_lines(lines: Lines, which: Integers, *, version: float) -> EpochLines:
-    """Parse epoch lines; events (flags 2 to 5) may lack the time.
-
-    RINEX 3 and 4 write ``> yyyy mm dd hh mm ss.sssssss  f nnn``, RINEX 2 the same without the
-    mark and with a year of two digits (80 to 99 are 19xx).
-    """
+    """Parse epoch lines of RINEX 2 (years of two digits), 3 and 4; events may lack the time."""
     width = epoch_width(version)
     text = np.ascontiguousarray(lines.columns(which, width).T)  # a row for each column of the file
     at = width - 35
@@ -227,8 +194,7 @@ def event_line(lines: Lines, line: int) -> tuple[int, int] | None:
     return int(flag), int(count)
 
 
-#: Constellation letters of RINEX.
-SYSTEMS: Final = "CEGIJRS"
+SYSTEMS: Final = "CEGIJRS"  #: Constellation letters of RINEX.
 #: Types of observable, in the order of the arrays: code, phase, Doppler, carrier-to-noise density.
 KINDS: Final = "CLDS"
 
@@ -248,11 +214,7 @@ _OWNERS_2: Final[dict[str, tuple[str, ...]]] = {"1": ("C1", "P1"), "2": ("P2", "
 
 @dataclass(frozen=True)
 class SignalColumn:
-    """Column of an observation type in the satellite lines of a constellation.
-
-    Position among the declared types, type as declared ("C1C" or "P2"), position in `KINDS`, signal ("1C"), and divisor
-    of the written value.
-    """
+    """Column of an observation type: position, type as declared, position in `KINDS`, signal, divisor."""
 
     index: int
     name: str
@@ -262,10 +224,7 @@ class SignalColumn:
 
 
 def signal_of(name: str, *, system: str, version: float, declared: Sequence[str]) -> str | None:
-    """Return the signal of an observation type; None for types of no signal (X1, T1, I1).
-
-    The type is "C1C" (RINEX 3, 4) or "P2" (RINEX 2); `declared` are all types of the header for the constellation.
-    """
+    """Return the signal of an observation type ("C1C", "P2") among all declared; None for X1, T1, I1."""
     if version >= 3.0:
         if name[0] not in KINDS:
             return None

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from os import PathLike
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +15,13 @@ from railfix.core.arrays import Datetimes, Floats, Masks, Strings
 from railfix.core.constants import BDT_MINUS_GPST_S
 from railfix.core.timescale import BDT_EPOCH, GPS_EPOCH, SECONDS_PER_WEEK, gpst_minus_utc, seconds, timedelta, to_week
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
-from railfix.io.rinex.packing import Packing, header_line, open_target, program_line
+from railfix.io.rinex.write import Packing, RinexVersion, header_line, open_target, program_line
 
-#: Written for an unknown transmission time.
-UNKNOWN_TRANSMISSION_S: Final = 0.9999e9
-#: Name of a constellation's Klobuchar coefficients.
-_IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}
+UNKNOWN_TRANSMISSION_S: Final = 0.9999e9  #: Written for an unknown transmission time.
+_IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}  #: Name of a constellation's Klobuchar coefficients.
 #: Messages of Keplerian records that version 3 has.
 _WRITTEN: Final = ("LNAV", "INAV", "FNAV", "D1", "D2")
 _BLANK: Final = " " * 19
-#: Versions that can be written.
-RinexVersion = Literal["3.04", "4.02"]
 #: Last line of a GLONASS record of version 4: flags, group delay and accuracy, which are not known here.
 _GLONASS_STATUS: Final = f"    {_BLANK}{'.999999999999E+09':>19}{_BLANK}{_BLANK}".rstrip() + "\n"
 
@@ -82,7 +78,12 @@ def write_navigation(
     if navigation.leap_seconds is not None:
         head.append(header_line(f"{navigation.leap_seconds:6d}", "LEAP SECONDS"))
     head.append(header_line("", "END OF HEADER"))
-    body = np.concatenate([_kepler_text(kepler), _glonass_text(glonass)])
+    texts = [np.empty(0, dtype="<U1")]
+    if len(kepler):
+        texts.append(_records(kepler.satellite, *_kepler_fields(kepler)))
+    if len(glonass):
+        texts.append(_records(glonass.satellite, *_glonass_fields(glonass)))
+    body = np.concatenate(texts)
     if version != "3.04":
         titles = [f"> EPH {s} {m}\n" for s, m in zip(kepler.satellite.tolist(), kepler.message.tolist(), strict=True)]
         titles += [f"> EPH {s} FDMA\n" for s in glonass.satellite.tolist()]
@@ -99,10 +100,7 @@ def write_navigation(
 
 
 def with_written_messages(navigation: Navigation) -> tuple[Navigation, dict[str, int]]:
-    """Return the records of messages that can be written, and the number of the others by constellation and message.
-
-    CNAV and CNV have numbers that `Navigation` does not keep.
-    """
+    """Return the records that can be written, and counts of the others (CNAV, CNV) by constellation and message."""
     kepler = navigation.kepler
     kept = np.isin(kepler.message, _WRITTEN)
     kinds = zip(kepler.satellite[~kept].tolist(), kepler.message[~kept].tolist(), strict=True)
@@ -131,10 +129,7 @@ def _field(values: Floats) -> Strings:
 
 
 def _records(satellite: Strings, time: Datetimes, fields: Sequence[Floats]) -> Strings:
-    """Format records: satellite, time, three clock fields, then four fields a line.
-
-    Blank fields at the end of a line are omitted, as receivers do.
-    """
+    """Format records: satellite, time, three clock fields, then four a line, blank ones at its end omitted."""
     text = np.char.add(satellite, _calendar_text(time))
     for i, values in enumerate(fields):
         if i >= 3 and i % 4 == 3:
@@ -163,13 +158,6 @@ def glonass_numbers(records: GlonassRecords) -> Iterator[tuple[str, np.datetime6
     toe, fields = _glonass_fields(records)
     for satellite, time, numbers in zip(records.satellite.tolist(), toe, np.stack(fields, axis=1), strict=True):
         yield satellite, time, numbers.tolist()
-
-
-def _kepler_text(records: KeplerRecords) -> Strings:
-    if len(records) == 0:
-        return np.empty(0, dtype="<U1")
-    toc, fields = _kepler_fields(records)
-    return _records(records.satellite, toc, fields)
 
 
 def _kepler_fields(records: KeplerRecords) -> tuple[Datetimes, list[Floats]]:
@@ -218,12 +206,6 @@ def _week_and_transmission(
     start = GPS_EPOCH + (week * SECONDS_PER_WEEK).astype("timedelta64[s]")
     sent = seconds(records.transmitted + shift - start)
     return own.astype(np.float64), np.where(np.isnan(sent), UNKNOWN_TRANSMISSION_S, sent)
-
-
-def _glonass_text(records: GlonassRecords) -> Strings:
-    if len(records) == 0:
-        return np.empty(0, dtype="<U1")
-    return _records(records.satellite, *_glonass_fields(records))
 
 
 def _glonass_fields(records: GlonassRecords) -> tuple[Datetimes, list[Floats]]:

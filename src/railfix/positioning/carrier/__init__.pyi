@@ -1,6 +1,6 @@
 # The names of `railfix.positioning.carrier`, imported at their first use (lazy-loader).
 
-from .ambiguities import ArcAmbiguities, PhaseLimits, PhasePositions, repeats_of
+from .ambiguities import ArcAmbiguities, Fixed, PhaseLimits, PhasePositions, fix_integers, repeats_of
 from .continuity import (
     ArcState,
     ContinuityLimits,
@@ -12,8 +12,7 @@ from .continuity import (
     track_jumps,
 )
 from .filtered import PhaseState, phase_positions
-from .integers import Fixed, IntegerChannels, fix_integers
-from .observation_model import Phases, corrected_phase_m
+from .observation_model import IntegerChannels, Phases, corrected_phase_m
 from .slips import CycleSlipLimits, CycleSlipState, SlipReason, Slips, find_slips
 from .smoothing import SmoothedCodes, SmoothingLimits, SmoothingState, smooth_codes
 

@@ -1,11 +1,9 @@
-"""Positions along the line from code and phase over a run of epochs: one least squares.
+"""Positions along the line from code and phase over a run of epochs (P4 with the map's constraint), integers fixed.
 
-P4's observation model with the map's constraint: the unknowns are the distance and the clocks of every
-epoch and one ambiguity per arc of phase. The unknowns of the epochs are eliminated: the
-normal matrix has one row per arc, whatever the number of epochs.
-
-`phase_positions` in `filtered` uses each epoch and those before it. The tests compare it with one least
-squares over all epochs of a run (`tests/helpers/phase_run.py`).
+The unknowns of the epochs (distance and clocks) are eliminated: the normal matrix has one row per arc of phase.
+Integers are fixed where the risk that they are wrong is bounded, by Bayes' rule: each vector with the density of the
+float ambiguities around it, against all others and against phases that are no whole cycles (multipath, half cycles), of
+prior probability `PhaseLimits.no_integer_prior` and uniform density.
 """
 
 from __future__ import annotations
@@ -16,20 +14,15 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.settings import Settings
 from railfix.core.timescale import GPS_EPOCH, seconds
-from railfix.positioning.carrier.observation_model import (
-    Linearised,
-    OwnUnknowns,
-    PhaseClocks,
-    Phases,
-)
+from railfix.positioning.carrier.observation_model import IntegerChannels, Linearised, OwnUnknowns, PhaseClocks, Phases
 from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.standstill_phase import IntegerSearch
 from railfix.track.trajectory import Trajectory
 
-#: Sigma of an ambiguity against its first value [m]: loose prior for conditioning.
-FREE_AMBIGUITY_M: Final = 1e4
+FREE_AMBIGUITY_M: Final = 1e4  #: Sigma of an ambiguity against its first value [m]: loose prior for conditioning.
 
 
 class PhaseLimits(Settings):
@@ -86,8 +79,7 @@ class ArcAmbiguities:
 class PhasePositions:
     """Positions along the line from code and phase, T epochs by M channels."""
 
-    #: Along the trajectory, within its ends; NaN without an initial position, or where the satellites do not determine
-    #: it; shape (T,).
+    #: Along the trajectory, within its ends; NaN without an initial position or enough satellites; shape (T,).
     arc_m: Floats
     #: Standard deviation with the map's error, and of noise alone; shape (T,).
     sigma_m: Floats
@@ -103,8 +95,7 @@ class PhasePositions:
     n_codes: Integers
     n_phases: Integers
     n_fixed: Integers  #: Differences of ambiguities fixed to whole cycles, shape (T,).
-    #: Probability that one of these is wrong, or of the best candidates where none is fixed; NaN without any; shape
-    #: (T,).
+    #: Probability that one of these is wrong, or of the best candidates; NaN without any; shape (T,).
     integer_risk: Floats
     #: All arcs of a run, or those alive after the last epoch (`phase_positions`); None in results, row by row.
     arcs: ArcAmbiguities | None
@@ -112,14 +103,10 @@ class PhasePositions:
     iterations: int
 
 
-def startable(ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Floats) -> tuple[Ranges, Phases, Floats]:
-    """Ranges, phases and positions to start from: epochs without a position have no weight and distance 0.
-
-    Raises
-    ------
-    ValueError
-        Shapes differ, or a used phase has no arc.
-    """
+def prepare_start(
+    ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Floats
+) -> tuple[Ranges, Phases, Floats]:
+    """Return ranges, phases and positions to start from; epochs without a position have no weight and arc 0."""
     shape = ranges.code_m.shape
     if phases.phase_m.shape != shape or phases.weight.shape != shape or phases.arc_id.shape != shape:
         raise ValueError(f"phases have shape {phases.phase_m.shape}, expected that of the ranges {shape}")
@@ -142,9 +129,8 @@ def startable(ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Flo
 def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
     """Inverse of normal matrices of ambiguities, shape (..., A, A).
 
-    With a clock of the phases' own a constant common to all ambiguities is unobservable. It is fixed
-    by the condition that the `held` ones (1, others 0; shape (..., A)) have zero mean, which changes no
-    difference between them and loses no digits.
+    A constant common to all, unobservable beside a clock of the phases' own, is fixed by a zero mean of the `held` ones
+    (1, others 0; shape (..., A)), which changes no difference between them.
     """
     size = matrix.shape[-1]
     count = np.maximum(held.sum(axis=-1), 1.0)
@@ -159,7 +145,7 @@ def moved(arc_m: Floats, own: OwnUnknowns, trajectory: Trajectory) -> Floats:
     return np.asarray(np.clip(arc_m + own.step_m, 0.0, trajectory.arc_m[-1]))
 
 
-def assembled(
+def assemble_positions(
     arc_m: Floats,
     started: Masks,
     own: OwnUnknowns,
@@ -187,4 +173,117 @@ def assembled(
         integer_risk=np.where(has, fixes[1], np.nan),
         arcs=arcs,
         iterations=limits.passes,
+    )
+
+
+_VECTORS: Final = 12  #: Vectors compared.
+#: Shares of the differences, those of the strongest phases, that are tried one after the other.
+_SHARES: Final = (1.0, 0.75, 0.5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fixed:
+    """Ambiguities of A arcs with those differences fixed that are certain enough."""
+
+    value_m: Floats  #: Ambiguities, and their responses to a map 1 m off across and in height; shape (A, 3).
+    covariance_m2: Floats  #: Of noise alone, shape (A, A).
+    count: int  #: Differences fixed; 0: the float ambiguities are returned.
+    #: Probability that one of them is wrong, or of the best ones where none is fixed; NaN without any difference.
+    risk: float
+
+
+def fix_integers(
+    value_m: Floats,
+    covariance_m2: Floats,
+    strength: Floats,
+    channels: IntegerChannels,
+    map_sigma_m: tuple[float, float],
+    *,
+    largest_risk: float,
+    no_integer_prior: float,
+) -> Fixed:
+    """Fix differences of float ambiguities to whole cycles.
+
+    Parameters
+    ----------
+    value_m : ndarray, shape (A, 3) [m]
+        Float ambiguities, and their responses to a map 1 m off across and in height.
+    covariance_m2 : ndarray, shape (A, A) [m^2]
+        Of noise alone.
+    strength : ndarray, shape (A,)
+        Weight of each phase: the strongest of a group is what the others are differenced with.
+    channels : IntegerChannels
+        Of the A arcs.
+    map_sigma_m : tuple of float
+        Standard deviation of the map across and in height [m].
+    largest_risk, no_integer_prior : float
+        See `PhaseLimits`.
+    """
+    first, second = _differences(strength, channels.group)
+    best = Fixed(value_m=value_m, covariance_m2=covariance_m2, count=0, risk=float("nan"))
+    count = len(first)
+    for size in dict.fromkeys(max(2, int(np.ceil(share * count))) for share in _SHARES):
+        if size > count:
+            break
+        kept = slice(0, size)
+        fixed = _fix(
+            (value_m, covariance_m2), (first[kept], second[kept]), channels.wavelength_m[first[kept]],
+            np.array(map_sigma_m), no_integer_prior,
+        )  # fmt: skip
+        if fixed is None:
+            continue
+        if fixed.risk <= largest_risk:
+            return fixed
+        best = Fixed(value_m=value_m, covariance_m2=covariance_m2, count=0, risk=float(np.fmin(best.risk, fixed.risk)))
+    return best
+
+
+def _differences(strength: Floats, group: Integers) -> tuple[Indices, Indices]:
+    """Return arcs and those that they are differenced with, the strongest first."""
+    first, second = [], []
+    for each in np.unique(group[group >= 0]).tolist():
+        own = np.flatnonzero(group == each)
+        own = own[np.argsort(-strength[own], kind="stable")]
+        first += own[1:].tolist()
+        second += [int(own[0])] * (len(own) - 1)
+    order = np.argsort(-strength[first], kind="stable") if first else np.empty(0, dtype=np.intp)
+    return np.array(first, dtype=np.intp)[order], np.array(second, dtype=np.intp)[order]
+
+
+def _fix(
+    ambiguities: tuple[Floats, Floats],
+    pairs: tuple[Indices, Indices],
+    wavelength_m: Floats,
+    map_sigma_m: Floats,
+    no_integer_prior: float,
+) -> Fixed | None:
+    """Fix all differences of some pairs to the most probable integers; None where their covariance is singular."""
+    value, noise = ambiguities
+    rows = np.arange(len(wavelength_m))
+    design = np.zeros((len(rows), len(value)))
+    design[rows, pairs[0]], design[rows, pairs[1]] = 1.0 / wavelength_m, -1.0 / wavelength_m
+    by_map = value[:, 1:] * map_sigma_m
+    cross = (noise + by_map @ by_map.T) @ design.T
+    covariance = design @ cross
+    covariance = 0.5 * (covariance + covariance.T)
+    cycles = design @ value[:, 0]
+    try:
+        integers, squares = IntegerSearch(covariance).nearest(cycles, _VECTORS)
+        gain = np.linalg.solve(covariance, cross.T).T
+    except np.linalg.LinAlgError:
+        return None
+    log_density = -0.5 * (squares + np.linalg.slogdet(2.0 * np.pi * covariance)[1])
+    peak = max(float(log_density[0]), 0.0)
+    weight = (1.0 - no_integer_prior) * np.exp(log_density - peak)
+    # A density of one a cycle: phases that are no whole cycles.
+    others = weight[1:].sum() + no_integer_prior * np.exp(-peak)
+    step = np.zeros((len(rows), 3))
+    step[:, 0] = cycles - integers[0]
+    step[:, 1:] = design @ value[:, 1:]
+    keep = np.eye(len(value)) - gain @ design
+    return Fixed(
+        value_m=value - gain @ step,
+        covariance_m2=keep @ noise @ keep.T,
+        count=len(rows),
+        risk=float(others / (weight[0] + others)),
     )

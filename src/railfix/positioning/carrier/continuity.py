@@ -1,14 +1,8 @@
-"""Phase jumps detected on the line from the change of the phases between two epochs.
+"""Phase jumps on the line from the change of the phases between two epochs, and numbers of arcs without a slip.
 
-Between two epochs the unknowns are the distance moved along a known line and the change of the clock;
-every further satellite is a check, precise to a centimetre at any rate of the log and
-without Dopplers. Where they disagree, the worst channels are rejected one by one until the others agree, and
-channels that then fit are accepted again.
-
-Numbers of phase arcs without a cycle slip.
-
-The number of an arc is unique in a run: the channel's five letters and the count of
-arcs of that channel so far. It does not depend on chunks or on the order of channels.
+Between two epochs the unknowns are the distance moved along a known line and the change of the clock; every further
+satellite is a check, precise to a centimetre. Where they disagree, the worst channels are rejected one by one until the
+others agree. The number of an arc, unique in a run, is the channel's five letters and its count of arcs so far.
 """
 
 from __future__ import annotations
@@ -26,13 +20,10 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.track.trajectory import Trajectory
 
-#: Bits of the count in an arc's number; the channel's letters are above them.
-COUNT_BITS: Final = 23
-#: No phase, no arc.
-NO_ARC: Final = -1
+COUNT_BITS: Final = 23  #: Bits of the count in an arc's number; the channel's letters are above them.
+NO_ARC: Final = -1  #: No phase, no arc.
 
-#: Satellite and signal of each channel.
-ChannelKeys = tuple[tuple[str, str], ...]
+ChannelKeys = tuple[tuple[str, str], ...]  #: Satellite and signal of each channel.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,20 +44,13 @@ def channel_keys(satellite: Strings, signal: Strings) -> ChannelKeys:
 
 
 def rows_before(before: ChannelKeys, now: ChannelKeys) -> Indices:
-    """Row of each channel among those of the epoch before, -1 for new ones, shape (M,).
-
-    Values of a state with one more for new channels at the end, ``np.append(values, np.nan)``, are indexed with it.
-    """
+    """Return the row of each channel in the epoch before, shape (M,); -1, the NaN appended to values, for new ones."""
     row = {key: i for i, key in enumerate(before)}
     return np.array([row.get(key, -1) for key in now], dtype=np.intp)
 
 
 def number_arcs(
-    slip: Masks,
-    has_phase: Masks,
-    satellite: Strings,
-    signal: Strings,
-    state: ArcState | None = None,
+    slip: Masks, has_phase: Masks, satellite: Strings, signal: Strings, state: ArcState | None = None
 ) -> tuple[Integers, ArcState]:
     """Number of the arc of each phase.
 
@@ -238,10 +222,9 @@ def _around(sats: Floats, trajectory: Trajectory, arc: Floats) -> tuple[Floats, 
 def _consistent(
     design: Floats, change: Floats, judged: Masks, sigma: Floats, aside: Floats, limits: ContinuityLimits
 ) -> tuple[Masks, Floats, Floats, Floats, Masks]:
-    """Channels that agree after the worst are rejected one by one.
+    """Reject the worst channels one by one until the rest agrees; with nothing to check with, all are kept.
 
-    Returns the mask of those kept, residuals of all, step along the line with its variance, and
-    where the rest agrees. Where there is nothing to check with, all are kept.
+    Returns the mask of those kept, residuals of all, step along the line, its variance, and where the rest agrees.
     """
     design = np.where(judged[..., None], design, 0.0)
     change = np.where(judged, change, 0.0)

@@ -1,9 +1,8 @@
 """Positions along the line from code and phase, each epoch from the past alone.
 
-The normal matrix of the running arcs' ambiguities is what one epoch leaves to the next; each epoch
-adds its information, and at multiples of a hop the ambiguities walk a little. Ambiguities of ended
-arcs are eliminated. So the state is as small as there are channels, a live epoch costs the same
-however long the run, and any cutting into chunks gives the same.
+The normal matrix of the running arcs' ambiguities is what one epoch leaves to the next; at multiples of a hop the
+ambiguities walk a little. Ambiguities of ended arcs are eliminated, so that the state is as small as there are
+channels.
 """
 
 from __future__ import annotations
@@ -20,29 +19,29 @@ from railfix.positioning.carrier.ambiguities import (
     ArcAmbiguities,
     PhaseLimits,
     PhasePositions,
-    assembled,
+    assemble_positions,
+    fix_integers,
     hop_of,
     inverse_of_arcs,
     moved,
+    prepare_start,
     repeats_of,
-    startable,
 )
 from railfix.positioning.carrier.continuity import channel_of
-from railfix.positioning.carrier.integers import IntegerChannels, fix_integers
 from railfix.positioning.carrier.observation_model import (
+    IntegerChannels,
     Linearised,
     Phases,
     linearise,
     own_clock,
     own_unknowns,
     reduce,
-    shifted,
+    shift_phases,
 )
 from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
 
-#: Epochs computed together: what bounds the memory.
-SEGMENT_EPOCHS: Final = 64
+SEGMENT_EPOCHS: Final = 64  #: Epochs computed together: what bounds the memory.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +101,7 @@ def phase_positions(
     if len(memories) != limits.passes:
         raise ValueError(f"the state has {len(memories)} passes, the limits ask for {limits.passes}")
     started = np.isfinite(arc_m_start)
-    ranges, phases, arc = startable(ranges, phases, trajectory, arc_m_start)
+    ranges, phases, arc = prepare_start(ranges, phases, trajectory, arc_m_start)
     cuts = _cuts(hop_of(time, limits), phases)
     integers, phases = phases.integers, replace(phases, integers=None)  # the last pass fixes
     after: list[Memory] = []
@@ -133,10 +132,7 @@ class _Inputs:
 
 
 def _cuts(hop: Integers, phases: Phases) -> list[Indices]:
-    """Epochs of segments: inside a hop, and with not many more arcs than channels.
-
-    Where else the cuts lie changes nothing but rounding: ending an arc early or late is the same.
-    """
+    """Cut epochs into segments inside a hop, with not many more arcs than channels."""
     epochs, channels = phases.arc_id.shape
     new = np.ones((epochs, channels), dtype=bool)
     new[1:] = phases.arc_id[1:] != phases.arc_id[:-1]
@@ -168,7 +164,7 @@ def _segment(
     index = np.full(used.shape, count, dtype=np.intp)
     index[used] = place[column]
     base = np.append(memory.first_m, 0.0)
-    lin = shifted(lin, base[index])
+    lin = shift_phases(lin, base[index])
 
     matrix, right, kept = _accumulate(lin, index, memory)
     row = np.arange(len(matrix))[:, None]
@@ -197,12 +193,10 @@ def _segment(
     last, end = floats
     running = np.isin(memory.arc_id, left.arc_id)
     arcs = ArcAmbiguities(
-        arc_id=left.arc_id,
-        ambiguity_m=(memory.first_m + end)[running],
-        covariance_m2=last[np.ix_(running, running)],
+        arc_id=left.arc_id, ambiguity_m=(memory.first_m + end)[running], covariance_m2=last[np.ix_(running, running)]
     )
     ambiguity = (base[index] + value[row, index, 0], covariance[row, index, index])
-    piece = assembled(arc, inputs.started, own, lin, ambiguity, arcs, fixes, limits)
+    piece = assemble_positions(arc, inputs.started, own, lin, ambiguity, arcs, fixes, limits)
     return piece, arc, left
 
 

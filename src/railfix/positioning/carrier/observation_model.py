@@ -5,18 +5,11 @@ Per epoch t and channel i, around a place on the line::
     code  - range = -u.e d + (-u.c m1 - u.h m2) + b_g
     phase - range = -u.e d + (-u.c m1 - u.h m2) + b   + N_arc
 
-with d along the section, m1 and m2 the map's error across the track and in height (prior: the
-map's sigmas), b_g the receiver clock of the constellation. P4 writes the same clock for code and
-phase, b = b_g (`clocks="shared"`). Telephones do not keep that: the codes of all satellites jump
-against the phases by tens of metres from epoch to epoch. A clock of the phases' own, one for all
-constellations because constants between them are part of the N, costs one unknown an epoch and
-leaves the N known up to a constant common to all. Only the N are common to epochs: with
-``L`` the normal matrix of an epoch's own unknowns and ``C`` what couples them to the N, the epoch
-adds ``diag(w) - C^T L^-1 C`` to the normal matrix of the N (Schur complement).
-
-The ionosphere delays the code and advances the phase (P4's signs). Corrected ranges and phases
-have the model's delay taken off with either sign; what the model misses is taken up by N at the
-arc's begin and drifts by twice its change from there on.
+with d along the section, m1 and m2 the map's error across the track and in height, b_g the clock of the constellation.
+P4 writes b = b_g (`clocks="shared"`); telephones do not keep that, and a clock of the phases' own leaves the N known up
+to a constant common to all. With ``L`` the normal matrix of an epoch's own unknowns and ``C`` what couples them to the
+N, the epoch adds ``diag(w) - C^T L^-1 C`` to the normal matrix of the N (Schur complement). What the ionosphere's model
+misses is taken up by N at the arc's begin and drifts by twice its change.
 """
 
 from __future__ import annotations
@@ -28,32 +21,33 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.geodesy import range_with_rotation
-from railfix.positioning.carrier.integers import IntegerChannels
 from railfix.positioning.normal_equations import ClockTies, Ranges
 from railfix.track.trajectory import Trajectory
 
 PhaseClocks = Literal["own", "shared"]
 
-#: Own unknowns of an epoch before the clocks: along, across, up.
-PLACE: Final = 3
-#: Sigma of an unknown without any information [m]: loose prior for conditioning.
-_FREE_M: Final = 1e5
-#: Least sigma of a tie between clocks [m].
-_LEAST_TIE_M: Final = 1e-2
+PLACE: Final = 3  #: Own unknowns of an epoch before the clocks: along, across, up.
+_FREE_M: Final = 1e5  #: Sigma of an unknown without any information [m]: loose prior for conditioning.
+_LEAST_TIE_M: Final = 1e-2  #: Least sigma of a tie between clocks [m].
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntegerChannels:
+    """Which channels have ambiguities that differ by whole cycles."""
+
+    wavelength_m: Floats  #: Shape (M,).
+    group: Integers  #: The same for channels of one clock and signal; -1 for those without integers; shape (M,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class Phases:
     """Corrected phases of an antenna beside its `Ranges`: T epochs by M channels."""
 
-    #: Phase times wavelength, corrected like the code: + satellite clock - troposphere + ionosphere
-    #: (`corrected_phase_m`); any value where the weight is 0; shape (T, M).
+    #: Phase times wavelength, corrected like the code (`corrected_phase_m`); any value where the weight is 0; (T, M).
     phase_m: Floats
-    #: 1/sigma^2, 0 for what is not used. Where it is not 0, `Ranges.sat_ecef_m` must be the satellite, whether its code
-    #: is used or not; shape (T, M) [1/m^2].
+    #: 1/sigma^2, 0 for what is not used; else `Ranges.sat_ecef_m` is the satellite; shape (T, M) [1/m^2].
     weight: Floats
-    #: The same number along an unbroken stretch of one channel's phase, and nowhere else (`arcs.number_arcs`); shape
-    #: (T, M).
+    #: The same number along an unbroken stretch of one channel's phase, and nowhere else; shape (T, M).
     arc_id: Integers
     integers: IntegerChannels | None = None  #: None leaves all ambiguities real numbers.
 
@@ -105,17 +99,7 @@ class Linearised:
 def linearise(
     ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Floats, *, clocks: PhaseClocks = "own"
 ) -> Linearised:
-    """Observation equations around places on the line.
-
-    Parameters
-    ----------
-    ranges : Ranges
-        T epochs.
-    arc_m : ndarray, shape (T,) [m]
-        Finite and on the line.
-    clocks : {"own", "shared"}
-        Whether phases have a clock of their own or that of the codes of their constellation.
-    """
+    """Linearise the observation equations around places on the line, finite, shape (T,) [m]."""
     section, along = trajectory.segment_at(arc_m)
     place = trajectory.ecef_m[section] + along[:, None] * trajectory.tangent[section]
     distance, los = range_with_rotation(ranges.sat_ecef_m, place[:, None, :])
@@ -173,10 +157,7 @@ def _level(values: Floats, weight: Floats) -> tuple[Floats, Floats]:
 
 
 def _ties(ties: ClockTies) -> tuple[Floats, Floats]:
-    """Return matrix and right-hand side of the known clock offsets, a common clock eliminated.
-
-    The first value of the clocks, the same for all groups, does not show in these differences.
-    """
+    """Return matrix and right-hand side of the known clock offsets, a common clock eliminated."""
     mass = 1.0 / np.maximum(ties.sigma_m, _LEAST_TIE_M) ** 2
     share = mass / mass.sum(axis=1, keepdims=True)
     matrix = mass[:, :, None] * (np.eye(mass.shape[1]) - share[:, None, :])
@@ -188,11 +169,8 @@ def own_clock(lin: Linearised) -> bool:
     return bool(lin.phase_design.shape[-1] > PLACE + lin.groups)
 
 
-def shifted(lin: Linearised, first_m: Floats) -> Linearised:
-    """The same with first values of the ambiguities taken off the phases, shape (T, M).
-
-    What is left in common (a clock of their own, milliseconds off) is taken off too.
-    """
+def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
+    """Take first values of the ambiguities (T, M), and what is left in common, off the phases."""
     phase = np.where(lin.phase_weight > 0, lin.phase_m - first_m, 0.0)
     clock = np.zeros(len(phase))
     if own_clock(lin):
@@ -250,20 +228,11 @@ class OwnUnknowns:
 def own_unknowns(
     lin: Linearised, ambiguity_m: Floats, covariance_m2: Floats, trajectory: Trajectory, *, repeats: Floats
 ) -> OwnUnknowns:
-    """Back-substitution of each epoch.
+    """Solve for each epoch's own unknowns by back-substitution.
 
-    The map is off by the same over a run: that does not average, unlike what the estimator assumes
-    (independent from epoch to epoch, so that phases cannot claim more than the map is good for).
-    The sigma therefore takes the response of the position to a map that is off at all epochs
-    together, in place of the share that an epoch alone has.
-
-    Parameters
-    ----------
-    ambiguity_m : ndarray, shape (T, M, 3) [m]
-        Of each channel, and its response to a map 1 m off across and in height.
-    covariance_m2 : ndarray, shape (T, M, M) [m^2]
-    repeats : ndarray, shape (T,)
-        Epochs with the same code errors: the ambiguities' variance is larger by that.
+    `ambiguity_m`, shape (T, M, 3), is of each channel, and its response to a map 1 m off across and in height. A map
+    off by the same over a run does not average, so the sigma takes that response in place of an epoch's share.
+    `repeats`, shape (T,): epochs with the same code errors, by which the ambiguities' variance is larger.
     """
     used = lin.phase_weight > 0
     known = np.where(used[..., None], ambiguity_m, 0.0)

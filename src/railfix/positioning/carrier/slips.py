@@ -1,14 +1,9 @@
 """Where the phase of a channel cannot be joined to the epoch before: cycle slips and gaps.
 
-Each epoch is judged against the one just before it. The phase's change is compared with what the
-mean of the two Dopplers gives, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``; where
-that cannot judge, with the change of the code. What is common to the channels is the receiver's
-clock and is taken off as their median, so that a clock step is no slip.
-
-Assumptions on a clock step: it is common to all channels of an epoch; codes follow the time
-tags (a RINEX pseudorange is tag less transmit time), so that the true interval is the tags' less
-the step seen in the codes; phases either step with the codes or run on, and a difference between
-the two is a whole number of milliseconds, which `Slips.phase_m` adds to the phases.
+The phase's change is compared with the Dopplers, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``, else with
+the change of the code, less the median of the channels, so that a clock step is no slip. A clock step is common to all
+channels of an epoch; codes follow the time tags, so that the true interval is the tags' less the step seen in the
+codes; phases step with the codes or run on, then by whole milliseconds, which `Slips.phase_m` adds.
 """
 
 from __future__ import annotations
@@ -24,16 +19,14 @@ from railfix.core.arrays import Floats, Integers, Masks, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
-from railfix.gnss.observations import Observations
-from railfix.gnss.signals import carrier_frequency_hz
+from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, rows_before
 
 #: One millisecond as a distance [m]: the step of receivers that keep their clock near GPS time.
 MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT
 #: A common change of the codes from which on the interval is corrected for it [m]; below, it is noise.
 _CLOCK_STEP_M: Final = 1e4
-#: Channels needed for a median to stand for the clock.
-_COMMON: Final = 3
+_COMMON: Final = 3  #: Channels needed for a median to stand for the clock.
 
 
 class SlipReason(IntFlag):
@@ -223,22 +216,10 @@ def find_slips(
 def slip_metrics(
     dt: Floats, code_m: Floats, phase_m: Floats, range_mps: Floats
 ) -> tuple[Floats, Integers, Floats, Floats]:
-    """Clock step of the codes, its whole milliseconds that phases lack, and the metrics of both tests.
+    """Compute the clock step of the codes [m], its whole milliseconds that phases lack, and the metrics of both tests.
 
-    Parameters
-    ----------
-    dt : ndarray, shape (T,) [s]
-        Since the epoch before.
-    code_m, phase_m : ndarray, shape (T, M) [m]
-        Changes since then.
-    range_mps : ndarray, shape (T, M) [m/s]
-        Range rate by the Dopplers.
-
-    Returns
-    -------
-    step_m : ndarray, shape (T,) [m]
-    lag_ms : ndarray of int, shape (T,)
-    doppler_metric_m, code_metric_m : ndarray, shape (T, M) [m]
+    `dt`, shape (T,), is the time since the epoch before; `code_m` and `phase_m`, shape (T, M), are changes since then,
+    `range_mps` the range rate by the Dopplers.
     """
     moved = np.where(np.isnan(range_mps), 0.0, range_mps) * dt[:, None]
     step = median_or_zero(code_m - moved)

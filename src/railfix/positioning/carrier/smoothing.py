@@ -1,11 +1,7 @@
-"""Carrier-smoothed codes (Hatch filter): the simple use of the phase.
+"""Carrier-smoothed codes (Hatch filter).
 
-Code less phase is constant along an arc, but for noise and for the ionosphere, which delays the
-code as much as it advances the phase: it drifts by twice the change of the delay. Its mean over
-the arc so far, put back on the phase, is a code with less noise. The window's end limits the
-drift: with the delay changing at 1 mm/s a window of 100 s leaves up to 0.2 m.
-
-Linear recursions along time without a loop over epochs.
+The mean of code less phase over the arc so far, put back on the phase, is a code with less noise. The ionosphere makes
+it drift by twice the change of its delay, which the window limits: at 1 mm/s one of 100 s leaves up to 0.2 m.
 """
 
 from __future__ import annotations
@@ -25,8 +21,7 @@ from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, ro
 def linear_recursion(gain: Floats, drive: Floats) -> Floats:
     """``x_k = gain_k x_{k-1} + drive_k`` along axis 0 with x_{-1} = 0, without a loop over epochs.
 
-    Pairs (gain, drive) are composed over strides of 1, 2, 4, ...: log2(T) passes over the arrays.
-    No division and no growing product: gains in [0, 1] make it as stable as the recursion itself.
+    Pairs (gain, drive) are composed over strides of 1, 2, 4, ...; gains in [0, 1] are stable.
     """
     total, factor = drive.copy(), gain.copy()  # gains may have fewer elements, those of `drive` broadcast
     stride = 1

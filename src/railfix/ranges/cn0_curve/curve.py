@@ -1,32 +1,9 @@
 """Mean C/N0 over elevation of one antenna and receiver, from a day of open sky (P1 2.3(1), figure 3).
 
-The curve belongs to the pair of antenna and receiver: the antenna pattern gives its shape, and each type of
-receiver estimates C/N0 differently. It is fitted per constellation and signal; satellites of BeiDou and QZSS
-fly in two kinds of orbits with different transmit power, which have curves of their own.
-
-Of each bin of elevation the mean is taken without outliers (beyond three robust standard deviations
-from the median). Between the middles of the bins the curve runs by monotone cubic interpolation
-(PCHIP): it never goes beyond the means on either side. Above the highest bin the last mean holds;
-below the lowest bin there is no curve.
-
-The file of a C/N0 curve: TOML that a person can read and check.
-
-::
-
-    format = "railfix C/N0 curve 1"
-
-    [source]
-    antenna = "NOV703GGG.R2    NONE"
-    receiver = "JAVAD TRE_G3T DELTA"
-    ...
-
-    [[curve]]
-    kind = "G"
-    signal = "1C"
-    elevation_deg = [2.5, 7.5, 12.5]
-    mean_dbhz = [33.1, 36.42, 38.9]
-    spread_db = [2.1, 1.71, 1.4]
-    count = [812, 1204, 1377]
+It is fitted per constellation and signal; satellites of BeiDou and QZSS fly in two kinds of orbits with curves of their
+own. Of each bin of elevation the mean is taken without outliers (beyond three robust standard deviations from the
+median). Between the middles of the bins the curve runs by monotone cubic interpolation (PCHIP). Above the highest bin
+the last mean holds; below the lowest bin there is no curve. The file is TOML.
 """
 
 from __future__ import annotations
@@ -44,9 +21,8 @@ from pydantic import Field, field_validator
 from railfix.core.arrays import Floats, Integers, Masks, Strings, read_only
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
-from railfix.core.settings import Settings, write_toml
+from railfix.core.settings import Settings, read_model_file, write_toml
 from railfix.gnss.observations import ObservationHeader
-from railfix.ranges.model_file import read_model_file
 
 if TYPE_CHECKING:
     from scipy.interpolate import PchipInterpolator
@@ -56,8 +32,7 @@ if TYPE_CHECKING:
 _NORMAL_MAD: Final = 1.482_602_218_505_602
 #: Numbers of BeiDou satellites 36 000 km above (GEO C01-C05, C59-C63; IGSO: CSNO, constellation status).
 _BEIDOU_HIGH: Final = frozenset({*range(1, 11), 13, 16, 31, 38, 39, 40, 56, *range(59, 64)})
-#: Numbers of the geostationary QZSS satellites (IS-QZSS-PNT: PRN 199, 200).
-_QZSS_GEO: Final = frozenset({7, 8})
+_QZSS_GEO: Final = frozenset({7, 8})  #: Numbers of the geostationary QZSS satellites (IS-QZSS-PNT: PRN 199, 200).
 
 #: Kinds of satellites of one transmit power, and their names.
 KINDS: Final[dict[str, str]] = {

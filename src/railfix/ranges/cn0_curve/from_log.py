@@ -29,16 +29,13 @@ from railfix.ranges.cn0_curve.curve import (
     fit_cn0_curve,
 )
 
-#: P1 2.3(1) asks for about a day; below this a note is made [s].
-_SHORT_S: Final = 12 * 3600.0
-#: P1 table 6: signals this far below the mean are rejected [dB-Hz].
-_DEFICIT_DBHZ: Final = 10.0
+_SHORT_S: Final = 12 * 3600.0  #: P1 2.3(1) asks for about a day; below this a note is made [s].
+_DEFICIT_DBHZ: Final = 10.0  #: P1 table 6: signals this far below the mean are rejected [dB-Hz].
 #: Lowest elevation of that check [deg], and the share of rejected samples of the calibration that gives a note.
 _CHECKED_FROM_DEG, _REJECTED_SHARE = 15.0, 0.01
 #: Elevation below which a satellite cannot be received: the position of the antenna is wrong [deg].
 _BELOW_DEG: Final = -5.0
-#: Share of satellites below the horizon that faulty navigation records may cause.
-_BELOW_SHARE: Final = 0.05
+_BELOW_SHARE: Final = 0.05  #: Share of satellites below the horizon that faulty navigation records may cause.
 
 
 @dataclass(frozen=True, kw_only=True)

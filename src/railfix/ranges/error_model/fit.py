@@ -1,14 +1,9 @@
-"""Error model from samples: bins, pooling where they are thin, statistics.
+"""Error model from samples: bins, pooling where they are thin, statistics; and the rate of local faults on a line.
 
-A normal distribution shifted by +b bounds the upper half of the errors, one shifted by -b the lower
-half: whatever probability one asks for, the bound's quantile lies further out than the sample's
-(CDF overbounding, B. DeCleene, Defining pseudorange integrity: overbounding, ION GPS 2000). Sums of
-independent errors stay bounded by the summed biases and the root of the summed squared sigmas as long
-as the distribution after the shift is symmetric and has one peak (the two-step method of J. Blanch, T.
-Walter, P. Enge, Gaussian bounds of sample distributions for integrity analysis, IEEE Trans. Aerospace
-and Electronic Systems 55(4), 2019, doi:10.1109/TAES.2018.2876583). Neither can be proven from samples.
-
-Local faults on a line: ranges beyond a bound in sigmas of the protection level; their rate, sides and places.
+A normal distribution shifted by +b bounds the upper half of the errors, one shifted by -b the lower half (CDF
+overbounding, B. DeCleene, ION GPS 2000). Sums of independent errors stay bounded as long as the distribution after the
+shift is symmetric and has one peak (the two-step method of J. Blanch, T. Walter, P. Enge, 2019,
+doi:10.1109/TAES.2018.2876583). Neither can be proven from samples.
 """
 
 from __future__ import annotations
@@ -25,8 +20,7 @@ from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.settings import Settings, option
 from railfix.ranges.error_model.model import POOLED, BinStatistics, ErrorBins, ErrorModel, FaultRate
 
-#: Standard scores from which on a sample belongs to the tail, which alone sets sigma.
-TAIL_SCORE: Final = 1.0
+TAIL_SCORE: Final = 1.0  #: Standard scores from which on a sample belongs to the tail, which alone sets sigma.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +112,7 @@ def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStat
     error, block, index = samples.error_m[kept], samples.block[kept], index[kept]
     size = int(np.prod(bins.shape))
     count = np.bincount(index, minlength=size)
-    blocks = _distinct(index, block, size)
+    blocks = np.bincount(np.unique(np.stack([index, block]), axis=1)[0], minlength=size)  # different ones in each bin
     sets = _members(bins.shape)
     figures = np.full((4, size), np.nan)
     pooled = np.full(size, len(POOLED) - 1, dtype=np.int64)
@@ -150,12 +144,6 @@ def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStat
 
 def _rows(order: Integers, start: Integers, of_set: Integers) -> Integers:
     return np.concatenate([order[start[i] : start[i + 1]] for i in of_set.tolist()])
-
-
-def _distinct(index: Integers, block: Integers, size: int) -> Integers:
-    """Number of different blocks in each bin."""
-    pairs = np.unique(np.stack([index, block]), axis=1)
-    return np.bincount(pairs[0], minlength=size)
 
 
 def _members(shape: tuple[int, int, int]) -> tuple[Integers, ...]:

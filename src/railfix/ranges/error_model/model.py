@@ -1,31 +1,7 @@
 """Error model of pseudoranges on a railway: bias, sigma and overbound by direction and C/N0 (P1 7).
 
-The bins are elevation, azimuth relative to the car body and C/N0. P1 names elevation and azimuth; C/N0
-is the strongest predictor of multipath on recordings, so it can be a third axis.
-
-The file of an error model: TOML with the bins, the conditions, and one array of numbers a column.
-
-::
-
-    format = "railfix error model 2"
-    covers = "local"
-
-    [bins]
-    elevation_deg = [0.0, 15.0, 30.0, 45.0, 60.0, 90.0]
-    sectors = 4
-    cn0_dbhz = [0.0, 30.0, 35.0, 40.0, 45.0, 60.0]
-
-    [conditions]
-    systems = ["G", "E"]
-    codes = "raw"
-    ...
-
-    [before]
-    count = [12, ...]
-    bias_m = [1.25, ...]
-
-The bins are in the order of elevation, then sector, then C/N0. `pooled` counts into `model.POOLED`. Files of
-version 1, which described their conditions by a sentence, are rejected: make them anew.
+The bins are elevation, azimuth relative to the car body and C/N0. The file is TOML with the bins, the conditions, and
+one array of numbers a column, in the order of elevation, then sector, then C/N0. `pooled` counts into `POOLED`.
 """
 
 from __future__ import annotations
@@ -41,8 +17,7 @@ from pydantic import Field, field_validator
 from railfix.core.arrays import Floats, Integers
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
-from railfix.core.settings import Settings, option, write_toml
-from railfix.ranges.model_file import read_model_file
+from railfix.core.settings import Settings, option, read_model_file, write_toml
 
 
 class Conditions(Settings):
@@ -167,8 +142,7 @@ class ErrorModelSource(Settings):
     files: tuple[tuple[str, str], ...] = ()  #: Names and SHA-256.
 
 
-#: Measured priors above this come of too few blocks of time to leave a level.
-LARGEST_PRIOR: Final = 0.05
+LARGEST_PRIOR: Final = 0.05  #: Measured priors above this come of too few blocks of time to leave a level.
 
 
 class FaultRate(Settings):

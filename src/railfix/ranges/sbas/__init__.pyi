@@ -4,8 +4,7 @@ from .corrections import SbasCorrections, SbasState, best_prn
 from .dfmc import DfmcService
 from .files import from_receiver, read_sbas
 from .messages import SbasMessages
-from .results import IonosphereDelays, IonosphereState, SatelliteCorrections, SatelliteState
-from .standard import SbasLimits
+from .standard import IonosphereDelays, IonosphereState, SatelliteCorrections, SatelliteState, SbasLimits
 
 __all__ = [
     "DfmcService",

@@ -13,10 +13,8 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.ranges.sbas.dfmc import MASK_S, DfmcService
-from railfix.ranges.sbas.grid import GridTables
-from railfix.ranges.sbas.ionosphere import ionosphere
+from railfix.ranges.sbas.ionosphere import GridTables, ionosphere
 from railfix.ranges.sbas.messages import Band, SbasMessages
-from railfix.ranges.sbas.results import IonosphereDelays, SatelliteCorrections, SatelliteState
 from railfix.ranges.sbas.satellites import (
     FastInForce,
     Growth,
@@ -36,6 +34,9 @@ from railfix.ranges.sbas.standard import (
     OLDEST_S,
     STOP_S,
     UDRE_VARIANCE_M2,
+    IonosphereDelays,
+    SatelliteCorrections,
+    SatelliteState,
     SbasLimits,
     mask_satellite,
     system_name,
@@ -288,12 +289,7 @@ class SbasCorrections:
         return np.where(by_place[:, None], factor[:, None], along)
 
     def ionosphere(
-        self,
-        time: Datetimes,
-        latitude_deg: Floats,
-        longitude_deg: Floats,
-        elevation_deg: Floats,
-        azimuth_deg: Floats,
+        self, time: Datetimes, latitude_deg: Floats, longitude_deg: Floats, elevation_deg: Floats, azimuth_deg: Floats
     ) -> IonosphereDelays:
         """Slant delays on L1 from the grid.
 

@@ -1,9 +1,6 @@
-"""SBAS messages decoded by tables of bit fields (RTCA DO-229D, A.4.4).
+"""SBAS messages decoded by tables of bit fields (RTCA DO-229D, A.4.4), in SI units; nothing is applied here.
 
-`LAYOUTS` names the fields of each message type: first bit, length, scale, sign, and how many follow one
-another. Numbers are those of the messages in SI units; nothing is applied here and no message is compared
-with another. Every decoder returns arrays by name, all with n rows, among them `row`: the row of the
-messages that each of its own rows comes from.
+Every decoder returns arrays by name, all with n rows, among them `row`: the row of the messages that each comes from.
 """
 
 from __future__ import annotations
@@ -18,12 +15,9 @@ from railfix.core.arrays import Bytes, Datetimes, Floats, Integers, Masks
 from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta
 from railfix.ranges.sbas.messages import SbasMessages
 
-#: Arrays by the name of their field.
-Decoded = dict[str, NDArray[Any]]
-#: Satellites that a PRN mask may name; corrections are sent for its slots 0 to 50.
-SLOTS: Final = 51
-#: Slots of one message of type 2 to 5.
-BLOCK: Final = 13
+Decoded = dict[str, NDArray[Any]]  #: Arrays by the name of their field.
+SLOTS: Final = 51  #: Satellites that a PRN mask may name; corrections are sent for its slots 0 to 50.
+BLOCK: Final = 13  #: Slots of one message of type 2 to 5.
 #: Regions of one message of type 27.
 _REGIONS: Final = 5
 _DO_NOT_USE_DELAY_M: Final = 0x1FF * 0.125
@@ -60,11 +54,7 @@ LAYOUTS: Final[dict[str, Layout]] = {
         "udrei": BitField(174, 4, number=BLOCK),
     },
     "type 6": {"iodf": BitField(14, 2, number=4), "udrei": BitField(22, 4, number=SLOTS)},
-    "type 7": {
-        "latency_s": BitField(14, 4, 1.0),
-        "iodp": BitField(18, 2),
-        "indicator": BitField(22, 4, number=SLOTS),
-    },
+    "type 7": {"latency_s": BitField(14, 4, 1.0), "iodp": BitField(18, 2), "indicator": BitField(22, 4, number=SLOTS)},
     # How errors grow (table A-9).
     "type 10": {
         "range_rate_m": BitField(14, 10, 0.002),
@@ -161,19 +151,9 @@ LAYOUTS: Final[dict[str, Layout]] = {
 
 
 def read_fields(bits: Bytes, layout: Layout, offset: int = 0) -> Decoded:
-    """Fields of messages of one layout.
+    """Decode the fields of a layout from messages, shape (n, 32), whose part begins at the bit `offset`.
 
-    Parameters
-    ----------
-    bits : ndarray of uint8, shape (n, 32)
-        As in `SbasMessages.bits`.
-    offset : int
-        Bit at which the part of the message begins that the layout describes.
-
-    Returns
-    -------
-    dict of str to ndarray, shape (n,) or (n, number)
-        int64, or float64 where the field has a scale.
+    Shapes (n,) or (n, number): int64, or float64 where the field has a scale.
     """
     unpacked = np.unpackbits(np.ascontiguousarray(bits), axis=1)
 
@@ -223,10 +203,7 @@ def prn_masks(messages: SbasMessages) -> Decoded:
 
 
 def fast_corrections(messages: SbasMessages, *, type0: Literal["stop", "as_type2"]) -> Decoded:
-    """Types 2 to 5, 24, and 0 where it stands for 2 and is not empty; one row a slot.
-
-    `slot`, `prc_m`, `udrei`, `iodf`, `iodp`, all (n,).
-    """
+    """Types 2 to 5, 24, and 0 for 2, one row a slot: `slot`, `prc_m`, `udrei`, `iodf`, `iodp`, all (n,)."""
     row = rows_of(messages, 2, 3, 4, 5)
     if type0 == "as_type2":
         zero = rows_of(messages, 0)
@@ -264,11 +241,7 @@ def _join(parts: Sequence[Decoded], slot: str = "slot") -> Decoded:
 
 
 def long_term(messages: SbasMessages) -> Decoded:
-    """Both halves of type 25 and that of type 24, one row a satellite.
-
-    `slot`, `iode`, `iodp`, `velocity_code` (n,); `position_m`, `velocity_mps` (n, 3), `clock_s`, `clock_rate`
-    (n,), and `reference` (n,), the instant they hold for, NaT without velocity.
-    """
+    """Both halves of type 25 and that of type 24, one row a satellite; `reference` is NaT without velocity."""
     parts: list[Decoded] = []
     for kind, start in ((25, 14), (25, 120), (24, 120)):
         row = rows_of(messages, kind)
@@ -304,10 +277,7 @@ def grid_delays(messages: SbasMessages) -> Decoded:
 
 
 def covariance(messages: SbasMessages) -> Decoded:
-    """Both halves of type 28, one row a satellite.
-
-    `slot`, `iodp`, `scale` (n,), `factor` (n, 4, 4), upper triangular, scaled.
-    """
+    """Both halves of type 28: `slot`, `iodp`, `scale` (n,), `factor` (n, 4, 4), upper triangular, scaled."""
     decoded = decode(messages, 28)
     row, parts = decoded["row"], []
     for start in (16, 121):

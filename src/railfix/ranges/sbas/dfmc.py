@@ -25,18 +25,14 @@ from railfix.ranges.sbas.decode import UPPER, BitField, Layout, read_fields
 from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import system_name
 
-#: Satellites of one mask.
-AUGMENTED: Final = 92
-#: Of which type 35 has the first ones, type 36 the others.
-FIRST: Final = 53
-#: Indicators without a sigma: not monitored is left out of type 32, 15 is do not use.
-DO_NOT_USE: Final = 15
+AUGMENTED: Final = 92  #: Satellites of one mask.
+FIRST: Final = 53  #: Of which type 35 has the first ones, type 36 the others.
+DO_NOT_USE: Final = 15  #: Indicators without a sigma: not monitored is left out of type 32, 15 is do not use.
 #: Sigma by indicator 0 to 14: least value and step [m].
 SIGMA_LEAST_M: Final = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 4.0, 6.0)
 SIGMA_STEP_M: Final = (0.0625, 0.125, 0.125, 0.125, 0.125, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5, 0.5, 1.0, 3.0, 6.0)
 _ONE_MORE: Final = -2
-#: Constellations of type 37 in order.
-_DEGRADED: Final = ("G", "R", "E", "C", "S", "")
+_DEGRADED: Final = ("G", "R", "E", "C", "S", "")  #: Constellations of type 37 in order.
 #: A mask, and an indicator, is valid for so long [s]; type 0 stops the sender for so long.
 MASK_S, INDICATOR_S, STOP_S = 600.0, 12.0, 60.0
 

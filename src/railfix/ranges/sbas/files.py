@@ -50,13 +50,7 @@ class RawMessage:
 
 
 def kind_of_file(path: str, lines: Sequence[str]) -> str:
-    """Format by the first line that is not empty or a comment: "rtklib", "ems" or "rinex".
-
-    Raises
-    ------
-    InputFileError
-        None of them.
-    """
+    """Return the format by the first line that is not empty or a comment: "rtklib", "ems" or "rinex"."""
     for number, text in enumerate(lines, start=1):
         line = text.strip()
         if not line or line[0] in "#%":
@@ -189,8 +183,7 @@ def _instant(date: str, second: str) -> int:
     return int((start - GPS_EPOCH).astype(np.int64)) + round(value * 1e9)
 
 
-#: Digits of a message cut after its data: 226 bits, and 6 of the parity or nothing.
-_SHORT: Final = 58
+_SHORT: Final = 58  #: Digits of a message cut after its data: 226 bits, and 6 of the parity or nothing.
 
 
 @dataclass

@@ -13,8 +13,7 @@ from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, read_only
 from railfix.io.receiver.framing import crc24q
 from railfix.ranges.sbas.standard import DECODED, system_name, type_name
 
-#: Frequency that messages are sent on, and corrections made for.
-Band = Literal["L1", "L5"]
+Band = Literal["L1", "L5"]  #: Frequency that messages are sent on, and corrections made for.
 #: First bits of successive messages: eight, three in turn (DO-229D, A.4.3.1); on L5 four, six in turn.
 PREAMBLES: Final[dict[Band, tuple[int, ...]]] = {"L1": (0x53, 0x9A, 0xC6), "L5": (0x5, 0xC, 0x6, 0x9, 0x3, 0xA)}
 #: Preamble, type and data; bytes a message takes in `SbasMessages.bits`.

@@ -14,13 +14,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits.record_selection import issue_records
 from railfix.ranges.sbas.decode import Decoded, service
 from railfix.ranges.sbas.messages import SbasMessages
-from railfix.ranges.sbas.standard import (
-    FAST_DEGRADATION_MPS2,
-    FAST_TIMEOUT_S,
-    SERVICE_FACTOR,
-    TIMEOUT_S,
-    SbasLimits,
-)
+from railfix.ranges.sbas.standard import FAST_DEGRADATION_MPS2, FAST_TIMEOUT_S, SERVICE_FACTOR, TIMEOUT_S, SbasLimits
 from railfix.ranges.sbas.tables import ALARM, SatelliteTables, Series
 
 #: A rate may carry a fast correction this many times the time between the two it was made of.
@@ -33,8 +27,7 @@ _FACTOR: Final = np.array(SERVICE_FACTOR)
 class FastInForce:
     """Fast corrections in force, all (T, K)."""
 
-    #: No fast correction at all; too old, or of a mask no longer in force; type 7 is missing; a rate is needed and not
-    #: available.
+    #: No fast correction; too old, or of a mask no longer in force; no type 7; a rate is needed and not available.
     missing: Masks
     timed_out: Masks
     no_factor: Masks
@@ -54,15 +47,7 @@ class FastInForce:
 def fast_in_force(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> FastInForce:
-    """Fast corrections of satellites at epochs.
-
-    Parameters
-    ----------
-    time, stop : ndarray of datetime64[ns], shape (T, 1)
-        Epochs, and when the GEO was last stopped.
-    number : ndarray of int, shape (1, K)
-        PRN mask numbers, -1 for none.
-    """
+    """Find the fast corrections of PRN mask numbers (1, K), -1 for none, at epochs (T, 1)."""
     fast, udre = tables.fast, tables.udre
     row, of_udre = fast.newest(number, time), udre.newest(number, time)
     missing = (row < 0) | (fast.time[row] <= stop)
@@ -170,16 +155,9 @@ def long_term_in_force(
     stop: Datetimes,
     navigation: Navigation | None,
 ) -> LongTermInForce:
-    """Newest long-term corrections whose issue of data a record has; satellites of SBAS itself need none.
+    """Find the newest long-term corrections whose issue of data a record has; satellites of SBAS itself need none.
 
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    satellite, number : ndarray, shape (K,)
-        And its number of the PRN mask.
-    stop : ndarray of datetime64[ns], shape (T, 1)
-    navigation : Navigation or None
-        None takes the newest correction as it is.
+    `number`, shape (K,), is that of the PRN mask. Without `navigation` the newest correction is taken as it is.
     """
     table, limit = tables.long_term, limits.timeout_s("long_term")
     newest = table.newest(number[None, :], time[:, None])
@@ -249,12 +227,7 @@ def degradation_row(
 
 
 def growth(
-    tables: SatelliteTables,
-    limits: SbasLimits,
-    time: Datetimes,
-    fast: FastInForce,
-    long_row: Integers,
-    stop: Datetimes,
+    tables: SatelliteTables, limits: SbasLimits, time: Datetimes, fast: FastInForce, long_row: Integers, stop: Datetimes
 ) -> Growth:
     """Degradation terms of satellites at epochs; times and stops of shape (T, 1)."""
     row, active = degradation_row(tables, limits, time, stop)
@@ -315,17 +288,10 @@ class ServiceTable:
         self._reject = limits.incomplete == "reject"
 
     def factor(self, time: Datetimes, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Masks]:
-        """Factor on sigma UDRE at places; the newest complete set of messages of one issue counts.
+        """Return the factor on sigma UDRE at places, NaN without type 27, and where a set is incomplete, shapes (T,).
 
-        Inside several regions the one of the highest priority counts, of equal ones the smallest
-        factor; outside all, the factor outside.
-
-        Returns
-        -------
-        factor : ndarray, shape (T,)
-            NaN where the GEO sends no type 27.
-        incomplete : ndarray of bool, shape (T,)
-            A set of type 27 is incomplete and incomplete data are rejected.
+        The newest complete set of one issue counts; inside several regions the highest priority, of equal ones the
+        smallest factor; outside all, the factor outside.
         """
         factor, incomplete = np.full(len(time), np.nan), np.zeros(len(time), dtype=bool)
         newest = np.searchsorted(self.time, time, side="right") - 1

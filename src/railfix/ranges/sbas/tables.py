@@ -26,29 +26,21 @@ from railfix.ranges.sbas.decode import (
 from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import NOT_MONITORED, OLDEST_S, SbasLimits
 
-#: Before every message.
-LONG_AGO: Final = GPS_EPOCH
-#: IODF of an alarm.
-ALARM: Final = 3
+LONG_AGO: Final = GPS_EPOCH  #: Before every message.
+ALARM: Final = 3  #: IODF of an alarm.
 #: Longest time that is resolved [ms]: 278 years, all that `datetime64[ns]` reaches.
 _SPAN: Final = np.int64(2**43)
 _MS: Final = np.int64(1_000_000)
 _OLDEST_MS: Final = np.int64(1000.0 * OLDEST_S)
-#: Series of the placeholder row of an empty table, which no search asks for.
-_NO_SERIES: Final = 2**19
+_NO_SERIES: Final = 2**19  #: Series of the placeholder row of an empty table, which no search asks for.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Series:
     """Rows of many series (satellites, grid points ...) sorted by series and time of reception.
 
-    An empty table holds one row of a series that is never used: `columns` can be indexed with the -1 that
-    `newest` returns for "none", and the caller masks the value.
-
-    Notes
-    -----
-    Times are resolved to the millisecond, a row's rounded up and an instant's rounded down: no row is
-    used before it was received.
+    An empty table holds one row that is never used, so that `columns` can be indexed with -1. A row's time is rounded
+    up to the millisecond, an instant's down: no row is used before it was received.
     """
 
     series: Integers  #: Shape (n,).
@@ -83,15 +75,7 @@ class Series:
         return replace(self, columns={**self.columns, **columns})
 
     def newest(self, series: Integers | int, time: Datetimes) -> Integers:
-        """Newest row of each series at or before each instant; -1 where there is none, or none younger than `OLDEST_S`.
-
-        Parameters
-        ----------
-        series : ndarray of int or int
-            -1 for none.
-        time : ndarray of datetime64[ns]
-            Broadcasts against `series`.
-        """
+        """Find the newest row of each series (-1: none) at or before each instant; -1 without, or beyond `OLDEST_S`."""
         since = (time - GPS_EPOCH).astype("timedelta64[ns]").astype(np.int64) // _MS
         wanted_series, wanted_time = np.broadcast_arrays(series, np.clip(since, 0, _SPAN - 1))
         wanted = wanted_series * _SPAN + wanted_time
@@ -166,27 +150,11 @@ class MaskTable:
 class SatelliteTables:
     """Everything one GEO sent about satellites, by number of the PRN mask.
 
-    Attributes
-    ----------
-    stops : Stops
-    masks : MaskTable
-    fast : Series
-        Fast corrections; `fresh` is the first row since the satellite was last out of use.
-    udre : Series
-        UDREI from fast corrections and type 6; `grows_from` is the reception of the message that the error,
-        and the fast correction's time-out, are counted from.
-    fast_degradation : Series
-        Type 7; `shortest` is the indicator with the smallest time-out of the message's satellites.
-    long_term : Series
-        `other` is the last row with another IODE, -1 without.
-    covariance : Series
-        Type 28.
-    covariance_time : ndarray of datetime64[ns]
-        Reception of type 28 of any satellite.
-    degradation : Series
-        Type 10, one series.
-    unused : Counter of str
-        Corrections that no mask, or no fast correction, fits.
+    `fast`: `fresh` is the first row since the satellite was last out of use. `udre`: UDREI from fast corrections and
+    type 6; `grows_from` is the reception of the message that its error and the time-out are counted from.
+    `fast_degradation` (type 7): `shortest` is the smallest time-out of the message's satellites. `long_term`: `other`
+    is the last row with another IODE, -1 without. `covariance` is type 28, `degradation` type 10; `unused` counts
+    corrections that no mask, or no fast correction, fits.
     """
 
     def __init__(self, messages: SbasMessages, limits: SbasLimits) -> None:

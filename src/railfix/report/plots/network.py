@@ -14,8 +14,8 @@ from railfix.report.plots.draw import draw_figure, save_figure
 from railfix.run.locate import Surveyed
 from railfix.track import Track, TrackQuality
 from railfix.track.network import Network, end_points
-from railfix.track.network_check import NetworkQuality
 from railfix.track.network_match import Matched, PlanLog
+from railfix.track.network_read import NetworkQuality
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,12 +1,8 @@
-"""Code, phase and C/N0 of an early-late receiver that several paths reach at once: closed forms, no memory.
+"""Code, phase and C/N0 of an early-late receiver that several paths reach at once; diffraction, antenna pattern.
 
-The loop is the coherent one on a phase lock to the sum: its code error is the zero of
-``Re(conj(P) (E - L))``, where E, L and P are the sums of all paths in the early, late and prompt
-correlators (Irsigler 2008, 4.1; Braasch in Parkinson & Spilker 1996, vol. I, ch. 14), with the
-triangle of unlimited bandwidth. On the stretches where the triangle is straight that zero is a
-quotient, so a few iterations find it.
-
-Loss by diffraction, and the antenna pattern.
+The code error of the coherent loop is the zero of ``Re(conj(P) (E - L))`` with the sums of all paths in the early, late
+and prompt correlators (Irsigler 2008, 4.1; Braasch in Parkinson & Spilker 1996, vol. I, ch. 14), with the triangle of
+unlimited bandwidth. Where the triangle is straight that zero is a quotient, so a few iterations find it.
 """
 
 from __future__ import annotations
@@ -26,8 +22,7 @@ Singles = NDArray[np.float32]
 #: Iterations: three suffice for errors of a few hundredths of a chip, a wide spacing needs more.
 _ROUNDS_NARROW: Final = 3
 _ROUNDS_WIDE: Final = 12
-#: Up to this spacing the correlator is narrow [chips].
-_NARROW_CHIPS: Final = 0.2
+_NARROW_CHIPS: Final = 0.2  #: Up to this spacing the correlator is narrow [chips].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,23 +48,11 @@ def tracked(
     code_loop_hz: float,
     carrier_loop_hz: float,
 ) -> TrackedCode:
-    """Code, phase, rate and strength of the sum of P paths, for N signals.
+    """Track the sum of P paths, for N signals; `field`, shape (P, N), is relative to the unobstructed direct signal.
 
-    The loops lock to the strongest path; the code error about it stays within half the spacing.
-    Fading faster than a loop's bandwidth is attenuated as by a loop of first order,
-    ``1 / sqrt(1 + (f / loop_hz)^2)``; its power is kept. C/N0 is averaged as the code is.
-
-    Parameters
-    ----------
-    field : ndarray of complex, shape (P, N)
-        Relative to the unobstructed direct signal, without the phase of the extra path.
-    extra_m, rate_mps : ndarray, shape (P, N)
-        Excess path and its rate.
-    wavelength_m, chip_m : ndarray, shape (N,)
-    spacing_chips : float
-        Early to late.
-    code_loop_hz, carrier_loop_hz : float
-        Bandwidths.
+    The loops lock to the strongest path; the code error about it stays within half the spacing (early to late). Fading
+    faster than a loop's bandwidth is attenuated by ``1 / sqrt(1 + (f / loop_hz)^2)``; its power is kept. C/N0 is
+    averaged as the code is. `extra_m` and `rate_mps`, shape (P, N), are the excess path and its rate.
     """
     column = np.arange(field.shape[1])
     strength = np.sqrt(field.real**2 + field.imag**2)
@@ -141,8 +124,7 @@ def _zero(real: Singles, imaginary: Singles, late: Singles, follow: Singles, spa
     return error
 
 
-#: Below this the loss of an edge is 0 by the formula of ITU-R P.526-15, 4.1.
-CLEAR_V: Final = -0.78
+CLEAR_V: Final = -0.78  #: Below this the loss of an edge is 0 by the formula of ITU-R P.526-15, 4.1.
 
 
 def per_metre(distance_m: Floats, wavelength_m: Floats) -> Floats:
@@ -186,8 +168,8 @@ def circular_reflection(cosine: Floats, permittivity: float) -> tuple[Floats, Fl
     """Amplitudes, right-handed and left-handed, that a smooth dielectric wall reflects of a right-handed circular wave.
 
     ``G_perp = (c - r) / (c + r)``, ``G_par = (e c - r) / (e c + r)`` with c the cosine of incidence from the wall's
-    normal, e the relative permittivity and ``r = sqrt(e - 1 + c^2)`` (Fresnel); right-handed ``|G_par + G_perp| / 2``,
-    left-handed ``|G_par - G_perp| / 2``: at normal incidence all is left-handed, at grazing incidence right-handed.
+    normal, e the relative permittivity and ``r = sqrt(e - 1 + c^2)`` (Fresnel); ``|G_par + G_perp| / 2`` right-handed,
+    ``|G_par - G_perp| / 2`` left-handed.
     """
     root = np.sqrt(permittivity - 1.0 + cosine**2)
     perpendicular = (cosine - root) / (cosine + root)

@@ -1,32 +1,16 @@
-"""Settings of the structures along a line that block, reflect and scatter signals.
+"""Settings of the structures along a line that block, reflect and scatter signals; by default there are none.
 
-By default there are none. In a scenario file::
-
-    [environment]
-    antenna_height_m = 4.0
+In a scenario file::
 
     [environment.electrification]
     spacing_m = 50.0
-    sides = "both"
-    beam_every = 1
 
     [[environment.sections]]
     from_m = 0.0
     to_m = 900.0
     kind = "urban"
 
-    [[environment.sections]]
-    from_m = 900.0
-    to_m = 1300.0
-    kind = "tunnel"
-
-or, instead of the sections, shares from which they are drawn for the line's length::
-
-    [environment.shares]
-    open = 0.2
-    suburban = 0.5
-    urban = 0.2
-    tunnel = 0.1
+or, instead of the sections, ``[environment.shares]`` of each kind from which they are drawn for the line's length.
 """
 
 from __future__ import annotations
@@ -37,7 +21,7 @@ from typing import Annotated, Any, Final, Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from railfix.simulate.setting_types import (
+from railfix.simulate.settings import (
     AngleBetween,
     Between,
     Finite,
@@ -52,8 +36,7 @@ from railfix.simulate.setting_types import (
 Kind = Literal["open", "suburban", "urban", "canyon", "cutting", "mountain", "station", "tunnel"]
 Sides = Literal["left", "right", "both"]
 
-#: Kinds of section.
-KINDS: Final[tuple[str, ...]] = get_args(Kind)
+KINDS: Final[tuple[str, ...]] = get_args(Kind)  #: Kinds of section.
 
 
 class ElectrificationSettings(ScenarioSettings):

@@ -11,7 +11,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Strings
 from railfix.simulate.environment.settings import Kind, RoofSettings, RowSettings, SectionSettings, TreeSettings
-from railfix.simulate.setting_types import Between
+from railfix.simulate.settings import Between
 
 #: A road over the tracks.
 _BRIDGE: Final = RoofSettings(
@@ -111,10 +111,8 @@ def drawn_sections(
     )
 
 
-#: The first and the last section go on so far beyond the line [m].
-BEYOND_M: Final = 500.0
-#: Sides of the line, in the order of the arrays.
-SIDES: Final = ("left", "right")
+BEYOND_M: Final = 500.0  #: The first and the last section go on so far beyond the line [m].
+SIDES: Final = ("left", "right")  #: Sides of the line, in the order of the arrays.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,8 +136,7 @@ class Strips:
 class Structures:
     """Walls, roofs and sections of a line."""
 
-    #: Vertical walls, row by row, with `distance_m` (at their middle), `height_m`, `reflection`, `roughness_m`, `slope`
-    #: (tangent of the yaw).
+    #: Vertical walls, row by row: `distance_m` (middle), `height_m`, `reflection`, `roughness_m`, `slope` (yaw).
     walls: tuple[Strips, ...]
     roofs: tuple[Strips, ...]  #: With `inner_m`, `outer_m`, `height_m`, `through` (amplitude).
     borders_m: Floats  #: From and to of the sections, shape (2 S,).
@@ -175,7 +172,8 @@ def build_structures(sections: Sequence[SectionSettings], line_length_m: float, 
                 tunnel = [(low, high)] if section.kind == "tunnel" else None
                 if roof.sides in (side, "both"):
                     spans = tunnel or _spans(roof.length_m, roof.gap_m, low, high, rng)
-                    roofs.setdefault(r, [[], []])[s] += [_roof(roof, *span) for span in spans]
+                    form = (roof.inner_m, roof.outer_m, roof.height_m, 10.0 ** (-roof.loss_db / 20.0))
+                    roofs.setdefault(r, [[], []])[s] += [[*span, *form] for span in spans]
     names = ("distance_m", "height_m", "reflection", "roughness_m", "slope")
     over_names = ("inner_m", "outer_m", "height_m", "through")
     kinds = [kind for section in sections for kind in ("open", section.kind)]
@@ -225,10 +223,6 @@ def _row(row: RowSettings, low: float, high: float, rng: np.random.Generator) ->
         if rng.uniform() < row.share:
             walls.append([start, end, *drawn, slope])
     return walls
-
-
-def _roof(roof: RoofSettings, start: float, end: float) -> list[float]:
-    return [start, end, roof.inner_m, roof.outer_m, roof.height_m, 10.0 ** (-roof.loss_db / 20.0)]
 
 
 def _strips(sides: list[list[list[float]]], names: tuple[str, ...], reach: float) -> Strips:

@@ -1,9 +1,6 @@
-"""Vertical walls along the line: shadowing of direct signals and specular reflection.
+"""Vertical walls along the line, side streets, trees, vehicles: shadowing and specular reflection.
 
-Frame of the antenna: x along the line (rising chainage), y to the right, z up; near one antenna the
-line is taken as straight.
-
-Obstacles beside the line: side streets, trees, vehicles that pass.
+Frame of the antenna: x along the line (rising chainage), y to the right, z up; near it the line is taken as straight.
 """
 
 from __future__ import annotations
@@ -24,10 +21,8 @@ from railfix.simulate.environment.correlator import (
 from railfix.simulate.environment.settings import AntennaSettings, NeighbourSettings, RoofEquipment, SideStreetSettings
 from railfix.simulate.environment.structures import Strips
 
-#: Fresnel parameter of an unobstructed ray.
-FREE_V: Final = -99.0
-#: Least lateral component of a direction: rays along the line meet no wall.
-_LEAST_LATERAL: Final = 1e-3
+FREE_V: Final = -99.0  #: Fresnel parameter of an unobstructed ray.
+_LEAST_LATERAL: Final = 1e-3  #: Least lateral component of a direction: rays along the line meet no wall.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,8 +40,7 @@ class Rays:
     def take(self, rows: Indices) -> Rays:
         """Rays of some rows."""
         return replace(
-            self,
-            **{name: getattr(self, name)[rows] for name in ("chainage_m", "x", "y", "z", "wavelength_m")},
+            self, **{name: getattr(self, name)[rows] for name in ("chainage_m", "x", "y", "z", "wavelength_m")}
         )
 
 
@@ -65,10 +59,7 @@ def wall_met(row: Strips, side: Indices, x0: Floats, lateral0: Floats, along: Fl
 
 
 def in_front(row: Strips, wall: Indices, rays: Rays, x: Floats, z: Floats, far_m: Floats, across: Floats) -> Floats:
-    """Fresnel parameter of a ray at a wall: positive inside its outline.
-
-    `across` is the lateral component of the ray's direction; the top edge is horizontal, the ends are vertical.
-    """
+    """Fresnel parameter of a ray at a wall with level top and vertical ends, positive inside its outline."""
     scale = per_metre(far_m, rays.wavelength_m)
     rise = np.abs(across) / np.sqrt(across**2 + rays.z**2)
     level = np.abs(across) / np.sqrt(np.maximum(1.0 - rays.z**2, 1e-9))
@@ -78,10 +69,7 @@ def in_front(row: Strips, wall: Indices, rays: Rays, x: Floats, z: Floats, far_m
 
 
 def shadow(row: Strips, rays: Rays, *, x0: Floats | float = 0.0, y0: Floats | float = 0.0) -> Floats:
-    """Fresnel parameter of the walls of a row that obstruct the satellites, shape (N,).
-
-    The rays begin at `x0`, `y0` from the antenna [m]: at its mirror image for a reflection.
-    """
+    """Fresnel parameter of the walls of a row that obstruct the satellites from `x0`, `y0`, shape (N,)."""
     side = (rays.y > 0.0).astype(np.intp)
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     begin = np.where(rays.y > 0.0, 1.0, -1.0) * y0
@@ -177,9 +165,8 @@ def second_reflection(
 ) -> tuple[Floats, Floats, Floats]:
     """Amplitude, extra path [m] and growth [m/m] of signals reflected by the nearest rows of both sides, shapes (N,).
 
-    The signal passes over the walls of the satellite's side, is reflected by the opposite row, then by the
-    satellite's own side, and reaches the antenna from there. Twice mirrored, the antenna's image lies
-    ``2 (d_A + d_B)`` away on the opposite side, so the extra path is ``2 (d_A + d_B) |u_y|`` with the distances of
+    The signal is reflected by the opposite row, then by the satellite's own side. Twice mirrored, the antenna's image
+    lies ``2 (d_A + d_B)`` away on the opposite side, so the extra path is ``2 (d_A + d_B) |u_y|`` with the distances of
     both walls, which are taken as parallel to the line.
     """
     row = rows[0]
@@ -209,8 +196,7 @@ def second_reflection(
     return np.where(seen, amplitude, 0.0), 2.0 * (near + away) * lateral, growth
 
 
-#: Least lateral and longitudinal component of a direction that is computed.
-_LEAST_SIDE: float = 0.02
+_LEAST_SIDE: float = 0.02  #: Least lateral and longitudinal component of a direction that is computed.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,10 +234,9 @@ def street_reflections(
     """Amplitude, extra path [m], growth [m/m] and cosine of incidence of each candidate street, shapes (N,).
 
     A satellite behind the train is reflected by a wall ahead that faces it, and the other way round: with the wall's
-    plane at a distance D along the line and u the direction to the satellite, the extra path is ``2 D |u_x|``; the
-    ray meets the wall ``D |u_y| / |u_x|`` to the side. It must meet the wall within the street, seen through the
-    street's mouth, and come in over the walls across the street. The streets are those on the left and on the right;
-    `candidates` of them are tried for each ray, from the first that the ray can meet on.
+    plane at a distance D along the line the extra path is ``2 D |u_x|``; the ray meets the wall ``D |u_y| / |u_x|`` to
+    the side, within the street, and comes in over the walls across it. `candidates` streets of each side are tried for
+    each ray.
     """
     along, lateral = np.maximum(np.abs(rays.x), _LEAST_SIDE), np.maximum(np.abs(rays.y), _LEAST_SIDE)
     ahead = np.where(rays.x < 0.0, 1.0, -1.0)
@@ -321,16 +306,11 @@ def foliage(row: Strips, rays: Rays) -> tuple[Floats, Floats, Floats]:
 
 
 _LEAST_VEHICLE: float = 1e-3
-#: Sign of the lateral component of rays toward a side.
-_SIDE: Final = {"right": 1.0, "left": -1.0}
+_SIDE: Final = {"right": 1.0, "left": -1.0}  #: Sign of the lateral component of rays toward a side.
 
 
 def neighbour_clearance(settings: NeighbourSettings, rays: Rays, time_s: Floats) -> Floats:
-    """Fresnel parameter of the vehicles on a parallel track, positive where they are in the way, shape (N,).
-
-    They follow each other at a constant headway and speed, so their places are a function of time alone, on any scale
-    that is the same for all calls. Rays to the other side pass.
-    """
+    """Fresnel parameter of the vehicles on a parallel track, positive where in the way, shape (N,)."""
     lateral = np.maximum(np.abs(rays.y), _LEAST_VEHICLE)
     far = settings.lateral_m / lateral
     spacing = settings.spacing_m

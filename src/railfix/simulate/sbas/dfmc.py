@@ -10,9 +10,9 @@ import numpy as np
 from railfix.core.arrays import Bytes, Floats
 from railfix.core.constants import CARRIER_FREQUENCY, SPEED_OF_LIGHT
 from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta
+from railfix.ranges.corrected import DFMC_SIGNALS
 from railfix.ranges.sbas.dfmc import AUGMENTED, FIRST, slot_satellite
 from railfix.ranges.sbas.messages import PREAMBLES
-from railfix.ranges.weights import DFMC_SIGNALS
 from railfix.simulate.receiver import group_delay_s, signals_of
 from railfix.simulate.sbas.service import CLOCK, Field, Service, packed
 
@@ -90,10 +90,8 @@ def parameters(
 _SLOT_OF: Final = {slot_satellite(slot): slot for slot in range(1, 215)}
 #: Factor of the covariance that is sent: 1.03 to 1.06 times the indicator's sigma along a line of sight.
 _COVARIANCE: Final = (3, np.diag([1.0, 1.0, 1.0, 4.0]))
-#: Largest correction of a clock that the field holds [m].
-_LARGEST_M: Final = 63.9
-#: Growth of the corrections' errors until the next ones [m/s].
-_GROWTH_MPS: Final = 0.002
+_LARGEST_M: Final = 63.9  #: Largest correction of a clock that the field holds [m].
+_GROWTH_MPS: Final = 0.002  #: Growth of the corrections' errors until the next ones [m/s].
 
 
 class DfmcService(Service):

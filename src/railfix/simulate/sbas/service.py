@@ -10,7 +10,7 @@ import numpy as np
 from railfix.core.arrays import Bytes, Floats
 from railfix.core.constants import FREQUENCY_L1
 from railfix.core.timescale import seconds, timedelta
-from railfix.ranges.sbas.grid import BANDS, COLUMNS, POINT_OF_BIT
+from railfix.ranges.sbas.ionosphere import BANDS, COLUMNS, POINT_OF_BIT
 from railfix.ranges.sbas.messages import DATA_BITS, PREAMBLES, with_parity
 from railfix.ranges.sbas.standard import DO_NOT_USE, NOT_MONITORED
 from railfix.simulate.constellation import newest_record
@@ -62,13 +62,7 @@ def mask(second: int, numbers: Collection[int], iodp: int = 0) -> Bytes:
 
 
 def fast(
-    second: int,
-    prc: Sequence[float],
-    udrei: Sequence[int],
-    *,
-    kind: int = 2,
-    iodf: int = 0,
-    iodp: int = 0,
+    second: int, prc: Sequence[float], udrei: Sequence[int], *, kind: int = 2, iodf: int = 0, iodp: int = 0
 ) -> Bytes:
     """Types 0 and 2 to 5; corrections in metres, slots left over are not monitored."""
     values = [round(v / STEP_M) for v in prc] + [0] * (13 - len(prc))
@@ -143,14 +137,11 @@ def grid_delay(
 
 #: Slots of one message of types 2 to 5; satellites of one of type 25; points of one of type 26.
 _FAST, _LONG_TERM, _DELAYS = 13, 4, 15
-#: Slots of type 24, which takes the place of the last fast message where no more are left.
-_MIXED: Final = 6
+_MIXED: Final = 6  #: Slots of type 24, which takes the place of the last fast message where no more are left.
 #: Largest correction, orbit correction and delay that the fields hold [m].
 _LARGEST_FAST_M, _LARGEST_ORBIT_M, _LARGEST_DELAY_M = 255.0, 31.875, 63.75
-#: Seconds from one fast correction of a satellite to the next.
-FAST_PERIOD_S: Final = 6
-#: Streams of random numbers: fast corrections, orbits, delays.
-CLOCK, _ORBIT, _DELAY = 50, 51, 52
+FAST_PERIOD_S: Final = 6  #: Seconds from one fast correction of a satellite to the next.
+CLOCK, _ORBIT, _DELAY = 50, 51, 52  #: Streams of random numbers: fast corrections, orbits, delays.
 
 
 class Service:

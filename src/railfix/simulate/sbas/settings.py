@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from railfix.simulate.setting_types import NotNegative, Positive, ScenarioSettings, Share
+from railfix.simulate.settings import NotNegative, Positive, ScenarioSettings, Share
 
 
 class SbasSettings(ScenarioSettings):

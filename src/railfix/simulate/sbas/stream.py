@@ -19,8 +19,7 @@ from railfix.simulate.sbas.settings import SbasSettings
 if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
 
-#: Stream of random numbers of lost messages.
-LOST: Final = 53
+LOST: Final = 53  #: Stream of random numbers of lost messages.
 
 
 def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessages:

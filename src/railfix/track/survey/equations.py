@@ -1,8 +1,4 @@
-"""Observation equations of a survey, linear about approximate positions.
-
-Unknown are three coordinates of each row of each run, an offset of each run, receiver clocks, and points of the line
-across and above a reference line.
-"""
+"""Observation equations of a survey, linear about approximate positions of runs, clocks and the line."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
 """Survey of a line: all runs of ordinary receivers adjusted to one map with its standard deviations.
 
-Errors follow Student's t distribution: iteratively reweighted least squares (K. Lange, R. Little and J. Taylor, Robust
-statistical modeling using the t distribution, Journal of the American Statistical Association 84, 1989), so that
-outliers lose their weight.
+Errors follow Student's t distribution: iteratively reweighted least squares (Lange, Little and Taylor 1989).
 """
 
 from __future__ import annotations
@@ -39,10 +37,8 @@ _ADJUSTMENT_ROUNDS: Final = 15
 _SETTLED_M: Final = 0.02
 #: Median of the norm of one, two and three standard normal variables.
 _MEDIAN: Final = {1: 0.6745, 2: 1.1774, 3: 1.5382}
-#: Scales of the stated standard deviations that residuals may show.
-_SCALES: Final = (0.2, 10.0)
-#: Loose prior for conditioning: standard deviation of every unknown [m].
-_ANYWHERE_M: Final = 1e5
+_SCALES: Final = (0.2, 10.0)  #: Scales of the stated standard deviations that residuals may show.
+_ANYWHERE_M: Final = 1e5  #: Loose prior for conditioning: standard deviation of every unknown [m].
 #: Points of the line whose standard deviation is computed at most, others are interpolated, and columns at a time.
 _SIGMAS: Final = 200
 _COLUMNS: Final = 20
@@ -53,8 +49,7 @@ class Adjusted:
     """Result of an adjustment."""
 
     ecef_m: tuple[Floats, ...]  #: Positions of each run, its offset taken off; shape (n, 3).
-    #: Points of the line across and above the reference line, and their standard deviations; of shape (0, 2) where they
-    #: were not asked for; shape (J, 2).
+    #: Points of the line across and above the reference line, and their sigmas, shape (J, 2); (0, 2) if not asked for.
     line_m: Floats
     line_sigma_m: Floats
     #: Mean weight of the positions or codes of each row, about 1 without outliers; 0 without any; shape (n,).
@@ -74,15 +69,9 @@ def adjust(
 ) -> Adjusted:
     """Adjust the positions of all runs, with the line where its passes are known.
 
-    Parameters
-    ----------
-    near_ecef_m : sequence of ndarray, shape (n, 3) [m]
-        Approximate positions of every row, right to a kilometre.
-    repeats : sequence of ndarray, shape (n,), optional
-        How often the run passes the place of each row: minutes later reflections are the same there, so all passes
-        together count as one.
-    sigmas : {"none", "line"}
-        Whether the standard deviations of the line are computed, which takes longer than the adjustment.
+    `near_ecef_m` are approximate positions of every row, right to a kilometre; `repeats` how often the run passes the
+    place of each row, where reflections are the same, so all passes count as one; `sigmas` "line" computes the standard
+    deviations of the line, which takes longer than the adjustment.
     """
     limits = limits or SurveyLimits()
     origin = np.mean(near_ecef_m[0], axis=0)
@@ -212,17 +201,13 @@ def _of_rows(weight: Floats, run: SurveyRun) -> Floats:
     return np.asarray(np.bincount(rows, weights=weight, minlength=len(run)) / np.maximum(count, 1))
 
 
-#: Adjustments with the line; after each of them the passes are found again.
-_ROUNDS: Final = 3
+_ROUNDS: Final = 3  #: Adjustments with the line; after each of them the passes are found again.
 #: The directions have a track each where they lie apart by more than so many standard deviations of what a run may be
 #: off: three of the difference of two.
 _OTHER_TRACK: Final = 3.0 * 2.0**0.5
-#: Way over which a change of direction is looked for [m].
-_TURN_M: Final = 40.0
-#: Points that show the direction at an end of the line.
-_END_POINTS: Final = 8
-#: Quantile of the standard deviations along the line that is that of the whole map.
-_OF_THE_MAP: Final = 95.0
+_TURN_M: Final = 40.0  #: Way over which a change of direction is looked for [m].
+_END_POINTS: Final = 8  #: Points that show the direction at an end of the line.
+_OF_THE_MAP: Final = 95.0  #: Quantile of the standard deviations along the line that is that of the whole map.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,20 +226,10 @@ class Survey:
 
 
 def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None, name: str = "survey") -> Survey:
-    """Adjust runs over one line to its map.
+    """Adjust runs over one line, each with three positions or more, to its map.
 
-    The runs are adjusted alone, then with each other as passes of one line: laps, both directions and parts of the
-    line. The course is that of the longest leg until it repeats itself, extended by the others.
-
-    Parameters
-    ----------
-    runs : sequence of SurveyRun
-        Over one line, each with three positions or more.
-
-    Raises
-    ------
-    ValueError
-        The runs never move, or lie apart.
+    The runs are adjusted alone, then with each other as passes of one line. The course is that of the longest leg until
+    it repeats itself, extended by the others. ValueError: the runs never move, or lie apart.
     """
     limits = limits or SurveyLimits()
     origin = np.nanmean(np.concatenate([run.ecef_m for run in runs]), axis=0)

@@ -13,18 +13,13 @@ from scipy.spatial import cKDTree
 from railfix.core.arrays import Floats, Indices, Integers
 from railfix.track.survey.runs import SurveyLimits
 
-#: Cosine of the largest angle between passes of one line.
-_SAME_WAY: Final = 0.7
+_SAME_WAY: Final = 0.7  #: Cosine of the largest angle between passes of one line.
 #: Parts of a leg nearer than this many widths (`same_line_m`) along it are no repetition of each other.
 _APART_WIDTHS: Final = 3.0
-#: Share of the points of a stretch that lie on the line where the stretch does.
-_MOSTLY: Final = 0.8
-#: Distance over which the seam of two passes is evened out [m].
-_SEAM_M: Final = 200.0
-#: Longer without any row a run is not followed [s].
-_GAP_S: Final = 10.0
-#: Neighbouring vertices that a point is compared with.
-_NEIGHBOURS: Final = 24
+_MOSTLY: Final = 0.8  #: Share of the points of a stretch that lie on the line where the stretch does.
+_SEAM_M: Final = 200.0  #: Distance over which the seam of two passes is evened out [m].
+_GAP_S: Final = 10.0  #: Longer without any row a run is not followed [s].
+_NEIGHBOURS: Final = 24  #: Neighbouring vertices that a point is compared with.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,8 +79,7 @@ class Pass:
     leg: int
     sign: int  #: 1 along the line, -1 against it.
     arc_m: Floats  #: Along the leg, rising; shape (p,).
-    #: Number of the point of the line with its fraction, monotone; beyond the last point where a closed line goes on;
-    #: shape (p,).
+    #: Number of the point of the line with its fraction, monotone; beyond the last point on a closed line; shape (p,).
     place: Floats
 
 
@@ -237,14 +231,8 @@ def _along(points: Floats, at: int) -> Floats:
 def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats, Integers, Floats]:
     """Match points of a leg, in its order, to the course.
 
-    Returns
-    -------
-    place : ndarray, shape (q,)
-        Number of the point of the course with its fraction; NaN further from it than the width, or across it.
-    sign : ndarray of int, shape (q,)
-        1 along the course, -1 against it, 0 beside it.
-    across_m : ndarray, shape (q,) [m]
-        Distance to the right of it.
+    Returns the number of the point of the course with its fraction, NaN further from it than the width; the sign, 1
+    along it, -1 against it, 0 beside it; and the distance to the right of it [m]; shapes (q,).
     """
     way, line_way = directions(points), course.direction
     vertices = course.point_m[:, :2]
@@ -318,11 +306,7 @@ def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tu
 def without_other_track(
     course: Course, legs: Sequence[Leg], passes: Sequence[Pass], limits: SurveyLimits, tolerance_m: float
 ) -> tuple[list[Pass], float]:
-    """Return the passes of one track, and how far those of the other direction lie beside it [m]; 0 where they do not.
-
-    The directions have a track each where the medians of their distances from the course differ by more than the
-    tolerance and most of one lies on one side of the other. The direction with more passes is kept.
-    """
+    """Return the passes of the direction with more, where both have a track each, and how far apart, else 0 [m]."""
     across: dict[int, Floats] = {}
     for sign in (1, -1):
         found = [

@@ -1,4 +1,4 @@
-"""Tables of EGNSS MATE (`railfix.core.mate`) of a simulated run."""
+"""Tables of EGNSS MATE (`railfix.io.mate`) of a simulated run."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from railfix.core.mate import READ
 from railfix.core.timescale import gpst_to_utc, to_week
 from railfix.gnss.observations import concatenate
-from railfix.simulate.sensors.tables import sensor_tables
+from railfix.io.mate import READ
+from railfix.simulate.sensor_tables import sensor_tables
 from railfix.simulate.signals import Simulation
 
 #: Country of the balises, and names of signals, by constellation and RINEX code.

@@ -1,8 +1,7 @@
 """Pulse times of a tachometer; specific force and angular rate of an inertial sensor fixed to the body.
 
-The position and the attitude of the body are those of the antennas' truth (bogies on the curve, cant,
-gradient, sway); specific force and angular rate are their differences in time, in the frame of the
-Earth, with its gravity and its rotation (Groves 2013, 2.3 to 2.5 and 5.2).
+Differences in time of position and attitude of the body, in the frame of the Earth, with its gravity and its rotation
+(Groves 2013, 2.3 to 2.5 and 5.2).
 """
 
 from __future__ import annotations
@@ -18,17 +17,16 @@ from railfix.core.arrays import Floats
 from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.timescale import timedelta
-from railfix.simulate.errors.processes import GaussMarkov, RandomFunction
+from railfix.simulate.errors import GaussMarkov, RandomFunction
 from railfix.simulate.motion import FULL_SPEED_MPS
-from railfix.simulate.sensors.settings import DrawnSlips, InertialSettings, SlipInterval, TachometerSettings
+from railfix.simulate.settings import DrawnSlips, InertialSettings, SlipInterval, TachometerSettings
 
 if TYPE_CHECKING:
     from railfix.simulate.motion import Motion
     from railfix.simulate.signals import Simulation
 
 
-#: Spacing of the instants between which the wheel's acceleration is constant [s].
-_STEP_S: Final = 0.01
+_STEP_S: Final = 0.01  #: Spacing of the instants between which the wheel's acceleration is constant [s].
 #: Spacing of the search for accelerations and brakings [s], and their least size [m/s^2].
 _LOOK_S: Final = 0.1
 _HARD_MPS2: Final = 0.05
@@ -136,7 +134,7 @@ def _miscount(time_s: Floats, settings: TachometerSettings, seed: int) -> Floats
 
 
 def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataFrame:
-    """Pulses as the tachometer gives them, see `railfix.simulate.sensors.tables.COLUMNS`."""
+    """Pulses as the tachometer gives them, see `railfix.simulate.sensor_tables.COLUMNS`."""
     scenario = simulation.scenario
     rng = np.random.default_rng([scenario.seed, _WHEEL])
     slips = wheel_slips(simulation, settings)
@@ -164,7 +162,7 @@ def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.Data
 
 
 def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataFrame:
-    """Truth of the wheel's slips and slides, see `railfix.simulate.sensors.tables.COLUMNS`."""
+    """Truth of the wheel's slips and slides, see `railfix.simulate.sensor_tables.COLUMNS`."""
     scenario = simulation.scenario
     slips = wheel_slips(simulation, settings)
     start = scenario.start + timedelta([slip.start_s for slip in slips])
@@ -173,12 +171,9 @@ def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataF
     return pl.DataFrame({"time_gpst": start, "end_gpst": end, "ratio": ratio})
 
 
-#: Longest half interval of the differences in time [s].
-_HALF_S: Final = 0.02
-#: Samples computed at once.
-_BLOCK: Final = 50_000
-#: Lever arm of the attitude, long so that rounding of positions is negligible [m].
-_LEVER_M: Final = 10.0
+_HALF_S: Final = 0.02  #: Longest half interval of the differences in time [s].
+_BLOCK: Final = 50_000  #: Samples computed at once.
+_LEVER_M: Final = 10.0  #: Lever arm of the attitude, long so that rounding of positions is negligible [m].
 #: Normal gravity of WGS 84 at the equator [m/s^2], Somigliana's constant, flattening, m, semi-major axis [m].
 _GRAVITY: Final = (9.780_325_335_9, 1.931_852_652_41e-3, 1.0 / 298.257_223_563, 3.449_786_506_84e-3, 6_378_137.0)
 _ECCENTRICITY_2: Final = 6.694_379_990_14e-3
@@ -230,7 +225,7 @@ def true_motion(simulation: Simulation, offset_m: tuple[float, float, float], ti
 
 
 def inertial_table(simulation: Simulation, settings: InertialSettings) -> pl.DataFrame:
-    """Samples of the inertial sensor, see `railfix.simulate.sensors.tables.COLUMNS`."""
+    """Samples of the inertial sensor, see `railfix.simulate.sensor_tables.COLUMNS`."""
     scenario = simulation.scenario
     time = np.arange(int(scenario.duration_s * settings.rate_hz + 1e-9) + 1) / settings.rate_hz
     offset = (settings.along_m, settings.across_m, settings.up_m)

@@ -9,19 +9,17 @@ import polars as pl
 
 from railfix.core.arrays import Floats
 from railfix.core.timescale import timedelta
-from railfix.simulate.errors.processes import GaussMarkov
-from railfix.simulate.sensors.body_sensors import inertial_table, pulse_table, slip_table
-from railfix.simulate.sensors.settings import Balise, BaliseSettings, GroundUnit, RadarSettings, RangingSettings
+from railfix.simulate.body_sensors import inertial_table, pulse_table, slip_table
+from railfix.simulate.errors import GaussMarkov
+from railfix.simulate.settings import Balise, BaliseSettings, GroundUnit, RadarSettings, RangingSettings
 
 if TYPE_CHECKING:
     from railfix.simulate.alignment import Alignment
     from railfix.simulate.signals import Simulation
 
 
-#: Streams of random numbers: error of a reading, missed, wrong identity.
-_BALISE_NOISE, _MISSED, _WRONG = 44, 45, 46
-#: Spacing of the instants between which a passing is interpolated [s].
-_STEP_S = 0.1
+_BALISE_NOISE, _MISSED, _WRONG = 44, 45, 46  #: Streams of random numbers: error of a reading, missed, wrong identity.
+_STEP_S = 0.1  #: Spacing of the instants between which a passing is interpolated [s].
 
 
 def balises_along(simulation: Simulation, settings: BaliseSettings) -> tuple[Balise, ...]:
@@ -33,7 +31,7 @@ def balises_along(simulation: Simulation, settings: BaliseSettings) -> tuple[Bal
 
 
 def balise_list_table(simulation: Simulation, settings: BaliseSettings) -> pl.DataFrame:
-    """The list of balises, see `railfix.simulate.sensors.tables.COLUMNS`."""
+    """The list of balises, see `railfix.simulate.sensor_tables.COLUMNS`."""
     balises, line = balises_along(simulation, settings), simulation.line
     at = np.array([balise.chainage_m for balise in balises], dtype=np.float64)
     mapped = np.interp(at, line.sampled_chainage_m(), line.track().chainage_m)
@@ -43,7 +41,7 @@ def balise_list_table(simulation: Simulation, settings: BaliseSettings) -> pl.Da
 
 
 def balise_tables(simulation: Simulation, settings: BaliseSettings) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Readings and the ground truth of all passings; see `railfix.simulate.sensors.tables.COLUMNS`."""
+    """Readings and the ground truth of all passings; see `railfix.simulate.sensor_tables.COLUMNS`."""
     scenario, balises = simulation.scenario, balises_along(simulation, settings)
     time = np.arange(0.0, scenario.duration_s + 1e-9, _STEP_S)
     reader = simulation.body_truth((settings.along_m, 0.0, 0.0), time)[0].chainage_m
@@ -77,12 +75,11 @@ def balise_tables(simulation: Simulation, settings: BaliseSettings) -> tuple[pl.
     return readings.select("time_gpst", balise="read").sort("time_gpst"), truth
 
 
-#: Streams of random numbers: noise, sway, dropouts.
-_NOISE, _SWAY, _DROPOUTS = 26, 27, 28
+_NOISE, _SWAY, _DROPOUTS = 26, 27, 28  #: Streams of random numbers: noise, sway, dropouts.
 
 
 def radar_table(simulation: Simulation, settings: RadarSettings) -> pl.DataFrame:
-    """Samples of the radar, see `railfix.simulate.sensors.tables.COLUMNS`."""
+    """Samples of the radar, see `railfix.simulate.sensor_tables.COLUMNS`."""
     scenario = simulation.scenario
     time = np.arange(int(scenario.duration_s * settings.rate_hz + 1e-9) + 1) / settings.rate_hz
     true = simulation.motion.at(time)[1]
@@ -129,7 +126,7 @@ def unit_ecef_m(line: Alignment, unit: GroundUnit) -> Floats:
 
 
 def unit_table(simulation: Simulation, settings: RangingSettings) -> pl.DataFrame:
-    """Surveyed positions of the ground units, see `railfix.simulate.sensors.tables.COLUMNS`."""
+    """Surveyed positions of the ground units, see `railfix.simulate.sensor_tables.COLUMNS`."""
     line = simulation.line
     place = np.array([unit_ecef_m(line, unit) for unit in settings.units]).reshape(-1, 3)
     chainage = np.array([unit.chainage_m for unit in settings.units])
@@ -141,7 +138,7 @@ def unit_table(simulation: Simulation, settings: RangingSettings) -> pl.DataFram
 
 
 def ranging_table(simulation: Simulation, settings: RangingSettings) -> pl.DataFrame:
-    """Measured ranges in order of time, see `railfix.simulate.sensors.tables.COLUMNS`."""
+    """Measured ranges in order of time, see `railfix.simulate.sensor_tables.COLUMNS`."""
     scenario = simulation.scenario
     time = np.arange(0.0, scenario.duration_s + 1e-9, settings.interval_s)
     offset = (settings.along_m, settings.across_m, settings.up_m)
