@@ -218,7 +218,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "protection_level_ground_m",
-            "the same of the straight distance on the ground, also on another lap",
+            "the same of the straight distance on the ground, also on another lap or beside the map",
             "tracked.ground_level_m",
         ),
         Column("protection_noise_m", "its part by noise without a fault", "tracked.level_noise_m"),

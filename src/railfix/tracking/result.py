@@ -80,8 +80,8 @@ class Tracked:
     map_scale : ndarray, shape (T,)
         Factor on the error of the map's lengths, 1 where codes do not contradict them.
     level_m, ground_level_m, level_noise_m, separation_m : ndarray, shape (T,) [m]
-        Of the error along the line; of the straight distance, all branches included; without faults and branches; and
-        the largest separation of a sub-filter. NaN where levels are off.
+        Of the error along the line; of the straight distance, all branches and a map aside included; without faults and
+        branches; and the largest separation of a sub-filter. NaN where levels are off.
     level_speed_mps : ndarray, shape (T,)
         Bound of the error of the speed, which carries the level on to the next epochs.
     amount_m : ndarray, shape (T,) [m]
