@@ -36,7 +36,7 @@ def line(folder: Path, name: str = "line.csv", *, kink: float = 0.0, end: float 
 def test_a_good_map_ends_with_0_and_a_picture(tmp_path: Path) -> None:
     code, printed = call("check", line(tmp_path), "--out", tmp_path / "report")
     assert code == 0
-    assert "0 error(s), 0 warning(s)" in printed
+    assert "0 errors, 0 warnings" in printed
     assert "41 points, 200.0 m" in printed
     picture = tmp_path / "report" / "map_check.png"
     assert picture.read_bytes().startswith(b"\x89PNG")

@@ -21,7 +21,7 @@ from rich.text import Text
 
 from railfix import kernels
 from railfix.core.reasons import Status
-from railfix.core.tables import Table, listed
+from railfix.core.tables import Table, listed, plural
 
 if TYPE_CHECKING:
     from railfix.evaluate import Evaluation
@@ -88,7 +88,7 @@ def _doubts(summary: RunSummary) -> str:
         text += "; of the filter " + ", ".join(f"{count:,} {word}" for word, count in of_filter.items() if count)
     if lost:
         text += f"; {lost:,} epochs have no observation"
-    return f"{text}; {len(summary.notes)} note(s) below the tables"
+    return f"{text}; {plural(summary.notes, 'note')} below the tables"
 
 
 def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:

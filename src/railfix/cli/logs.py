@@ -11,7 +11,7 @@ import typer
 from railfix.cli.console import console_of_tables, show_files, show_notes, show_table
 from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs, from_models, overwriting, settings_of
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.tables import listed
+from railfix.core.tables import listed, plural
 from railfix.evaluate.inputs import TABLES, read_run, tables_of
 from railfix.io.positions_export import style_file, write_positions
 from railfix.pipeline.tables import rounded
@@ -219,7 +219,7 @@ def doctor(
     diagnosis = examine_files(files)
     console = console_of_tables()
     problems = diagnosis.problems
-    verdict = f"{len(problems)} thing(s) to mend" if problems else "the files fit together"
+    verdict = f"{plural(problems, 'thing')} to mend" if problems else "the files fit together"
     console.print(f"{len(diagnosis.findings)} files: {verdict}", markup=False)
     for problem in problems:
         console.print(f"- {problem}", markup=False, soft_wrap=True)

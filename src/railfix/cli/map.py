@@ -15,7 +15,7 @@ from railfix.cli.map_network import Columns, MapReading, match_command, network,
 from railfix.cli.map_runs import service, survey
 from railfix.cli.options import OverwriteOption, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
-from railfix.core.tables import listed
+from railfix.core.tables import listed, plural
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import column_names, read_positions
 from railfix.track import (
@@ -94,7 +94,7 @@ def check(
     _print_quality(quality, picture)
     if quality.errors:
         raise MapQualityError(
-            f"{track.name}: the track map has {len(quality.errors)} error(s), the first {quality.errors[0].sentence}"
+            f"{track.name}: the track map has {plural(quality.errors, 'error')}, the first {quality.errors[0].sentence}"
         )
 
 
@@ -258,7 +258,7 @@ def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
     console, track, geometry = console_of_tables(), quality.track, quality.geometry
     spacing = geometry.spacing_m
     console.print(
-        f"{track.name}: {len(track)} points, {track.chainage_m[-1]:,.1f} m, {len(track.sections)} section(s); "
+        f"{track.name}: {len(track)} points, {track.chainage_m[-1]:,.1f} m, {plural(track.sections, 'section')}; "
         f"heights {track.provenance.height_datum_used}"
         + (f" + geoid {track.provenance.geoid}" if track.provenance.geoid else ""),
         markup=False,
@@ -280,7 +280,7 @@ def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
     rest = len(quality.findings) - _SHOWN
     if rest > 0:
         console.print(f"... and {rest} more")
-    console.print(f"{len(quality.errors)} error(s), {len(quality.warnings)} warning(s)")
+    console.print(f"{plural(quality.errors, 'error')}, {plural(quality.warnings, 'warning')}")
     if picture is not None:
         console.print(f"picture: {picture}", markup=False, soft_wrap=True)
 
@@ -290,7 +290,7 @@ def _print_thinned(track: Track, thinned: Thinned, rows: int, out: Path) -> None
     console.print(f"{rows} positions, {len(track)} points kept, {track.chainage_m[-1]:,.1f} m")
     show_notes(console, track.provenance.notes)
     quality = check_track(track)
-    console.print(f"map check: {len(quality.errors)} error(s), {len(quality.warnings)} warning(s)")
+    console.print(f"map check: {plural(quality.errors, 'error')}, {plural(quality.warnings, 'warning')}")
     for finding in quality.errors[:_SHOWN]:
         console.print(f"error: {finding.sentence}", markup=False)
     if quality.errors:

@@ -14,7 +14,7 @@ from railfix.cli.options import OverwriteOption, Without, check_outputs, from_mo
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.core.tables import listed
+from railfix.core.tables import listed, plural
 from railfix.run.inputs import ColumnNames, TrackReading
 from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network
@@ -125,7 +125,7 @@ def network(
     console = console_of_tables()
     console.print(
         f"{quality.tracks} tracks, {quality.length_m / 1e3:,.1f} km, {quality.switches} switches, {quality.ends} ends "
-        f"without connection, {quality.parts} separate part(s)"
+        f"without connection, {plural(quality.parts, 'separate part')}"
     )
     show_notes(console, dict.fromkeys([*tracks.notes, *(n for t in tracks.tracks for n in t.notes)]))
     if quality.findings:
@@ -148,7 +148,7 @@ def network(
         console.print(f"page: {page}", markup=False, soft_wrap=True)
     faults = [f for f in quality.findings if f.kind in ("gap", "joint", "kink")]
     if faults:
-        raise MapQualityError(f"the network has {len(faults)} fault(s), the first: {faults[0].sentence}")
+        raise MapQualityError(f"the network has {plural(faults, 'fault')}, the first: {faults[0].sentence}")
 
 
 @from_models

@@ -15,7 +15,7 @@ from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs
 from railfix.core.errors import SettingsError
 from railfix.core.files import BrokenLines
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.core.tables import Column, count, listed, listing, number, percent
+from railfix.core.tables import Column, count, listed, listing, number, percent, plural
 from railfix.run.inputs import ColumnNames, LogReading
 from railfix.track.survey.runs import SurveyLimits
 
@@ -70,7 +70,7 @@ def service(
     served = found.filter(pl.col("within_limit_share") >= _SERVED)
     worst = found.sort("within_limit_share", "tracking_share", "ok_share", nulls_last=True).row(0, named=True)
     console = console_of_tables()
-    verdict = [f"{len(found)} stretches of {stretch:g} m passed by {len(runs)} run(s)"]
+    verdict = [f"{len(found)} stretches of {stretch:g} m passed by {plural(runs, 'run')}"]
     if worst["within_limit_share"] is not None:
         verdict.append(
             f"{len(served)} of them have a level within {limit:g} m in {_SERVED:.0%} of the epochs or more; worst from "
@@ -149,7 +149,7 @@ def survey(
     closed = "closed line" if result.closed else "line"
     weak = result.sigma_plan_m > 2.0 * np.median(result.sigma_plan_m)
     verdict = [
-        f"a {closed} of {track.chainage_m[-1]:,.0f} m from {len(runs)} run(s), {len(track)} points",
+        f"a {closed} of {track.chainage_m[-1]:,.0f} m from {plural(runs, 'run')}, {len(track)} points",
         f"standard deviation across {np.median(result.sigma_plan_m):.1f} m at the median, largest "
         f"{result.sigma_plan_m.max():.1f} m at chainage {track.chainage_m[np.argmax(result.sigma_plan_m)]:.0f} m; in "
         f"height {np.median(result.sigma_height_m):.1f} m, largest {result.sigma_height_m.max():.1f} m",

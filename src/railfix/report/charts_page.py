@@ -22,7 +22,7 @@ from railfix import __version__
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import read_json_object, write_whole
-from railfix.core.tables import Table, number, share
+from railfix.core.tables import Table, number, plural, share
 from railfix.core.timescale import seconds
 from railfix.report.plots.chart import Band, Bars, Cells, Chart, Curve, Layer, Marks, Points, RangeBars, SkyEpochs
 from railfix.report.plots.network import network_plan
@@ -332,7 +332,7 @@ def _tables(network: Network, quality: NetworkQuality, run: tuple[PlanLog, Match
     seen = np.zeros(len(network.tracks), dtype=np.int64)
     blocks: list[Block] = [
         Sentence(
-            f"{quality.ends:,} ends without a connection, {quality.parts:,} separate part(s), "
+            f"{quality.ends:,} ends without a connection, {plural(quality.parts, 'separate part')}, "
             f"{sum(f.kind != 'dead end' for f in quality.findings):,} findings."
         )
     ]

@@ -12,6 +12,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.settings import misspelt
+from railfix.core.tables import plural
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.track.crs import frame_degrees, known_crs, older_datum_note, used_crs
 from railfix.track.heights import check_height_datum, ellipsoidal_heights
@@ -55,7 +56,7 @@ def read_csv_segment(path: str | PathLike[str], reading: MapReading) -> Segment:
     datum = _datum(table, reading.height_datum)
     heights = table.numbers("height_m" if datum == "ellipsoidal" else "elevation_m")
     if len(table) < 2:
-        raise InputFileError(path, f"{len(table)} point(s); a track needs at least two")
+        raise InputFileError(path, f"{plural(table, 'point')}; a track needs at least two")
     same = (np.diff(latitude) == 0) & (np.diff(longitude) == 0) & (np.diff(heights) == 0)
     if reading.duplicates == "reject" and same.any():
         row = int(np.argmax(same)) + 1

@@ -15,6 +15,7 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.settings import Settings
+from railfix.core.tables import plural
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog, qualities_in_words
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
@@ -271,12 +272,12 @@ def track_of(
         )
     if len(thinned.jumps):
         notes.append(
-            f"{len(thinned.jumps)} gap(s) between positions are bridged by a straight line, "
+            f"{plural(thinned.jumps, 'gap')} between positions bridged by a straight line, "
             f"the longest {thinned.jump_m.max():.0f} m"
         )
     if len(thinned.turns):
         notes.append(
-            f"the path turns back at {len(thinned.turns)} point(s): where it lies beside itself, positions are "
+            f"the path turns back at {plural(thinned.turns, 'point')}: where it lies beside itself, positions are "
             "ambiguous and the filter may follow the wrong leg, so give positions of one way"
         )
     return Track.from_ecef(

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from railfix.core.arrays import Floats, Masks
 from railfix.core.settings import Settings
+from railfix.core.tables import plural
 from railfix.track.track import HEIGHTS_M, Geometry, Track, geometry_of, kilometrage_breaks, windowed_gradients
 
 Severity = Literal["error", "warning"]
@@ -124,7 +125,7 @@ def error_note(quality: TrackQuality) -> tuple[str, ...]:
     if not quality.errors:
         return ()
     return (
-        f"map check: {len(quality.errors)} error(s), {len(quality.warnings)} warning(s); the first error "
+        f"map check: {plural(quality.errors, 'error')}, {plural(quality.warnings, 'warning')}; the first error "
         f"{quality.errors[0].sentence}; see railfix map check",
     )
 

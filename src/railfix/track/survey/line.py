@@ -15,6 +15,7 @@ from scipy.sparse.linalg import splu
 
 from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.tables import plural
 from railfix.track.from_positions import ANTENNA_PATH
 from railfix.track.survey import equations as eq
 from railfix.track.survey.equations import Equations, ReferenceLine, RunColumns
@@ -357,7 +358,7 @@ def _survey(
     length = float(np.linalg.norm(np.diff(ecef[order], axis=0), axis=1).sum())
     notes = [
         ANTENNA_PATH,
-        f"surveyed from {len(runs)} run(s) of {driven:,.0f} m together, {driven / length:.1f} times the line, "
+        f"surveyed from {plural(runs, 'run')} of {driven:,.0f} m together, {driven / length:.1f} times the line, "
         f"{against:.0%} of it against its direction; each point is passed {count[order].min()} to {count[order].max()} "
         "times",
         f"accuracy of the map {sigma_plan:.2f} m in plan and {sigma_height:.2f} m in height: 95th percentiles along it",
