@@ -360,13 +360,16 @@ def test_one_centre_has_a_database(tmp_path: Path) -> None:
         assert second.document("interlocking") is None
 
 
+#: Sequences that once broke a promise: a report of another line hid a roll-back (742), a rejected report's clock
+#: counted for the next (1159, 1362), a route through the station where a train stood (41611 and after).
+ONCE_BROKEN = (
+    742, 1159, 1362, 3373, 4342, 5621, 6032, 5804, 6750, 14607, 15332, 41611, 50609, 61477, 83224, 90532, 95639, 101642,
+)  # fmt: skip
+
+
 @pytest.mark.parametrize(
     "seeds",
-    # a first report of another line hid a roll-back (742); a rejected report's clock counted for the next (1159, 1362)
-    [
-        [*range(70), 742, 1159, 1362, 3373, 4342, 5621, 6032, 5804, 6750, 14607, 15332],
-        pytest.param(range(100_000), marks=pytest.mark.slow),
-    ],
+    [[*range(70), *ONCE_BROKEN], pytest.param(range(100_000), marks=pytest.mark.slow)],
     ids=["70 sequences", "100,000 sequences"],
 )
 def test_no_sequence_leads_to_an_authority_into_a_train(seeds: Sequence[int]) -> None:

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from railfix.ground import stops, supervision
+from railfix.ground import interlocking, stops, supervision
 from railfix.ground.interlocking import Interlocking, PointState, TrainInterval, extended, route_requested
 from railfix.ground.layout import Layout, LoopStation
-from railfix.ground.stops import release_train
+from railfix.ground.stops import release_train, stop_trains
 from railfix.ground.supervision import Supervision, at_start, report_received, standing_train
 from railfix.ground.train import Authority, OnBoard
 from test_ground_attacks import LENGTH_M, LIMITS, after, report
@@ -35,6 +35,9 @@ RULES["tracks kept"] = {supervision._turned: {"if station in under": "if station
 RULES["end of the place"] = {OnBoard.receive: {"if not self._granted:": "if False:"}}
 RULES["two places"] = {OnBoard.moved: {"self.direction * before)": "-1e9)"}}
 RULES["unknown before"] = {OnBoard.receive: {"authority.shortens and not (agrees or self._granted)": "False"}}
+RULES["station reached"] = {
+    interlocking.route_requested: {"layout.is_reached(target, here.front_m, direction)": "False"}
+}
 RULES["points under"] = {
     stops.release_train: {
         "not points[name].wanted == points[name].detected == known.tracks.get(name[0])": "False",
@@ -106,6 +109,20 @@ def test_a_wrong_change_of_ends_in_the_next_station_frees_no_track(monkeypatch: 
     assert reason() == "track 2 of B is taken by train 1"
     take_out(monkeypatch, "tracks kept")
     assert reason() is None
+
+
+def test_a_wrong_change_of_ends_in_the_next_station_sets_no_other_track(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Train 1 stands in B on track 2; one report has it in A, looking back to B, whose track up is 1."""
+    state = at_start(LINE, [down_train(1, 2100.0, 0, end_m=80.0, tracks={0: 2, 1: 2})])
+    wrong = report(1, 300.0, facing=1, direction=0, speed_cmps=0, standstill=True)
+    turned = report_received(state, wrong, LINE, limits=LIMITS)
+    assert (turned.trains[1].direction, turned.trains[1].front_m, turned.trains[1].station) == (1, 2305.0, 0)
+    seen = replace(turned, trains={1: replace(turned.trains[1], rear_m=2095.0)})
+    assert route_requested(seen, 1, LINE)[2] == "the train is in B"
+    released, reason = release_train(stop_trains(seen, [1], "by hand"), 1, LINE)
+    assert (reason, released.trains[1].station, released.trains[1].tracks[1]) == (None, 1, 2)
+    take_out(monkeypatch, "station reached")
+    assert interlocking.route_requested(seen, 1, LINE)[0].trains[1].tracks[1] == 1
 
 
 @pytest.mark.parametrize(

@@ -185,6 +185,8 @@ def route_requested(
         return state, (), f"the train is stopped: {stops[train]}"
     if not 0 <= target < len(layout.stations):
         return state, (), "there is no station ahead"
+    if layout.is_reached(target, here.front_m, direction):  # it has a track there, on which it may stand
+        return state, (), f"the train is in {layout.stations[target].name}"
     track = 1 if direction > 0 else 2
     section = min(begin, target)
     if state.closed & {2 * target + 1, 2 * section + 2}:

@@ -130,6 +130,11 @@ class Layout(Settings):
             pieces.append((0, at, high))
         return pieces
 
+    def is_reached(self, station: int, front_m: float, direction: int) -> bool:
+        """Return whether a front that runs in a direction is beyond the entry of a station."""
+        begin, end = self.block_m(2 * station + 1)
+        return front_m > begin if direction > 0 else front_m < end
+
     def station_at(self, low_m: float, high_m: float) -> int | None:
         """Return the station whose tracks hold a whole interval, None where there is none."""
         for k in self.stations_between(low_m, high_m):

@@ -60,7 +60,11 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
             points[name] = replace(points[name], locked={**points[name].locked, train: None})
     direction = known.direction  # where the train ran too far, its authority now ends there
     end = direction * max(direction * known.end_m, direction * known.front_m)
-    released_state = with_train(replace(state, points=points), replace(known, stop=None, end_m=end, line=None))
+    station = known.station  # a train that turned by a wrong report stands in one before it, on the track that it has
+    while (station + direction) in known.tracks and layout.is_reached(station + direction, known.front_m, direction):
+        station += direction
+    moved = replace(known, stop=None, end_m=end, line=None, station=station)
+    released_state = with_train(replace(state, points=points), moved)
     if overlaps_stopped(released_state, layout) != released_state:
         return state, f"the interval of train {train} meets another one"
     return released_state, None
