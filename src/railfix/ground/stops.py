@@ -41,7 +41,7 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
     """Return the state with the stop of one train released by hand, and the reason of a refusal.
 
     Points under its interval, which a train that has rolled back has passed, are locked for it again; its next
-    report names its line.
+    report names its line. Its station becomes the furthest that its front has reached, on the track that it has there.
     """
     known = state.trains.get(train)
     if known is None or known.stop is None:
@@ -60,7 +60,7 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
             points[name] = replace(points[name], locked={**points[name].locked, train: None})
     direction = known.direction  # where the train ran too far, its authority now ends there
     end = direction * max(direction * known.end_m, direction * known.front_m)
-    station = known.station  # a train that turned by a wrong report stands in one before it, on the track that it has
+    station = known.station  # after a wrong change of ends one behind the train
     while (station + direction) in known.tracks and layout.is_reached(station + direction, known.front_m, direction):
         station += direction
     moved = replace(known, stop=None, end_m=end, line=None, station=station)

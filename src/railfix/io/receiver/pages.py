@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes
+from railfix.core.arrays import Bytes, Masks
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.framing import Field, Subframes, fields, packed_words, unsigned
 from railfix.io.receiver.measurements import Values
@@ -77,16 +77,30 @@ def _cnav(part: Subframes, letter: str, counts: Counter[str]) -> Iterator[tuple[
 
 
 def _fnav(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
-    fnav = np.isin(part.signal, _UBX_E5A)
-    if not fnav.any():
+    here, fault = np.isin(part.signal, _UBX_E5A), "E pages without valid CRC"
+    for row, kind, values in _by_kind(part, here, nav_messages.FNAV_CHECKED, 0, nav_messages.FNAV, counts, fault):
+        yield row, FNAV_FROM + kind, values
+
+
+def _by_kind(
+    part: Subframes,
+    here: Masks,
+    checked: int,
+    kind_bit: int,
+    layouts: Mapping[int, Mapping[str, Field]],
+    counts: Counter[str],
+    fault: str,
+) -> Iterator[tuple[int, int, Values]]:
+    """Decode pages under a CRC by their kind, six bits from `kind_bit` on; those whose check fails count as `fault`."""
+    if not here.any():
         return
     bits = packed_words(part.words, drop=0, keep=32)
-    valid = fnav & nav_messages.has_crc(bits, nav_messages.FNAV_CHECKED)
-    counts["E pages without valid CRC"] += int(np.count_nonzero(fnav & ~valid))
-    kind = unsigned(bits, 0, 6)
-    for k, layout in nav_messages.FNAV.items():
+    valid = here & nav_messages.has_crc(bits, checked)
+    counts[fault] += int(np.count_nonzero(here & ~valid))
+    kind = unsigned(bits, kind_bit, 6)
+    for k, layout in layouts.items():
         for row, values in _rows(bits, np.flatnonzero(valid & (kind == k)), layout):
-            yield row, FNAV_FROM + k, values
+            yield row, k, values
 
 
 def _inav(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
@@ -126,16 +140,10 @@ def _beidou(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, V
 
 
 def _bcnav2(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
-    modern = np.isin(part.signal, _B2A)
-    if not modern.any():
-        return
-    bits = packed_words(part.words, drop=0, keep=32)
-    valid = modern & nav_messages.has_crc(bits, nav_messages.BCNAV2_CHECKED)
-    counts["C B-CNAV2 without valid CRC"] += int(np.count_nonzero(modern & ~valid))
-    kind = unsigned(bits, 6, 6)
-    for k, layout in nav_messages.BCNAV2.items():
-        for row, values in _rows(bits, np.flatnonzero(valid & (kind == k)), nav_messages.BCNAV2_HEAD | layout):
-            yield row, CNAV_FROM + k, values
+    here, fault = np.isin(part.signal, _B2A), "C B-CNAV2 without valid CRC"
+    layouts = {k: nav_messages.BCNAV2_HEAD | layout for k, layout in nav_messages.BCNAV2.items()}
+    for row, kind, values in _by_kind(part, here, nav_messages.BCNAV2_CHECKED, 6, layouts, counts, fault):
+        yield row, CNAV_FROM + kind, values
 
 
 def _glonass(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:

@@ -248,7 +248,7 @@ def write_level(
     Infinite without a sub-filter, and where the measurements of one have contradicted it for longer than
     `TrackingLimits.level_doubt_s`: it has settled somewhere else, or began where the fault of its source had led the
     filter, and bounds nothing. Along the line it is infinite where another place of it, further away than a bound may
-    reach, is more probable than the risk; the straight distance is bounded with all branches.
+    reach, is more probable than the risk; the straight distance is bounded with all branches and a map that lies aside.
     """
     place, sigma = state.mean[0, ARC], math.sqrt(state.covariance[0, ARC, ARC])
     noise, apart = parameters.level_k * sigma, math.nan
