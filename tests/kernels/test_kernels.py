@@ -70,6 +70,7 @@ KERNELS = {
     "ranges": ("reduced_equations", "misfits", "iterated_points", "iterated_along"),
     "reading": ("decoded_fields", "placed_fields", "line_ends"),
     "robust": ("reweighted",),
+    "screens": ("suspicions",),
     "search": ("radii_of_balls", "points_in_balls", "best_points"),
 }
 NAMES = [(module, name) for module, names in KERNELS.items() for name in names]

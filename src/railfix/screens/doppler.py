@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, freeze_arrays
+from railfix import kernels
+from railfix.core.arrays import Datetimes, Floats, Strings, freeze_arrays
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
@@ -243,7 +244,7 @@ def doppler_screen(
     limit, sum_log, weight = _limit_m(interval, metric, sigmas, before, limits)
     metric = np.where(np.isnan(limit), np.nan, metric)
     limit = np.where(np.isnan(metric), np.nan, limit)
-    reject, level, since = suspicions(
+    reject, level, since = kernels.screens.suspicions(
         when.astype(np.int64), metric, limit, before.level_m, before.since.astype(np.int64), int(limits.hold_s * _NS)
     )
     after = DopplerState(
@@ -310,48 +311,6 @@ def _limit_m(
     else:
         row = doppler_limit_m(interval, limits=limits)
     return np.broadcast_to(row[:, None], metric.shape), total, epochs
-
-
-def suspicions(
-    time_ns: Integers, metric: Floats, limit: Floats, level_before: Floats, since_before: Integers, hold_ns: int
-) -> tuple[Masks, Floats, Integers]:
-    """Follow the levels of satellites after jumps; a loop over jumps only.
-
-    `metric` and `limit`, shape (T, M), in C order; level and start of suspicions before, shape (M,), NaT as a number
-    for none. Returns the rejections, the levels (0 without suspicion, NaN without a metric), and the starts at the end.
-    Levels are summed from the jump on, so that a cut between does not show.
-    """
-    never = np.iinfo(np.int64).min
-    reject = np.zeros(metric.shape, dtype=bool)
-    level = np.where(np.isnan(metric), np.nan, 0.0)
-    since = np.full(metric.shape[1], never)
-    jumped = np.abs(metric) > limit
-    carried = since_before != never
-    for m in np.flatnonzero(jumped.any(axis=0) | carried).tolist():
-        starts = np.flatnonzero(jumped[:, m])
-        blind = np.flatnonzero(np.isnan(metric[:, m]))
-        k, start, old = 0, int(since_before[m]), float(level_before[m])
-        if not carried[m]:
-            k, start, old = int(starts[0]), int(time_ns[starts[0]]), 0.0
-        while True:
-            known = int(blind[i]) if (i := int(np.searchsorted(blind, k))) < len(blind) else len(time_ns)
-            held = int(np.searchsorted(time_ns, start + hold_ns, side="right"))
-            end = min(known, held)
-            levels = np.cumsum(np.concatenate([[old], metric[k:end, m]]))[1:]
-            back = np.flatnonzero(np.abs(levels) <= limit[k:end, m])
-            stop = k + int(back[0]) if len(back) else end
-            reject[k:stop, m] = True
-            level[k:stop, m] = levels[: stop - k]
-            if stop == len(time_ns):
-                since[m] = start
-                break
-            # the epoch of coming back is not judged again; the one after the hold is
-            i = int(np.searchsorted(starts, stop + 1 if len(back) else stop))
-            if i == len(starts):
-                break
-            k, old = int(starts[i]), 0.0
-            start = int(time_ns[k])
-    return reject, level, since
 
 
 class DopplerScreen(ObservationScreen[DopplerLimits]):
