@@ -87,8 +87,8 @@ class Recursion:
         written = {field.name: getattr(result, field.name) for field in fields(result)}
         self.answers = layout.Outputs(**{name: written[name] for name in layout.Outputs._fields})
 
-    def advance(self, state: TrackState, first: int, trace: list[Step] | None) -> int:
-        """Do epochs from `first` on, change the state, and return the first before which places have to be sought.
+    def advance(self, state: TrackState, first: int, trace: list[Step] | None) -> tuple[int, bool]:
+        """Do epochs from `first` on and change the state; return the next, and whether places have to be sought there.
 
         One at a time where the smoother needs something of each.
         """
@@ -99,15 +99,15 @@ class Recursion:
         done = handed.run(layout.WHOLE)
         if done > first:
             handed.take_back(state, first, done)
-        return done
+        return done, done < last
 
-    def _advance_traced(self, state: TrackState, epoch: int, trace: list[Step]) -> int:
+    def _advance_traced(self, state: TrackState, epoch: int, trace: list[Step]) -> tuple[int, bool]:
         handed = Handover(self, state, epoch, epoch + 1, every=True)
         if handed.run(layout.WHOLE) == epoch:
-            return epoch
+            return epoch, True
         parents = Sought(lost=False, parent=np.arange(state.hypotheses), splits=None)
         self._take_back_traced(state, epoch, handed, parents, trace)
-        return epoch + 1
+        return epoch + 1, False
 
     def search(self, state: TrackState, epoch: int, trace: list[Step] | None) -> None:
         """Do an epoch before which places have to be sought."""
@@ -245,7 +245,7 @@ def track(
     if len(epochs):
         chunk = prepare_chunk(epochs, state, limits)
         recursion = Recursion(chunk, line, sensors, limits, result, levels=levels)
-        epoch = 0
+        epoch, sought = 0, False
         while epoch < len(epochs):
             lost = not np.isfinite(state.mean[:, StateIndex.ARC]).all()
             if lost or chunk.apart[epoch] or chunk.off_map[epoch]:
@@ -256,13 +256,11 @@ def track(
                     trace.append(Step.without_place(state, float(chunk.interval_s[epoch])))
                 epoch += 1
                 continue
-            done = epoch
-            if state.hypotheses:
-                done = recursion.advance(state, epoch, trace)
-            if done == epoch:
+            if state.hypotheses and not sought:
+                epoch, sought = recursion.advance(state, epoch, trace)
+            else:
                 recursion.search(state, epoch, trace)
-                done += 1
-            epoch = done
+                epoch, sought = epoch + 1, False
         finish_chunk(chunk, epochs, state, limits)
     np.add(result.arc_m, line.round_m(result.arc_m), out=result.arc_m)
     return result, state

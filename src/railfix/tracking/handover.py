@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -239,14 +240,10 @@ def _subfilters(
 ) -> layout.Subfilters:
     """Sub-filters by source, none of them where levels are off."""
     n = len(full)
-    prior, k, k_speed = (np.zeros(len(names)) for _ in range(3))
-    begun = np.zeros(n + len(_OF_EPOCH))
+    begun, parameters = np.zeros(n + len(_OF_EPOCH)), _source_parameters(tuple(names), limits)
     running, weak = np.zeros(len(names), dtype=np.bool_), np.zeros(len(names))
     mean, covariance = np.zeros((len(names), n)), np.zeros((len(names), n, n))
     if names:
-        given, kinds = bank.budget(limits), [bank.kind_of(name) for name in names]
-        prior[:], k[:] = np.array(given.prior)[kinds], np.array(given.k_fault)[kinds]
-        k_speed[:] = np.array(given.k_speed_fault)[kinds]
         start = np.full(1, limits.expired_sigma_m)
         _, fresh = begin(np.zeros(1), start, len(state.satellite), line, limits)
         begun[:] = np.diagonal(fresh[0])[np.concatenate([full, _OF_EPOCH])]
@@ -262,12 +259,21 @@ def _subfilters(
         mean=mean,
         covariance=covariance,
         weak_s=weak,
-        prior=prior,
-        k=k,
-        k_speed=k_speed,
+        **parameters,
         begun=begun,
         clock=np.array(clock, dtype=np.intp),
     )
+
+
+@lru_cache(maxsize=64)
+def _source_parameters(names: tuple[str, ...], limits: TrackingLimits) -> dict[str, Floats]:
+    """Prior and factors of sub-filters by their source, which the kernel only reads."""
+    given, kinds = bank.budget(limits), np.array([bank.kind_of(name) for name in names], dtype=np.intp)
+    return {
+        "prior": np.array(given.prior)[kinds],
+        "k": np.array(given.k_fault)[kinds],
+        "k_speed": np.array(given.k_speed_fault)[kinds],
+    }
 
 
 def _work_space(

@@ -107,7 +107,7 @@ class Line:
         first, last = self.arc_m[0], self.arc_m[-1]
         for excess, turn in ((arc_m - last, last - self.joins_m[1]), (first - arc_m, first - self.joins_m[0])):
             if turn == turn:
-                back -= np.maximum(np.ceil(np.nan_to_num(excess) / abs(turn)), 0.0) * turn
+                back -= np.fmax(np.ceil(excess / abs(turn)), 0.0) * turn
         return back
 
     def nearest_m(self, arc_m: Floats, to_m: Floats) -> Floats:
