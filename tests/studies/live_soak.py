@@ -1,6 +1,6 @@
 """A day of a live session as fast as it goes: memory, messages, what is kept of ephemerides and SBAS messages.
 
-    python tests/studies/live_soak.py [--hours 24] [--rate 0.2] [--sbas]
+    python tests/studies/live_soak.py [--hours 24] [--rate 0.2] [--sbas] [--channels 2]
 
 Two antennas of a simulated train that runs to and fro on a line of 36 km, with the filter along the track; ephemerides
 come when they are sent, messages go into a file, the state is pickled every 360 epochs. Prints memory hour by hour.
@@ -26,6 +26,7 @@ import railfix
 from railfix.gnss.navigation import Navigation
 from railfix.io.train_message import from_json
 from railfix.live import session
+from railfix.live.channels import TwoChannels
 from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
@@ -55,8 +56,8 @@ def sent_by(navigation: Navigation, after: np.datetime64, until: np.datetime64) 
     return replace(navigation, kepler=part)
 
 
-def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False) -> dict[str, Any]:
-    """Run a session over a simulated day; return what it left."""
+def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False, channels: int = 1) -> dict[str, Any]:
+    """Run a session over a simulated day; return what it left. Two channels that differ end it."""
     files = simulated(folder, hours, rate_hz, sbas=sbas)
     track, vehicle = railfix.read_track([files["track"]]), railfix.read_vehicle(files["vehicle"])
     navigation = railfix.read_navigation(files["nav"])
@@ -69,7 +70,8 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False) -> d
         navigation=sent_by(navigation, np.datetime64("1980-01-06", "ns"), start),
         messages=None,
     )
-    engine = LiveEngine(processor, LiveSettings(period_s=min(1.0 / rate_hz, 60.0), no_input="skip"))
+    settings = LiveSettings(period_s=min(1.0 / rate_hz, 60.0), no_input="skip")
+    engine = (TwoChannels if channels == 2 else LiveEngine)(processor, settings)
     memory: list[float] = []
     counts = {"outputs": 0, "saved": 0}
 
@@ -82,7 +84,7 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False) -> d
             memory.append(resident_mb())
             print(f"{len(memory):3d} h  {memory[-1]:7.1f} MB  state {counts['saved'] / 1e3:.0f} kB", flush=True)
 
-    async def arrivals(source: str, state: ReceiverState, _: object) -> AsyncIterator[ReceivedData]:
+    async def arrivals(source: str, state: ReceiverState, *_: object) -> AsyncIterator[ReceivedData]:
         last, front = start, source == str(files["front"])
         for piece in railfix.scan_observations(source, epochs=100):
             for epoch in single_epochs(piece):
@@ -103,7 +105,11 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False) -> d
             await run_session(engine, sources, [sink], speed=None, hooks=Hooks(observe=observe))
         sink.close()
 
-    asyncio.run(run())
+    try:
+        asyncio.run(run())
+    finally:
+        if isinstance(engine, TwoChannels):
+            engine.close()
     numbers = [from_json(line).sequence for line in (folder / "messages.jsonl").read_text().splitlines()]
     saved = engine.saved()
     assert saved is not None
@@ -143,9 +149,14 @@ def main() -> None:
     parser.add_argument("--hours", type=float, default=24.0)
     parser.add_argument("--rate", type=float, default=0.2, help="epochs a second")
     parser.add_argument("--sbas", action="store_true")
+    parser.add_argument(
+        "--channels", type=int, choices=(1, 2), default=1, help="2: a second process checks each message"
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        left = soak(Path(folder), hours=options.hours, rate_hz=options.rate, sbas=options.sbas)
+        left = soak(
+            Path(folder), hours=options.hours, rate_hz=options.rate, sbas=options.sbas, channels=options.channels
+        )
     numbers = left.pop("sequence")
     missing = numbers != list(range(1, left["epochs"] + 1))
     print({name: value for name, value in left.items() if name != "memory_mb"})
