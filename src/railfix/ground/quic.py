@@ -198,7 +198,9 @@ async def connected(
     )
     try:
         protocol.connect(address)
-        await asyncio.wait_for(protocol.wait_connected(), timeout_s)
+        # `wait_for` would leave the error of a connection that ends as it gives up to nobody.
+        async with asyncio.timeout(timeout_s):
+            await protocol.wait_connected()
         yield protocol
     finally:
         protocol._connected_waiter = None  # after a time-out nobody takes the error that closing gives it
