@@ -15,8 +15,10 @@ from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Mas
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import bdt_to_gpst, gpst_minus_utc, nearest_week
 from railfix.gnss.observations import named_frequency_hz
+from railfix.io.receiver import nav_messages
 from railfix.io.receiver.framing import Field, Frames, fields, signed, unsigned
 from railfix.io.receiver.measurements import Measurements, joined
+from railfix.io.receiver.nav_messages import Coding, layout
 
 #: Constellation letter by tens of the message number of an MSM.
 SYSTEMS: Final = {107: "G", 108: "R", 109: "E", 110: "S", 111: "J", 112: "C"}
@@ -331,89 +333,49 @@ def _times(system: str, bits: Bytes, near: np.datetime64) -> Datetimes:
     return bdt_to_gpst(time) if system == "C" else time
 
 
-def _sequence(*items: tuple[str, int, float, str]) -> dict[str, Field]:
+def _sequence(codings: Mapping[str, Coding], names: str) -> dict[str, Field]:
     """A layout from fields that follow each other after the message number."""
-    layout: dict[str, Field] = {}
-    first = 12
-    for name, length, factor, coding in items:
-        layout[name] = (first, length, factor, coding)
-        first += length
-    return layout
+    lengths = [codings[name][0] for name in names.split()]
+    places = np.cumsum([12, *lengths[:-1]]).tolist()
+    return layout(codings, **dict(zip(names.split(), places, strict=True)))
 
 
-_SC: Final = np.pi
-_ANGLE, _RATE_A = 2.0**-31 * _SC, 2.0**-43 * _SC
+_ORBIT: Final = "crs delta_n m0 cuc eccentricity cus sqrt_a toe_sow_s cic omega0 cis i0 crc omega omega_dot"
+_GALILEO: Final = f"number week iod accuracy i_dot toc_s af2 af1 af0_s {_ORBIT} group_delay_1_s"
 #: Ephemeris messages: fields in the order in which they are sent.
 EPHEMERIDES: Final[dict[int, dict[str, Field]]] = {
     1019: _sequence(
-        ("number", 6, 1, "u"), ("week", 10, 1, "u"), ("accuracy", 4, 1, "u"), ("codes", 2, 1, "u"),
-        ("i_dot", 14, _RATE_A, "s"), ("iode", 8, 1, "u"), ("toc_s", 16, 16, "u"), ("af2", 8, 2.0**-55, "s"),
-        ("af1", 16, 2.0**-43, "s"), ("af0_s", 22, 2.0**-31, "s"), ("iodc", 10, 1, "u"), ("crs", 16, 2.0**-5, "s"),
-        ("delta_n", 16, _RATE_A, "s"), ("m0", 32, _ANGLE, "s"), ("cuc", 16, 2.0**-29, "s"),
-        ("eccentricity", 32, 2.0**-33, "u"), ("cus", 16, 2.0**-29, "s"), ("sqrt_a", 32, 2.0**-19, "u"),
-        ("toe_sow_s", 16, 16, "u"), ("cic", 16, 2.0**-29, "s"), ("omega0", 32, _ANGLE, "s"),
-        ("cis", 16, 2.0**-29, "s"), ("i0", 32, _ANGLE, "s"), ("crc", 16, 2.0**-5, "s"), ("omega", 32, _ANGLE, "s"),
-        ("omega_dot", 24, _RATE_A, "s"), ("group_delay_1_s", 8, 2.0**-31, "s"), ("health", 6, 1, "u"),
-        ("flag", 1, 1, "u"), ("fit", 1, 1, "u"),
+        nav_messages.LNAV_CODINGS,
+        f"number week accuracy codes i_dot iode toc_s af2 af1 af0_s iodc {_ORBIT} group_delay_1_s health flag fit",
     ),
     1044: _sequence(
-        ("number", 4, 1, "u"), ("toc_s", 16, 16, "u"), ("af2", 8, 2.0**-55, "s"), ("af1", 16, 2.0**-43, "s"),
-        ("af0_s", 22, 2.0**-31, "s"), ("iode", 8, 1, "u"), ("crs", 16, 2.0**-5, "s"), ("delta_n", 16, _RATE_A, "s"),
-        ("m0", 32, _ANGLE, "s"), ("cuc", 16, 2.0**-29, "s"), ("eccentricity", 32, 2.0**-33, "u"),
-        ("cus", 16, 2.0**-29, "s"), ("sqrt_a", 32, 2.0**-19, "u"), ("toe_sow_s", 16, 16, "u"),
-        ("cic", 16, 2.0**-29, "s"), ("omega0", 32, _ANGLE, "s"), ("cis", 16, 2.0**-29, "s"), ("i0", 32, _ANGLE, "s"),
-        ("crc", 16, 2.0**-5, "s"), ("omega", 32, _ANGLE, "s"), ("omega_dot", 24, _RATE_A, "s"),
-        ("i_dot", 14, _RATE_A, "s"), ("codes", 2, 1, "u"), ("week", 10, 1, "u"), ("accuracy", 4, 1, "u"),
-        ("health", 6, 1, "u"), ("group_delay_1_s", 8, 2.0**-31, "s"), ("iodc", 10, 1, "u"), ("fit", 1, 1, "u"),
+        {**nav_messages.LNAV_CODINGS, "number": (4, 1, "u")},
+        f"number toc_s af2 af1 af0_s iode {_ORBIT} i_dot codes week accuracy health group_delay_1_s iodc fit",
     ),
     1042: _sequence(
-        ("number", 6, 1, "u"), ("week", 13, 1, "u"), ("accuracy", 4, 1, "u"), ("i_dot", 14, _RATE_A, "s"),
-        ("aode", 5, 1, "u"), ("toc_s", 17, 8, "u"), ("af2", 11, 2.0**-66, "s"), ("af1", 22, 2.0**-50, "s"),
-        ("af0_s", 24, 2.0**-33, "s"), ("aodc", 5, 1, "u"), ("crs", 18, 2.0**-6, "s"), ("delta_n", 16, _RATE_A, "s"),
-        ("m0", 32, _ANGLE, "s"), ("cuc", 18, 2.0**-31, "s"), ("eccentricity", 32, 2.0**-33, "u"),
-        ("cus", 18, 2.0**-31, "s"), ("sqrt_a", 32, 2.0**-19, "u"), ("toe_sow_s", 17, 8, "u"),
-        ("cic", 18, 2.0**-31, "s"), ("omega0", 32, _ANGLE, "s"), ("cis", 18, 2.0**-31, "s"), ("i0", 32, _ANGLE, "s"),
-        ("crc", 18, 2.0**-6, "s"), ("omega", 32, _ANGLE, "s"), ("omega_dot", 24, _RATE_A, "s"),
-        ("group_delay_1_s", 10, 1e-10, "s"), ("group_delay_2_s", 10, 1e-10, "s"), ("health", 1, 1, "u"),
+        nav_messages.BEIDOU_CODINGS,
+        f"number week accuracy i_dot aode toc_s af2 af1 af0_s aodc {_ORBIT} group_delay_1_s group_delay_2_s health",
     ),
-    **{
-        number: _sequence(
-            ("number", 6, 1, "u"), ("week", 12, 1, "u"), ("iod", 10, 1, "u"), ("accuracy", 8, 1, "u"),
-            ("i_dot", 14, _RATE_A, "s"), ("toc_s", 14, 60, "u"), ("af2", 6, 2.0**-59, "s"), ("af1", 21, 2.0**-46, "s"),
-            ("af0_s", 31, 2.0**-34, "s"), ("crs", 16, 2.0**-5, "s"), ("delta_n", 16, _RATE_A, "s"),
-            ("m0", 32, _ANGLE, "s"), ("cuc", 16, 2.0**-29, "s"), ("eccentricity", 32, 2.0**-33, "u"),
-            ("cus", 16, 2.0**-29, "s"), ("sqrt_a", 32, 2.0**-19, "u"), ("toe_sow_s", 14, 60, "u"),
-            ("cic", 16, 2.0**-29, "s"), ("omega0", 32, _ANGLE, "s"), ("cis", 16, 2.0**-29, "s"),
-            ("i0", 32, _ANGLE, "s"), ("crc", 16, 2.0**-5, "s"), ("omega", 32, _ANGLE, "s"),
-            ("omega_dot", 24, _RATE_A, "s"), ("group_delay_1_s", 10, 2.0**-32, "s"), *rest,
-        )
-        for number, rest in (
-            (1045, (("e5a_health", 2, 1, "u"), ("e5a_invalid", 1, 1, "u"))),
-            (1046, (("group_delay_2_s", 10, 2.0**-32, "s"), ("e5b_health", 2, 1, "u"), ("e5b_invalid", 1, 1, "u"),
-                    ("e1b_health", 2, 1, "u"), ("e1b_invalid", 1, 1, "u"))),
-        )
-    },
+    1045: _sequence(nav_messages.GALILEO_CODINGS, f"{_GALILEO} e5a_health e5a_invalid"),
+    1046: _sequence(
+        nav_messages.GALILEO_CODINGS, f"{_GALILEO} group_delay_2_s e5b_health e5b_invalid e1b_health e1b_invalid"
+    ),
     1020: _sequence(
-        ("number", 6, 1, "u"), ("channel", 5, 1, "u"), ("almanac", 4, 1, "u"), ("hour", 5, 3600, "u"),
-        ("minute", 6, 60, "u"), ("half_minute", 1, 30, "u"), ("health", 1, 1, "u"), ("p2", 1, 1, "u"),
-        ("tb_s", 7, 900, "u"), ("x_velocity", 24, 2.0**-20, "m"), ("x", 27, 2.0**-11, "m"),
-        ("x_acceleration", 5, 2.0**-30, "m"), ("y_velocity", 24, 2.0**-20, "m"), ("y", 27, 2.0**-11, "m"),
-        ("y_acceleration", 5, 2.0**-30, "m"), ("z_velocity", 24, 2.0**-20, "m"), ("z", 27, 2.0**-11, "m"),
-        ("z_acceleration", 5, 2.0**-30, "m"), ("p3", 1, 1, "u"), ("relative_frequency", 11, 2.0**-40, "m"),
-        ("p", 2, 1, "u"), ("ln", 1, 1, "u"), ("tau_s", 22, 2.0**-30, "m"), ("dtau", 5, 2.0**-30, "m"),
-        ("age", 5, 1, "u"),
+        {**nav_messages.GLONASS_CODINGS, "health": (1, 1, "u")},
+        "number channel almanac hour minute half_minute health p2 tb_s x_velocity x x_acceleration y_velocity y "
+        "y_acceleration z_velocity z z_acceleration p3 relative_frequency p ln tau_s dtau age",
     ),
-}  # fmt: skip
+}
 
 
 def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float]]]:
     """Fields of every ephemeris message: place in the stream, message number, values."""
-    for number, layout in EPHEMERIDES.items():
+    for number, sent in EPHEMERIDES.items():
         chosen = frames.of("rtcm3", number)
-        needed = max(first + length for first, length, _, _ in layout.values() if isinstance(first, int))
+        needed = max(first + length for first, length, _, _ in sent.values() if isinstance(first, int))
         chosen = chosen[(frames.end - frames.start)[chosen] * 8 >= needed]
         if not len(chosen):
             continue
-        table = fields(bits_of(frames, chosen, needed), layout)
+        table = fields(bits_of(frames, chosen, needed), sent)
         for k, place in enumerate(frames.frame_start[chosen].tolist()):
             yield place, number, {name: float(values[k]) for name, values in table.items()}
