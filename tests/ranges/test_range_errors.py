@@ -14,8 +14,8 @@ import recordings_truth
 from railfix.cli import app
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.evaluate.range_errors import (
-    CommonErrors,
     ModelInputs,
+    StationErrors,
     base_station,
     base_station_from_files,
     error_model_from_runs,
@@ -67,7 +67,7 @@ def test_too_few_ranges_have_no_clock() -> None:
 
 
 def test_a_station_speaks_between_its_epochs_and_of_its_satellites() -> None:
-    station = CommonErrors(
+    station = StationErrors(
         name="x",
         time=EPOCH + np.array([0, 30, 90]) * np.timedelta64(1, "s"),
         satellite=np.array(["E01", "G01"]),

@@ -31,7 +31,7 @@ class OtherPositions(Settings):
     columns: ColumnNames = Field(default_factory=ColumnNames)  #: Of a CSV file with other names.
 
 
-class Scenario(Settings):
+class RecordedScenario(Settings):
     """Description of a test scenario for record and replay (EN 16803-2, EN 16803-1: set-up, trajectory, environment).
 
     Attributes
@@ -71,7 +71,7 @@ class CaseFile(Settings):
     files: RunInputs  #: As the options of `railfix run`, with the ground truth as `truth`.
     sha256: dict[str, str]  #: SHA-256 of every file of `files` and `positions`, by its name there.
     positions: dict[str, OtherPositions] = Field(default_factory=dict)  #: Positions by the name of the program.
-    scenario: Scenario = Scenario()
+    scenario: RecordedScenario = RecordedScenario()
     options: RunOptions = RunOptions()
     evaluation: EvaluationOptions = EvaluationOptions()
 

@@ -51,7 +51,7 @@ from railfix.run.sources import aligned
 from railfix.track.trajectory import Trajectory
 
 __all__ = [
-    "CommonErrors", "GatherLimits", "ModelInputs", "RangeErrors", "RobustClock", "StationBeside", "base_station",
+    "GatherLimits", "ModelInputs", "RangeErrors", "RobustClock", "StationBeside", "StationErrors", "base_station",
     "base_station_from_files", "error_model_from_runs", "range_errors", "robust_clock",
 ]  # fmt: skip
 
@@ -87,7 +87,7 @@ class GatherLimits(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CommonErrors:
+class StationErrors:
     """Common errors by satellite, B epochs of the station by S satellites."""
 
     name: str
@@ -112,7 +112,7 @@ class CommonErrors:
 
 def base_station(
     parts: Iterable[Observations], processor: EpochProcessor, position_ecef_m: Floats, *, name: str
-) -> CommonErrors:
+) -> StationErrors:
     """Common range errors from the log of a station at a known position.
 
     Its pseudoranges are corrected like those of the train, with the same settings, and smoothed by carrier phase
@@ -146,7 +146,7 @@ def base_station(
         for part, empty in zip(errors, blank, strict=True)
         if names
     ]
-    return CommonErrors(
+    return StationErrors(
         name=name,
         time=np.concatenate(times) if times else np.empty(0, dtype="datetime64[ns]"),
         satellite=np.array(names, dtype=np.str_),
@@ -157,7 +157,7 @@ def base_station(
 
 def base_station_from_files(
     paths: Sequence[Path], processor: EpochProcessor, *, position_ecef_m: Floats | None = None
-) -> CommonErrors:
+) -> StationErrors:
     """Common range errors from RINEX files; the position is that of the header where none is given.
 
     Raises
@@ -189,7 +189,7 @@ def range_errors(
     result: AntennaResult,
     trajectory: Trajectory,
     reference: AntennaReference,
-    base: CommonErrors | None = None,
+    base: StationErrors | None = None,
     *,
     limits: GatherLimits | None = None,
     block_s: float = 30.0,
@@ -204,7 +204,7 @@ def range_errors(
     ----------
     trajectory : Trajectory
         Of the antenna; gives the azimuth of the vehicle.
-    base : CommonErrors, optional
+    base : StationErrors, optional
         Without one, satellite and atmospheric errors remain.
     block_s : float [s]
         Length of the blocks of `ErrorSamples.block`.
@@ -377,7 +377,7 @@ def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit, limits: Ga
     references = read_reference(source.reference, tuple(past.inputs.logs), columns=source.columns)
     processor = processor_of(past.config.replaced(filter="off"), navigation, line.trajectories)
     state = State()
-    base: CommonErrors | None = None
+    base: StationErrors | None = None
     if source.base:
         base = base_station_from_files(source.base, processor, position_ecef_m=source.base_position_ecef_m)
     parts: list[ErrorSamples] = []

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from railfix.track.csv_file import read_csv_segment
 from railfix.track.geojson_file import read_geojson_segments
 from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
 from railfix.track.heights import GEOIDS, check_height_datum
-from railfix.track.route import MAX_GAP_M, NO_HEIGHTS, MapReading, Segment, join
+from railfix.track.route import MAX_GAP_M, NO_HEIGHTS, MapOptions, MapReading, Segment, join
 from railfix.track.track import Track
 from railfix.track.vector_file import ENDINGS as VECTOR_ENDINGS
 from railfix.track.vector_file import SIGMA_M as OSM_SIGMA_M
@@ -28,15 +29,11 @@ from railfix.track.xml_files import read_rinf_segments
 def read_track(
     paths: str | PathLike[str] | Sequence[str | PathLike[str]],
     *,
-    crs: str | None = None,
-    height_datum: str | None = None,
-    geoid: str | None = None,
     name: str | None = None,
     max_gap_m: float = MAX_GAP_M,
-    sigma_plan_m: float | None = None,
     sigma_height_m: float | None = None,
-    duplicates: str = "reject",
     heights: str | PathLike[str] | None = None,
+    **options: Unpack[MapOptions],
 ) -> Track:
     """Read the centreline of a route from map files.
 
@@ -76,24 +73,22 @@ def read_track(
     SettingsError
         An option is unknown or contradicts the file.
     """
-    check_height_datum(height_datum)
-    if duplicates not in ("reject", "keep"):
-        raise ValueError(f"duplicates is {duplicates!r}, expected 'reject' or 'keep'")
-    for key, value in (("sigma_plan_m", sigma_plan_m), ("sigma_height_m", sigma_height_m)):
+    reading = MapReading(**options)
+    check_height_datum(reading.height_datum)
+    if reading.duplicates not in ("reject", "keep"):
+        raise ValueError(f"duplicates is {reading.duplicates!r}, expected 'reject' or 'keep'")
+    for key, value in (("sigma_plan_m", reading.sigma_plan_m), ("sigma_height_m", sigma_height_m)):
         if value is not None and not value > 0.0:
             raise SettingsError(f"{key} is {value:g}; a positive number of metres was expected")
     files = [paths] if isinstance(paths, str | PathLike) else list(paths)
-    reading = MapReading(
-        crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates, sigma_plan_m=sigma_plan_m
-    )
     if not files:
         raise SettingsError("no track map was given")
     return track_of_segments(
         [segment for file in files for segment in read_segments(file, reading)],
         heights=heights,
-        geoid=geoid,
+        geoid=reading.geoid,
         name=name,
-        height_datum=height_datum,
+        height_datum=reading.height_datum,
         max_gap_m=max_gap_m,
         sigma_height_m=sigma_height_m,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypedDict
 
 import numpy as np
 
@@ -23,6 +24,16 @@ RINF_SECTIONS = (
     "sections of line and operational points of ERA RINF have no geometry of tracks; export the register's topology as "
     "RDF (.ttl, .rdf, .nt, .jsonld)"
 )
+
+
+class MapOptions(TypedDict, total=False):
+    """Fields of `MapReading` by their names."""
+
+    crs: str | None
+    height_datum: str | None
+    geoid: str | None
+    duplicates: str
+    sigma_plan_m: float | None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -94,7 +94,7 @@ _LARGEST_M: Final = 63.9  #: Largest correction of a clock that the field holds 
 _GROWTH_MPS: Final = 0.002  #: Growth of the corrections' errors until the next ones [m/s].
 
 
-class DfmcService(Service):
+class SimulatedDfmc(Service):
     """Corrections on L5 of a simulated run: GPS L1 C/A with L5, Galileo E1 with E5a."""
 
     systems = "".join(DFMC_SIGNALS)

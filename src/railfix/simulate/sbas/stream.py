@@ -12,7 +12,7 @@ from railfix.core.files import write_whole
 from railfix.core.timescale import seconds, timedelta, to_week
 from railfix.ranges.sbas import SbasMessages
 from railfix.ranges.sbas.messages import message_type
-from railfix.simulate.sbas.dfmc import DfmcService
+from railfix.simulate.sbas.dfmc import SimulatedDfmc
 from railfix.simulate.sbas.service import FAST_PERIOD_S, Service
 from railfix.simulate.sbas.settings import SbasSettings
 
@@ -30,7 +30,7 @@ def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessage
     into clocks, group delays, orbits and ionosphere, to the messages' resolution (0.125 m); only GPS is corrected.
     On L5: integrity (types 35, 36) every 6 s, between them mask, degradation and corrections of GPS and Galileo.
     """
-    service = (DfmcService if settings.band == "L5" else Service)(simulation, settings)
+    service = (SimulatedDfmc if settings.band == "L5" else Service)(simulation, settings)
     scenario = simulation.scenario
     fast, slow = service.fast_messages(), service.slow_messages()
     first = -int(np.ceil(settings.lead_s))

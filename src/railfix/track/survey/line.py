@@ -263,15 +263,27 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
         positions = adjusted.ecef_m
     assert adjusted is not None
     assert course is not None
-    found = _survey(runs, legs, passes, ties, adjusted, course, moved, beside, name)
-    if not apart:
-        return found
-    note = (
-        f"the runs of one direction lie {apart:.1f} m beside those of the other: another track, left out; give the "
-        "runs of each track by themselves"
+    order, count = _kept_points(course, ties)
+    sigma = adjusted.line_sigma_m[order]
+    sigma_plan, sigma_height = (float(np.percentile(sigma[:, axis], _OF_THE_MAP)) for axis in range(2))
+    notes = _notes(runs, legs, passes, count, moved[order], (sigma_plan, sigma_height), beside, apart)
+    track = Track.from_ecef(
+        moved[order],
+        name=name,
+        sigma_plan_m=sigma_plan,
+        sigma_height_m=sigma_height,
+        provenance=Provenance(files=tuple(run.name for run in runs), notes=notes),
     )
-    notes = (*found.track.provenance.notes, note)
-    return replace(found, track=replace(found.track, provenance=replace(found.track.provenance, notes=notes)))
+    return Survey(
+        track=track,
+        sigma_plan_m=sigma[:, 0],
+        sigma_height_m=sigma[:, 1],
+        passes=count,
+        runs_ecef_m=adjusted.ecef_m,
+        scale=adjusted.scale,
+        beside_m=beside,
+        closed=course.closed and order[0] == order[-1],
+    )
 
 
 def _filled(run: SurveyRun) -> Floats:
@@ -330,18 +342,8 @@ def _length(step_m: Floats) -> float:
     return float(np.linalg.norm(step_m))
 
 
-def _survey(
-    runs: Sequence[SurveyRun],
-    legs: Sequence[Leg],
-    passes: Sequence[Pass],
-    ties: Ties,
-    adjusted: Adjusted,
-    course: Course,
-    ecef: Floats,
-    beside: float,
-    name: str,
-) -> Survey:
-    """Make the map of the adjusted line: points that no pass crosses are left out, a closed one ends where it began."""
+def _kept_points(course: Course, ties: Ties) -> tuple[Indices, Integers]:
+    """Points of the line that a pass crosses, a closed one ending where it began, and the number of passes of each."""
     count = np.bincount(ties.point, minlength=len(course))
     kept = np.flatnonzero(count > 0)
     closed = course.closed and len(kept) == len(course)
@@ -351,36 +353,36 @@ def _survey(
     order = np.append(kept, kept[0]) if closed else kept
     if len(order) < 3:
         raise ValueError("the runs have no line in common; give runs over one line")
-    sigma = adjusted.line_sigma_m[order]
-    sigma_plan, sigma_height = (float(np.percentile(sigma[:, axis], _OF_THE_MAP)) for axis in range(2))
+    return order, count[order]
+
+
+def _notes(
+    runs: Sequence[SurveyRun],
+    legs: Sequence[Leg],
+    passes: Sequence[Pass],
+    count: Integers,
+    ecef_m: Floats,
+    sigma_m: tuple[float, float],
+    beside: float,
+    apart: float,
+) -> tuple[str, ...]:
+    """Sentences on the runs and the line of them."""
     against = sum(len(each.place) for each in passes if each.sign < 0) / max(sum(len(e.place) for e in passes), 1)
     driven = sum(float(leg.arc_m[-1]) for leg in legs)
-    length = float(np.linalg.norm(np.diff(ecef[order], axis=0), axis=1).sum())
+    length = float(np.linalg.norm(np.diff(ecef_m, axis=0), axis=1).sum())
     notes = [
         ANTENNA_PATH,
         f"surveyed from {plural(runs, 'run')} of {driven:,.0f} m together, {driven / length:.1f} times the line, "
-        f"{against:.0%} of it against its direction; each point is passed {count[order].min()} to {count[order].max()} "
-        "times",
-        f"accuracy of the map {sigma_plan:.2f} m in plan and {sigma_height:.2f} m in height: 95th percentiles along it",
+        f"{against:.0%} of it against its direction; each point is passed {count.min()} to {count.max()} times",
+        f"accuracy of the map {sigma_m[0]:.2f} m in plan and {sigma_m[1]:.2f} m in height: 95th percentiles along it",
     ]
     if beside > 0.02 * driven:
         notes.append(
             f"{beside:,.0f} m of the runs do not lie on the line and are not used: branches, or wrong positions"
         )
-    track = Track.from_ecef(
-        ecef[order],
-        name=name,
-        sigma_plan_m=sigma_plan,
-        sigma_height_m=sigma_height,
-        provenance=Provenance(files=tuple(run.name for run in runs), notes=tuple(notes)),
-    )
-    return Survey(
-        track=track,
-        sigma_plan_m=sigma[:, 0],
-        sigma_height_m=sigma[:, 1],
-        passes=count[order],
-        runs_ecef_m=adjusted.ecef_m,
-        scale=adjusted.scale,
-        beside_m=beside,
-        closed=closed,
-    )
+    if apart:
+        notes.append(
+            f"the runs of one direction lie {apart:.1f} m beside those of the other: another track, left out; give the "
+            "runs of each track by themselves"
+        )
+    return tuple(notes)
