@@ -30,7 +30,7 @@ from railfix.io.receiver.measurements import (
     glonass_record,
     gps_record,
 )
-from railfix.io.receiver.pages import CNAV_FROM, E1B_SOURCE, E5A_SOURCE, E5B_SOURCE, FNAV_FROM, decoded_pages
+from railfix.io.receiver.nav_messages import CNAV_FROM, E1B_SOURCE, E5A_SOURCE, E5B_SOURCE, FNAV_FROM, decoded_pages
 from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_records, kepler_records
 
 #: Constellation of RTCM ephemeris messages.

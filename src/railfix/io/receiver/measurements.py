@@ -14,6 +14,7 @@ from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Mas
 from railfix.core.timescale import from_week, gpst_minus_utc, nearest_week, seconds, timedelta, to_week
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.io.receiver import nav_messages
+from railfix.io.receiver.nav_messages import Values
 from railfix.io.rinex.navigation_records import RawRecord, fields_of
 
 _SLIP, _HALF_CYCLE = 1, 2  #: RINEX loss-of-lock bits: lock lost since the epoch before; half-cycle ambiguity possible.
@@ -176,7 +177,6 @@ def joined(parts: Sequence[Measurements]) -> Measurements:
     )
 
 
-Values = Mapping[str, float]
 Record = tuple[RawRecord, tuple[float, ...]]  #: A record, and what tells it from the satellite's next one.
 
 _GALILEO_WEEK_MINUS_GPS: Final = 1024

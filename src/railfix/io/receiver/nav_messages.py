@@ -10,22 +10,29 @@ BDS-SIS-ICD-B1I 3.0, 5.2 and 5.3; BDS-SIS-ICD-B2a 1.0, 6.2 and 7 (as cssrlib
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Floats, Masks
-from railfix.io.receiver.framing import Field, crc24q, fields
+from railfix.core.arrays import Bytes, Floats, Integers, Masks
+from railfix.io.receiver.framing import Field, Subframes, crc24q, fields, packed_words, unsigned
 
 _PI: Final = np.pi
 Coding = tuple[int, float, str]  #: Number of bits, factor, and how it is coded, of a field (as in `Field`).
+Values = Mapping[str, float]  #: Fields of a message by name.
 Place = int | tuple[tuple[int, int], ...]
 
 
 def layout(codings: Mapping[str, Coding], **places: Place) -> dict[str, Field]:
     """Layout of a message from the codings of its family and where each field begins (or its pieces, with lengths)."""
     return {name: (place, *codings[name]) for name, place in places.items()}
+
+
+def _headed(head: dict[str, Field], kinds: dict[int, dict[str, Field]]) -> dict[int, dict[str, Field]]:
+    """Layouts by kind, with the fields that all messages of the family begin with."""
+    return {kind: head | fields for kind, fields in kinds.items()}
 
 
 def _flags(**lengths: int) -> dict[str, Coding]:
@@ -68,14 +75,14 @@ LNAV_CODINGS: Final[dict[str, Coding]] = {
 }
 #: LNAV subframes without parity (10 words of 24 bits); TOW count and number are in all of them.
 LNAV_HEAD: Final = layout(LNAV_CODINGS, tow_s=24, subframe=43)
-LNAV: Final = {
+LNAV: Final = _headed(LNAV_HEAD, {
     1: layout(LNAV_CODINGS, week=48, accuracy=60, health=64, iodc=((70, 2), (168, 8)), group_delay_1_s=160, toc_s=176,
               af2=192, af1=200, af0_s=216, codes=58, flag=72),
     2: layout(LNAV_CODINGS, iode=48, crs=56, delta_n=72, m0=88, cuc=120, eccentricity=136, cus=168, sqrt_a=184,
               toe_sow_s=216, fit=232),
     3: layout(LNAV_CODINGS, cic=48, omega0=64, cis=96, i0=112, crc=144, omega=160, omega_dot=192, iode=216, i_dot=224),
     4: layout(LNAV_CODINGS, data_id=48, page_sv=50, leap_seconds=192) | _klobuchar(56),
-}  # fmt: skip
+})  # fmt: skip
 GALILEO_CODINGS: Final[dict[str, Coding]] = {
     **_ORBIT,
     **_HARMONICS,
@@ -131,7 +138,7 @@ _CNAV_CODINGS: Final[dict[str, Coding]] = {
 }
 #: CNAV messages of 300 bits; PRN, type and TOW count are in all of them.
 CNAV_HEAD: Final = layout(_CNAV_CODINGS, number=8, type=14, tow_s=20)
-CNAV: Final = {
+CNAV: Final = _headed(CNAV_HEAD, {
     10: layout(_CNAV_CODINGS, week=38, health=51, top=54, accuracy_index=65, toe_sow_s=70, delta_a=81, a_dot=107,
                delta_n=132, delta_n_dot=149, m0=172, eccentricity=205, omega=238),
     11: layout(_CNAV_CODINGS, toe_sow_s=38, omega0=49, i0=82, delta_omega_dot=115, i_dot=132, cis=147, cic=163,
@@ -139,7 +146,7 @@ CNAV: Final = {
     30: layout(_CNAV_CODINGS, ned_0=49, ned_1=54, ned_2=57, toc_s=60, af0_s=71, af1=97, af2=117, group_delay_1_s=127,
                inter_signal_0=140, inter_signal_1=153, inter_signal_2=166, inter_signal_3=179, week_top=256)
     | _klobuchar(192),
-}  # fmt: skip
+})  # fmt: skip
 CNAV_NO_DELAY_S: Final = -4096 * 2.0**-35  #: A group delay of CNAV that is not available (IS-GPS-200N, 30.3.3.3.1.1).
 #: Semi-major axes [m] that CNAV refers to, and rate of the node [rad/s] (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
 CNAV_AXIS_M: Final = {"G": 26_559_710.0, "J": 42_164_200.0}
@@ -155,14 +162,14 @@ _BCNAV2_CODINGS: Final[dict[str, Coding]] = {
 }
 #: BeiDou B-CNAV2 messages of 288 bits, without preamble and parity symbols; PRN, type and SOW are in all of them.
 BCNAV2_HEAD: Final = layout(_BCNAV2_CODINGS, number=0, tow_s=12)
-BCNAV2: Final = {
+BCNAV2: Final = _headed(BCNAV2_HEAD, {
     10: layout(_BCNAV2_CODINGS, week=30, iode=53, toe_sow_s=61, kind=72, delta_a=74, a_dot=100, delta_n=125,
                delta_n_dot=142, m0=165, eccentricity=198, omega=231),
     11: layout(_BCNAV2_CODINGS, health=30, flags=32, sismai=35, omega0=42, i0=75, omega_dot=108, i_dot=127, cis=142,
                cic=158, crs=174, crc=198, cus=222, cuc=243),
     30: layout(_BCNAV2_CODINGS, toc_s=42, af0_s=53, af1=78, af2=100, iodc=111, group_delay_2_s=121, inter_signal_1=133,
                group_delay_1_s=219),
-}  # fmt: skip
+})  # fmt: skip
 #: Semi-major axes that B-CNAV2 refers to [m]: medium orbits (kind 3), and those of the period of the Earth.
 BCNAV2_AXIS_M: Final = {1: 42_162_200.0, 2: 42_162_200.0, 3: 27_906_100.0}
 CNAV_CHECKED, FNAV_CHECKED, BCNAV2_CHECKED = 276, 214, 264  #: Bits of CNAV, F/NAV and B-CNAV2 before their CRC.
@@ -180,7 +187,7 @@ BEIDOU_CODINGS: Final[dict[str, Coding]] = {
 }
 #: BeiDou: seconds of week and subframe number of D1 and D2 (10 words of 30 bits, parity included).
 BDS_HEAD: Final = layout(BEIDOU_CODINGS, tow_s=((18, 8), (30, 12)), subframe=15)
-D1: Final = {
+D1: Final = _headed(BDS_HEAD, {
     1: layout(BEIDOU_CODINGS, health=42, aodc=43, accuracy=48, week=60, toc_s=((73, 9), (90, 8)), group_delay_1_s=98,
               group_delay_2_s=((108, 4), (120, 6)), ion0=126, ion1=134, ion2=150, ion3=158, ion4=((166, 6), (180, 2)),
               ion5=182, ion6=190, ion7=((198, 4), (210, 4)), af2=214, af0_s=((225, 7), (240, 17)),
@@ -191,7 +198,7 @@ D1: Final = {
     3: layout(BEIDOU_CODINGS, toe_low=((42, 10), (60, 5)), i0=((65, 17), (90, 15)), cic=((105, 7), (120, 11)),
               omega_dot=((131, 11), (150, 13)), cis=((163, 9), (180, 9)), i_dot=((189, 13), (210, 1)),
               omega0=((211, 21), (240, 11)), omega=((251, 11), (270, 21))),
-}  # fmt: skip
+})  # fmt: skip
 #: Where each page of D2, subframe 1, begins in the 3000 bits of its ten pages put after each other: page k (1 to 10) at
 #: 300 (k - 1); fields that go over a page are given in pieces.
 _PAGE: Final = {k: 300 * (k - 1) for k in range(1, 11)}
@@ -294,3 +301,111 @@ def glonass_hamming(bits: Bytes) -> Masks:
     total = value.sum(axis=1) & 1
     wrong = np.stack(checks, axis=1).any(axis=1)
     return np.asarray(~wrong & (total == 0))
+
+
+#: Galileo data source: I/NAV with clock and group delay E5b/E1, received on E1-B or on E5b-I.
+E1B_SOURCE, E5B_SOURCE = 1 << 0 | 1 << 9, 1 << 2 | 1 << 9
+#: Galileo data source: F/NAV with clock and group delay E5a/E1.
+E5A_SOURCE: Final = 1 << 1 | 1 << 8
+_UBX_E5B: Final = (5, 6)
+_UBX_E5A: Final = (3, 4)
+_CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}  #: Signals with CNAV: L2C and L5.
+#: BeiDou signals with D1 or D2, B-CNAV1 (B1C) and B-CNAV2 (B2a).
+_D_SIGNALS, _B1C, _B2A = (0, 1, 2, 3, 4, 10), (5, 6), (7, 8)
+#: Numbers of F/NAV pages and of CNAV messages among those of a satellite come after these.
+FNAV_FROM, CNAV_FROM = 200, 300
+_PREAMBLE: Final = 0x8B
+Pages = Iterator[tuple[int, int, Values]]  #: Row, number among those of the satellite, and fields of each page.
+
+
+def decoded_pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], Counter[str]]:
+    """Decoded pages in the order of the stream: row, satellite, number, fields."""
+    counts = Counter(subframes.skipped)
+    pages: list[tuple[int, str, int, Values]] = []
+    letters = subframes.satellite.astype("<U1")
+    for letter, decode in (("G", _lnav), ("J", _lnav), ("E", _galileo), ("C", _beidou), ("R", _glonass)):
+        rows = np.flatnonzero(letters == letter)
+        if len(rows):
+            for row, number, values in decode(subframes.take(rows), counts):
+                pages.append((int(rows[row]), str(subframes.satellite[rows[row]]), number, values))
+    pages.sort(key=lambda page: page[0])
+    return pages, counts
+
+
+def _of_kinds(
+    bits: Bytes, valid: Masks, kind: Integers, layouts: Mapping[int, Mapping[str, Field]], first: int = 0
+) -> Pages:
+    """Row, number (`first` and the kind) and fields of the valid pages of each kind."""
+    for k, layout in layouts.items():
+        rows = np.flatnonzero(valid & (kind == k))
+        table = fields(bits[rows], layout)
+        for i, row in enumerate(rows.tolist()):
+            yield row, first + k, {name: float(values[i]) for name, values in table.items()}
+
+
+def _with_crc(
+    part: Subframes, here: Masks, checked: int, counts: Counter[str], fault: str, preamble: int | None = None
+) -> tuple[Bytes, Masks]:
+    """Bits of pages, and which of those `here` have their preamble and CRC; the others count as `fault`."""
+    bits = packed_words(part.words, drop=0, keep=32)
+    if not here.any():
+        return bits, here
+    valid = here & has_crc(bits, checked)
+    if preamble is not None:
+        valid &= unsigned(bits, 0, 8) == preamble
+    counts[fault] += int(np.count_nonzero(here & ~valid))
+    return bits, valid
+
+
+def _lnav(part: Subframes, counts: Counter[str]) -> Pages:
+    """LNAV and CNAV."""
+    letter, civil = str(part.satellite[0][0]), part.signal == 0
+    cnav = np.isin(part.signal, _CNAV_SIGNALS[letter])
+    counts[f"{letter} pages of other messages"] += int(np.count_nonzero(~cnav & ~civil))
+    checked, fault = CNAV_CHECKED, f"{letter} CNAV without valid CRC"
+    bits, valid = _with_crc(part, cnav, checked, counts, fault, _PREAMBLE)
+    kind = unsigned(bits, 14, 6)
+    kind = np.where((kind == 61) & (letter == "J"), 30, kind)  # a message of type 61 of QZSS is one of type 30
+    yield from _of_kinds(bits, valid, kind, CNAV, CNAV_FROM)
+    bits = packed_words(part.words, drop=6, keep=24)
+    yield from _of_kinds(bits, civil & (unsigned(bits, 0, 8) == _PREAMBLE), unsigned(bits, 43, 3), LNAV)
+
+
+def _galileo(part: Subframes, counts: Counter[str]) -> Pages:
+    """I/NAV and F/NAV."""
+    e5b, fnav = np.isin(part.signal, _UBX_E5B), np.isin(part.signal, _UBX_E5A)
+    inav, fault = (part.signal == 1) | e5b, "E pages without valid CRC"
+    counts["E pages of other messages"] += int(np.count_nonzero(~inav & ~fnav))
+    bits, valid = _with_crc(part, fnav, FNAV_CHECKED, counts, fault)
+    yield from _of_kinds(bits, valid, unsigned(bits, 0, 6), FNAV, FNAV_FROM)
+    bits, valid = inav_words(part.words)
+    counts[fault] += int(np.count_nonzero(inav & ~valid))
+    for row, k, values in _of_kinds(bits, inav & valid, unsigned(bits, 0, 6), INAV):
+        yield row, k, {**values, "source": float(E5B_SOURCE if e5b[row] else E1B_SOURCE)}
+
+
+def _beidou(part: Subframes, counts: Counter[str]) -> Pages:
+    """D1, D2 and B-CNAV2."""
+    legacy, first, b2a = (np.isin(part.signal, signals) for signals in (_D_SIGNALS, _B1C, _B2A))
+    counts["C pages of B-CNAV1 (B-CNAV2 of B2a is read, D1 and D2 too)"] += int(np.count_nonzero(first))
+    counts["C pages of other messages"] += int(np.count_nonzero(~legacy & ~first & ~b2a))
+    bits, valid = _with_crc(part, b2a, BCNAV2_CHECKED, counts, "C B-CNAV2 without valid CRC")
+    yield from _of_kinds(bits, valid, unsigned(bits, 6, 6), BCNAV2, CNAV_FROM)
+    bits = packed_words(part.words, drop=0, keep=30)
+    number = np.array([int(name[1:]) for name in part.satellite.tolist()])
+    geo = (number <= 5) | (number >= 59)
+    subframe = unsigned(bits, 15, 3)
+    valid = legacy & (unsigned(bits, 0, 11) == 0x712)
+    yield from _of_kinds(bits, valid & ~geo, subframe, D1)
+    heads = dict.fromkeys(range(1, 11), BDS_HEAD)
+    for row, k, head in _of_kinds(bits, valid & geo & (subframe == 1), unsigned(bits, 42, 4), heads, 100):
+        packed = int("".join(map(str, bits[row].tolist())), 2)
+        yield row, k, {**head, "page": packed}  # the page whole: its fields go over page ends
+
+
+def _glonass(part: Subframes, counts: Counter[str]) -> Pages:
+    bits = packed_words(part.words[:, :3], drop=0, keep=32)[:, :85]
+    valid = glonass_hamming(bits)
+    counts["R strings without valid code"] += int(np.count_nonzero(~valid))
+    for row, k, values in _of_kinds(bits, valid, unsigned(bits, 1, 4), GLONASS):
+        yield row, k, {**values, "channel": float(part.glonass_channel[row])}
