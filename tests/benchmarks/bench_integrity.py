@@ -36,13 +36,8 @@ from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.ranges.atmosphere import rtca_troposphere_m, rtca_troposphere_sigma_m
-from railfix.ranges.error_model import (
-    ErrorModel,
-    ErrorModelFit,
-    ErrorSamples,
-    fit_bins,
-    write_error_model,
-)
+from railfix.ranges.error_model import ErrorModel, write_error_model
+from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fit_bins
 from railfix.ranges.sbas import SbasCorrections, read_sbas
 from railfix.run.driver import RunOptions
 from railfix.run.processor import processor_of

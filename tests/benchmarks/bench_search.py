@@ -21,8 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
 
 import synthetic
-from railfix.positioning.constrained import SinglePoint, single_point
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.normal_equations import Ranges, SinglePoint, single_point
 from railfix.positioning.section_search import SearchIndex, search
 from railfix.track.trajectory import Trajectory
 

@@ -30,7 +30,7 @@ from railfix.core.constants import (
 )
 from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits import SatelliteStates, satellite_states
-from railfix.gnss.orbits.kepler import Orbits, eccentric_anomaly, kepler_state
+from railfix.gnss.orbits.ephemerides import Orbits, eccentric_anomaly, kepler_state
 
 REFERENCES = json.loads((Path(__file__).parents[1] / "references" / "orbits.json").read_text())
 CODE = 23_456_789.012

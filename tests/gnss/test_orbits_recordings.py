@@ -15,8 +15,8 @@ from orbit_cases import one_record
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits import satellite_states
-from railfix.gnss.orbits.kepler import Orbits, kepler_state
-from railfix.gnss.orbits.record_selection import validity_s
+from railfix.gnss.orbits.ephemerides import Orbits, kepler_state
+from railfix.gnss.orbits.prepared_records import validity_s
 from railfix.io.rinex import read_navigation
 
 FILES = (

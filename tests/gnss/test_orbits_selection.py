@@ -13,8 +13,7 @@ from orbit_cases import HOUR, TOE, kepler, navigation
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits import SatelliteStates, satellite_states
-from railfix.gnss.orbits.prepared_records import group_delay_s, unhealthy
-from railfix.gnss.orbits.record_selection import make_lookup
+from railfix.gnss.orbits.prepared_records import group_delay_s, make_lookup, unhealthy
 
 CODE = 23_000_000.0
 NAT = np.datetime64("NaT", "ns")

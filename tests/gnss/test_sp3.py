@@ -19,7 +19,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.errors import InputFileError
 from railfix.gnss.navigation import PreciseEphemeris
 from railfix.gnss.orbits import satellite_states
-from railfix.gnss.orbits.kepler import Orbits, kepler_state
+from railfix.gnss.orbits.ephemerides import Orbits, kepler_state
 from railfix.io.sp3 import read_sp3
 
 START = TOE - np.timedelta64(2, "h")

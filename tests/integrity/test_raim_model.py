@@ -13,8 +13,7 @@ import raim_oracle as oracle
 import synthetic
 from railfix.integrity.raim import constrained_model
 from railfix.integrity.raim.model import compact, regular_inverse
-from railfix.positioning.constrained import constrained_position, single_point
-from railfix.positioning.normal_equations import UNTIED_M, ClockTies
+from railfix.positioning.normal_equations import UNTIED_M, ClockTies, constrained_position, single_point
 from raim_oracle import point_model
 
 pytestmark = pytest.mark.requirement("B6")

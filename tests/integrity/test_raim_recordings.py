@@ -23,8 +23,7 @@ from railfix.integrity.raim import (
 )
 from railfix.integrity.raim.model import compact
 from railfix.io.rinex import read_observations
-from railfix.positioning.constrained import Constrained, constrained_position
-from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.positioning.normal_equations import Constrained, Ranges, clock_groups, constrained_position
 from railfix.track.trajectory import Trajectory
 from raim_oracle import point_model
 from recordings_score import geonet

@@ -23,7 +23,7 @@ from railfix.io.receiver.log import StreamState, decode
 from railfix.live.stream import ReceiverState, receive_bytes
 from railfix.ranges.sbas import from_receiver
 from railfix.ranges.sbas.messages import with_parity
-from railfix.simulate.sbas import dfmc
+from railfix.simulate.sbas import stream
 
 pytestmark = pytest.mark.requirement("A8")
 
@@ -300,7 +300,7 @@ def test_sbas_messages_of_pages() -> None:
 
 def test_sbas_messages_of_l5_are_another_stream() -> None:
     """GEORawL5 beside GEORawL1: each is read for its own frequency alone."""
-    bits = np.array([dfmc.message(63, k) for k in range(3)])
+    bits = np.array([stream.message(63, k) for k in range(3)])
     words = np.zeros((3, 10), dtype=np.uint32)
     words[:, :8] = bits.view(">u4").reshape(3, 8)
     zero = np.zeros(3, dtype=np.int64)

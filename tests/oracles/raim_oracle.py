@@ -13,8 +13,15 @@ import synthetic
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
 from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, constrained_model
 from railfix.integrity.raim.model import _model
-from railfix.positioning.constrained import Constrained, constrained_position, single_point
-from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, clock_groups
+from railfix.positioning.normal_equations import (
+    UNTIED_M,
+    ClockTies,
+    Constrained,
+    Ranges,
+    clock_groups,
+    constrained_position,
+    single_point,
+)
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 

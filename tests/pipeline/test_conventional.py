@@ -9,7 +9,7 @@ from scipy.stats import binomtest
 import synthetic
 from pipeline_cases import channel, clean_observations, front_alone, with_code
 from railfix.pipeline.solve import PointStatus, position_dilution, validate_point
-from railfix.positioning.constrained import SinglePointLimits, single_point
+from railfix.positioning.normal_equations import SinglePointLimits, single_point
 
 pytestmark = pytest.mark.requirement("A6")
 LINE = synthetic.line()

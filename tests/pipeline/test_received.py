@@ -25,7 +25,7 @@ from railfix.core.errors import SettingsError
 from railfix.core.reasons import Reason
 from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import GlonassRecords, Navigation
-from railfix.gnss.orbits.record_selection import validity_s
+from railfix.gnss.orbits.prepared_records import validity_s
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor

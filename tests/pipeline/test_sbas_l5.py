@@ -24,7 +24,7 @@ from railfix.ranges.sbas.dfmc import DfmcService, DfmcState
 from railfix.run.processor import processor_of
 from railfix.simulate import Scenario, Simulation, write_run
 from railfix.simulate.errors import SatelliteFault
-from railfix.simulate.sbas import SbasSettings, dfmc
+from railfix.simulate.sbas import SbasSettings, stream
 from railfix.simulate.sbas.stream import sbas_messages, write_sbas
 from railfix.simulate.scenario_file import load_recipe
 from railfix.track.trajectory import Trajectory
@@ -60,7 +60,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     messages = read_sbas(files["sbas"], band="L5")
     stop = np.flatnonzero(messages.time >= scenario().start + np.timedelta64(STOP_S, "s"))[0]
     bits = messages.bits.copy()
-    bits[stop] = dfmc.message(0, int(stop) - 300)
+    bits[stop] = stream.message(0, int(stop) - 300)
     write_sbas(
         SbasMessages(
             **{**vars(messages), "bits": bits, "type": np.where(np.arange(len(bits)) == stop, 0, messages.type)}

@@ -30,8 +30,8 @@ from railfix.pipeline.processor import AntennaResult
 from railfix.pipeline.results import State
 from railfix.pipeline.solve import fault_free, place_on_line
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.constrained import single_point
 from railfix.positioning.map_offset import MapOffset
+from railfix.positioning.normal_equations import single_point
 from railfix.ranges.atmosphere import saastamoinen_delay_m
 from railfix.ranges.corrected import REASONS
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, read_sbas

@@ -16,8 +16,7 @@ from phase_run import phase_run
 from railfix.core.geodesy import range_with_rotation
 from railfix.positioning.carrier import PhaseLimits, PhasePositions, Phases, PhaseState, phase_positions
 from railfix.positioning.carrier.ambiguities import FREE_AMBIGUITY_M, hop_of
-from railfix.positioning.constrained import constrained_position
-from railfix.positioning.normal_equations import ClockTies, Ranges
+from railfix.positioning.normal_equations import ClockTies, Ranges, constrained_position
 from railfix.track.trajectory import Trajectory
 
 LINE = carrier_cases.straight()

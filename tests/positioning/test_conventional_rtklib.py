@@ -31,8 +31,7 @@ from railfix.io.position_log import read_positions
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import AntennaResult
-from railfix.positioning.constrained import single_point
-from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.positioning.normal_equations import Ranges, clock_groups, single_point
 from railfix.ranges.atmosphere import klobuchar_delay_m
 from railfix.run.processor import processor_of
 from railfix.track.trajectory import Trajectory

@@ -11,8 +11,15 @@ from scipy.optimize import least_squares
 import synthetic
 from exhaustive_search import exhaustive_search
 from railfix.core.geodesy import range_with_rotation
-from railfix.positioning.constrained import constrained_position, single_point
-from railfix.positioning.normal_equations import Ranges, clock_groups, fit, inverse_3x3, normal_equations
+from railfix.positioning.normal_equations import (
+    Ranges,
+    clock_groups,
+    constrained_position,
+    fit,
+    inverse_3x3,
+    normal_equations,
+    single_point,
+)
 from railfix.positioning.section_search import SearchIndex, SectionLimits, search
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory

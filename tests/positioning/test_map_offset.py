@@ -13,7 +13,6 @@ import raim_oracle as oracle
 import synthetic
 from railfix.core.timescale import seconds, timedelta
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.constrained import SinglePoint, single_point
 from railfix.positioning.map_offset import (
     LinePositions,
     MapOffset,
@@ -23,7 +22,7 @@ from railfix.positioning.map_offset import (
     beyond_threshold,
     map_offset,
 )
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.normal_equations import Ranges, SinglePoint, single_point
 from railfix.positioning.section_search import SearchIndex
 
 pytestmark = pytest.mark.requirement("C4")

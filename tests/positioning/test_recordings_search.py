@@ -19,9 +19,8 @@ import synthetic
 from exhaustive_search import exhaustive_search
 from pipeline_cases import demo_observations, processor
 from railfix.pipeline import corrected_ranges, solve
-from railfix.positioning import constrained, section_search
-from railfix.positioning.constrained import Constrained
-from railfix.positioning.normal_equations import UNTIED_M, Ranges
+from railfix.positioning import normal_equations, section_search
+from railfix.positioning.normal_equations import UNTIED_M, Constrained, Ranges
 from railfix.positioning.section_search import SearchIndex, Section
 from railfix.track.trajectory import Trajectory
 
@@ -47,7 +46,7 @@ def calls(monkeypatch) -> Calls:
         return result
 
     def position(ranges: Ranges, trajectory: Trajectory, *args, **kwargs) -> Constrained:
-        result = constrained.constrained_position(ranges, trajectory, *args, **kwargs)
+        result = normal_equations.constrained_position(ranges, trajectory, *args, **kwargs)
         found.positions.append((ranges, trajectory, result))
         return result
 

@@ -18,17 +18,19 @@ from railfix.ranges.error_model import (
     Conditions,
     ErrorBins,
     ErrorModel,
-    ErrorModelFit,
     ErrorModelSource,
-    ErrorSamples,
     condition_differences,
+    read_error_model,
+    write_error_model,
+)
+from railfix.ranges.error_model_fit import (
+    ErrorModelFit,
+    ErrorSamples,
     fault_rate,
     faulty_stretches,
     fit_bins,
     gaussian_overbound,
-    read_error_model,
     summary,
-    write_error_model,
 )
 
 pytestmark = pytest.mark.requirement("C3")

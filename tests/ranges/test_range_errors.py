@@ -29,7 +29,8 @@ from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import conditions_of
 from railfix.pipeline.processor import EpochProcessor
-from railfix.ranges.error_model import ErrorModelFit, read_error_model, write_error_model
+from railfix.ranges.error_model import read_error_model, write_error_model
+from railfix.ranges.error_model_fit import ErrorModelFit
 from railfix.run import RunOptions, read_record, run_files
 from railfix.run.driver import open_inputs
 from railfix.run.processor import processor_of

@@ -9,7 +9,7 @@ from railfix.core.errors import InputFileError
 from railfix.ranges.sbas import SbasMessages, read_sbas
 from railfix.ranges.sbas.dfmc import DfmcService, DfmcState, residual_ionosphere_m, slot_satellite
 from railfix.ranges.sbas.messages import message_type, with_parity
-from railfix.simulate.sbas import dfmc
+from railfix.simulate.sbas import stream
 from railfix.simulate.sbas.stream import write_sbas
 
 pytestmark = pytest.mark.requirement("C5")
@@ -35,8 +35,8 @@ def service(*messages: tuple[float, np.ndarray]) -> DfmcService:
 def standard(*more: tuple[float, np.ndarray], **parameters: object) -> DfmcService:
     """A mask, type 37, and a correction of G05 with rates."""
     moved, rates = (1.0, -2.5, 0.0625, -3.125), (0.01, 0.0, -0.005, 0.02)
-    sent = dfmc.correction(2, 5, 77, moved, rates, time_of_day_s=TOD_S)
-    first = [(0.0, dfmc.mask(0, SLOTS)), (1.0, dfmc.parameters(1, **parameters)), (2.0, sent)]  # type: ignore[arg-type]
+    sent = stream.correction(2, 5, 77, moved, rates, time_of_day_s=TOD_S)
+    first = [(0.0, stream.mask(0, SLOTS)), (1.0, stream.parameters(1, **parameters)), (2.0, sent)]  # type: ignore[arg-type]
     return service(*sorted([*first, *more], key=lambda item: item[0]))
 
 
@@ -55,7 +55,7 @@ def test_a_message_by_hand() -> None:
     text = f"{0x6:04b}{32:06b}" + f"{5:08b}{77:010b}" + "1" * 11 + "0" * 22 + f"{2:012b}" + "0" * 33
     text += f"{round(TOD_S / 16):013b}" + "101" + f"{4:09b}" + "0" * 27 + "0" * 60 + f"{3:04b}" + "1111"
     assert len(text) == 226
-    written = dfmc.correction(
+    written = stream.correction(
         2, 5, 77, (-0.0625, 0, 0, 0.0625), time_of_day_s=TOD_S, covariance=(5, np.diag([4.0, 0, 0, 0])), dfrei=3
     )
     assert "".join(f"{b:08b}" for b in written)[:226] == text
@@ -99,14 +99,14 @@ def test_what_is_missing_has_a_name(second: float, satellite: str, state: DfmcSt
 @pytest.mark.parametrize(
     ("message", "state", "sigma"),
     [
-        (dfmc.integrity(0, [4, 3, 3]), DfmcState.OK, 0.625),
-        (dfmc.integrity(0, [15, 3, 3]), DfmcState.DO_NOT_USE, np.nan),
-        (dfmc.integrity(0, [15, 3, 3], iodm=1), DfmcState.OK, 0.5),  # of another mask
-        (dfmc.changes(0, [0, 1, 3], [9]), DfmcState.OK, 0.5),
-        (dfmc.changes(0, [1, 0, 0], [6]), DfmcState.OK, 1.0),
-        (dfmc.changes(0, [2, 0, 0]), DfmcState.OK, 0.625),
-        (dfmc.changes(0, [3, 0, 0]), DfmcState.DO_NOT_USE, np.nan),
-        (dfmc.message(63, 0), DfmcState.OK, 0.5),
+        (stream.integrity(0, [4, 3, 3]), DfmcState.OK, 0.625),
+        (stream.integrity(0, [15, 3, 3]), DfmcState.DO_NOT_USE, np.nan),
+        (stream.integrity(0, [15, 3, 3], iodm=1), DfmcState.OK, 0.5),  # of another mask
+        (stream.changes(0, [0, 1, 3], [9]), DfmcState.OK, 0.5),
+        (stream.changes(0, [1, 0, 0], [6]), DfmcState.OK, 1.0),
+        (stream.changes(0, [2, 0, 0]), DfmcState.OK, 0.625),
+        (stream.changes(0, [3, 0, 0]), DfmcState.DO_NOT_USE, np.nan),
+        (stream.message(63, 0), DfmcState.OK, 0.5),
     ],
 )
 def test_later_indicators_count(message: np.ndarray, state: DfmcState, sigma: float) -> None:
@@ -119,33 +119,33 @@ def test_the_last_of_many_satellites_is_in_type_36() -> None:
     slots = [*range(1, 33), *range(75, 111)]  # 68 satellites: E36 is number 67
     grades = [15] * 14 + [7]
     found = service(
-        (0.0, dfmc.mask(0, slots)),
-        (1.0, dfmc.parameters(1)),
-        (2.0, dfmc.correction(2, 110, 5, (0, 0, 0, 0), time_of_day_s=TOD_S)),
-        (3.0, dfmc.integrity(3, grades, kind=36)),
+        (0.0, stream.mask(0, slots)),
+        (1.0, stream.parameters(1)),
+        (2.0, stream.correction(2, 110, 5, (0, 0, 0, 0), time_of_day_s=TOD_S)),
+        (3.0, stream.integrity(3, grades, kind=36)),
     )
     assert at(found, 4.0, "E36").sigma_m[0, 0] == pytest.approx(1.25)
 
 
 def test_type_0_stops_the_service_and_what_came_before_it() -> None:
     """Also where it carries the content of another type, as in tests of a service."""
-    content = dfmc.integrity(5, [3, 3, 3])
+    content = stream.integrity(5, [3, 3, 3])
     content[0] = (content[0] & 0xF0) | 0  # the type is 0 now
     content[1] &= 0x3F
     stop = with_parity(content[None])[0]
     found = standard((5.0, stop))
     assert at(found, 4.0).state[0, 0] == DfmcState.OK
     assert at(found, 6.0).state[0, 0] == DfmcState.STOPPED
-    again = standard((5.0, stop), (66.0, dfmc.integrity(0, [3, 3, 3])))
+    again = standard((5.0, stop), (66.0, stream.integrity(0, [3, 3, 3])))
     assert at(again, 67.0).state[0, 0] == DfmcState.NO_CORRECTION  # the correction was sent before the stop
 
 
 def test_broken_and_foreign_messages_are_counted_and_left_out(tmp_path: Path) -> None:
-    broken, foreign = dfmc.mask(0, SLOTS).copy(), dfmc.mask(0, SLOTS).copy()
+    broken, foreign = stream.mask(0, SLOTS).copy(), stream.mask(0, SLOTS).copy()
     broken[10] ^= 4
     foreign[0] = 0x13  # no preamble of L5
     foreign = with_parity(foreign[None])[0]
-    written = log((0.0, broken), (1.0, foreign), (2.0, dfmc.message(61, 2)), (3.0, dfmc.message(47, 3)))
+    written = log((0.0, broken), (1.0, foreign), (2.0, stream.message(61, 2)), (3.0, stream.message(47, 3)))
     write_sbas(written, tmp_path / "l5.sbs")
     read = read_sbas(tmp_path / "l5.sbs", band="L5")
     assert read.account() == {

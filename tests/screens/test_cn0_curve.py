@@ -24,13 +24,12 @@ from railfix.ranges.cn0_curve import (
     Cn0Mean,
     Cn0Samples,
     CurveFit,
-    cn0_curve_from_log,
     fit_cn0_curve,
     read_cn0_curve,
-    satellite_elevation_deg,
     satellite_kind,
     write_cn0_curve,
 )
+from railfix.ranges.cn0_curve_log import cn0_curve_from_log, satellite_elevation_deg
 from railfix.report.plots.screens import draw_cn0_curve, draw_screen
 from railfix.screens import ScreenPicture, cn0_screen
 

@@ -43,8 +43,7 @@ from railfix.positioning.carrier import (
     smooth_codes,
     track_jumps,
 )
-from railfix.positioning.constrained import constrained_position
-from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, clock_groups
+from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, clock_groups, constrained_position
 from railfix.ranges.atmosphere import saastamoinen_delay_m
 from railfix.run.processor import processor_of
 from railfix.track import read_track

@@ -36,8 +36,7 @@ from railfix.integrity.raim.model import compact
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import AntennaResult
-from railfix.positioning.constrained import constrained_position
-from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups
+from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, constrained_position
 from railfix.run.processor import processor_of
 from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of

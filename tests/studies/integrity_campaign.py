@@ -29,16 +29,8 @@ from railfix.integrity.stanford import Region, stanford
 from railfix.io.reference_log import AntennaReference
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.results import AntennaResult, State
-from railfix.ranges.error_model import (
-    ErrorBins,
-    ErrorModel,
-    ErrorModelFit,
-    ErrorSamples,
-    fault_rate,
-    fit_bins,
-    read_error_model,
-    write_error_model,
-)
+from railfix.ranges.error_model import ErrorBins, ErrorModel, read_error_model, write_error_model
+from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fault_rate, fit_bins
 from railfix.run.processor import processor_of
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table

@@ -34,9 +34,9 @@ from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
 from railfix.pipeline.level_stage import risk_of
 from railfix.pipeline.processor import AntennaResult
-from railfix.positioning.constrained import constrained_position
-from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, fit
-from railfix.ranges.error_model import ErrorBins, ErrorModelFit, read_error_model, write_error_model
+from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, constrained_position, fit
+from railfix.ranges.error_model import ErrorBins, read_error_model, write_error_model
+from railfix.ranges.error_model_fit import ErrorModelFit
 from railfix.run.driver import open_inputs
 from railfix.run.processor import processor_of
 from railfix.run.record import read_record

@@ -18,8 +18,8 @@ from p1_rtklib import ABSENT, PROGRAM
 from railfix.core.arrays import Masks
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate import Scenario, Simulation
-from railfix.simulate.sbas.settings import SbasSettings
 from railfix.simulate.scenario_file import load_recipe
+from railfix.simulate.settings import SbasSettings
 
 PICTURE: Final = paths.ROOT / "docs" / "pictures" / "p1-figure-8.png"
 #: Figure 7: mask of 30 degrees, nothing else; GPS, as its receiver of 2010.

@@ -25,7 +25,6 @@ from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import without
 from railfix.pipeline.processor import AntennaResult
-from railfix.positioning.constrained import Constrained, constrained_position, single_point
 from railfix.positioning.intersystem_bias import OffsetState, tie_clocks
 from railfix.positioning.noise_scale import (
     NoiseState,
@@ -35,7 +34,7 @@ from railfix.positioning.noise_scale import (
     robust_fit,
     robust_scale,
 )
-from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.positioning.normal_equations import Constrained, Ranges, clock_groups, constrained_position, single_point
 from railfix.positioning.section_search import SearchIndex, search
 from railfix.ranges.corrected import code_sigma_m
 from railfix.run.processor import processor_of

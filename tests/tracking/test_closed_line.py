@@ -18,7 +18,7 @@ from railfix.evaluate import evaluate_run
 from railfix.io.reference_log import AntennaReference
 from railfix.pipeline.filter_result import Replay, ReturnState, gated_codes, smooth
 from railfix.pipeline.sensor_epochs import SensorLimits
-from railfix.positioning.constrained import constrained_position, single_point
+from railfix.positioning.normal_equations import constrained_position, single_point
 from railfix.positioning.section_search import SearchIndex, SectionLimits, search
 from railfix.run.inputs import TrackReading
 from railfix.run.sources import open_line

@@ -32,17 +32,8 @@ from railfix.pipeline.processor import EpochProcessor, State
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.noise_scale import RobustClock, robust_clock
 from railfix.positioning.normal_equations import clock_groups
-from railfix.ranges.error_model import (
-    Conditions,
-    ErrorModel,
-    ErrorModelFit,
-    ErrorModelSource,
-    ErrorSamples,
-    condition_differences,
-    fault_rate,
-    faulty_stretches,
-    fit_bins,
-)
+from railfix.ranges.error_model import Conditions, ErrorModel, ErrorModelSource, condition_differences
+from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fault_rate, faulty_stretches, fit_bins
 from railfix.run.driver import open_inputs
 from railfix.run.inputs import ColumnNames, input_option
 from railfix.run.processor import processor_of

@@ -24,8 +24,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
 from railfix.pipeline.received import Received as Known
 from railfix.pipeline.received import known_from_start, receive
-from railfix.positioning.constrained import single_point
-from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.positioning.normal_equations import Ranges, clock_groups, single_point
 from railfix.ranges.atmosphere import SeenFrom, modelled_delays
 from railfix.ranges.corrected import PLAUSIBLE_CODE_M, code_sigma_m
 

@@ -12,7 +12,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, Paths, listed, read_text_lines
 from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
 from railfix.gnss.navigation import PreciseEphemeris
-from railfix.gnss.orbits.precise import POINTS
+from railfix.gnss.orbits.ephemerides import POINTS
 
 #: Time systems that are GPS time up to nanoseconds; SP3-a files name none and are in GPS time.
 _GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")

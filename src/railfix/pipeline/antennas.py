@@ -25,7 +25,7 @@ from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.solution import Solution, reason_of_all_channels, satellites_rejected
 from railfix.positioning.antenna_rows import AntennaRows, joined
 from railfix.screens import FilteredMotion, PairedEpochs, PairScreen, PositionScreen, Screened
-from railfix.screens.pairs import on_pairs, pair_epochs
+from railfix.screens.base import on_pairs, pair_epochs
 from railfix.track.track import interpolate_kilometrage
 from railfix.track.trajectory import Trajectory
 

@@ -19,8 +19,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import Slips
-from railfix.positioning.constrained import SinglePointLimits, single_point
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.normal_equations import Ranges, SinglePointLimits, single_point
 from railfix.positioning.section_search import SearchIndex, search
 from railfix.positioning.two_frequencies import Combined, SecondCodes
 from railfix.ranges.atmosphere import SeenFrom, modelled_delays

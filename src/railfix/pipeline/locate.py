@@ -19,9 +19,8 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import ANCHOR_SIGMA_M, usable_ranges, without
 from railfix.pipeline.received import Received
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
-from railfix.positioning.constrained import single_point
 from railfix.positioning.noise_scale import robust_fit
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.normal_equations import Ranges, single_point
 from railfix.ranges.atmosphere import SeenFrom, modelled_delays
 from railfix.ranges.corrected import PLAUSIBLE_CODE_M, code_sigma_m, first_available
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, thinned_rows

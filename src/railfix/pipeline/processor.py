@@ -47,7 +47,7 @@ from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.error_model import condition_differences
 from railfix.ranges.sbas import SbasMessages
 from railfix.screens import SCREENS, AntennaRanges, ObservationScreen, PairedEpochs, Screen, ScreenSetup, in_order
-from railfix.screens.pairs import pair_antennas
+from railfix.screens.base import pair_antennas
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 

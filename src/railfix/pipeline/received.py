@@ -11,7 +11,7 @@ from railfix.core.arrays import Floats, Strings
 from railfix.core.errors import SettingsError
 from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
-from railfix.gnss.orbits.record_selection import VALIDITY_S, validity_s
+from railfix.gnss.orbits.prepared_records import VALIDITY_S, validity_s
 from railfix.pipeline.config import Config
 from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR
 from railfix.ranges.base_station import BaseErrors

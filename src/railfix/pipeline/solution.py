@@ -33,7 +33,6 @@ from railfix.pipeline.solve import (
 )
 from railfix.positioning.antenna_rows import AntennaRows, rows_of
 from railfix.positioning.carrier import PhasePositions
-from railfix.positioning.constrained import SinglePoint, constrained_position, single_point
 from railfix.positioning.intersystem_bias import tie_clocks
 from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
 from railfix.positioning.noise_scale import (
@@ -47,7 +46,15 @@ from railfix.positioning.noise_scale import (
     robust_scale,
     stated_scale,
 )
-from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, fit
+from railfix.positioning.normal_equations import (
+    UNTIED_M,
+    ClockTies,
+    Ranges,
+    SinglePoint,
+    constrained_position,
+    fit,
+    single_point,
+)
 from railfix.positioning.section_search import SearchIndex
 
 

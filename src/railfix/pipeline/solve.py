@@ -32,15 +32,17 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.results import RaimResult, patched
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.constrained import (
+from railfix.positioning.noise_scale import LastingErrorState, ages, decayed_sums, steps_s
+from railfix.positioning.normal_equations import (
     Constrained,
+    Ranges,
     SinglePoint,
     SinglePointLimits,
     constrained_position,
+    inverse_3x3,
+    normal_equations,
     single_point,
 )
-from railfix.positioning.noise_scale import LastingErrorState, ages, decayed_sums, steps_s
-from railfix.positioning.normal_equations import Ranges, inverse_3x3, normal_equations
 from railfix.positioning.section_search import SearchIndex, Section, search
 
 

@@ -1,6 +1,6 @@
 # The names of `railfix.positioning`, imported at their first use (lazy-loader).
 
-from .constrained import Constrained, ConstrainedLimits, SinglePoint, SinglePointLimits
+from .normal_equations import Constrained, ConstrainedLimits, SinglePoint, SinglePointLimits
 from .section_search import SearchIndex, Section, SectionLimits
 from .stages import find_section, point_position, position_on_line, weighted_ranges
 

@@ -15,9 +15,8 @@ from pydantic import Field
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import EVERY
-from railfix.positioning.constrained import SinglePoint
 from railfix.positioning.noise_scale import correlated_sums
-from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges
+from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, SinglePoint
 
 
 class ClockOffsetLimits(Settings):

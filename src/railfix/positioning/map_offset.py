@@ -19,9 +19,8 @@ from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.constrained import SinglePoint
 from railfix.positioning.noise_scale import correlated_sums
-from railfix.positioning.normal_equations import RangeArrays, Ranges
+from railfix.positioning.normal_equations import RangeArrays, Ranges, SinglePoint
 from railfix.track.trajectory import Trajectory
 
 _SUMS: Final = 9  #: Sums of a window.

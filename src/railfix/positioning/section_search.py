@@ -23,8 +23,7 @@ from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.settings import Settings
 from railfix.kernels.layout import CLEAR_M, FAN_OUT, ROTATION_GRADIENT
-from railfix.positioning.constrained import SinglePoint
-from railfix.positioning.normal_equations import Ranges, fit, normal_equations
+from railfix.positioning.normal_equations import Ranges, SinglePoint, fit, normal_equations
 from railfix.track.trajectory import Trajectory
 
 

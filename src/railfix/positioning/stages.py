@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Strings
-from railfix.positioning.constrained import (
+from railfix.positioning.normal_equations import (
     Constrained,
     ConstrainedLimits,
+    Ranges,
     SinglePoint,
     SinglePointLimits,
+    clock_groups,
     constrained_position,
     single_point,
 )
-from railfix.positioning.normal_equations import Ranges, clock_groups
 from railfix.positioning.section_search import SearchIndex, Section, SectionLimits, search
 from railfix.track.trajectory import Trajectory
 

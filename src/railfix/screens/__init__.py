@@ -29,12 +29,13 @@ from railfix.screens.base import (
     ScreenPicture,
     ScreenSetup,
     Verdict,
+    pair_channels,
+    pair_epochs,
     suspicion_sigma_m,
 )
 from railfix.screens.cn0 import Cn0Limits, Cn0Screened, cn0_screen
 from railfix.screens.doppler import DopplerLimits, DopplerScreened, DopplerState, doppler_limit_m, doppler_screen
 from railfix.screens.elevation import ElevationLimits, elevation_screen
-from railfix.screens.pairs import pair_channels, pair_epochs
 from railfix.screens.registry import SCREENS, in_order
 
 __all__ = [

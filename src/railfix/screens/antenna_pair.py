@@ -38,8 +38,11 @@ from railfix.screens.base import (
     Screened,
     ScreenPicture,
     Verdict,
+    clock_medians,
+    on_pairs,
+    pair_channels,
+    row_median,
 )
-from railfix.screens.pairs import clock_medians, on_pairs, pair_channels, row_median
 
 #: Treatments of the receiver clocks, as named in the output.
 CLOCKS: Final = {

@@ -36,8 +36,9 @@ from railfix.screens.base import (
     ScreenPicture,
     ScreenSetup,
     Verdict,
+    clock_medians,
+    row_median,
 )
-from railfix.screens.pairs import clock_medians, row_median
 
 _MEDIAN_NORMAL: Final = 0.674_489_750_196_081_7  #: Median of the absolute value of a unit normal variable.
 _FINEST_M: Final = 1e-3  #: Smallest change used for the receiver's scale [m].

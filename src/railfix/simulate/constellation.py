@@ -20,7 +20,7 @@ from railfix.core.constants import BDT_MINUS_GPST_S, EARTH_ROTATION_RATE, GM_GPS
 from railfix.core.errors import MismatchError
 from railfix.core.timescale import gpst_minus_utc, seconds, timedelta, to_week
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
-from railfix.gnss.orbits.kepler import GM, ROTATION, Orbits, kepler_state
+from railfix.gnss.orbits.ephemerides import GM, ROTATION, Orbits, kepler_state
 from railfix.io.rinex import read_navigation
 from railfix.simulate.scenario import Scenario
 

@@ -13,7 +13,6 @@ from railfix.core.errors import SettingsError
 from railfix.simulate.disturbance import CN0_HORIZON_DBHZ, CN0_RISE_DB, Disturbances
 from railfix.simulate.environment.settings import EnvironmentSettings
 from railfix.simulate.line_file import LineSettings
-from railfix.simulate.sbas.settings import SbasSettings
 from railfix.simulate.settings import (
     SYSTEMS,
     ErrorSettings,
@@ -22,6 +21,7 @@ from railfix.simulate.settings import (
     NotNegative,
     Positive,
     SatelliteFault,
+    SbasSettings,
     ScenarioSettings,
     Seed,
     SensorSettings,

@@ -13,8 +13,7 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Str
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.orbits.kepler import Orbits, kepler_state
-from railfix.gnss.orbits.precise import precise_clock_s, precise_state
+from railfix.gnss.orbits.ephemerides import Orbits, kepler_state, precise_clock_s, precise_state
 from railfix.gnss.orbits.prepared_records import ChannelRecords, PreparedRecords, prepared_records
 
 #: Chunks of fewer epochs are computed with all channels together, longer ones channel by channel: the same

@@ -13,8 +13,17 @@ from .continuity import (
 )
 from .filtered import PhaseState, phase_positions
 from .observation_model import IntegerChannels, Phases, corrected_phase_m
-from .slips import CycleSlipLimits, CycleSlipState, SlipReason, Slips, find_slips
-from .smoothing import SmoothedCodes, SmoothingLimits, SmoothingState, smooth_codes
+from .smoothing import (
+    CycleSlipLimits,
+    CycleSlipState,
+    SlipReason,
+    Slips,
+    SmoothedCodes,
+    SmoothingLimits,
+    SmoothingState,
+    find_slips,
+    smooth_codes,
+)
 
 __all__ = [
     "ArcAmbiguities",

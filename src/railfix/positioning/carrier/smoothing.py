@@ -7,15 +7,226 @@ it drift by twice the change of its delay, which the window limits: at 1 mm/s on
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from enum import IntFlag
+from typing import Final, Literal
 
 import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
+from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
+from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, rows_before
+
+#: One millisecond as a distance [m]: the step of receivers that keep their clock near GPS time.
+MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT
+#: A common change of the codes from which on the interval is corrected for it [m]; below, it is noise.
+_CLOCK_STEP_M: Final = 1e4
+_COMMON: Final = 3  #: Channels needed for a median to stand for the clock.
+
+
+class SlipReason(IntFlag):
+    """Why the phase of an epoch and channel begins anew. 0 = joined to the epoch before."""
+
+    JOINED = 0
+    #: No phase at this epoch: nothing begins.
+    NO_PHASE = 1 << 0
+    #: A phase, but none of this channel at the epoch before.
+    FIRST = 1 << 1
+    #: Bit 0 of the receiver's loss-of-lock indicator.
+    LOSS_OF_LOCK = 1 << 2
+    #: Bit 1 of it (half a cycle not resolved) is not what it was at the epoch before.
+    HALF_CYCLE = 1 << 3
+    #: The epoch before is longer ago than the limit.
+    GAP = 1 << 4
+    #: The log marks a break before this epoch.
+    BREAK = 1 << 5
+    #: The phase's change is not that of the Dopplers.
+    DOPPLER = 1 << 6
+    #: The phase's change is not that of the code, where Dopplers cannot judge.
+    CODE = 1 << 7
+
+
+class CycleSlipLimits(Settings):
+    """Limits of the tests, in metres for an interval dt in seconds.
+
+    The Doppler test rejects a change over ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``: noise
+    of the phases, noise of the mean Doppler, and what the trapezoid of the Dopplers misses of a
+    motion with that jerk. One cycle on L1 (0.19 m) is seen up to intervals of about 1 s, two to
+    1.5 s; a test on the track (`continuity.track_jumps`) has no such end.
+    """
+
+    max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is bridged: that of a station's log of 30 s.
+    #: Limit of the phase against its Doppler, constant and by the interval. On real receivers at 1 Hz the median of the
+    #: metric is 0.01 to 0.04 m.
+    doppler_m: float = Field(default=0.05, gt=0)
+    doppler_mps: float = Field(default=0.05, gt=0)
+    jerk_mps3: float = Field(default=0.5, gt=0)  #: Of the antenna; passenger trains stay below 0.5.
+    code_m: float = Field(default=10.0, gt=0)  #: Limit of code less phase where Dopplers are absent or less sharp.
+
+
+@dataclass(frozen=True, kw_only=True)
+class CycleSlipState:
+    """The last epoch of a chunk, by channel ("G05", "1C"), and the steps so far."""
+
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
+    channels: ChannelKeys = ()
+    #: The phase as received, without `step_ms`; shape (M,).
+    code_m: Floats = field(default_factory=lambda: np.empty(0))
+    phase_m: Floats = field(default_factory=lambda: np.empty(0))
+    doppler_mps: Floats = field(default_factory=lambda: np.empty(0))
+    half_cycle: Masks = field(default_factory=lambda: np.empty(0, dtype=np.bool_))  #: Shape (M,).
+    step_ms: int = 0  #: Whole milliseconds that the codes' clock has stepped and the phases' has not.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slips:
+    """Phases and where their arcs begin, T epochs by M channels."""
+
+    slip: Masks  #: True where there is a phase that may not be joined to the epoch before, shape (T, M).
+    reason: Integers  #: `SlipReason` bits, shape (T, M).
+    #: Phase times wavelength on the clock of the codes: whole milliseconds that only the codes stepped are added. NaN
+    #: where there is no phase or its wavelength is unknown; shape (T, M).
+    phase_m: Floats
+    #: Metrics of the two tests; NaN where they cannot judge; shape (T, M).
+    doppler_metric_m: Floats
+    code_metric_m: Floats
+    doppler_limit_m: Floats  #: Shape (T,).
+    #: Step of the receiver's clock into the epoch as the codes show it; 0 where none is seen; shape (T,).
+    clock_step_m: Floats
+    half_cycle: Masks  #: The receiver reports an unresolved half cycle: harmless to a float ambiguity; shape (T, M).
+
+
+def median_or_zero(values: Floats) -> Floats:
+    """Median over the channels of each epoch, 0 where fewer than three have one; shape (T,)."""
+    count = np.count_nonzero(np.isfinite(values), axis=1)
+    result = np.zeros(len(values))
+    enough = np.flatnonzero(count >= _COMMON)
+    if len(enough):
+        # NaN sorts last: the median is the middle of the finite values.
+        ranked = np.sort(values[enough], axis=1)
+        row, number = np.arange(len(enough)), count[enough]
+        result[enough] = 0.5 * (ranked[row, (number - 1) // 2] + ranked[row, number // 2])
+    return result
+
+
+def _before(values: Floats, last: Floats) -> Floats:
+    """Values of the epoch before each one; the first comes from the state."""
+    return np.concatenate([last[None], values[:-1]])
+
+
+def find_slips(
+    observations: Observations,
+    state: CycleSlipState | None = None,
+    *,
+    frequency_hz: Floats | None = None,
+    limits: CycleSlipLimits | None = None,
+) -> tuple[Slips, CycleSlipState]:
+    """Cycle slips of every channel of a chunk.
+
+    A channel's phase starts a new arc after an epoch without it.
+    With fewer than three channels a clock step cannot be told from a slip, and counts as a slip.
+
+    Parameters
+    ----------
+    observations : Observations
+        T epochs, M channels.
+    state : CycleSlipState, optional
+        Left by the chunk before; None at the start of a log.
+    frequency_hz : ndarray, shape (M,), optional [Hz]
+        Carrier of each channel; by default from the log's header alone, where GLONASS may lack its
+        channels.
+    limits : CycleSlipLimits, optional
+
+    Returns
+    -------
+    Slips
+    CycleSlipState
+        Division into chunks does not change the result.
+    """
+    limits, state = limits or CycleSlipLimits(), state or CycleSlipState()
+    channels = channel_keys(observations.satellite, observations.signal)
+    rows = rows_before(state.channels, channels)
+    last = {
+        name: np.append(getattr(state, name), np.nan)[rows]
+        for name in ("code_m", "phase_m", "doppler_mps", "half_cycle")
+    }
+    if frequency_hz is None:
+        frequency_hz = carrier_frequency_hz(
+            observations.satellite, observations.signal, observations.header.glonass_channel
+        )
+    wavelength = SPEED_OF_LIGHT / frequency_hz
+    phase, doppler = observations.phase_cycles * wavelength, observations.doppler_hz * wavelength
+    times = np.concatenate([np.asarray([state.time], dtype="datetime64[ns]"), observations.time])
+    since, moved = seconds(np.diff(times)), phase - _before(phase, last["phase_m"])
+    step, lag_ms, doppler_metric, code_metric = slip_metrics(
+        since,
+        observations.code_m - _before(observations.code_m, last["code_m"]),
+        moved,
+        -0.5 * (doppler + _before(doppler, last["doppler_mps"])),
+    )
+    dt = np.where(np.isnan(since), 0.0, since)
+    doppler_limit = limits.doppler_m + limits.doppler_mps * dt + limits.jerk_mps3 * dt**3 / 12.0
+    half = (observations.loss_of_lock & 2) > 0
+    half_before = _before(half.astype(np.float64), last["half_cycle"])
+    by_doppler = np.isfinite(doppler_metric) & (doppler_limit <= limits.code_m)[:, None]
+
+    has = np.isfinite(phase)
+    reason = np.zeros(phase.shape, dtype=np.int64)
+    for mask, bit in (
+        (np.isnan(moved), SlipReason.FIRST),
+        ((observations.loss_of_lock & 1) > 0, SlipReason.LOSS_OF_LOCK),
+        (half != (half_before > 0), SlipReason.HALF_CYCLE),
+        ((dt > limits.max_gap_s)[:, None], SlipReason.GAP),
+        (observations.break_before[:, None], SlipReason.BREAK),
+        (by_doppler & (np.abs(doppler_metric) > doppler_limit[:, None]), SlipReason.DOPPLER),
+        (~by_doppler & (np.abs(code_metric) > limits.code_m), SlipReason.CODE),
+    ):
+        reason |= np.where(mask & has, int(bit), 0)
+    reason[~has] = SlipReason.NO_PHASE
+    total_ms = np.cumsum(np.r_[state.step_ms, lag_ms])
+    after = state
+    if len(observations):
+        after = CycleSlipState(
+            time=observations.time[-1],
+            channels=channels,
+            code_m=read_only(observations.code_m[-1].copy()),
+            phase_m=read_only(phase[-1].copy()),
+            doppler_mps=read_only(doppler[-1].copy()),
+            half_cycle=read_only(half[-1].copy()),
+            step_ms=int(total_ms[-1]),
+        )
+    slips = Slips(
+        slip=has & (reason != 0),
+        reason=reason,
+        phase_m=phase + (total_ms[1:] * MILLISECOND_M)[:, None],
+        doppler_metric_m=doppler_metric,
+        code_metric_m=code_metric,
+        doppler_limit_m=doppler_limit,
+        clock_step_m=step,
+        half_cycle=half,
+    )
+    return slips, after
+
+
+def slip_metrics(
+    dt: Floats, code_m: Floats, phase_m: Floats, range_mps: Floats
+) -> tuple[Floats, Integers, Floats, Floats]:
+    """Compute the clock step of the codes [m], its whole milliseconds that phases lack, and the metrics of both tests.
+
+    `dt`, shape (T,), is the time since the epoch before; `code_m` and `phase_m`, shape (T, M), are changes since then,
+    `range_mps` the range rate by the Dopplers.
+    """
+    moved = np.where(np.isnan(range_mps), 0.0, range_mps) * dt[:, None]
+    step = median_or_zero(code_m - moved)
+    step = np.where(np.abs(step) > _CLOCK_STEP_M, step, 0.0)
+    apart = code_m - phase_m
+    lag_ms = np.rint(median_or_zero(apart) / MILLISECOND_M).astype(np.int64)
+    apart = apart - (lag_ms * MILLISECOND_M)[:, None]
+    doppler = phase_m - range_mps * (dt - step / SPEED_OF_LIGHT)[:, None]
+    return step, lag_ms, doppler - median_or_zero(doppler)[:, None], apart - median_or_zero(apart)[:, None]
 
 
 def linear_recursion(gain: Floats, drive: Floats) -> Floats:

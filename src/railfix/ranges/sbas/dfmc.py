@@ -20,7 +20,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.orbits.record_selection import issue_records
+from railfix.gnss.orbits.prepared_records import issue_records
 from railfix.ranges.sbas.decode import UPPER, BitField, Layout, read_fields
 from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import system_name

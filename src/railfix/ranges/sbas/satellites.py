@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.orbits.record_selection import issue_records
+from railfix.gnss.orbits.prepared_records import issue_records
 from railfix.ranges.sbas.decode import Decoded, service
 from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import FAST_DEGRADATION_MPS2, FAST_TIMEOUT_S, SERVICE_FACTOR, TIMEOUT_S, SbasLimits

@@ -10,8 +10,7 @@ import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.reasons import Reason, first_reason, reason_names
-from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean
-from railfix.ranges.cn0_curve.curve import satellite_kind
+from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean, satellite_kind
 from railfix.report.plots.chart import (
     BLACK,
     BLUE,

@@ -1,5 +1,5 @@
 """Messages of a simulated SBAS that corrects the simulated errors."""
 
-from railfix.simulate.sbas.settings import SbasSettings
+from railfix.simulate.settings import SbasSettings
 
 __all__ = ["SbasSettings"]

@@ -15,7 +15,7 @@ from railfix.ranges.sbas.messages import DATA_BITS, PREAMBLES, with_parity
 from railfix.ranges.sbas.standard import DO_NOT_USE, NOT_MONITORED
 from railfix.simulate.constellation import newest_record
 from railfix.simulate.receiver import ionosphere_m
-from railfix.simulate.sbas.settings import SbasSettings
+from railfix.simulate.settings import SbasSettings
 
 if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation

@@ -2,22 +2,160 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from railfix.core.arrays import Bytes, Floats
+from railfix.core.constants import CARRIER_FREQUENCY, SPEED_OF_LIGHT
 from railfix.core.files import write_whole
-from railfix.core.timescale import seconds, timedelta, to_week
+from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta, to_week
+from railfix.ranges.corrected import DFMC_SIGNALS
 from railfix.ranges.sbas import SbasMessages
-from railfix.ranges.sbas.messages import message_type
-from railfix.simulate.sbas.dfmc import SimulatedDfmc
-from railfix.simulate.sbas.service import FAST_PERIOD_S, Service
-from railfix.simulate.sbas.settings import SbasSettings
+from railfix.ranges.sbas.dfmc import AUGMENTED, FIRST, slot_satellite
+from railfix.ranges.sbas.messages import PREAMBLES, message_type
+from railfix.simulate.receiver import group_delay_s, signals_of
+from railfix.simulate.sbas.service import CLOCK, FAST_PERIOD_S, Field, Service, packed
+from railfix.simulate.settings import SbasSettings
 
 if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
+
+
+def message(kind: int, second: int, *fields: Field) -> Bytes:
+    """Message of a type, its preamble by its second, with parity, shape (32,).
+
+    The fields (value, length) lie from bit 10 on, negative values in two's complement. ValueError: one does not fit.
+    """
+    return packed(f"{PREAMBLES['L5'][second % 6]:04b}{kind:06b}", kind, fields)
+
+
+def mask(second: int, slots: Collection[int], iodm: int = 0) -> Bytes:
+    """Type 31: satellites by their slots."""
+    return message(31, second, *((int(slot in slots), 1) for slot in range(1, 215)), (iodm, 2))
+
+
+def correction(
+    second: int,
+    slot: int,
+    issue: int,
+    moved: Sequence[float],
+    rates: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+    *,
+    time_of_day_s: float,
+    covariance: tuple[int, Floats] = (5, np.eye(4)),
+    dfrei: int = 3,
+) -> Bytes:
+    """Type 32: position and clock [m], their rates [m/s], and the upper triangular factor of the covariance.
+
+    `covariance`: exponent, and the factor in units of 2^(exponent - 5).
+    """
+    exponent, factor = covariance
+    values = [(round(v / 0.0625), 11) for v in moved[:3]] + [(round(moved[3] / 0.03125), 12)]
+    values += [(round(v * 2**11), 8) for v in rates[:3]] + [(round(rates[3] * 2**12), 9)]
+    upper = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    return message(
+        32, second, (slot, 8), (issue, 10), *values, (round(time_of_day_s / 16.0), 13), (exponent, 3),
+        *((round(float(factor[k, k])), 9) for k in range(4)), *((round(float(factor[i, j])), 10) for i, j in upper),
+        (dfrei, 4), (15, 4),
+    )  # fmt: skip
+
+
+def changes(second: int, change: Sequence[int], dfrei: Sequence[int] = (), iodm: int = 0) -> Bytes:
+    """Type 34: for each satellite of the mask 0 nothing new, 1 the next of `dfrei`, 2 one more, 3 do not use."""
+    every = [*change, *([0] * (AUGMENTED - len(change)))]
+    grades = [*dfrei, *([0] * (7 - len(dfrei)))]
+    return message(34, second, *((c, 2) for c in every), *((g, 4) for g in grades), (0, 2), (iodm, 2))
+
+
+def integrity(second: int, dfrei: Sequence[int], *, kind: int = 35, iodm: int = 0) -> Bytes:
+    """Types 35 and 36: indicators of the first 53 satellites of the mask, and of the others."""
+    count = 53 if kind == 35 else 39
+    fields = [(grade, 4) for grade in [*dfrei, *([15] * (count - len(dfrei)))]]
+    return message(kind, second, *fields, (0, 2 if kind == 35 else 58), (iodm, 2))
+
+
+def parameters(
+    second: int,
+    *,
+    valid_s: float = 120.0,
+    covariance: float = 0.0,
+    degradation: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    scale: int = 0,
+) -> Bytes:
+    """Type 37: one degradation (interval [s], step [m], rate [m/s]) of all constellations, one code of the scale."""
+    interval, step, rate = degradation
+    each = [(round(interval / 6.0), 5), (round(step / 0.01), 8), (round(rate / 0.0002), 8)]
+    valid = (round(valid_s / 6.0), 6)
+    return message(
+        37, second, valid, valid, (0, 6), (round(covariance / 0.1), 7), *(each * 6), *([(scale, 4)] * 15), (0, 3)
+    )
+
+
+_SLOT_OF: Final = {slot_satellite(slot): slot for slot in range(1, 215)}
+#: Factor of the covariance that is sent: 1.03 to 1.06 times the indicator's sigma along a line of sight.
+_COVARIANCE: Final = (3, np.diag([1.0, 1.0, 1.0, 4.0]))
+_LARGEST_M: Final = 63.9  #: Largest correction of a clock that the field holds [m].
+_GROWTH_MPS: Final = 0.002  #: Growth of the corrections' errors until the next ones [m/s].
+
+
+class SimulatedDfmc(Service):
+    """Corrections on L5 of a simulated run: GPS L1 C/A with L5, Galileo E1 with E5a."""
+
+    systems = "".join(DFMC_SIGNALS)
+
+    def clocks_m(self, second: float) -> Floats:
+        """Corrections of the clocks of `satellites` [m] for ionosphere-free codes, group delays included.
+
+        Those of GPS refer to the clock without its group delays, those of Galileo to that of F/NAV.
+        """
+        names, at = self.satellites, self._instant(second)
+        first, other = ([signals_of(name[0], self._simulation.scenario.receiver)[k] for name in names] for k in (0, 1))
+        ratio = np.array([(CARRIER_FREQUENCY[name[0]]["1"] / CARRIER_FREQUENCY[name[0]]["5"]) ** 2 for name in names])
+        delay_m = [self._errors.group_delay_m(names, signals) for signals in (first, other)]
+        time, kepler = self._start + timedelta(at), self._simulation.navigation.kepler
+        for signals, added in zip((first, other), delay_m, strict=True):
+            for k, (name, signal) in enumerate(zip(names, signals, strict=True)):
+                if name[0] == "G":
+                    added[k] += SPEED_OF_LIGHT * group_delay_s(kepler, name, signal, time)[0]
+        clock = self._errors.clock_error_m(at)[0] - (ratio * delay_m[0] - delay_m[1]) / (ratio - 1.0)
+        clock = clock + self._settings.clock_sigma_m * self._rng[CLOCK].standard_normal(len(names))
+        return np.asarray(np.clip(clock, -_LARGEST_M, _LARGEST_M))
+
+    def fast_messages(self) -> list[Callable[[int, int], Bytes]]:
+        """Types 35 and 36, each a function of the second and of an issue that they do not have."""
+
+        def of_kind(kind: int, part: slice) -> Callable[[int, int], Bytes]:
+            return lambda second, _: integrity(second, self.indicators(second)[part], kind=kind)
+
+        later = [of_kind(36, slice(FIRST, AUGMENTED))] if len(self.satellites) > FIRST else []
+        return [of_kind(35, slice(0, FIRST)), *later]
+
+    def slow_messages(self) -> list[Callable[[int], Bytes]]:
+        """Types 31, 37 and 32 of all satellites in turn, each a function of the second."""
+        slots = [_SLOT_OF[name] for name in self.satellites]
+        messages: list[Callable[[int], Bytes]] = [
+            lambda second: mask(second, slots),
+            lambda second: parameters(second, valid_s=240.0, degradation=(0.0, 0.0, _GROWTH_MPS)),
+        ]
+        return messages + [self._correction(k, slot) for k, slot in enumerate(slots)]
+
+    def _correction(self, k: int, slot: int) -> Callable[[int], Bytes]:
+        day_s = float(seconds(self._start - self._start.astype("datetime64[D]")))
+
+        def made(second: int) -> Bytes:
+            _, issue, place, _ = self.orbits(second)[k]
+            moved = (*place, float(self.clocks_m(second)[k]))
+            return correction(
+                second, slot, issue, moved, time_of_day_s=(day_s + second) % SECONDS_PER_DAY,
+                covariance=_COVARIANCE, dfrei=self.indicators(second)[k],
+            )  # fmt: skip
+
+        return made
+
 
 LOST: Final = 53  #: Stream of random numbers of lost messages.
 

@@ -18,7 +18,7 @@ from scipy.special import betaincinv, ndtri
 
 from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.settings import Settings, option
-from railfix.ranges.error_model.model import POOLED, BinStatistics, ErrorBins, ErrorModel, FaultRate
+from railfix.ranges.error_model import POOLED, BinStatistics, ErrorBins, ErrorModel, FaultRate
 
 TAIL_SCORE: Final = 1.0  #: Standard scores from which on a sample belongs to the tail, which alone sets sigma.
 
