@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from railfix.cli import app
-from railfix.motion.features import FeatureLimits, LineSeries, LocatedFeature, line_series, locate, map_features
+from railfix.motion.features import LineSeries, LocatedFeature, line_series, locate, map_features
 from railfix.simulate.demonstration import demo_inputs
 from tracking_cases import bent_line
 
@@ -125,7 +125,7 @@ def test_features_of_a_map_are_where_the_line_bends() -> None:
     series = line_series(bent_line(1500.0, turn_deg=60.0))
     middle = (series.arc_m > 600.0) & (series.arc_m < 900.0)
     assert np.median(series.curvature_1pm[middle]) == pytest.approx(np.radians(60.0) / 500.0, rel=0.05)
-    found = [f for f in map_features(series, limits=FeatureLimits()) if f.quantity == "curvature"]
+    found = [f for f in map_features(series) if f.quantity == "curvature"]
     assert min(abs(f.arc_m - 500.0) for f in found) < 20.0
     assert min(abs(f.arc_m - 1000.0) for f in found) < 20.0
 

@@ -64,15 +64,16 @@ NO_RANGE: Final = (
     | Reason.SBAS_NO_IONOSPHERE
 )
 
+#: Epochs whose reference has a larger standard deviation are left out.
+_LARGEST_REFERENCE_SIGMA_M: Final = 0.5
+#: Longest gap of the reference trajectory and of the reference station that is interpolated over.
+_LARGEST_REFERENCE_GAP_S: Final = 2.5
+_LARGEST_BASE_GAP_S: Final = 35.0
+
 
 class GatherLimits(Settings):
     """Limits for the range errors of a run."""
 
-    #: Epochs whose reference has a larger standard deviation are left out.
-    largest_reference_sigma_m: float = Field(default=0.5, gt=0.0)
-    #: Longest gap of the reference trajectory and of the reference station that is interpolated over.
-    largest_reference_gap_s: float = Field(default=2.5, gt=0.0)
-    largest_base_gap_s: float = Field(default=35.0, gt=0.0)
     #: Fewest ranges of one constellation, after the screens, from which its receiver clock is estimated.
     least_ranges: int = Field(default=4, ge=1)
 
@@ -207,21 +208,21 @@ def range_errors(
     """
     limits = limits or GatherLimits()
     columns = result.columns
-    good = ~(reference.sigma_m > limits.largest_reference_sigma_m)
+    good = ~(reference.sigma_m > _LARGEST_REFERENCE_SIGMA_M)
     if np.count_nonzero(good) < 2:
         raise MismatchError(
             f"fewer than two of the {len(good)} reference positions have a sigma of "
-            f"{limits.largest_reference_sigma_m:g} m or less; a more accurate reference is needed"
+            f"{_LARGEST_REFERENCE_SIGMA_M:g} m or less; a more accurate reference is needed"
         )
     place = interpolate_reference(
-        result.time, reference.time[good], reference.ecef_m[good], largest_gap_s=limits.largest_reference_gap_s
+        result.time, reference.time[good], reference.ecef_m[good], largest_gap_s=_LARGEST_REFERENCE_GAP_S
     )
     distance, _ = range_with_rotation(result.satellites.position_ecef_m, place[:, None, :])
     reason = result.reason[:, columns]
     satellite = result.satellite[columns]
     residual = np.where((reason & NO_RANGE) == 0, result.corrected_code_m[:, columns] - distance, np.nan)
     if base is not None:
-        residual = residual - base.at(result.time, satellite, largest_gap_s=limits.largest_base_gap_s)
+        residual = residual - base.at(result.time, satellite, largest_gap_s=_LARGEST_BASE_GAP_S)
     used = (reason == Reason.USED) & np.isfinite(residual)
     # What a screen suspects has a sigma of its own: the errors of the others are what the model is of.
     for name in ("doppler", "antenna_pair"):

@@ -26,6 +26,10 @@ from railfix.core.errors import InputFileError
 from railfix.core.settings import Settings
 from railfix.ground.layout import Layout, PointName, overlap
 
+SPEED_ERROR_MPS: Final = 1.0  #: Largest error of a reported speed.
+#: Largest sum of over- and under-reading amount of a report that is taken.
+WIDEST_M: Final = 1000.0
+
 
 class InterlockingLimits(Settings):
     """Limits of the interlocking."""
@@ -36,9 +40,6 @@ class InterlockingLimits(Settings):
     speed_mps: float = Field(default=60.0, gt=0)  #: Highest speed of a train.
     #: Highest acceleration and deceleration, between two reports with speeds.
     acceleration_mps2: float = Field(default=2.0, gt=0)
-    speed_error_mps: float = Field(default=1.0, ge=0)  #: Largest error of a reported speed.
-    #: Largest sum of over- and under-reading amount of a report that is taken.
-    widest_m: float = Field(default=1000.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from railfix.ground.centre import CentreLimits, Rejection, TrainRecord
 from railfix.ground.centre import report_received as record_received
 from railfix.ground.interlocking import (
+    SPEED_ERROR_MPS,
+    WIDEST_M,
     Interlocking,
     InterlockingLimits,
     NearbyTrains,
@@ -74,8 +76,8 @@ def compute_contradiction(
         return "the report has no train length"
     if known.line is not None and message.line != known.line:
         return f"the report is of line {message.line}, the train is on line {known.line}"
-    if over + under > limits.widest_m:
-        return f"the bounds of the place are wider than {limits.widest_m:g} m"
+    if over + under > WIDEST_M:
+        return f"the bounds of the place are wider than {WIDEST_M:g} m"
     if not layout.stations[0].begin_m - over <= front <= layout.stations[-1].end_m + under:
         return f"the place {front:.0f} m is not on the line"
     if (message.authority or 0) > granted:
@@ -144,7 +146,7 @@ def _longest_way_m(before: float | None, now: float | None, elapsed: float, limi
     top = limits.speed_mps
     if before is not None and now is not None:
         # speeds in between are at most so much above both ends
-        top = min(top, max(before, now) + limits.speed_error_mps + 0.5 * limits.acceleration_mps2 * elapsed)
+        top = min(top, max(before, now) + SPEED_ERROR_MPS + 0.5 * limits.acceleration_mps2 * elapsed)
     return top * elapsed
 
 

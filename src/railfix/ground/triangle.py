@@ -217,14 +217,16 @@ class Order(Enum):
     RESUME = "resume satellite positioning"
 
 
+#: Time after a stop in which `GROUND_LOST` is replaced by a more exact cause: an error that grows takes one fix out
+#: of its circle before the others.
+_SETTLE_S: Final = 10.0
+
+
 class MonitorLimits(Settings):
     """Times of the monitor."""
 
     #: A set of three fixes is late after this time; with the period of the fixes below the time to alert of 6 s.
     late_s: float = option("Time after which three fixes are late.", 3.0, name="--late", metavar="S", gt=0, le=5.0)
-    #: Time after a stop in which `GROUND_LOST` is replaced by a more exact cause: an error that grows takes one fix out
-    #: of its circle before the others.
-    settle_s: float = Field(default=10.0, ge=0)
     healthy_s: float = Field(default=300.0, gt=0)  #: Healthy time before a stop can be released.
 
 
@@ -269,11 +271,11 @@ def advance(
         state = replace(state, healthy_since_s=None)
         if now_s - state.complete_s <= limits.late_s:
             return state, ()
-        return _stop(state, now_s, verdict or TriangleVerdict.MONITOR_LOST, -1, limits)
+        return _stop(state, now_s, verdict or TriangleVerdict.MONITOR_LOST, -1)
     assert verdict is not None
     state = replace(state, complete_s=now_s, warning=receiver if verdict is TriangleVerdict.RECEIVER_DRIFTING else -1)
     if verdict in STOPPING:
-        return _stop(replace(state, healthy_since_s=None), now_s, verdict, receiver, limits)
+        return _stop(replace(state, healthy_since_s=None), now_s, verdict, receiver)
     if verdict is not TriangleVerdict.HEALTHY:
         return replace(state, healthy_since_s=None), ()
     since = now_s if state.healthy_since_s is None else state.healthy_since_s
@@ -281,10 +283,10 @@ def advance(
 
 
 def _stop(
-    state: MonitorState, now_s: float, cause: TriangleVerdict, receiver: int, limits: MonitorLimits
+    state: MonitorState, now_s: float, cause: TriangleVerdict, receiver: int
 ) -> tuple[MonitorState, tuple[Order, ...]]:
     if state.stopped and state.cause is not None:
-        if state.cause is TriangleVerdict.GROUND_LOST and now_s - state.since_s <= limits.settle_s:
+        if state.cause is TriangleVerdict.GROUND_LOST and now_s - state.since_s <= _SETTLE_S:
             return replace(state, cause=cause, receiver=receiver), ()
         return state, ()  # latched with its cause
     return replace(state, stopped=True, cause=cause, receiver=receiver, since_s=now_s), (Order.SUSPEND, Order.STOP)

@@ -1,7 +1,7 @@
 # The names of `railfix.motion`, imported at their first use (lazy-loader).
 
-from .features import Feature, FeatureLimits, LineSeries, LocatedFeature, line_series, locate, map_features
-from .radar import EchoLimits, radar_speed_mps, two_way_range_m
+from .features import Feature, LineSeries, LocatedFeature, line_series, locate, map_features
+from .radar import radar_speed_mps, two_way_range_m
 from .samples import InertialSamples, RadarSpeeds, SensorSamples, StationRanges, TachometerPulses
 from .slip import MotionState, SlipLimits, SlipResult, find_slips
 from .tachometer import (
@@ -16,9 +16,7 @@ from .tachometer import (
 )
 
 __all__ = [
-    "EchoLimits",
     "Feature",
-    "FeatureLimits",
     "InertialSamples",
     "LineSeries",
     "LocatedFeature",

@@ -11,36 +11,30 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from pydantic import Field
 
 from railfix.core.arrays import Floats
-from railfix.core.settings import Settings
 from railfix.track.trajectory import Trajectory
 
 #: Quantities of a feature.
 Quantity = Literal["gradient", "curvature"]
 QUANTITIES: Final[tuple[Quantity, ...]] = ("gradient", "curvature")
 
-
-class FeatureLimits(Settings):
-    """What a feature is, and when a measured one is accepted."""
-
-    step_m: float = Field(default=1.0, gt=0)  #: Spacing of the series along the line.
-    #: Length over which a change is taken: about that between the bogies of a vehicle, which rounds what is shorter.
-    base_m: float = Field(default=15.0, gt=0)
-    #: Least change: 3 permille, and from straight to a radius of 1000 m.
-    gradient_change: float = Field(default=0.003, gt=0)
-    curvature_change_1pm: float = Field(default=1e-3, gt=0)
-    half_length_m: float = Field(default=60.0, gt=0)  #: Line before and behind a feature that is compared.
-    likelihood_ratio: float = Field(default=1e3, gt=1)  #: Of the place found to any other place of the window.
-    gap_sigmas: float = Field(default=3.0, gt=0)  #: Disagreement with the distance to the last accepted feature.
-    fit_limit: float = Field(default=3.0, gt=0)  #: Mean square of the other quantity's residual over its variance.
-    scale_sigma: float = Field(default=2e-3, gt=0)  #: Of a way by wheel, as a share.
+#: Least change: 3 permille, and from straight to a radius of 1000 m.
+_GRADIENT_CHANGE: Final = 0.003
+_CURVATURE_CHANGE_1PM: Final = 1e-3
+_LIKELIHOOD_RATIO: Final = 1e3  #: Of the place found to any other place of the window.
+_GAP_SIGMAS: Final = 3.0  #: Disagreement with the distance to the last accepted feature.
+_FIT_LIMIT: Final = 3.0  #: Mean square of the other quantity's residual over its variance.
+SCALE_SIGMA: Final = 2e-3  #: Of a way by wheel, as a share.
+STEP_M: Final = 1.0  #: Spacing of the series along the line.
+HALF_LENGTH_M: Final = 60.0  #: Line before and behind a feature that is compared.
+#: Length over which a change is taken: about that between the bogies of a vehicle, which rounds what is shorter.
+BASE_M: Final = 15.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class LineSeries:
-    """Gradient and curvature along a line, N places `FeatureLimits.step_m` apart."""
+    """Gradient and curvature along a line, N places `STEP_M` apart."""
 
     arc_m: Floats  #: Shape (N,).
     gradient: Floats  #: Climb over horizontal length in rising arc length, shape (N,).
@@ -60,11 +54,10 @@ class Feature:
     change: float
 
 
-def line_series(trajectory: Trajectory, *, limits: FeatureLimits | None = None) -> LineSeries:
-    """Return gradient and curvature of a trajectory over chords of `base_m`, as a vehicle on two bogies has them."""
-    limits = limits or FeatureLimits()
-    half = 0.5 * limits.base_m
-    arc = np.arange(half, float(trajectory.arc_m[-1]) - half, limits.step_m)
+def line_series(trajectory: Trajectory) -> LineSeries:
+    """Return gradient and curvature of a trajectory over chords of `BASE_M`, as a vehicle on two bogies has them."""
+    half = 0.5 * BASE_M
+    arc = np.arange(half, float(trajectory.arc_m[-1]) - half, STEP_M)
     front, rear = trajectory.at_arc(arc + half), trajectory.at_arc(arc - half)
     index = trajectory.segment_at(arc)[0]
     chord = front - rear
@@ -74,29 +67,25 @@ def line_series(trajectory: Trajectory, *, limits: FeatureLimits | None = None) 
     gradient = climb / np.linalg.norm(flat, axis=1)
     ahead = flat[1:] / np.linalg.norm(flat[1:], axis=1, keepdims=True)
     behind = flat[:-1] / np.linalg.norm(flat[:-1], axis=1, keepdims=True)
-    turn = -(np.cross(behind, ahead) * up[1:]).sum(axis=1) / limits.step_m
+    turn = -(np.cross(behind, ahead) * up[1:]).sum(axis=1) / STEP_M
     # each turn belongs to the middle of its step
     curvature = np.concatenate([turn[:1], 0.5 * (turn[1:] + turn[:-1]), turn[-1:]])
     return LineSeries(arc_m=arc, gradient=gradient, curvature_1pm=curvature)
 
 
-def map_features(
-    series: LineSeries, *, limits: FeatureLimits | None = None, least: Mapping[Quantity, Floats] | None = None
-) -> list[Feature]:
-    """Return the features of a line in order: where gradient or curvature change most within `base_m`.
+def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None = None) -> list[Feature]:
+    """Return the features of a line in order: where gradient or curvature change most within `BASE_M`.
 
     Parameters
     ----------
     series : LineSeries
-    limits : FeatureLimits, optional
     least : mapping of ndarray, shape (N,), optional
         Of a measured line, by quantity: a change must also be larger than that of either side together (root sum of
         squares).
     """
-    limits = limits or FeatureLimits()
-    lag = max(round(limits.base_m / limits.step_m), 1)
+    lag = max(round(BASE_M / STEP_M), 1)
     found = []
-    for quantity, smallest in (("gradient", limits.gradient_change), ("curvature", limits.curvature_change_1pm)):
+    for quantity, smallest in (("gradient", _GRADIENT_CHANGE), ("curvature", _CURVATURE_CHANGE_1PM)):
         values = series.gradient if quantity == "gradient" else series.curvature_1pm
         change = values[2 * lag :] - values[: -2 * lag] if len(values) > 2 * lag else np.empty(0)
         size = np.abs(change)
@@ -129,7 +118,6 @@ def locate(
     quantity: Quantity,
     noise: tuple[float, float],
     last: tuple[float, float, float] | None = None,
-    limits: FeatureLimits | None = None,
 ) -> LocatedFeature:
     """Return the place of a measured stretch by maximum likelihood within four sigmas of the predicted one.
 
@@ -148,17 +136,15 @@ def locate(
         Standard deviations of the two quantities in one step.
     last : tuple of float, optional
         Place of the last accepted feature, its sigma, and the way by wheel since [m].
-    limits : FeatureLimits, optional
     """
-    limits = limits or FeatureLimits()
-    offsets = np.arange(-4.0 * sigma_m, 4.0 * sigma_m + limits.step_m, 0.25 * limits.step_m)
+    offsets = np.arange(-4.0 * sigma_m, 4.0 * sigma_m + STEP_M, 0.25 * STEP_M)
     at = predicted_m + offsets[:, None] + measured.arc_m
     expected = np.interp(at, line.arc_m, line.of(quantity))
     residual = measured.of(quantity) - expected
     residual = residual - residual.mean(axis=1, keepdims=True)
     spread = noise[QUANTITIES.index(quantity)]
     likelihood = -0.5 * (residual**2).sum(axis=1) / spread**2
-    slope = np.gradient(expected[int(np.argmax(likelihood))], limits.step_m)
+    slope = np.gradient(expected[int(np.argmax(likelihood))], STEP_M)
     information = float(((slope - slope.mean()) ** 2).sum()) / spread**2
     best = int(np.argmax(likelihood))
     if information < 16.0 / sigma_m**2:
@@ -166,22 +152,22 @@ def locate(
             verdict="none", arc_m=np.nan, sigma_m=np.nan, reason="no change sharper than the prediction"
         )
     sigma = float(1.0 / np.sqrt(information))
-    place = predicted_m + float(offsets[best]) + _vertex(likelihood, best) * 0.25 * limits.step_m
-    apart = np.abs(offsets - offsets[best]) > max(5.0 * sigma, 2.0 * limits.step_m)
+    place = predicted_m + float(offsets[best]) + _vertex(likelihood, best) * 0.25 * STEP_M
+    apart = np.abs(offsets - offsets[best]) > max(5.0 * sigma, 2.0 * STEP_M)
     if best in (0, len(offsets) - 1):
         return LocatedFeature(verdict="ambiguous", arc_m=np.nan, sigma_m=sigma, reason="best at the edge of the window")
-    if apart.any() and likelihood[best] - likelihood[apart].max() < np.log(limits.likelihood_ratio):
+    if apart.any() and likelihood[best] - likelihood[apart].max() < np.log(_LIKELIHOOD_RATIO):
         return LocatedFeature(
             verdict="ambiguous", arc_m=np.nan, sigma_m=sigma, reason="another place fits nearly as well"
         )
     other: Quantity = QUANTITIES[1 - QUANTITIES.index(quantity)]
     rest = measured.of(other) - np.interp(place + measured.arc_m, line.arc_m, line.of(other))
     misfit = float(((rest - rest.mean()) ** 2).mean()) / noise[QUANTITIES.index(other)] ** 2
-    if misfit > limits.fit_limit:
+    if misfit > _FIT_LIMIT:
         return LocatedFeature(verdict="none", arc_m=np.nan, sigma_m=sigma, reason=f"the {other} does not fit there")
     if last is not None:
         gap = place - last[0]
-        allowed = limits.gap_sigmas * np.sqrt(sigma**2 + last[1] ** 2 + (limits.scale_sigma * last[2]) ** 2)
+        allowed = _GAP_SIGMAS * np.sqrt(sigma**2 + last[1] ** 2 + (SCALE_SIGMA * last[2]) ** 2)
         if abs(gap - last[2]) > allowed:
             return LocatedFeature(
                 verdict="none", arc_m=np.nan, sigma_m=sigma, reason="distance to the last feature disagrees"

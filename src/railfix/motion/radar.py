@@ -10,11 +10,9 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
-from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.motion.samples import RadarSpeeds
 
@@ -131,13 +129,3 @@ def two_way_range_m(delay_s: Floats, answer_s: float) -> Floats:
 def radar_speed_mps(shift_hz: Floats, carrier_hz: float, angle_rad: float) -> Floats:
     """Return the speed by a Doppler shift: ``v = c f_d / (2 f_0 cos(alpha))`` (P2 3.1, figure 9)."""
     return np.asarray(SPEED_OF_LIGHT * shift_hz / (2.0 * carrier_hz * np.cos(angle_rad)))
-
-
-class EchoLimits(Settings):
-    """Gate of ranges against the predicted one."""
-
-    #: Least width of the gate toward long ranges: echoes are late, and separate from 0.3 m on (P2, table 3).
-    late_m: float = Field(default=0.6, gt=0)
-    #: Width of the gate on both sides.
-    early_sigmas: float = Field(default=3.0, gt=0)
-    late_sigmas: float = Field(default=3.0, gt=0)

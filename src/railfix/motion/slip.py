@@ -9,7 +9,7 @@ one that no line has. Two rules:
   come back to the speed carried by inertia and the pitch fits.
 
 While a slip lasts, speed and way come from the accelerometer less the pitch and its offset, learnt while the wheel
-rolls, from `look_back_s` before the detection. The pitch is that of the line where the place is known; with a gyro the
+rolls, from `LOOK_BACK_S` before the detection. The pitch is that of the line where the place is known; with a gyro the
 integral of the pitch rate, which follows the line slowly, or without the line the pitch by wheel and accelerometer (P2
 2.1(3)).
 """
@@ -21,7 +21,7 @@ from copy import copy
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -52,6 +52,31 @@ class MotionState(IntEnum):
     EXPIRED = 7
 
 
+#: Sine of the pitch against the line's: 0.1 m/s2 of wheel against train.
+_MAP_LIMIT: Final = 0.015
+#: The limit is at least so many standard deviations while the wheel rolls, over such a time: a body that pitches
+#: shakes its accelerometer too, the more the higher it is mounted.
+_NOISE_SIGMAS: Final = 5.0
+_NOISE_S: Final = 30.0
+#: A slip ends when wheel and inertia agree so well for so long.
+_LATCH_MPS: Final = 0.15
+_LATCH_SHARE: Final = 0.01
+_LATCH_S: Final = 0.5
+LOOK_BACK_S: Final = 0.3  #: How long before the detection the carry begins.
+#: After this the carried speed has expired: `carry_drift_mps2` has become 0.3 m/s.
+_LONGEST_CARRY_S: Final = 30.0
+#: Time constant of the mean of the pitch: of the body's pitching at about 1 Hz and of vibration.
+SMOOTHING_S: Final = 0.2
+_STANDING_S: Final = 1.0  #: Time without a pulse after which a vehicle at rest stands.
+_PITCH_S: Final = 20.0
+#: Time for which the body swings after a stop; its pitch then is the one of the standstill.
+_SETTLING_S: Final = 2.0
+#: Change of the pitch at standstill, duration and speed that mean rolling away.
+_ROLLING_LIMIT: Final = 0.002
+_ROLLING_S: Final = 0.3
+_ROLLING_MPS: Final = 0.05
+
+
 class SlipLimits(Settings):
     """Limits of the detection."""
 
@@ -59,36 +84,13 @@ class SlipLimits(Settings):
     rule: Literal["map", "p2"] = "map"
     #: Sine of the pitch: 35 permille of line (P2 2.1) and 10 permille of body.
     p2_limit: float = Field(default=0.045, gt=0)
-    #: Sine of the pitch against the line's: 0.1 m/s2 of wheel against train.
-    map_limit: float = Field(default=0.015, gt=0)
-    #: The limit is at least so many standard deviations while the wheel rolls, over such a time: a body that pitches
-    #: shakes its accelerometer too, the more the higher it is mounted.
-    noise_sigmas: float = Field(default=5.0, ge=0)
-    noise_s: float = Field(default=30.0, gt=0)
     confirm_s: float = Field(default=0.1, ge=0)  #: Time over the limit after which a slip is one.
-    #: A slip ends when wheel and inertia agree so well for so long.
-    latch_mps: float = Field(default=0.15, gt=0)
-    latch_share: float = Field(default=0.01, ge=0)
-    latch_s: float = Field(default=0.5, ge=0)
     #: The two may differ by so much more a second of the carry: 1e-3 of gravity, the offset of the accelerometer and
     #: the error of the pitch together.
     carry_drift_mps2: float = Field(default=0.01, ge=0)
-    look_back_s: float = Field(default=0.3, ge=0)  #: How long before the detection the carry begins.
-    #: After this the carried speed has expired: `carry_drift_mps2` has become 0.3 m/s.
-    longest_carry_s: float = Field(default=30.0, gt=0)
-    #: Time constant of the mean of the pitch: of the body's pitching at about 1 Hz and of vibration.
-    smoothing_s: float = Field(default=0.2, gt=0)
     offset_s: float = Field(default=60.0, gt=0)  #: Time constant of the accelerometer's offset.
-    standing_s: float = Field(default=1.0, gt=0)  #: Time without a pulse after which a vehicle at rest stands.
     #: Time constants of the gyro's pitch and bias. Without a line the pitch by wheel and accelerometer takes its place.
-    pitch_s: float = Field(default=20.0, gt=0)
     bias_s: float = Field(default=200.0, gt=0)
-    #: Time for which the body swings after a stop; its pitch then is the one of the standstill.
-    settling_s: float = Field(default=2.0, ge=0)
-    #: Change of the pitch at standstill, duration and speed that mean rolling away.
-    rolling_limit: float = Field(default=0.002, gt=0)
-    rolling_s: float = Field(default=0.3, gt=0)
-    rolling_mps: float = Field(default=0.05, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +104,7 @@ class SlipResult:
     way_m: Floats
     #: Sine of the pitch by wheel and accelerometer less the reference pitch; NaN without pulses; shape (N,).
     metric: Floats
-    smooth: Floats  #: Mean of the metric over `SlipLimits.smoothing_s` less the accelerometer's offset; shape (N,).
+    smooth: Floats  #: Mean of the metric over `SMOOTHING_S` less the accelerometer's offset; shape (N,).
     pitch: Floats  #: Sine of the reference pitch; NaN before it is known; shape (N,).
     gyro_bias_radps: Floats  #: Of the pitch rate, as learnt; 0 without a gyro; shape (N,).
     offset_mps2: Floats  #: Of the accelerometer, as learnt; shape (N,).
@@ -206,7 +208,7 @@ class _Automaton:
         self.state = MotionState.INIT
         self.speed, self.way, self.metric, self.offset = float("nan"), 0.0, float("nan"), 0.0
         self.pitch, self.bias = float("nan"), 0.0
-        self._smooth, self._limit, self._square = 0.0, limits.map_limit, 0.0
+        self._smooth, self._limit, self._square = 0.0, _MAP_LIMIT, 0.0
         self._over = self._fits = self._gap = self._silent = self._carried = self._apart = self._age = 0.0
         self._rest = float("nan")
         #: Time since a sample, speed and acceleration by inertia: what a detection looks back on.
@@ -241,11 +243,11 @@ class _Automaton:
         inertial = force - GRAVITY_MPS2 * reference - self.offset
         self.metric = (force - acceleration) / GRAVITY_MPS2 - reference if measured else float("nan")
         if self.metric == self.metric:
-            share = min(dt / limits.smoothing_s, 1.0)
+            share = min(dt / SMOOTHING_S, 1.0)
             self._smooth += share * (self.metric - self.offset / GRAVITY_MPS2 - self._smooth)
         # A held pitch is that of some place behind.
-        least = limits.map_limit if sine == sine or rate == rate else limits.p2_limit
-        self._limit = max(least, limits.noise_sigmas * self._square**0.5)
+        least = _MAP_LIMIT if sine == sine or rate == rate else limits.p2_limit
+        self._limit = max(least, _NOISE_SIGMAS * self._square**0.5)
         if self.state in (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE):
             self._carry(dt, inertial)
             self._release(dt, wheel, heard=heard)
@@ -279,14 +281,14 @@ class _Automaton:
             return
         if target == target:
             gap = target - self.pitch
-            self.pitch += min(dt / limits.pitch_s, 1.0) * gap
+            self.pitch += min(dt / _PITCH_S, 1.0) * gap
             if turning:
-                self.bias -= gap * dt / (limits.pitch_s * limits.bias_s)
+                self.bias -= gap * dt / (_PITCH_S * limits.bias_s)
 
     def _carry(self, dt: float, inertial: float) -> None:
         self.speed += inertial * dt
         self._carried += dt
-        if self._carried > self.limits.longest_carry_s:
+        if self._carried > _LONGEST_CARRY_S:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _release(self, dt: float, wheel: float, *, heard: bool) -> None:
@@ -297,12 +299,12 @@ class _Automaton:
             if back:
                 self.state, self.speed = MotionState.NORMAL, wheel
             return
-        near = max(limits.latch_mps, limits.latch_share * abs(self.speed)) + limits.carry_drift_mps2 * self._carried
+        near = max(_LATCH_MPS, _LATCH_SHARE * abs(self.speed)) + limits.carry_drift_mps2 * self._carried
         fits = heard and abs(wheel - self.speed) < near and abs(self._smooth) < self._limit
         self._gap = self._gap + (wheel - self.speed) * dt if fits else 0.0
         self._fits = self._fits + dt if fits else 0.0
-        if self._fits >= limits.latch_s:
-            lasted = self._carried + limits.look_back_s + limits.confirm_s + limits.smoothing_s
+        if self._fits >= _LATCH_S:
+            lasted = self._carried + LOOK_BACK_S + limits.confirm_s + SMOOTHING_S
             self.way += 0.5 * lasted * (self._gap / self._fits if self._fits else 0.0)
             self.state, self.speed, self._over = MotionState.NORMAL, wheel, 0.0
 
@@ -319,7 +321,7 @@ class _Automaton:
         self._over = self._over + dt if over else 0.0
         self.speed = wheel
         if not over:
-            self._square += min(dt / limits.noise_s, 1.0) * (self._smooth**2 - self._square)
+            self._square += min(dt / _NOISE_S, 1.0) * (self._smooth**2 - self._square)
         if not over and sine == sine:
             share = min(dt / limits.offset_s, 1.0)
             self.offset += share * GRAVITY_MPS2 * self._smooth
@@ -331,7 +333,7 @@ class _Automaton:
 
     def _look_back(self, inertial: float, dt: float) -> None:
         """Put speed and way on the carry from a little before the detection."""
-        begin = self._age - self.limits.look_back_s - self.limits.confirm_s - self.limits.smoothing_s
+        begin = self._age - LOOK_BACK_S - self.limits.confirm_s - SMOOTHING_S
         past = [entry for entry in self._past if entry[0] >= begin and entry[1] == entry[1]]
         if not past:
             return
@@ -346,7 +348,6 @@ class _Automaton:
 
     def _quiet(self, dt: float, force: float, inertial: float) -> None:
         """No pulse: standing, starting or stopping slowly, or rolling away."""
-        limits = self.limits
         if self.state == MotionState.NORMAL:
             self.state = MotionState.LOW_SPEED
         if self.state == MotionState.LOW_SPEED:
@@ -356,18 +357,18 @@ class _Automaton:
             self._watch(dt, force)
         elif self.state == MotionState.INIT:
             return  # a sensor that was never heard may be dead
-        elif self._silent >= limits.standing_s and not abs(self.speed) > 0.5:
+        elif self._silent >= _STANDING_S and not abs(self.speed) > 0.5:
             self.state, self.speed, self._rest, self._apart, self._carried = MotionState.STANDING, 0.0, force, 0.0, 0.0
-        elif self._carried > limits.longest_carry_s:
+        elif self._carried > _LONGEST_CARRY_S:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _watch(self, dt: float, force: float) -> None:
         """At rest the force is gravity's share; freed, it falls toward zero and the change is the motion."""
         limits = self.limits
-        if self.state == MotionState.STANDING and self._silent < limits.standing_s + limits.settling_s:
+        if self.state == MotionState.STANDING and self._silent < _STANDING_S + _SETTLING_S:
             self._rest = force
         change = force - self._rest
-        moved = abs(change) > limits.rolling_limit * GRAVITY_MPS2
+        moved = abs(change) > _ROLLING_LIMIT * GRAVITY_MPS2
         if self.state == MotionState.STANDING:
             self._apart = self._apart + dt if moved else 0.0
             if not moved:
@@ -376,7 +377,7 @@ class _Automaton:
                 return
             # Rolling freely the accelerometer shows nothing; the acceleration is gravity's, which it showed at rest.
             self.speed += change * dt
-            if self._apart >= limits.rolling_s and abs(self.speed) > limits.rolling_mps:
+            if self._apart >= _ROLLING_S and abs(self.speed) > _ROLLING_MPS:
                 self.state = MotionState.ROLLING
         else:
             self._carry(dt, change)

@@ -23,6 +23,7 @@ from railfix.motion.samples import TachometerPulses
 _UNITS: Final = {3.6: "km/h", 2.2369: "miles per hour", 1.94384: "knots"}
 #: A ratio within this share of a unit's is that unit: more than a worn wheel (2 %), less than between two units.
 _UNIT_SHARE: Final = 0.05
+LEAST_SPEED_MPS: Final = 1.0 / 3.6  #: Below it there is no output (P2 1; 1 km/h).
 
 
 class TachometerLimits(Settings):
@@ -33,7 +34,6 @@ class TachometerLimits(Settings):
     #: Time over which speeds are taken. P2 3.2 calls 0.1 s the usual smoothing of a tachometer; with uneven teeth take
     #: that of a whole turn.
     window_s: float = Field(default=0.1, gt=0)
-    least_speed_mps: float = Field(default=1.0 / 3.6, gt=0)  #: Below it there is no output (P2 1; 1 km/h).
     silence_s: float = Field(default=0.3, gt=0)  #: Time without a pulse after which there is no output.
     #: Standard deviation of a pulse's instant, and the step of its clock.
     jitter_s: float = Field(default=5e-6, ge=0)
@@ -83,7 +83,7 @@ def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: Tachomete
         size = count * limits.pulse_m / duration
         spread = size * np.sqrt(2.0 * limits.jitter_s**2 + limits.resolution_s**2 / 6.0) / duration
         bound = np.where(last >= 0, limits.pulse_m / np.maximum(since, 1e-9), np.nan)
-    valid = some & (duration > 0) & (size >= limits.least_speed_mps) & (since <= limits.silence_s)
+    valid = some & (duration > 0) & (size >= LEAST_SPEED_MPS) & (since <= limits.silence_s)
     # A pulse that has not come yet bounds the speed too.
     valid &= bound >= 0.5 * size
     sign = np.where(pulses.direction[at] == 0, 1.0, pulses.direction[at])

@@ -52,6 +52,10 @@ STANDSTILL_MPS: Final = 1.0 / 3.6
 #: Places beyond an end of the line by so many sigmas, or so far [m], are on its end.
 _END_SIGMAS: Final = 4.0
 _END_M: Final = 30.0
+#: Gate of two-way ranges against the predicted one, in standard deviations; least width toward long ones: echoes are
+#: late, and separate from 0.3 m on (P2, table 3) [m].
+_GATE_SIGMAS: Final = 3.0
+_LATE_M: Final = 0.6
 #: With sensors, epochs of so much GPS time go through the filter together [ns].
 _STRETCH_NS: Final = 5_000_000_000
 #: A direction is given where the speed is beyond this many of its sigmas.
@@ -270,9 +274,8 @@ def _gated_ranges(ranges: RangeEpochs, time: Datetimes, line: Line, state: Filte
     unit = point + right * axes[:, 1] + up * axes[:, 2]
     size = np.linalg.norm(ranges.unit_ecef_m - unit.reshape(*place.shape, 3), axis=-1)
     residual = ranges.range_m - size
-    echo = config.sensors.echo
-    late = np.maximum(echo.late_sigmas * spread, echo.late_m)
-    kept = (residual >= -echo.early_sigmas * spread) & (residual <= late) & np.isfinite(place)
+    late = np.maximum(_GATE_SIGMAS * spread, _LATE_M)
+    kept = (residual >= -_GATE_SIGMAS * spread) & (residual <= late) & np.isfinite(place)
     return replace(ranges, range_m=np.where(kept, ranges.range_m, np.nan))
 
 

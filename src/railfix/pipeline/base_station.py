@@ -22,7 +22,7 @@ from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import corrected_phase_m, number_arcs
 from railfix.positioning.noise_scale import robust_clock
 from railfix.positioning.section_search import SearchIndex
-from railfix.ranges.base_station import BaseErrors
+from railfix.ranges.base_station import LONGEST_AGE_S, BaseErrors
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -95,7 +95,7 @@ class BaseStation:
             state = BaseState(errors=new if errors is None else errors.joined(new), carrier=carrier)
         if np.isnat(began) or state.errors is None:
             return state
-        kept = np.timedelta64(round(2e9 * self._config.base.longest_age_s), "ns")
+        kept = np.timedelta64(round(2e9 * LONGEST_AGE_S), "ns")
         return replace(state, errors=state.errors.kept_from(began - kept))
 
     def _rows(self, ecef_m: Floats) -> AntennaRows:

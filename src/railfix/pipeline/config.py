@@ -95,6 +95,10 @@ else:
         "ScreenSettings", __base__=Settings, **{screen.name: (type(screen.limits), screen.limits) for screen in SCREENS}
     )
 
+#: Time off the map after which the filter gives up its place, or on it begins anew. On the recordings, with a right
+#: map, no two positions in a row are off it.
+OFF_MAP_S: Final = 10.0
+
 
 class Config(ScreenSettings):
     """Settings of the positioning, each with its default and where that comes from.
@@ -134,9 +138,6 @@ class Config(ScreenSettings):
     dilution_limit: float = Field(default=20.0, gt=0)  #: Largest along-track dilution [m/m] of a position.
     #: Probability that noise alone puts a position off the map; the noise is judged by the residuals of the 3-D fit.
     off_map_risk: float = Field(default=1e-6, gt=0, lt=1)
-    #: Time off the map after which the filter gives up its place, or on it begins anew. On the recordings, with a right
-    #: map, no two positions in a row are off it.
-    off_map_s: float = Field(default=10.0, gt=0)
     #: Probability of another track above which no position on a network is `ok`, `tracking` or has a level. `railfix
     #: which-track` allows the same.
     track_risk: float = Field(default=1e-3, gt=0, lt=1)

@@ -10,8 +10,8 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.timescale import seconds
 from railfix.motion.features import (
+    HALF_LENGTH_M,
     Feature,
-    FeatureLimits,
     LineSeries,
     LocatedFeature,
     line_series,
@@ -41,15 +41,15 @@ class LineFeatures:
     line: Line  #: Tells whether it is closed.
 
     @classmethod
-    def of(cls, track: Track, trajectory: Trajectory, limits: FeatureLimits) -> LineFeatures:
+    def of(cls, track: Track, trajectory: Trajectory) -> LineFeatures:
         """Features of a track for the body that carries an antenna."""
         line = Trajectory.from_track(track)
-        series = line_series(line, limits=limits)
+        series = line_series(line)
         body = trajectory.chainage_m if trajectory.body_chainage_m is None else trajectory.body_chainage_m
         inside = np.clip(body, line.chainage_m[0], line.chainage_m[-1])
         return cls(
             series=series,
-            features=tuple(map_features(series, limits=limits)),
+            features=tuple(map_features(series)),
             antenna_m=np.asarray(trajectory.arc_m),
             body_m=line.arc_at_chainage(inside) + body - inside,
             line=Line.of(line),
@@ -127,11 +127,10 @@ def feature_fixes(
     state: FeatureState,
     *,
     noise: tuple[float, float],
-    limits: FeatureLimits,
 ) -> tuple[list[FeatureFix], FeatureState]:
     """Return verdicts on the features that were passed, and the state to pass on.
 
-    A feature is compared once the body's middle is `half_length_m` beyond it. Only ways without a slip and faster than
+    A feature is compared once the body's middle is `HALF_LENGTH_M` beyond it. Only ways without a slip and faster than
     1 m/s count: heading and pitch are integrals, and a break begins them anew. `facing`: 1 where the front points to
     rising arc length, else -1; `sigma_m`: of the place by the wheel; `noise`: standard deviations of gradient and
     curvature in one metre.
@@ -144,7 +143,7 @@ def feature_fixes(
     usable = rates.rolls & (np.abs(rates.speed_mps) > SLOWEST_MPS) & np.isfinite(heading[1:] + pitch[1:])
     fixes: list[FeatureFix] = []
     metre, headings, pitches = state.metre, state.heading_rad, state.pitch_rad
-    kept, last, done = int(2.5 * limits.half_length_m), state.last, state.done_m
+    kept, last, done = int(2.5 * HALF_LENGTH_M), state.last, state.done_m
     breaks = np.flatnonzero(~usable)
     # stretches of usable ticks, each closed by one that is not
     edges = np.concatenate([[-1], breaks, [len(usable)]])
@@ -167,7 +166,7 @@ def feature_fixes(
         if not np.isfinite(body[-1]) or len(metre) < _LEAST_POINTS:
             continue
         sense = 1.0 if metre[-1] > metre[0] else -1.0
-        behind = body - sense * limits.half_length_m
+        behind = body - sense * HALF_LENGTH_M
         passed = float(behind[-1])
         known = done if done == done else float(behind[0])
         for feature in line.features:
@@ -188,14 +187,14 @@ def feature_fixes(
                 # on a closed line the last feature may lie before the join
                 nearest = line.line.nearest_m(np.array(last[0]), np.array(feature.arc_m - covered))
                 before = (float(nearest), last[1], covered)
-            located = _compare(profile, feature, line, sigma_m, before, noise, limits)
+            located = _compare(profile, feature, line, sigma_m, before, noise)
             if located is None:
                 continue
             fixes.append(FeatureFix(tick=tick, feature=feature, located=located))
             if located.verdict == "accepted":
                 last = (located.arc_m, located.sigma_m, feature.arc_m - shift)
         # a place corrected backward passes nothing twice
-        done = passed if not sense * (passed - done) < 0.0 or abs(passed - done) > limits.half_length_m else done
+        done = passed if not sense * (passed - done) < 0.0 or abs(passed - done) > HALF_LENGTH_M else done
     metre, headings, pitches = metre[-kept:], headings[-kept:], pitches[-kept:]
     angles = (float(np.nan_to_num(heading[-1])), float(np.nan_to_num(pitch[-1])))
     return fixes, replace(
@@ -219,13 +218,12 @@ def _compare(
     sigma_m: float,
     last: tuple[float, float, float] | None,
     noise: tuple[float, float],
-    limits: FeatureLimits,
 ) -> LocatedFeature | None:
     """Verdict on one feature by arc lengths, headings and pitches; None where it was not passed without a break."""
     arc_m, heading_rad, pitch_rad = profile
     about = arc_m - feature.arc_m
-    near = np.flatnonzero(np.abs(about) <= limits.half_length_m)
-    if len(near) < 1.8 * limits.half_length_m or len(near) < 3:
+    near = np.flatnonzero(np.abs(about) <= HALF_LENGTH_M)
+    if len(near) < 1.8 * HALF_LENGTH_M or len(near) < 3:
         return None
     heading, pitch = heading_rad[near], pitch_rad[near]
     measured = LineSeries(
@@ -233,6 +231,4 @@ def _compare(
         gradient=np.tan(pitch[1:-1]),
         curvature_1pm=0.5 * (heading[2:] - heading[:-2]),
     )
-    return locate(
-        measured, line.series, feature.arc_m, sigma_m, quantity=feature.quantity, noise=noise, last=last, limits=limits
-    )
+    return locate(measured, line.series, feature.arc_m, sigma_m, quantity=feature.quantity, noise=noise, last=last)

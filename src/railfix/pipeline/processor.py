@@ -386,8 +386,7 @@ class EpochProcessor:
         """Ground units, balises, and the features of the line: made when there is an inertial unit."""
         wanted = "feature" in self.config.filter_sources and sensors is not None and len(sensors.inertial) > 0
         if wanted and self._track is not None and name not in self._features:
-            limits = self.config.sensors.feature
-            self._features[name] = LineFeatures.of(self._track, self.trajectories[name], limits)
+            self._features[name] = LineFeatures.of(self._track, self.trajectories[name])
         return LineReferences(features=self._features.get(name), units=self.units, balises=self.balises)
 
     def _pair(self, ranges: Mapping[str, AntennaRanges]) -> PairedEpochs | None:

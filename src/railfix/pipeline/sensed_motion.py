@@ -13,6 +13,8 @@ from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.timescale import seconds
 from railfix.motion.samples import InertialSamples, TachometerPulses
 from railfix.motion.slip import (
+    LOOK_BACK_S,
+    SMOOTHING_S,
     MotionSamples,
     MotionState,
     SlipLimits,
@@ -163,7 +165,7 @@ def sensed_motion(
         state=state.slip,
     )
     swing = np.nan_to_num(GRAVITY_MPS2 * (found.pitch - line_sine))
-    lag = limits.look_back_s + limits.confirm_s + limits.smoothing_s
+    lag = LOOK_BACK_S + limits.confirm_s + SMOOTHING_S
     doubt = GRAVITY_MPS2 * lag * np.abs(found.smooth)
     at = np.searchsorted(ticks * _TICK_NS, ends, side="right")
     turned, rolls = heading_rate_radps(force, rates, known_speed), found.state == MotionState.NORMAL

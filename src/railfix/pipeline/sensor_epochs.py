@@ -12,8 +12,7 @@ from pydantic import Field
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
-from railfix.motion.features import FeatureLimits
-from railfix.motion.radar import EchoLimits
+from railfix.motion.features import HALF_LENGTH_M, SCALE_SIGMA
 from railfix.motion.samples import (
     BaliseReadings,
     GroundUnits,
@@ -25,7 +24,7 @@ from railfix.motion.samples import (
     TachometerPulses,
 )
 from railfix.motion.slip import MotionState, SlipLimits
-from railfix.motion.tachometer import TachometerLimits, faults_until, way_m, window_start
+from railfix.motion.tachometer import LEAST_SPEED_MPS, TachometerLimits, faults_until, way_m, window_start
 from railfix.pipeline.balises import BaliseLimits, BaliseState, balise_epochs
 from railfix.pipeline.feature_stage import FeatureFix, FeatureState, LineFeatures, RateSeries, ahead_m, feature_fixes
 from railfix.pipeline.sensed_motion import CARRIED, REACH, SensedMotion, SensedState, nothing_sensed, sensed_motion
@@ -59,17 +58,18 @@ class LineReferences:
     balises: ListedBalises | None = None
 
 
+#: Of a two-way range where the device reports none: 0.19 to 0.24 m (P2 3.3), echoes and drifts of the unit's
+#: answering delay beside it.
+_RANGE_SIGMA_M: Final = 0.5
+_RADAR_SIGMA_MPS: Final = 0.1
+
+
 class SensorLimits(Settings):
     """Noise of the sensors as the filter sees them."""
 
     tachometer: TachometerLimits = Field(default_factory=TachometerLimits)
     #: Of the detection of slip and slide by tachometer and inertial unit together.
     slip: SlipLimits = Field(default_factory=SlipLimits)
-    feature: FeatureLimits = Field(default_factory=FeatureLimits)  #: Of places by changes of gradient and curvature.
-    #: Of a two-way range where the device reports none: 0.19 to 0.24 m (P2 3.3), echoes and drifts of the unit's
-    #: answering delay beside it.
-    range_sigma_m: float = Field(default=0.5, gt=0)
-    echo: EchoLimits = Field(default_factory=EchoLimits)  #: Gate of ranges against the place of the filter.
     #: Place of the vehicle's ranging unit: ahead of the vehicle's middle (without a vehicle file: of the antenna), to
     #: the right of the antenna's path and above the antenna.
     range_ahead_m: float = 0.0
@@ -83,7 +83,6 @@ class SensorLimits(Settings):
     #: Of a way between two epochs beside the pulse: creep of a braked or driven wheel.
     wheel_sigma_m: float = Field(default=0.01, gt=0)
     #: Of one speed, and the usual time between two.
-    radar_sigma_mps: float = Field(default=0.1, gt=0)
     radar_step_s: float = Field(default=0.1, gt=0)
     #: Of a mean force between two epochs: pitching of the body beside the sensor's noise (1 mrad is 0.01 m/s2), and the
     #: map's gradient.
@@ -169,16 +168,14 @@ def sensor_epochs(
         )
         if rates is not None and surroundings is not None and surroundings.features is not None:
             noise = _with_map(trajectory)
-            fixes, passing = feature_fixes(
-                rates, surroundings.features, facing, motion.sigma_m, passing, noise=noise, limits=limits.feature
-            )
-            values |= _places(fixes, rates, time, limits.feature)
+            fixes, passing = feature_fixes(rates, surroundings.features, facing, motion.sigma_m, passing, noise=noise)
+            values |= _places(fixes, rates, time)
     if wheel:
         way = np.diff(way_m(pulses, edges, limits=limits.tachometer))
         known = (
             usable
             & (edges[:-1] >= pulses.time[0])
-            & ~(np.abs(way) < limits.tachometer.least_speed_mps * np.maximum(span, 1e-9))
+            & ~(np.abs(way) < LEAST_SPEED_MPS * np.maximum(span, 1e-9))
             & (np.diff(faults_until(pulses, edges)) == 0)
         )
         quantum = limits.tachometer.pulse_m / np.sqrt(6.0)
@@ -195,7 +192,7 @@ def sensor_epochs(
     if len(radar) and "radar" in sources:
         mean, share = _mean_between(radar.time, radar.speed_mps, edges)
         known = usable & (share >= _COMPLETE) & ~_silent("radar", samples, len(time))
-        sigma = limits.radar_sigma_mps * np.sqrt(np.maximum(span, limits.radar_step_s) * limits.radar_step_s)
+        sigma = _RADAR_SIGMA_MPS * np.sqrt(np.maximum(span, limits.radar_step_s) * limits.radar_step_s)
         values |= {"radar_m": np.where(known, facing * mean * span, np.nan), "radar_sigma_m": sigma}
     if force:
         mean, share = _mean_between(inertial.time, inertial.force_mps2[:, 0], edges)
@@ -205,7 +202,7 @@ def sensor_epochs(
             "force_sigma_mps2": np.full(len(time), limits.force_sigma_mps2),
         }
     if len(ranging) and "range" in sources and surroundings is not None and surroundings.units is not None:
-        values["ranges"] = _ranges(ranging, edges, surroundings.units, ranging_lever_m(trajectory, limits), limits)
+        values["ranges"] = _ranges(ranging, edges, surroundings.units, ranging_lever_m(trajectory, limits))
     if len(state.samples.balises) and "balise" in sources and surroundings is not None and surroundings.balises:
         values["balises"], balises = balise_epochs(
             state.samples.balises, edges, surroundings.balises, trajectory, balises, limits.balise
@@ -232,7 +229,7 @@ def _with_map(trajectory: Trajectory) -> tuple[float, float]:
     return float(np.hypot(_GRADIENT_NOISE, gradient)), float(np.hypot(_CURVATURE_NOISE_1PM, curvature))
 
 
-def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes, limits: FeatureLimits) -> dict[str, Floats]:
+def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes) -> dict[str, Floats]:
     """Places of the antenna by the accepted features, at the first epoch after each."""
     place, sigma = np.full(len(time), np.nan), np.full(len(time), np.nan)
     at = rates.arc_at(time)
@@ -240,7 +237,7 @@ def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes, limits:
         if fix.located.verdict == "accepted":
             epoch = int(np.searchsorted(time, rates.known[fix.tick]))
             place[epoch] = at[epoch] + fix.correction_m
-            since = limits.scale_sigma * limits.half_length_m
+            since = SCALE_SIGMA * HALF_LENGTH_M
             sigma[epoch] = np.sqrt(fix.located.sigma_m**2 + since**2 + _FEATURE_SIGMA_M**2)
     return {"place_m": place, "place_sigma_m": sigma}
 
@@ -252,9 +249,7 @@ def ranging_lever_m(trajectory: Trajectory, limits: SensorLimits) -> Floats:
     return np.array([along, facing * limits.range_right_m, limits.range_above_m])
 
 
-def _ranges(
-    ranging: StationRanges, edges: Datetimes, units: GroundUnits, lever_m: Floats, limits: SensorLimits
-) -> RangeEpochs:
+def _ranges(ranging: StationRanges, edges: Datetimes, units: GroundUnits, lever_m: Floats) -> RangeEpochs:
     """Ranges by the epoch that comes after each."""
     index = {str(name): k for k, name in enumerate(units.name)}
     unit = np.array([index.get(str(name), -1) for name in ranging.station], dtype=np.intp)
@@ -267,7 +262,7 @@ def _ranges(
     places = np.full((*shape, 3), np.nan)
     values[epoch, slot] = ranging.range_m[rows]
     stated = ranging.sigma_m[rows]
-    sigmas[epoch, slot] = np.where(np.isfinite(stated), np.maximum(stated, limits.range_sigma_m), limits.range_sigma_m)
+    sigmas[epoch, slot] = np.where(np.isfinite(stated), np.maximum(stated, _RANGE_SIGMA_M), _RANGE_SIGMA_M)
     ages[epoch, slot] = seconds(edges[1:][epoch] - ranging.time[rows])
     places[epoch, slot] = units.ecef_m[unit[rows]]
     return RangeEpochs(range_m=values, sigma_m=sigmas, age_s=ages, unit_ecef_m=places, lever_m=lever_m)

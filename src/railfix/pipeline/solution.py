@@ -15,7 +15,7 @@ from railfix.core.reasons import Reason, Status
 from railfix.integrity.protection.araim import AraimResult
 from railfix.integrity.raim import LinearModel
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
-from railfix.pipeline.config import Config
+from railfix.pipeline.config import OFF_MAP_S, Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.filter_result import OffMapState, off_map_epochs
 from railfix.pipeline.interference_stage import Interference
@@ -166,7 +166,7 @@ def solve(
     on_map = np.isfinite(constrained.arc_m) & ~off_map
 
     def own_absence(_: SearchIndex, rows: slice, state: AntennaState) -> tuple[Masks, OffMapState]:
-        return off_map_epochs(time[rows], on_map[rows], off_map[rows], state.off_map, least_s=config.off_map_s)
+        return off_map_epochs(time[rows], on_map[rows], off_map[rows], state.off_map, least_s=OFF_MAP_S)
 
     away, off_map_states = antennas.each_with_state(own_absence, states)
     offset, map_states = map_offset(

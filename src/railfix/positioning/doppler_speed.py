@@ -33,6 +33,7 @@ _STEP_S: Final = 1.0  #: Step over which clocks and elevations are differenced [
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
 _PASSES: Final = 3  #: Fits with the scale of the one before; the first takes the limits' own noise.
 _TELLING: Final = 2.0  #: Mean squares of residuals within this many standard deviations of 1 are what noise makes.
+_FLOOR_MPS: Final = 0.02
 
 
 class DopplerSpeedLimits(Settings):
@@ -42,7 +43,6 @@ class DopplerSpeedLimits(Settings):
     #: ``sigma^2 = floor^2 + (zenith 10^((45 - min(C/N0, 50)) / 20))^2`` of a Doppler. Only ratios matter to the speed:
     #: the receiver's own size is found from the residuals of the log.
     zenith_mps: float = Field(default=0.03, gt=0)
-    floor_mps: float = Field(default=0.02, gt=0)
     #: A Doppler is left out when its residual is over this many of its own standard deviations (the w-test of W.
     #: Baarda, 1968); the largest goes first.
     outlier: float = Field(default=3.5, gt=0)
@@ -135,7 +135,7 @@ def doppler_speed(
         raise ValueError(f"ecef_m and tangent have shapes {ecef_m.shape} and {tangent.shape}, expected {shape}")
     measured, slope, elevation = _equations(dopplers, ecef_m, tangent)
     cn0 = np.where(np.isnan(dopplers.cn0_dbhz), 45.0, np.minimum(dopplers.cn0_dbhz, 50.0))
-    sigma = np.hypot(limits.floor_mps, limits.zenith_mps * 10.0 ** ((45.0 - cn0) / 20.0))
+    sigma = np.hypot(_FLOOR_MPS, limits.zenith_mps * 10.0 ** ((45.0 - cn0) / 20.0))
     offered = np.isfinite(measured) & np.isfinite(slope) & (elevation >= limits.mask_deg)
     measured, slope = np.where(offered, measured, 0.0), np.where(offered, slope, 0.0)
     scale, used = 1.0, offered

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -26,6 +26,10 @@ from railfix.kernels.layout import CLEAR_M, FAN_OUT, ROTATION_GRADIENT
 from railfix.positioning.normal_equations import Ranges, SinglePoint, fit, normal_equations
 from railfix.track.trajectory import Trajectory
 
+#: Other places are sought as far as noise has this probability: further than they are ambiguous, for a fault of one
+#: range can hide that much.
+_REACH_RISK: Final = 1e-16
+
 
 class SectionLimits(Settings):
     """Limits of ambiguous sections."""
@@ -33,9 +37,6 @@ class SectionLimits(Settings):
     #: Probability that noise makes the true place fit so much worse than the best one. Chi-square, one degree of
     #: freedom. P1 3.2: wrong sections on sharp curves.
     ambiguity_risk: float = Field(default=1e-3, gt=0, lt=1)
-    #: Other places are sought as far as noise has this probability: further than they are ambiguous, for a fault of one
-    #: range can hide that much.
-    reach_risk: float = Field(default=1e-16, gt=0, lt=1)
     separation_m: float = Field(default=30.0, ge=0)  #: Least distance along the line between two distinct places.
     #: Ranges beyond the unknowns below which a section is doubtful: on real recordings of two constellations a quarter
     #: of the sections were wrong with one redundant range, 3 to 4 % with two.
@@ -49,7 +50,7 @@ class SectionLimits(Settings):
     @cached_property
     def reach(self) -> float:
         """Excess of q up to which other places are found."""
-        return float(chdtri(1, min(self.reach_risk, self.ambiguity_risk)))
+        return float(chdtri(1, min(_REACH_RISK, self.ambiguity_risk)))
 
 
 @dataclass(frozen=True, kw_only=True)

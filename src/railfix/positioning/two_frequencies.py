@@ -28,6 +28,7 @@ _CLIP: Final = 2.5  #: Sigmas beyond which the mean difference of a satellite co
 #: Satellites that the error of the model is judged by at least, and the least share of its prior variance then.
 _FEWEST: Final = 5
 _LEAST_PRIOR: Final = 0.04
+_LEAST_SUSPICION_M: Final = 3.0  #: Smallest such difference.
 
 
 class TwoFrequencyLimits(Settings):
@@ -41,7 +42,6 @@ class TwoFrequencyLimits(Settings):
     delay_sigma_m: float = Field(default=0.2, gt=0)
     #: Sigmas beyond which a difference of the two codes weighs the range down.
     suspicion: float = Field(default=4.0, gt=0)
-    least_suspicion_m: float = Field(default=3.0, gt=0)  #: Smallest such difference.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +164,7 @@ def combine_codes(
         ionosphere_m=np.where(known, ionosphere, np.nan),
         ionosphere_sigma_m=np.where(known, np.sqrt(left), np.nan),
         difference_m=apart,
-        suspected=np.abs(apart) > np.maximum(limits.suspicion * np.sqrt(total), limits.least_suspicion_m),
+        suspected=np.abs(apart) > np.maximum(limits.suspicion * np.sqrt(total), _LEAST_SUSPICION_M),
     )
     last = time[-1] if len(time) else own.last
     return found, TwoFrequencyState(names=own.names, sums=sums, scale=of_scale, last=last, age=age)

@@ -38,6 +38,9 @@ _ANY_PLACE_M: Final = 50.0
 #: Probability of a larger misfit of the mean codes below which the error model is not believed.
 _MISFIT: Final = 1e-4
 NONE: Final = "none"
+#: Probability that the phases of a standstill follow no model, by a slip or half a cycle that was not seen.
+_PHASE_FAULT_PRIOR: Final = 1e-3
+_UNMAPPED_WIDTH_M: Final = 60.0  #: Width over which a track that the map does not have can lie.
 
 
 class StandstillErrors(Settings):
@@ -51,15 +54,12 @@ class StandstillErrors(Settings):
     correlation_s: float = option("Time over which the varying part persists.", 60.0, metavar="S", gt=0)
     #: Constant part of a satellite's carrier phase at the zenith, likewise.
     phase_bias_m: float = option("Constant phase error of a satellite at the zenith.", 0.005, metavar="M", gt=0)
-    #: Probability that the phases of a standstill follow no model, by a slip or half a cycle that was not seen.
-    phase_fault_prior: float = Field(default=1e-3, gt=0, lt=1)
     #: Error of each antenna's place on the train, along and across: spacing, sway, lean.
     antenna_sigma_m: float = Field(default=0.05, gt=0)
     #: Error across the track that all tracks of a yard have in common, lean of the antenna on canted track included.
     map_sigma_m: float = option("Error of the map across the track, common to its tracks.", 0.3, metavar="M", ge=0)
 
     unmapped_prior: float = option("Prior probability of a track not in the map.", 0.05, metavar="P", gt=0, lt=1)
-    unmapped_width_m: float = Field(default=60.0, gt=0)  #: Width over which a track that the map does not have can lie.
 
     def bias_m(self, elevation_deg: Floats) -> Floats:
         """Standard deviation of the constant code error [m]."""
@@ -188,7 +188,7 @@ def track_posterior(
         raise ValueError("the prior names none of the tracks")
     weights = weights / weights.sum() * (1.0 - errors.unmapped_prior)
     nearest = int(np.argmin([_distance(track.points_m, fixes[0].east_north_m) for track in tracks]))
-    half = errors.unmapped_width_m / 2.0
+    half = _UNMAPPED_WIDTH_M / 2.0
     shifts = np.arange(-half, half + _ACROSS_M / 2.0, _ACROSS_M)
     width = len(shifts)
     shifts = shifts[_clear(shifts, tracks, nearest, fixes[0].east_north_m)]
@@ -227,7 +227,7 @@ def _with_phases(
     codes = [fix.place for fix in fixes if fix.place is not None]
     heights = np.array([code.place_m[2] for code in codes])
     best = max(item.log_evidence.max(initial=-np.inf) for row in found for item in row)
-    lowest = uniform_log_likelihood(phases, fault_prior=errors.phase_fault_prior)
+    lowest = uniform_log_likelihood(phases, fault_prior=_PHASE_FAULT_PRIOR)
     result = []
     for row in found:
         updated: list[_Places] = []
@@ -245,7 +245,7 @@ def _with_phases(
                     _spread(item.heading, errors),
                     codes,
                     phases,
-                    fault_prior=errors.phase_fault_prior,
+                    fault_prior=_PHASE_FAULT_PRIOR,
                 )
             updated.append(replace(item, log_evidence=evidence))
         result.append(updated)

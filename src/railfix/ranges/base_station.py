@@ -16,20 +16,20 @@ from railfix.core.timescale import seconds, timedelta
 Values = TypeVar("Values", Floats, Integers)
 #: An epoch of the base station counts for those of the train up to this time before it [s]: clocks of receivers differ.
 _SAME_S: Final = 0.05
+#: Age up to which codes, and phases, of the station are used. Without selective availability errors of codes change
+#: by centimetres in 30 s, phases by millimetres in a second.
+LONGEST_AGE_S: Final = 60.0
+_PHASE_AGE_S: Final = 1.1
+#: Added for each kilometre between the two: ionosphere, troposphere and orbits seen from elsewhere.
+_PER_KM_M: Final = 0.004
+_LONGEST_KM: Final = 100.0  #: Distance up to which the station is used [km].
 
 
 class BaseLimits(Settings):
     """Limits of the differences with a base station."""
 
-    #: Age up to which codes, and phases, of the station are used. Without selective availability errors of codes change
-    #: by centimetres in 30 s, phases by millimetres in a second.
-    longest_age_s: float = Field(default=60.0, gt=0, le=600)
-    phase_age_s: float = Field(default=1.1, gt=0, le=30)
     #: Standard deviation of a difference beside the train's noise: the station's smoothed multipath.
     sigma_m: float = Field(default=0.3, gt=0)
-    #: Added for each kilometre between the two: ionosphere, troposphere and orbits seen from elsewhere.
-    per_km_m: float = Field(default=0.004, ge=0)
-    longest_km: float = Field(default=100.0, gt=0)  #: Distance up to which the station is used [km].
     #: Random walk of the differences of phases, in place of `PhaseLimits.drift_m` [m/sqrt(s)].
     drift_m: float = Field(default=0.001, ge=0)
 
@@ -121,11 +121,11 @@ class BaseErrors:
             nothing = np.full(shape, np.nan)
             return BaseDifferences(code_m=nothing, phase_m=nothing, arc=np.full(shape, -1), sigma_m=nothing)
         age = np.where(row >= 0, seconds(time - self.time[row]), np.inf)
-        near = (distance_km <= limits.longest_km)[:, None] & (column >= 0)
+        near = (distance_km <= _LONGEST_KM)[:, None] & (column >= 0)
         at = np.ix_(row, column)
-        code = np.where(near & (age <= limits.longest_age_s)[:, None], self.code_m[at], np.nan)
-        fresh = near & (age <= limits.phase_age_s)[:, None]
-        sigma = np.hypot(limits.sigma_m, limits.per_km_m * distance_km)
+        code = np.where(near & (age <= LONGEST_AGE_S)[:, None], self.code_m[at], np.nan)
+        fresh = near & (age <= _PHASE_AGE_S)[:, None]
+        sigma = np.hypot(limits.sigma_m, _PER_KM_M * distance_km)
         return BaseDifferences(
             code_m=code,
             phase_m=np.where(fresh, self.phase_m[at], np.nan),

@@ -59,6 +59,10 @@ DFMC_SIGNALS: Final[Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
     "E": (("1C", "1X", "1B"), ("5Q", "5X", "5I")),
 }
 
+#: A C/N0 above the cap counts as the cap.
+_CN0_REFERENCE_DBHZ: Final = 45.0
+_CN0_CAP_DBHZ: Final = 50.0
+
 
 class CodeNoise(Settings):
     """Standard deviation of a corrected pseudorange from C/N0 and elevation.
@@ -72,9 +76,6 @@ class CodeNoise(Settings):
     zenith_sigma_m: float = Field(default=1.0, gt=0)
     #: Error floor: residual errors of satellite clock and orbit, ionosphere and troposphere.
     floor_sigma_m: float = Field(default=1.0, ge=0)
-    #: A C/N0 above the cap counts as the cap.
-    cn0_reference_dbhz: float = 45.0
-    cn0_cap_dbhz: float = 50.0
 
 
 def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | None = None) -> Floats:
@@ -83,9 +84,14 @@ def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | 
     sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
     sigma = noise.zenith_sigma_m / sine
     if noise.model == "cn0_elevation":
-        cn0 = np.where(np.isnan(cn0_dbhz), noise.cn0_reference_dbhz, np.minimum(cn0_dbhz, noise.cn0_cap_dbhz))
-        sigma = sigma * np.exp((noise.cn0_reference_dbhz - cn0) * (np.log(10.0) / 20.0))
+        cn0 = np.where(np.isnan(cn0_dbhz), _CN0_REFERENCE_DBHZ, np.minimum(cn0_dbhz, _CN0_CAP_DBHZ))
+        sigma = sigma * np.exp((_CN0_REFERENCE_DBHZ - cn0) * (np.log(10.0) / 20.0))
     return np.asarray(np.hypot(sigma, noise.floor_sigma_m))
+
+
+#: Accuracies of records (URA, SISA) up to this stand for `satellite_sigma_m`: 2 to 4.85 m are usual. A worse one is
+#: believed: it is added to the sigma of the satellite's ranges.
+_USUAL_ACCURACY_M: Final = 5.0
 
 
 class NominalErrors(Settings):
@@ -98,9 +104,6 @@ class NominalErrors(Settings):
     #: Orbit and clock in the range; GPS and Galileo stay near half a metre, their service definitions promise 2 m and
     #: 95 % of the time less.
     satellite_sigma_m: float = Field(default=0.8, ge=0)
-    #: Accuracies of records (URA, SISA) up to this stand for `satellite_sigma_m`: 2 to 4.85 m are usual. A worse one is
-    #: believed: it is added to the sigma of the satellite's ranges.
-    usual_accuracy_m: float = Field(default=5.0, gt=0)
     #: Vertical delay that Klobuchar's model leaves. Mostly common to all satellites, taken as independent.
     ionosphere_sigma_m: float = Field(default=1.0, ge=0)
     #: Added to it, and to the ranges, with typical coefficients: what the two models differ by.
@@ -117,7 +120,7 @@ class NominalErrors(Settings):
 
     def stated_m(self, accuracy_m: Floats) -> Floats:
         """Accuracies of records, any shape, where they are worse than usual; 0 for the others and for unknown ones."""
-        return np.where(accuracy_m > self.usual_accuracy_m, accuracy_m, 0.0)
+        return np.where(accuracy_m > _USUAL_ACCURACY_M, accuracy_m, 0.0)
 
 
 def channel_order(

@@ -28,6 +28,18 @@ def _limit(text: str, default: float | None, metavar: str, name: str) -> Any:
     return option(text, default, name=name, metavar=metavar, panel="Limits", gt=0.0, allow_inf_nan=False)
 
 
+_TRAVEL_SHARE: Final = 0.005
+#: Fixes that disagree with those before and after are rejected up to twice this long; if they disagree for longer,
+#: the distance travelled is taken to be wrong.
+_TRAVEL_HOLD_S: Final = 10.0
+_FIX_FLOOR_M: Final = 0.01
+#: Standard deviation and correlation time of the train's acceleration (R. A. Singer, 1970): trains accelerate and
+#: brake by 0.5 to 1 m/s2 for some seconds [m/s2] [s].
+MOTION_MPS2: Final = 0.5
+MOTION_S: Final = 5.0
+ACCELERATION_BIAS_MPS2: Final = 0.05
+
+
 class ReferenceSettings(Settings):
     """Limits and noise; all of them are recorded in ``reference.json``."""
 
@@ -45,10 +57,6 @@ class ReferenceSettings(Settings):
     #: Largest difference between the distance of two fixes and the distance travelled (P2 3.3): constant part, and
     #: share of the distance [m] [-].
     travel_m: float = _positive(0.10)
-    travel_share: float = _positive(0.005)
-    #: Fixes that disagree with those before and after are rejected up to twice this long; if they disagree for longer,
-    #: the distance travelled is taken to be wrong.
-    travel_hold_s: float = _positive(10.0)
     #: Largest speed of a train: of several passes of the line at one place only those within reach are considered.
     max_speed_mps: float = _positive(100.0)
     #: Longer gaps between good fixes are not bridged.
@@ -57,11 +65,6 @@ class ReferenceSettings(Settings):
     max_sigma_m: float = _limit("Largest standard deviation of a bridged instant.", 1.0, "M", "--max-sigma")
     #: Standard deviation of a fix along the track where the log has none; and the least one that is used.
     fix_sigma_m: float = _positive(0.03)
-    fix_floor_m: float = _positive(0.01)
-    #: Standard deviation and correlation time of the train's acceleration (R. A. Singer, 1970): trains accelerate and
-    #: brake by 0.5 to 1 m/s2 for some seconds [m/s2] [s].
-    motion_mps2: float = _positive(0.5)
-    motion_s: float = _positive(5.0)
 
     doppler: DopplerSpeedLimits = Field(default_factory=DopplerSpeedLimits)
     #: Standard deviation and correlation time of the time-correlated error of the Doppler speed. The standard deviation
@@ -79,7 +82,6 @@ class ReferenceSettings(Settings):
     slip_m: float = _positive(0.005)  #: Random error of the wheel's distance [m per square root of m].
     #: Noise of the accelerometer, and standard deviation of its offset [m/s2 per square root of Hz] [m/s2].
     acceleration_mps2: float = _positive(0.02)
-    acceleration_bias_mps2: float = _positive(0.05)
 
 
 #: Positions of two antennas that are tagged no further apart belong to one instant [ns].
@@ -236,7 +238,7 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
         )
         arc[rows], lateral[rows], height[rows] = matched.arc_m, matched.lateral_m, matched.height_m
         along = sigma_along(fixes.sigma_enu_m[rows], fixes.ecef_m[rows], trajectory.tangent[matched.section])
-        sigma[rows] = np.where(np.isnan(along), settings.fix_sigma_m, np.maximum(along, settings.fix_floor_m))
+        sigma[rows] = np.where(np.isnan(along), settings.fix_sigma_m, np.maximum(along, _FIX_FLOOR_M))
         missed = np.isnan(arc) & (rejection == 0)
         _reject(rejection, missed & ~(np.abs(lateral) <= settings.lateral_m), FixRejection.OFF_TRACK)
         _reject(rejection, missed & ~(np.abs(height) <= settings.height_m), FixRejection.OFF_HEIGHT)
@@ -262,11 +264,11 @@ def judge_travel(
 
     def agrees(i: Indices, j: Indices) -> Masks:
         spread = np.abs(variance[j] - variance[i]) + fixes.sigma_m[rows[i]] ** 2 + fixes.sigma_m[rows[j]] ** 2
-        limit = settings.travel_m + settings.travel_share * np.abs(way[j] - way[i]) + _TRAVEL_SIGMAS * np.sqrt(spread)
+        limit = settings.travel_m + _TRAVEL_SHARE * np.abs(way[j] - way[i]) + _TRAVEL_SIGMAS * np.sqrt(spread)
         # Where the distance travelled was not measured, nothing is rejected.
         return np.asarray(~(np.abs(offset[j] - offset[i]) > limit))
 
-    keep = _best_chain(agrees, seconds(fixes.time[rows] - fixes.time[rows[0]]), settings.travel_hold_s)
+    keep = _best_chain(agrees, seconds(fixes.time[rows] - fixes.time[rows[0]]), _TRAVEL_HOLD_S)
     rejection, travel = fixes.rejection.copy(), np.full(len(fixes), np.nan)
     rejection[rows[~keep]] |= FixRejection.TRAVEL
     kept = np.flatnonzero(keep)

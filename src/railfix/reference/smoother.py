@@ -16,7 +16,7 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.timescale import seconds
 from railfix.io.reference_log import AntennaReference
 from railfix.motion.chain import Chain, singer_steps
-from railfix.reference.fixes import Fixes, ReferenceSettings
+from railfix.reference.fixes import ACCELERATION_BIAS_MPS2, MOTION_MPS2, MOTION_S, Fixes, ReferenceSettings
 from railfix.track.trajectory import Trajectory
 
 #: Standard deviations of what nothing is known of: speed [m/s], difference of the wheel's distance [m].
@@ -96,7 +96,7 @@ def smooth(evidence: Evidence, settings: ReferenceSettings) -> SmoothedReference
         )
         chain = _with_doppler(chain, unknowns, evidence, np.diff(t), seen, relief, settings)
         chain = _with_wheel(chain, unknowns, evidence, np.diff(t), nominal, settings)
-        chain = _with_offset(chain, unknowns, np.diff(t), settings)
+        chain = _with_offset(chain, unknowns, np.diff(t))
         value, covariance = chain.solve()
         if len(seen):
             left = np.abs(evidence.doppler_mps - value[:, unknowns.speed] - value[:, unknowns.doppler])[seen]
@@ -116,9 +116,9 @@ def _with_motion(
 ) -> Chain:
     """Position, speed and a time-correlated acceleration (Singer's model), with the accelerometer's measurements."""
     first = np.array([0])
-    for unknown, sigma in ((unknowns.speed, _ANY_SPEED_MPS), (unknowns.acceleration, settings.motion_mps2)):
+    for unknown, sigma in ((unknowns.speed, _ANY_SPEED_MPS), (unknowns.acceleration, MOTION_MPS2)):
         chain = chain.with_observations(first, _one(unknowns, unknown), np.zeros(1), np.full(1, sigma**-2))
-    turn, noise = singer_steps(dt, settings.motion_mps2, settings.motion_s)
+    turn, noise = singer_steps(dt, MOTION_MPS2, MOTION_S)
     before, after = np.zeros((2, len(dt), 3, unknowns.count))
     before[:, :, :3], after[:, :, :3] = -turn, np.eye(3)
     value = np.zeros((len(dt), 3))
@@ -186,10 +186,10 @@ def _with_wheel(
     return chain
 
 
-def _with_offset(chain: Chain, unknowns: _Unknowns, dt: Floats, settings: ReferenceSettings) -> Chain:
+def _with_offset(chain: Chain, unknowns: _Unknowns, dt: Floats) -> Chain:
     """The accelerometer's offset, a random walk."""
     if unknowns.offset >= 0:
-        prior = np.full(1, settings.acceleration_bias_mps2**-2)
+        prior = np.full(1, ACCELERATION_BIAS_MPS2**-2)
         chain = chain.with_observations(np.array([0]), _one(unknowns, unknowns.offset), np.zeros(1), prior)
         chain = _with_walk(chain, unknowns.offset, np.ones(len(dt)), 1.0 / (_OFFSET_DRIFT_MPS2**2 * dt))
     return chain

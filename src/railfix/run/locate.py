@@ -19,7 +19,7 @@ from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
 from railfix.io.nmea import read_any_positions
 from railfix.io.receiver.framing import head_of, is_receiver_log
-from railfix.motion.features import Feature, FeatureLimits, LineSeries, Quantity, map_features
+from railfix.motion.features import BASE_M, STEP_M, Feature, LineSeries, Quantity, map_features
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.locate import locate, survey_run
@@ -299,33 +299,30 @@ class MeasuredFeature:
     map_m: float  #: Chainage of the same feature of the map; NaN where the map has none.
 
 
-def measured_features(
-    runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = (), *, limits: FeatureLimits | None = None
-) -> list[MeasuredFeature]:
+def measured_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) -> list[MeasuredFeature]:
     """Return the features that all runs (`read_measured`) together show, in order; `of_map`: those of the map."""
-    limits = limits or FeatureLimits()
-    alone = [_features(run, limits) for run in runs]
+    alone = [_features(run) for run in runs]
     found = []
-    for feature in _features(pl.concat(runs).sort(_COLUMNS[0]), limits):
-        places = [place for each in alone if np.isfinite(place := _nearest(feature, each, limits))]
-        at_map = _nearest(feature, of_map, limits)
+    for feature in _features(pl.concat(runs).sort(_COLUMNS[0])):
+        places = [place for each in alone if np.isfinite(place := _nearest(feature, each))]
+        at_map = _nearest(feature, of_map)
         found.append(MeasuredFeature(feature=feature, places_m=np.array(places), map_m=at_map))
     return found
 
 
-def _nearest(feature: Feature, others: Sequence[Feature], limits: FeatureLimits) -> float:
+def _nearest(feature: Feature, others: Sequence[Feature]) -> float:
     """Place of the nearest one of the same kind and direction; NaN where there is none near."""
     alike = [f.arc_m for f in others if f.quantity == feature.quantity and f.change * feature.change > 0.0]
-    near = [at for at in alike if abs(at - feature.arc_m) < 2.0 * limits.base_m]
+    near = [at for at in alike if abs(at - feature.arc_m) < 2.0 * BASE_M]
     return min(near, key=lambda at: abs(at - feature.arc_m), default=float("nan"))
 
 
-def _features(rows: pl.DataFrame, limits: FeatureLimits) -> list[Feature]:
+def _features(rows: pl.DataFrame) -> list[Feature]:
     """Features of rows by chainage; stretches without values part them."""
     at = rows[_COLUMNS[0]].to_numpy()
-    grid = np.arange(np.ceil(at[0]), np.floor(at[-1]), limits.step_m)
-    first = np.searchsorted(at, grid - 0.5 * limits.base_m)
-    last = np.searchsorted(at, grid + 0.5 * limits.base_m)
+    grid = np.arange(np.ceil(at[0]), np.floor(at[-1]), STEP_M)
+    first = np.searchsorted(at, grid - 0.5 * BASE_M)
+    last = np.searchsorted(at, grid + 0.5 * BASE_M)
     count = last - first
     gradient, gradient_sigma = _means(rows[_COLUMNS[1]].to_numpy() * 1e-3, first, last)
     curvature, curvature_sigma = _means(rows[_COLUMNS[2]].to_numpy(), first, last)
@@ -337,13 +334,13 @@ def _features(rows: pl.DataFrame, limits: FeatureLimits) -> list[Feature]:
         series = LineSeries(arc_m=grid[part], gradient=gradient[part], curvature_1pm=curvature[part])
         sigma: dict[Quantity, Floats] = {"gradient": gradient_sigma[part], "curvature": curvature_sigma[part]}
         least = {name: _SIGMAS * each for name, each in sigma.items()}
-        found += centred(map_features(series, limits=limits, least=least), series, limits)
+        found += centred(map_features(series, least=least), series)
     return found
 
 
-def centred(features: Sequence[Feature], series: LineSeries, limits: FeatureLimits) -> list[Feature]:
+def centred(features: Sequence[Feature], series: LineSeries) -> list[Feature]:
     """Return features at the middle of their change: that of a transition curve is flat, and noise chooses on it."""
-    lag = max(round(limits.base_m / limits.step_m), 1)
+    lag = max(round(BASE_M / STEP_M), 1)
     found = []
     for feature in features:
         values = series.of(feature.quantity)
@@ -351,7 +348,7 @@ def centred(features: Sequence[Feature], series: LineSeries, limits: FeatureLimi
         change[lag:-lag] = (values[2 * lag :] - values[: -2 * lag]) * np.sign(feature.change)
         over, middle = np.maximum(change - 0.5 * abs(feature.change), 0.0), feature.arc_m
         for _ in range(_CENTRED):
-            weight = np.where(np.abs(series.arc_m - middle) <= 2.0 * limits.base_m, over, 0.0)
+            weight = np.where(np.abs(series.arc_m - middle) <= 2.0 * BASE_M, over, 0.0)
             middle = float((weight * series.arc_m).sum() / weight.sum())
         found.append(replace(feature, arc_m=middle))
     return found

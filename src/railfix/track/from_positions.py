@@ -22,6 +22,7 @@ from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 
 #: Note of every map of this kind.
 ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
+_STANDING_WINDOW_S: Final = 3.0  #: Half of the window of the displacement.
 
 
 class ThinningLimits(Settings):
@@ -34,7 +35,6 @@ class ThinningLimits(Settings):
     #: Below this horizontal speed over `standing_window_s` the antenna is stationary and its positions are noise or
     #: drift. Requires times; 0 keeps all.
     standing_mps: float = Field(default=0.2, ge=0)
-    standing_window_s: float = Field(default=3.0, gt=0)  #: Half of the window of the displacement.
     #: Neighbouring points further apart, joined by a straight line, are reported.
     jump_m: float = Field(default=50.0, gt=0)
     gap_m: float = Field(default=2000.0, gt=0)  #: Neighbouring points further apart do not form a line: an error.
@@ -94,7 +94,7 @@ def thin(
     rows = np.flatnonzero(good)
     reachable = _reachable(time[rows], ecef_m[rows], limits)
     rows, out_of_reach = rows[reachable], int(np.count_nonzero(~reachable))
-    stands = stationary(time[rows], ecef_m[rows], speed_mps=limits.standing_mps, window_s=limits.standing_window_s)
+    stands = stationary(time[rows], ecef_m[rows], speed_mps=limits.standing_mps, window_s=_STANDING_WINDOW_S)
     stands = _with_short_moves(ecef_m[rows], stands, limits.spacing_m)
     moving = rows[~stands]
     chosen = _at_spacing(ecef_m[moving], limits.spacing_m)

@@ -20,6 +20,15 @@ from railfix.track.track import HEIGHTS_M, Geometry, Track, geometry_of, kilomet
 Severity = Literal["error", "warning"]
 _COARSE_DEG: Final = 1e-5  #: Coordinates rounded to this are up to half of it off [deg]: 0.6 m.
 _LEAST_CANT_M: Final = 5e-4  #: Cant of less than this everywhere was meant to be in another unit [m].
+_NEAR_DUPLICATE_M: Final = 0.10  #: Points nearer than this are the same point measured twice.
+#: A turn at a point of more than this and sharper than `least_radius_m` is a kink.
+_KINK_DEG: Final = 3.0
+_SHARP_KINK_DEG: Final = 15.0  #: A kink of more than this is an error, else a warning.
+#: Largest deviation of the height of a point from the line through its neighbours.
+_HEIGHT_SPIKE_M: Final = 0.50
+#: Largest difference of the gradient attribute from the heights, over `gradient_window_m`.
+_GRADIENT_DIFFERENCE_PERMILLE: Final = 5.0
+_GRADIENT_WINDOW_M: Final = 100.0
 
 
 class MapLimits(Settings):
@@ -29,18 +38,9 @@ class MapLimits(Settings):
     spacing_m: float = Field(default=50.0, gt=0)  #: Longest segment (P1 2.2(1): some tens of metres on straight track).
     #: A segment longer than this is a point that does not belong to the line, or a missing piece of it.
     gap_m: float = Field(default=2000.0, gt=0)
-    near_duplicate_m: float = Field(default=0.10, gt=0)  #: Points nearer than this are the same point measured twice.
-    #: A turn at a point of more than this and sharper than `least_radius_m` is a kink.
-    kink_deg: float = Field(default=3.0, gt=0)
-    sharp_kink_deg: float = Field(default=15.0, gt=0)  #: A kink of more than this is an error, else a warning.
     least_radius_m: float = Field(default=60.0, gt=0)  #: Smallest radius that a railway vehicle can pass.
     gradient_permille: float = Field(default=60.0, gt=0)  #: Steepest segment.
-    #: Largest deviation of the height of a point from the line through its neighbours.
-    height_spike_m: float = Field(default=0.50, gt=0)
-    #: Largest difference of the gradient attribute from the heights, over `gradient_window_m`.
-    gradient_difference_permille: float = Field(default=5.0, gt=0)
 
-    gradient_window_m: float = Field(default=100.0, gt=0)
     cant_m: float = Field(default=0.20, gt=0)  #: Largest absolute cant.
 
 
@@ -176,12 +176,12 @@ def _spacing(report: _Report, geometry: Geometry, limits: MapLimits) -> Iterator
     spacing = geometry.spacing_m
     yield from report.runs(spacing == 0.0, "error", "duplicate", "the same point twice or more; remove the repetition")
     yield from report.runs(
-        (spacing > 0.0) & (spacing < limits.near_duplicate_m),
+        (spacing > 0.0) & (spacing < _NEAR_DUPLICATE_M),
         "warning",
         "near duplicate",
         "points only {value:.3f} m apart (limit {limit:g} m)",
         values=spacing,
-        limit=limits.near_duplicate_m,
+        limit=_NEAR_DUPLICATE_M,
     )
     degrees = np.stack([report.track.latitude_deg, report.track.longitude_deg]) / _COARSE_DEG
     yield from report.runs(
@@ -221,11 +221,11 @@ def _shape(report: _Report, geometry: Geometry, limits: MapLimits) -> Iterator[F
         )
         turn = np.abs(geometry.turn_deg)
         sharp = np.radians(turn) > geometry.reach_m / limits.least_radius_m
-        kink = sharp & (turn > limits.kink_deg)
-        too_sharp = turn > limits.sharp_kink_deg
+        kink = sharp & (turn > _KINK_DEG)
+        too_sharp = turn > _SHARP_KINK_DEG
     text = "the direction turns by {value:.1f} degrees at one point (limit {limit:g})"
-    yield from report.runs(kink & too_sharp, "error", "kink", text, values=turn, limit=limits.sharp_kink_deg)
-    yield from report.runs(kink & ~too_sharp, "warning", "kink", text, values=turn, limit=limits.kink_deg)
+    yield from report.runs(kink & too_sharp, "error", "kink", text, values=turn, limit=_SHARP_KINK_DEG)
+    yield from report.runs(kink & ~too_sharp, "warning", "kink", text, values=turn, limit=_KINK_DEG)
 
 
 def _kilometrage(report: _Report, track: Track) -> Iterator[Finding]:
@@ -269,22 +269,22 @@ def _heights(report: _Report, track: Track, geometry: Geometry, limits: MapLimit
             limit=limits.gradient_permille,
         )
         yield from report.runs(
-            np.abs(geometry.height_spike_m) > limits.height_spike_m,
+            np.abs(geometry.height_spike_m) > _HEIGHT_SPIKE_M,
             "error",
             "height spike",
             "the height deviates from the line through its neighbours by {value:.2f} m (limit {limit:g} m)",
             values=geometry.height_spike_m,
-            limit=limits.height_spike_m,
+            limit=_HEIGHT_SPIKE_M,
         )
-        attribute, from_heights = windowed_gradients(track, window_m=limits.gradient_window_m)
+        attribute, from_heights = windowed_gradients(track, window_m=_GRADIENT_WINDOW_M)
         difference = attribute - from_heights
         yield from report.runs(
-            np.abs(difference) > limits.gradient_difference_permille,
+            np.abs(difference) > _GRADIENT_DIFFERENCE_PERMILLE,
             "warning",
             "gradient attribute",
             "gradient_permille differs from the heights by {value:.1f} per mille (limit {limit:g}); rising is positive",
             values=difference,
-            limit=limits.gradient_difference_permille,
+            limit=_GRADIENT_DIFFERENCE_PERMILLE,
         )
 
 

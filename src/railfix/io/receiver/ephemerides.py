@@ -21,7 +21,6 @@ from railfix.io.receiver import nav_messages
 from railfix.io.receiver.framing import Subframes, fields
 from railfix.io.receiver.measurements import (
     Record,
-    Values,
     bcnav2_record,
     beidou_record,
     cnav_record,
@@ -30,7 +29,15 @@ from railfix.io.receiver.measurements import (
     glonass_record,
     gps_record,
 )
-from railfix.io.receiver.nav_messages import CNAV_FROM, E1B_SOURCE, E5A_SOURCE, E5B_SOURCE, FNAV_FROM, decoded_pages
+from railfix.io.receiver.nav_messages import (
+    CNAV_FROM,
+    E1B_SOURCE,
+    E5A_SOURCE,
+    E5B_SOURCE,
+    FNAV_FROM,
+    Values,
+    decoded_pages,
+)
 from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_records, kepler_records
 
 #: Constellation of RTCM ephemeris messages.

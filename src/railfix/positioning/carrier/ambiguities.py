@@ -23,6 +23,7 @@ from railfix.positioning.standstill_phase import IntegerSearch
 from railfix.track.trajectory import Trajectory
 
 FREE_AMBIGUITY_M: Final = 1e4  #: Sigma of an ambiguity against its first value [m]: loose prior for conditioning.
+FORGET_S: Final = 600.0  #: An arc not observed for this long starts again.
 
 
 class PhaseLimits(Settings):
@@ -41,7 +42,6 @@ class PhaseLimits(Settings):
     correlation_s: float = Field(default=20.0, ge=0)
     #: Linearisations of `phase_positions`; each has its own state, so that results do not depend on chunks.
     passes: int = Field(default=2, ge=1)
-    forget_s: float = Field(default=600.0, gt=0)  #: An arc not observed for this long starts again.
     #: Beside a base station: largest probability of a wrong integer with which ambiguities are fixed.
     integer_risk: float = Field(default=1e-4, gt=0, lt=0.5)
     #: Probability that phases are no whole cycles (multipath, half a cycle).

@@ -15,6 +15,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.timescale import GPS_EPOCH, seconds
 from railfix.positioning.carrier.ambiguities import (
+    FORGET_S,
     FREE_AMBIGUITY_M,
     ArcAmbiguities,
     PhaseLimits,
@@ -275,7 +276,7 @@ def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
     if now == before:
         return memory
     begin = GPS_EPOCH + np.timedelta64(int(now) * round(limits.hop_s * 1e9), "ns")
-    memory = _without(memory, seconds(begin - memory.seen) > limits.forget_s)
+    memory = _without(memory, seconds(begin - memory.seen) > FORGET_S)
     variance = limits.drift_m**2 * float(now - before) * limits.hop_s
     # (Lambda^-1 + v I)^-1 = (I + v Lambda)^-1 Lambda, also where Lambda is singular.
     both = np.concatenate([memory.matrix, memory.right], axis=1)

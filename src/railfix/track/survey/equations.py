@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from railfix.core.arrays import Floats, Indices
 from railfix.core.geodesy import range_with_rotation
 from railfix.track.survey.passes import Ties
-from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun
+from railfix.track.survey.runs import CLIMB_MPS2, RunSignals, SurveyLimits, SurveyRun
 
 #: Standard deviation of the bend of the line against the reference line at a point [m]; at corners, where moving the
 #: line sideways bends it, larger by so much for a turn of one radian, squared.
@@ -156,7 +156,7 @@ def motion_equations(
     dt = np.diff(run.seconds)
     rows = np.arange(1, len(run) - 1)
     mean = 0.5 * (dt[:-1] + dt[1:])
-    sigma = np.array([limits.acceleration_mps2, limits.acceleration_mps2, limits.climb_mps2]) * np.sqrt(mean)[:, None]
+    sigma = np.array([limits.acceleration_mps2, limits.acceleration_mps2, CLIMB_MPS2]) * np.sqrt(mean)[:, None]
     white = axes[None] / sigma[:, :, None]
     before, after = white / dt[:-1, None, None], white / dt[1:, None, None]
     parts = [

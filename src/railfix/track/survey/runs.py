@@ -22,6 +22,7 @@ COMMON_SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxy
     {1: (0.02, 0.04), 2: (0.2, 0.4), 3: (0.5, 1.0), 4: (0.3, 0.6), 5: (1.0, 2.0)}
 )
 _UNKNOWN_QUALITY: Final = 5
+CLIMB_MPS2: Final = 0.1
 
 
 class SurveyLimits(Settings):
@@ -33,7 +34,6 @@ class SurveyLimits(Settings):
     correlation_m: float = Field(default=50.0, ge=0)
     #: Standard deviation of the change of the horizontal and of the vertical velocity in a second.
     acceleration_mps2: float = Field(default=1.0, gt=0)
-    climb_mps2: float = Field(default=0.1, gt=0)
     freedom: float = Field(default=3.0, gt=0)  #: Degrees of freedom of Student's t errors: outliers lose their weight.
     #: Passes so near to each other, in the same or the opposite direction, are on one line.
     same_line_m: float = option(
