@@ -14,7 +14,7 @@ Multipath below the difference that these explain is not detected.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 from typing import Final, Literal, NamedTuple
@@ -31,12 +31,11 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.screens.base import (
     AntennaRanges,
+    ObservationPicture,
     PairedEpochs,
     PairScreen,
-    RunTables,
     ScreenColumn,
     Screened,
-    ScreenPicture,
     Verdict,
     clock_medians,
     on_pairs,
@@ -270,6 +269,12 @@ class AntennaPairScreen(PairScreen[AntennaPairLimits]):
             verdict="antenna_pair",
         ),
     )
+    observation_pictures = (
+        ObservationPicture(
+            "antenna_pair", "pseudoranges of two antennas", "rear less front less spacing [m]", "metric_antenna_pair_m",
+            Reason.ANTENNA_PAIR, "limit_m",
+        ),
+    )  # fmt: skip
 
     def judge(
         self, front: AntennaRanges, rear: AntennaRanges, pair: PairedEpochs, limits: AntennaPairLimits
@@ -298,19 +303,6 @@ class AntennaPairScreen(PairScreen[AntennaPairLimits]):
             verdict = Verdict(name=self.name, reason=Reason.ANTENNA_PAIR, screened=own, error_m=error)
             verdicts[name] = (verdict,)
         return verdicts
-
-    def pictures(self, tables: RunTables, limits: AntennaPairLimits) -> Iterator[tuple[str, ScreenPicture]]:
-        """Yield the differences against the limit."""
-        yield (
-            "antenna_pair",
-            ScreenPicture(
-                title="pseudoranges of two antennas",
-                label="rear less front less spacing [m]",
-                metric=tables.channels("metric_antenna_pair_m"),
-                reject=tables.rejected(Reason.ANTENNA_PAIR),
-                limit=limits.limit_m,
-            ),
-        )
 
 
 SCREEN = AntennaPairScreen()

@@ -113,7 +113,7 @@ class ScreenColumn:
     table: Literal["observations", "positions"] = "observations"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class ScreenPicture:
     """Data of the picture of one screen, T epochs by M channels (M = 1 for a screen of positions)."""
 
@@ -123,6 +123,18 @@ class ScreenPicture:
     reject: Masks  #: Shape (T, M).
     limit: Floats | float  #: Broadcasts to (T, M).
     #: Side on which the screen rejects: beyond the limit on both sides, above it, or below it.
+    sides: Literal["both", "above", "below"] = "both"
+
+
+class ObservationPicture(NamedTuple):
+    """Picture of a column of the observations against its limit."""
+
+    name: str
+    title: str
+    label: str
+    metric: str  #: Column of the observations.
+    reason: Reason  #: Of the rejected observations.
+    limit: str  #: Field of the screen's limits (no picture where it is None), or column of the observations.
     sides: Literal["both", "above", "below"] = "both"
 
 
@@ -146,6 +158,7 @@ class Screen(ABC, Generic[Limits]):
     limits: Limits  #: Default limits; their type has the fields of the group of settings.
     needs: ClassVar[str]  #: Data without which it cannot judge, for the note.
     columns: ClassVar[tuple[ScreenColumn, ...]] = ()  #: Columns of the result tables.
+    observation_pictures: ClassVar[tuple[ObservationPicture, ...]] = ()
 
     def unable(self, limits: Limits, setup: ScreenSetup) -> bool:  # noqa: ARG002  for screens that override it
         """Return whether the screen can judge nothing in this run."""
@@ -155,9 +168,12 @@ class Screen(ABC, Generic[Limits]):
         """Return sentences on a screen that was asked for and cannot judge, or not fully."""
         return (f"screen {self.name}: inactive; it needs {self.needs}",) if self.unable(limits, setup) else ()
 
-    def pictures(self, tables: RunTables, limits: Limits) -> Iterator[tuple[str, ScreenPicture]]:  # noqa: ARG002
-        """Yield name and data of each picture of the screen."""
-        yield from ()
+    def pictures(self, tables: RunTables, limits: Limits) -> Iterator[tuple[str, ScreenPicture]]:
+        """Yield name and data of each picture of the screen: `observation_pictures`, or what an override yields."""
+        for name, title, label, metric, reason, where, sides in self.observation_pictures:
+            limit = getattr(limits, where) if hasattr(limits, where) else tables.channels(where)
+            if limit is not None:
+                yield name, ScreenPicture(title, label, tables.channels(metric), tables.rejected(reason), limit, sides)
 
 
 class ObservationScreen(Screen[Limits]):

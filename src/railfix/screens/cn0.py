@@ -6,7 +6,6 @@ rejects what lies 10 dB-Hz below it; and, for all satellites alike, what lies be
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,11 +19,10 @@ from railfix.core.settings import Settings
 from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.screens.base import (
     AntennaRanges,
+    ObservationPicture,
     ObservationScreen,
-    RunTables,
     ScreenColumn,
     Screened,
-    ScreenPicture,
     ScreenSetup,
     Verdict,
 )
@@ -98,6 +96,15 @@ class Cn0Screen(ObservationScreen[Cn0Limits]):
             name="metric_cn0_deficit_dbhz", meaning="screen `cn0`: mean at the elevation less C/N0", verdict="cn0_curve"
         ),
     )
+    observation_pictures = (
+        ObservationPicture(
+            "cn0_floor", "signal strength, floor", "C/N0 [dB-Hz]", "cn0_dbhz", Reason.CN0_FLOOR, "floor_dbhz", "below"
+        ),
+        ObservationPicture(
+            "cn0_curve", "signal strength against an open sky", "mean at the elevation less C/N0 [dB]",
+            "metric_cn0_deficit_dbhz", Reason.CN0_CURVE, "deficit_dbhz", "above",
+        ),
+    )  # fmt: skip
 
     def unable(self, limits: Cn0Limits, setup: ScreenSetup) -> bool:
         """Return whether there is neither a curve nor a floor."""
@@ -125,33 +132,6 @@ class Cn0Screen(ObservationScreen[Cn0Limits]):
             Verdict(name="cn0_floor", reason=Reason.CN0_FLOOR, screened=result.floor),
             Verdict(name="cn0_curve", reason=Reason.CN0_CURVE, screened=result.curve),
         ), state
-
-    def pictures(self, tables: RunTables, limits: Cn0Limits) -> Iterator[tuple[str, ScreenPicture]]:
-        """Yield C/N0 against the floor, and the deficits against their limit."""
-        if limits.floor_dbhz is not None:
-            yield (
-                "cn0_floor",
-                ScreenPicture(
-                    title="signal strength, floor",
-                    label="C/N0 [dB-Hz]",
-                    metric=tables.channels("cn0_dbhz"),
-                    reject=tables.rejected(Reason.CN0_FLOOR),
-                    limit=limits.floor_dbhz,
-                    sides="below",
-                ),
-            )
-        if limits.deficit_dbhz is not None:
-            yield (
-                "cn0_curve",
-                ScreenPicture(
-                    title="signal strength against an open sky",
-                    label="mean at the elevation less C/N0 [dB]",
-                    metric=tables.channels("metric_cn0_deficit_dbhz"),
-                    reject=tables.rejected(Reason.CN0_CURVE),
-                    limit=limits.deficit_dbhz,
-                    sides="above",
-                ),
-            )
 
 
 SCREEN = Cn0Screen()

@@ -13,7 +13,6 @@ recordings at 1 Hz: a quarter of the bad codes found at the same loss); neither 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, NamedTuple
 
@@ -29,11 +28,10 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.screens.base import (
     AntennaRanges,
+    ObservationPicture,
     ObservationScreen,
-    RunTables,
     ScreenColumn,
     Screened,
-    ScreenPicture,
     ScreenSetup,
     Verdict,
     clock_medians,
@@ -333,6 +331,12 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
             field="limit_m",
         ),
     )
+    observation_pictures = (
+        ObservationPicture(
+            "doppler", "pseudorange against Doppler", "change of the pseudorange less Doppler [m]", "metric_doppler_m",
+            Reason.DOPPLER, "limit_doppler_m",
+        ),
+    )  # fmt: skip
 
     def judge(
         self,
@@ -354,19 +358,6 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
         )
         error = np.fmax(np.abs(screened.level_m), screened.limit_m) if limits.verdict == "weigh" else None
         return (Verdict(name="doppler", reason=Reason.DOPPLER, screened=screened, error_m=error),), after
-
-    def pictures(self, tables: RunTables, limits: DopplerLimits) -> Iterator[tuple[str, ScreenPicture]]:  # noqa: ARG002
-        """Yield the changes against their limits."""
-        yield (
-            "doppler",
-            ScreenPicture(
-                title="pseudorange against Doppler",
-                label="change of the pseudorange less Doppler [m]",
-                metric=tables.channels("metric_doppler_m"),
-                reject=tables.rejected(Reason.DOPPLER),
-                limit=tables.channels("limit_doppler_m"),
-            ),
-        )
 
 
 SCREEN = DopplerScreen()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,10 +12,9 @@ from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.screens.base import (
     AntennaRanges,
+    ObservationPicture,
     ObservationScreen,
-    RunTables,
     Screened,
-    ScreenPicture,
     ScreenSetup,
     Verdict,
 )
@@ -48,6 +46,17 @@ class ElevationScreen(ObservationScreen[ElevationLimits]):
     name = "elevation"
     limits = ElevationLimits()
     needs = "navigation records"
+    observation_pictures = (
+        ObservationPicture(
+            "elevation",
+            "elevation mask",
+            "elevation [deg]",
+            "elevation_deg",
+            Reason.ELEVATION_MASK,
+            "mask_deg",
+            "below",
+        ),
+    )
 
     def judge(
         self,
@@ -59,20 +68,6 @@ class ElevationScreen(ObservationScreen[ElevationLimits]):
         """Return the verdict on a chunk; the screen has no memory."""
         screened = elevation_screen(antenna.elevation_deg, limits=limits)
         return (Verdict(name="elevation", reason=Reason.ELEVATION_MASK, screened=screened),), state
-
-    def pictures(self, tables: RunTables, limits: ElevationLimits) -> Iterator[tuple[str, ScreenPicture]]:
-        """Yield the elevations against the mask."""
-        yield (
-            "elevation",
-            ScreenPicture(
-                title="elevation mask",
-                label="elevation [deg]",
-                metric=tables.channels("elevation_deg"),
-                reject=tables.rejected(Reason.ELEVATION_MASK),
-                limit=limits.mask_deg,
-                sides="below",
-            ),
-        )
 
 
 SCREEN = ElevationScreen()

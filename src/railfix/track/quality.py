@@ -40,7 +40,6 @@ class MapLimits(Settings):
     gap_m: float = Field(default=2000.0, gt=0)
     least_radius_m: float = Field(default=60.0, gt=0)  #: Smallest radius that a railway vehicle can pass.
     gradient_permille: float = Field(default=60.0, gt=0)  #: Steepest segment.
-
     cant_m: float = Field(default=0.20, gt=0)  #: Largest absolute cant.
 
 
@@ -130,6 +129,53 @@ def error_note(quality: TrackQuality) -> tuple[str, ...]:
     )
 
 
+#: Severity and sentence of each fault; ``{value}`` is the worst one, ``{limit}`` its limit.
+_FAULTS: Final[dict[str, tuple[Severity, str]]] = {
+    "duplicate": ("error", "the same point twice or more; remove the repetition"),
+    "near duplicate": ("warning", "points only {value:.3f} m apart (limit {limit:g} m)"),
+    "rounded": (
+        "warning",
+        "latitude and longitude have five decimals or fewer, so that points are up to 0.6 m off; seven were expected",
+    ),
+    "gap": (
+        "error",
+        "points {value:.0f} m apart (limit {limit:g} m); a point is wrong, or a piece of the line is missing",
+    ),
+    "spacing": ("warning", "points {value:.1f} m apart (limit {limit:g} m); a curve in between would be missed"),
+    "mid-chord": ("error", "the chord deviates from the arc by {value:.3f} m (limit {limit:g} m); add points"),
+    "kink": ("warning", "the direction turns by {value:.1f} degrees at one point (limit {limit:g})"),
+    "kilometrage break": (
+        "warning",
+        "the kilometrage changes by {value:.4g} m, which is not the distance; metres were expected",
+    ),
+    "kilometrage reversal": ("warning", "the kilometrage reverses its direction"),
+    "kilometrage absent": ("warning", "the map has no kilometrage here"),
+    "height": (
+        "error",
+        "a height of {value:,.0f} m, where no railway is; is it in millimetres, or does it mean that there is none?",
+    ),
+    "gradient": ("warning", "the gradient of the heights is {value:.1f} per mille (limit {limit:g})"),
+    "height spike": (
+        "error",
+        "the height deviates from the line through its neighbours by {value:.2f} m (limit {limit:g} m)",
+    ),
+    "gradient attribute": (
+        "warning",
+        "gradient_permille differs from the heights by {value:.1f} per mille (limit {limit:g}); rising is positive",
+    ),
+    "cant": ("error", "cant of {value:.3f} m (limit {limit:g} m); the column is in millimetres"),
+    "small cant": (
+        "error",
+        "cant of {value:.2g} m, and nowhere more; is it in metres, where millimetres were expected?",
+    ),
+    "radius": ("error", "radius of {value:.1f} m (limit {limit:g} m)"),
+    "radius side": (
+        "error",
+        "radius_m has the opposite sign of the bend of the points; right is positive in the direction of the file",
+    ),
+}
+
+
 class _Report:
     """Converter of masks over points or segments to findings, one for each range of neighbours."""
 
@@ -139,15 +185,15 @@ class _Report:
     def runs(
         self,
         mask: Masks,
-        severity: Severity,
-        kind: str,
-        text: str,
-        *,
+        fault: str,
         values: Floats | None = None,
         limit: float = np.nan,
+        *,
+        severity: Severity | None = None,
     ) -> Iterator[Finding]:
-        """Yield findings for a mask over V points or V - 1 segments; `text` may have ``{value}`` and ``{limit}``."""
+        """Yield findings of a fault of `_FAULTS` for a mask over V points or V - 1 segments."""
         track = self.track
+        usual, text = _FAULTS[fault]
         edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
         over = 1 if len(mask) == len(track) - 1 else 0
         for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
@@ -160,8 +206,8 @@ class _Report:
                 f" to {track.chainage_m[last]:.1f} m" if track.chainage_m[last] > track.chainage_m[first] else ""
             )
             yield Finding(
-                severity=severity,
-                kind=kind,
+                severity=severity or usual,
+                kind=fault.removeprefix("small "),
                 first=first,
                 last=last,
                 chainage_m=float(track.chainage_m[first]),
@@ -174,58 +220,27 @@ class _Report:
 
 def _spacing(report: _Report, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
     spacing = geometry.spacing_m
-    yield from report.runs(spacing == 0.0, "error", "duplicate", "the same point twice or more; remove the repetition")
-    yield from report.runs(
-        (spacing > 0.0) & (spacing < _NEAR_DUPLICATE_M),
-        "warning",
-        "near duplicate",
-        "points only {value:.3f} m apart (limit {limit:g} m)",
-        values=spacing,
-        limit=_NEAR_DUPLICATE_M,
-    )
+    yield from report.runs(spacing == 0.0, "duplicate")
+    near = (spacing > 0.0) & (spacing < _NEAR_DUPLICATE_M)
+    yield from report.runs(near, "near duplicate", spacing, _NEAR_DUPLICATE_M)
     degrees = np.stack([report.track.latitude_deg, report.track.longitude_deg]) / _COARSE_DEG
-    yield from report.runs(
-        np.full(len(report.track), bool((np.abs(degrees - np.round(degrees)) < 1e-4).all())),
-        "warning",
-        "rounded",
-        "latitude and longitude have five decimals or fewer, so that points are up to 0.6 m off; seven were expected",
-    )
-    yield from report.runs(
-        spacing > limits.gap_m,
-        "error",
-        "gap",
-        "points {value:.0f} m apart (limit {limit:g} m); a point is wrong, or a piece of the line is missing",
-        values=spacing,
-        limit=limits.gap_m,
-    )
-    yield from report.runs(
-        (spacing > limits.spacing_m) & (spacing <= limits.gap_m),
-        "warning",
-        "spacing",
-        "points {value:.1f} m apart (limit {limit:g} m); a curve in between would be missed",
-        values=spacing,
-        limit=limits.spacing_m,
-    )
+    rounded = bool((np.abs(degrees - np.round(degrees)) < 1e-4).all())
+    yield from report.runs(np.full(len(report.track), rounded), "rounded")
+    yield from report.runs(spacing > limits.gap_m, "gap", spacing, limits.gap_m)
+    wide = (spacing > limits.spacing_m) & (spacing <= limits.gap_m)
+    yield from report.runs(wide, "spacing", spacing, limits.spacing_m)
 
 
 def _shape(report: _Report, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
     with np.errstate(invalid="ignore"):
         deviation = np.abs(geometry.mid_chord_m)
-        yield from report.runs(
-            deviation > limits.mid_chord_m,
-            "error",
-            "mid-chord",
-            "the chord deviates from the arc by {value:.3f} m (limit {limit:g} m); add points",
-            values=deviation,
-            limit=limits.mid_chord_m,
-        )
+        yield from report.runs(deviation > limits.mid_chord_m, "mid-chord", deviation, limits.mid_chord_m)
         turn = np.abs(geometry.turn_deg)
         sharp = np.radians(turn) > geometry.reach_m / limits.least_radius_m
         kink = sharp & (turn > _KINK_DEG)
         too_sharp = turn > _SHARP_KINK_DEG
-    text = "the direction turns by {value:.1f} degrees at one point (limit {limit:g})"
-    yield from report.runs(kink & too_sharp, "error", "kink", text, values=turn, limit=_SHARP_KINK_DEG)
-    yield from report.runs(kink & ~too_sharp, "warning", "kink", text, values=turn, limit=_KINK_DEG)
+    yield from report.runs(kink & too_sharp, "kink", turn, _SHARP_KINK_DEG, severity="error")
+    yield from report.runs(kink & ~too_sharp, "kink", turn, _KINK_DEG)
 
 
 def _kilometrage(report: _Report, track: Track) -> Iterator[Finding]:
@@ -235,91 +250,38 @@ def _kilometrage(report: _Report, track: Track) -> Iterator[Finding]:
     broken = kilometrage_breaks(track.chainage_m, kilometrage)
     change = np.diff(kilometrage)
     of_length = float(np.diff(track.chainage_m)[broken].sum() / track.chainage_m[-1])
-    yield from report.runs(
-        broken,
-        "error" if of_length > 0.5 else "warning",
-        "kilometrage break",
-        "the kilometrage changes by {value:.4g} m, which is not the distance; metres were expected",
-        values=change,
-    )
+    yield from report.runs(broken, "kilometrage break", change, severity="error" if of_length > 0.5 else None)
     direction = np.where(broken | (change == 0.0), np.nan, np.sign(change))
     known = np.flatnonzero(np.isfinite(direction))
     turned = np.zeros(len(track), dtype=np.bool_)
     turned[known[1:][np.diff(direction[known]) != 0.0]] = True
-    yield from report.runs(turned, "warning", "kilometrage reversal", "the kilometrage reverses its direction")
-    yield from report.runs(np.isnan(kilometrage), "warning", "kilometrage absent", "the map has no kilometrage here")
+    yield from report.runs(turned, "kilometrage reversal")
+    yield from report.runs(np.isnan(kilometrage), "kilometrage absent")
 
 
 def _heights(report: _Report, track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
-    yield from report.runs(
-        (track.height_m < HEIGHTS_M[0]) | (track.height_m > HEIGHTS_M[1]),
-        "error",
-        "height",
-        "a height of {value:,.0f} m, where no railway is; is it in millimetres, or does it mean that there is none?",
-        values=track.height_m,
-    )
+    impossible = (track.height_m < HEIGHTS_M[0]) | (track.height_m > HEIGHTS_M[1])
+    yield from report.runs(impossible, "height", track.height_m)
+    gradient, spike = geometry.gradient_permille, geometry.height_spike_m
     with np.errstate(invalid="ignore"):
-        steep = np.abs(geometry.gradient_permille) > limits.gradient_permille
-        yield from report.runs(
-            steep,
-            "warning",
-            "gradient",
-            "the gradient of the heights is {value:.1f} per mille (limit {limit:g})",
-            values=geometry.gradient_permille,
-            limit=limits.gradient_permille,
-        )
-        yield from report.runs(
-            np.abs(geometry.height_spike_m) > _HEIGHT_SPIKE_M,
-            "error",
-            "height spike",
-            "the height deviates from the line through its neighbours by {value:.2f} m (limit {limit:g} m)",
-            values=geometry.height_spike_m,
-            limit=_HEIGHT_SPIKE_M,
-        )
+        steep = np.abs(gradient) > limits.gradient_permille
+        yield from report.runs(steep, "gradient", gradient, limits.gradient_permille)
+        yield from report.runs(np.abs(spike) > _HEIGHT_SPIKE_M, "height spike", spike, _HEIGHT_SPIKE_M)
         attribute, from_heights = windowed_gradients(track, window_m=_GRADIENT_WINDOW_M)
         difference = attribute - from_heights
-        yield from report.runs(
-            np.abs(difference) > _GRADIENT_DIFFERENCE_PERMILLE,
-            "warning",
-            "gradient attribute",
-            "gradient_permille differs from the heights by {value:.1f} per mille (limit {limit:g}); rising is positive",
-            values=difference,
-            limit=_GRADIENT_DIFFERENCE_PERMILLE,
-        )
+        wrong = np.abs(difference) > _GRADIENT_DIFFERENCE_PERMILLE
+        yield from report.runs(wrong, "gradient attribute", difference, _GRADIENT_DIFFERENCE_PERMILLE)
 
 
 def _attributes(report: _Report, track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
+    cant = np.abs(track.cant_m)
     with np.errstate(invalid="ignore"):
-        yield from report.runs(
-            np.abs(track.cant_m) > limits.cant_m,
-            "error",
-            "cant",
-            "cant of {value:.3f} m (limit {limit:g} m); the column is in millimetres",
-            values=track.cant_m,
-            limit=limits.cant_m,
-        )
-        canted = np.abs(track.cant_m) > 0.0
-        yield from report.runs(
-            canted & (np.nanmax(np.abs(track.cant_m), initial=0.0) < _LEAST_CANT_M),
-            "error",
-            "cant",
-            "cant of {value:.2g} m, and nowhere more; is it in metres, where millimetres were expected?",
-            values=track.cant_m,
-        )
+        yield from report.runs(cant > limits.cant_m, "cant", track.cant_m, limits.cant_m)
+        small = (cant > 0.0) & (np.nanmax(cant, initial=0.0) < _LEAST_CANT_M)
+        yield from report.runs(small, "small cant", track.cant_m)
         sharp = np.abs(track.radius_m) < limits.least_radius_m
-        yield from report.runs(
-            sharp,
-            "error",
-            "radius",
-            "radius of {value:.1f} m (limit {limit:g} m)",
-            values=np.where(np.isfinite(track.radius_m), track.radius_m, 0.0),
-            limit=limits.least_radius_m,
-        )
+        radius = np.where(np.isfinite(track.radius_m), track.radius_m, 0.0)
+        yield from report.runs(sharp, "radius", radius, limits.least_radius_m)
         opposite = geometry.map_curvature * geometry.point_curvature < 0.0
         opposite &= (np.abs(geometry.map_curvature) > 1 / 3000) & (np.abs(geometry.point_curvature) > 1 / 3000)
-    yield from report.runs(
-        opposite,
-        "error",
-        "radius side",
-        "radius_m has the opposite sign of the bend of the points; right is positive in the direction of the file",
-    )
+    yield from report.runs(opposite, "radius side")
