@@ -36,6 +36,15 @@ def freeze_arrays(instance: DataclassInstance) -> None:
     vars(instance).update({n: read_only(v) for n, v in vars(instance).items() if isinstance(v, np.ndarray)})
 
 
+def freeze_rows(instance: DataclassInstance, of: str, first: str = "time") -> None:
+    """Freeze the arrays of a dataclass that has one row of each; ValueError where one is longer or shorter."""
+    rows = len(vars(instance)[first])
+    for name, value in vars(instance).items():
+        if isinstance(value, np.ndarray) and len(value) != rows:
+            raise ValueError(f"{name} has {len(value)} {of}, {first} has {rows}")
+    freeze_arrays(instance)
+
+
 class FrozenArrays:
     """Base of dataclasses that freeze their arrays, also in copies and other processes: kernels compile once."""
 

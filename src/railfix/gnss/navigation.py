@@ -7,13 +7,12 @@ Units are those of the interface documents (SI, radians). Absent is NaN (NaT for
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Strings, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Strings, freeze_arrays, freeze_rows
 from railfix.core.tables import NotebookTable, plural, time_span_text
 
 
@@ -25,14 +24,6 @@ def _records_text(satellite: Strings, toe: Datetimes) -> str:
     return f"{text} ({systems}), {time_span_text(np.sort(toe))}" if satellites.size else text
 
 
-def _freeze(table: Any, length: int) -> None:
-    for item in fields(table):
-        value = getattr(table, item.name)
-        if isinstance(value, np.ndarray) and len(value) != length:
-            raise ValueError(f"{item.name} has {len(value)} records, satellite has {length}")
-    freeze_arrays(table)
-
-
 class _NavigationRecords(FrozenArrays, NotebookTable):
     """Length, text and freezing of broadcast records."""
 
@@ -40,7 +31,7 @@ class _NavigationRecords(FrozenArrays, NotebookTable):
     toe: Datetimes
 
     def __post_init__(self) -> None:
-        _freeze(self, len(self.satellite))
+        freeze_rows(self, "records", "satellite")  # type: ignore[arg-type]
 
     def __len__(self) -> int:
         return len(self.satellite)

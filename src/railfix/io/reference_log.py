@@ -8,7 +8,7 @@ coordinates), ``speed_mps``, ``sigma_m`` along the track, ``source`` (``rtk``, `
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Final
@@ -17,7 +17,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_rows
 from railfix.core.errors import InputFileError
 from railfix.core.files import ending
 from railfix.core.timescale import seconds
@@ -58,11 +58,7 @@ class AntennaReference:
         epochs = len(self.time)
         if self.ecef_m.shape != (epochs, 3):
             raise ValueError(f"ecef_m has shape {self.ecef_m.shape}, expected ({epochs}, 3)")
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if len(value) != epochs:
-                raise ValueError(f"{item.name} has {len(value)} epochs, time has {epochs}")
-        freeze_arrays(self)
+        freeze_rows(self, "epochs")
         if np.isnat(self.time).any() or not (np.diff(self.time) > np.timedelta64(0, "ns")).all():
             raise ValueError("time must rise strictly")
         unknown = sorted(set(self.source.tolist()) - set(SOURCES))

@@ -9,7 +9,8 @@ from __future__ import annotations
 import gc
 import hashlib
 import multiprocessing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from multiprocessing.connection import Connection
 from typing import Any, Final
 
@@ -17,14 +18,10 @@ import numpy as np
 
 from railfix import kernels
 from railfix.core.errors import ChannelsDisagreeError
-from railfix.gnss.navigation import Navigation
-from railfix.gnss.observations import Observations
 from railfix.io.train_message import encode
-from railfix.live.engine import EngineState, LiveEngine, LiveOutput
+from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.settings import LiveSettings
-from railfix.live.stream import Sensed
 from railfix.pipeline.processor import EpochProcessor
-from railfix.ranges.sbas import SbasMessages
 
 #: First word of the second channel.
 _READY: Final = "ready"
@@ -97,41 +94,6 @@ class TwoChannels(LiveEngine):
         if self._recv() != _READY:
             raise ChannelsDisagreeError("the second channel does not start; no message is sent")
 
-    def start(self, *, now_ns: int) -> None:
-        """As `LiveEngine.start`."""
-        super().start(now_ns=now_ns)
-        self._call("start", now_ns=now_ns)
-
-    def resume(self, saved: EngineState) -> None:
-        """As `LiveEngine.resume`."""
-        super().resume(saved)
-        self._call("resume", saved)
-
-    def add_navigation(self, navigation: Navigation) -> None:
-        """As `LiveEngine.learn`."""
-        super().add_navigation(navigation)
-        self._call("add_navigation", navigation)
-
-    def add_sbas(self, messages: SbasMessages) -> None:
-        """As `LiveEngine.hear`."""
-        super().add_sbas(messages)
-        self._call("add_sbas", messages)
-
-    def add_base(self, epoch: Observations) -> None:
-        """As `LiveEngine.add_base`."""
-        super().add_base(epoch)
-        self._call("add_base", epoch)
-
-    def add_samples(self, sensed: Sensed) -> None:
-        """As `LiveEngine.sense`."""
-        super().add_samples(sensed)
-        self._call("add_samples", sensed)
-
-    def push(self, antenna: str, epoch: Observations, *, now_ns: int) -> None:
-        """As `LiveEngine.push`."""
-        super().push(antenna, epoch, now_ns=now_ns)
-        self._call("push", antenna, epoch, now_ns=now_ns)
-
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
         """As `LiveEngine.poll`, after both channels have agreed.
 
@@ -159,6 +121,21 @@ class TwoChannels(LiveEngine):
         self._connection.close()
         self._process.kill()
         self._process.join(timeout=5.0)
+
+
+def _in_both(name: str) -> Callable[..., None]:
+    """A method of the engine that both channels carry out."""
+
+    @wraps(getattr(LiveEngine, name))
+    def in_both(self: TwoChannels, *arguments: Any, **keywords: Any) -> None:
+        getattr(super(TwoChannels, self), name)(*arguments, **keywords)
+        self._call(name, *arguments, **keywords)
+
+    return in_both
+
+
+for _name in ("start", "resume", "add_navigation", "add_sbas", "add_base", "add_samples", "push"):
+    setattr(TwoChannels, _name, _in_both(_name))
 
 
 def compare(ours: list[dict[str, str]], theirs: list[dict[str, str]]) -> None:

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, read_only
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, freeze_rows
 
 #: Sensors on board by the names of their samples.
 SENSORS: Final = ("tachometer", "inertial", "radar", "ranging", "balises")
@@ -21,11 +21,7 @@ class Samples:
     time: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if len(value) != len(self.time):
-                raise ValueError(f"{item.name} has {len(value)} samples, time has {len(self.time)}")
-            object.__setattr__(self, item.name, read_only(value))
+        freeze_rows(self, "samples")
 
     def __len__(self) -> int:
         return len(self.time)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -173,7 +174,8 @@ def _sources(result: AlongTrack) -> Strings:
 
 
 def _innovation(result: AlongTrack, kind: Kind) -> Floats:
-    return np.asarray(result.tracked.sensed[:, kind - Kind.WHEEL])
+    kinds = [Kind.BALISE, Kind.NEXT_BALISE] if kind == Kind.BALISE else [kind]
+    return np.asarray(np.fmax.reduce([result.tracked.sensed[:, each - Kind.WHEEL] for each in kinds]))
 
 
 #: Columns of the table of the filter along the track.
@@ -297,35 +299,20 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             "distance by satellites over the last two minutes less that of the wheel",
             "wheel.difference_m",
         ),
-        Column(
-            "innovation_wheel_m",
-            "measured less predicted: way since the epoch before",
-            lambda r: _innovation(r, Kind.WHEEL),
-        ),
-        Column(
-            "innovation_radar_m",
-            "measured less predicted: way since the epoch before",
-            lambda r: _innovation(r, Kind.RADAR),
-        ),
-        Column(
-            "innovation_force_mps2",
-            "measured less predicted: mean specific force forward",
-            lambda r: _innovation(r, Kind.FORCE),
-        ),
-        Column(
-            "innovation_place_m",
-            "measured less predicted: place by a feature of the line",
-            lambda r: _innovation(r, Kind.PLACE),
-        ),
-        Column(
-            "innovation_balise_m",
-            "measured less predicted: place of a balise",
-            lambda r: np.fmax(_innovation(r, Kind.BALISE), _innovation(r, Kind.NEXT_BALISE)),
-        ),
-        Column(
-            "innovation_range_m",
-            "measured less predicted: range to a ground unit",
-            lambda r: _innovation(r, Kind.RANGE),
+        *(
+            Column(
+                f"innovation_{kind.name.lower()}_{unit}",
+                f"measured less predicted: {what}",
+                partial(_innovation, kind=kind),
+            )
+            for kind, unit, what in (
+                (Kind.WHEEL, "m", "way since the epoch before"),
+                (Kind.RADAR, "m", "way since the epoch before"),
+                (Kind.FORCE, "mps2", "mean specific force forward"),
+                (Kind.PLACE, "m", "place by a feature of the line"),
+                (Kind.BALISE, "m", "place of a balise"),
+                (Kind.RANGE, "m", "range to a ground unit"),
+            )
         ),
     )
 )

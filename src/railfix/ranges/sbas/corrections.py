@@ -122,13 +122,7 @@ class SbasCorrections:
         ValueError
             There is no message of that PRN.
         """
-        known = ", ".join(str(number) for number in messages.prns)
-        if prn == "best":
-            prn, choice = best_prn(messages, limits)
-        elif prn in messages.prns:
-            choice = f"SBAS PRN {prn} was asked for; the log has {known}"
-        else:
-            raise ValueError(f"the log has no SBAS message of PRN {prn}; it has {known}")
+        prn, choice = best_prn(messages, limits) if prn == "best" else (prn, messages.choice_of(prn))
         corrections = cls(messages, prn=prn, limits=limits, notes=(*messages.notes, choice))
         corrections.notes += tuple(corrections._leave_out(messages.of(prn)))
         return corrections

@@ -172,15 +172,12 @@ class DfmcService:
         ValueError
             There is no message of that PRN.
         """
-        known = ", ".join(str(number) for number in messages.prns)
         if prn == "best":
             numbers, count = np.unique(messages.prn[messages.type == 32], return_counts=True)
             prn = int(numbers[np.argmax(count)]) if len(numbers) else messages.prns[0]
-            choice = f"best SBAS PRN by corrections on L5: {prn} (the log has {known})"
-        elif prn in messages.prns:
-            choice = f"SBAS PRN {prn} was asked for; the log has {known}"
+            choice = f"best SBAS PRN by corrections on L5: {prn} (the log has {', '.join(map(str, messages.prns))})"
         else:
-            raise ValueError(f"the log has no SBAS message of PRN {prn}; it has {known}")
+            choice = messages.choice_of(prn)
         notes = (*messages.notes, choice)
         if zeros := int(np.sum(messages.of(prn).type == 0)):
             notes += (f"PRN {prn} sent {zeros} messages of type 0 (do not use for safety): each stopped it for 60 s",)

@@ -9,7 +9,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, read_only
+from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, freeze_rows
 from railfix.io.receiver.framing import crc24q
 from railfix.ranges.sbas.standard import DECODED, system_name, type_name
 
@@ -114,12 +114,7 @@ class SbasMessages:
     band: Band = "L1"
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, np.ndarray):
-                if len(value) != len(self.time):
-                    raise ValueError(f"{item.name} has {len(value)} messages, time has {len(self.time)}")
-                object.__setattr__(self, item.name, read_only(value))
+        freeze_rows(self, "messages")
 
     def __len__(self) -> int:
         return len(self.time)
@@ -128,6 +123,13 @@ class SbasMessages:
     def prns(self) -> tuple[int, ...]:
         """PRNs that sent anything, rising."""
         return tuple(int(prn) for prn in np.unique(self.prn))
+
+    def choice_of(self, prn: int) -> str:
+        """A sentence on a PRN that was asked for; ValueError where none of the messages is of it."""
+        known = ", ".join(map(str, self.prns))
+        if prn not in self.prns:
+            raise ValueError(f"the log has no SBAS message of PRN {prn}; it has {known}")
+        return f"SBAS PRN {prn} was asked for; the log has {known}"
 
     def account(self) -> dict[str, int]:
         """Counts of all messages: decoded by type, not decoded by type and name, or rejected by reason.

@@ -9,7 +9,7 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Integers, Masks, read_only
+from railfix.core.arrays import Floats, Integers, Masks, freeze_arrays
 from railfix.core.settings import Settings
 
 #: Types decoded into corrections or into records.
@@ -231,10 +231,7 @@ class IonosphereState(IntEnum):
 
 class _Frozen:
     def __post_init__(self) -> None:
-        for item in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, item.name)
-            if isinstance(value, np.ndarray):
-                object.__setattr__(self, item.name, read_only(value))
+        freeze_arrays(self)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, kw_only=True)
