@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from railfix.ranges.sbas import SbasMessages
-from railfix.simulate.sbas.service import (
+from railfix.simulate.sbas_service import (
     factors,
     fast,
     grid_delay,

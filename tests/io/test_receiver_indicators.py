@@ -14,8 +14,7 @@ from pyubx2 import UBXReader
 
 import pipeline_cases
 from railfix.io.receiver.framing import find_frames
-from railfix.io.receiver.indicators import Indicators, indicators_at
-from railfix.io.receiver.log import StreamState, decode
+from railfix.io.receiver.log import Indicators, StreamState, decode, indicators_at
 from railfix.io.receiver.measurements import observations_of
 from railfix.live.stream import ReceiverState, receive_bytes
 from ubx_made import frame, rawx

@@ -23,7 +23,7 @@ from railfix.io.receiver.log import StreamState, decode
 from railfix.live.stream import ReceiverState, receive_bytes
 from railfix.ranges.sbas import from_receiver
 from railfix.ranges.sbas.messages import with_parity
-from railfix.simulate.sbas import stream
+from railfix.simulate import sbas_stream as stream
 
 pytestmark = pytest.mark.requirement("A8")
 

@@ -23,10 +23,11 @@ from railfix.ranges.sbas import SbasMessages, SbasState, read_sbas
 from railfix.ranges.sbas.dfmc import DfmcService, DfmcState
 from railfix.run.processor import processor_of
 from railfix.simulate import Scenario, Simulation, write_run
+from railfix.simulate import sbas_stream as stream
 from railfix.simulate.errors import SatelliteFault
-from railfix.simulate.sbas import SbasSettings, stream
-from railfix.simulate.sbas.stream import sbas_messages, write_sbas
+from railfix.simulate.sbas_stream import sbas_messages, write_sbas
 from railfix.simulate.scenario_file import load_recipe
+from railfix.simulate.settings import SbasSettings
 from railfix.track.trajectory import Trajectory
 
 pytestmark = pytest.mark.requirement("C5")

@@ -9,8 +9,8 @@ from railfix.core.errors import InputFileError
 from railfix.ranges.sbas import SbasMessages, read_sbas
 from railfix.ranges.sbas.dfmc import DfmcService, DfmcState, residual_ionosphere_m, slot_satellite
 from railfix.ranges.sbas.messages import message_type, with_parity
-from railfix.simulate.sbas import stream
-from railfix.simulate.sbas.stream import write_sbas
+from railfix.simulate import sbas_stream as stream
+from railfix.simulate.sbas_stream import write_sbas
 
 pytestmark = pytest.mark.requirement("C5")
 START = np.datetime64("2026-03-01T06:00:00", "ns")

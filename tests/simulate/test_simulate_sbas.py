@@ -12,12 +12,13 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.io.rinex import read_observations
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, SbasLimits, SbasMessages, read_sbas
 from railfix.simulate import Scenario, Simulation, write_run
+from railfix.simulate import sbas_service as service
 from railfix.simulate.errors import SatelliteFault
 from railfix.simulate.receiver import ionosphere_m
-from railfix.simulate.sbas import SbasSettings, service
-from railfix.simulate.sbas.stream import sbas_messages, write_sbas
+from railfix.simulate.sbas_stream import sbas_messages, write_sbas
 from railfix.simulate.scenario import ReferenceStation
 from railfix.simulate.scenario_file import load_recipe
+from railfix.simulate.settings import SbasSettings
 from test_simulate_signals import whole
 
 pytestmark = pytest.mark.requirement("D4")

@@ -21,7 +21,7 @@ import belief_campaign
 import recordings_truth
 from railfix.evaluate.cases import write_case
 from railfix.track import from_positions
-from railfix.track.csv_file import write_track_csv
+from railfix.track.point_files import write_track_csv
 
 PAGE: Final = paths.ROOT / "docs" / "benchmark-recordings.md"
 _URBANNAV: Final = {

@@ -25,8 +25,7 @@ from railfix.gnss.observations import Observations
 from railfix.integrity.interference import Suspicion, cause_text
 from railfix.integrity.protection import LevelStatus
 from railfix.io import read_navigation, read_observations
-from railfix.io.receiver.indicators import read_receiver_positions
-from railfix.io.receiver.log import read_receiver_navigation
+from railfix.io.receiver.log import read_receiver_navigation, read_receiver_positions
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult

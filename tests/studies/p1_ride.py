@@ -27,7 +27,7 @@ from railfix.run.processor import processor_of
 from railfix.run.sensors import read_sensors
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
-from railfix.simulate.sbas.stream import sbas_messages, write_sbas
+from railfix.simulate.sbas_stream import sbas_messages, write_sbas
 from railfix.simulate.scenario import ANTENNAS, RunSettings
 from railfix.simulate.scenario_file import load_recipe
 from railfix.simulate.sensor_tables import sensor_tables

@@ -25,14 +25,15 @@ from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import without
 from railfix.pipeline.processor import AntennaResult
-from railfix.positioning.intersystem_bias import OffsetState, tie_clocks
 from railfix.positioning.noise_scale import (
     NoiseState,
+    OffsetState,
     map_information,
     noise_age,
     own_sigma_m,
     robust_fit,
     robust_scale,
+    tie_clocks,
 )
 from railfix.positioning.normal_equations import Constrained, Ranges, clock_groups, constrained_position, single_point
 from railfix.positioning.section_search import SearchIndex, search

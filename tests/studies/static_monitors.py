@@ -16,7 +16,7 @@ import paths
 from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.ground.station_fixes import StationFixes, station_fixes, stream_fixes
 from railfix.io import read_navigation, read_observations
-from railfix.io.receiver.indicators import read_receiver_positions
+from railfix.io.receiver.log import read_receiver_positions
 
 RADIUS_M = 12.0
 

@@ -14,7 +14,7 @@ from belief_campaign import Case, joined, over, run
 from railfix.core.timescale import seconds
 from railfix.evaluate.cases import write_case
 from railfix.track import Track
-from railfix.track.csv_file import write_track_csv
+from railfix.track.point_files import write_track_csv
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import TrackStatus
 

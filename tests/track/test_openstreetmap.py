@@ -15,8 +15,8 @@ from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.io.position_log import PositionLog
 from railfix.track import Track
+from railfix.track.frames import geoid_heights
 from railfix.track.height_source import with_heights
-from railfix.track.heights import geoid_heights
 from railfix.track.network import Network
 from railfix.track.network_read import read_network
 from railfix.track.read import read_segments, track_of_segments

@@ -1,4 +1,4 @@
-"""``railfix simulate``: simulated runs as files, with ground truth."""
+"""``railfix simulate``: simulated runs as files, with ground truth; ``railfix demo``: the demonstration positioned."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from railfix.core.timescale import from_week, utc_to_gpst
 from railfix.gnss.observations import capped_problems
 from railfix.io.position_log import PositionLog, read_positions
 from railfix.io.receiver.framing import head_of, is_receiver_log
-from railfix.io.receiver.indicators import read_receiver_positions
+from railfix.io.receiver.log import read_receiver_positions
 
 #: Quality as RTKLIB numbers it, by the position type of NovAtel.
 _QUALITY: Final = {"INT": 1, "FLOAT": 2, "WAAS": 3, "SBAS": 3, "PSRDIFF": 4, "PPP": 6, "SINGLE": 5, "PSRSP": 5}
@@ -287,7 +287,7 @@ def read_any_positions(
     """Read a log of positions of any kind, by its ending.
 
     NMEA (``.nmea``, ``.nma``, ``.gga``), GPX (``.gpx``), NovAtel ASCII (``.asc``, ``.ascii``, ``.gps``), receiver logs
-    by their content (`railfix.io.receiver.indicators`), else `read_positions`.
+    by their content (`railfix.io.receiver.log`), else `read_positions`.
 
     Parameters
     ----------

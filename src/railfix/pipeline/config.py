@@ -32,9 +32,8 @@ from railfix.integrity.protection import RiskBudget
 from railfix.integrity.protection.araim import AraimBudget
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.positioning.carrier import ContinuityLimits, CycleSlipLimits, PhaseLimits, SmoothingLimits
-from railfix.positioning.intersystem_bias import ClockOffsetLimits
 from railfix.positioning.map_offset import MapOffsetLimits
-from railfix.positioning.noise_scale import LastingErrorLimits, NoiseScaleLimits, RobustFitLimits
+from railfix.positioning.noise_scale import ClockOffsetLimits, LastingErrorLimits, NoiseScaleLimits, RobustFitLimits
 from railfix.positioning.normal_equations import ConstrainedLimits, SinglePointLimits
 from railfix.positioning.section_search import SectionLimits
 from railfix.positioning.two_frequencies import TwoFrequencyLimits

@@ -21,9 +21,8 @@ from railfix.pipeline.filter_result import AlongTrack, FilterState, OffMapState
 from railfix.pipeline.interference_stage import Interference, InterferenceState
 from railfix.pipeline.received import Received
 from railfix.positioning.carrier import PhasePositions
-from railfix.positioning.intersystem_bias import OffsetState
 from railfix.positioning.map_offset import MapOffset, MapOffsetState
-from railfix.positioning.noise_scale import LastingErrorState, NoiseState
+from railfix.positioning.noise_scale import LastingErrorState, NoiseState, OffsetState
 from railfix.positioning.normal_equations import Constrained, SinglePoint
 from railfix.positioning.section_search import Section
 from railfix.positioning.two_frequencies import Combined, SecondCodes, TwoFrequencyState

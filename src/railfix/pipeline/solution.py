@@ -33,7 +33,6 @@ from railfix.pipeline.solve import (
 )
 from railfix.positioning.antenna_rows import AntennaRows, rows_of
 from railfix.positioning.carrier import PhasePositions
-from railfix.positioning.intersystem_bias import tie_clocks
 from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
 from railfix.positioning.noise_scale import (
     NoiseState,
@@ -45,6 +44,7 @@ from railfix.positioning.noise_scale import (
     robust_fit,
     robust_scale,
     stated_scale,
+    tie_clocks,
 )
 from railfix.positioning.normal_equations import (
     UNTIED_M,

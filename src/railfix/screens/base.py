@@ -2,6 +2,8 @@
 
 A screen is one subclass of `ObservationScreen`, `PairScreen` or `PositionScreen`, and one line in
 `railfix.screens.registry` or one entry point of an installed package (docs/screens.md shows an example).
+
+Pairs of epochs and channels of two antennas, and medians over the channels of a clock, are for screens of pairs.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.io.rinex import write_navigation, write_observations
 from railfix.run.output import CSV_TIME, OutputFolder, Overwrite
-from railfix.simulate.sbas.stream import sbas_messages, write_sbas
+from railfix.simulate.sbas_stream import sbas_messages, write_sbas
 from railfix.simulate.scenario import ANTENNAS, Scenario, VehicleSettings
 from railfix.simulate.scenario_file import scenario_table
 from railfix.simulate.sensor_tables import COLUMNS, sensor_tables

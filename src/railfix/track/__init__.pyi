@@ -1,7 +1,7 @@
 # The names of `railfix.track`, imported at their first use (lazy-loader).
 
-from .csv_file import write_track_csv
 from .from_positions import Thinned, ThinningLimits, from_position_log, from_positions, thin
+from .point_files import write_track_csv
 from .quality import Finding, MapLimits, TrackQuality, check_track
 from .read import read_track
 from .track import Provenance, Track, interpolate_kilometrage

@@ -18,7 +18,7 @@ from pyproj import CRS, Transformer
 from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import InputFileError
 from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, frame_degrees, is_in_area, older_datum_note, unit_of_grid
-from railfix.track.heights import stated_heights
+from railfix.track.frames import stated_heights
 from railfix.track.route import NO_HEIGHTS, MapReading, Segment
 
 #: Share of the change of curvature or cant at a share t of the element, and its integral from 0 (IFC 4.3.2).

@@ -18,8 +18,8 @@ from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog
+from railfix.track.frames import GEOIDS, ellipsoidal_heights, own_height_datum
 from railfix.track.from_positions import SIGMA_OF_QUALITY
-from railfix.track.heights import GEOIDS, ellipsoidal_heights, own_height_datum
 from railfix.track.track import SIGMA_HEIGHT_M, Track
 from railfix.track.trajectory import NearestOnPolyline
 

@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import ending, read_text
-from railfix.track.geojson_file import RELATION
 from railfix.track.network import Link, Network, end_points
+from railfix.track.point_files import RELATION
 from railfix.track.read import read_segments
 from railfix.track.route import MapReading, Segment, first_gap, orient
 from railfix.track.vector_file import read_layers

@@ -13,10 +13,9 @@ import numpy as np
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import ending
 from railfix.io.mate import mate_table
-from railfix.track.csv_file import read_csv_segment
-from railfix.track.geojson_file import read_geojson_segments
+from railfix.track.frames import GEOIDS, check_height_datum
 from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
-from railfix.track.heights import GEOIDS, check_height_datum
+from railfix.track.point_files import read_csv_segment, read_geojson_segments
 from railfix.track.route import MAX_GAP_M, NO_HEIGHTS, MapOptions, MapReading, Segment, join
 from railfix.track.track import Track
 from railfix.track.vector_file import ENDINGS as VECTOR_ENDINGS

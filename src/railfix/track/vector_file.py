@@ -24,7 +24,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import ending, open_stream
 from railfix.track.crs import frame_degrees, older_datum_note, unit_of_heights, used_crs
-from railfix.track.heights import check_height_datum, stated_heights
+from railfix.track.frames import check_height_datum, stated_heights
 from railfix.track.route import ATTRIBUTES, NO_HEIGHTS, MapReading, Segment
 from railfix.track.track import UNNAMED
 

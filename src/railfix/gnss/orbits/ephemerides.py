@@ -1,4 +1,7 @@
-"""Satellites by broadcast records: Keplerian elements and GLONASS state vectors."""
+"""Satellites by broadcast records (Keplerian elements, GLONASS state vectors) and by precise ephemerides.
+
+Precise positions are interpolated by a polynomial, clocks linearly.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,13 @@
-"""Lookups and orbit elements of a `Navigation`, computed once and cached."""
+"""Selection of the navigation record of a satellite at an epoch; lookups and orbit elements, computed once and cached.
+
+The newest record transmitted before the epoch is selected. A record without a transmission time
+counts as transmitted half-way between the reference times of the record before it and its own. Where
+the newest record is outside its validity (expired while an older one is still valid, or transmitted
+long before its validity begins), or where all records were transmitted after the epoch (a file that
+begins later than the log), the record with the nearest reference time is selected if it is valid,
+and flagged if it had not been transmitted yet. Health is that of the selected record: an older
+healthy record does not override it.
+"""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def layout(codings: Mapping[str, Coding], **places: Place) -> dict[str, Field]:
     return {name: (place, *codings[name]) for name, place in places.items()}
 
 
-def _headed(head: dict[str, Field], kinds: dict[int, dict[str, Field]]) -> dict[int, dict[str, Field]]:
+def _with_head(head: dict[str, Field], kinds: dict[int, dict[str, Field]]) -> dict[int, dict[str, Field]]:
     """Layouts by kind, with the fields that all messages of the family begin with."""
     return {kind: head | fields for kind, fields in kinds.items()}
 
@@ -75,7 +75,7 @@ LNAV_CODINGS: Final[dict[str, Coding]] = {
 }
 #: LNAV subframes without parity (10 words of 24 bits); TOW count and number are in all of them.
 LNAV_HEAD: Final = layout(LNAV_CODINGS, tow_s=24, subframe=43)
-LNAV: Final = _headed(LNAV_HEAD, {
+LNAV: Final = _with_head(LNAV_HEAD, {
     1: layout(LNAV_CODINGS, week=48, accuracy=60, health=64, iodc=((70, 2), (168, 8)), group_delay_1_s=160, toc_s=176,
               af2=192, af1=200, af0_s=216, codes=58, flag=72),
     2: layout(LNAV_CODINGS, iode=48, crs=56, delta_n=72, m0=88, cuc=120, eccentricity=136, cus=168, sqrt_a=184,
@@ -138,7 +138,7 @@ _CNAV_CODINGS: Final[dict[str, Coding]] = {
 }
 #: CNAV messages of 300 bits; PRN, type and TOW count are in all of them.
 CNAV_HEAD: Final = layout(_CNAV_CODINGS, number=8, type=14, tow_s=20)
-CNAV: Final = _headed(CNAV_HEAD, {
+CNAV: Final = _with_head(CNAV_HEAD, {
     10: layout(_CNAV_CODINGS, week=38, health=51, top=54, accuracy_index=65, toe_sow_s=70, delta_a=81, a_dot=107,
                delta_n=132, delta_n_dot=149, m0=172, eccentricity=205, omega=238),
     11: layout(_CNAV_CODINGS, toe_sow_s=38, omega0=49, i0=82, delta_omega_dot=115, i_dot=132, cis=147, cic=163,
@@ -162,7 +162,7 @@ _BCNAV2_CODINGS: Final[dict[str, Coding]] = {
 }
 #: BeiDou B-CNAV2 messages of 288 bits, without preamble and parity symbols; PRN, type and SOW are in all of them.
 BCNAV2_HEAD: Final = layout(_BCNAV2_CODINGS, number=0, tow_s=12)
-BCNAV2: Final = _headed(BCNAV2_HEAD, {
+BCNAV2: Final = _with_head(BCNAV2_HEAD, {
     10: layout(_BCNAV2_CODINGS, week=30, iode=53, toe_sow_s=61, kind=72, delta_a=74, a_dot=100, delta_n=125,
                delta_n_dot=142, m0=165, eccentricity=198, omega=231),
     11: layout(_BCNAV2_CODINGS, health=30, flags=32, sismai=35, omega0=42, i0=75, omega_dot=108, i_dot=127, cis=142,
@@ -187,7 +187,7 @@ BEIDOU_CODINGS: Final[dict[str, Coding]] = {
 }
 #: BeiDou: seconds of week and subframe number of D1 and D2 (10 words of 30 bits, parity included).
 BDS_HEAD: Final = layout(BEIDOU_CODINGS, tow_s=((18, 8), (30, 12)), subframe=15)
-D1: Final = _headed(BDS_HEAD, {
+D1: Final = _with_head(BDS_HEAD, {
     1: layout(BEIDOU_CODINGS, health=42, aodc=43, accuracy=48, week=60, toc_s=((73, 9), (90, 8)), group_delay_1_s=98,
               group_delay_2_s=((108, 4), (120, 6)), ion0=126, ion1=134, ion2=150, ion3=158, ion4=((166, 6), (180, 2)),
               ion5=182, ion6=190, ion7=((198, 4), (210, 4)), af2=214, af0_s=((225, 7), (240, 17)),

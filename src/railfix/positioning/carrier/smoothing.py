@@ -1,4 +1,9 @@
-"""Carrier-smoothed codes (Hatch filter).
+"""Cycle slips and gaps of the phase, and carrier-smoothed codes (Hatch filter).
+
+The phase's change is compared with the Dopplers, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``, else with
+the change of the code, less the median of the channels, so that a clock step is no slip. A clock step is common to all
+channels of an epoch; codes follow the time tags, so that the true interval is the tags' less the step seen in the
+codes; phases step with the codes or run on, then by whole milliseconds, which `Slips.phase_m` adds.
 
 The mean of code less phase over the arc so far, put back on the phase, is a code with less noise. The ionosphere makes
 it drift by twice the change of its delay, which the window limits: at 1 mm/s one of 100 s leaves up to 0.2 m.

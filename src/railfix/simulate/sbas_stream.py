@@ -1,4 +1,4 @@
-"""Streams of simulated SBAS messages, one a second, and their file."""
+"""Streams of simulated SBAS messages, one a second, and their file; messages of dual-frequency SBAS (L5)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from railfix.ranges.sbas import SbasMessages
 from railfix.ranges.sbas.dfmc import AUGMENTED, FIRST, slot_satellite
 from railfix.ranges.sbas.messages import PREAMBLES, message_type
 from railfix.simulate.receiver import group_delay_s, signals_of
-from railfix.simulate.sbas.service import CLOCK, FAST_PERIOD_S, Field, Service, packed
+from railfix.simulate.sbas_service import CLOCK, FAST_PERIOD_S, Field, Service, packed
 from railfix.simulate.settings import SbasSettings
 
 if TYPE_CHECKING:
