@@ -54,6 +54,7 @@ class _Program(LazyCommands):
         "error-model": "evaluate",
         "live": "run",
         "cn0-curve": "evaluate",
+        "demo": "simulate",
     }
 
 
