@@ -1,50 +1,18 @@
-"""Registry of the screens: those of railfix, and those that packages name as entry points of ``railfix.screens``.
-
-RAIM is among them with its settings and its picture; the pipeline runs it on the solved positions.
-"""
+"""Registry of the screens: those of railfix, and those that packages name as entry points of ``railfix.screens``."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, Final
 
-import numpy as np
-
 from railfix.core.errors import SettingsError
-from railfix.integrity.raim import RaimLimits
-from railfix.screens.base import ObservationScreen, PairScreen, PositionScreen, RunTables, Screen, ScreenPicture
+from railfix.screens.base import ObservationScreen, PairScreen, PositionScreen, Screen
 
 #: Group of entry points.
 GROUP: Final = "railfix.screens"
-#: Modules with a screen each.
-_MODULES: Final = ("elevation", "cn0", "doppler", "antenna_pair", "antenna_spacing")
-_NAMES: Final = (*_MODULES, "raim")
-
-
-class RaimScreen(Screen[RaimLimits]):
-    """Fault detection and exclusion (`railfix.integrity.raim`)."""
-
-    name = "raim"
-    limits = RaimLimits()
-    needs = "more satellites than unknowns"
-
-    def pictures(self, tables: RunTables, limits: RaimLimits) -> Iterator[tuple[str, ScreenPicture]]:
-        """Yield the test statistic against its threshold."""
-        statistic, threshold = tables.epochs("raim_statistic"), tables.epochs("raim_threshold")
-        unit = "m^2" if limits.mode == "fixed" else "noise variances"
-        yield (
-            "raim",
-            ScreenPicture(
-                title="RAIM, before any exclusion",
-                label=f"sum of squared residuals [{unit}]",
-                metric=np.where(np.isfinite(threshold), statistic, np.nan),
-                reject=statistic >= threshold,
-                limit=threshold,
-                sides="above",
-            ),
-        )
+_NAMES: Final = ("elevation", "cn0", "doppler", "antenna_pair", "raim", "antenna_spacing")
 
 
 def in_order(screens: Iterable[Screen[Any]]) -> tuple[Screen[Any], ...]:
@@ -78,5 +46,5 @@ def _find_installed() -> list[Screen[Any]]:
 
 #: All screens, in the order in which they judge.
 SCREENS: Final[tuple[Screen[Any], ...]] = in_order(
-    (*(import_module(f"railfix.screens.{name}").SCREEN for name in _MODULES), RaimScreen(), *_find_installed())
+    (*(import_module(f"railfix.screens.{name}").SCREEN for name in _NAMES), *_find_installed())
 )
