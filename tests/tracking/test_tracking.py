@@ -7,6 +7,8 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.state import TrackState
 from railfix.tracking.velocity import singer_step
@@ -213,6 +215,34 @@ def test_a_place_10_m_behind_a_corner_is_corrected_within_10_s(seed: int) -> Non
     error, corner = np.abs(result.arc_m - case.arc_m), int(np.searchsorted(case.arc_m, 600.0))
     assert error[corner - 1] > 8.0
     assert error[corner + 50 :].max() < 5.0
+
+
+@pytest.mark.requirement("C6")
+def test_a_corner_does_not_decide_between_laps() -> None:
+    """Behind a corner the train seems to stand on every lap: places beside the one in the lead alone would win."""
+    case = ride(
+        75, trajectory=corner_line(4800.0), start_m=2700.0, rate_hz=5.0, noise=1.0, code_sigma_m=6.0,
+        speed_mps=lambda t: np.full(len(t), 6.0),
+    )  # fmt: skip
+    result, _ = track(with_codes_behind(case, 10.0, 3000.0), case.line)
+    corner = int(np.searchsorted(case.arc_m, 3000.0))
+    assert result.probability[corner:].max() < 0.9
+    assert np.abs(result.arc_m % 2400.0 - case.arc_m % 2400.0)[corner + 50 :].max() < 5.0
+
+
+@pytest.mark.requirement("C6")
+@pytest.mark.parametrize("speed_mps", [2.0, 15.0, 40.0])
+def test_a_train_that_leaves_the_map_has_no_level(speed_mps: float) -> None:
+    """Codes and motion go on beyond an open end, where the place may not follow."""
+    whole = bent_line()
+    points = np.asarray(whole.ecef_m)[np.asarray(whole.arc_m) <= 1500.0]
+    start_m = 1500.0 - 30.0 * speed_mps
+    case = ride(60, trajectory=whole, start_m=start_m, noise=0.5, speed_mps=lambda t: np.full(len(t), speed_mps))
+    result, _ = track(case.epochs, Line.of(Trajectory.from_track(Track.from_ecef(points))), levels=True)
+    over = np.abs(np.clip(result.arc_m, 0.0, 1500.0) - case.arc_m) > result.level_m
+    assert not over.any()
+    assert np.isfinite(result.level_m[20:30]).all()
+    assert not np.isin(result.status[45:], [TrackStatus.TRACKING, TrackStatus.COASTING]).any()
 
 
 @pytest.mark.requirement("E5")

@@ -39,7 +39,9 @@ _ANY_DRIFT_MPS: Final = 1e3
 WHEEL_PRIOR: Final = 0.02
 FORCE_PRIOR_MPS2: Final = 0.1
 RADAR_PRIOR: Final = 0.02
-#: Standard deviation of the speed beyond a bend [m/s], and the share of probability that places beside get.
+#: Places beside in `bend_m`, how many, standard deviation of their speed [m/s], and share of probability that they get.
+_BESIDE_STEPS: Final = np.array([-2.0, -1.0, 1.0, 2.0])
+_BESIDE: Final = len(_BESIDE_STEPS)
 _BEND_SPEED_MPS: Final = 10.0
 _BESIDE_SHARE: Final = 0.01
 #: What a new hypothesis takes over from a lost track: its error has gone into everything else.
@@ -178,7 +180,7 @@ def beside(mean: Floats, covariance: Floats, limits: TrackingLimits) -> tuple[Fl
     mean, covariance : ndarray, shapes (N,), (N, N)
     limits : TrackingLimits
     """
-    steps = limits.bend_m * np.array([-2.0, -1.0, 1.0, 2.0])
+    steps = limits.bend_m * _BESIDE_STEPS
     gain = np.zeros(len(mean))
     gain[[StateIndex.ARC, StateIndex.PREVIOUS_ARC]] = 1.0
     means = mean + gain * steps[:, None]
@@ -252,7 +254,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         contradicted = state.weak_motion_s >= BESIDE_AFTER_S or state.across >= ACROSS_DOUBT
         contradicted = contradicted or state.motion_misfit > 1.0 - MOTION_FIT
         if contradicted and state.measured >= state.time:
-            parent = np.append(parent, np.full(_try_beside(state, limits), -1))
+            parent = np.append(parent, np.full(_try_beside(state, line, limits), -1))
         return Sought(lost=False, parent=parent, splits=None)
     arc, sigma = places(chunk, epoch, line, limits)
     if not len(arc):
@@ -303,18 +305,29 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
     return Sought(lost=lost, parent=parent, splits=None if lost else splits)
 
 
-def _try_beside(state: TrackState, limits: TrackingLimits) -> int:
-    """Add hypotheses beside the best one, whose motion was contradicted at the epoch before; return how many."""
-    if state.hypotheses > limits.most_hypotheses // 2:
+def _try_beside(state: TrackState, line: Line, limits: TrackingLimits) -> int:
+    """Add hypotheses beside those that are apart, the most probable first; return how many.
+
+    Motion that contradicts the best one contradicts another lap of it alike: without places of its own beside it the
+    other lap would lose by them.
+    """
+    parents: list[int] = []
+    room = (limits.most_hypotheses - state.hypotheses) // _BESIDE
+    for h in np.argsort(-state.log_probability, kind="stable").tolist():
+        there = line.nearest_m(state.mean[parents, StateIndex.ARC], state.mean[h, StateIndex.ARC])
+        if len(parents) < room and (np.abs(there - state.mean[h, StateIndex.ARC]) > limits.start_separation_m).all():
+            parents.append(h)
+    if state.hypotheses > limits.most_hypotheses // 2 or not parents:
         return 0
-    best = int(np.argmax(state.log_probability))
-    mean, covariance, share = beside(state.mean[best], state.covariance[best], limits)
-    log_probability = np.concatenate([state.log_probability, state.log_probability[best] + share])
+    parts = [beside(state.mean[h], state.covariance[h], limits) for h in parents]
+    mean, covariance, share = (np.concatenate(items) for items in zip(*parts, strict=True))
+    parent = np.repeat(parents, _BESIDE)
+    log_probability = np.concatenate([state.log_probability, state.log_probability[parent] + share])
     state.mean = np.concatenate([state.mean, mean])
     state.covariance = np.concatenate([state.covariance, covariance])
     state.log_probability = log_probability - np.logaddexp.reduce(log_probability)
     state.log_least = np.concatenate([state.log_least, np.zeros(len(mean))])
     state.log_recent = np.concatenate([state.log_recent, np.zeros(len(mean))])
-    state.log_code = np.concatenate([state.log_code, np.full(len(mean), state.log_code[best])])
+    state.log_code = np.concatenate([state.log_code, state.log_code[parent]])
     state.origin_m = np.concatenate([state.origin_m, mean[:, StateIndex.ARC]])
     return len(mean)

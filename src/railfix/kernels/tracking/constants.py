@@ -84,6 +84,8 @@ CODE_LEAK: Final = 1.0
 BIAS_MEMORY_S: Final = 60.0
 BIAS_MOST: Final = 1.0
 BIAS_FAULTY: Final = 0.35
+#: More satellites left out at a time have no faults of their own: the map or a constellation is wrong.
+BIAS_SATELLITES: Final = 2
 #: Factor on the variance of codes that are left out: their innovations go on telling when the fault ends.
 BIAS_INFLATED: Final = 1e6
 #: Standard deviation added to the place when a satellite is left out from here on: its codes have led it so far [m].

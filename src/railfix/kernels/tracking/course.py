@@ -93,7 +93,7 @@ def gradient_at(line: LineArrays, arc: float) -> float:
 
 @borrowing
 def onto_line(line: LineArrays, reach_m: float, work: Work, h: int) -> float:
-    """Put a place a little beyond an end on the line; return how far.
+    """Put a place a little beyond an end on the line; return how far beyond it was, 0 within its noise.
 
     Projection on the constraint along the correlations (D. Simon, Kalman filtering with state constraints, 2010); a
     place within two sigmas of it is noise, and one further out than a start may be wrong is left: the map may end
@@ -102,8 +102,9 @@ def onto_line(line: LineArrays, reach_m: float, work: Work, h: int) -> float:
     mean, covariance = work.new_mean, work.new_covariance
     excess = min(max(mean[h, ARC], line.start_m), line.end_m) - mean[h, ARC]
     variance = covariance[h, ARC, ARC]
-    if abs(excess) > 2.0 * math.sqrt(variance) and abs(excess) <= reach_m:
+    if abs(excess) <= 2.0 * math.sqrt(variance):
+        return 0.0
+    if abs(excess) <= reach_m:
         for c in range(covariance.shape[1]):
             mean[h, c] += covariance[h, c, ARC] / variance * excess
-        return float(abs(excess))
-    return 0.0
+    return float(abs(excess))

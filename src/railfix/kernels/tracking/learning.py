@@ -16,6 +16,7 @@ from railfix.kernels.tracking.constants import (
     BIAS_FAULTY,
     BIAS_MEMORY_S,
     BIAS_MOST,
+    BIAS_SATELLITES,
     CODE_LEAK,
     LARGEST_SCALE,
     LEAST_SCALE,
@@ -31,6 +32,7 @@ from railfix.kernels.tracking.layout import (
     SCALE_PHASE,
     WEAK_CODE,
     WEAK_MOTION,
+    WITHHELD,
     Inputs,
     KernelState,
     Outputs,
@@ -76,11 +78,15 @@ def learn(
         gone = max(scalars[WEAK_CODE] - CODE_LEAK * code_s, 0.0)
         scalars[WEAK_CODE] = scalars[WEAK_CODE] + code_s if weak else gone
     learn_map(scalars, 0.0 if best else shift, code_s, parameters)
+    left_out = 0
     for i in range(nc):
         k = rows.codes[i]
+        left_out += abs(state.code_bias[epochs.slot[k]]) > BIAS_FAULTY
         sigma = epochs.code_sigma_m[t, k] * math.sqrt(1.0 + parameters.code_white_share**2)
         now = update_bias(state.code_bias, epochs.slot[k], innovation[best, i] / sigma, code_s)
         found = found or now
+    if left_out > BIAS_SATELLITES:
+        scalars[WITHHELD] = max(scalars[WITHHELD], parameters.level_hold_s)
     return found
 
 

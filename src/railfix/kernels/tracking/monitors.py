@@ -118,7 +118,7 @@ def watch(
     withheld = 0.0
     doubtful = scalars[WEAK_CODE] > parameters.level_doubt_code_s or scalars[WEAK_MOTION] > parameters.level_doubt_s
     doubtful = doubtful or scalars[MOTION_MISFIT] > 1.0 - MOTION_FIT
-    if doubtful or scalars[ACROSS] > ACROSS_DOUBT:
+    if doubtful or scalars[ACROSS] > ACROSS_DOUBT or pushed_m > 0.0:
         withheld = parameters.level_hold_s
     if scalars[BRANCH_S] < parameters.level_start_s:
         largest = -math.inf
