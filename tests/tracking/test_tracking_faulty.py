@@ -10,13 +10,16 @@ import pytest
 
 import belief_campaign
 from plain_kernels import plain
+from railfix.core.geodesy import enu_axes
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking.constants import BIAS_FAULTY
 from railfix.pipeline.config import parse_config
 from railfix.run.processor import processor_of
 from railfix.run.tally import Tally
-from railfix.tracking import Kind, TrackState, track
-from tracking_cases import part, ride
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
+from railfix.tracking import Kind, Line, TrackState, track
+from tracking_cases import LATITUDE, LONGITUDE, bent_line, part, ride
 
 
 @pytest.mark.requirement("E5")
@@ -51,6 +54,23 @@ def test_a_code_that_stays_wrong_is_left_out_and_comes_back(size_m: float) -> No
         some, state = track(part(epochs, slice(begin, end)), case.line, state)
         pieces.append(some.faulty)
     np.testing.assert_array_equal(np.concatenate(pieces), found.faulty)
+
+
+@pytest.mark.requirement("C6")
+def test_many_faulty_satellites_are_a_wrong_map() -> None:
+    """10 m aside in curves: each satellite contradicts the map by itself, and without them nothing does."""
+    turning = bent_line(2000.0, turn_deg=300.0)
+    case = ride(
+        160, trajectory=turning, start_m=100.0, noise=1.0, code_sigma_m=1.0, speed_mps=lambda t: np.full(len(t), 10.0)
+    )
+    north = enu_axes(np.array(LATITUDE), np.array(LONGITUDE))[1]
+    aside = Track.from_ecef(np.asarray(turning.ecef_m) + 10.0 * north)
+    wrong, _ = track(case.epochs, Line.of(Trajectory.from_track(aside)), levels=True)
+    many = wrong.faulty.sum(axis=1) > 2
+    assert many.sum() > 50
+    assert not np.isfinite(wrong.ground_level_m[many]).any()
+    right, _ = track(case.epochs, case.line, levels=True)
+    assert np.isfinite(right.ground_level_m[30:]).all()
 
 
 @pytest.mark.requirement("B4", "E5", "C6")
