@@ -39,6 +39,7 @@ import recordings_truth
 import sensed_ride
 from posterior_score import arc_of, bounds
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.settings import write_toml
 from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference, straight_distance
@@ -299,6 +300,30 @@ def moved(case: Case, metres: float) -> Case:
     return on_line(case, points + metres * right)
 
 
+def ended(case: Case, share: float = 0.6) -> Case:
+    """A case whose line ends where the drive is after a share of its epochs; chainages go on beyond the end.
+
+    Nothing is known where the drive comes back to it on another lap.
+    """
+    points, arc = np.asarray(case.trajectory.ecef_m), np.asarray(case.trajectory.arc_m)
+    known = case.reference_arc_m[np.isfinite(case.reference_arc_m)]
+    way = np.sign(known[-1] - known[0])
+    ends = np.sort([known[0] - 100.0 * way, known[int(share * len(known))]])
+    kept = (arc >= ends[0]) & (arc <= ends[1])
+    if kept.sum() < 2:
+        return case
+    other = Trajectory.from_track(Track.from_ecef(points[kept]))
+    at, aside = other.nearest(case.reference_ecef_m)
+    arc_m = case.reference_arc_m - arc[kept][0]
+    lap = (aside < 30.0) & (np.abs(at - arc_m) > 30.0)
+    return replace(
+        case,
+        trajectory=other,
+        reference_arc_m=arc_m,
+        reference_ecef_m=np.where(lap[:, None], np.nan, case.reference_ecef_m),
+    )
+
+
 def roughened(case: Case, metres: float, length_m: float = 80.0, *, seed: int = 0) -> Case:
     """A case whose map wanders across and up by so much over such a length, and says so."""
     at, random = case.trajectory, np.random.default_rng(seed)
@@ -374,12 +399,15 @@ def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterat
         listed.append((f"code {rate:g} m/s", rate * after * of(one), nothing, nothing))
     whole = -100.0 * (of(one) & on)
     listed.append(("clock -100 m", whole, whole, nothing))
-    drift = -1.0 * after * of(one)
-    listed.append(("clock -1 m/s", drift, drift, -1.0 * (of(one) & on)))
+    for rate in (-1.0, 0.5):
+        drift = rate * after * of(one)
+        listed.append((f"clock {rate:g} m/s", drift, drift, rate * (of(one) & on)))
     if len(letters) > 1:
         own = np.char.startswith(obs.satellite.astype(str), letter)[None, :]
         tilt = np.where(own & on, 30.0 * along, 0.0)
         listed.append(("constellation 30 m along", tilt, nothing, nothing))
+        pull = np.where(own, along, 0.0)
+        listed.append(("constellation 0.5 m/s along, all", *(x * pull for x in (0.5 * after, 0.5 * after, 0.5 * on))))
     _, short = since(45.0)
     short = short & (t < 65.0)[:, None]
     listed.append(("Dopplers +5 m/s", nothing, nothing, 5.0 * along * short))
@@ -408,6 +436,9 @@ def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterat
     yield "map 20 m to the right", moved(case, 20.0)
     yield "map 20 m to the left", moved(case, -20.0)
     yield "map 5 m to the right", moved(case, 5.0)
+    north = enu_axes(*geodetic_from_ecef(case.trajectory.ecef_m[0])[:2])[1]
+    yield "map 10 m to the north", on_line(case, np.asarray(case.trajectory.ecef_m) + 10.0 * north)
+    yield "line that ends under way", ended(case)
     yield "map 2 % long", stretched(case, 0.02)
     yield "map wandering by 2 m, stated", roughened(case, 2.0)
 

@@ -291,7 +291,7 @@ def _work_space(
         "weight": (room, most), "residual": (room, most), "fitted": (room, most), "new_mean": (room, unknowns + 1),
         "new_covariance": (room, unknowns, unknowns), "log_before": (room,), "log_after": (room,),
         "evidence": (room,), "code_evidence": (room,), "joined": (5, room), "branch": (room, 3),
-        "pushed": (room,), "variance": (most,), "masked": (most,),
+        "beyond": (room,), "variance": (most,), "masked": (most,),
         "system": (room, size, size), "factor": (size, size), "lower": (size, size), "right": (max(size, room),),
         "diagonal": (size,), "with_clock": (size,),
         "ordered": (most,), "part": (4,), "gain": (size, unknowns + 1), "less": (size, unknowns),

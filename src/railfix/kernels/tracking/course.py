@@ -92,19 +92,11 @@ def gradient_at(line: LineArrays, arc: float) -> float:
 
 
 @borrowing
-def onto_line(line: LineArrays, reach_m: float, work: Work, h: int) -> float:
-    """Put a place a little beyond an end on the line; return how far beyond it was, 0 within its noise.
+def beyond_end(line: LineArrays, work: Work, h: int) -> float:
+    """Return how far a place is beyond an open end, 0 within two of its standard deviations, which are noise.
 
-    Projection on the constraint along the correlations (D. Simon, Kalman filtering with state constraints, 2010); a
-    place within two sigmas of it is noise, and one further out than a start may be wrong is left: the map may end
-    before the line.
+    It goes on straight there: put back onto the end, it would stand while the train drives off the map.
     """
-    mean, covariance = work.new_mean, work.new_covariance
-    excess = min(max(mean[h, ARC], line.start_m), line.end_m) - mean[h, ARC]
-    variance = covariance[h, ARC, ARC]
-    if abs(excess) <= 2.0 * math.sqrt(variance):
-        return 0.0
-    if abs(excess) <= reach_m:
-        for c in range(covariance.shape[1]):
-            mean[h, c] += covariance[h, c, ARC] / variance * excess
-    return float(abs(excess))
+    arc = work.new_mean[h, ARC]
+    excess = abs(min(max(arc, line.start_m), line.end_m) - arc)
+    return excess if excess > 2.0 * math.sqrt(work.new_covariance[h, ARC, ARC]) else 0.0

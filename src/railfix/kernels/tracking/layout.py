@@ -234,7 +234,7 @@ class Work(NamedTuple):
     evidence: Floats
     code_evidence: Floats
     branch: Floats
-    pushed: Floats
+    beyond: Floats
     anew: Masks
     ranked: Indices
     kept: Indices

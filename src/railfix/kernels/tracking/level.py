@@ -24,7 +24,7 @@ from railfix.kernels.tracking.constants import (
     PRECISION_M,
     ROUNDS,
 )
-from railfix.kernels.tracking.course import find_ends, onto_line, point_at
+from railfix.kernels.tracking.course import find_ends, point_at
 from railfix.kernels.tracking.equations import combine, move_sensor_equations, write_equations
 from railfix.kernels.tracking.layout import (
     ARC,
@@ -125,7 +125,6 @@ def _update(inputs: Inputs, t: int, rows: Rows, best: int, work: Work, h: int) -
     first_weights(rows, work.masked, parameters.degrees, 0.0, 0.0, work, h, h)
     reweight(rows, work.masked, parameters.degrees, parameters.level_passes, work, h, h, h)
     apply_update(rows, work, h)
-    onto_line(line, parameters.start_sigma_m, work, h)
 
 
 @borrowing

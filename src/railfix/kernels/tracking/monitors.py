@@ -97,20 +97,20 @@ def watch(
     bank: Subfilters,
     square: float,
     shift: float,
-    pushed_m: float,
+    beyond_m: float,
     dt: float,
     code_s: float,
 ) -> None:
     """Take the contradictions of an epoch into the state.
 
-    `square` is `contradiction` of the most probable hypothesis, `shift` the one that its codes ask for, `pushed_m` how
-    far its place was put back onto an open end of the line, `code_s` the time that the codes stand for.
+    `square` is `contradiction` of the most probable hypothesis, `shift` the one that its codes ask for, `beyond_m` how
+    far its place is beyond an open end of the line, `code_s` the time that the codes stand for.
     """
     scalars = state.scalars
     if not math.isnan(square):
         gained = (min(square, LARGEST_SQUARE) - ALLOWED_SQUARE) * min(dt, 1.0)
         scalars[ACROSS] = max(scalars[ACROSS] + gained, 0.0)
-    if pushed_m > 0.0 and scalars[WEAK_MOTION] >= parameters.end_doubt_s:
+    if beyond_m > 0.0 and scalars[WEAK_MOTION] >= parameters.end_doubt_s:
         scalars[ACROSS] = ACROSS_LOST
     if code_s > 0.0:
         stepped = abs(shift) > STEP_SIGMAS
@@ -118,7 +118,7 @@ def watch(
     withheld = 0.0
     doubtful = scalars[WEAK_CODE] > parameters.level_doubt_code_s or scalars[WEAK_MOTION] > parameters.level_doubt_s
     doubtful = doubtful or scalars[MOTION_MISFIT] > 1.0 - MOTION_FIT
-    if doubtful or scalars[ACROSS] > ACROSS_DOUBT or pushed_m > 0.0:
+    if doubtful or scalars[ACROSS] > ACROSS_DOUBT or beyond_m > 0.0:
         withheld = parameters.level_hold_s
     if scalars[BRANCH_S] < parameters.level_start_s:
         largest = -math.inf

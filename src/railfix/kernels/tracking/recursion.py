@@ -36,7 +36,7 @@ from railfix.kernels.tracking.constants import (
     TRACKING,
     WEAK_FIT,
 )
-from railfix.kernels.tracking.course import on_course, onto_line
+from railfix.kernels.tracking.course import beyond_end, on_course
 from railfix.kernels.tracking.equations import combine, write_equations
 from railfix.kernels.tracking.layout import (
     ACCELERATION,
@@ -183,7 +183,7 @@ def _measure(
         for b in range(len(bank.running)):
             bank.covariance[b, ARC, ARC] += FREED_M**2
     square, dt = contradiction(epochs, t, inputs.line, inputs.parameters, state, work, best), epochs.interval_s[t]
-    watch(inputs.parameters, state, bank, square, 0.0 if best else shift, work.pushed[best], dt, code_s)
+    watch(inputs.parameters, state, bank, square, 0.0 if best else shift, work.beyond[best], dt, code_s)
     return best
 
 
@@ -229,7 +229,7 @@ def _update(inputs: Inputs, t: int, state: KernelState, rows: Rows, work: Work) 
     if count > 1:
         reweigh(line, parameters, rows, state, work, count, epochs.interval_s[t])
     for h in range(count):
-        work.pushed[h] = onto_line(line, parameters.start_sigma_m, work, h)
+        work.beyond[h] = beyond_end(line, work, h)
     return shift
 
 
