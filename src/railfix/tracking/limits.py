@@ -171,7 +171,7 @@ class TrackingLimits(Settings):
     #: track was lost.
     level_start_s: float = Field(default=15.0, ge=0)
     level_hold_s: float = Field(default=5.0, ge=0)  #: A level comes back so long after the last contradiction.
-    #: Pushed beyond an open end with motion in doubt for so long, the track is lost.
+    #: Beyond an open end with motion in doubt for so long, the track is lost.
     end_doubt_s: float = Field(default=0.9, ge=0)
     expired_sigma_m: float = Field(default=200.0, gt=0)  #: Largest standard deviation of a predicted position.
 
