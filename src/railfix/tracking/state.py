@@ -142,7 +142,7 @@ class TrackState:
     direction : float
         Sign of the last speed with a direction.
     speed_range_mps : tuple of float
-        Speeds that are possible after those measured so far (`railfix.kernels.tracking.possible_speed`); no bounds
+        Speeds that are possible after those measured so far (`railfix.kernels.tracking.prediction`); no bounds
         while there are several hypotheses.
     """
 

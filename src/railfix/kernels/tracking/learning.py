@@ -12,6 +12,7 @@ import math
 
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import borrowing
+from railfix.kernels.tracking.algebra import factorise
 from railfix.kernels.tracking.constants import (
     BIAS_FAULTY,
     BIAS_MEMORY_S,
@@ -20,26 +21,35 @@ from railfix.kernels.tracking.constants import (
     CODE_LEAK,
     LARGEST_SCALE,
     LEAST_SCALE,
+    MISFIT_CLIPPED,
+    MISFIT_CODES,
+    MISFIT_LARGEST,
+    MISFIT_LEARNT_S,
+    MISFIT_MOST,
     MOTION_FIT_S,
     MOTION_LEAK,
     SCALE_S,
+    STEP_SIGMAS,
 )
 from railfix.kernels.tracking.layout import (
     FORCE_ROW,
+    MAP_LOG_VARIANCE,
     MOTION_MISFIT,
     RANGE_ROW,
     SCALE_DOPPLER,
     SCALE_PHASE,
+    SHIFT,
+    SHIFT_VARIANCE,
     WEAK_CODE,
     WEAK_MOTION,
     WITHHELD,
     Inputs,
     KernelState,
     Outputs,
+    Parameters,
     Rows,
     Work,
 )
-from railfix.kernels.tracking.misfit import learn_map
 from railfix.kernels.tracking.update import mean_weights
 
 
@@ -121,3 +131,56 @@ def write_rows(outputs: Outputs, rows: Rows, work: Work, t: int, best: int, beli
         kind = min(rows.sensors[j], RANGE_ROW)
         outputs.used[t, 3 + kind] += believed * weight[best, gnss + j] > 0.5
         outputs.sensed[t, kind] = innovation[best, gnss + j]
+
+
+@borrowing
+def code_shift(rows: Rows, work: Work, h: int) -> float:
+    """Shift of the place that the codes of an epoch ask for, over its standard deviation; 0 with too few codes.
+
+    The score of the innovations against a shift: standard normal and white over epochs where the model holds.
+    """
+    if rows.counts[0] < MISFIT_CODES:
+        return 0.0
+    nc, root, own, design, value = rows.counts[0], work.root, work.own, work.design, work.value
+    system, factor, right = work.system, work.factor, work.right
+    clock = root[h, nc]
+    for i in range(nc):
+        for j in range(i, nc):
+            system[h, i, j] = (
+                root[h, i] * root[h, j] * own[h, i, j]
+                + clock * (root[h, i] * own[h, i, nc] + root[h, j] * own[h, j, nc])
+                + clock * clock
+            )
+        system[h, i, i] += work.variance[i] / min(work.weight[h, i], 1.0)
+    factorise(system, h, nc, factor)
+    # both solved forward: the products of U'^-1 by the design with itself and with the values are what is wanted
+    score, information = 0.0, 0.0
+    for i in range(nc):
+        right[i] = design[h, i, 0]
+        work.ordered[i] = value[h, i]
+    for i in range(nc):
+        solved, other = right[i] / factor[i, i], work.ordered[i] / factor[i, i]
+        score += solved * other
+        information += solved * solved
+        for j in range(i + 1, nc):
+            right[j] -= factor[i, j] * solved
+            work.ordered[j] -= factor[i, j] * other
+    if not information > 0.0:
+        return 0.0
+    return float(min(max(score / math.sqrt(information), -MISFIT_MOST), MISFIT_MOST))
+
+
+@borrowing
+def learn_map(scalars: Floats, shift: float, dt: float, parameters: Parameters) -> None:
+    """Take an epoch's shift into the running mean, and raise or lower the error of the map's lengths."""
+    dt = min(dt, 1.0)
+    share = 1.0 - math.exp(-dt / parameters.map_misfit_s)
+    shift = 0.0 if abs(shift) > STEP_SIGMAS else min(max(shift, -MISFIT_CLIPPED), MISFIT_CLIPPED)
+    mean = (1.0 - share) * scalars[SHIFT] + share * shift
+    variance = (1.0 - share) ** 2 * scalars[SHIFT_VARIANCE] + share**2
+    scalars[SHIFT], scalars[SHIFT_VARIANCE] = mean, variance
+    beyond = abs(mean) / (math.sqrt(variance) * parameters.map_misfit_sigmas)
+    scale = scalars[MAP_LOG_VARIANCE] * math.exp(-dt / parameters.map_misfit_kept_s)
+    if beyond > 1.0:
+        scale += 2.0 * math.log(beyond) * dt / MISFIT_LEARNT_S
+    scalars[MAP_LOG_VARIANCE] = min(scale, MISFIT_LARGEST)

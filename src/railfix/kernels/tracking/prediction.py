@@ -1,4 +1,9 @@
-"""Prediction of the unknowns from one epoch to the next."""
+"""Prediction of the unknowns from one epoch to the next, and speeds that a train can have after those measured so far.
+
+Reflections off one wall can agree with each other on a speed and a place that are wrong; with few satellites in view
+the measurements do not show it. The speed does: no train goes from 11 m/s to rest in a second.
+The prediction's own standard deviation does not, as it grows with every epoch without redundancy.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +17,7 @@ from railfix.kernels.tracking.constants import (
     HEIGHT_ROUGHNESS,
     LEAST_STEP_M2,
     RADAR_WALK,
+    SPEED_SIGMAS,
     WHEEL_WALK,
 )
 from railfix.kernels.tracking.layout import (
@@ -20,7 +26,10 @@ from railfix.kernels.tracking.layout import (
     CODE_PLACE,
     DOPPLER_SPEED,
     DRIFT,
+    HYPOTHESES,
+    LEAST_SPEED,
     MAP_LENGTH_ERROR,
+    MOST_SPEED,
     OF_EPOCH,
     PHASE_CLOCK,
     PREVIOUS_ARC,
@@ -31,7 +40,9 @@ from railfix.kernels.tracking.layout import (
     STEP_UP,
     UP,
     Inputs,
+    KernelState,
     Parameters,
+    Rows,
     Work,
 )
 
@@ -148,3 +159,30 @@ def add_bend(parameters: Parameters, work: Work, h: int) -> None:
     position_variance = min(spread[h, ARC, ARC] - length, parameters.start_sigma_m**2)
     spread[h, n + STEP_RIGHT, n + STEP_RIGHT] += position_variance * bend[0] ** 2
     spread[h, n + STEP_UP, n + STEP_UP] += position_variance * bend[1] ** 2
+
+
+@borrowing
+def possible(parameters: Parameters, state: KernelState, rows: Rows, work: Work, dt: float, measured: bool) -> bool:
+    """Return whether the speed after an epoch is possible, and narrow its range to it; no bounds on several branches.
+
+    Enough satellites, or a sensor on board too, are believed whatever the range. Where the speed is not, the range
+    grows by emergency braking, so that braking is followed from the next epoch.
+    """
+    scalars, counts = state.scalars, rows.counts
+    low, high = -math.inf, math.inf
+    if int(scalars[HYPOTHESES]) == 1:
+        change = parameters.service_acceleration_mps2 * dt
+        low, high = scalars[LEAST_SPEED] - change, scalars[MOST_SPEED] + change
+        if measured:
+            satellites = max(counts[1], counts[2])
+            if not 0 < satellites < parameters.trusted_satellites or counts[3] > 0:
+                low, high = -math.inf, math.inf
+            speed = work.new_mean[0, SPEED]
+            reach = SPEED_SIGMAS * math.sqrt(work.new_covariance[0, SPEED, SPEED])
+            if speed + reach < low or speed - reach > high:
+                change = parameters.level_acceleration_mps2 * dt
+                scalars[LEAST_SPEED], scalars[MOST_SPEED] = low - change, high + change
+                return False
+            low, high = max(low, speed - reach), min(high, speed + reach)
+    scalars[LEAST_SPEED], scalars[MOST_SPEED] = low, high
+    return True

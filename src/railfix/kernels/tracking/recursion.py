@@ -12,7 +12,6 @@ from railfix.kernels.compiling import borrowing, borrowing_kernel
 from railfix.kernels.references import by_reference
 from railfix.kernels.tracking.algebra import invert, restart
 from railfix.kernels.tracking.branches import keep_hypotheses, leading, reweigh
-from railfix.kernels.tracking.clocks import start_clocks
 from railfix.kernels.tracking.constants import (
     ACROSS_DOUBT,
     ACROSS_LOST,
@@ -74,13 +73,17 @@ from railfix.kernels.tracking.layout import (
     Subfilters,
     Work,
 )
-from railfix.kernels.tracking.learning import learn, write_rows
+from railfix.kernels.tracking.learning import code_shift, learn, write_rows
 from railfix.kernels.tracking.level import advance_subfilters, speed_bound, write_branches, write_level
-from railfix.kernels.tracking.measurements import choose_rows, choose_sensors, code_interval_s, write_variances
-from railfix.kernels.tracking.misfit import code_shift
+from railfix.kernels.tracking.measurements import (
+    choose_rows,
+    choose_sensors,
+    code_interval_s,
+    start_clocks,
+    write_variances,
+)
 from railfix.kernels.tracking.monitors import contradiction, watch
-from railfix.kernels.tracking.possible_speed import possible
-from railfix.kernels.tracking.prediction import add_bend, predict
+from railfix.kernels.tracking.prediction import add_bend, possible, predict
 from railfix.kernels.tracking.update import apply_update, first_weights, mean_weights, reweight, second_start
 
 
