@@ -7,10 +7,11 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from railfix.kernels.tracking.constants import ACROSS_LOST
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackingLimits, TrackStatus, track
-from railfix.tracking.state import TrackState
+from railfix.tracking.state import StateIndex, TrackState
 from railfix.tracking.velocity import singer_step
 from tracking_cases import Ride, bent_line, corner_line, part, reflected, ride, wheel, with_codes_behind, without_epochs
 
@@ -352,3 +353,19 @@ def test_nothing_learnt_outlives_a_reset() -> None:
         else:
             assert value == begun or str(value) == str(begun) == "NaT", name
     assert state.time == case.epochs.time[-1]
+
+
+@pytest.mark.requirement("C6")
+def test_an_improbable_place_hides_no_other() -> None:
+    """Places near a hypothesis are not begun anew, unless it has drifted off them and is as good as excluded."""
+    case = ride(40, noise=0.5)
+    _, state = track(case.epochs.take(slice(0, 30)), case.line)
+    for name in ("mean", "covariance", "log_code", "log_least", "log_recent"):
+        setattr(state, name, np.repeat(getattr(state, name)[:1], 2, axis=0))
+    for arc in (StateIndex.ARC, StateIndex.PREVIOUS_ARC):
+        state.mean[:, arc] += [600.0, 50.0]
+    state.log_probability, state.origin_m = np.array([0.0, -36.0]), state.mean[:, StateIndex.ARC].copy()
+    state.across = ACROSS_LOST
+    result, _ = track(case.epochs.take(slice(30, None)), case.line, state)
+    assert result.hypotheses[0] == 3
+    np.testing.assert_allclose(result.arc_m, case.arc_m[30:], atol=1.5)

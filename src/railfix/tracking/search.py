@@ -274,7 +274,10 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
             ]
     if lost:
         best = int(np.argmax(state.log_probability))
-        going = mean[best : best + 1, StateIndex.ARC] if weak else mean[:, StateIndex.ARC]
+        elsewhere = 1.0 if weak or state.across >= ACROSS_TAKEN else _ELSEWHERE
+        # One that is less probable than a new place has drifted from where codes would begin it.
+        alive = state.log_probability >= np.log(elsewhere / len(arc))
+        going = mean[best : best + 1, StateIndex.ARC] if weak else mean[alive, StateIndex.ARC]
         there = line.nearest_m(arc[:, None], going)
         arc = arc[(np.abs(there - going) > limits.start_separation_m).all(axis=1)]
         # The old place goes on too, free to be pulled to where the codes are; where the velocity alone contradicts it,
@@ -282,7 +285,6 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         arc = np.concatenate([going, arc]) if weak else arc
         sigma = np.full(len(arc), limits.start_sigma_m)
         fresh = begin(arc, sigma, satellites, line, limits, known=(mean[best], covariance[best]))
-        elsewhere = 1.0 if weak or state.across >= ACROSS_TAKEN else _ELSEWHERE
         share = np.full(len(arc), np.log(elsewhere / max(len(arc), 1)))
         parts = [] if weak else parts
         parts.append((*fresh, share, arc, np.zeros(len(arc))))
