@@ -432,7 +432,7 @@ def test_two_files_keep_their_distance_in_a_replay(tmp_path: Path) -> None:
     machine = LiveEngine(
         railfix.EpochProcessor(railfix.Config(), paths, navigation=railfix.read_navigation(files["nav"])), settings
     )
-    asyncio.run(run_session(machine, sources, [], speed=4.0))
+    asyncio.run(run_session(machine, sources, [], speed=1.0))
     assert machine.counts["rear alone"] == machine.counts["late"] == 0
     assert machine.counts["paired"] == 20
     assert machine.counts["front alone"] == 40
