@@ -425,7 +425,7 @@ def test_the_command_with_tables_and_with_streams_is_the_run(served: dict[bytes,
     streams = [f"--{name}=tcp://127.0.0.1:{port}" for name, port in ports.items()]
     for folder, words in (
         ("tables", tables),
-        ("streams", [*streams, "--speed", "15", "--live", "sensor_wait_s=5", "--live", "period_s=0.03"]),
+        ("streams", [*streams, "--speed", "1.5", "--live", "sensor_wait_s=5", "--live", "period_s=0.03"]),
     ):
         said = RUNNER.invoke(app, ["live", *given, *words, *send, "--out", str(tmp_path / folder)])
         assert said.exit_code == 0, said.output
