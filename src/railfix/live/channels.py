@@ -12,7 +12,7 @@ import multiprocessing
 from collections.abc import Callable, Sequence
 from functools import wraps
 from multiprocessing.connection import Connection
-from typing import Any, Final
+from typing import Any, Concatenate, Final, ParamSpec
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from railfix.io.train_message import encode
 from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.settings import LiveSettings
 from railfix.pipeline.processor import EpochProcessor
+
+P = ParamSpec("P")
 
 #: First word of the second channel.
 _READY: Final = "ready"
@@ -80,6 +82,17 @@ def _second_channel(
             getattr(engine, name)(*arguments, **keywords)
 
 
+def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Concatenate[TwoChannels, P], None]:
+    """The method of the engine, carried out in this channel and then in the second."""
+
+    @wraps(method)
+    def in_both(self: TwoChannels, /, *arguments: P.args, **keywords: P.kwargs) -> None:
+        method(self, *arguments, **keywords)
+        self._call(method.__name__, *arguments, **keywords)
+
+    return in_both
+
+
 class TwoChannels(LiveEngine):
     """A `LiveEngine` with a second one beside it, in a process of its own, that gets every call as well."""
 
@@ -93,6 +106,14 @@ class TwoChannels(LiveEngine):
         # before there is anything to process: waiting for it later would hold up data, and the end by a signal
         if self._recv() != _READY:
             raise ChannelsDisagreeError("the second channel does not start; no message is sent")
+
+    start = _in_both(LiveEngine.start)
+    resume = _in_both(LiveEngine.resume)
+    add_navigation = _in_both(LiveEngine.add_navigation)
+    add_sbas = _in_both(LiveEngine.add_sbas)
+    add_base = _in_both(LiveEngine.add_base)
+    add_samples = _in_both(LiveEngine.add_samples)
+    push = _in_both(LiveEngine.push)
 
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
         """As `LiveEngine.poll`, after both channels have agreed.
@@ -121,21 +142,6 @@ class TwoChannels(LiveEngine):
         self._connection.close()
         self._process.kill()
         self._process.join(timeout=5.0)
-
-
-def _in_both(name: str) -> Callable[..., None]:
-    """A method of the engine that both channels carry out."""
-
-    @wraps(getattr(LiveEngine, name))
-    def in_both(self: TwoChannels, *arguments: Any, **keywords: Any) -> None:
-        getattr(super(TwoChannels, self), name)(*arguments, **keywords)
-        self._call(name, *arguments, **keywords)
-
-    return in_both
-
-
-for _name in ("start", "resume", "add_navigation", "add_sbas", "add_base", "add_samples", "push"):
-    setattr(TwoChannels, _name, _in_both(_name))
 
 
 def compare(ours: list[dict[str, str]], theirs: list[dict[str, str]]) -> None:
