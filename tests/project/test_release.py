@@ -6,6 +6,7 @@ import copy
 import json
 import os
 import runpy
+import shutil
 import subprocess
 import sys
 from importlib.metadata import distribution, version
@@ -186,3 +187,23 @@ def test_interpreters_are_those_that_run(tmp_path: Path) -> None:
     (tmp_path / "python3.99").symlink_to(sys.executable)  # another version than its name says
     assert interpreter(own, [broken, tmp_path]) == tmp_path / f"python{own}"
     assert interpreter("3.99", [tmp_path]) is None
+
+
+@pytest.mark.parametrize("failing", ["", "pytest", "ruff", "mypy"])
+def test_the_checks_fail_exactly_where_one_of_them_does(failing: str, tmp_path: Path) -> None:
+    programs = tmp_path / "programs"
+    for path in (tmp_path / ".ci", programs):
+        path.mkdir()
+    for name in ("rnx2rtkp", "chromium", "pdftotext", "mosquitto", "python"):
+        (programs / name).write_text(f'#!/bin/sh\necho "ran $*"\n[ "$2" != "{failing}" ]\n', encoding="utf-8")
+        (programs / name).chmod(0o755)
+    (tmp_path / "README.md").write_text(
+        "<!-- test command -->\n```sh\n"
+        "mkdir -p .venv/bin && cp programs/python .venv/bin && .venv/bin/python -m pytest\n```\n",
+        encoding="utf-8",
+    )
+    shutil.copy(ROOT / ".ci" / "run", tmp_path / ".ci")
+    path = f"{programs}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run([tmp_path / ".ci" / "run"], capture_output=True, text=True, env=os.environ | {"PATH": path})
+    assert done.returncode == bool(failing), done.stdout + done.stderr
+    assert failing or done.stdout.splitlines()[-1] == "ran -m mypy"
