@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import operator
 import os
 import pickle
 import shutil
@@ -17,6 +18,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 import pytest
+from numba.core.types.functions import BaseFunction
 
 import raim_oracle
 import separation_oracle
@@ -389,3 +391,24 @@ for value in (1, 2):
     assert told == ("compiling for this processor, once: about a minute\n" if terminal else "") + "end\n"
     for end in pipe:
         os.close(end)
+
+
+@pytest.mark.requirement("A8")
+def test_what_the_compiler_has_found_for_types_is_not_looked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[object] = []
+    resolve = BaseFunction.get_call_type
+
+    def count(self: BaseFunction, context: object, args: object, kws: object) -> object:
+        asked.append((self.typing_key, args))
+        return resolve(self, context, args, kws)
+
+    def used_thrice(number: float) -> float:
+        return (number + 1.5) * (number + 2.5) * (number + 3.5)
+
+    monkeypatch.setattr(BaseFunction, "get_call_type", count)
+    with compiling.resolved_once():
+        once = numba.njit(used_thrice)
+        assert once(2.0) == 3.5 * 4.5 * 5.5
+    assert BaseFunction.get_call_type is count
+    additions = [args for function, args in asked if function is operator.add]
+    assert len(additions) == len(set(additions)) > 0

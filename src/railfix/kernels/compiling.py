@@ -7,7 +7,8 @@ import multiprocessing
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeVar, cast
@@ -18,7 +19,9 @@ from numba.core.caching import IndexDataCacheFile
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.options import DefaultOptions
+from numba.core.targetconfig import ConfigStack
 from numba.core.typed_passes import NativeLowering
+from numba.core.types.functions import BaseFunction
 
 from railfix.core.errors import SettingsError
 from railfix.kernels import FILTER_ALONE
@@ -74,6 +77,38 @@ class _InnerCompiler(CompilerBase):
 #: Versions of numba whose inner workings `_InnerCompiler` is known to suit; others compile in the usual way.
 _SUITED: Final = ((0, 61), (0, 68))
 _IS_SUITED: Final = _SUITED[0] <= tuple(int(part) for part in numba.__version__.split(".")[:2]) <= _SUITED[1]
+
+
+@contextmanager
+def resolved_once() -> Generator[None]:
+    """Keep what numba finds for an operator or a function of its own and types of arguments.
+
+    It would ask all implementations anew at each use: a fifth of the time that compiling takes.
+    """
+    if not _IS_SUITED:
+        yield
+        return
+    resolve = BaseFunction.get_call_type
+    found: dict[Any, tuple[Any, Any]] = {}
+
+    def resolve_once(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        # Of the options of a compilation only the counting of references differs between the kernels.
+        counted = getattr(ConfigStack.top_or_none(), "nrt", None)  # type: ignore[no-untyped-call]
+        key = (self.key, context, tuple(args), tuple(kws.items()), counted)
+        known = found.get(key)
+        if known is None:
+            signature: Any = resolve(self, context, args, kws)
+            known = found[key] = signature, self._impl_keys[signature.args]
+        signature, self._impl_keys[signature.args] = known
+        return signature
+
+    BaseFunction.get_call_type = resolve_once  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        BaseFunction.get_call_type = resolve  # type: ignore[method-assign]
+
+
 #: The option is one of numba's own; a numba without it counts.
 _UNCOUNTED: Final[dict[str, Any]] = {"_nrt": False} if hasattr(DefaultOptions, "_nrt") else {}
 _INNER: Final[dict[str, Any]] = {

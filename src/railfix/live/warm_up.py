@@ -22,6 +22,7 @@ import numpy as np
 from railfix import kernels
 from railfix.gnss.observations import Observations
 from railfix.io.rinex import read_navigation, read_observations
+from railfix.kernels.compiling import resolved_once
 from railfix.pipeline.config import parse_config
 from railfix.run.processor import processor_of
 from railfix.simulate.demonstration import demo_inputs
@@ -50,7 +51,7 @@ def prepare_kernels() -> bool:
         return False
     begin = time.monotonic()
     kernels.announced()
-    _say("compiling for this processor, once: about a minute on two cores")
+    _say("compiling for this processor, once: about forty seconds on two cores")
     environment = {**os.environ, kernels.FILTER_ALONE: "1"}
     if kernels.FILTER in missing:
         with subprocess.Popen([sys.executable, "-c", _PROGRAM], env=environment, stderr=subprocess.PIPE) as other:
@@ -86,7 +87,8 @@ def _run(settings: _Settings) -> None:
     """
     gc.disable()
     try:
-        _process(settings)
+        with resolved_once():
+            _process(settings)
     finally:
         gc.enable()
 
