@@ -4,7 +4,7 @@
 recordings as in `belief_campaign`. Kinds: `window`, a map of the way of the minute before the start to the minute after
 the end, on which no course comes back; `reverse`, the map from its end to its beginning; `gps`, one constellation;
 `half-sky`, every 30 s another random half of the satellites; `outages`, 10 s of 40 s without any; `no-doppler`,
-`no-phase`; `wander`, a map drawn to 2 m, and stated so. Several with a plus: ``window+half-sky``.
+`no-phase`, `no-cn0`; `wander`, a map drawn to 2 m, and stated so. Several with a plus: ``window+half-sky``.
 """
 
 from __future__ import annotations
@@ -81,6 +81,7 @@ KINDS: Final[dict[str, Variation]] = {
     "outages": outages,
     "no-doppler": lambda _, part: without(part, np.True_, ("doppler_hz",)),
     "no-phase": lambda _, part: without(part, np.True_, ("phase_cycles",)),
+    "no-cn0": lambda _, part: without(part, np.True_, ("cn0_dbhz",)),
     "wander": lambda _, part: roughened(part, 2.0),
 }
 

@@ -1,25 +1,34 @@
-"""A centre that is killed again and again while its trains report: ``python tests/studies/ground_kills.py [KILLS]``.
+"""What is killed again and again while trains report: ``python tests/studies/ground_kills.py [KILLS] [--of trains]``.
 
-Four trains run over links on a line of twelve stations, a report a second each. The centre is a process that SIGKILL
-ends at a random instant and that is started again on its database. After each kill the database has every report that
-an authority has answered, the number of every authority and its end; at each authority no two trains hold track in
-common. Printed: what was lost, and the time without a centre.
+Four trains run over links on a line of twelve stations, a report a second each. SIGKILL ends the `centre`, the server
+of its `database` (PostgreSQL, which Debian installs in /usr/lib/postgresql; psycopg from the package index), or what
+the `trains` have on board (``railfix ground train``), one in turn, at a random instant; it is started again. After each
+kill the database has every report that an authority has answered, the number of every authority and its end, and no
+two trains hold track in common. Printed: what was lost, and the time until all trains have a new authority.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import json
 import multiprocessing
+import os
 import random
+import shutil
+import subprocess
+import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable
 from itertools import combinations
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Final
 
 import numpy as np
+import psutil
 
 from ground_load import BEARERS_OF, centre_file
 from railfix.ground.interlocking import HEAD, Interlocking, from_documents
@@ -29,7 +38,7 @@ from railfix.ground.serve import run_centre
 from railfix.ground.store import Store
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
 from railfix.ground.train import Authority, OnBoard
-from railfix.io.train_message import encode
+from railfix.io.train_message import encode, to_json
 
 #: Station and direction of each train at the start.
 PLACES = ((0, 1), (2, 1), (11, -1), (9, -1))
@@ -41,10 +50,98 @@ def serve(path: Path, ready: Connection) -> None:
     asyncio.run(run_centre(path, password="secret", announce=ready.send))
 
 
+class Server:
+    """PostgreSQL in a folder, as the user postgres where the study is run by root, who may not."""
+
+    ADDRESS: Final = "postgresql+psycopg://postgres@127.0.1.1:54329/postgres"
+
+    def __init__(self, folder: Path) -> None:
+        self._data = folder / "postgres"
+        self._programs = max(Path("/usr/lib/postgresql").glob("*/bin"))
+        self._user = ["runuser", "-u", "postgres", "--"] if os.getuid() == 0 else []
+        self._data.mkdir()
+        if self._user:
+            folder.chmod(0o755)
+            shutil.chown(self._data, "postgres")
+        self._call("initdb", "--username", "postgres", "--auth", "trust")
+        self.start()
+
+    def _call(self, program: str, *options: str) -> None:
+        command = [*self._user, self._programs / program, "-D", self._data, *options]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+    def start(self) -> None:
+        """Start it, until it can be connected to."""
+        listen = f"-h 127.0.1.1 -p 54329 -k {self._data}"
+        self._call("pg_ctl", "-w", "-l", f"{self._data}/log", "-o", listen, "start")
+
+    def kill(self) -> None:
+        """End all its processes by SIGKILL."""
+        first = psutil.Process(int((self._data / "postmaster.pid").read_text().split()[0]))
+        all_of_it = [first, *first.children()]
+        for process in all_of_it:
+            process.kill()
+        psutil.wait_procs(all_of_it)
+
+
+class TrainProgram:
+    """``railfix ground train`` as a process, which a simulated train gives its positions and obeys."""
+
+    def __init__(self, train: SimulatedTrain, folder: Path) -> None:
+        self.train, self._folder = train, folder
+        self.running: asyncio.subprocess.Process | None = None
+        self.authorities = 0
+
+    async def start(self) -> None:
+        """Start it; the train has no authority before the program says so."""
+        self.train.on_board = OnBoard(direction=self.train.direction, end_m=self.train.front_m)
+        addresses = [word for bearer in BEARERS_OF.values() for word in ("--centre", "{}:{}".format(*bearer.centre))]
+        local = [word for bearer in BEARERS_OF.values() for word in ("--local", bearer.local)]
+        self.running = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "railfix", "ground", "train", str(self.train.number),
+            "--keys", str(self._folder / "keys"), *addresses, *local,
+            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
+        )  # fmt: skip
+
+    async def kill(self) -> None:
+        """End it by SIGKILL; the train has no authority any more."""
+        assert self.running is not None
+        self.running.kill()
+        await self.running.wait()
+        self.train.on_board = OnBoard(direction=self.train.direction, end_m=self.train.front_m)
+
+    def report(self) -> None:
+        """Give it a position; a program that has just been killed takes none."""
+        assert self.running is not None
+        assert self.running.stdin is not None
+        if self.running.returncode is None and not self.running.stdin.is_closing():
+            self.running.stdin.write(to_json(self.train.message(time.monotonic())).encode() + b"\n")
+
+    async def listen(self, received: Callable[[int, Authority], None]) -> None:
+        """Obey what it writes, and what the one says that is started after it."""
+        while True:
+            program = self.running
+            assert program is not None
+            assert program.stdout is not None
+            while line := await program.stdout.readline():
+                said = json.loads(line)
+                age_s = said.pop("age_s", None)
+                if age_s is not None and program is self.running:
+                    authority = Authority.model_validate(said)
+                    assert self.train.on_board.receive(authority)
+                    self.train.on_board.answered_s = time.monotonic() - age_s
+                    received(self.train.number, authority)
+            while program is self.running:
+                await asyncio.sleep(0.05)
+
+
 class KilledCentre:
     """Centre, its trains, and what went wrong."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, of: str) -> None:
+        self.of = of
+        self.server = Server(folder) if of == "database" else None
+        self.programs = dict[int, TrainProgram]()
         self.folder, self.trains = folder, dict[int, SimulatedTrain]()
         for number, (station, direction) in enumerate(PLACES, start=1):
             inner = LINE.stations[station].inner_m
@@ -53,9 +150,16 @@ class KilledCentre:
                 number=number, front_m=front, tracks={station: 1 if direction > 0 else 2}, sequence=first_sequence(),
                 on_board=OnBoard(direction=direction, end_m=front),
             )  # fmt: skip
+        self.address = f"sqlite:///{folder / 'centre.db'}" if self.server is None else Server.ADDRESS
         self.path = centre_file(folder, LINE, self.trains)
+        if self.server is not None:
+            self.path.write_text(f'database = "{self.address}"\n' + self.path.read_text())
+        if of == "trains":
+            self.programs = {number: TrainProgram(train, folder) for number, train in self.trains.items()}
         self.newest: dict[int, Authority] = {}
-        self.lost: Counter[str] = Counter(dict.fromkeys(("reports", "authorities", "ends", "track in common"), 0))
+        self.lost: Counter[str] = Counter(
+            dict.fromkeys(("reports", "authorities", "ends", "track in common", "order"), 0)
+        )
         self.counted: Counter[str] = Counter()
         self.without_s: list[float] = []
         context = multiprocessing.get_context("forkserver")
@@ -75,11 +179,33 @@ class KilledCentre:
         """Take an authority on board."""
         authority = Authority.decode(payload)
         if self.trains[number].on_board.receive(authority):
-            self.newest[number] = authority
-            self.counted["authorities"] += 1
+            self.taken(number, authority)
+
+    def taken(self, number: int, authority: Authority) -> None:
+        """Note an authority that a train has taken; none is older than the one before."""
+        self.lost["order"] += number in self.newest and authority.number <= self.newest[number].number
+        self.newest[number] = authority
+        self.counted["authorities"] += 1
+
+    async def run_program(self, number: int) -> None:
+        """Give a train's program a position once a second."""
+        program = self.programs[number]
+        await program.start()
+        listening = asyncio.create_task(program.listen(self.taken))
+        try:
+            while True:
+                program.train.step(time.monotonic())
+                program.report()
+                self.counted["reports"] += 1
+                await asyncio.sleep(1.0)
+        finally:
+            listening.cancel()
+            await program.kill()
 
     async def run_train(self, number: int) -> None:
         """Report once a second."""
+        if self.programs:
+            await self.run_program(number)
         train = self.trains[number]
         link = TrainLinks(
             number, self.folder / "keys", BEARERS_OF, received=lambda payload: self.received(number, payload)
@@ -96,7 +222,7 @@ class KilledCentre:
 
     def check(self) -> None:
         """Compare the database of a centre that has ended with what its trains know."""
-        with Store(f"sqlite:///{self.folder / 'centre.db'}") as store:
+        with Store(self.address) as store:
             records, state = store.records(), from_documents(store.documents(HEAD))
         for number, authority in self.newest.items():
             known = state.trains[number]
@@ -114,39 +240,60 @@ class KilledCentre:
         for one, other in combinations(held.values(), 2):
             self.lost["track in common"] += overlap(one, other)
 
+    async def kill(self) -> None:
+        """Kill, compare the database with what trains know, and start again."""
+        if self.server is not None:
+            self.server.kill()
+            await asyncio.to_thread(self.server.start)
+            self.check()
+        elif self.programs:
+            program = self.programs[self.counted["kills"] % len(self.programs) + 1]
+            await program.kill()
+            self.check()
+            await program.start()
+        else:
+            assert self.process is not None
+            self.process.kill()
+            self.process.join()
+            self.check()
+            await self.start()
+
     async def run(self, kills: int, seconds: float) -> None:
         """Kill and start again, so often or for so long."""
-        rng, end = random.Random(1), time.monotonic() + seconds
+        rng, killed, end = random.Random(1), 0.0, time.monotonic() + seconds
         await self.start()
         running = [asyncio.create_task(self.run_train(number)) for number in self.trains]
         while self.counted["kills"] < kills and time.monotonic() < end:
             before = dict(self.newest)
             while any(self.newest.get(number) is before.get(number) for number in self.trains):
+                for task in running:
+                    if task.done():
+                        task.result()
                 await asyncio.sleep(0.02)
+            if self.counted["kills"]:
+                self.without_s.append(time.monotonic() - killed)
             await asyncio.sleep(rng.uniform(0.0, 1.0))
-            assert self.process is not None
-            self.process.kill()
             killed = time.monotonic()
-            self.process.join()
+            await self.kill()
             self.counted["kills"] += 1
-            self.check()
-            await self.start()
-            self.without_s.append(time.monotonic() - killed)
         for task in running:
             task.cancel()
         await asyncio.gather(*running, return_exceptions=True)
         assert self.process is not None
         self.process.kill()
+        if self.server is not None:
+            self.server.kill()
 
 
 def main() -> None:
     """Print what was lost."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("kills", type=int, nargs="?", default=200)
+    parser.add_argument("--of", choices=("centre", "database", "trains"), default="centre", help="what is killed")
     parser.add_argument("--seconds", type=float, default=3600.0, help="end after this time, however few kills")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        centre = KilledCentre(Path(name))
+        centre = KilledCentre(Path(name), given.of)
         begun = {number: train.front_m for number, train in centre.trains.items()}
         asyncio.run(centre.run(given.kills, given.seconds))
     way_m = sum(abs(train.front_m - begun[number]) for number, train in centre.trains.items())
@@ -154,7 +301,7 @@ def main() -> None:
           f"{centre.counted['authorities']} authorities; the trains ran {way_m / 1000.0:.1f} km")  # fmt: skip
     print("lost: " + ", ".join(f"{name} {count}" for name, count in centre.lost.items()))
     shown = np.percentile(centre.without_s, [50, 100])
-    print(f"without a centre: median {shown[0]:.2f} s, longest {shown[1]:.2f} s")
+    print(f"until all trains have a new authority: median {shown[0]:.2f} s, longest {shown[1]:.2f} s")
     raise SystemExit(int(any(centre.lost.values())))
 
 
