@@ -1,15 +1,14 @@
 """Scores of the filter along the track on the real recordings: ``python tests/studies/filter_score.py [TABLE ...]``.
 
 Tables: ``figures`` (single epochs beside, and smoothed), ``codes`` (whether their errors are common), ``ablation``
-(without each kind of measurement), ``gaps`` (windows without satellites, with and without a wheel), ``levels``,
-``terms`` (what decides them), ``faults`` (of each satellite in turn, a quarter of an hour; only when asked for),
-``systems`` (one constellation alone), ``cost``. One setting for all recordings; distances are straight ones on the map.
+(without each kind of measurement), ``gaps`` (windows without satellites, with and without a wheel), ``terms`` (what
+decides levels; levels themselves: `belief_campaign`), ``systems`` (one constellation alone). One setting for all
+recordings; distances are straight ones on the map.
 """
 
 from __future__ import annotations
 
 import sys
-import time as clock
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -284,24 +283,7 @@ def show_gaps(all_cases: list[Case]) -> None:
 
 def _levelled(found: Tracked) -> np.ndarray:
     """Epochs with a level: finite, and neither lost nor expired."""
-    return np.isfinite(found.level_m) & ~np.isin(found.status, (TrackStatus.LOST, TrackStatus.EXPIRED))
-
-
-def show_levels(all_cases: list[Case]) -> None:
-    """Levels without a fault put in, and errors over them."""
-    for whole in all_cases:
-        found = whole.run(levels=True)
-        told = _levelled(found)
-        ok = whole.observed & told
-        level, error, noise = found.level_m[ok], whole.error(found)[ok], np.median(found.level_noise_m[ok])
-        print(
-            f"{whole.name:9s} level p50 {np.median(level):.1f}, p95 {np.percentile(level, 95):.1f} m; without the "
-            f"sub-filters {noise:.1f} m; under 10 m {100.0 * np.mean(level < 10.0):.0f} %; alarms "
-            f"{np.count_nonzero(whole.observed & ~told)} of {whole.observed.sum()}; over it "
-            f"{np.count_nonzero(error > level)}, of them with several branches "
-            f"{np.count_nonzero((error > level) & (found.status[ok] == TrackStatus.SEVERAL_BRANCHES))}",
-            flush=True,
-        )
+    return np.isfinite(found.ground_level_m) & ~np.isin(found.status, (TrackStatus.LOST, TrackStatus.EXPIRED))
 
 
 def show_terms(all_cases: list[Case]) -> None:
@@ -312,13 +294,14 @@ def show_terms(all_cases: list[Case]) -> None:
         named: dict[str, list[tuple[float, float, float]]] = {}
         for t in range(len(case.epochs)):
             found, state = track(case.epochs.take(slice(t, t + 1)), line, state, limits=limits, levels=True)
-            if state.bank is None or not len(state.bank.without) or not np.isfinite(found.level_m[0]):
+            if state.bank is None or not len(state.bank.without) or not np.isfinite(found.ground_level_m[0]):
                 continue
             apart = np.abs(state.bank.mean[:, 0] - state.mean[0, 0])
             sigma = np.sqrt(state.bank.covariance[:, 0, 0])
             prior = np.array([given.prior[kind_of(name)] for name in state.bank.without])
-            spent = prior * (ndtr((apart - found.level_m) / sigma) + ndtr((-apart - found.level_m) / sigma))
-            own = 2.0 * ndtr(-found.level_m[0] / found.sigma_m[0])
+            level = found.ground_level_m
+            spent = prior * (ndtr((apart - level) / sigma) + ndtr((-apart - level) / sigma))
+            own = 2.0 * ndtr(-level[0] / found.sigma_m[0])
             k = int(np.argmax(spent))
             name = state.bank.without[k] if spent[k] > own else "noise"
             named.setdefault(name, []).append((max(float(spent[k]), own) / given.risk, sigma[k], apart[k]))
@@ -334,70 +317,7 @@ def show_terms(all_cases: list[Case]) -> None:
         ):
             found = case.run(levels=True, **changes)
             ok = case.observed & _levelled(found)
-            print(f"{case.name:9s} {label}: level p50 {np.median(found.level_m[ok]):.1f} m", flush=True)
-
-
-#: Faults by name: metres of a range so many seconds after they began.
-FAULTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    **{f"ramp {rate:g} m/s": (lambda t, rate=rate: rate * t) for rate in (0.02, 0.1, 0.5, 1.0)},
-    **{f"step {size:g} m": (lambda t, size=size: np.full(len(t), size)) for size in (10.0, 20.0, 50.0, 100.0)},
-}
-
-
-def show_faults(all_cases: list[Case]) -> None:
-    """Every satellite faulty in turn, in the 5 min after it is first measured, from 60 s on; errors over the level.
-
-    The code alone comes late (multipath), or code, phase and Doppler are together too short (satellite clock). An alarm
-    is an epoch without a level. A vehicle that covers its own course several times has laps as branches, at the same
-    place: levels of the status `several_branches` count, errors over them are listed apart too.
-    """
-    print("| recording | fault | trials | level p50 | largest error | least level less error | alarms % | over it |")
-    for whole in all_cases:
-        t = seconds(whole.epochs.time - whole.epochs.time[0])
-        seen = np.isfinite(whole.epochs.code_m)
-        for label, size in FAULTS.items():
-            for whole_channel in (False, True):
-                level, margin, error, alarms, several, trials = [], [], [], 0, 0, 0
-                for k in np.flatnonzero(seen.sum(axis=0) > 120):
-                    first = int(np.argmax(seen[:, k]))
-                    case = whole.part(first, int(np.searchsorted(t, t[first] + FAULT_WINDOW_S)))
-                    found = case.run(with_fault(case.epochs, k, size, whole=whole_channel), levels=True)
-                    faulty = case.observed & (seconds(case.epochs.time - case.epochs.time[0]) > FAULT_FROM_S)
-                    told = faulty & _levelled(found)
-                    off = case.error(found)
-                    level.append(found.level_m[told])
-                    margin.append((found.level_m - off)[told])
-                    error.append(off[told])
-                    alarms += int(np.count_nonzero(faulty & ~told))
-                    branches = found.status == TrackStatus.SEVERAL_BRANCHES
-                    several += int(np.count_nonzero(told & branches & (off > found.level_m)))
-                    trials += 1
-                over = np.concatenate(margin)
-                print(
-                    f"| {whole.name} | {label}{', clock' if whole_channel else ', late'} | {trials} | "
-                    f"{np.median(np.concatenate(level)):.1f} | {np.concatenate(error).max():.1f} | {over.min():.1f} | "
-                    f"{100.0 * alarms / (len(over) + alarms):.1f} | "
-                    f"{np.count_nonzero(over < 0.0)} ({several}) of {len(over)} |",
-                    flush=True,
-                )
-
-
-#: A fault begins so long after a cold start, and is looked at for the rest of the window [s].
-FAULT_FROM_S, FAULT_WINDOW_S = 60.0, 300.0
-
-
-def with_fault(epochs: GnssEpochs, k: int, size: Callable[[np.ndarray], np.ndarray], *, whole: bool) -> GnssEpochs:
-    """Epochs with one channel's code late from `FAULT_FROM_S` on, or all that it measures too short."""
-    since = seconds(epochs.time - epochs.time[0]) - FAULT_FROM_S
-    bias = np.where(since > 0.0, size(since), 0.0)
-    code, phase, rate = epochs.code_m.copy(), epochs.phase_m.copy(), epochs.rate_mps.copy()
-    if not whole:
-        code[:, k] += bias
-        return replace(epochs, code_m=code)
-    code[:, k] -= bias
-    phase[:, k] -= bias
-    rate[:, k] -= np.where(since > 0.0, size(since + 1.0) - size(since), 0.0)
-    return replace(epochs, code_m=code, phase_m=phase, rate_mps=rate)
+            print(f"{case.name:9s} {label}: level p50 {np.median(found.ground_level_m[ok]):.1f} m", flush=True)
 
 
 def show_systems(all_cases: list[Case]) -> None:
@@ -417,26 +337,13 @@ def show_systems(all_cases: list[Case]) -> None:
             print(f"{case.name:9s} {name} {codes:2d} codes  {text}  {ratio_of(case, found)}", flush=True)
 
 
-def show_cost(all_cases: list[Case]) -> None:
-    for case in all_cases:
-        for label, levels in (("off", False), ("on", True)):
-            began = clock.process_time()
-            found = case.run(levels=levels)
-            spent = clock.process_time() - began
-            counts = {s.text: int((found.status == s).sum()) for s in TrackStatus if (found.status == s).any()}
-            print(f"{case.name:9s} level {label:3s} {1e3 * spent / len(found):5.2f} ms an epoch  {counts}")
-
-
 TABLES = {
     "figures": show_figures,
     "codes": show_codes,
     "ablation": show_ablation,
     "gaps": show_gaps,
-    "levels": show_levels,
     "terms": show_terms,
-    "faults": show_faults,
     "systems": show_systems,
-    "cost": show_cost,
 }
 
 
@@ -445,11 +352,10 @@ def main() -> int:
     if not data.is_dir():
         print(f"the real recordings are not at {data}", file=sys.stderr)
         return 1
-    asked = sys.argv[1:] or [name for name in TABLES if name != "faults"]
     listed = list(cases(data))
-    for name in asked:
+    for name in sys.argv[1:] or TABLES:
         print(f"\n{name}")
-        TABLES[name](listed if name in ("ablation", "gaps", "cost") else [*listed, smartloc_case(data)])
+        TABLES[name](listed if name in ("ablation", "gaps") else [*listed, smartloc_case(data)])
     return 0
 
 
