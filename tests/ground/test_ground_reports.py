@@ -38,6 +38,7 @@ RULES["unknown before"] = {OnBoard.receive: {"authority.shortens and not (agrees
 RULES["station reached"] = {
     interlocking.route_requested: {"layout.is_reached(target, here.front_m, direction)": "False"}
 }
+RULES["place covered"] = {supervision.stop_contradicted: {'reason.endswith("is not on the line")': "True"}}
 RULES["points under"] = {
     stops.release_train: {
         "not points[name].wanted == points[name].detected == known.tracks.get(name[0])": "False",
@@ -69,6 +70,23 @@ def test_a_clock_set_forward_makes_no_way_possible(state: Interlocking, monkeypa
     rule_out = True
     take_out(monkeypatch, "clock")
     assert rear_m() == 4900.0 - 205.0
+
+
+def test_a_roll_back_counts_whatever_the_clock_of_the_report(
+    state: Interlocking, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A report was an hour ahead: those after it are older, and say that the train has rolled back by 300 m."""
+    hour, standing = 3_600_000_000_000, {"speed_cmps": 0, "standstill": True}
+    ahead = report(1, 3000.0, time_ns=hour, sent_ns=hour, **standing)
+    back = [report(k, 2700.0, **standing) for k in (2, 3, 4)]
+    found = after(state, ahead, back[0])
+    assert found.trains[1].stop == "the place is older than that of the report before"
+    assert found.trains[1].rear_m == 2495.0
+    released, reason = release_train(found, 1, TWO)
+    assert reason is None
+    assert after(released, *back[1:]).trains[1].stop is None  # its clock counts anew
+    take_out(monkeypatch, "place covered")
+    assert after(state, ahead, back[0]).trains[1].rear_m == 2795.0
 
 
 def test_reports_that_were_late_are_no_clock_set_forward(state: Interlocking) -> None:

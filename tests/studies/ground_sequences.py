@@ -34,6 +34,8 @@ def main() -> None:
     while count < given.random and time.monotonic() < end:
         line = run_sequence(given.first + count)
         violations += line.violations
+        if line.violations:
+            print(f"seed {given.first + count}: {dict(line.violations)}", flush=True)
         seen += line.seen
         count += 1
     print(

@@ -41,7 +41,8 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
     """Return the state with the stop of one train released by hand, and the reason of a refusal.
 
     Points under its interval, which a train that has rolled back has passed, are locked for it again; its next
-    report names its line. Its station becomes the furthest that its front has reached, on the track that it has there.
+    report names its line and its clock. Its station becomes the furthest that its front has reached, on the track that
+    it has there.
     """
     known = state.trains.get(train)
     if known is None or known.stop is None:
@@ -63,7 +64,7 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
     station = known.station  # after a wrong change of ends one behind the train
     while (station + direction) in known.tracks and layout.is_reached(station + direction, known.front_m, direction):
         station += direction
-    moved = replace(known, stop=None, end_m=end, line=None, station=station)
+    moved = replace(known, stop=None, end_m=end, line=None, measured_ns=None, station=station)
     released_state = with_train(replace(state, points=points), moved)
     if overlaps_stopped(released_state, layout) != released_state:
         return state, f"the interval of train {train} meets another one"

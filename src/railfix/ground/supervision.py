@@ -112,23 +112,21 @@ def compute_contradiction(
 def stop_contradicted(
     known: TrainInterval, message: TrainMessage, reason: str, rear: float, ahead: float
 ) -> TrainInterval:
-    """Return a train that is stopped; where it may really be outside its interval, the interval grows."""
+    """Return a train that is stopped, its interval with the place that it reports, unless that is what cannot be right.
+
+    Whatever else is wrong with a report, as its clock, the train may be there.
+    """
     stopped = replace(
         known, stop=known.stop or reason, sequence=message.sequence, standstill=message.standstill, claimed_m=None
     )
     direction = known.direction
-    # Where the line is wrong, of this report or of the first one, the place may be right.
-    if reason.startswith(("the train has changed ends", "the report is of line")):
-        ends = direction * rear, direction * ahead
-        back, front = min(*ends, direction * known.rear_m), max(*ends, direction * known.front_m)
-        return replace(stopped, rear_m=direction * back, front_m=direction * front)
-    if reason in ("the train has rolled back", "the train runs backward"):
-        return replace(stopped, rear_m=direction * min(direction * rear, direction * known.rear_m))
-    if reason == "the train is beyond its authority":
-        return replace(stopped, front_m=direction * max(direction * ahead, direction * known.front_m))
     if reason.startswith(HOLDS_MORE) and message.authority_end_cm is not None:
-        return replace(stopped, end_m=message.authority_end_cm / 100.0)
-    return stopped
+        stopped = replace(stopped, end_m=message.authority_end_cm / 100.0)
+    if reason.startswith(("the bounds of", "the train has moved")) or reason.endswith("is not on the line"):
+        return stopped
+    ends = direction * rear, direction * ahead
+    back, front = min(*ends, direction * known.rear_m), max(*ends, direction * known.front_m)
+    return replace(stopped, rear_m=direction * back, front_m=direction * front)
 
 
 def _turn_contradiction(known: TrainInterval, facing: int, front: float, over: float, under: float) -> str | None:
@@ -264,7 +262,8 @@ class Supervision:
 
     def _read_clock(self, message: TrainMessage, now_s: float) -> tuple[int | None, tuple[float, float]]:
         """Return the train's clock at most, by the delays of the reports before (None without one), and its delay."""
-        before = self._clocks.get(message.train)
+        known = self.state.trains[message.train]
+        before = None if known.measured_ns is None else self._clocks.get(message.train)
         apart_s = now_s - message.sent_ns / 1e9
         least_s = apart_s if before is None else before[0] + CLOCK_DRIFT * (now_s - before[1])
         latest_ns = None if before is None else round((now_s - least_s + CLOCK_TOLERANCE_S) * 1e9)
