@@ -9,8 +9,8 @@ of B-CNAV1. GLONASS has slots, but is corrected on L1OC and L3OC, which are not 
 The standard was not at hand. Layouts are those of cssrlib (sbas.py), least values and degradation those of MAAST
 (L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), slots those of both and of Wireshark (packet-sbas_l5.c). By an
 hour of SouthPAN and BDSBAS (`test_sbas_dfmc.py`) slot and share of the rate have 8 and 4 bits, as in cssrlib, and the
-issue of BeiDou is the IODE of B-CNAV1; corrections of a few centimetres, where group delays differ by metres, are
-without them.
+issue of BeiDou is the IODE of B-CNAV1. BDSBAS corrects clocks of BeiDou-3 by decimetres, where group delays differ by
+metres: they are not in its corrections.
 """
 
 from __future__ import annotations
