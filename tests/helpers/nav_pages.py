@@ -143,6 +143,20 @@ def bcnav2_messages(values: Mapping[str, float], number: int) -> list[np.ndarray
     return [with_crc(text) for text in (ten, eleven, thirty, forty)]
 
 
+def bcnav1_frame(values: Mapping[str, float], number: int, page: int = 1) -> np.ndarray:
+    """1800 symbols of a record as RINEX has it (BDS-SIS-ICD-B1C 1.0, 6.2.2); those that correct others are ones."""
+    v, (ten, eleven, thirty, _) = values, ("".join(map(str, page)) for page in bcnav2_messages(values, number))
+    # orbit and clock have the fields and the order of B-CNAV2
+    second = put([(WEEK - 1356, 13), (TOW_S // 3600, 8), (v["iodc"], 10), (v["iode"], 8)])
+    second += ten[61:264] + eleven[42:264] + thirty[42:111]
+    delays = [v["group_delay_2_s"], v["inter_signal_0"], v["group_delay_1_s"]]
+    second += put([*((delay * 2.0**34, 12) for delay in delays), (0, 7)])
+    third = put([(page, 6), (v["health"], 2), (v["flags"], 3), (v["sismai"], 4), *[(0, 25)] * 9])
+    first = f"{number:06b}" + "1" * 15 + f"{(TOW_S + 60) % 3600 // 18:08b}" + "1" * 43
+    parts = first, with_crc(second), np.ones(600), with_crc(third), np.ones(264)
+    return np.concatenate([np.array([int(bit) for bit in part], dtype=np.uint8) for part in parts])
+
+
 def words_of(page: np.ndarray) -> bytes:
     """Bits as big-endian words of 32 bits, the last one filled with zeros."""
     return np.packbits(np.concatenate([page, np.zeros(-len(page) % 32, np.uint8)])).tobytes()
@@ -160,8 +174,13 @@ def sbf_page(page: np.ndarray, system: str, number: int) -> bytes:
     """GPSRawL5, QZSRawL5, GALRawFNAV, or BDSRawB2a with parity symbols, of a page."""
     kind, shift, source = {"G": (4019, 0, 4), "J": (4068, 180, 26), "E": (4022, 70, 20), "C": (4219, 140, 14)}[system]
     page = np.concatenate([page, np.ones(288, np.uint8)]) if system == "C" else page
+    return sbf_block(kind, page, number + shift, (1, 0, source))
+
+
+def sbf_block(kind: int, page: np.ndarray, sv: int, flags: tuple[int, int, int]) -> bytes:
+    """Block with the bits of a page, as BDSRawB1C has them; `flags`: two of the checks, and the signal."""
     words = np.frombuffer(words_of(page), ">u4").astype("<u4").tobytes()
-    body = struct.pack("<IHBBBBBB", TOW_S * 1000, WEEK, number + shift, 1, 0, source, 0, 1) + words
+    body = struct.pack("<IHBBBBBB", TOW_S * 1000, WEEK, sv, *flags, 0, 1) + words
     rest = struct.pack("<HH", kind, 8 + len(body)) + body
     value = 0
     for byte in rest:

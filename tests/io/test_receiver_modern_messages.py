@@ -1,4 +1,4 @@
-"""CNAV, F/NAV and B-CNAV2 pages of receivers: from broadcast records, against cssrlib's reading, whole and cut streams.
+"""CNAV, F/NAV and B-CNAV pages of receivers: from broadcast records, against cssrlib's reading, whole and cut streams.
 
 `tests/references/nav_pages.json` was written by ``python tests/references/make_nav_page_references.py`` with
 cssrlib 1.2.1, which reads the same pages.
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from conftest import ROOT
-from nav_pages import bcnav2_messages, cnav_pages, fnav_pages, sbf_page, ubx_page
+from nav_pages import bcnav1_frame, bcnav2_messages, cnav_pages, fnav_pages, sbf_block, sbf_page, ubx_page
 from railfix.core.timescale import from_week
 from railfix.gnss.navigation import Navigation
 from railfix.io import read_navigation
@@ -78,22 +78,49 @@ def test_fnav_pages_give_the_record_they_are_made_of_and_cssrlibs(protocol: str)
     assert record.health[0] == 1 << 4 | 0 << 3
 
 
-@pytest.mark.parametrize("protocol", ["ubx", "sbf"])
-def test_bcnav2_messages_give_the_record_they_are_made_of_and_cssrlibs(protocol: str) -> None:
-    data = stream(bcnav2_messages(BCNAV2, 27), "C", 27, protocol=protocol)
+def b1c_block(frame: np.ndarray, number: int = 27, checks: tuple[int, int] = (1, 1)) -> bytes:
+    return sbf_block(4218, frame, number + 140, (*checks, 13))
+
+
+BCNAV: Final = {
+    "ubx": ("bcnav2", stream(bcnav2_messages(BCNAV2, 27), "C", 27, protocol="ubx")),
+    "sbf": ("bcnav2", stream(bcnav2_messages(BCNAV2, 27), "C", 27, protocol="sbf")),
+    "sbf, B1C": ("bcnav1", b1c_block(bcnav1_frame(BCNAV2, 27))),
+}
+
+
+@pytest.mark.parametrize("made", list(BCNAV))
+def test_bcnav_messages_give_the_record_they_are_made_of_and_cssrlibs(made: str) -> None:
+    message, data = BCNAV[made]
     found = navigation(data)
-    record, expected = found.kepler, REFERENCE["bcnav2"]["cssrlib"]
-    assert (record.satellite.tolist(), record.message.tolist()) == (["C27"], ["CNV2"])
+    record, expected = found.kepler, REFERENCE[message]["cssrlib"]
+    assert (record.satellite.tolist(), record.message.tolist()) == (["C27"], [message.upper().replace("BCNAV", "CNV")])
     assert not found.skipped
     for name, value in expected.items():
-        got = getattr(record, name)[0] if name != "isc_1" else record.inter_signal_s[0, 1]
+        got = getattr(record, name)[0] if name[:4] != "isc_" else record.inter_signal_s[0, int(name[4:])]
         assert float(got) == pytest.approx(value, rel=1e-12, abs=1e-22), name
     for name, half in {"af0_s": 2.0**-35, "m0": 1e-9, "omega_dot": 2.0**-44, "crs": 2.0**-9, "cuc": 2.0**-31}.items():
         assert getattr(record, name)[0] == pytest.approx(BCNAV2[name], abs=half * np.pi), name
     assert (record.health[0], record.iode[0], record.iodc[0]) == (1, 117, 629)
     # GPS time is 14 s ahead of BeiDou's, and week 997 of that is week 2353
     assert record.toc[0] == record.toe[0] == from_week(2353, 576_000.0) + np.timedelta64(14, "s")
-    assert record.transmitted[0] == from_week(2353, 576_012.0) + np.timedelta64(14, "s")
+    sent_s = 576_012.0 if message == "bcnav2" else 576_072.0
+    assert record.transmitted[0] == from_week(2353, sent_s) + np.timedelta64(14, "s")
+
+
+def test_bcnav1_frames_damaged_or_of_another_satellite_make_no_record_and_are_read_once() -> None:
+    frame = bcnav1_frame(BCNAV2, 27)
+    assert not len(navigation(b1c_block(frame, 28)).kepler)
+    for place in (100, 660, 1280, 1530):
+        broken = frame.copy()
+        broken[place] ^= 1
+        found = navigation(b1c_block(broken))
+        assert (len(found.kepler), found.skipped) == (0, {"C B-CNAV1 without valid CRC": 1})
+    for checks in ((0, 1), (1, 0)):
+        assert not len(navigation(b1c_block(frame, checks=checks)).kepler)
+    assert not len(navigation(b1c_block(bcnav1_frame(BCNAV2, 27, page=25))).kepler)
+    frame[700] ^= 1  # a symbol that corrects others
+    assert len(navigation(b1c_block(frame) * 2, step=37).kepler) == 1
 
 
 def test_bcnav2_messages_of_two_issues_damaged_or_of_another_satellite_make_no_record() -> None:

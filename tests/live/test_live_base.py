@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-import pyrtklib5
 import pytest
 from typer.testing import CliRunner
 
@@ -21,6 +20,7 @@ from railfix.core.timescale import GPS_EPOCH, SECONDS_PER_WEEK
 from railfix.gnss.observations import Observations
 from railfix.io.rinex import write_observations
 
+pyrtklib5 = pytest.importorskip("pyrtklib5")
 pytestmark = pytest.mark.requirement("A12")
 RUNNER = CliRunner(env={"COLUMNS": "200", "TERM": "dumb", "NO_COLOR": "1"})
 EPOCHS, DATE = 40, "2024-06-24"

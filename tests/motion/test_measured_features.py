@@ -89,7 +89,7 @@ def test_a_folder_without_a_measured_line_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match=r"train.parquet.*has no measured line .*; give a folder of railfix run"):
         read_measured(tmp_path)
     nothing = {name: [None] for name in ("measured_chainage_m", "measured_gradient_permille", "measured_curvature_1pm")}
-    start = [np.datetime64("2024-03-05T03:10:00", "ns")]
+    start = np.array(["2024-03-05T03:10:00"], dtype="datetime64[ns]")
     columns = {"time_gpst": start, "antenna": ["front"], "motion": ["init"]}
     pl.DataFrame({**columns, **nothing}).write_parquet(tmp_path / "train.parquet")
     with pytest.raises(InputFileError, match="has no measured gradient and curvature; run with --tachometer"):

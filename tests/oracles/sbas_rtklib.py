@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import pyrtklib5 as rtk
 
-from pyrtklib_orbits import instant, satellite_number
+from pyrtklib_orbits import instant, rtk, satellite_number
 from railfix.core.timescale import to_week
 from railfix.ranges.sbas import SbasMessages
 

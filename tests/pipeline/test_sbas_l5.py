@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from railfix.core.reasons import Reason
 from railfix.gnss.observations import concatenate
 from railfix.gnss.orbits import satellite_states
 from railfix.pipeline.base_station import BaseStation
+from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import parse_config
 from railfix.ranges.corrected import DFMC_REASONS
 from railfix.ranges.sbas import SbasMessages, SbasState, read_sbas
@@ -158,6 +160,19 @@ def test_corrected_codes_are_true_ranges() -> None:
         own = own[:, np.isfinite(own).all(axis=0)]
         assert own.shape[1] >= 3
         assert np.abs(own - own.mean(axis=1, keepdims=True)).max() < 0.35
+
+
+def test_beidou_is_taken_on_b1c_first() -> None:
+    simulation = Simulation(scenario())
+    first = next(iter(simulation.observations("front")))
+    galileo, e1 = np.char.startswith(first.satellite, "E"), first.signal == "1C"
+    signal = np.where(galileo, np.where(e1, "2I", "1P"), first.signal)
+    obs = replace(first, satellite=np.char.replace(first.satellite, "E", "C"), signal=signal)
+    config = parse_config({"sbas": "stream", "sbas_prn": 137, "sbas_band": "L5"})
+    for chosen, wanted in ((config, "1P"), (parse_config({}), "2I")):
+        channels = ChannelBook(chosen).of(obs, simulation.navigation)
+        names, best = np.unique(channels.satellite, return_index=True)
+        assert set(channels.signal[best[np.char.startswith(names, "C")]]) == {wanted}
 
 
 def test_every_state_has_a_reason() -> None:

@@ -1,11 +1,17 @@
 """Dual-frequency SBAS: layouts, corrections in force, integrity, traps."""
 
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import orbit_cases as cases
 from railfix.core.errors import InputFileError
+from railfix.core.reasons import Reason
+from railfix.gnss.orbits.states import satellite_states
+from railfix.io.rinex import read_navigation
+from railfix.ranges.corrected import dfmc_satellites
 from railfix.ranges.sbas import SbasMessages, read_sbas
 from railfix.ranges.sbas.dfmc import DfmcService, DfmcState, residual_ionosphere_m, slot_satellite
 from railfix.ranges.sbas.messages import message_type, with_parity
@@ -73,11 +79,61 @@ def test_corrections_move_with_their_rates_and_belong_to_an_issue() -> None:
     assert found.sigma_along_m(np.array([[[1.0, 0.0, 0.0]]]))[0, 0] == pytest.approx(0.5 * np.sqrt(2.0))
 
 
-def test_sigma_grows_by_scale_covariance_and_age() -> None:
-    found = at(standard(scale=4, covariance=0.5, degradation=(6.0, 0.02, 0.001)), 12.5)
-    age = 10.5
-    expected = (0.5 + 4 * 0.125) * (np.sqrt(2.0) + 0.5) + np.floor(age / 6.0) * 0.02 + 0.001 * age
+@pytest.mark.parametrize(("age", "steps", "share"), [(10.5, 0, 0.5), (35.5, 0, 0.5), (36.5, 1, 1.0), (73.0, 2, 1.0)])
+def test_sigma_grows_by_scale_covariance_and_age(age: float, steps: int, share: float) -> None:
+    """Half the rate is asked for (the last four bits before the parity are 7), until an interval has passed."""
+    sent = stream.correction(2, 5, 77, (0, 0, 0, 0), time_of_day_s=TOD_S)
+    sent[27] ^= 2  # the first bit of the share
+    more = (2.5, with_parity(sent[None])[0]), (2.5 + age - 1.0, stream.integrity(0, [3, 3, 3]))
+    found = at(standard(*more, scale=4, covariance=0.5, degradation=(36.0, 0.02, 0.001)), 2.5 + age)
+    expected = (0.5 + 4 * 0.125) * (np.sqrt(2.0) + 0.5) + steps * 0.02 + share * 0.001 * age
     assert found.sigma_along_m(np.array([[[0.0, 1.0, 0.0]]]))[0, 0] == pytest.approx(expected)
+
+
+def test_limits_of_type_37() -> None:
+    """35 steps of 6 s and 30 s are what SouthPAN sends; indicator 14 begins at 10 m."""
+    assert int("".join(map(str, np.unpackbits(stream.parameters(1, valid_s=240.0))[10:16])), 2) == 35
+    found = standard(*((t, stream.integrity(0, [14, 3, 3])) for t in (235.0, 242.0)), valid_s=240.0)
+    assert at(found, 241.0).state[0, 0] == DfmcState.OK
+    assert at(found, 241.0).sigma_m[0, 0] == pytest.approx(10.0)
+    assert at(found, 242.5).state[0, 0] == DfmcState.TIMED_OUT
+
+
+def test_beidou_is_corrected_by_the_iode_of_b_cnav1_and_glonass_not_at_all() -> None:
+    slots, satellite, time = (40, 178), np.array(["C20", "R03"]), np.array([START + np.timedelta64(4, "s")])
+    sent = [(float(k + 2), stream.correction(2, slot, 21, (1, 0, 0, 0.5), time_of_day_s=TOD_S))
+            for k, slot in enumerate(slots)]  # fmt: skip
+    own = service((0.0, stream.mask(0, slots)), (1.0, stream.parameters(1)), *sent)
+    kinds = [{"message": name, "iode": iode} for name, iode in (("D1", 21), ("CNV1", 20), ("CNV1", 21))]
+    records = cases.navigation(*({"satellite": "C20", "toe": START, **kind} for kind in kinds))
+    found = own.satellites(time, satellite, records)
+    assert found.state.tolist() == [[DfmcState.OK, DfmcState.NO_RECORD]]
+    assert found.record.tolist() == [[2, -1]]
+    states = satellite_states(time, satellite, np.array(["1P", "1C"]), np.full((1, 2), 2.3e7), records)
+    moved, reason = dfmc_satellites(states, found, satellite, np.array(["1P", "1C"]))
+    assert reason.tolist() == [[0, int(Reason.SBAS_NOT_COVERED)]]
+    assert moved.clock_m[0, 0] - states.clock_m[0, 0] == pytest.approx(0.5)
+    assert dfmc_satellites(states, found, satellite, np.array(["2I", "1C"]))[1][0, 0] == int(Reason.SBAS_NOT_COVERED)
+
+
+def test_an_hour_of_services_under_test(recordings: Path) -> None:
+    """SouthPAN and BDSBAS, 2025-02-15, of L1 and L5: without type 0, which they send for as long as they are tested."""
+    folder = recordings / "sbas" / "msas_20250215"
+    if not (folder / "046r_sbas.txt").is_file():
+        pytest.skip("046r_sbas.txt of cssrlib-data is not beside the recordings")
+    log = read_sbas(folder / "046r_sbas.txt", band="L5", broken_lines="skip")
+    assert log.rejected["parity"] == log.rejected["preamble"] == 0
+    time, navigation = log.time[log.prn == 130][300::10], read_navigation(folder / "046r_rnx.nav")
+    untested = replace(log, **{f.name: getattr(log, f.name)[log.type != 0] for f in fields(log)[:7]})
+    states = {}
+    for prn, names in ((122, ["G24", "E27", "C19"]), (130, ["G24", "E27", "C19", "C20"])):
+        assert (DfmcService(log, prn=prn).satellites(time, np.array(names)).state == DfmcState.STOPPED).all()
+        own = DfmcService(untested, prn=prn)
+        states[prn] = own.satellites(time, np.array(names), navigation).state.T
+        assert set(own._read[37]["valid_32_s"]) == {240.0 if prn == 122 else 150.0}
+    assert [(row == DfmcState.OK).any() for row in states[122]] == [True, True, False]
+    assert (states[122][2] == DfmcState.NOT_IN_MASK).all()
+    assert [np.mean(row == DfmcState.OK).round(2) for row in states[130]] == [1.0, 0.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize(

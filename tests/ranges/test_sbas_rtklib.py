@@ -41,7 +41,6 @@ def seconds_of(log: SbasMessages, step: int) -> np.ndarray:
 )
 def test_corrections_are_those_of_rtklib(recordings: Path, name: str, prn: int, step: int, fewest: int) -> None:
     """Every satellite and every `step` seconds, within 1 mm, and corrected by both or by neither."""
-    pytest.importorskip("pyrtklib5", reason="pyrtklib5 (the oracle) is not installed")
     from sbas_rtklib import replay
 
     log = read_sbas(recordings / "sbas" / name).of(prn)
@@ -74,7 +73,6 @@ def test_corrections_are_those_of_rtklib(recordings: Path, name: str, prn: int, 
 )
 def test_delays_are_those_of_rtklib(recordings: Path, name: str, prn: int, fewest: int) -> None:
     """Places all over Japan and south of it, within 0.1 mm; RTKLIB takes a delay that says do not use for zero."""
-    pytest.importorskip("pyrtklib5", reason="pyrtklib5 (the oracle) is not installed")
     from sbas_rtklib import replay
 
     log = read_sbas(recordings / "sbas" / name).of(prn)
@@ -101,7 +99,6 @@ def test_delays_are_those_of_rtklib(recordings: Path, name: str, prn: int, fewes
 
 @pytest.mark.requirement("C1")
 def test_the_troposphere_is_that_of_rtklib() -> None:
-    pytest.importorskip("pyrtklib5", reason="pyrtklib5 (the oracle) is not installed")
     from sbas_rtklib import troposphere
 
     random = np.random.default_rng(1)

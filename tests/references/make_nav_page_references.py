@@ -16,7 +16,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "helpers"))
 
-from nav_pages import bcnav2_messages, cnav_pages, fnav_pages, words_of  # noqa: E402
+from nav_pages import bcnav1_frame, bcnav2_messages, cnav_pages, fnav_pages, words_of  # noqa: E402
 
 #: GPS PRN 30 on 2025-02-15, 17:30, as a RINEX 4 file has its CNAV record.
 CNAV = {
@@ -42,7 +42,8 @@ FNAV = {
 BCNAV2 = {
     "kind": 3.0, "flags": 0.0, "sismai": 5.0, "health": 1.0, "iode": 117.0, "iodc": 629.0, "toe_sow_s": 576_000.0,
     "toc_s": 576_000.0, "af0_s": -5.7e-4, "af1": 1.9e-11, "af2": 4e-19, "group_delay_1_s": -3.2e-9,
-    "group_delay_2_s": 1.7e-9, "inter_signal_1": -4.1e-10, "sqrt_a": 5282.6123, "a_dot": -0.0123, "delta_n": 3.7e-9,
+    "group_delay_2_s": 1.7e-9, "inter_signal_0": 2.3e-10,
+    "inter_signal_1": -4.1e-10, "sqrt_a": 5282.6123, "a_dot": -0.0123, "delta_n": 3.7e-9,
     "delta_n_dot": -2.2e-14, "m0": 1.7321, "eccentricity": 7.31e-4, "omega": -0.9876, "omega0": -2.4567, "i0": 0.95512,
     "omega_dot": -6.79e-9, "i_dot": 2.6e-10, "cuc": -4.4e-6, "cus": 8.7e-6, "crc": 187.3, "crs": -93.7, "cic": 5.5e-8,
     "cis": -3.9e-8,
@@ -72,14 +73,19 @@ def main() -> None:
     beidou = None
     for page in bcnav2_messages(BCNAV2, 27):
         beidou = raw.decode_bds_b2a(2353, None, prn2sat(uGNSS.BDS, 27), words_of(page)) or beidou
-    of_beidou = named(beidou)
-    of_beidou |= {"a_dot": float(beidou.Adot), "delta_n_dot": float(beidou.delnd)}
-    of_beidou |= {"group_delay_2_s": float(beidou.tgd_b), "isc_1": float(beidou.isc[1])}
+    bits = bcnav1_frame(BCNAV2, 27)  # as cssrlib's decode_sbf.py hands it on
+    page = np.concatenate([bits[72:672], np.zeros(8, np.uint8), bits[1272:1536], bits[21:29]])
+    b1c = raw.decode_bds_b1c(2353, None, prn2sat(uGNSS.BDS, 27), words_of(page))
+    of_beidou = {}
+    for message, k, eph in (("bcnav1", 0, b1c), ("bcnav2", 1, beidou)):
+        of_beidou[message] = named(eph) | {"a_dot": float(eph.Adot), "delta_n_dot": float(eph.delnd)}
+        of_beidou[message] |= {"group_delay_2_s": float(eph.tgd_b), f"isc_{k}": float(eph.isc[k])}
     of_cnav = named(cnav)
     of_cnav |= {"a_dot": float(cnav.Adot), "delta_n_dot": float(cnav.delnd)}
     of_cnav |= {f"isc_{k}": float(cnav.isc[k]) for k in range(4)}
     found = {"cnav": {"given": CNAV, "cssrlib": of_cnav}, "fnav": {"given": FNAV, "cssrlib": named(fnav)}}
-    found["bcnav2"] = {"given": BCNAV2, "cssrlib": of_beidou}
+    found["bcnav1"] = {"cssrlib": of_beidou["bcnav1"]}
+    found["bcnav2"] = {"given": BCNAV2, "cssrlib": of_beidou["bcnav2"]}
     path = ROOT / "tests" / "references" / "nav_pages.json"
     path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 

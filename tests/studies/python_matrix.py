@@ -43,7 +43,7 @@ def folders_of_interpreters() -> list[Path]:
     return [Path(name) for name in os.environ["PATH"].split(os.pathsep)] + sorted(pyenv.glob("*/bin"))
 
 
-def run_with(python: Path, wheel: Path, tests: str | None) -> str:
+def run_with(python: Path, wheel: Path, tests: Sequence[str]) -> str:
     """Install the wheel for one interpreter, run it, and return what came of it in one line."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -54,7 +54,7 @@ def run_with(python: Path, wheel: Path, tests: str | None) -> str:
             "installation": [str(own), "-m", "pip", "install", "-q", asked],
             "version": [str(own), "-m", "railfix", "--version"],
             "demo": [str(own), "-m", "railfix", "demo"],
-            **({"tests": [str(own), "-m", "pytest", "-q", tests]} if tests else {}),
+            **({"tests": [str(own), "-m", "pytest", "-q", *tests]} if tests else {}),
         }
         last = {}
         for step, command in steps.items():
@@ -74,7 +74,7 @@ def main() -> int:
     """Run every version and print a line for each."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("wheel", type=Path)
-    parser.add_argument("--tests", help="tests to run, such as tests/track")
+    parser.add_argument("--tests", nargs="+", default=(), help="tests to run, such as tests/track")
     chosen = parser.parse_args()
     failed = False
     for version in supported_versions():

@@ -238,8 +238,10 @@ class ChannelBook:
         return channels
 
     def _select(self, obs: Observations, glonass: Mapping[str, int]) -> Channels:
-        systems = self._config.systems
-        columns = channel_order(obs.satellite, obs.signal, systems=systems, signals=self._config.signals)
+        systems, signals = self._config.systems, self._config.signals
+        if self._config.dual_frequency_sbas:
+            signals = {name: (*DFMC_SIGNALS.get(name, ((),))[0], *own) for name, own in signals.items()}
+        columns = channel_order(obs.satellite, obs.signal, systems=systems, signals=signals)
         unwanted = np.isin(obs.satellite, self._config.exclude) | np.isin(obs.system, self._config.exclude)
         columns = columns[~unwanted[columns]]
         satellite, signal = obs.satellite[columns], obs.signal[columns]

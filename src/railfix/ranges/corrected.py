@@ -57,6 +57,7 @@ SECOND_SIGNALS: Final[Mapping[str, tuple[str, ...]]] = {
 DFMC_SIGNALS: Final[Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
     "G": (("1C",), ("5Q", "5X", "5I")),
     "E": (("1C", "1X", "1B"), ("5Q", "5X", "5I")),
+    "C": (("1P", "1X", "1D"), ("5P", "5X", "5D")),
 }
 
 #: A C/N0 above the cap counts as the cap.

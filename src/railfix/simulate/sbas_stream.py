@@ -13,7 +13,6 @@ from railfix.core.arrays import Bytes, Floats
 from railfix.core.constants import CARRIER_FREQUENCY, SPEED_OF_LIGHT
 from railfix.core.files import write_whole
 from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta, to_week
-from railfix.ranges.corrected import DFMC_SIGNALS
 from railfix.ranges.sbas import SbasMessages
 from railfix.ranges.sbas.dfmc import AUGMENTED, FIRST, slot_satellite
 from railfix.ranges.sbas.messages import PREAMBLES, message_type
@@ -83,13 +82,13 @@ def parameters(
     *,
     valid_s: float = 120.0,
     covariance: float = 0.0,
-    degradation: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    degradation: tuple[float, float, float] = (30.0, 0.0, 0.0),
     scale: int = 0,
 ) -> Bytes:
     """Type 37: one degradation (interval [s], step [m], rate [m/s]) of all constellations, one code of the scale."""
     interval, step, rate = degradation
-    each = [(round(interval / 6.0), 5), (round(step / 0.01), 8), (round(rate / 0.0002), 8)]
-    valid = (round(valid_s / 6.0), 6)
+    each = [(round(interval / 6.0) - 5, 5), (round(step / 0.01), 8), (round(rate / 0.0002), 8)]
+    valid = (round(valid_s / 6.0) - 5, 6)
     return message(
         37, second, valid, valid, (0, 6), (round(covariance / 0.1), 7), *(each * 6), *([(scale, 4)] * 15), (0, 3)
     )
@@ -105,7 +104,7 @@ _GROWTH_MPS: Final = 0.002  #: Growth of the corrections' errors until the next 
 class SimulatedDfmc(Service):
     """Corrections on L5 of a simulated run: GPS L1 C/A with L5, Galileo E1 with E5a."""
 
-    systems = "".join(DFMC_SIGNALS)
+    systems = "GE"
 
     def clocks_m(self, second: float) -> Floats:
         """Corrections of the clocks of `satellites` [m] for ionosphere-free codes, group delays included.
@@ -139,7 +138,7 @@ class SimulatedDfmc(Service):
         slots = [_SLOT_OF[name] for name in self.satellites]
         messages: list[Callable[[int], Bytes]] = [
             lambda second: mask(second, slots),
-            lambda second: parameters(second, valid_s=240.0, degradation=(0.0, 0.0, _GROWTH_MPS)),
+            lambda second: parameters(second, valid_s=240.0, degradation=(30.0, 0.0, _GROWTH_MPS)),
         ]
         return messages + [self._correction(k, slot) for k, slot in enumerate(slots)]
 

@@ -128,7 +128,7 @@ def validity_s(records: KeplerRecords) -> Floats:
     return np.fmax(base, records.fit_interval_h * 1800.0)
 
 
-_ISSUES: Final = 1024  #: Number of different issues of data: 10 bits of Galileo; GPS and QZSS have 8.
+_ISSUES: Final = 1024  #: Number of different issues of data: 10 bits of Galileo; the others have 8.
 #: Time span that a lookup key can hold [ms]: 278 years.
 _ISSUE_SPAN: Final = np.int64(2**43)
 _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
@@ -140,7 +140,7 @@ class _Issues:
 
     def __init__(self, navigation: Navigation) -> None:
         kepler = navigation.kepler
-        row = np.flatnonzero(np.isin(kepler.message, ("LNAV", "INAV", "FNAV")))
+        row = np.flatnonzero(np.isin(kepler.message, ("LNAV", "INAV", "FNAV", "CNV1")))
         issue = kepler.iode[row] % np.where(kepler.message[row] == "LNAV", 256, _ISSUES)
         names, number = np.unique(kepler.satellite[row], return_inverse=True)
         self.number = {str(name): i for i, name in enumerate(names)}
@@ -173,13 +173,13 @@ def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, i
     satellite : ndarray of str, shape (M,)
     time : ndarray of datetime64[ns], shape (T,)
     issue : ndarray of int, shape (T, M)
-        IODE, of Galileo IODnav; -1 for none. Of 10 bits for GPS and QZSS (IODC) the lower 8 count.
+        IODE (BeiDou: of B-CNAV1), of Galileo IODnav; -1 for none. Of IODC, 10 bits, the lower 8 count.
 
     Returns
     -------
     ndarray of int, shape (T, M)
         The record of that issue whose reference time is nearest, if the epoch lies in its
-        validity; -1 elsewhere, and for satellites other than GPS, QZSS and Galileo. The record may
+        validity; -1 elsewhere, and for GLONASS. The record may
         have been transmitted after the epoch: see `SatelliteStates.future_record`.
     """
     table = _issues_of(navigation)

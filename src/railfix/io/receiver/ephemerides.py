@@ -1,7 +1,7 @@
 """Ephemerides put together from navigation subframes as they are received.
 
-A record needs several subframes of one issue: GPS and QZSS three, Galileo five words, BeiDou three (D1, B-CNAV2)
-or ten pages (D2), GLONASS four strings. `assembled` takes the subframes of a piece of a stream and what
+A record needs several subframes of one issue: GPS and QZSS three, Galileo five words, BeiDou three (D1, B-CNAV1,
+B-CNAV2) or ten pages (D2), GLONASS four strings. `assembled` takes the subframes of a piece of a stream and what
 earlier pieces left unfinished, so that a stream cut anywhere gives the same records.
 """
 
@@ -21,7 +21,7 @@ from railfix.io.receiver import nav_messages
 from railfix.io.receiver.framing import Subframes, fields
 from railfix.io.receiver.measurements import (
     Record,
-    bcnav2_record,
+    bcnav_record,
     beidou_record,
     cnav_record,
     frame_time,
@@ -30,6 +30,7 @@ from railfix.io.receiver.measurements import (
     gps_record,
 )
 from railfix.io.receiver.nav_messages import (
+    BCNAV1_FROM,
     CNAV_FROM,
     E1B_SOURCE,
     E5A_SOURCE,
@@ -197,6 +198,8 @@ class _EphemerisBuilder:
 
     def _maker(self, letter: str, number: int) -> Callable[[str, np.datetime64], Record | None]:
         """Return what makes a record of the message that a subframe is of."""
+        if number >= BCNAV1_FROM:
+            return self._bcnav1
         if number > FNAV_FROM:
             return {"E": self._galileo_f, "C": self._bcnav2}.get(letter, self._modernised)
         if letter == "C":
@@ -280,9 +283,16 @@ class _EphemerisBuilder:
             or int(parts[2]["iodc"]) & 255 != parts[0]["iode"]
         ):
             return None
-        values = {**parts[2], **parts[1], **parts[0]}
-        known = int(values["kind"]) in nav_messages.BCNAV2_AXIS_M and f"C{int(values['number']):02d}" == satellite
-        return bcnav2_record(satellite, values) if known else None
+        return bcnav_record(satellite, "CNV2", {**parts[2], **parts[1], **parts[0]})
+
+    def _bcnav1(self, satellite: str, _: np.datetime64) -> Record | None:
+        """Record of B-CNAV1, whose pages are of one frame, with the health in the last."""
+        parts = self._parts(satellite, tuple(BCNAV1_FROM + k for k in nav_messages.BCNAV1))
+        if parts is None or len({part["tow_s"] for part in parts}) != 1:
+            return None
+        if parts[2]["page"] not in nav_messages.BCNAV1_WITH_HEALTH:
+            return None
+        return bcnav_record(satellite, "CNV1", {**parts[2], **parts[1], **parts[0]})
 
     def _d1(self, satellite: str, time: np.datetime64) -> Record | None:
         parts = self._parts(satellite, (1, 2, 3))

@@ -342,7 +342,8 @@ def joined_subframes(first: Subframes, second: Subframes) -> Subframes:
     return both.take(np.argsort(both.order, kind="stable"))
 
 
-SBAS_L5: Final = -5  #: Signal number of SBAS on L5 among subframes; UBX has none.
+#: Signal numbers among subframes of SBAS on L5 and of pages of B-CNAV1; UBX has none.
+SBAS_L5, BCNAV1_PAGE = -5, -6
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -217,16 +217,20 @@ def cnav_record(satellite: str, values: Values) -> Record:
     return _raw(satellite, "CNAV", toc, numbers), _issue(values, "toe_sow_s", "top", "health", "m0", "af0_s")
 
 
-def bcnav2_record(satellite: str, values: Values) -> Record:
-    """Record of BeiDou from the fields of B-CNAV2 messages 10, 11 and 30 (the whole week: no date is needed)."""
+def bcnav_record(satellite: str, message: str, values: Values) -> Record | None:
+    """Record of BeiDou from the fields of B-CNAV1 or 2 (the whole week: no date is needed); None of another
+    satellite.
+    """
+    if int(values["kind"]) not in nav_messages.BCNAV_AXIS_M or f"C{int(values['number']):02d}" != satellite:
+        return None
     sent = from_week(int(values["week"]) + _BDS_WEEK_MINUS_GPS, values["tow_s"])
     numbers = {
         **values,
-        "sqrt_a": float(np.sqrt(nav_messages.BCNAV2_AXIS_M[int(values["kind"])] + values["delta_a"])),
+        "sqrt_a": float(np.sqrt(nav_messages.BCNAV_AXIS_M[int(values["kind"])] + values["delta_a"])),
         "transmitted": values["tow_s"],
     }
     issue = _issue(values, "iodc", "toe_sow_s", "toc_s", "health")
-    return _raw(satellite, "CNV2", nearest_week(values["toc_s"], sent), numbers), issue
+    return _raw(satellite, message, nearest_week(values["toc_s"], sent), numbers), issue
 
 
 def galileo_record(satellite: str, values: Values, time: np.datetime64) -> Record:

@@ -1,11 +1,11 @@
-"""Navigation messages, bit by bit: GPS, QZSS LNAV and CNAV, Galileo I/NAV, F/NAV, BeiDou D1, D2, B-CNAV2, GLONASS.
+"""Navigation messages, bit by bit: GPS, QZSS LNAV and CNAV, Galileo I/NAV, F/NAV, BeiDou D1, D2, B-CNAV1, 2, GLONASS.
 
 Each function takes the bits of many messages of one kind and returns their fields, scaled, as arrays.
 Angles are turned from semicircles into radians.
 
 Sources: IS-GPS-200N, 20.3.3 and 30.3.3; IS-QZSS-PNT-005, 4.1.2 and 4.3.2; Galileo OS SIS ICD 2.1, 4.2.3 and 4.3.5;
-BDS-SIS-ICD-B1I 3.0, 5.2 and 5.3; BDS-SIS-ICD-B2a 1.0, 6.2 and 7 (as cssrlib
-1.2.1 reads it); GLONASS ICD L1, L2 5.1, 4.4.
+BDS-SIS-ICD-B1I 3.0, 5.2 and 5.3; BDS-SIS-ICD-B1C 1.0, 6.2 and B2a 1.0, 6.2 and 7 (as cssrlib
+1.2.1 reads them); GLONASS ICD L1, L2 5.1, 4.4.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Bytes, Floats, Integers, Masks
-from railfix.io.receiver.framing import Field, Subframes, crc24q, fields, packed_words, unsigned
+from railfix.io.receiver.framing import BCNAV1_PAGE, Field, Subframes, crc24q, fields, packed_words, unsigned
 
 _PI: Final = np.pi
 Coding = tuple[int, float, str]  #: Number of bits, factor, and how it is coded, of a field (as in `Field`).
@@ -170,8 +170,25 @@ BCNAV2: Final = _with_head(BCNAV2_HEAD, {
     30: layout(_BCNAV2_CODINGS, toc_s=42, af0_s=53, af1=78, af2=100, iodc=111, group_delay_2_s=121, inter_signal_1=133,
                group_delay_1_s=219),
 })  # fmt: skip
-#: Semi-major axes that B-CNAV2 refers to [m]: medium orbits (kind 3), and those of the period of the Earth.
-BCNAV2_AXIS_M: Final = {1: 42_162_200.0, 2: 42_162_200.0, 3: 27_906_100.0}
+_BCNAV1_CODINGS: Final[dict[str, Coding]] = {
+    **_BCNAV2_CODINGS,
+    **_flags(page=6),
+    "tow_s": (16, 18.0, "u"),
+    "inter_signal_0": (12, 2.0**-34, "s"),
+}
+BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of subframe 3 that begin with the health; others are not known.
+#: Bits of subframes 2 and 3 of B-CNAV1 in each of the pages that a frame is passed on as, after PRN, number and SOW.
+BCNAV1_PARTS: Final = ((2, 0, 275), (2, 275, 569), (3, 0, 15))
+BCNAV1_HEAD: Final = layout(_BCNAV1_CODINGS, number=0, tow_s=8)
+BCNAV1: Final = _with_head(BCNAV1_HEAD, {
+    0: layout(_BCNAV1_CODINGS, week=24, iodc=45, iode=55, toe_sow_s=63, kind=74, delta_a=76, a_dot=102, delta_n=127,
+              delta_n_dot=144, m0=167, eccentricity=200, omega=233, omega0=266),
+    1: layout(_BCNAV1_CODINGS, i0=24, omega_dot=57, i_dot=76, cis=91, cic=107, crs=123, crc=147, cus=171, cuc=192,
+              toc_s=213, af0_s=224, af1=249, af2=271, group_delay_2_s=282, inter_signal_0=294, group_delay_1_s=306),
+    2: layout(_BCNAV1_CODINGS, page=24, health=30, flags=32, sismai=35),
+})  # fmt: skip
+#: Semi-major axes that B-CNAV1 and B-CNAV2 refer to [m]: medium orbits (kind 3), and those of the period of the Earth.
+BCNAV_AXIS_M: Final = {1: 42_162_200.0, 2: 42_162_200.0, 3: 27_906_100.0}
 CNAV_CHECKED, FNAV_CHECKED, BCNAV2_CHECKED = 276, 214, 264  #: Bits of CNAV, F/NAV and B-CNAV2 before their CRC.
 BEIDOU_CODINGS: Final[dict[str, Coding]] = {
     **_ORBIT,
@@ -312,8 +329,8 @@ _UBX_E5A: Final = (3, 4)
 _CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}  #: Signals with CNAV: L2C and L5.
 #: BeiDou signals with D1 or D2, B-CNAV1 (B1C) and B-CNAV2 (B2a).
 _D_SIGNALS, _B1C, _B2A = (0, 1, 2, 3, 4, 10), (5, 6), (7, 8)
-#: Numbers of F/NAV pages and of CNAV messages among those of a satellite come after these.
-FNAV_FROM, CNAV_FROM = 200, 300
+#: Numbers of F/NAV pages, of CNAV messages and of pages of B-CNAV1 among those of a satellite come after these.
+FNAV_FROM, CNAV_FROM, BCNAV1_FROM = 200, 300, 400
 _PREAMBLE: Final = 0x8B
 Pages = Iterator[tuple[int, int, Values]]  #: Row, number among those of the satellite, and fields of each page.
 
@@ -385,12 +402,14 @@ def _galileo(part: Subframes, counts: Counter[str]) -> Pages:
 
 
 def _beidou(part: Subframes, counts: Counter[str]) -> Pages:
-    """D1, D2 and B-CNAV2."""
+    """D1, D2, B-CNAV1 and B-CNAV2."""
     legacy, first, b2a = (np.isin(part.signal, signals) for signals in (_D_SIGNALS, _B1C, _B2A))
-    counts["C pages of B-CNAV1 (B-CNAV2 of B2a is read, D1 and D2 too)"] += int(np.count_nonzero(first))
-    counts["C pages of other messages"] += int(np.count_nonzero(~legacy & ~first & ~b2a))
+    frame = part.signal == BCNAV1_PAGE
+    counts["C pages of B-CNAV1 of UBX (that of SBF is read)"] += int(np.count_nonzero(first))
+    counts["C pages of other messages"] += int(np.count_nonzero(~legacy & ~first & ~b2a & ~frame))
     bits, valid = _with_crc(part, b2a, BCNAV2_CHECKED, counts, "C B-CNAV2 without valid CRC")
     yield from _of_kinds(bits, valid, unsigned(bits, 6, 6), BCNAV2, CNAV_FROM)
+    yield from _of_kinds(bits, frame, unsigned(bits, 6, 2), BCNAV1, BCNAV1_FROM)
     bits = packed_words(part.words, drop=0, keep=30)
     number = np.array([int(name[1:]) for name in part.satellite.tolist()])
     geo = (number <= 5) | (number >= 59)

@@ -2,8 +2,8 @@
 
 Source: mosaic-X5 reference guide 4.14, sections 4.1.9 (satellites), 4.1.10 (signals), 4.2.1 (MeasEpoch), 4.2.2
 (GPSRawCA, GPSRawL2C, GPSRawL5, GALRawFNAV, GALRawINAV, BDSRaw, GLORawCA, QZSRawL1CA, QZSRawL2C, QZSRawL5, GEORawL1,
-GEORawL5, BDSRawB1C, BDSRawB2a),
-4.2.8 (PVTGeodetic, PVTCartesian).
+GEORawL5, BDSRawB2a), 4.2.8 (PVTGeodetic, PVTCartesian); PolaRx5TR reference guide 5.5.0, page 326 (BDSRawB1C).
+The 72, 1200 and 528 symbols of B-CNAV1 are its three subframes, the bits of each before those that correct them.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week
 from railfix.gnss.observations import named_frequency_hz
-from railfix.io.receiver.framing import SBAS_L5, Frames, Subframes
+from railfix.io.receiver.framing import BCNAV1_PAGE, SBAS_L5, Frames, Subframes, joined_subframes
 from railfix.io.receiver.measurements import Measurements
+from railfix.io.receiver.nav_messages import BCNAV1_PARTS, has_crc
 from railfix.io.receiver.ubx import gathered
 
 Words = np.ndarray[tuple[int, int], np.dtype[np.uint32]]
@@ -51,7 +52,6 @@ _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
     GAL_RAW_FNAV: ("E", {20: 4}),
     GAL_RAW_INAV: ("E", {17: 1, 21: 5, 22: 5}),
     BDS_RAW: ("C", {28: 0, 29: 2, 30: 4}),
-    BDS_RAW_B1C: ("C", {13: 6}),
     BDS_RAW_B2A: ("C", {14: 8}),
     GLO_RAW_CA: ("R", None),
     GEO_RAW_L1: ("S", None),
@@ -98,6 +98,9 @@ _PAGE: Final = np.dtype(
         ("channel", "u1"), ("_", "V1"), ("words", "<u4", 10),
     ]
 )  # fmt: skip
+_FRAME: Final = np.dtype(
+    [("tow_ms", "<u4"), ("week", "<u2"), ("sv", "u1"), ("crc", "u1", 2), ("_", "V3"), ("words", "<u4", 57)]
+)
 _PVT: Final = np.dtype(
     [("tow_ms", "<u4"), ("week", "<u2"), ("mode", "u1"), ("error", "u1"), ("place", "<f8", 3), ("undulation", "<f4")]
 )
@@ -288,7 +291,7 @@ def navigation_subframes(frames: Frames) -> Subframes:
         "SBF navigation pages without valid CRC": int(np.count_nonzero(known & ~passed)),
         "SBF navigation pages of unknown satellites or signals": int(np.count_nonzero(~known)),
     }
-    return Subframes(
+    pages = Subframes(
         satellite=satellite,
         signal=signal,
         glonass_channel=rows["channel"].astype(np.int64) - 8,
@@ -296,11 +299,37 @@ def navigation_subframes(frames: Frames) -> Subframes:
         order=frames.frame_start[chosen],
         skipped={what: number for what, number in counts.items() if number},
     ).take(known & passed)
+    return joined_subframes(pages, _bcnav1_pages(frames))
+
+
+def _bcnav1_pages(frames: Frames) -> Subframes:
+    """Frames of B-CNAV1 with valid CRCs, each as three pages (`nav_messages.BCNAV1`)."""
+    chosen = frames.of("sbf", BDS_RAW_B1C)
+    chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _FRAME.itemsize]
+    rows = gathered(frames.data, frames.start[chosen], _FRAME)
+    bits = np.unpackbits(rows["words"].astype(">u4").view(np.uint8).reshape(len(rows), 228), axis=1)
+    subframe = {2: bits[:, 72:672], 3: bits[:, 1272:1536]}
+    valid = (rows["crc"] == 1).all(axis=1) & has_crc(subframe[2], 576) & has_crc(subframe[3], 240)
+    frame_of_week = 200 * np.packbits(subframe[2][:, 13:21], axis=1).astype(">u2") + np.packbits(bits[:, 21:29], axis=1)
+    sent = np.unpackbits(frame_of_week.astype(">u2").view(np.uint8).reshape(len(rows), 2), axis=1)
+    pages = np.zeros((len(rows), len(BCNAV1_PARTS), 320), dtype=np.uint8)
+    for k, (number, first, end) in enumerate(BCNAV1_PARTS):
+        pages[:, k, :6], pages[:, k, 6:8], pages[:, k, 8:24] = bits[:, :6], (k >> 1, k & 1), sent
+        pages[:, k, 24 : 24 + end - first] = subframe[number][:, first:end]
+    row = np.repeat(np.flatnonzero(valid), len(BCNAV1_PARTS))
+    return Subframes(
+        satellite=_NAMES[rows["sv"]][row],
+        signal=np.full(len(row), BCNAV1_PAGE),
+        glonass_channel=np.zeros(len(row), dtype=np.int64),
+        words=np.packbits(pages[valid], axis=2).reshape(-1).view(">u4").reshape(-1, 10).astype(np.uint32),
+        order=frames.frame_start[chosen][row],
+        skipped={"C B-CNAV1 without valid CRC": int(np.count_nonzero(~valid))} if not valid.all() else {},
+    )
 
 
 def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
     """Places in the stream of navigation pages with a time, and their times."""
-    chosen = frames.of("sbf", *_PAGES)
+    chosen = frames.of("sbf", *_PAGES, BDS_RAW_B1C)
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _TIME.itemsize]
     rows = gathered(frames.data, frames.start[chosen], _TIME)
     dated = (rows["tow_ms"] != _NO_TIME) & (rows["week"] != _NO_WEEK)

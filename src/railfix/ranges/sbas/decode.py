@@ -35,6 +35,7 @@ class BitField(NamedTuple):
     signed: bool = False
     number: int | None = None
     step: int | None = None
+    least: float = 0.0  #: Added to a number with a unit.
 
 
 def _read_signed(first: int, length: int, scale: float | None = None, number: int | None = None) -> BitField:
@@ -168,7 +169,7 @@ def read_fields(bits: Bytes, layout: Layout, offset: int = 0) -> Decoded:
             value = np.where(value >> (field.length - 1), value - (np.int64(1) << field.length), value)
         if field.number is None:
             value = value[:, 0]
-        return value if field.scale is None else np.asarray(value * field.scale, dtype=np.float64)
+        return value if field.scale is None else np.asarray(value * field.scale + field.least, dtype=np.float64)
 
     return {name: read(field) for name, field in layout.items()}
 

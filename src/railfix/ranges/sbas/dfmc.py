@@ -3,10 +3,14 @@
 Messages of 250 bits with preambles of four bits. Types 31 (mask), 32 (orbit and clock with covariance), 34 to 36
 (integrity) and 37 (degradation and the scale of the integrity indicator) are decoded; 39, 40 (orbit of the SBAS
 satellite itself), 42 and 47 are recognised and counted. The corrections are for ionosphere-free ranges of L1 C/A and
-L5, E1 and E5a; biases between the signals are in the clock correction.
+L5, E1 and E5a, where biases between the signals are in the clock correction, and of B1C and B2a, less the group delays
+of B-CNAV1. GLONASS has slots, but is corrected on L1OC and L3OC, which are not read.
 
-The layouts of type 31, preambles and parity agree in two sources; those of types 32 to 37, the order of constellations
-in type 37 and the sum of the degradations stand in one public source each, and no public log was at hand.
+The standard was not at hand. Layouts are those of cssrlib (sbas.py), least values and degradation those of MAAST
+(L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), slots those of both and of Wireshark (packet-sbas_l5.c). By an
+hour of SouthPAN and BDSBAS (`test_sbas_dfmc.py`) slot and share of the rate have 8 and 4 bits, as in cssrlib, and the
+issue of BeiDou is the IODE of B-CNAV1. BDSBAS corrects clocks of BeiDou-3 by decimetres, where group delays differ by
+metres: they are not in its corrections.
 """
 
 from __future__ import annotations
@@ -29,7 +33,7 @@ AUGMENTED: Final = 92  #: Satellites of one mask.
 FIRST: Final = 53  #: Of which type 35 has the first ones, type 36 the others.
 DO_NOT_USE: Final = 15  #: Indicators without a sigma: not monitored is left out of type 32, 15 is do not use.
 #: Sigma by indicator 0 to 14: least value and step [m].
-SIGMA_LEAST_M: Final = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 4.0, 6.0)
+SIGMA_LEAST_M: Final = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 4.0, 10.0)
 SIGMA_STEP_M: Final = (0.0625, 0.125, 0.125, 0.125, 0.125, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5, 0.5, 1.0, 3.0, 6.0)
 _ONE_MORE: Final = -2
 _DEGRADED: Final = ("G", "R", "E", "C", "S", "")  #: Constellations of type 37 in order.
@@ -56,11 +60,11 @@ LAYOUTS: Final[dict[int, Layout]] = {
     35: {"dfrei": BitField(10, 4, number=FIRST), "iodm": BitField(224, 2)},
     36: {"dfrei": BitField(10, 4, number=AUGMENTED - FIRST), "iodm": BitField(224, 2)},
     37: {
-        "valid_32_s": BitField(10, 6, 6.0),
-        "valid_40_s": BitField(16, 6, 6.0),
+        "valid_32_s": BitField(10, 6, 6.0, least=30.0),
+        "valid_40_s": BitField(16, 6, 6.0, least=30.0),
         "en_route_m": BitField(22, 6, 0.5),
         "covariance": BitField(28, 7, 0.1),
-        "interval_s": BitField(35, 5, 6.0, False, 6, 21),
+        "interval_s": BitField(35, 5, 6.0, False, 6, 21, 30.0),
         "step_m": BitField(40, 8, 0.01, False, 6, 21),
         "rate_mps": BitField(48, 8, 0.0002, False, 6, 21),
         "scale": BitField(161, 4, None, False, 15),
@@ -157,7 +161,7 @@ class DfmcService:
         self.notes = (
             *notes,
             f"SBAS on L5 asked for: corrections of {system_name(prn)} PRN {prn} used, for ionosphere-free codes of GPS "
-            "(L1 C/A, L5) and Galileo (E1, E5a); other satellites and signals are rejected",
+            "(L1 C/A, L5), Galileo (E1, E5a) and BeiDou (B1C, B2a); other satellites and signals are rejected",
         )
         self._time = {kind: own.time[own.type == kind] for kind in (0, *LAYOUTS)}
         self._read = {kind: read_fields(own.bits[own.type == kind], layout) for kind, layout in LAYOUTS.items()}
@@ -254,9 +258,8 @@ class DfmcService:
         kind = _DEGRADED.index(name[0])
         age = seconds(time - self._time[32][row])
         interval = scale["interval_s"][ten, kind]
-        steps = np.where(interval > 0.0, np.floor(age / np.where(interval > 0.0, interval, 1.0)), 0.0)
-        rate = scale["rate_mps"][ten, kind] * (sent["rate_share"] + 1.0) / 16.0
-        own["growth_m"][good] = steps * scale["step_m"][ten, kind] + rate * age
+        rate = scale["rate_mps"][ten, kind] * np.where(age > interval, 1.0, (sent["rate_share"] + 1.0) / 16.0)
+        own["growth_m"][good] = np.floor(age / interval) * scale["step_m"][ten, kind] + rate * age
 
     def _newest(self, kind: int, time: Datetimes, longest_s: float) -> Integers:
         """Row of the newest message of a type, -1 without one that is new enough."""
