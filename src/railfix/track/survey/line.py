@@ -93,7 +93,7 @@ def adjust(
             systems.append(eq.position_equations(run, of_run, axes, origin, share, unknowns))
         else:
             systems.append(eq.code_equations(run.signals, of_run, near, origin, share, unknowns))
-            systems.append(eq.change_equations(run.signals, of_run, near, origin, unknowns))
+            systems.append(eq.change_equations(run.signals, of_run, near, origin, share, unknowns))
         systems.append(eq.motion_equations(run, of_run, axes, limits, unknowns))
         systems.append(eq.offset_equations(run, of_run, axes, unknowns))
     if line is not None and ties is not None:
