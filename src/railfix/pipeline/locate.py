@@ -231,6 +231,7 @@ def survey_epochs(
         after_ecef_m=position[step + 1, of_step],
         change_m=np.where(joined, by_phase, by_doppler)[step, of_step],
         change_sigma_m=np.where(joined, phase_m, doppler_m)[step, of_step],
+        by_doppler=doppler[step, of_step],
     )
     epochs = SurveyEpochs(
         time=time,

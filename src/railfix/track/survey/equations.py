@@ -126,9 +126,12 @@ def code_equations(
 
 
 def change_equations(
-    signals: RunSignals, columns: RunColumns, near: Floats, origin: Floats, unknowns: int
-) -> Equations:  # fmt: skip
-    """Changes of ranges: coordinates at both rows and a change of the clock a step."""
+    signals: RunSignals, columns: RunColumns, near: Floats, origin: Floats, share: Floats, unknowns: int
+) -> list[Equations]:  # fmt: skip
+    """Changes of ranges, phases and Dopplers: coordinates at both rows and a change of the clock a step.
+
+    Dopplers stand in for phases that are lost behind obstacles: reflections bias them for as long as the codes.
+    """
     step, sigma = signals.step, signals.change_sigma_m
     before, sight_before = range_with_rotation(signals.before_ecef_m, near[step] + origin)
     after, sight_after = range_with_rotation(signals.after_ecef_m, near[step + 1] + origin)
@@ -138,7 +141,12 @@ def change_equations(
     value += np.einsum("mij,mj->m", first, near[step]) + np.einsum("mij,mj->m", last, near[step + 1])
     parts = [*_point(columns.row[step], first), *_point(columns.row[step + 1], last)]
     parts.append((columns.step[step], (1.0 / sigma)[:, None]))
-    return Equations(matrix=_matrix(1, unknowns, parts), value=value, size=1, share=np.ones(len(step)))
+    matrix = _matrix(1, unknowns, parts)
+    return [
+        Equations(matrix=matrix[kind], value=value[kind], size=1, share=independent[kind], scaled=by_doppler)
+        for by_doppler, independent in ((False, np.ones(len(step))), (True, share[step + 1]))
+        for kind in (np.flatnonzero(signals.by_doppler == by_doppler),)
+    ]
 
 
 def _group_medians(value: Floats, group: Indices) -> Floats:

@@ -38,7 +38,8 @@ _ADJUSTMENT_ROUNDS: Final = 15
 _SETTLED_M: Final = 0.02
 #: Median of the norm of one, two and three standard normal variables.
 _MEDIAN: Final = {1: 0.6745, 2: 1.1774, 3: 1.5382}
-_SCALES: Final = (0.2, 10.0)  #: Scales of the stated standard deviations that residuals may show.
+#: Scales of the stated standard deviations that residuals may show: errors that satellites share are in none of them.
+_SCALES: Final = (0.5, 10.0)
 _ANYWHERE_M: Final = 1e5  #: Loose prior for conditioning: standard deviation of every unknown [m].
 #: Points of the line whose standard deviation is computed at most, others are interpolated, and columns at a time.
 _SIGMAS: Final = 200
@@ -93,7 +94,7 @@ def adjust(
             systems.append(eq.position_equations(run, of_run, axes, origin, share, unknowns))
         else:
             systems.append(eq.code_equations(run.signals, of_run, near, origin, share, unknowns))
-            systems.append(eq.change_equations(run.signals, of_run, near, origin, unknowns))
+            systems += eq.change_equations(run.signals, of_run, near, origin, share, unknowns)
         systems.append(eq.motion_equations(run, of_run, axes, limits, unknowns))
         systems.append(eq.offset_equations(run, of_run, axes, unknowns))
     if line is not None and ties is not None:

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Indices, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Indices, Masks, freeze_arrays
 from railfix.core.settings import Settings, option
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
@@ -22,7 +22,8 @@ COMMON_SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxy
     {1: (0.02, 0.04), 2: (0.2, 0.4), 3: (0.5, 1.0), 4: (0.3, 0.6), 5: (1.0, 2.0)}
 )
 _UNKNOWN_QUALITY: Final = 5
-CLIMB_MPS2: Final = 0.1
+#: Standard deviation of the change of the vertical velocity in a second. Road vehicles: 0.02 to 0.07.
+CLIMB_MPS2: Final = 0.05
 
 
 class SurveyLimits(Settings):
@@ -32,8 +33,9 @@ class SurveyLimits(Settings):
     #: Errors of positions repeat over so long at standstill and over so much way: together they count as one.
     correlation_s: float = Field(default=30.0, ge=0)
     correlation_m: float = Field(default=50.0, ge=0)
-    #: Standard deviation of the change of the horizontal and of the vertical velocity in a second.
-    acceleration_mps2: float = Field(default=1.0, gt=0)
+    #: Standard deviation of the change of the horizontal velocity in a second, east and north: over five seconds, as
+    #: curves and braking last, three road vehicles' changes are 1.2 to 1.8 times the root of the time.
+    acceleration_mps2: float = Field(default=1.5, gt=0)
     freedom: float = Field(default=3.0, gt=0)  #: Degrees of freedom of Student's t errors: outliers lose their weight.
     #: Passes so near to each other, in the same or the opposite direction, are on one line.
     same_line_m: float = option(
@@ -74,6 +76,7 @@ class RunSignals(FrozenArrays):
     #: Change of the range by the carrier phase or Dopplers, shape (C,).
     change_m: Floats
     change_sigma_m: Floats
+    by_doppler: Masks  #: Whether Dopplers give the change, shape (C,).
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
