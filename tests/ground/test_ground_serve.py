@@ -411,8 +411,8 @@ def test_a_train_that_nobody_answers_says_so(folder: Path) -> None:
     ("change", "words"),
     [
         (("track = 1", "track = 3"), "trains.0.track"),
-        (("front_m = 300", "front_m = 90"), "does not stand between the points of A (50 to 350 m): with its"),
-        (('station = "A"', 'station = "X"'), "points of X (none, the stations are A, B)"),
+        (("front_m = 300", "front_m = 90"), "does not stand between the points of A (60 to 440 m): with its"),
+        (('station = "A"', 'station = "X"'), "points of X (none, the stations are A, B, C)"),
         (("listen", "lisen"), "unknown setting lisen"),
         ((":", ";"), "HOST:PORT was expected"),
         (('keys = "keys"', 'keys = "none"'), "railfix ground keys writes it"),
