@@ -42,7 +42,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def evaluated(demo: Path) -> tuple[Evaluation, tuple[dict, ...]]:
     """The evaluation of the demonstration by both programs."""
     truth = demo_files()["truth"]
-    return evaluate_run(demo, truth, options=OPTIONS), independent_evaluation.evaluated(demo, truth)
+    return evaluate_run(str(demo), str(truth), options=OPTIONS), independent_evaluation.evaluated(demo, truth)
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -41,8 +42,16 @@ def test_satellites_and_constellations(log: Observations) -> None:
     assert set(some.satellite) == {"G06", *log.satellite[log.system == "E"]}
     with pytest.raises(KeyError, match="no G99 among the satellites"):
         log[:5, "G99"]
-    with pytest.raises(KeyError, match="is no time"):
-        log["noon":]  # type: ignore[misc]
+    for bound in ("noon", "2024-03-05T03:11:00Z", "03:11:00+09:00", datetime(2024, 3, 5, 3, 11, tzinfo=UTC), 0.5):
+        with pytest.raises(KeyError, match="is no GPS time"):
+            log[bound:]  # type: ignore[misc]
+    for rows in ("G06", 5, [1, 2]):
+        with pytest.raises(KeyError, match=r"is no range of epochs, such as log\[10:20\]"):
+            log[rows]  # type: ignore[index]
+
+
+def test_a_datetime_is_a_bound(log: Observations) -> None:
+    np.testing.assert_array_equal(log[datetime(2024, 3, 5, 3, 11) :].time, log["03:11:00":].time)  # type: ignore[misc]
 
 
 def test_a_result_by_its_antenna(log: Observations) -> None:

@@ -397,11 +397,22 @@ def test_a_centre_counts_what_does_not_count(centre: tuple[ControlCentre, list[A
     assert sorted(control.rejected.values()) == [1, 1, 1, 1]
 
 
+def test_a_train_that_nobody_answers_says_so(folder: Path) -> None:
+    train = SimulatedTrain(number=1, front_m=400.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=400.0))
+    command = [sys.executable, "-m", "railfix", "ground", "train", "1", "--keys", str(folder / "keys"), "--for", "2"]
+    command += ["--centre", "127.0.0.1:9", "--centre", "127.0.0.1:9"]
+    line = to_json(train.message(0.0)) + "\n"
+    done = subprocess.run(command, input=line, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0
+    assert "no authority came, to" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (("track = 1", "track = 3"), "trains.0.track"),
-        (("front_m = 300", "front_m = 90"), "does not stand between the points of A"),
+        (("front_m = 300", "front_m = 90"), "does not stand between the points of A (60 to 440 m): with its"),
+        (('station = "A"', 'station = "X"'), "points of X (none, the stations are A, B, C)"),
         (("listen", "lisen"), "unknown setting lisen"),
         ((":", ";"), "HOST:PORT was expected"),
         (('keys = "keys"', 'keys = "none"'), "railfix ground keys writes it"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
@@ -80,8 +81,9 @@ def test_the_nearest_epoch_is_meant_and_another_time_is_refused(results: Path) -
     assert found.track["antenna"] == found.single["antenna"] == "rear"
     with pytest.raises(MismatchError, match="no epoch within a minute of 23:59:00; it goes from 2024-03-05"):
         explain_epoch(results, "23:59:00")
-    with pytest.raises(SettingsError, match="time is 'noon', expected hh:mm:ss"):
-        explain_epoch(results, "noon")
+    for wrong in ("noon", "03:10:05Z", "2024-03-05 03:10:05+09:00"):
+        with pytest.raises(SettingsError, match=f"time is '{re.escape(wrong)}', expected hh:mm:ss"):
+            explain_epoch(results, wrong)
     with pytest.raises(SettingsError, match="antenna is 'middle', the run has front and rear"):
         explain_epoch(results, clock, antenna="middle")
 

@@ -526,7 +526,7 @@ def test_an_earlier_page_is_replaced_and_an_error_leaves_it(folder: Path, tmp_pa
     page.write_text("old")
     assert RUNNER.invoke(app, ["report", str(tmp_path), "--out", str(page), "--overwrite"]).exit_code == 3
     assert page.read_text() == "old"
-    assert write_report([folder], page).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert write_report([str(folder)], str(page)).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
 

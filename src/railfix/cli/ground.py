@@ -15,7 +15,7 @@ from railfix.cli.console import console_of_tables, show_files, show_table
 from railfix.cli.options import check_outputs, from_models
 from railfix.core.errors import MismatchError, OutputError, SettingsError
 from railfix.core.settings import Settings, option
-from railfix.core.tables import listed
+from railfix.core.tables import listed, plural
 from railfix.ground.train import OnBoardLimits
 from railfix.ground.triangle import MonitorLimits, TriangleLimits
 from railfix.run.output import Overwrite
@@ -200,7 +200,7 @@ class KeyChoices(Settings):
     """Trains that get keys."""
 
     train: tuple[int, ...] = option("Trains, from 1.", metavar="N")
-    days: int = option("Validity of the certificates.", 365, metavar="DAYS", ge=1)
+    days: int = option("Validity of the certificates.", 365, metavar="DAYS", ge=1, le=36_500)
 
 
 @app.command("keys", cls=Command)
@@ -395,7 +395,13 @@ def train(
         integrity=choices.integrity,
         for_s=choices.for_s,
     )
-    asyncio.run(work)
+    reports, authorities = asyncio.run(work)
+    if not authorities:
+        typer.echo(
+            f"railfix ground train: no authority came, to {plural(reports, 'report')}; the page of the centre says why "
+            "a report is rejected, and positions that are replayed from a file are too old for it",
+            err=True,
+        )
 
 
 def _show_figures(figures: dict[str, Any]) -> None:

@@ -154,7 +154,7 @@ def survey(
         f"{result.sigma_plan_m.max():.1f} m at chainage {track.chainage_m[np.argmax(result.sigma_plan_m)]:.0f} m; in "
         f"height {np.median(result.sigma_height_m):.1f} m, largest {result.sigma_height_m.max():.1f} m",
     ]
-    if weak.any():
+    if weak.mean() >= 0.005:
         verdict.append(
             f"{weak.mean():.0%} of it is worse than twice the median: more runs there, or a receiver of two bands, help"
         )

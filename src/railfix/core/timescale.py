@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from datetime import datetime
 from typing import Final
 
 import numpy as np
@@ -28,6 +30,14 @@ _LEAP_UTC: Final = np.array(
     ],
     dtype="datetime64[ns]",
 )  # fmt: skip
+
+
+def gps_time(value: str | datetime | np.datetime64) -> np.datetime64:
+    """Return a time that is GPS time; ValueError where it is no time or has a time zone, which numpy takes for UTC."""
+    text = str(value).strip().replace(" ", "T")
+    if re.search(r":.*([Zz]|[+-][\d:]+)$", text):
+        raise ValueError(f"{value} has a time zone; GPS time has none, and UTC is behind it by the leap seconds")
+    return np.datetime64(text, "ns")
 
 
 def seconds(delta: ArrayLike) -> Floats:

@@ -169,15 +169,16 @@ class _EvaluatedPart:
 
 
 def evaluate_run(
-    run: Path,
-    reference: Reference = None,
+    run: Path | str,
+    reference: Reference | str = None,
     *,
     sections: Path | None = None,
     files: TrackFiles | None = None,
     options: EvaluationOptions | None = None,
 ) -> Evaluation:
     """Evaluate one run against its reference trajectory; see `evaluate_runs`."""
-    item = RunAndReference(run=run, reference=reference)
+    place = Path(reference) if isinstance(reference, str) else reference
+    item = RunAndReference(run=Path(run), reference=place)
     return evaluate_runs([item], sections=sections, files=files, options=options)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from itertools import chain, islice
 from typing import Any, Final
 
@@ -17,6 +18,7 @@ import numpy as np
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, freeze_arrays
 from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP
 from railfix.core.tables import NotebookTable, plural, time_span_text
+from railfix.core.timescale import gps_time
 
 
 def carrier_frequency_hz(
@@ -188,8 +190,10 @@ class Observations(NotebookTable):
             A satellite or constellation that the log does not have, or a bound that is no time.
         """
         rows, names = key if isinstance(key, tuple) else (key, None)
+        if not isinstance(rows, slice):
+            raise KeyError(f"{rows!r} is no range of epochs, such as log[10:20]; satellites are log[:, 'G01']")
         start, stop = (
-            self._epoch_at(bound) if isinstance(bound, str | np.datetime64) else bound
+            bound if bound is None or hasattr(bound, "__index__") else self._epoch_at(bound)
             for bound in (rows.start, rows.stop)
         )
         epochs = slice(start, stop, rows.step)
@@ -206,18 +210,18 @@ class Observations(NotebookTable):
             header=self.header,
         )
 
-    def _epoch_at(self, bound: str | np.datetime64) -> int:
+    def _epoch_at(self, bound: str | datetime | np.datetime64) -> int:
         """Return the number of the first epoch at or after a time."""
         text = str(bound).replace(" ", "T")
         try:
             if "-" in text or not len(self):
-                time = np.datetime64(text, "ns")
+                time = gps_time(text)
             else:
                 day = self.time[0].astype("datetime64[D]")
-                time = np.datetime64(f"{day}T{text}", "ns")
+                time = gps_time(f"{day}T{text}")
                 time += np.timedelta64(1, "D") if time < self.time[0] - np.timedelta64(12, "h") else np.timedelta64(0)
         except ValueError:
-            raise KeyError(f"{bound!r} is no time; expected hh:mm, hh:mm:ss or yyyy-mm-ddThh:mm:ss") from None
+            raise KeyError(f"{bound!r} is no GPS time; expected hh:mm, hh:mm:ss or yyyy-mm-ddThh:mm:ss") from None
         return int(np.searchsorted(self.time, time))
 
     def _channels_of(self, names: Sequence[str]) -> Indices:

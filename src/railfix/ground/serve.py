@@ -123,9 +123,11 @@ class CentreFile(Settings):
             low, high = sorted((train.front_m, train.front_m - train.direction * train.length_m))
             found = layout.station_at(low - train.bound_m, high + train.bound_m)
             if found is None or layout.stations[found].name != train.station:
+                tracks = {station.name: "{:.0f} to {:.0f} m".format(*station.inner_m) for station in layout.stations}
+                where = tracks.get(train.station, f"none, the stations are {', '.join(tracks)}")
                 raise ValueError(
-                    f"train {train.number} does not stand between the points of {train.station} "
-                    f"({low - train.bound_m:.0f} to {high + train.bound_m:.0f} m)"
+                    f"train {train.number} does not stand between the points of {train.station} ({where}): with its "
+                    f"bounds it is at {low - train.bound_m:.0f} to {high + train.bound_m:.0f} m"
                 )
         places = [(train.station, train.track) for train in self.trains]
         if len(set(places)) < len(places):
@@ -144,9 +146,8 @@ class CentreFile(Settings):
         try:
             return self.replaced(stations=stations, network=())
         except ValidationError as error:
-            named = ", ".join(f"{s.name} {s.inner_m[0]:.0f} to {s.inner_m[1]:.0f} m" for s in stations)
             message = error.errors()[0]["msg"].removeprefix("Value error, ")
-            raise SettingsError(f"trains: {message}; the network has {named}") from None
+            raise SettingsError(f"trains: {message}") from None
 
     @property
     def layout(self) -> Layout:

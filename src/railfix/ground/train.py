@@ -212,8 +212,10 @@ async def run_train(
     limits: OnBoardLimits | None = None,
     integrity: Path | None = None,
     for_s: float | None = None,
-) -> None:
+) -> tuple[int, int]:
     """Send the newest position every second, and write authorities and braking as lines of JSON.
+
+    Returns the number of reports and of authorities.
 
     With the train's own two files and ``authority.pem`` of the folder `keys`. The positions are messages as
     `railfix.io.train_message.to_json` writes them, from the standard input by default. With `integrity`, a file of the
@@ -234,6 +236,7 @@ async def run_train(
         for task in (reading, sending):
             task.cancel()
         await links.stop()
+    return desk.reports, desk.authorities
 
 
 def is_complete(path: Path) -> bool:
@@ -259,6 +262,7 @@ class _Desk:
         self._sequence = first_sequence()
         self._on_board: OnBoard | None = None
         self._reason: str | None = ""
+        self.reports = self.authorities = 0
 
     async def read(self, lines: AsyncIterator[str]) -> None:
         async for line in lines:
@@ -280,6 +284,7 @@ class _Desk:
     def _report(self, links: TrainLinks, message: TrainMessage, now_s: float) -> None:
         # numbers go on rising where the source of the positions is started again
         self._sequence += 1
+        self.reports += 1
         complete = message.complete if self._integrity is None else is_complete(self._integrity)
         taken = {} if self._on_board is None else self._on_board.acknowledgement()
         message = message.replaced(train=self._train, sequence=self._sequence, complete=complete, **taken)
@@ -309,6 +314,7 @@ class _Desk:
             self._line(rejected=str(error))
             return
         if self._on_board is not None and authority.train == self._train and self._on_board.receive(authority):
+            self.authorities += 1
             self._line(**authority.model_dump(), age_s=round(self._on_board.age_s(time.monotonic()), 3))
 
     def _line(self, **values: Any) -> None:

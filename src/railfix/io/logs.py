@@ -13,6 +13,7 @@ import numpy as np
 
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import BrokenLines, Paths, listed
+from railfix.core.timescale import gps_time
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io import rinex
@@ -63,6 +64,8 @@ def read_observations(
     ModuleNotFoundError
         georinex is not installed (``pip install railfix[notebook]``).
     """
+    if reader not in ("railfix", "georinex"):
+        raise ValueError(f"reader is {reader!r}, 'railfix' or 'georinex' was expected")
     if reader == "georinex":
         return _by_georinex(listed(path), systems, _instant(start), _instant(end))
     pieces = scan_observations(
@@ -155,7 +158,7 @@ def _mate_pieces(
 
 
 def _instant(time: Time) -> np.datetime64 | None:
-    return None if time is None else np.asarray(time, dtype="datetime64[ns]").reshape(1)[0]
+    return None if time is None else gps_time(time)
 
 
 def _receiver_runs(

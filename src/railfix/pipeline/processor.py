@@ -118,8 +118,8 @@ class EpochProcessor:
         stations: Stations | None = None,
         screens: Sequence[Screen[Any]] = (),
     ) -> None:
-        if not trajectories:
-            raise ValueError("at least one antenna's trajectory is needed")
+        if not (isinstance(trajectories, Mapping) and trajectories):
+            raise ValueError("trajectories are one for each antenna, at least one: {'front': trajectory}")
         if len({(t.sigma_plan_m, t.sigma_height_m) for t in trajectories.values()}) > 1:
             raise ValueError("the trajectories of the antennas have different sigmas of the map; they are of one map")
         self.config = config
@@ -241,6 +241,8 @@ class EpochProcessor:
         base: Observations | None = None,
     ) -> tuple[SolvedChunk, State]:
         """Return the single epochs of one chunk: the part of `process` before the filter; parameters are the same."""
+        if not (isinstance(observations, Mapping) and observations):
+            raise ValueError("observations are one log for each antenna, at least one: {'front': log}")
         unknown = sorted(set(observations) - set(self.trajectories))
         if unknown:
             raise ValueError(f"no trajectory for antenna {', '.join(unknown)}")

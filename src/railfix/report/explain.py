@@ -21,6 +21,7 @@ from railfix.core.constants import CLOCK_GROUP
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.geodesy import enu_axes
+from railfix.core.timescale import gps_time
 from railfix.evaluate.inputs import RunFolder, read_run
 from railfix.run.record import reading_table
 from railfix.track import read_track
@@ -120,10 +121,10 @@ def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanat
 
 def _nearest(times: Any, at: str) -> int:
     """Return the row whose time is the nearest to what was asked for."""
-    text = at.strip().replace("T", " ")
+    text = at.strip()
     days = np.unique(times.astype("datetime64[D]")) if ":" in text and "-" not in text else [None]
     try:
-        asked = [np.datetime64(text.replace(" ", "T") if day is None else f"{day}T{text}", "ns") for day in days]
+        asked = [gps_time(text if day is None else f"{day}T{text}") for day in days]
     except ValueError:
         raise SettingsError(f"time is {at!r}, expected hh:mm:ss or 'yyyy-mm-dd hh:mm:ss' in GPS time") from None
     rows = [int(np.argmin(np.abs(times - one))) for one in asked]

@@ -222,12 +222,12 @@ _LEAST_SKY: Final = 200
 
 
 def write_report(
-    runs: Sequence[Path],
-    out: Path,
+    runs: Sequence[Path | str],
+    out: Path | str,
     *,
-    references: Sequence[Path] = (),
-    conventional: Sequence[Path] = (),
-    background: Path | None = None,
+    references: Sequence[Path | str] = (),
+    conventional: Sequence[Path | str] = (),
+    background: Path | str | None = None,
     title: str = "",
     options: EvaluationOptions | None = None,
 ) -> Path:
@@ -258,9 +258,10 @@ def write_report(
     OutputError
         The page cannot be written.
     """
-    reported, evaluation = read_runs(runs, references, conventional=conventional, options=options)
-    lines = () if background is None else read_background(background)
-    return write_page(reported, evaluation, out, background=lines, title=title)
+    folders, others, unscreened = ([Path(name) for name in names] for names in (runs, references, conventional))
+    reported, evaluation = read_runs(folders, others, conventional=unscreened, options=options)
+    lines = () if background is None else read_background(Path(background))
+    return write_page(reported, evaluation, Path(out), background=lines, title=title)
 
 
 def write_page(

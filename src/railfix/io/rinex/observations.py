@@ -18,7 +18,7 @@ import numpy as np
 from railfix.core.arrays import Integers, Masks
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import BrokenLines, ByteStream, FilePath, Paths, listed, open_stream
-from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
+from railfix.core.timescale import bdt_to_gpst, gps_time, utc_to_gpst
 from railfix.gnss.observations import Observations, channels_with_data, concatenate
 from railfix.io.rinex.header import RinexHeader, apply_records, parse_header, read_header_bytes
 from railfix.io.rinex.observations_decode import PADDING, decode, lines_per_satellite
@@ -312,7 +312,7 @@ def _selection(
     limits = {}
     for name, time in (("start_ns", start), ("end_ns", end)):
         if time is not None:
-            limits[name] = int(np.asarray(time, dtype="datetime64[ns]").astype(np.int64))
+            limits[name] = int(gps_time(time).astype(np.int64))
     return Selection(broken_lines=broken_lines, systems=letters, **limits)
 
 
