@@ -396,10 +396,12 @@ def train(
         for_s=choices.for_s,
     )
     reports, authorities = asyncio.run(work)
-    if not authorities:
+    if not reports:
+        typer.echo("railfix ground train: nothing was reported: the input ended before the first look at it", err=True)
+    elif not authorities:
         typer.echo(
             f"railfix ground train: no authority came, to {plural(reports, 'report')}; the page of the centre says why "
-            "a report is rejected, and positions that are replayed from a file are too old for it",
+            "a report is rejected",
             err=True,
         )
 
