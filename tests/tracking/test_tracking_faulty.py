@@ -56,6 +56,16 @@ def test_a_code_that_stays_wrong_is_left_out_and_comes_back(size_m: float) -> No
     np.testing.assert_array_equal(np.concatenate(pieces), found.faulty)
 
 
+@pytest.mark.requirement("C6", "E5")
+def test_errors_of_orbits_clocks_and_the_ionosphere_are_no_faults() -> None:
+    """Under an open sky they are larger than the noise of a code, and last for the whole run."""
+    case = ride(400, noise=1.0, seed=3, code_sigma_m=0.5, speed_mps=lambda t: np.clip(0.5 * (t - 10.0), 0.0, 5.0))
+    nominal = np.random.default_rng(3).normal(0.0, 1.0, case.epochs.code_m.shape[1])
+    found, _ = track(replace(case.epochs, code_m=case.epochs.code_m + nominal), case.line, levels=True)
+    assert np.isfinite(found.level_m[60:]).all()
+    assert (np.abs(found.arc_m - case.arc_m) < found.level_m)[60:].all()
+
+
 @pytest.mark.requirement("C6")
 def test_many_faulty_satellites_are_a_wrong_map() -> None:
     """10 m aside in curves: each satellite contradicts the map by itself, and without them nothing does."""

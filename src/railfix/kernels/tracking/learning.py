@@ -28,6 +28,7 @@ from railfix.kernels.tracking.constants import (
     MISFIT_MOST,
     MOTION_FIT_S,
     MOTION_LEAK,
+    NOMINAL_M,
     SCALE_S,
     STEP_SIGMAS,
 )
@@ -92,7 +93,8 @@ def learn(
     for i in range(nc):
         k = rows.codes[i]
         left_out += abs(state.code_bias[epochs.slot[k]]) > BIAS_FAULTY
-        sigma = epochs.code_sigma_m[t, k] * math.sqrt(1.0 + parameters.code_white_share**2)
+        own = epochs.code_sigma_m[t, k] ** 2 * (1.0 + parameters.code_white_share**2)
+        sigma = math.sqrt(own + NOMINAL_M**2)
         now = update_bias(state.code_bias, epochs.slot[k], innovation[best, i] / sigma, code_s)
         found = found or now
     if left_out > BIAS_SATELLITES:
