@@ -66,6 +66,18 @@ def test_errors_of_orbits_clocks_and_the_ionosphere_are_no_faults() -> None:
     assert (np.abs(found.arc_m - case.arc_m) < found.level_m)[60:].all()
 
 
+@pytest.mark.requirement("C6", "E5")
+def test_three_late_codes_are_reflections_and_no_wrong_map() -> None:
+    case = ride(400, noise=1.0, seed=3, code_sigma_m=2.0, speed_mps=lambda t: np.clip(0.5 * (t - 10.0), 0.0, 5.0))
+    code = case.epochs.code_m.copy()
+    code[30:, [1, 4, 7]] += 15.0
+    found, _ = track(replace(case.epochs, code_m=code), case.line, levels=True)
+    several = found.faulty.sum(axis=1) > 2
+    assert several.sum() > 100
+    assert np.isfinite(found.level_m[several]).mean() > 0.9
+    assert (np.abs(found.arc_m - case.arc_m) < found.level_m)[5:].all()
+
+
 @pytest.mark.requirement("C6")
 def test_many_faulty_satellites_are_a_wrong_map() -> None:
     """10 m aside in curves: each satellite contradicts the map by itself, and without them nothing does."""

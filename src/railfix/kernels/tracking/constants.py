@@ -86,7 +86,8 @@ BIAS_MOST: Final = 1.0
 BIAS_FAULTY: Final = 0.35
 #: Standard deviation of a satellite's errors that last for hours without a fault: orbit, clock, ionosphere [m].
 NOMINAL_M: Final = 1.5
-#: More satellites left out at a time have no faults of their own: the map or a constellation is wrong.
+#: More satellites left out at a time have no faults of their own where the codes of one are too short, which no
+#: reflection makes: the map or a constellation is wrong.
 BIAS_SATELLITES: Final = 2
 #: Factor on the variance of codes that are left out: their innovations go on telling when the fault ends.
 BIAS_INFLATED: Final = 1e6

@@ -89,15 +89,16 @@ def learn(
         gone = max(scalars[WEAK_CODE] - CODE_LEAK * code_s, 0.0)
         scalars[WEAK_CODE] = scalars[WEAK_CODE] + code_s if weak else gone
     learn_map(scalars, 0.0 if best else shift, code_s, parameters)
-    left_out = 0
+    left_out = early = 0
     for i in range(nc):
         k = rows.codes[i]
         left_out += abs(state.code_bias[epochs.slot[k]]) > BIAS_FAULTY
+        early += state.code_bias[epochs.slot[k]] < -BIAS_FAULTY
         own = epochs.code_sigma_m[t, k] ** 2 * (1.0 + parameters.code_white_share**2)
         sigma = math.sqrt(own + NOMINAL_M**2)
         now = update_bias(state.code_bias, epochs.slot[k], innovation[best, i] / sigma, code_s)
         found = found or now
-    if left_out > BIAS_SATELLITES:
+    if early and left_out > BIAS_SATELLITES:
         scalars[WITHHELD] = max(scalars[WITHHELD], parameters.level_hold_s)
     return found
 
