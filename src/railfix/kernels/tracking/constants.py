@@ -84,8 +84,8 @@ CODE_LEAK: Final = 1.0
 BIAS_MEMORY_S: Final = 60.0
 BIAS_MOST: Final = 1.0
 BIAS_FAULTY: Final = 0.35
-#: Standard deviation of a satellite's errors that last for hours without a fault: orbit, clock, ionosphere [m].
-NOMINAL_M: Final = 1.5
+#: Errors of a satellite's orbit, clock and ionosphere last for hours: a mean below this is no sign of a wrong map [m].
+NOMINAL_M: Final = 0.8
 #: More satellites left out at a time have no faults of their own where the codes of one are too short, which no
 #: reflection makes: the map or a constellation is wrong.
 BIAS_SATELLITES: Final = 2

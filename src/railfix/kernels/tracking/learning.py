@@ -92,10 +92,11 @@ def learn(
     left_out = early = 0
     for i in range(nc):
         k = rows.codes[i]
-        left_out += abs(state.code_bias[epochs.slot[k]]) > BIAS_FAULTY
-        early += state.code_bias[epochs.slot[k]] < -BIAS_FAULTY
-        own = epochs.code_sigma_m[t, k] ** 2 * (1.0 + parameters.code_white_share**2)
-        sigma = math.sqrt(own + NOMINAL_M**2)
+        sigma = epochs.code_sigma_m[t, k] * math.sqrt(1.0 + parameters.code_white_share**2)
+        bias = state.code_bias[epochs.slot[k]]
+        if abs(bias) > BIAS_FAULTY and abs(bias) * sigma > NOMINAL_M:
+            left_out += 1
+            early += bias < 0.0
         now = update_bias(state.code_bias, epochs.slot[k], innovation[best, i] / sigma, code_s)
         found = found or now
     if early and left_out > BIAS_SATELLITES:
