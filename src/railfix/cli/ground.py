@@ -397,7 +397,7 @@ def train(
     )
     reports, authorities = asyncio.run(work)
     if not reports:
-        typer.echo("railfix ground train: nothing was reported: the input ended before the first look at it", err=True)
+        typer.echo("railfix ground train: nothing was reported: the input ended before the first report", err=True)
     elif not authorities:
         typer.echo(
             f"railfix ground train: no authority came, to {plural(reports, 'report')}; the page of the centre says why "

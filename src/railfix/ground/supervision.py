@@ -48,6 +48,8 @@ LENGTH_ROUNDING_M: Final = 0.02
 ROLLING_MPS: Final = 0.5
 #: Beginning of the reason where a train holds an authority beyond the end of its interval.
 HOLDS_MORE: Final = "the train holds an authority beyond its interval,"
+#: Beginnings of the reasons where the reported place itself cannot be right.
+WRONG_PLACE: Final = ("the bounds of the place are wider", "the train has moved", "the place is not on the line")
 
 
 def confirms_rear(known: TrainInterval, message: TrainMessage) -> bool:
@@ -79,7 +81,7 @@ def compute_contradiction(
     if over + under > WIDEST_M:
         return f"the bounds of the place are wider than {WIDEST_M:g} m"
     if not layout.stations[0].begin_m - over <= front <= layout.stations[-1].end_m + under:
-        return f"the place {front:.0f} m is not on the line"
+        return f"the place is not on the line: {front:.0f} m"
     if (message.authority or 0) > granted:
         return f"the train holds authority {message.authority}, the centre's database ends at {granted}"
     if message.facing != known.direction:
@@ -112,7 +114,7 @@ def compute_contradiction(
 def stop_contradicted(
     known: TrainInterval, message: TrainMessage, reason: str, rear: float, ahead: float
 ) -> TrainInterval:
-    """Return a train that is stopped, its interval with the place that it reports, unless that is what cannot be right.
+    """Return a train that is stopped, its interval extended to the reported place unless that cannot be right.
 
     Whatever else is wrong with a report, as its clock, the train may be there.
     """
@@ -122,7 +124,7 @@ def stop_contradicted(
     direction = known.direction
     if reason.startswith(HOLDS_MORE) and message.authority_end_cm is not None:
         stopped = replace(stopped, end_m=message.authority_end_cm / 100.0)
-    if reason.startswith(("the bounds of", "the train has moved")) or reason.endswith("is not on the line"):
+    if reason.startswith(WRONG_PLACE):
         return stopped
     ends = direction * rear, direction * ahead
     back, front = min(*ends, direction * known.rear_m), max(*ends, direction * known.front_m)

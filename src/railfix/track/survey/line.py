@@ -38,7 +38,7 @@ _ADJUSTMENT_ROUNDS: Final = 15
 _SETTLED_M: Final = 0.02
 #: Median of the norm of one, two and three standard normal variables.
 _MEDIAN: Final = {1: 0.6745, 2: 1.1774, 3: 1.5382}
-#: Scales of the stated standard deviations that residuals may show: errors that satellites share are in none of them.
+#: Scales of the stated standard deviations that residuals may show; they do not show errors that satellites share.
 _SCALES: Final = (0.5, 10.0)
 _ANYWHERE_M: Final = 1e5  #: Loose prior for conditioning: standard deviation of every unknown [m].
 #: Points of the line whose standard deviation is computed at most, others are interpolated, and columns at a time.
