@@ -29,7 +29,12 @@ from railfix.kernels import FILTER_ALONE
 Function = TypeVar("Function", bound=Callable[..., Any])
 #: Compiled functions of the modules that are imported.
 COMPILED: Final[list[Any]] = []
-_OPTIONS: Final[dict[str, Any]] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_OPTIONS: Final[dict[str, Any]] = {
+    "nogil": True,
+    "error_model": "numpy",
+    "no_cfunc_wrapper": True,
+    "fastmath": {"contract"},  # products are added without a rounding between
+}
 
 
 def _finish_unbuilt(library: Any) -> None:

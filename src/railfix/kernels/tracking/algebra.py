@@ -77,18 +77,26 @@ def square(lower: Floats, size: int, result: Floats, to: int) -> None:
 
 @borrowing
 def multiply(left: Floats, l: int, right: Floats, size: int, width: int, result: Floats) -> None:  # noqa: E741
-    """Write the product of `left[l]`, `size` squared, and the first `width` columns of `right` into `result`."""
-    for i in range(size):
+    """Write the product of `left[l]`, `size` squared, and the first `width` columns of `right` into `result`.
+
+    Two rows at a time, the last two again where `size` is odd: what is read of `right` counts twice.
+    """
+    for pair in range((size + 1) // 2):
+        i = min(2 * pair, size - 2)
         for c in range(width):
-            result[i, c] = 0.0
+            result[i, c] = result[i + 1, c] = 0.0
         for j in range(0, size - 3, 4):
             a, b, d, e = left[l, i, j], left[l, i, j + 1], left[l, i, j + 2], left[l, i, j + 3]
+            p, q, r, s = left[l, i + 1, j], left[l, i + 1, j + 1], left[l, i + 1, j + 2], left[l, i + 1, j + 3]
             for c in range(width):
-                result[i, c] += a * right[j, c] + b * right[j + 1, c] + d * right[j + 2, c] + e * right[j + 3, c]
+                w, x, y, z = right[j, c], right[j + 1, c], right[j + 2, c], right[j + 3, c]
+                result[i, c] += a * w + b * x + d * y + e * z
+                result[i + 1, c] += p * w + q * x + r * y + s * z
         for j in range(size // 4 * 4, size):
-            a = left[l, i, j]
+            a, p = left[l, i, j], left[l, i + 1, j]
             for c in range(width):
                 result[i, c] += a * right[j, c]
+                result[i + 1, c] += p * right[j, c]
 
 
 @borrowing

@@ -266,16 +266,20 @@ def apply_update(rows: Rows, work: Work, h: int) -> None:
     for i in range(size):
         for c in range(n + 1):
             new_mean[h, c] += gain[i, c] * change[h, i]
-    for c in range(n):
+    for pair in range((n + 1) // 2):  # two rows at a time
+        c = min(2 * pair, n - 2)
+        for e in range(c + 2):
+            new_covariance[h, c, e], new_covariance[h, c + 1, e] = spread[h, c, e], spread[h, c + 1, e]
+        for i in range(0, size - 1, 2):
+            p, q, r, s = gain[i, c], gain[i + 1, c], gain[i, c + 1], gain[i + 1, c + 1]
+            for e in range(c + 2):
+                x, y = less[i, e], less[i + 1, e]
+                new_covariance[h, c, e] -= p * x + q * y
+                new_covariance[h, c + 1, e] -= r * x + s * y
+        if size % 2:
+            p, r = gain[size - 1, c], gain[size - 1, c + 1]
+            for e in range(c + 2):
+                new_covariance[h, c, e] -= p * less[size - 1, e]
+                new_covariance[h, c + 1, e] -= r * less[size - 1, e]
         for e in range(c + 1):
-            new_covariance[h, c, e] = spread[h, c, e]
-        for i in range(0, size - 3, 4):
-            p, q, r, s = gain[i, c], gain[i + 1, c], gain[i + 2, c], gain[i + 3, c]
-            for e in range(c + 1):
-                new_covariance[h, c, e] -= p * less[i, e] + q * less[i + 1, e] + r * less[i + 2, e] + s * less[i + 3, e]
-        for i in range(size // 4 * 4, size):
-            p = gain[i, c]
-            for e in range(c + 1):
-                new_covariance[h, c, e] -= p * less[i, e]
-        for e in range(c):
-            new_covariance[h, e, c] = new_covariance[h, c, e]
+            new_covariance[h, e, c], new_covariance[h, e, c + 1] = new_covariance[h, c, e], new_covariance[h, c + 1, e]
