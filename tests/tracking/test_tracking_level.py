@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
+import belief_campaign
 from plain_kernels import memory, named_tuple, parameters, plain, subfilters, work_space
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits, TrackStatus, track
 from railfix.tracking.bank import OTHERS, budget
@@ -81,6 +84,38 @@ def test_other_branches_are_hypotheses_of_the_level(probability: float) -> None:
         else:
             distance = apart if apart <= LIMITS.start_separation_m else 0.0
             assert spent(found["level_m"], distance) == pytest.approx(given.risk, rel=1e-5)
+
+
+@pytest.mark.requirement("C6")
+def test_what_a_map_is_off_across_is_off_along_after_a_bend() -> None:
+    """By hand, 60 degrees to the left: the way on the map has it, what the phases measure has not."""
+    work, random, turn = work_space(1), np.random.default_rng(3), np.radians(60.0)
+    width = work.mean.shape[1]
+    mean, root = random.normal(size=width), random.normal(size=(width, width))
+    work.mean[0], work.spread[0] = mean, root @ root.T
+    work.axes[1] = np.eye(3)
+    work.axes[0, 0] = np.cos(turn), -np.sin(turn), 0.0
+    work.axes[0, 1] = np.sin(turn), np.cos(turn), 0.0
+    plain("tracking.level")._turn_map(30.0, work, 0)
+    length = width - layout.OF_EPOCH + layout.MAP_LENGTH_ERROR
+    step = np.eye(width)
+    step[layout.ARC, layout.RIGHT] = -np.sin(turn)
+    step[length, layout.RIGHT] = np.sin(turn)
+    step[layout.RIGHT, layout.RIGHT] = np.cos(turn)
+    expected = step @ root @ root.T @ step.T
+    expected[layout.RIGHT, layout.RIGHT] += (30.0 * np.sin(turn)) ** 2
+    np.testing.assert_allclose(work.mean[0], step @ mean, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(work.spread[0], expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.requirement("C6")
+@pytest.mark.parametrize("start", [0, 75, 150])
+def test_a_map_off_to_the_north_is_in_the_level_beyond_the_corners_of_a_recording(recordings: Path, start: int) -> None:
+    case = belief_campaign.cases(recordings)["japan"]().part(start, start + 150)
+    shift = 10.0 * enu_axes(*geodetic_from_ecef(case.trajectory.ecef_m[0])[:2])[1]
+    found = belief_campaign.run(belief_campaign.on_line(case, np.asarray(case.trajectory.ecef_m) + shift), {})
+    assert np.isfinite(found.ground_level_m).sum() > 15
+    assert not found.over_ground.any()
 
 
 @pytest.mark.requirement("C2")

@@ -31,6 +31,7 @@ from railfix.kernels.tracking.layout import (
     CODE_CLOCK,
     COMBINED,
     DRIFT,
+    MAP_LENGTH_ERROR,
     OF_EPOCH,
     OTHERS,
     PHASE_CLOCK,
@@ -101,6 +102,32 @@ def _begin(bank: Subfilters, b: int, copied: bool, best: int, parameters: Parame
     if b == len(bank.running) - 1:
         spread[h, RIGHT, RIGHT] += parameters.level_map_m**2
         spread[h, UP, UP] += parameters.level_map_m**2
+
+
+@borrowing
+def _turn_map(wrong_m: float, work: Work, h: int) -> None:
+    """Turn the displacement of a map that may be wrong with the line: what was across in a bend is along after it.
+
+    It is in the way on the map, not in that of the phases. What was along before is not known.
+    """
+    mean, spread, n = work.mean, work.spread, work.mean.shape[1] - OF_EPOCH
+    length = n + MAP_LENGTH_ERROR
+    along = right = 0.0
+    for c in range(3):
+        along += work.axes[1, 1, c] * work.axes[0, 0, c]
+        right += work.axes[1, 1, c] * work.axes[0, 1, c]
+    mean[h, ARC] += along * mean[h, RIGHT]
+    mean[h, length] -= along * mean[h, RIGHT]
+    mean[h, RIGHT] *= right
+    for c in range(mean.shape[1]):
+        spread[h, ARC, c] += along * spread[h, RIGHT, c]
+        spread[h, length, c] -= along * spread[h, RIGHT, c]
+        spread[h, RIGHT, c] *= right
+    for c in range(mean.shape[1]):
+        spread[h, c, ARC] += along * spread[h, c, RIGHT]
+        spread[h, c, length] -= along * spread[h, c, RIGHT]
+        spread[h, c, RIGHT] *= right
+    spread[h, RIGHT, RIGHT] += (along * wrong_m) ** 2
 
 
 @borrowing
@@ -175,6 +202,8 @@ def advance_subfilters(
             wrong_m = parameters.level_map_m if b == len(bank.running) - 1 else 0.0
             predict(inputs, t, bank.mean[b], bank.covariance[b], map_log_variance, wrong_m, work, h)
             find_ends(line, mean[h, ARC], mean[h, n + PREVIOUS_ARC], work)
+            if wrong_m > 0.0:
+                _turn_map(wrong_m, work, h)
             add_bend(parameters, work, h)
             sigma = math.sqrt(spread[h, ARC, ARC])
             near = abs(mean[h, ARC] - mean[best, ARC]) < JOINED * sigma
