@@ -155,7 +155,24 @@ def test_the_accuracy_of_a_flat_geojson_is_used(tmp_path: Path) -> None:
     path = geojson(tmp_path / "a.geojson", {"1": {}}, sigma_plan_m=1.5)
     assert read_track(path, heights=profile).sigma_plan_m == 1.5
     path = geojson(tmp_path / "b.geojson", {"1": {"sigma_plan_m": 2.5}})
-    assert read_track(path, heights=profile).sigma_plan_m == 2.5
+    stated = read_track(path, heights=profile)
+    assert stated.sigma_plan_m == 2.5
+    assert not any("states no accuracy" in note for note in stated.provenance.notes)
+
+
+@pytest.mark.requirement("A1")
+def test_a_file_without_an_accuracy_is_taken_as_a_survey_with_a_note(tmp_path: Path) -> None:
+    """The bound of the filter rests on it: a line drawn by hand is not known to 0.3 m."""
+    profile = tmp_path / "profile.csv"
+    profile.write_text("# sigma_m: 0.2\nchainage_m,height_m\n0,480\n5000,480\n")
+    path = geojson(tmp_path / "c.geojson", {"1": {}})
+    track = read_track(path, heights=profile)
+    assert track.sigma_plan_m == 0.3
+    note = "map: c.geojson states no accuracy, 0.3 m in plan is taken, that of an aerial survey (--plan-sigma)"
+    assert track.provenance.notes.count(note) == 1
+    given = read_track(path, heights=profile, sigma_plan_m=3.0)
+    assert given.sigma_plan_m == 3.0
+    assert note not in given.provenance.notes
 
 
 def test_net_relations_without_a_geometry_are_connections(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from railfix.track.frames import GEOIDS, check_height_datum
 from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
 from railfix.track.point_files import read_csv_segment, read_geojson_segments
 from railfix.track.route import MAX_GAP_M, NO_HEIGHTS, MapOptions, MapReading, Segment, join
-from railfix.track.track import Track
+from railfix.track.track import SIGMA_PLAN_M, Track
 from railfix.track.vector_file import ENDINGS as VECTOR_ENDINGS
 from railfix.track.vector_file import SIGMA_M as OSM_SIGMA_M
 from railfix.track.vector_file import read_vector_segments
@@ -145,11 +145,15 @@ def read_segments(file: str | PathLike[str], reading: MapReading) -> list[Segmen
     segments = _segments_of(file, reading)
     if (given := reading.sigma_plan_m) is not None:
         return [_with_accuracy(segment, given) for segment in segments]
-    note = f"map: OpenStreetMap states no accuracy, {OSM_SIGMA_M:g} m in plan is taken (--plan-sigma)"
-    return [
-        _with_accuracy(s, OSM_SIGMA_M, note) if "origin" in s.metadata and "sigma_plan_m" not in s.metadata else s
-        for s in segments
-    ]
+    return [s if "sigma_plan_m" in s.metadata else _with_usual_accuracy(s, Path(file).name) for s in segments]
+
+
+def _with_usual_accuracy(segment: Segment, file: str) -> Segment:
+    drawn = "origin" in segment.metadata
+    sigma_m, source = (OSM_SIGMA_M, "OpenStreetMap") if drawn else (SIGMA_PLAN_M, file)
+    usual = "" if drawn else ", that of an aerial survey"
+    note = f"map: {source} states no accuracy, {sigma_m:g} m in plan is taken{usual} (--plan-sigma)"
+    return _with_accuracy(segment, sigma_m, note)
 
 
 def _with_accuracy(segment: Segment, sigma_m: float, *notes: str) -> Segment:
