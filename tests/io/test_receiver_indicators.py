@@ -154,10 +154,10 @@ def test_a_recorded_stream_has_no_alarm_and_the_gain_of_pyubx2(recordings: Path)
         ([(500, 0, 0)], 2),  # a simulated signal since 500 s
         ([(500, 0, 0), (3, 0, 1)], 0),  # and no more for 3 s
         ([(3, 0, 1), (500, 0, 0)], 0),  # whatever the order
-        ([(20, 4, 0)], 1),
-        ([(20, 5, 0), (10, 0, 0)], 3),
-        ([(4, 5, 2)], 1),  # a single trigger, which has no end
-        ([(40, 5, 2)], 0),
+        ([(20, 4, 0), (20, 5, 0)], 0),  # jamming: begins with a warning
+        ([(20, 5, 0), (10, 0, 0)], 2),
+        ([(4, 0, 2)], 2),  # a single trigger, which has no end
+        ([(40, 0, 2)], 0),
         ([(1, 1, 0), (1, 2, 0), (1, 3, 0)], 0),  # what tunnels make, too
     ],
 )

@@ -50,11 +50,10 @@ _BLOCK: Final = 24  #: u-blox: bytes of a block of MON-RF after the four of the 
 #: Septentrio: first block of bands or front ends after the time stamp (6 bytes).
 _BANDS, _FRONT_ENDS = 12, 24
 _NO_GAIN: Final = -128
-#: u-blox SEC-SIGLOG: bytes of an event, kinds of detection that count, and how long a single trigger does [s].
+#: u-blox SEC-SIGLOG: bytes of an event, and how long a single trigger counts [s].
 _EVENT: Final = 8
-_SIMULATED: Final = 0
-_LOGGED_JAMMING: Final = frozenset((4, 5))
 _TRIGGERED_S: Final = 10
+_SIMULATED: Final = 0  #: Kind of detection that counts; those of jamming begin with a warning, as in that recording.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,20 +127,16 @@ def _sec_sig(data: Bytes) -> tuple[int, float] | None:
 
 
 def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
-    """Jamming and spoofing that the log has begun and not ended, by the newest event of each kind.
+    """Simulated signals that the log has begun and not ended, by the newest event, are spoofing.
 
-    A simulated signal counts as spoofing, broad and narrow bands as jamming. Abnormal signals, contradictions of an
-    inertial unit and abrupt changes do not count: tunnels make them.
+    Abnormal signals, contradictions of an inertial unit and abrupt changes do not count: tunnels make them.
     """
     if len(data) < 8 or len(data) != 8 + _EVENT * int(data[1]):
         return None
-    newest: dict[int, tuple[int, int]] = {}
-    for event in data[8:].reshape(-1, _EVENT):
-        elapsed, detection, kind = int(event[:4].view("<u4")[0]), int(event[4]), int(event[5])
-        if elapsed < newest.get(detection, (1 << 32, 0))[0]:
-            newest[detection] = elapsed, kind
-    open_kinds = {d for d, (elapsed, kind) in newest.items() if kind == 0 or (kind == 2 and elapsed <= _TRIGGERED_S)}
-    return JAMMING * bool(open_kinds & _LOGGED_JAMMING) | SPOOFING * (_SIMULATED in open_kinds), np.nan
+    events = data[8:].reshape(-1, _EVENT)
+    simulated = events[events[:, 4] == _SIMULATED]
+    elapsed, kind = min(((int(e[:4].view("<u4")[0]), int(e[5])) for e in simulated), default=(0, 1))
+    return SPOOFING * (kind == 0 or (kind == 2 and elapsed <= _TRIGGERED_S)), np.nan
 
 
 def _rf_status(data: Bytes) -> tuple[int, float] | None:
