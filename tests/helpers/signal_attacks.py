@@ -99,12 +99,19 @@ def repeated(scene: Scene, at: int, east_north_m: tuple[float, float], delay_m: 
 
 
 def pulled(
-    scene: Scene, at: int, rate_mps: float, *, systems: str = "", power: str = "own", rng: np.random.Generator
+    scene: Scene,
+    at: int,
+    rate_mps: float,
+    *,
+    systems: str = "",
+    power: str = "own",
+    straight: bool = False,
+    rng: np.random.Generator,
 ) -> Observations:
     """A position pulled along the track from an epoch on, codes, phases and Dopplers agreeing.
 
     `systems`: of these constellations alone; all where it is blank. `power`: "own" keeps the C/N0 of each satellite,
-    "equal" is that of one transmitter.
+    "equal" is that of one transmitter. `straight`: in the direction of the track at the first epoch.
     """
     since = np.maximum(scene.seconds - scene.seconds[at], 0.0)
     along = np.gradient(scene.ecef_m, axis=0)
@@ -116,6 +123,7 @@ def pulled(
     # a train that turns back keeps the direction of the line
     turned = np.where((along[1:] * along[:-1]).sum(axis=1) < 0.0, -1.0, 1.0)
     along *= np.cumprod(np.concatenate([[1.0], turned]))[:, None]
+    along = along[[at]] if straight else along
     chosen = np.isin(scene.observations.system, list(systems or "GJEC"))
     begun = np.arange(len(since)) >= at
     longer = scene.longer_m(scene.ecef_m + (rate_mps * since)[:, None] * along) * chosen

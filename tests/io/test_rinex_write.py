@@ -7,6 +7,7 @@ import warnings
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
+from typing import Literal
 
 import georinex
 import numpy as np
@@ -19,8 +20,9 @@ from railfix.core.errors import OutputError
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import ObservationHeader, Observations, concatenate
 from railfix.io.rinex import read_navigation, read_observations, write_navigation, write_observations
-from railfix.io.rinex.write import _fixed_3, packing_of
+from railfix.io.rinex.write import RinexVersion, _fixed_3, packing_of
 from railfix.simulate import Scenario, SkySettings, simulated_navigation
+from railfix.simulate.scenario import ReceiverSettings
 
 START = np.datetime64("2024-03-05T23:59:58.5", "ns")
 CHANNELS = [("G01", "1C"), ("G01", "2W"), ("G12", "1C"), ("R05", "1C"), ("E11", "1C"), ("J02", "1C"), ("C19", "2I")]
@@ -238,9 +240,11 @@ def test_a_folder_that_is_not_there_is_an_output_error(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- navigation
 
 
-def navigation() -> Navigation:
-    """Five constellations, three issues each, with transmission in the week before toe."""
-    scenario = Scenario(start=np.datetime64("2024-03-03T00:10:00", "ns"), sky=SkySettings(systems="GJEC"))
+def navigation(second: Literal["L2", "L5"] = "L2") -> Navigation:
+    """Five constellations, three issues each, with transmission in the week before toe; B-CNAV1 with L5."""
+    receiver = ReceiverSettings(signals_per_satellite=2, second=second)
+    start, sky = np.datetime64("2024-03-03T00:10:00", "ns"), SkySettings(systems="GJEC")
+    scenario = Scenario(start=start, sky=sky, receiver=receiver)
     made = simulated_navigation(scenario)
     rng = np.random.default_rng(1)
     toe = np.datetime64("2024-03-03T00:15:18", "ns") + np.arange(3) * np.timedelta64(1800, "s")
@@ -265,10 +269,13 @@ def navigation() -> Navigation:
 
 
 @pytest.mark.requirement("A7")
-@pytest.mark.parametrize("name", ["nav.rnx", "nav.rnx.gz"])
-def test_navigation_reads_back(tmp_path: Path, name: str) -> None:
-    written = navigation()
-    write_navigation(written, tmp_path / name)
+@pytest.mark.parametrize(
+    ("name", "second", "version"), [("nav.rnx", "L2", "3.04"), ("nav.rnx.gz", "L2", "3.04"), ("nav.rnx", "L5", "4.02")]
+)
+def test_navigation_reads_back(tmp_path: Path, name: str, second: Literal["L2", "L5"], version: RinexVersion) -> None:
+    written = navigation(second)
+    assert ("CNV1" in written.kepler.message) == (second == "L5")
+    write_navigation(written, tmp_path / name, version=version)
     found = read_navigation(tmp_path / name)
     assert found.leap_seconds == 18
     np.testing.assert_array_equal(found.klobuchar["G"], written.klobuchar["G"])
@@ -316,4 +323,6 @@ def test_what_has_no_navigation_form_is_refused(tmp_path: Path) -> None:
     odd = KeplerRecords(**(fields | {"satellite": np.array(["I01"])}))
     with pytest.raises(ValueError, match="'I'"):
         write_navigation(Navigation(kepler=odd, glonass=made.glonass), tmp_path / "nav.rnx")
+    with pytest.raises(ValueError, match="records of CNV1 cannot be written; leave them out"):
+        write_navigation(navigation("L5"), tmp_path / "nav.rnx")
     assert not list(tmp_path.iterdir())

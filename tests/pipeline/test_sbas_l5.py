@@ -22,7 +22,9 @@ from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import parse_config
 from railfix.ranges.corrected import DFMC_REASONS
 from railfix.ranges.sbas import SbasMessages, SbasState, read_sbas
-from railfix.ranges.sbas.dfmc import DfmcService, DfmcState
+from railfix.ranges.sbas.decode import read_fields
+from railfix.ranges.sbas.dfmc import LAYOUTS, DfmcService, DfmcState
+from railfix.ranges.sbas.messages import with_parity
 from railfix.run.processor import processor_of
 from railfix.simulate import Scenario, Simulation, write_run
 from railfix.simulate import sbas_stream as stream
@@ -35,12 +37,15 @@ from railfix.track.trajectory import Trajectory
 pytestmark = pytest.mark.requirement("C5")
 FAULT_S, STOP_S, DURATION_S = 90, 130, 150
 FAULTY = "G10"
+#: BeiDou without a slot; corrected for a record that nobody sent.
+NO_SLOT, OTHER_ISSUE = "C38", "C36"
 
 
 def scenario(**receiver: object) -> Scenario:
     """Errors of a commercial line's run under an open sky, and an ionosphere far from its model."""
     usual, errors = Scenario(), load_recipe("commercial-run").scenario().errors
     return usual.replaced(
+        seed=5,  # six satellites of BeiDou with a slot above 20 degrees
         duration_s=float(DURATION_S),
         rate_hz=1.0,
         errors=usual.errors.replaced(
@@ -50,6 +55,7 @@ def scenario(**receiver: object) -> Scenario:
             noise=errors.noise,
             faults=(SatelliteFault(satellite=FAULTY, start_s=float(FAULT_S), step_m=40.0),),
         ),
+        sky=usual.sky.replaced(systems="GJEC"),
         receiver=usual.receiver.replaced(signals_per_satellite=2, second="L5", **receiver),
         sbas=SbasSettings(band="L5"),
     )
@@ -64,6 +70,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     stop = np.flatnonzero(messages.time >= scenario().start + np.timedelta64(STOP_S, "s"))[0]
     bits = messages.bits.copy()
     bits[stop] = stream.message(0, int(stop) - 300)
+    own = (messages.type == 32) & (read_fields(bits, LAYOUTS[32])["slot"] == 158 + int(OTHER_ISSUE[1:]))
+    assert own.any()
+    bits[own, 3] ^= 0x40  # bits 18 to 27 are the issue, 25 is worth 4
+    bits = with_parity(bits)
     write_sbas(
         SbasMessages(
             **{**vars(messages), "bits": bits, "type": np.where(np.arange(len(bits)) == stop, 0, messages.type)}
@@ -72,7 +82,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     given = [word for name in ("front", "nav", "track", "vehicle") for word in (f"--{name}", str(files[name]))]
     l5 = ["--sbas", str(files["sbas"]), "--set", "sbas_band=L5"]
-    for name, options in (("plain", []), ("l5", l5)):
+    for name, options in (("plain", []), ("l5", l5), ("beidou", [*l5, "--set", 'systems=["C"]'])):
         done = CliRunner().invoke(app, ["run", *given, *options, "--observations", "--out", str(made / name)])
         assert done.exit_code == 0, done.output
     return made
@@ -101,10 +111,25 @@ def test_results_say_what_was_asked_and_used(folder: Path) -> None:
     assert "frequencies: one asked for, ionosphere-free codes used in their place" in said
     assert "SBAS on L5 asked for: corrections of MSAS PRN 137 used" in said
     table = pl.read_parquet(folder / "l5" / "observations.parquet").filter(pl.col("reason") == 0)
-    assert set(table["satellite"].str.slice(0, 1)) == {"G", "E"}
+    assert set(table["satellite"].str.slice(0, 1)) == {"G", "E", "C"}
     ratio = (154 / 115) ** 2
     np.testing.assert_allclose(table["second_share"].drop_nulls().drop_nans(), -1.0 / (ratio - 1.0), rtol=1e-6)
-    assert table.filter(pl.col("signal") == "5Q").height == table.filter(pl.col("signal") == "1C").height
+    counts = dict(table.group_by("signal").len().iter_rows())
+    assert (counts["5Q"], counts["5P"]) == (counts["1C"], counts["1P"])
+
+
+def test_beidou_alone_is_corrected_within_its_levels(folder: Path) -> None:
+    """On slots of the mask, each satellite by the record of B-CNAV1 with the issue of its correction."""
+    for name, least in (("positions", 0.2), ("train", 0.9)):  # five satellites
+        error, level = errors_m(folder, "beidou", name)
+        assert np.isfinite(level).mean() > least
+        assert (error <= level)[np.isfinite(level)].all()
+    assert np.median(error) < 0.5
+    table = pl.read_parquet(folder / "l5" / "observations.parquet").filter(pl.col("signal") == "1P")
+    for name, reason in ((NO_SLOT, Reason.SBAS_NOT_COVERED), (OTHER_ISSUE, Reason.SBAS_NO_CORRECTION)):
+        own = table.filter(pl.col("satellite") == name)["reason"].to_numpy()[:STOP_S]
+        assert len(own) == STOP_S
+        assert (own & int(reason)).all(), name
 
 
 def test_satellites_are_rejected_by_do_not_use_and_all_by_type_0(folder: Path) -> None:
@@ -155,7 +180,7 @@ def test_corrected_codes_are_true_ranges() -> None:
     distance, _ = range_with_rotation(states.position_ecef_m + fixes.position_m, truth[:, None])
     error = found.corrected_code_m[:, columns] - distance
     good = (found.reason[:, columns] == 0) & (found.elevation_deg[:, columns] > 30.0)
-    for letter in "GE":
+    for letter in "GEC":
         own = np.where(good & np.char.startswith(satellite, letter), error, np.nan)
         own = own[:, np.isfinite(own).all(axis=0)]
         assert own.shape[1] >= 3
@@ -165,9 +190,7 @@ def test_corrected_codes_are_true_ranges() -> None:
 def test_beidou_is_taken_on_b1c_first() -> None:
     simulation = Simulation(scenario())
     first = next(iter(simulation.observations("front")))
-    galileo, e1 = np.char.startswith(first.satellite, "E"), first.signal == "1C"
-    signal = np.where(galileo, np.where(e1, "2I", "1P"), first.signal)
-    obs = replace(first, satellite=np.char.replace(first.satellite, "E", "C"), signal=signal)
+    obs = replace(first, signal=np.char.replace(first.signal, "5P", "2I"))
     config = parse_config({"sbas": "stream", "sbas_prn": 137, "sbas_band": "L5"})
     for chosen, wanted in ((config, "1P"), (parse_config({}), "2I")):
         channels = ChannelBook(chosen).of(obs, simulation.navigation)

@@ -1,6 +1,6 @@
 """Attacks on simulated trains: what is suspected, when, and whether a level is exceeded before; recordings without one.
 
-``python tests/studies/interference_trials.py`` prints the tables of tests/references/results/interference.txt: 200
+``python tests/studies/interference_trials.py`` prints the tables of tests/references/results/interference.txt: 240
 attacks on the demonstration's line at 1 Hz, by the codes and Dopplers of single epochs, and, with the recordings beside
 the checkout, the largest statistics of each.
 """
@@ -38,11 +38,13 @@ from recordings_truth import smartloc_rinex_truth
 from signal_attacks import Scene
 
 SINGLE: Final = parse_config({"filter": "off"})
-#: Trials of each attack: 200 in all.
+#: Trials of each attack.
 TRIALS: Final = 40
-#: Scenarios that trials share.
+#: Scenarios that trials share, and how long they are.
 _SEEDS: Final = (1, 2, 3, 4)
+_RIDE_S: Final = 400.0
 _FIRST, _LAST = 60, 120
+_SILENT: Final = 10
 
 Attack = Callable[[Scene, int, np.random.Generator], Observations]
 
@@ -64,6 +66,10 @@ def _pull_with_own_power(scene: Scene, at: int, rng: np.random.Generator) -> Obs
     return signal_attacks.pulled(scene, at, rng.choice([-0.5, 0.5]), rng=rng)
 
 
+def _straight_pull(scene: Scene, at: int, rng: np.random.Generator) -> Observations:
+    return signal_attacks.pulled(scene, at, rng.choice([-0.5, 0.5]), straight=True, rng=rng)
+
+
 def _one_constellation(scene: Scene, at: int, rng: np.random.Generator) -> Observations:
     return signal_attacks.pulled(scene, at, rng.choice([-0.5, 0.5]), systems=str(rng.choice(["G", "E"])), rng=rng)
 
@@ -73,6 +79,7 @@ ATTACKS: Final[dict[str, Attack]] = {
     "meaconing, 30 to 500 m later": _meacon,
     "pull of 0.5 m/s, one transmitter's C/N0": _pull,
     "pull of 0.5 m/s, C/N0 as before": _pull_with_own_power,
+    "the same, straight on where the line bends": _straight_pull,
     "pull of 0.5 m/s, one constellation": _one_constellation,
 }
 
@@ -101,10 +108,12 @@ class Train:
 
 @dataclass(frozen=True)
 class Trial:
-    """What one attack led to: delay of the first suspicion [s], NaN without one; alarms before the attack; largest
-    error [m]; epochs whose error exceeds a level without an alarm; causes."""
+    """What one attack led to: delays of the first suspicion and of the first 10 epochs without a level [s], NaN where
+    there are none; alarms before the attack; largest error [m]; epochs whose error exceeds a level without an alarm;
+    causes."""
 
     delay_s: float
+    silent_s: float
     early: int
     error_m: float
     exceeded: int
@@ -123,13 +132,19 @@ def trial(train: Train, attack: Attack, at: int, rng: np.random.Generator, *, ki
     error = np.abs(result.chainage_m - train.chainage_m)
     promised = result.protection.status != int(LevelStatus.ALARM)
     exceeded = promised & (error > result.protection.level.level_m)
+    silent = np.convolve(~promised[start:], np.ones(_SILENT), mode="valid") == _SILENT
+    silence = float(np.argmax(silent)) if silent.any() else np.nan
     texts = {word for text in cause_text(result.interference.causes).tolist() for word in text.split("+") if word}
-    return Trial(delay, int((found[:start] > 0).sum()), float(np.nanmax(error)), int(exceeded.sum()), frozenset(texts))
+    return Trial(
+        delay, silence, int((found[:start] > 0).sum()), float(np.nanmax(error)), int(exceeded.sum()), frozenset(texts)
+    )
 
 
 def trials(number: int = TRIALS) -> Iterator[tuple[str, list[Trial]]]:
     with TemporaryDirectory() as folder:
-        trains = [Train.of(Scenario(seed=seed, rate_hz=1.0), Path(folder) / str(seed)) for seed in _SEEDS]
+        trains = [
+            Train.of(Scenario(seed=seed, rate_hz=1.0, duration_s=_RIDE_S), Path(folder) / str(seed)) for seed in _SEEDS
+        ]
     for name, attack in ATTACKS.items():
         rng = np.random.default_rng(7)
         kind = Suspicion.JAMMING_SUSPECTED if attack is _jammer else Suspicion.SPOOFING_SUSPECTED
@@ -138,15 +153,21 @@ def trials(number: int = TRIALS) -> Iterator[tuple[str, list[Trial]]]:
 
 
 def row(name: str, found: list[Trial]) -> str:
-    delay = np.array([one.delay_s for one in found])
-    known = delay[np.isfinite(delay)]
-    times = f"{np.median(known):5.0f} {known.max():5.0f}" if len(known) else "    -     -"
+    suspected, silent = ([getattr(one, f"{what}_s") for one in found] for what in ("delay", "silent"))
     causes = sorted(frozenset().union(*(one.causes for one in found)))
     return (
-        f"{name:42} {len(found):6} {len(known):8} {times} {sum(one.early for one in found):6} "
+        f"{name:42} {len(found):6} {_times(suspected)} {_times(silent)} {sum(one.early for one in found):6} "
         f"{sum(one.exceeded > 0 for one in found):8} {np.median([one.error_m for one in found]):8.1f}  "
         + " ".join(causes)
     )
+
+
+def _times(delays: list[float]) -> str:
+    """Number of delays, their median, 95 % and largest."""
+    known = np.array(delays)[np.isfinite(delays)]
+    if not len(known):
+        return f"{0:8} {'-':>5} {'-':>5} {'-':>5}"
+    return f"{len(known):8} {np.median(known):5.0f} {np.percentile(known, 95):5.0f} {known.max():5.0f}"
 
 
 def clean(data: Path) -> Iterator[tuple[str, Observations, Navigation, Trajectory]]:
@@ -193,10 +214,12 @@ def clean_row(name: str, log: Observations, navigation: Navigation, line: Trajec
 
 
 def main() -> int:
+    times = f"{'p50':>5} {'p95':>5} {'max':>5}"
     print(
-        f"{'attack':42} {'trials':>6} {'detected':>8} {'after [s]':>11} {'early':>6} {'exceeded':>8} {'error':>8}  by"
+        f"{'attack':42} {'trials':>6} {'detected':>8} {'after [s]':>17} {'no level':>8} {'after [s]':>17} {'early':>6} "
+        f"{'exceeded':>8} {'error':>8}  by"
     )
-    print(f"{'':58} {'p50':>5} {'max':>5} {'epochs':>6} {'trials':>8} {'p50 [m]':>8}")
+    print(f"{'':58} {times} {'':8} {times} {'epochs':>6} {'trials':>8} {'p50 [m]':>8}")
     for name, found in trials():
         print(row(name, found), flush=True)
     if paths.DATA.is_dir():

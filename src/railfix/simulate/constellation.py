@@ -31,6 +31,7 @@ _SERVES_S: Final = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0}
 #: Time from transmission to reference time, where the transmission time is absent or implausible [s].
 _SENT_BEFORE_S: Final = {"G": 7200.0, "J": 3600.0, "E": 600.0, "C": 3600.0}
 _SIGNALS_MESSAGE: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV",), "C": ("D1", "D2")}
+_WITH_L5: Final = {**_SIGNALS_MESSAGE, "C": ("CNV1",)}  #: Where `ReceiverSettings.has_l5`.
 
 
 def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
@@ -46,7 +47,7 @@ def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
             f"{path}: has no Klobuchar coefficients of GPS, which the simulated ionosphere needs; take another file, "
             "or set sky.ionosphere_scale to 0 and position with `--set ionosphere=off`"
         )
-    records = _select_simulated(navigation.kepler, scenario.sky.systems)
+    records = _select_simulated(navigation.kepler, scenario.sky.systems, _messages(scenario))
     first = scenario.start
     last = first + np.timedelta64(round(scenario.duration_s * 1e9), "ns")
     kept = [rows for name in np.unique(records.satellite) if len(rows := _serving(records, str(name), first, last))]
@@ -81,13 +82,17 @@ def _rows(records: KeplerRecords, rows: Indices | Masks) -> KeplerRecords:
     return replace(records, **{item.name: getattr(records, item.name)[rows] for item in fields(records)})
 
 
-def _select_simulated(records: KeplerRecords, systems: str) -> KeplerRecords:
+def _messages(scenario: Scenario) -> dict[str, tuple[str, ...]]:
+    return _WITH_L5 if scenario.receiver.has_l5 else _SIGNALS_MESSAGE
+
+
+def _select_simulated(records: KeplerRecords, systems: str, messages: dict[str, tuple[str, ...]]) -> KeplerRecords:
     """Records of the simulated signals, with plausible transmission times."""
     letter = records.satellite.astype("<U1")
     usable = np.zeros(len(records), dtype=np.bool_)
     delay = np.where(letter == "E", records.group_delay_2_s, records.group_delay_1_s)
     for system in systems:
-        usable |= (letter == system) & np.isin(records.message, _SIGNALS_MESSAGE[system]) & np.isfinite(delay)
+        usable |= (letter == system) & np.isin(records.message, messages[system]) & np.isfinite(delay)
     records, letter = _rows(records, usable), letter[usable]
     serves, before = (timedelta([table[str(s)] for s in letter]) for table in (_SERVES_S, _SENT_BEFORE_S))
     early = records.toe - records.transmitted
@@ -119,7 +124,6 @@ KLOBUCHAR: Final = (1.118e-8, 2.235e-8, -5.960e-8, -1.192e-7, 1.044e5, 1.147e5, 
 _ISSUE_S: Final = {"G": 7200, "J": 3600, "E": 3600, "C": 3600}
 #: Transmission begins a little after the hour.
 _SENT_AFTER_S: Final = 18
-_MESSAGE: Final = {"G": "LNAV", "J": "LNAV", "E": "INAV", "C": "D1"}
 #: Galileo data source: I/NAV of E1-B, clock of E5b and E1 (RINEX 3.04, table A8: bits 0, 2 and 9).
 _INAV_SOURCE: Final = 517
 
@@ -252,7 +256,7 @@ def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Gener
     wobble = dict(zip(("cuc", "cus", "cic", "cis"), rng.normal(0.0, 3e-6, 4) * (1, 1, 0.03, 0.03), strict=True))
     wobble |= {"crc": rng.normal(200.0, 60.0), "crs": rng.normal(0.0, 60.0)}
     delay = rng.normal(-5e-9, 6e-9, 2)
-    issue = int(rng.integers(1, 25))
+    issue, message = int(rng.integers(1, 25)), _messages(scenario)[system][0]
     sqrt_a = float(_digits(np.sqrt(orbit.semi_major_m)))
     speed = np.sqrt(mu) / sqrt_a**3 + motion
     rows = []
@@ -269,7 +273,7 @@ def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Gener
             "m0": _wrap(orbit.mean_anomaly + speed * dt), "delta_n": motion, "omega0": _wrap(node),
             "i0": orbit.tilt + tilting * dt, "omega": _wrap(orbit.perigee), "omega_dot": drift, "i_dot": tilting,
             **wobble, "a_dot": 0.0, "delta_n_dot": 0.0, "toe_sow_s": float(toe_sow),
-            "accuracy_m": 3.12 if system == "E" else 2.0,
+            "accuracy_m": np.nan if message == "CNV1" else 3.12 if system == "E" else 2.0,
             "group_delay_1_s": delay[0], "group_delay_2_s": delay[1] if system in "EC" else np.nan,
             "fit_interval_h": {"G": 4.0, "J": 2.0}.get(system, np.nan),
         }  # fmt: skip
@@ -277,7 +281,7 @@ def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Gener
         rows.append(
             row
             | {
-                "satellite": orbit.name, "message": _MESSAGE[system], "toc": toe, "toe": toe,
+                "satellite": orbit.name, "message": message, "toc": toe, "toe": toe,
                 "inter_signal_s": np.full(6, np.nan),
                 "transmitted": scenario.start + timedelta(sent_sow - start_sow),
                 "health": _ILL_HEALTH[system] if ill else 0,

@@ -206,15 +206,15 @@ def troposphere_m(latitude_deg: Floats, height_m: Floats, elevation_deg: Floats)
 
 #: Signals of each constellation, the first one first.
 SIGNALS: Final = {"G": ("1C", "2L"), "J": ("1C", "2L"), "E": ("1C", "7Q"), "C": ("2I", "6I")}
-#: With `ReceiverSettings.second` "L5".
-_WITH_L5: Final = {**SIGNALS, "G": ("1C", "5Q"), "J": ("1C", "5Q"), "E": ("1C", "5Q")}
+#: Two of each satellite with `ReceiverSettings.second` "L5".
+_WITH_L5: Final = {"G": ("1C", "5Q"), "J": ("1C", "5Q"), "E": ("1C", "5Q"), "C": ("1P", "5P")}
 #: Streams of random numbers: white noise, correlated noise, cycle slips, satellites' power.
 _WHITE, _CARRIED, _SLIPS, _POWER = 2, 3, 4, 6
 
 
 def signals_of(letter: str, settings: ReceiverSettings) -> tuple[str, ...]:
     """Signals that a receiver observes of a constellation."""
-    return (_WITH_L5 if settings.second == "L5" else SIGNALS)[letter][: settings.signals_per_satellite]
+    return (_WITH_L5 if settings.has_l5 else SIGNALS)[letter][: settings.signals_per_satellite]
 
 
 class Receiver:
@@ -241,7 +241,7 @@ class Receiver:
         self.wavelength_m = SPEED_OF_LIGHT / frequency
         #: Ionospheric delay relative to that on L1.
         self.scale = (FREQUENCY_L1 / frequency) ** 2
-        self.second = np.array([g != SIGNALS[n[0]][0] for n, g in channels])
+        self.second = np.array([g != signals_of(n[0], scenario.receiver)[0] for n, g in channels])
         self.group_delay_error_m = common_errors.group_delay_m(self.names.tolist(), self.signals.tolist())
         offsets = [errors.intersystem.get(name[0], InterSystemSettings()) for name, _ in channels]
         self.offset_m = np.array([o.offset_m + (o.rear_difference_m if antenna == "rear" else 0.0) for o in offsets])
@@ -274,13 +274,14 @@ def group_delay_s(records: KeplerRecords, satellite: str, signal: str, time: Dat
 
     GPS and QZSS: TGD on L1, scaled by (f1/f)^2 on L2 (IS-GPS-200, 20.3.3.3.3.2), TGD on L5, whose ISC LNAV lacks.
     Galileo I/NAV: BGD E5b/E1 likewise, on E5a that of both BGDs (OS SIS ICD, 5.1.5). BeiDou: TGD1 on B1I, none on B3I,
-    which the clock refers to.
+    which the clock refers to; TGD_B1Cp on B1C, TGD_B2ap on B2a.
     """
     row = newest_record(records, satellite, time)
     letter = satellite[0]
     frequency = CARRIER_FREQUENCY[letter]
     if letter == "C":
-        return np.where(signal[0] == "2", records.group_delay_1_s[row], 0.0)
+        of_band = {"1": records.group_delay_1_s, "2": records.group_delay_1_s, "5": records.group_delay_2_s}
+        return of_band[signal[0]][row] if signal[0] in of_band else np.zeros(len(row))
     delay = records.group_delay_2_s if letter == "E" else records.group_delay_1_s
     if signal[0] == "5":
         scale = (frequency["1"] / frequency["5"]) ** 2

@@ -278,7 +278,12 @@ def _write_files(
                     progress(antenna, len(part))
 
         write_observations(watched(), files[antenna], comments=_COMMENTS)
-    write_navigation(simulation.navigation, files["nav"], comments=_COMMENTS)
+    write_navigation(
+        simulation.navigation,
+        files["nav"],
+        version="4.02" if scenario.receiver.has_l5 else "3.04",
+        comments=_COMMENTS,
+    )
     write_track_csv(simulation.line.track(), files["track"])
     write_toml(files["vehicle"], vehicle_table(scenario.vehicle))
     content = _csv(truth_table(simulation), TRUTH_DECIMALS)

@@ -147,20 +147,22 @@ CLOCK, _ORBIT, _DELAY = 50, 51, 52  #: Streams of random numbers: fast correctio
 class Service:
     """Corrections of a simulated run at any second, and the messages that carry them."""
 
-    systems = "G"  #: Constellations corrected.
-
     def __init__(self, simulation: Simulation, settings: SbasSettings) -> None:
         self._simulation, self._settings = simulation, settings
         scenario = simulation.scenario
         names = {str(name) for name in simulation.navigation.kepler.satellite}
-        # in the order of the mask
-        self.satellites = [name for letter in self.systems for name in sorted(names) if name[0] == letter]
-        # All of GPS, not only what the train sees; each satellite's errors are its own, so they are the same.
+        # All of the mask, not only what the train sees; each satellite's errors are its own, so they are the same.
+        self.satellites = sorted((name for name in names if self.slot(name)), key=self.slot)
         self._errors, self._start = simulation.errors_of(self.satellites), scenario.start
         self._group_delay_m = self._errors.group_delay_m(self.satellites, ["1C"] * len(self.satellites))
         self._rng = {key: np.random.default_rng([scenario.seed, key]) for key in (CLOCK, _ORBIT, _DELAY)}
         self._last_s = scenario.duration_s
         self.bands = self._grid_points()
+
+    @staticmethod
+    def slot(name: str) -> int:
+        """Number of a satellite in the mask, 0 where it is not corrected."""
+        return int(name[1:]) if name[0] == "G" else 0
 
     def _instant(self, second: float) -> Floats:
         """Time of the corrections sent at a second; before the start of the run its errors are those of the start."""

@@ -102,14 +102,18 @@ _GROWTH_MPS: Final = 0.002  #: Growth of the corrections' errors until the next 
 
 
 class SimulatedDfmc(Service):
-    """Corrections on L5 of a simulated run: GPS L1 C/A with L5, Galileo E1 with E5a."""
+    """Corrections on L5 of a simulated run: GPS L1 C/A with L5, Galileo E1 with E5a, BeiDou B1C with B2a."""
 
-    systems = "GE"
+    @staticmethod
+    def slot(name: str) -> int:
+        """Slot of a satellite, 0 without one."""
+        return _SLOT_OF.get(name, 0)
 
     def clocks_m(self, second: float) -> Floats:
         """Corrections of the clocks of `satellites` [m] for ionosphere-free codes, group delays included.
 
-        Those of GPS refer to the clock without its group delays, those of Galileo to that of F/NAV.
+        Those of GPS refer to the clock without its group delays, those of Galileo to that of F/NAV, those of BeiDou to
+        that of B-CNAV1 with its group delays.
         """
         names, at = self.satellites, self._instant(second)
         first, other = ([signals_of(name[0], self._simulation.scenario.receiver)[k] for name in names] for k in (0, 1))
@@ -135,7 +139,7 @@ class SimulatedDfmc(Service):
 
     def slow_messages(self) -> list[Callable[[int], Bytes]]:
         """Types 31, 37 and 32 of all satellites in turn, each a function of the second."""
-        slots = [_SLOT_OF[name] for name in self.satellites]
+        slots = [self.slot(name) for name in self.satellites]
         messages: list[Callable[[int], Bytes]] = [
             lambda second: mask(second, slots),
             lambda second: parameters(second, valid_s=240.0, degradation=(30.0, 0.0, _GROWTH_MPS)),
@@ -165,7 +169,7 @@ def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessage
     Every 6 s the fast corrections of all satellites (types 2 to 5, 24); in the seconds between, in turn, the masks,
     long-term corrections, grid, degradation and integrity. All corrections undo the errors that `Scenario.errors` puts
     into clocks, group delays, orbits and ionosphere, to the messages' resolution (0.125 m); only GPS is corrected.
-    On L5: integrity (types 35, 36) every 6 s, between them mask, degradation and corrections of GPS and Galileo.
+    On L5: integrity (types 35, 36) every 6 s, between them mask, degradation and corrections of GPS, Galileo, BeiDou.
     """
     service = (SimulatedDfmc if settings.band == "L5" else Service)(simulation, settings)
     scenario = simulation.scenario

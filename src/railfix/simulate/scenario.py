@@ -149,7 +149,8 @@ class ReceiverSettings(ScenarioSettings):
     """
 
     signals_per_satellite: Literal[1, 2] = 1  #: 1 gives four observables a satellite, 2 gives eight.
-    second: Literal["L2", "L5"] = "L2"  #: Second signals: L2C, E5b, B3I; or L5, E5a, B3I.
+    #: Second signals: L2C, E5b, B3I; or L5, E5a and B2a, with B1C in place of B1I and B-CNAV1 in place of D1.
+    second: Literal["L2", "L5"] = "L2"
     #: 0 switches that noise off.
     code_sigma_m: NotNegative = 0.5
     phase_sigma_m: NotNegative = 0.002
@@ -167,6 +168,11 @@ class ReceiverSettings(ScenarioSettings):
     clock_drift: Finite = 2.0e-7
     #: "millisecond" puts a clock that is over half a millisecond off back by a whole one.
     clock_steps: Literal["none", "millisecond"] = "none"
+
+    @property
+    def has_l5(self) -> bool:
+        """Whether two signals of a satellite are L1 and L5, or their like."""
+        return self.signals_per_satellite == 2 and self.second == "L5"
 
 
 class ReferenceStation(ScenarioSettings):
@@ -216,9 +222,7 @@ class Scenario(ScenarioSettings):
 
     @model_validator(mode="after")
     def _receivers_of_l5(self) -> Scenario:
-        receiver = self.receiver
-        two = receiver.signals_per_satellite == 2 and receiver.second == "L5"
-        if self.sbas is not None and self.sbas.band == "L5" and not two:
+        if self.sbas is not None and self.sbas.band == "L5" and not self.receiver.has_l5:
             raise ValueError('sbas.band = "L5" needs receiver.signals_per_satellite = 2 and receiver.second = "L5"')
         return self
 

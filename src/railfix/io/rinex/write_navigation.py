@@ -11,16 +11,20 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.constants import BDT_MINUS_GPST_S
 from railfix.core.timescale import BDT_EPOCH, GPS_EPOCH, SECONDS_PER_WEEK, gpst_minus_utc, seconds, timedelta, to_week
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.io.rinex.navigation_records import FIELDS
 from railfix.io.rinex.write import Packing, RinexVersion, header_line, open_target, program_line
 
-UNKNOWN_TRANSMISSION_S: Final = 0.9999e9  #: Written for an unknown transmission time.
+UNKNOWN_S: Final = 0.9999e9  #: Written for an unknown transmission time, and for what CNV1 has beside the records.
 _IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}  #: Name of a constellation's Klobuchar coefficients.
-#: Messages of Keplerian records that version 3 has.
-_WRITTEN: Final = ("LNAV", "INAV", "FNAV", "D1", "D2")
+#: Messages of Keplerian records that a version has.
+_WRITTEN: Final[dict[RinexVersion, tuple[str, ...]]] = {
+    "3.04": ("LNAV", "INAV", "FNAV", "D1", "D2"),
+    "4.02": ("LNAV", "INAV", "FNAV", "D1", "D2", "CNV1"),
+}
 _BLANK: Final = " " * 19
 #: Last line of a GLONASS record of version 4: flags, group delay and accuracy, which are not known here.
 _GLONASS_STATUS: Final = f"    {_BLANK}{'.999999999999E+09':>19}{_BLANK}{_BLANK}".rstrip() + "\n"
@@ -39,7 +43,7 @@ def write_navigation(
 
     Records are sorted by clock time, then satellite. Fields that `Navigation` does not have (L2 code
     and P flags, the GLONASS status words) are written as 0, NaN as blank, an unknown transmission time
-    as 0.9999E9. `precise` is not written.
+    and what CNV1 has beside them as 0.9999E9. `precise` is not written.
 
     Parameters
     ----------
@@ -79,8 +83,13 @@ def write_navigation(
         head.append(header_line(f"{navigation.leap_seconds:6d}", "LEAP SECONDS"))
     head.append(header_line("", "END OF HEADER"))
     texts = [np.empty(0, dtype="<U1")]
-    if len(kepler):
-        texts.append(_records(kepler.satellite, *_kepler_fields(kepler)))
+    _check_messages(kepler, version)
+    kepler = _rows(kepler, np.argsort(kepler.message == "CNV1", kind="stable"))
+    late = kepler.message == "CNV1"
+    for rows, numbers in ((~late, _kepler_fields), (late, _cnv1_fields)):
+        if rows.any():
+            part = _rows(kepler, rows)
+            texts.append(_records(part.satellite, *numbers(part)))
     if len(glonass):
         texts.append(_records(glonass.satellite, *_glonass_fields(glonass)))
     body = np.concatenate(texts)
@@ -99,14 +108,23 @@ def write_navigation(
         target.write("".join(body[order].tolist()).encode("ascii"))
 
 
-def with_written_messages(navigation: Navigation) -> tuple[Navigation, dict[str, int]]:
+def with_written_messages(navigation: Navigation, version: RinexVersion = "3.04") -> tuple[Navigation, dict[str, int]]:
     """Return the records that can be written, and counts of the others (CNAV, CNV) by constellation and message."""
     kepler = navigation.kepler
-    kept = np.isin(kepler.message, _WRITTEN)
+    kept = np.isin(kepler.message, _WRITTEN[version])
     kinds = zip(kepler.satellite[~kept].tolist(), kepler.message[~kept].tolist(), strict=True)
     left_out = Counter(f"{satellite[0]} {message} ephemerides, which are not written" for satellite, message in kinds)
-    columns = {item.name: getattr(kepler, item.name)[kept] for item in fields(kepler)}
-    return replace(navigation, kepler=KeplerRecords(**columns)), dict(left_out)
+    return replace(navigation, kepler=_rows(kepler, kept)), dict(left_out)
+
+
+def _rows(records: KeplerRecords, rows: Masks | Indices) -> KeplerRecords:
+    return KeplerRecords(**{item.name: getattr(records, item.name)[rows] for item in fields(records)})
+
+
+def _check_messages(records: KeplerRecords, version: RinexVersion) -> None:
+    """Raise ValueError on a record of a message that the version lacks."""
+    if (other := ~np.isin(records.message, _WRITTEN[version])).any():
+        raise ValueError(f"records of {records.message[other][0]} cannot be written; leave them out")
 
 
 def _ionosphere_records(navigation: Navigation) -> str:
@@ -148,6 +166,7 @@ def _calendar_text(time: Datetimes) -> Strings:
 
 def kepler_numbers(records: KeplerRecords) -> Iterator[tuple[str, np.datetime64, list[float]]]:
     """Satellite, clock time in the constellation's own time, and numbers in file order of each record."""
+    _check_messages(records, "3.04")
     toc, fields = _kepler_fields(records)
     for satellite, time, numbers in zip(records.satellite.tolist(), toc, np.stack(fields, axis=1), strict=True):
         yield satellite, time, numbers.tolist()
@@ -166,8 +185,6 @@ def _kepler_fields(records: KeplerRecords) -> tuple[Datetimes, list[Floats]]:
     unknown = np.unique(letter[~np.isin(letter, ["G", "J", "E", "C"])])
     if unknown.size:
         raise ValueError(f"Keplerian records of constellation {unknown[0]!r} have no RINEX form")
-    if (other := ~np.isin(records.message, _WRITTEN)).any():
-        raise ValueError(f"records of {records.message[other][0]} cannot be written; leave them out")
     beidou, galileo = letter == "C", letter == "E"
     navstar = ~(beidou | galileo)
     shift = timedelta(np.where(beidou, BDT_MINUS_GPST_S, 0.0))
@@ -195,6 +212,17 @@ def _kepler_fields(records: KeplerRecords) -> tuple[Datetimes, list[Floats]]:
     return toc, [np.asarray(f, dtype=np.float64) for f in fields]
 
 
+def _cnv1_fields(records: KeplerRecords) -> tuple[Datetimes, list[Floats]]:
+    """Clock time in BDT, and one array for each number of CNV1 (RINEX 4.02, table A18)."""
+    shift = timedelta(np.full(len(records), BDT_MINUS_GPST_S))
+    known = {name: getattr(records, name) for name in KeplerRecords.__dataclass_fields__}
+    known["inter_signal_0"] = records.inter_signal_s[:, 0]
+    known["transmitted"] = _week_and_transmission(records, shift, np.ones(len(records), dtype=bool))[1]
+    known["spare"], unknown = np.full((2, len(records)), [[np.nan], [UNKNOWN_S]])
+    toc = np.asarray(records.toc + shift, dtype="datetime64[ns]")
+    return toc, [np.asarray(known.get(name, unknown), dtype=np.float64) for name in FIELDS["C CNV1"]]
+
+
 def _week_and_transmission(
     records: KeplerRecords, shift: NDArray[np.timedelta64], beidou: Masks
 ) -> tuple[Floats, Floats]:
@@ -205,7 +233,7 @@ def _week_and_transmission(
     own = week - np.asarray((origin - GPS_EPOCH) // np.timedelta64(7, "D"), dtype=np.int64)
     start = GPS_EPOCH + (week * SECONDS_PER_WEEK).astype("timedelta64[s]")
     sent = seconds(records.transmitted + shift - start)
-    return own.astype(np.float64), np.where(np.isnan(sent), UNKNOWN_TRANSMISSION_S, sent)
+    return own.astype(np.float64), np.where(np.isnan(sent), UNKNOWN_S, sent)
 
 
 def _glonass_fields(records: GlonassRecords) -> tuple[Datetimes, list[Floats]]:
@@ -218,7 +246,7 @@ def _glonass_fields(records: GlonassRecords) -> tuple[Datetimes, list[Floats]]:
     fields: list[Floats] = [
         records.clock_bias_s,
         records.relative_frequency,
-        np.where(np.isnan(frame), UNKNOWN_TRANSMISSION_S, frame % SECONDS_PER_WEEK),
+        np.where(np.isnan(frame), UNKNOWN_S, frame % SECONDS_PER_WEEK),
     ]
     last = (records.health, records.frequency_channel, records.age_days)
     for axis, extra in enumerate(last):

@@ -1,16 +1,21 @@
 """Dual-frequency SBAS on L5 (ICAO Annex 10, 8th edition, appendix B, 3.5.14; ED-259A): corrections of satellites.
 
 Messages of 250 bits with preambles of four bits. Types 31 (mask), 32 (orbit and clock with covariance), 34 to 36
-(integrity) and 37 (degradation and the scale of the integrity indicator) are decoded; 39, 40 (orbit of the SBAS
-satellite itself), 42 and 47 are recognised and counted. The corrections are for ionosphere-free ranges of L1 C/A and
-L5, E1 and E5a, where biases between the signals are in the clock correction, and of B1C and B2a, less the group delays
-of B-CNAV1. GLONASS has slots, but is corrected on L1OC and L3OC, which are not read.
+(integrity) and 37 (degradation and the scale of the integrity indicator) are decoded. The corrections are for
+ionosphere-free ranges of L1 C/A and L5, E1 and E5a, where biases between the signals are in the clock correction, and
+of B1C and B2a, less the group delays of B-CNAV1. GLONASS has slots, but is corrected on L1OC and L3OC, which are not
+read.
 
 The standard was not at hand. Layouts are those of cssrlib (sbas.py), least values and degradation those of MAAST
 (L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), slots those of both and of Wireshark (packet-sbas_l5.c). By an
 hour of SouthPAN and BDSBAS (`test_sbas_dfmc.py`) slot and share of the rate have 8 and 4 bits, as in cssrlib, and the
 issue of BeiDou is the IODE of B-CNAV1. BDSBAS corrects clocks of BeiDou-3 by decimetres, where group delays differ by
 metres: they are not in its corrections.
+
+Types 39 and 40, the orbit of the SBAS satellite, are counted: cssrlib and MAAST differ in the inclination rate (7/6 and
+7 pi 2^-21 1e-6 rad/s a step) and by 6370 km in the semi-major axis. The hour settles the axis alone, after MAAST:
+SouthPAN sends zeros with indicator 15, BDSBAS another layout (the axis in type 39, from bit 89 on). Neither program
+decodes type 42; no range needs the almanac, type 47.
 """
 
 from __future__ import annotations
