@@ -281,7 +281,7 @@ def _write_files(
     write_navigation(
         simulation.navigation,
         files["nav"],
-        version="4.02" if scenario.receiver.has_l5 else "3.04",
+        version="4.02" if "CNV1" in simulation.navigation.kepler.message else "3.04",
         comments=_COMMENTS,
     )
     write_track_csv(simulation.line.track(), files["track"])
