@@ -88,8 +88,8 @@ def write_navigation(
     late = kepler.message == "CNV1"
     for rows, numbers in ((~late, _kepler_fields), (late, _cnv1_fields)):
         if rows.any():
-            part = _rows(kepler, rows)
-            texts.append(_records(part.satellite, *numbers(part)))
+            own = _rows(kepler, rows)
+            texts.append(_records(own.satellite, *numbers(own)))
     if len(glonass):
         texts.append(_records(glonass.satellite, *_glonass_fields(glonass)))
     body = np.concatenate(texts)
