@@ -88,7 +88,7 @@ def find_interference(
 ) -> tuple[Interference, InterferenceState]:
     """Return the interference of the epochs of one antenna, whose ranges have all reasons, and the state to pass on."""
     observations, reason = corrected.observations, corrected.reason
-    channel = np.char.add(corrected.satellite, corrected.signal)
+    channel = corrected.channels.names
     taken = (reason & _NOT_ITS_SIGNAL) == 0
     cn0 = np.where(taken & np.isfinite(corrected.code_m), corrected.cn0_dbhz, np.nan)
     power, power_state = power_signs(corrected.time, channel, cn0, observations.front_end_gain, state.power, limits)
@@ -168,27 +168,29 @@ def _once_a_second(
     corrected: CorrectedRanges,
     solution: Solution,
     index: SearchIndex,
+    rows: slice,
     state: InterferenceState,
     limits: InterferenceLimits,
 ) -> tuple[Interference, InterferenceState]:
-    """Return the interference of the epochs of one antenna: looked for at the first epoch of each second.
+    """Return the interference of the epochs of one antenna, `rows`: looked for at the first epoch of each second.
 
     The others have what was found there; a break or an alarm between counts at the next one.
     """
-    time = corrected.time
+    time = corrected.time[rows]
     if not len(time):
-        return find_interference(corrected, solution, index, state, limits)
+        return find_interference(rows_of(corrected, rows), rows_of(solution, rows), index, state, limits)
     second = (time - GPS_EPOCH + _TAG) // _SECOND
     due = second != np.concatenate([[state.second], second[:-1]])
     group = np.cumsum(due)
     alarm, broken = np.zeros(group[-1] + 2, dtype=np.uint8), np.zeros(group[-1] + 2, dtype=np.bool_)
     alarm[0], broken[0] = state.alarm, state.broken
     # what came after a due epoch belongs to the next one
-    np.bitwise_or.at(alarm, group - due, corrected.observations.receiver_alarm)
-    np.logical_or.at(broken, group - due, corrected.break_before)
+    np.bitwise_or.at(alarm, group - due, corrected.observations.receiver_alarm[rows])
+    np.logical_or.at(broken, group - due, corrected.break_before[rows])
     at = np.flatnonzero(due)
     found, after = [], state
     if len(at):
+        at = at + (rows.start or 0)
         part, places = rows_of(corrected, at), rows_of(solution, at)
         observations = changed(part.observations, receiver_alarm=alarm[:-2])
         part = changed(part, observations=observations, break_before=broken[:-2])
@@ -238,7 +240,7 @@ def judge_interference(
         return solution, states
 
     def of_antenna(index: SearchIndex, rows: slice, state: InterferenceState) -> tuple[Interference, InterferenceState]:
-        return _once_a_second(rows_of(corrected, rows), rows_of(solution, rows), index, state, limits)
+        return _once_a_second(corrected, solution, index, rows, state, limits)
 
     found, after = antennas.each_with_state(of_antenna, states)
     status = with_statuses(solution.status, found.suspicion)

@@ -273,32 +273,32 @@ def lasting_errors(
     noise: Floats,
     config: Config,
     states: Sequence[LastingErrorState],
-) -> tuple[Ranges, Place, Masks, list[LastingErrorState]]:
-    """Return ranges and positions without satellites that are wrong for long, these satellites, and the states.
+) -> tuple[Ranges, Place, LinearModel, Masks, list[LastingErrorState]]:
+    """Return ranges, positions and model without satellites that are wrong for long, these satellites, and the states.
 
     The worst satellite is left out, then the worst of the rest, whose residuals are then those without the first.
     `noise` is the noise scale of the receiver, shape (T,); satellites are of shape (T, K), states by antenna.
     """
     limits, time = config.lasting_errors, corrected.time
-    channel = np.char.add(corrected.channels.satellite, corrected.channels.signal)
+    channel, model = corrected.channels.names, line_model(ranges, antennas, place.constrained)
     left_out = np.zeros(ranges.code_m.shape, dtype=np.bool_)
     if "raim" not in config.screens or not limits.most_satellites:
-        return ranges, place, left_out, list(states)
+        return ranges, place, model, left_out, list(states)
     least = {"window_s": limits.memory_s, "least_epochs": limits.memory_s}
     age = antennas.apart(lambda _, rows, state: ages(time[rows], state.time, state.age, **least), states)
+    share = antennas.apart(lambda _, rows, state: np.minimum(steps_s(time[rows], state.time), 1.0), states)
+    error = _own_errors(model, noise, limits.clipped)
     sums: list[list[Floats]] = [[] for _ in states]
     for turn in range(limits.most_satellites):
-        error = _own_errors(line_model(ranges, antennas, place.constrained), noise, limits.clipped)
 
         def mean_error(
-            _: SearchIndex, rows: slice, of_antenna: Floats, state: LastingErrorState, values: Floats = error,
-            turn: int = turn,
+            _: SearchIndex, rows: slice, of_antenna: Floats, step: Floats, state: LastingErrorState,
+            values: Floats = error, turn: int = turn,
         ) -> tuple[Floats, Floats]:  # fmt: skip
-            share = np.minimum(steps_s(time[rows], state.time), 1.0) / limits.memory_s
             start = _arrange(state.sums[:, turn : turn + 1], state.channel, channel).sum(axis=1)
-            return decayed_sums(of_antenna, share[:, None] * values[rows], start, state.age)
+            return decayed_sums(of_antenna, (step / limits.memory_s)[:, None] * values[rows], start, state.age)
 
-        mean, after = antennas.each_with_state(mean_error, age, states)
+        mean, after = antennas.each_with_state(mean_error, age, share, states)
         for k, new in enumerate(after):
             sums[k].append(new)
         worst = np.abs(np.where(ranges.weight > 0, mean, 0.0)).argmax(axis=1) if len(channel) else np.zeros(0, int)
@@ -313,13 +313,15 @@ def lasting_errors(
             ranges = without(ranges, found)
             for index, epochs in antennas.split(np.flatnonzero(found.any(axis=1))):
                 place = solved_again(ranges, index, place, epochs, config)
+            model = line_model(ranges, antennas, place.constrained)
+            error = _own_errors(model, noise, limits.clipped)
     after_states = [
         replace(state, time=time[rows][-1], age=float(own[-1]), channel=channel, sums=np.stack(new, axis=1))
         if len(time[rows])
         else state
         for rows, own, new, state in zip(antennas.parts, age, sums, states, strict=True)
     ]
-    return ranges, place, left_out, after_states
+    return ranges, place, model, left_out, after_states
 
 
 def _own_errors(model: LinearModel, noise: Floats, clipped: float) -> Floats:
@@ -332,6 +334,8 @@ def _own_errors(model: LinearModel, noise: Floats, clipped: float) -> Floats:
 
 def _arrange(sums: Floats, of_channel: Strings, channel: Strings) -> Floats:
     """Return sums by channel, in rows, for other channels: 0 for new ones; those that are gone are forgotten."""
+    if of_channel is channel:
+        return sums
     start = np.zeros((len(channel), sums.shape[1]))
     _, here, there = np.intersect1d(channel, of_channel, return_indices=True)
     start[here] = sums[there]

@@ -338,40 +338,57 @@ def pair_antennas(
 
 def row_median(values: Floats) -> Floats:
     """Median of each row over what is not NaN, shape (T, 1); NaN where nothing is."""
-    if not values.shape[1]:
-        return np.full((len(values), 1), np.nan)
-    alike = np.zeros(values.shape[1], dtype=np.intp)
-    return medians_of_clocks(np.ascontiguousarray(values), alike, alike, 0)[:, :1]
+    return medians_of_clocks(values, _alike(values.shape[1]), 0)
 
 
 def clock_medians(values: Floats, satellite: Strings, *, least: int = 0) -> Floats:
     """Median over the channels of one clock, at each channel (T, M); NaN below `least` satellites."""
-    return medians_of_clocks(np.ascontiguousarray(values), *_number(tuple(satellite.tolist())), least)
+    clocks = _clocks(satellite.dtype.str, satellite.tobytes())
+    return medians_of_clocks(values, clocks, least)[:, clocks.clock]
+
+
+class Clocks(NamedTuple):
+    """Receiver clocks of M channels: G clocks of at most W channels, S satellites."""
+
+    clock: Indices  #: Of each channel, shape (M,).
+    columns: Indices  #: Channels of each clock, filled up with M; shape (G, W).
+    member: Floats  #: 1 where a channel is of a satellite, shape (M, S); small counts are exact as floats of 32 bits.
+    of_clock: Floats  #: 1 where a satellite is of a clock, shape (S, G).
 
 
 @lru_cache(maxsize=256)
-def _number(satellites: tuple[str, ...]) -> tuple[Indices, Indices]:
-    """Receiver clock and satellite of each channel as numbers, shape (M,) each."""
-    clock = np.unique([CLOCK_GROUP[name[0]] for name in satellites], return_inverse=True)[1]
-    number = np.unique(list(satellites), return_inverse=True)[1]
-    return read_only(clock.astype(np.intp)), read_only(number.astype(np.intp))
+def _clocks(kind: str, satellites: bytes) -> Clocks:
+    names = np.frombuffer(satellites, dtype=kind).tolist()
+    clock = np.unique([CLOCK_GROUP[name[0]] for name in names], return_inverse=True)[1].astype(np.intp)
+    number = np.unique(names, return_inverse=True)[1]
+    rows = [np.flatnonzero(clock == one).tolist() for one in range(int(clock.max(initial=-1)) + 1)]
+    widest = max(map(len, rows), default=0)
+    columns = np.array([row + [len(names)] * (widest - len(row)) for row in rows], dtype=np.intp)
+    member = (number[:, None] == np.arange(int(number.max(initial=-1)) + 1)).astype(np.float32)
+    of_clock = (member.T @ (clock[:, None] == np.arange(len(rows))) > 0).astype(np.float32)
+    return Clocks(*map(read_only, (clock, columns.reshape(len(rows), widest), member, of_clock)))
 
 
-def medians_of_clocks(values: Floats, clock: Indices, satellite: Indices, least: int) -> Floats:
-    """Compute `clock_medians`; clocks and satellites as numbers from 0 on, arrays in C order."""
-    result = np.full(values.shape, np.nan)
-    for one in range(int(clock.max(initial=-1)) + 1):
-        columns = np.flatnonzero(clock == one)
-        part = values[:, columns]
-        ordered = np.sort(part, axis=1)  # NaN last
-        count = np.count_nonzero(~np.isnan(part), axis=1)[:, None]
-        low = np.take_along_axis(ordered, np.maximum((count - 1) // 2, 0), axis=1)
-        high = np.take_along_axis(ordered, np.minimum(count // 2, len(columns) - 1), axis=1)
-        enough = count > 0
-        if least:
-            # small counts are exact as floats, which are multiplied in blocks
-            member = (satellite[columns, None] == np.unique(satellite[columns])).astype(np.float32)
-            seen = np.isfinite(part).astype(np.float32) @ member > 0
-            enough = enough & (np.count_nonzero(seen, axis=1)[:, None] >= least)
-        result[:, columns] = np.where(enough, (low + high) / 2.0, np.nan)
-    return result
+@lru_cache(maxsize=256)
+def _alike(channels: int) -> Clocks:
+    """One clock of all channels."""
+    every = np.arange(channels)
+    return Clocks(every * 0, every[None], np.ones((channels, 0)), np.ones((0, 1)))
+
+
+def medians_of_clocks(values: Floats, clocks: Clocks, least: int) -> Floats:
+    """Median over the channels of each clock, shape (T, G); NaN below `least` satellites."""
+    epochs, (groups, widest) = len(values), clocks.columns.shape
+    if not widest:
+        return np.full((epochs, groups), np.nan)
+    padded = np.concatenate([values, np.full((epochs, 1), np.nan)], axis=1)
+    ordered = padded.take(clocks.columns, axis=1)
+    ordered.sort(axis=2)  # NaN last
+    count = (~np.isnan(ordered)).sum(axis=2)
+    row, clock = np.arange(epochs)[:, None], np.arange(groups)
+    low = ordered[row, clock, np.maximum((count - 1) // 2, 0)]
+    median = (low + ordered[row, clock, np.minimum(count // 2, widest - 1)]) / 2.0
+    if least:
+        seen = (np.isfinite(values).astype(np.float32) @ clocks.member > 0).astype(np.float32)
+        median = np.where(seen @ clocks.of_clock >= least, median, np.nan)
+    return median
