@@ -8,7 +8,6 @@ it should be ahead.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
@@ -94,7 +93,7 @@ def antenna_results(
         section=solution.place.section,
         constrained=constrained,
         phase=solution.phase,
-        raim=replace(solution.raim, protection_level_m=np.where(has, solution.raim.protection_level_m, np.nan)),
+        raim=changed(solution.raim, protection_level_m=np.where(has, solution.raim.protection_level_m, np.nan)),
         protection=None if protection is None else judged(protection, solution.status, has, chainage, config),
         map_offset=solution.map_offset,
         interference=solution.interference,

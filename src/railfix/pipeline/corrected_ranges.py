@@ -254,7 +254,7 @@ def _anchor(antennas: AntennaRows, config: Config, ranges: Ranges) -> Floats:
     the middle of the line at every epoch so that no epoch depends on another; the 3-D position
     itself where it is far from the line; the best-fitting point of the line where there is no 3-D position.
     """
-    middle = antennas.each(lambda index, rows: np.broadcast_to(index.middle_ecef_m, (len(ranges.code_m[rows]), 3)))
+    middle = antennas.each(lambda index, rows: index.middle_ecef_m[None].repeat(len(ranges.code_m[rows]), axis=0))
     point = single_point(ranges, middle, limits=_rough(config.single_point))
     anchor = point.ecef_m.copy()
     solved = np.isfinite(anchor[:, 0])

@@ -42,11 +42,10 @@ if TYPE_CHECKING:
 _CONTRADICTED: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.ALONE_ON_ITS_CLOCK)
 _NOT_ITS_SIGNAL: Final = int(Reason.OTHER_SIGNAL_TAKEN)
 #: Statuses of positions that spoofing outranks, and those that jamming does.
-_UNDER_SPOOFING: Final = (
+_UNDER_SPOOFING: Final = np.isin(np.arange(len(Status)), [
     Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN,
     Status.MAP_OFFSET,
-)  # fmt: skip
-_UNDER_JAMMING: Final = (Status.OK,)
+])  # fmt: skip
 #: Interference is looked for once so long; tags may be so much before the whole second.
 _SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
 
@@ -199,7 +198,7 @@ def _once_a_second(
     known = found if state.latest is None else [state.latest, *found]
     every = joined(known)
     row = group - (state.latest is None)
-    after = replace(
+    after = changed(
         after, second=int(second[-1]), alarm=int(alarm[group[-1]]), broken=bool(broken[group[-1]]),
         latest=rows_of(every, row[-1:]),
     )  # fmt: skip
@@ -208,8 +207,8 @@ def _once_a_second(
 
 def with_statuses(status: Codes, kind: Codes) -> Codes:
     """Return the statuses of positions with those of interference where they outrank, shape (T,)."""
-    jammed = (kind == Suspicion.JAMMING_SUSPECTED) & np.isin(status, _UNDER_JAMMING)
-    spoofed = (kind == Suspicion.SPOOFING_SUSPECTED) & np.isin(status, _UNDER_SPOOFING)
+    jammed = (kind == Suspicion.JAMMING_SUSPECTED) & (status == Status.OK)
+    spoofed = (kind == Suspicion.SPOOFING_SUSPECTED) & _UNDER_SPOOFING[status]
     status = np.where(jammed, np.int8(Status.JAMMING_SUSPECTED), status)
     return np.where(spoofed, np.int8(Status.SPOOFING_SUSPECTED), status)
 

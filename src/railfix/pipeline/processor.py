@@ -268,7 +268,7 @@ class EpochProcessor:
         solution, signs = judge_interference(
             corrected, solution, antennas, [own.interference for own in own_states], self.config.interference
         )
-        own_states = [replace(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
+        own_states = [changed(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
         solution = with_araim(corrected, solution, antennas, self._support, self.config)
         solved = SolvedChunk(
             results=self._results(antennas, corrected, solution, pair, ranges),
@@ -286,8 +286,8 @@ class EpochProcessor:
         )
         after = dict(state.antennas)
         for name, part, own in zip(names, observations.values(), own_states, strict=True):
-            after[name] = replace(own, ended=part.time[-1] if len(part) else own.ended)
-        return solved, replace(state, received=received, antennas=after, base=base_state)
+            after[name] = changed(own, ended=part.time[-1] if len(part) else own.ended)
+        return solved, changed(state, received=received, antennas=after, base=base_state)
 
     def along_track(self, solved: SolvedChunk, state: State) -> tuple[Result, State]:
         """Return the results of one chunk with those of the filter, where it is on: the second part of `process`.
@@ -312,7 +312,7 @@ class EpochProcessor:
                 path = self.trajectories[name]
                 fusion[name], filter_states[name] = with_passings(tracked, own, self.balises, path, sensors, limits)
         result = Result(antennas=with_wheel(solved.results, fusion), notes=solved.notes, fusion=fusion)
-        return result, replace(state, fusion=filter_states)
+        return result, changed(state, fusion=filter_states)
 
     def _screened(
         self, names: Sequence[str], antennas: AntennaRows, corrected: CorrectedRanges, received: Received, state: State
@@ -335,7 +335,7 @@ class EpochProcessor:
                 if self.config.carrier == "smoothed":
                     own, carrier = smoothed(own, self.config, carrier)
             ranges[name] = own
-            after.append(replace(before, screens=states, carrier=carrier, two_frequencies=two))
+            after.append(changed(before, screens=states, carrier=carrier, two_frequencies=two))
         return ranges, after
 
     def _results(

@@ -232,9 +232,9 @@ def solve(
             sums = {"robust": robust_sums[k], "remaining": stated_sums[k]}
             noise = NoiseState(time=time[rows][-1], age=float(ages[k][-1]), **sums)
         after.append(
-            replace(
+            changed(
                 state, offsets=offsets[k], noise=noise, map_offset=map_states[k], off_map=off_map_states[k],
-                lasting=replace(lasting_states[k], noise=raised_sums[k]), carrier=carriers[k],
+                lasting=changed(lasting_states[k], noise=raised_sums[k]), carrier=carriers[k],
             )
         )  # fmt: skip
     return corrected, solution, after

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, changed
 from railfix.integrity.raim import (
     Exclusion,
     LinearModel,
@@ -114,8 +114,7 @@ def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, l
         limits=RaimLimits(false_alarm=limits.false_alarm),
     )
     located = np.asarray(np.isfinite(point.ecef_m).all(axis=1))
-    over = np.zeros(len(ranges), dtype=np.bool_)
-    over[located] = ~(position_dilution(ranges.take(located), point.ecef_m[located]) <= limits.dilution_limit)
+    over = ~(position_dilution(ranges, point.ecef_m) <= limits.dilution_limit)
     conditions = [~located, test.detected, over]
     return np.select(conditions, [PointStatus.NO_POSITION, PointStatus.RESIDUALS, PointStatus.DILUTION]).astype(np.int8)
 
@@ -285,20 +284,21 @@ def lasting_errors(
     if "raim" not in config.screens or not limits.most_satellites:
         return ranges, place, model, left_out, list(states)
     least = {"window_s": limits.memory_s, "least_epochs": limits.memory_s}
-    age = antennas.apart(lambda _, rows, state: ages(time[rows], state.time, state.age, **least), states)
-    share = antennas.apart(lambda _, rows, state: np.minimum(steps_s(time[rows], state.time), 1.0), states)
+    step = antennas.apart(lambda _, rows, state: steps_s(time[rows], state.time), states)
+    age = [ages(own, state.age, **least) for own, state in zip(step, states, strict=True)]
     error = _own_errors(model, noise, limits.clipped)
     sums: list[list[Floats]] = [[] for _ in states]
     for turn in range(limits.most_satellites):
 
         def mean_error(
-            _: SearchIndex, rows: slice, of_antenna: Floats, step: Floats, state: LastingErrorState,
+            _: SearchIndex, rows: slice, of_antenna: Floats, since: Floats, state: LastingErrorState,
             values: Floats = error, turn: int = turn,
         ) -> tuple[Floats, Floats]:  # fmt: skip
             start = _arrange(state.sums[:, turn : turn + 1], state.channel, channel).sum(axis=1)
-            return decayed_sums(of_antenna, (step / limits.memory_s)[:, None] * values[rows], start, state.age)
+            share = np.minimum(since, 1.0) / limits.memory_s
+            return decayed_sums(of_antenna, share[:, None] * values[rows], start, state.age)
 
-        mean, after = antennas.each_with_state(mean_error, age, share, states)
+        mean, after = antennas.each_with_state(mean_error, age, step, states)
         for k, new in enumerate(after):
             sums[k].append(new)
         worst = np.abs(np.where(ranges.weight > 0, mean, 0.0)).argmax(axis=1) if len(channel) else np.zeros(0, int)
@@ -316,7 +316,7 @@ def lasting_errors(
             model = line_model(ranges, antennas, place.constrained)
             error = _own_errors(model, noise, limits.clipped)
     after_states = [
-        replace(state, time=time[rows][-1], age=float(own[-1]), channel=channel, sums=np.stack(new, axis=1))
+        changed(state, time=time[rows][-1], age=float(own[-1]), channel=channel, sums=np.stack(new, axis=1))
         if len(time[rows])
         else state
         for rows, own, new, state in zip(antennas.parts, age, sums, states, strict=True)

@@ -42,13 +42,13 @@ def steps_s(time: Datetimes, last: np.datetime64) -> Floats:
     return np.fmax(seconds(every[1:] - every[:-1]), 0.0)
 
 
-def ages(time: Datetimes, last: np.datetime64, last_age: float, *, window_s: float, least_epochs: float) -> Floats:
-    """Age of each epoch since the start of a log, shape (T,) [windows]; `last` and `last_age` are of the epoch before.
+def ages(step_s: Floats, last_age: float, *, window_s: float, least_epochs: float) -> Floats:
+    """Age of each epoch since the start of a log, shape (T,) [windows], by `steps_s` and the age of the epoch before.
 
     A window is `window_s` or `least_epochs` epochs, whichever is longer, so that gaps forget no faster than epochs
     come.
     """
-    step = np.minimum(steps_s(time, last) / window_s, 1.0 / least_epochs)
+    step = np.minimum(step_s / window_s, 1.0 / least_epochs)
     return np.concatenate([[last_age], step]).cumsum()[1:]
 
 
@@ -86,11 +86,12 @@ def correlated_sums(
     """Sums over a window of epochs whose errors are alike for `correlation_s`: each counts by the time since the one
     before.
 
-    Arguments as for `ages` and `decayed_sums`. Returns decayed sums at each epoch, its own values not included (T, K),
-    what each epoch adds (T, K), running sums after the last epoch (K,), and its age.
+    Arguments as for `steps_s` and `decayed_sums`. Returns decayed sums at each epoch, its own values not included
+    (T, K), what each epoch adds (T, K), running sums after the last epoch (K,), and its age.
     """
-    own = np.minimum(steps_s(time, last) / correlation_s, 1.0)[:, None] * values
-    age = ages(time, last, last_age, window_s=window_s, least_epochs=window_s / correlation_s)
+    step = steps_s(time, last)
+    own = np.minimum(step / correlation_s, 1.0)[:, None] * values
+    age = ages(step, last_age, window_s=window_s, least_epochs=window_s / correlation_s)
     before, after = decayed_sums(age, own, start, last_age)
     return before, own, after, float(age[-1]) if len(time) else last_age
 
@@ -217,7 +218,8 @@ class NoiseState:
 
 def noise_age(time: Datetimes, state: NoiseState, *, limits: NoiseScaleLimits) -> Floats:
     """Age of each epoch, shape (T,) [windows]."""
-    return ages(time, state.time, state.age, window_s=limits.window_s, least_epochs=limits.least_epochs)
+    step = steps_s(time, state.time)
+    return ages(step, state.age, window_s=limits.window_s, least_epochs=limits.least_epochs)
 
 
 def robust_scale(

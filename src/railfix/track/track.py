@@ -219,7 +219,7 @@ def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, kno
         NaN where the nearer point has no kilometrage, and for NaN.
     """
     at = np.asarray(chainage_m, dtype=np.float64)
-    index = np.clip(np.searchsorted(known_chainage_m, at, side="right") - 1, 0, len(known_chainage_m) - 2)
+    index = np.minimum(np.maximum(known_chainage_m.searchsorted(at, "right") - 1, 0), len(known_chainage_m) - 2)
     start, end = known_chainage_m[index], known_chainage_m[index + 1]
     before, after = known_kilometrage_m[index], known_kilometrage_m[index + 1]
     length = np.where(end > start, end - start, 1.0)

@@ -7,7 +7,6 @@ on the unknowns that are in use; the state has all of them.
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import fields
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
@@ -84,8 +83,7 @@ class Recursion:
         self.course = layout.LineArrays(**line.written)
         branch_m = max(limits.map_branch_m, _BRANCH_SIGMAS * line.sigma_plan_m)
         self.parameters = _parameters(limits)._replace(map_branch_m=branch_m)
-        written = {field.name: getattr(result, field.name) for field in fields(result)}
-        self.answers = layout.Outputs(**{name: written[name] for name in layout.Outputs._fields})
+        self.answers = layout.Outputs(*(vars(result)[name] for name in layout.Outputs._fields))
 
     def advance(self, state: TrackState, first: int, trace: list[Step] | None) -> tuple[int, bool]:
         """Do epochs from `first` on and change the state; return the next, and whether places have to be sought there.
