@@ -100,7 +100,7 @@ def along_track(
     inside = on_line_m(tracked, trajectory)
     ecef, chainage = trajectory.at_arc(inside), trajectory.chainage_at(inside)
     latitude, longitude, height = geodetic_from_ecef(ecef)
-    speed, sigma = np.nan_to_num(tracked.speed_mps), np.nan_to_num(tracked.speed_sigma_mps, nan=np.inf)
+    speed, sigma = tracked.speed_mps, tracked.speed_sigma_mps
     direction = np.where(np.abs(speed) > _DIRECTION_SIGMAS * sigma, np.sign(speed), 0.0)
     result = AlongTrack(
         tracked=tracked,
@@ -333,9 +333,12 @@ def gnss_epochs(
         slips, after = find_slips(obs, state, frequency_hz=ranges.channels.every_frequency_hz, limits=config.slips)
     healthy = (ranges.reason & ~int(_WEIGHED_BY_FILTER)) == 0
     phases, dopplers = ("phase" in config.filter_sources, "doppler" in config.filter_sources)
-    no_delay = np.zeros(ranges.code_m.shape)
+    no_delay, air = np.zeros(ranges.code_m.shape), ranges.troposphere_m
     phase = corrected_phase_m(
-        slips.phase_m[:, columns], ranges.satellites.clock_m, no_delay, np.nan_to_num(ranges.troposphere_m)
+        slips.phase_m[:, columns],
+        ranges.satellites.clock_m,
+        no_delay,
+        np.where(np.isnan(air), 0.0, air),
     )
     epochs = GnssEpochs(
         time=obs.time,

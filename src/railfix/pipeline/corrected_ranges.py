@@ -278,11 +278,9 @@ def _reasons_of_codes(satellite: Strings, code: Floats) -> Bits:
     observed = np.isfinite(code)
     plausible = (code > PLAUSIBLE_CODE_M[0]) & (code < PLAUSIBLE_CODE_M[1])
     taken = first_available(satellite, plausible)
-    return np.select(
-        [~observed, ~plausible, ~taken],
-        [int(Reason.NOT_OBSERVED), int(Reason.IMPLAUSIBLE_CODE), int(Reason.OTHER_SIGNAL_TAKEN)],
-        int(Reason.USED),
-    )
+    reason = np.where(taken, int(Reason.USED), int(Reason.OTHER_SIGNAL_TAKEN))
+    reason = np.where(plausible, reason, int(Reason.IMPLAUSIBLE_CODE))
+    return np.where(observed, reason, int(Reason.NOT_OBSERVED))
 
 
 def usable_ranges(

@@ -297,6 +297,8 @@ class SensedMotion:
     @classmethod
     def joined(cls, parts: Sequence[SensedMotion]) -> SensedMotion:
         """Return parts one after the other."""
+        if len(parts) == 1:
+            return parts[0]
         return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
 
 

@@ -115,8 +115,9 @@ def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, l
     )
     located = np.asarray(np.isfinite(point.ecef_m).all(axis=1))
     over = ~(position_dilution(ranges, point.ecef_m) <= limits.dilution_limit)
-    conditions = [~located, test.detected, over]
-    return np.select(conditions, [PointStatus.NO_POSITION, PointStatus.RESIDUALS, PointStatus.DILUTION]).astype(np.int8)
+    status = np.where(over, int(PointStatus.DILUTION), int(PointStatus.VALID))
+    status = np.where(test.detected, int(PointStatus.RESIDUALS), status)
+    return np.where(located, status, int(PointStatus.NO_POSITION)).astype(np.int8)
 
 
 def position_dilution(ranges: Ranges, ecef_m: Floats) -> Floats:
@@ -328,8 +329,8 @@ def _own_errors(model: LinearModel, noise: Floats, clipped: float) -> Floats:
     """Return the residuals over their standard deviations, clipped, over `clipped`; 0 where nothing checks a range."""
     checked = model.redundancy > _LEAST_REDUNDANCY
     own = np.where(checked, model.residual / np.sqrt(np.where(checked, model.redundancy, 1.0)), 0.0)
-    own = np.nan_to_num(own) / np.maximum(noise, 1.0)[:, None]
-    return np.asarray(np.clip(own, -clipped, clipped) / clipped)
+    own = np.where(np.isnan(own), 0.0, own) / np.maximum(noise, 1.0)[:, None]
+    return np.asarray(np.minimum(np.maximum(own, -clipped), clipped) / clipped)
 
 
 def _arrange(sums: Floats, of_channel: Strings, channel: Strings) -> Floats:

@@ -94,8 +94,8 @@ def nearest_segments(
     best = offset.min(axis=1)
     # independent of the order of the tree that has named the segments
     place = np.where(offset <= best[:, None] * (1 + 1e-12) + 1e-9, segment + share, np.inf)
-    column = np.argmin(place, axis=1)[:, None]
-    return (np.take_along_axis(segment, column, axis=1)[:, 0], np.take_along_axis(share, column, axis=1)[:, 0], best)
+    row, column = np.arange(len(points_m)), place.argmin(axis=1)
+    return segment[row, column], share[row, column], best
 
 
 #: A line goes on where its end comes this close to another place of it [m]: no other track is as near.

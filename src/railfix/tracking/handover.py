@@ -87,7 +87,7 @@ class Handover:
         scalars = np.array([
             state.hypotheses, state.weak_motion_s, state.weak_code_s, *state.log_scale, state.distance_since_code_m,
             state.direction, seconds(state.measured - origin), *state.code_shift, state.map_log_variance,
-            *state.speed_range_mps, np.nan_to_num(seconds(state.coded - origin), nan=-np.inf), state.branch_s,
+            *state.speed_range_mps, np.fmax(seconds(state.coded - origin), -np.inf), state.branch_s,
             state.branch_m, state.across, state.step_s, state.withheld_s, state.open_s, state.motion_misfit,
         ])  # fmt: skip
         self.memory = layout.KernelState(

@@ -320,7 +320,7 @@ def _list_hypotheses(plan: Allocation, rows: Indices, n: int) -> Asked:
 
 def _channels(channel: Indices, place: Indices) -> Indices:
     """Channels at places side by side, shape (T, k); -1 for -1."""
-    return np.where(place >= 0, np.take_along_axis(channel, np.maximum(place, 0), axis=1), -1)
+    return np.where(place >= 0, channel[np.arange(len(channel))[:, None], np.maximum(place, 0)], -1)
 
 
 @lru_cache(maxsize=64)
