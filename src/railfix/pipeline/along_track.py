@@ -153,9 +153,7 @@ def checked(
         disagreed[1:], error = np.where(spacing.reject, time, np.datetime64("NaT", "ns")), spacing.metric
     disagreed = np.fmax.accumulate(disagreed)
     held = seconds(time - disagreed[1:]) <= held_s
-    tracked = result.tracked
-    if held.any():
-        tracked = doubted(tracked, held & is_bounded(tracked.status), TrackStatus.ANTENNAS_DISAGREE)
+    tracked = doubted(result.tracked, held & is_bounded(result.tracked.status), TrackStatus.ANTENNAS_DISAGREE)
     return changed(result, tracked=tracked, spacing_error_m=error), changed(state, disagreed=disagreed[-1])
 
 
@@ -177,6 +175,8 @@ def with_passings(
 
 def doubted(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:
     """Return places with a status of doubt at some epochs; nothing bounds their error there."""
+    if not doubtful.any():
+        return tracked
     told = np.where(doubtful, np.int8(status), tracked.status)
     unbounded = doubtful & ~np.isnan(tracked.level_m)
     names = ("level_m", "ground_level_m", "amount_m")

@@ -108,7 +108,7 @@ class CorrectedRanges(AntennaRanges):
             reject = verdict.screened.reject
             if verdict.error_m is None:
                 ranges = ranges.rejected(reject, verdict.reason)
-            else:
+            elif reject.any():
                 ranges = changed(ranges, sigma_m=suspicion_sigma_m(reject, verdict.error_m, ranges.sigma_m))
             ranges = changed(ranges, screens={**ranges.screens, verdict.name: verdict.screened})
         return ranges

@@ -349,8 +349,8 @@ class EpochProcessor:
         ranges: Mapping[str, CorrectedRanges],
     ) -> dict[str, AntennaResult]:
         """Return the results of single epochs by antenna, after the screens of the published positions."""
-        chainage = antennas.apart(lambda index, rows: index.trajectory.chainage_at(solution.arc_m[rows]))
-        published = dict(zip(ranges, chainage, strict=True))
+        chainage = antennas.each(lambda index, rows: index.trajectory.chainage_at(solution.arc_m[rows]))
+        published = {name: chainage[rows] for name, rows in zip(ranges, antennas.parts, strict=True)}
         screens = {name: dict(own.screens) for name, own in ranges.items()}
         rows_by_name, status = dict(zip(ranges, antennas.parts, strict=True)), solution.status.copy()
         for name, verdicts in position_verdicts(self.screens, pair, published).items():
@@ -359,7 +359,7 @@ class EpochProcessor:
                 doubtful = verdict.screened.reject & with_coordinates(self.config.failed_checks)[status[rows]]
                 status[rows] = np.where(doubtful, verdict.status, status[rows])
                 screens[name][verdict.name] = verdict.screened
-        results = antenna_results(corrected, antennas, changed(solution, status=status), self.config)
+        results = antenna_results(corrected, antennas, changed(solution, status=status), chainage, self.config)
         return {name: changed(rows_of(results, rows), screens=screens[name]) for name, rows in rows_by_name.items()}
 
     def _filtered(self, solved: SolvedChunk, state: State) -> dict[str, tuple[AlongTrack, FilterState]]:

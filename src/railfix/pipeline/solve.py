@@ -308,7 +308,9 @@ def lasting_errors(
             rows = np.arange(len(worst))
             found[rows, worst] = np.abs(mean[rows, worst]) > limits.share
             found &= ranges.weight > 0
-            found &= (redundancy_of(without(ranges, found)) >= _LEAST_FREEDOM)[:, None]
+        if not found.any():
+            continue
+        found &= (redundancy_of(without(ranges, found)) >= _LEAST_FREEDOM)[:, None]
         left_out |= found
         if found.any():
             ranges = without(ranges, found)

@@ -286,7 +286,7 @@ def pair_epochs(time_front: ArrayLike, time_rear: ArrayLike, *, tolerance_s: flo
 
 def _nearest(values: Integers, among: Integers) -> Indices:
     """Return the index of the nearest of rising numbers, the earlier of two equally near."""
-    after = np.clip(np.searchsorted(among, values), 1, max(len(among) - 1, 1))
+    after = np.minimum(np.maximum(among.searchsorted(values), 1), max(len(among) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(among) - 1)
     return np.where(np.abs(values - among[before]) <= np.abs(among[after] - values), before, after)

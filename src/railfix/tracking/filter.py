@@ -82,7 +82,7 @@ class Recursion:
         self.epochs = layout.Epochs(**arrays, unsigned=sensors.wheel_sign == "unknown")
         self.course = layout.LineArrays(**line.written)
         branch_m = max(limits.map_branch_m, _BRANCH_SIGMAS * line.sigma_plan_m)
-        self.parameters = _parameters(limits)._replace(map_branch_m=branch_m)
+        self.parameters = _parameters(limits, branch_m)
         self.answers = layout.Outputs(*(vars(result)[name] for name in layout.Outputs._fields))
 
     def advance(self, state: TrackState, first: int, trace: list[Step] | None) -> tuple[int, bool]:
@@ -189,11 +189,12 @@ def _columns(sensors: SensorEpochs, time: Datetimes) -> dict[str, Floats]:
 
 
 @lru_cache(maxsize=8)
-def _parameters(limits: TrackingLimits) -> layout.Parameters:
+def _parameters(limits: TrackingLimits, branch_m: float) -> layout.Parameters:
     """Settings as the kernel takes them."""
     budget = bank.budget(limits)
     given: dict[str, Any] = {
         "degrees": tuple(limits.tails),
+        "map_branch_m": branch_m,
         "level_risk": budget.risk,
         "level_k": budget.k,
         "level_k_speed": budget.k_speed,
