@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, Protocol,
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks, Strings, read_only
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks, Strings, medians, read_only
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
 from railfix.core.settings import Settings
@@ -336,28 +336,22 @@ def pair_antennas(
     )
 
 
-def row_median(values: Floats) -> Floats:
-    """Median of each row over what is not NaN, shape (T, 1); NaN where nothing is."""
-    return medians_of_clocks(values, _alike(values.shape[1]), 0)
-
-
 def clock_medians(values: Floats, satellite: Strings, *, least: int = 0) -> Floats:
     """Median over the channels of one clock, at each channel (T, M); NaN below `least` satellites."""
-    clocks = _clocks(satellite.dtype.str, satellite.tobytes())
-    return medians_of_clocks(values, clocks, least)[:, clocks.clock]
-
-
-class Clocks(NamedTuple):
-    """Receiver clocks of M channels: G clocks of at most W channels, S satellites."""
-
-    clock: Indices  #: Of each channel, shape (M,).
-    columns: Indices  #: Channels of each clock, filled up with M; shape (G, W).
-    member: Floats  #: 1 where a channel is of a satellite, shape (M, S); small counts are exact as floats of 32 bits.
-    of_clock: Floats  #: 1 where a satellite is of a clock, shape (S, G).
+    clock, columns, member, of_clock = _clocks(satellite.dtype.str, satellite.tobytes())
+    padded = np.concatenate([values, np.full((len(values), 1), np.nan)], axis=1)
+    median = medians(padded.take(columns, axis=1))
+    if least:
+        seen = (np.isfinite(values).astype(np.float32) @ member > 0).astype(np.float32)
+        median = np.where(seen @ of_clock >= least, median, np.nan)
+    return np.asarray(median[:, clock])
 
 
 @lru_cache(maxsize=256)
-def _clocks(kind: str, satellites: bytes) -> Clocks:
+def _clocks(kind: str, satellites: bytes) -> tuple[Indices, Indices, Floats, Floats]:
+    """Return clocks of M channels; channels of G clocks, filled up with M, (G, W); which are of S satellites, (M, S);
+    and which of these of a clock, (S, G): small counts are exact as floats of 32 bits.
+    """
     names = np.frombuffer(satellites, dtype=kind).tolist()
     clock = np.unique([CLOCK_GROUP[name[0]] for name in names], return_inverse=True)[1].astype(np.intp)
     number = np.unique(names, return_inverse=True)[1]
@@ -366,29 +360,5 @@ def _clocks(kind: str, satellites: bytes) -> Clocks:
     columns = np.array([row + [len(names)] * (widest - len(row)) for row in rows], dtype=np.intp)
     member = (number[:, None] == np.arange(int(number.max(initial=-1)) + 1)).astype(np.float32)
     of_clock = (member.T @ (clock[:, None] == np.arange(len(rows))) > 0).astype(np.float32)
-    return Clocks(*map(read_only, (clock, columns.reshape(len(rows), widest), member, of_clock)))
-
-
-@lru_cache(maxsize=256)
-def _alike(channels: int) -> Clocks:
-    """One clock of all channels."""
-    every = np.arange(channels)
-    return Clocks(every * 0, every[None], np.ones((channels, 0)), np.ones((0, 1)))
-
-
-def medians_of_clocks(values: Floats, clocks: Clocks, least: int) -> Floats:
-    """Median over the channels of each clock, shape (T, G); NaN below `least` satellites."""
-    epochs, (groups, widest) = len(values), clocks.columns.shape
-    if not widest:
-        return np.full((epochs, groups), np.nan)
-    padded = np.concatenate([values, np.full((epochs, 1), np.nan)], axis=1)
-    ordered = padded.take(clocks.columns, axis=1)
-    ordered.sort(axis=2)  # NaN last
-    count = (~np.isnan(ordered)).sum(axis=2)
-    row, clock = np.arange(epochs)[:, None], np.arange(groups)
-    low = ordered[row, clock, np.maximum((count - 1) // 2, 0)]
-    median = (low + ordered[row, clock, np.minimum(count // 2, widest - 1)]) / 2.0
-    if least:
-        seen = (np.isfinite(values).astype(np.float32) @ clocks.member > 0).astype(np.float32)
-        median = np.where(seen @ clocks.of_clock >= least, median, np.nan)
-    return median
+    columns = columns.reshape(len(rows), widest)
+    return read_only(clock), read_only(columns), read_only(member), read_only(of_clock)

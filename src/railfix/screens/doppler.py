@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Strings, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, Strings, freeze_arrays, medians
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
@@ -35,7 +35,6 @@ from railfix.screens.base import (
     ScreenSetup,
     Verdict,
     clock_medians,
-    row_median,
 )
 
 _MEDIAN_NORMAL: Final = 0.674_489_750_196_081_7  #: Median of the absolute value of a unit normal variable.
@@ -115,7 +114,7 @@ def receiver_limit_m(
     averaged, so that an epoch full of multipath does not carry it).
     """
     growth = _growth(interval_s, limits)
-    shown = row_median(np.abs(metric_m))[:, 0] / _MEDIAN_NORMAL / growth
+    shown = medians(np.abs(metric_m)) / _MEDIAN_NORMAL / growth
     counts = (np.count_nonzero(np.isfinite(metric_m), axis=1) >= _LEAST_CHANGES) & np.isfinite(shown)
     logs = np.where(counts, np.log(np.maximum(np.where(counts, shown, 1.0), _FINEST_M)), 0.0)
     # running sums, one after the other from the carried ones: a cut does not show

@@ -7,10 +7,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, medians
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
-from railfix.integrity.interference.limits import InterferenceLimits, _median
+from railfix.integrity.interference.limits import InterferenceLimits
 
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 #: Steps of receiver clocks by whole milliseconds are none of interference [m].
@@ -258,7 +258,7 @@ def _clock_jump(
     change = codes[1:] - codes[before, column] - (rates[1:] + rates[before, column]) / 2.0 * dt
     change = np.where(near, change, np.nan)
     enough = np.count_nonzero(np.isfinite(change), axis=1) >= limits.least_satellites
-    step = np.where(enough, _median(change), np.nan)
+    step = np.where(enough, medians(change), np.nan)
     last = row[-1]
     kept = np.where(broken[-1] == broken[last], 0.0, np.nan)  # nothing is compared across a break
     after = codes[last, column] + kept, rates[last, column], when[last, column]

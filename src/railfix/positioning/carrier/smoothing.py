@@ -18,7 +18,7 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, medians, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
@@ -106,12 +106,7 @@ class Slips:
 
 def median_or_zero(values: Floats) -> Floats:
     """Median over the channels of each epoch, 0 where fewer than three have one; shape (T,)."""
-    if values.shape[1] < _COMMON:
-        return np.zeros(len(values))
-    count, row = np.isfinite(values).sum(axis=1), np.arange(len(values))
-    ranked = np.sort(values, axis=1)  # NaN last: the median is the middle of the finite values
-    middle = 0.5 * (ranked[row, np.maximum(count - 1, 0) // 2] + ranked[row, count // 2])
-    return np.where(count >= _COMMON, middle, 0.0)
+    return np.where(np.isfinite(values).sum(axis=1) >= _COMMON, medians(values), 0.0)
 
 
 def _before(values: Floats, last: Floats) -> Floats:
