@@ -120,7 +120,7 @@ def _join(values: Sequence[Any]) -> Any:
     first = values[0]
     if isinstance(first, np.ndarray):
         return np.concatenate(values)
-    if not (has_rows := _members(type(first))):
+    if not (has_rows := _members(first.__class__)):
         return first
     own = [vars(value) for value in values]
     return _make(type(first), {n: _join([o[n] for o in own]) if rows else own[0][n] for n, rows in has_rows.items()})
@@ -134,7 +134,7 @@ def rows_of(value: Value, rows: slice | Indices) -> Value:
 def _rows_of(value: Any, rows: slice | Indices) -> Any:
     if isinstance(value, np.ndarray):
         return value[rows]
-    if not (has_rows := _members(type(value))):
+    if not (has_rows := _members(value.__class__)):
         return value
     own, members = vars(value), {}
     for name, of_rows in has_rows.items():
