@@ -15,7 +15,7 @@ from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
-from railfix.positioning.noise_scale import NoiseScaleLimits, ages, decayed_sums, epoch_variance, robust_fit
+from railfix.positioning.noise_scale import NoiseScaleLimits, ages, decayed_sums, epoch_variance, robust_fit, steps_s
 from railfix.positioning.normal_equations import Ranges
 from railfix.simulate.demonstration import demo_files
 
@@ -56,7 +56,7 @@ def test_sums_decay_as_one_by_one() -> None:
     time = np.datetime64("2024-03-05T00:00:00", "ns") + timedelta(np.cumsum(step))
     values = generator.normal(size=(300, 2))
     nothing = np.datetime64("NaT", "ns")
-    age = ages(time, nothing, 0.0, window_s=100.0, least_epochs=4.0)
+    age = ages(steps_s(time, nothing), 0.0, window_s=100.0, least_epochs=4.0)
     before, after = decayed_sums(age, values, np.zeros(2), 0.0)
     total = np.zeros(2)
     for t in range(300):

@@ -57,3 +57,14 @@ def changed(instance: Instance, **values: Any) -> Instance:
     copy = object.__new__(type(instance))
     vars(copy).update(vars(instance), **values)
     return copy
+
+
+def medians(values: Floats) -> Floats:
+    """Return the medians along the last axis over what is not NaN; NaN where nothing is."""
+    *shape, width = values.shape
+    if not width:
+        return np.full(shape, np.nan)
+    rows = np.sort(values, axis=-1).reshape(-1, width)  # NaN last
+    count, row = (~np.isnan(rows)).sum(axis=1), np.arange(len(rows))
+    low, high = rows[row, np.maximum(count - 1, 0) // 2], rows[row, np.minimum(count // 2, width - 1)]
+    return np.asarray((low + high) / 2.0).reshape(shape)

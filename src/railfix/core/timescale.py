@@ -19,6 +19,7 @@ BDT_EPOCH: Final = np.datetime64("2006-01-01T00:00:00", "ns")
 SECONDS_PER_WEEK: Final = 604_800
 SECONDS_PER_DAY: Final = 86_400
 _NS: Final = 1_000_000_000
+_NAT: Final = np.iinfo(np.int64).min
 
 #: UTC instants from which GPST - UTC takes a new value [s] (IERS Bulletin C).
 _LEAP_UTC: Final = np.array(
@@ -42,10 +43,9 @@ def gps_time(value: str | datetime | np.datetime64) -> np.datetime64:
 
 def seconds(delta: ArrayLike) -> Floats:
     """Convert time differences to seconds; NaN where they are NaT."""
-    ns = np.asarray(delta, dtype="timedelta64[ns]")
-    count = ns.astype(np.int64)
-    result = (count // _NS).astype(np.float64) + (count % _NS) / _NS
-    return np.where(np.isnat(ns), np.nan, result)
+    count = np.asarray(delta, dtype="timedelta64[ns]").view(np.int64)
+    whole, rest = np.divmod(count, _NS)
+    return np.where(count == _NAT, np.nan, whole + rest / _NS)
 
 
 def timedelta(seconds_s: ArrayLike) -> NDArray[np.timedelta64]:

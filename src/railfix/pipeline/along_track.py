@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, changed
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Reason
@@ -33,6 +33,7 @@ from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import LineReferences, sensor_epochs
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.screens import Screened
+from railfix.track.track import interpolate_kilometrage
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, Tracked, TrackStatus, track
 from railfix.tracking.levels import track_with_levels
@@ -78,10 +79,10 @@ def along_track(
     balises of `surroundings`.
     """
     epochs, slips = gnss_epochs(ranges, single.noise_scale, config, state.slips)
-    epochs = replace(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m)
+    epochs = changed(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m)
     line = Line.of(trajectory) if state.line is None else state.line
     tracked, sensed, replays, after = _tracked(
-        epochs, trajectory, line, config, replace(state, slips=slips), samples, surroundings,
+        epochs, trajectory, line, config, changed(state, slips=slips), samples, surroundings,
         (single.arc_m, single.sigma_m),
     )  # fmt: skip
     beside = (tracked.status == TrackStatus.TRACKING) & single.map_offset
@@ -97,14 +98,14 @@ def along_track(
             after, tracked = replace(after, pulled=filtered), _bounded_by_wheel(tracked, pulled.bound_m)
         tracked = doubted(tracked, wheel.parted & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
     inside = on_line_m(tracked, trajectory)
-    ecef = trajectory.at_arc(inside)
+    ecef, chainage = trajectory.at_arc(inside), trajectory.chainage_at(inside)
     latitude, longitude, height = geodetic_from_ecef(ecef)
-    speed, sigma = np.nan_to_num(tracked.speed_mps), np.nan_to_num(tracked.speed_sigma_mps, nan=np.inf)
+    speed, sigma = tracked.speed_mps, tracked.speed_sigma_mps
     direction = np.where(np.abs(speed) > _DIRECTION_SIGMAS * sigma, np.sign(speed), 0.0)
     result = AlongTrack(
         tracked=tracked,
-        chainage_m=trajectory.chainage_at(inside),
-        kilometrage_m=trajectory.kilometrage_at(inside),
+        chainage_m=chainage,
+        kilometrage_m=interpolate_kilometrage(chainage, trajectory.chainage_m, trajectory.kilometrage_m),
         ecef_m=ecef,
         latitude_deg=latitude,
         longitude_deg=longitude,
@@ -116,7 +117,7 @@ def along_track(
         wheel=wheel,
         replay=replays,
     )
-    return result, replace(after, line=line)
+    return result, changed(after, line=line)
 
 
 def _bounded_by_wheel(tracked: Tracked, bound_m: Floats) -> Tracked:
@@ -152,10 +153,8 @@ def checked(
         disagreed[1:], error = np.where(spacing.reject, time, np.datetime64("NaT", "ns")), spacing.metric
     disagreed = np.fmax.accumulate(disagreed)
     held = seconds(time - disagreed[1:]) <= held_s
-    tracked = result.tracked
-    if held.any():
-        tracked = doubted(tracked, held & is_bounded(tracked.status), TrackStatus.ANTENNAS_DISAGREE)
-    return replace(result, tracked=tracked, spacing_error_m=error), replace(state, disagreed=disagreed[-1])
+    tracked = doubted(result.tracked, held & is_bounded(result.tracked.status), TrackStatus.ANTENNAS_DISAGREE)
+    return changed(result, tracked=tracked, spacing_error_m=error), changed(state, disagreed=disagreed[-1])
 
 
 def with_passings(
@@ -176,11 +175,13 @@ def with_passings(
 
 def doubted(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:
     """Return places with a status of doubt at some epochs; nothing bounds their error there."""
+    if not doubtful.any():
+        return tracked
     told = np.where(doubtful, np.int8(status), tracked.status)
     unbounded = doubtful & ~np.isnan(tracked.level_m)
     names = ("level_m", "ground_level_m", "amount_m")
     levels = {name: np.where(unbounded, np.inf, getattr(tracked, name)) for name in names}
-    return replace(tracked, status=told, **levels)
+    return changed(tracked, status=told, **levels)
 
 
 def _tracked(
@@ -231,7 +232,7 @@ def _tracked(
         else:
             tracked, after = track(part, line, state.track, limits=config.tracking, sensors=sensors)
         fixed = _fixed(tracked) if len(part) else state.fixed
-        state = replace(state, track=after, level=level, sensors=kept, fixed=fixed)
+        state = changed(state, track=after, level=level, sensors=kept, fixed=fixed)
         parts.append(tracked)
         motions.append(sensed)
     return _join(parts), SensedMotion.joined(motions), tuple(replays), state
@@ -332,9 +333,12 @@ def gnss_epochs(
         slips, after = find_slips(obs, state, frequency_hz=ranges.channels.every_frequency_hz, limits=config.slips)
     healthy = (ranges.reason & ~int(_WEIGHED_BY_FILTER)) == 0
     phases, dopplers = ("phase" in config.filter_sources, "doppler" in config.filter_sources)
-    no_delay = np.zeros(ranges.code_m.shape)
+    no_delay, air = np.zeros(ranges.code_m.shape), ranges.troposphere_m
     phase = corrected_phase_m(
-        slips.phase_m[:, columns], ranges.satellites.clock_m, no_delay, np.nan_to_num(ranges.troposphere_m)
+        slips.phase_m[:, columns],
+        ranges.satellites.clock_m,
+        no_delay,
+        np.where(np.isnan(air), 0.0, air),
     )
     epochs = GnssEpochs(
         time=obs.time,

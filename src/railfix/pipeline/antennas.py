@@ -8,7 +8,6 @@ it should be ahead.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
@@ -38,13 +37,13 @@ def with_coordinates(failed_checks: str) -> Masks:
 
 
 def antenna_results(
-    corrected: CorrectedRanges, antennas: AntennaRows, solution: Solution, config: Config
+    corrected: CorrectedRanges, antennas: AntennaRows, solution: Solution, chainage_m: Floats, config: Config
 ) -> AntennaResult:
-    """Return the result of one antenna, or of the rows of several."""
+    """Return the result of one antenna, or of the rows of several; `chainage_m` of all positions, shape (T,)."""
     obs, point, constrained = corrected.observations, solution.point, solution.place.constrained
     has = with_coordinates(config.failed_checks)[solution.status]
-    arc = np.where(has, solution.arc_m, np.nan)
-    ecef, chainage, kilometrage = antennas.each(lambda index, rows: _places(index.trajectory, arc[rows]))
+    arc, chainage = np.where(has, solution.arc_m, np.nan), np.where(has, chainage_m, np.nan)
+    ecef, kilometrage = antennas.each(lambda index, rows: _places(index.trajectory, arc[rows], chainage[rows]))
     latitude, longitude, height = geodetic_from_ecef(ecef)
     nearest, offset, beside = antennas.each(lambda index, rows: _nearest(index.trajectory, point.ecef_m[rows]))
     reason = reason_of_all_channels(corrected)
@@ -94,7 +93,7 @@ def antenna_results(
         section=solution.place.section,
         constrained=constrained,
         phase=solution.phase,
-        raim=replace(solution.raim, protection_level_m=np.where(has, solution.raim.protection_level_m, np.nan)),
+        raim=changed(solution.raim, protection_level_m=np.where(has, solution.raim.protection_level_m, np.nan)),
         protection=None if protection is None else judged(protection, solution.status, has, chainage, config),
         map_offset=solution.map_offset,
         interference=solution.interference,
@@ -105,10 +104,9 @@ def antenna_results(
     )
 
 
-def _places(line: Trajectory, arc_m: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return points (T, 3), chainages and kilometrage (T,) of a line at arc lengths [m]."""
-    chainage = line.chainage_at(arc_m)
-    return line.at_arc(arc_m), chainage, interpolate_kilometrage(chainage, line.chainage_m, line.kilometrage_m)
+def _places(line: Trajectory, arc_m: Floats, chainage_m: Floats) -> tuple[Floats, Floats]:
+    """Return points (T, 3) and kilometrage (T,) of a line at arc lengths and their chainages [m]."""
+    return line.at_arc(arc_m), interpolate_kilometrage(chainage_m, line.chainage_m, line.kilometrage_m)
 
 
 def _nearest(line: Trajectory, ecef_m: Floats) -> tuple[Floats, Floats, Floats]:

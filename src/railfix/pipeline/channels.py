@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -211,6 +211,11 @@ class Channels:
     second_noise: Floats
     pair_names: tuple[str, ...]  #: Satellite and both signals, length K P.
     pair_groups: Integers  #: Number of the pairs with one delay in the receiver, shape (K P,).
+
+    @cached_property
+    def names(self) -> Strings:
+        """Satellite and signal, shape (K,)."""
+        return np.char.add(self.satellite, self.signal)
 
 
 class ChannelBook:

@@ -108,7 +108,7 @@ class CorrectedRanges(AntennaRanges):
             reject = verdict.screened.reject
             if verdict.error_m is None:
                 ranges = ranges.rejected(reject, verdict.reason)
-            else:
+            elif reject.any():
                 ranges = changed(ranges, sigma_m=suspicion_sigma_m(reject, verdict.error_m, ranges.sigma_m))
             ranges = changed(ranges, screens={**ranges.screens, verdict.name: verdict.screened})
         return ranges
@@ -254,7 +254,7 @@ def _anchor(antennas: AntennaRows, config: Config, ranges: Ranges) -> Floats:
     the middle of the line at every epoch so that no epoch depends on another; the 3-D position
     itself where it is far from the line; the best-fitting point of the line where there is no 3-D position.
     """
-    middle = antennas.each(lambda index, rows: np.broadcast_to(index.middle_ecef_m, (len(ranges.code_m[rows]), 3)))
+    middle = antennas.each(lambda index, rows: index.middle_ecef_m[None].repeat(len(ranges.code_m[rows]), axis=0))
     point = single_point(ranges, middle, limits=_rough(config.single_point))
     anchor = point.ecef_m.copy()
     solved = np.isfinite(anchor[:, 0])
@@ -278,11 +278,9 @@ def _reasons_of_codes(satellite: Strings, code: Floats) -> Bits:
     observed = np.isfinite(code)
     plausible = (code > PLAUSIBLE_CODE_M[0]) & (code < PLAUSIBLE_CODE_M[1])
     taken = first_available(satellite, plausible)
-    return np.select(
-        [~observed, ~plausible, ~taken],
-        [int(Reason.NOT_OBSERVED), int(Reason.IMPLAUSIBLE_CODE), int(Reason.OTHER_SIGNAL_TAKEN)],
-        int(Reason.USED),
-    )
+    reason = np.where(taken, int(Reason.USED), int(Reason.OTHER_SIGNAL_TAKEN))
+    reason = np.where(plausible, reason, int(Reason.IMPLAUSIBLE_CODE))
+    return np.where(observed, reason, int(Reason.NOT_OBSERVED))
 
 
 def usable_ranges(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -126,10 +127,11 @@ def off_map_epochs(
     """
     off, known, since = state.off, state.known, state.since
     result = np.full(len(time), off)
-    judged = np.flatnonzero(on_map | off_map)
-    runs = np.split(judged, np.flatnonzero(np.diff(off_map[judged])) + 1) if len(judged) else []
-    for run in runs:
-        says = bool(off_map[run[0]])
+    judged = (on_map | off_map).nonzero()[0]
+    told = off_map[judged]
+    edges = [0, *((told[1:] != told[:-1]).nonzero()[0] + 1).tolist(), len(judged)]
+    for first, end in pairwise(edges) if len(judged) else ():
+        run, says = judged[first:end], bool(told[first])
         if known and says == off:
             since = _NEVER
             continue

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Bytes, Codes, Floats, Masks, changed, read_only
+from railfix.core.arrays import Bits, Bytes, Codes, Floats, Indices, Masks, changed, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
 from railfix.core.timescale import GPS_EPOCH
@@ -42,11 +42,10 @@ if TYPE_CHECKING:
 _CONTRADICTED: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.ALONE_ON_ITS_CLOCK)
 _NOT_ITS_SIGNAL: Final = int(Reason.OTHER_SIGNAL_TAKEN)
 #: Statuses of positions that spoofing outranks, and those that jamming does.
-_UNDER_SPOOFING: Final = (
+_UNDER_SPOOFING: Final = np.isin(np.arange(len(Status)), [
     Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN,
     Status.MAP_OFFSET,
-)  # fmt: skip
-_UNDER_JAMMING: Final = (Status.OK,)
+])  # fmt: skip
 #: Interference is looked for once so long; tags may be so much before the whole second.
 _SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
 
@@ -82,44 +81,52 @@ class Interference:
 def find_interference(
     corrected: CorrectedRanges,
     solution: Solution,
+    rows: Indices,
+    heard: tuple[Bytes, Masks],
     index: SearchIndex,
     state: InterferenceState,
     limits: InterferenceLimits,
 ) -> tuple[Interference, InterferenceState]:
-    """Return the interference of the epochs of one antenna, whose ranges have all reasons, and the state to pass on."""
-    observations, reason = corrected.observations, corrected.reason
-    channel = np.char.add(corrected.satellite, corrected.signal)
+    """Return the interference of some epochs of one antenna, whose ranges have all reasons, and the state to pass on.
+
+    `heard`: alarms of the receiver and breaks since the epoch before, of each.
+    """
+    (alarm, broken), time, reason = heard, corrected.time[rows], corrected.reason[rows]
+    channel, code = corrected.channels.names, corrected.code_m[rows]
     taken = (reason & _NOT_ITS_SIGNAL) == 0
-    cn0 = np.where(taken & np.isfinite(corrected.code_m), corrected.cn0_dbhz, np.nan)
-    power, power_state = power_signs(corrected.time, channel, cn0, observations.front_end_gain, state.power, limits)
+    cn0 = np.where(taken & np.isfinite(code), corrected.cn0_dbhz[rows], np.nan)
+    power, power_state = power_signs(
+        time, channel, cn0, corrected.observations.front_end_gain[rows], state.power, limits
+    )
     clocks = list(corrected.clocks)
-    arc, offset = index.trajectory.nearest(solution.point.ecef_m)
+    near = solution.point.ecef_m[rows]
+    arc, offset = index.trajectory.nearest(near)
     inside = (arc > 0.0) & (arc < index.trajectory.arc_m[-1])
     motion, motion_state = motion_signs(
         MotionInputs(
-            time=corrected.time,
-            break_before=corrected.break_before,
+            time=time,
+            break_before=broken,
             channel=channel,
             group=np.array([clocks.index(letter) for letter in corrected.channels.clock.tolist()], dtype=np.intp),
-            near_ecef_m=solution.point.ecef_m,
-            sat_ecef_m=corrected.satellites.position_ecef_m,
-            sat_velocity_mps=corrected.satellites.velocity_ecef_mps,
-            code_m=np.where(taken, corrected.code_m, np.nan),
-            rate_mps=-SPEED_OF_LIGHT / corrected.frequency_hz * corrected.doppler_hz,
-            corrected_code_m=corrected.corrected_code_m,
-            sigma_m=corrected.sigma_m,
+            near_ecef_m=near,
+            sat_ecef_m=corrected.satellites.position_ecef_m[rows],
+            sat_velocity_mps=corrected.satellites.velocity_ecef_mps[rows],
+            code_m=np.where(taken, code, np.nan),
+            rate_mps=-SPEED_OF_LIGHT / corrected.frequency_hz * corrected.doppler_hz[rows],
+            corrected_code_m=corrected.corrected_code_m[rows],
+            sigma_m=corrected.sigma_m[rows],
             used=(reason & ~_CONTRADICTED) == 0,
-            noise_scale=solution.noise_scale,
-            clock_offset_m=solution.ties.offset_m,
-            clock_sigma_m=solution.ties.sigma_m,
+            noise_scale=solution.noise_scale[rows],
+            clock_offset_m=solution.ties.offset_m[rows],
+            clock_sigma_m=solution.ties.sigma_m[rows],
             off_line_m=np.where(inside, offset, np.nan),
         ),
         state.motion,
         limits,
     )
-    signs = _signs(observations.receiver_alarm, power, motion, limits)
+    signs = _signs(alarm, power, motion, limits)
     hold, release = _times(limits)
-    _, stays, held_state = held(corrected.time, signs, state.held, hold_s=hold, release_s=release)
+    _, stays, held_state = held(time, signs, state.held, hold_s=hold, release_s=release)
     causes = (stays * np.array([int(cause) for cause in CAUSES])).sum(axis=1, dtype=np.int64)
     after = replace(state, power=power_state, motion=motion_state, held=held_state)
     return Interference(causes=causes, power=power, motion=motion), after
@@ -168,36 +175,36 @@ def _once_a_second(
     corrected: CorrectedRanges,
     solution: Solution,
     index: SearchIndex,
+    rows: slice,
     state: InterferenceState,
     limits: InterferenceLimits,
 ) -> tuple[Interference, InterferenceState]:
-    """Return the interference of the epochs of one antenna: looked for at the first epoch of each second.
+    """Return the interference of the epochs of one antenna, `rows`: looked for at the first epoch of each second.
 
     The others have what was found there; a break or an alarm between counts at the next one.
     """
-    time = corrected.time
+    time = corrected.time[rows]
     if not len(time):
-        return find_interference(corrected, solution, index, state, limits)
+        nothing = np.empty(0, np.uint8), np.empty(0, np.bool_)
+        return find_interference(corrected, solution, np.empty(0, np.intp), nothing, index, state, limits)
     second = (time - GPS_EPOCH + _TAG) // _SECOND
     due = second != np.concatenate([[state.second], second[:-1]])
     group = np.cumsum(due)
     alarm, broken = np.zeros(group[-1] + 2, dtype=np.uint8), np.zeros(group[-1] + 2, dtype=np.bool_)
     alarm[0], broken[0] = state.alarm, state.broken
     # what came after a due epoch belongs to the next one
-    np.bitwise_or.at(alarm, group - due, corrected.observations.receiver_alarm)
-    np.logical_or.at(broken, group - due, corrected.break_before)
+    np.bitwise_or.at(alarm, group - due, corrected.observations.receiver_alarm[rows])
+    np.logical_or.at(broken, group - due, corrected.break_before[rows])
     at = np.flatnonzero(due)
     found, after = [], state
     if len(at):
-        part, places = rows_of(corrected, at), rows_of(solution, at)
-        observations = changed(part.observations, receiver_alarm=alarm[:-2])
-        part = changed(part, observations=observations, break_before=broken[:-2])
-        own, after = find_interference(part, places, index, state, limits)
+        heard, at = (alarm[:-2], broken[:-2]), at + (rows.start or 0)
+        own, after = find_interference(corrected, solution, at, heard, index, state, limits)
         found = [own]
     known = found if state.latest is None else [state.latest, *found]
     every = joined(known)
     row = group - (state.latest is None)
-    after = replace(
+    after = changed(
         after, second=int(second[-1]), alarm=int(alarm[group[-1]]), broken=bool(broken[group[-1]]),
         latest=rows_of(every, row[-1:]),
     )  # fmt: skip
@@ -206,8 +213,8 @@ def _once_a_second(
 
 def with_statuses(status: Codes, kind: Codes) -> Codes:
     """Return the statuses of positions with those of interference where they outrank, shape (T,)."""
-    jammed = (kind == Suspicion.JAMMING_SUSPECTED) & np.isin(status, _UNDER_JAMMING)
-    spoofed = (kind == Suspicion.SPOOFING_SUSPECTED) & np.isin(status, _UNDER_SPOOFING)
+    jammed = (kind == Suspicion.JAMMING_SUSPECTED) & (status == Status.OK)
+    spoofed = (kind == Suspicion.SPOOFING_SUSPECTED) & _UNDER_SPOOFING[status]
     status = np.where(jammed, np.int8(Status.JAMMING_SUSPECTED), status)
     return np.where(spoofed, np.int8(Status.SPOOFING_SUSPECTED), status)
 
@@ -238,7 +245,7 @@ def judge_interference(
         return solution, states
 
     def of_antenna(index: SearchIndex, rows: slice, state: InterferenceState) -> tuple[Interference, InterferenceState]:
-        return _once_a_second(rows_of(corrected, rows), rows_of(solution, rows), index, state, limits)
+        return _once_a_second(corrected, solution, index, rows, state, limits)
 
     found, after = antennas.each_with_state(of_antenna, states)
     status = with_statuses(solution.status, found.suspicion)

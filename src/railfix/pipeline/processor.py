@@ -59,7 +59,8 @@ class SolvedChunk:
     """Single epochs of a chunk, and what the filter along the track takes from them."""
 
     results: Mapping[str, AntennaResult]
-    ranges: Mapping[str, CorrectedRanges]  #: After all screens and exclusions, by antenna.
+    #: After all screens and exclusions, by antenna, where the filter is on.
+    ranges: Mapping[str, CorrectedRanges]
     off_map: Mapping[str, Masks]  #: The train is away from the line, shape (T,).
     pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.
     sensors: SensorSamples | None  #: Of the sensors on board since the chunk before.
@@ -268,11 +269,12 @@ class EpochProcessor:
         solution, signs = judge_interference(
             corrected, solution, antennas, [own.interference for own in own_states], self.config.interference
         )
-        own_states = [replace(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
+        own_states = [changed(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
         solution = with_araim(corrected, solution, antennas, self._support, self.config)
+        wanted = names if self.config.filter == "track" else ()
         solved = SolvedChunk(
             results=self._results(antennas, corrected, solution, pair, ranges),
-            ranges={name: rows_of(corrected, rows) for name, rows in zip(names, parts, strict=True)},
+            ranges={name: rows_of(corrected, rows) for name, rows in zip(wanted, parts, strict=bool(wanted))},
             off_map={name: solution.off_map[rows] for name, rows in zip(names, parts, strict=True)},
             pair=pair,
             sensors=sensors,
@@ -286,8 +288,8 @@ class EpochProcessor:
         )
         after = dict(state.antennas)
         for name, part, own in zip(names, observations.values(), own_states, strict=True):
-            after[name] = replace(own, ended=part.time[-1] if len(part) else own.ended)
-        return solved, replace(state, received=received, antennas=after, base=base_state)
+            after[name] = changed(own, ended=part.time[-1] if len(part) else own.ended)
+        return solved, changed(state, received=received, antennas=after, base=base_state)
 
     def along_track(self, solved: SolvedChunk, state: State) -> tuple[Result, State]:
         """Return the results of one chunk with those of the filter, where it is on: the second part of `process`.
@@ -312,7 +314,7 @@ class EpochProcessor:
                 path = self.trajectories[name]
                 fusion[name], filter_states[name] = with_passings(tracked, own, self.balises, path, sensors, limits)
         result = Result(antennas=with_wheel(solved.results, fusion), notes=solved.notes, fusion=fusion)
-        return result, replace(state, fusion=filter_states)
+        return result, changed(state, fusion=filter_states)
 
     def _screened(
         self, names: Sequence[str], antennas: AntennaRows, corrected: CorrectedRanges, received: Received, state: State
@@ -335,7 +337,7 @@ class EpochProcessor:
                 if self.config.carrier == "smoothed":
                     own, carrier = smoothed(own, self.config, carrier)
             ranges[name] = own
-            after.append(replace(before, screens=states, carrier=carrier, two_frequencies=two))
+            after.append(changed(before, screens=states, carrier=carrier, two_frequencies=two))
         return ranges, after
 
     def _results(
@@ -347,8 +349,8 @@ class EpochProcessor:
         ranges: Mapping[str, CorrectedRanges],
     ) -> dict[str, AntennaResult]:
         """Return the results of single epochs by antenna, after the screens of the published positions."""
-        chainage = antennas.apart(lambda index, rows: index.trajectory.chainage_at(solution.arc_m[rows]))
-        published = dict(zip(ranges, chainage, strict=True))
+        chainage = antennas.each(lambda index, rows: index.trajectory.chainage_at(solution.arc_m[rows]))
+        published = {name: chainage[rows] for name, rows in zip(ranges, antennas.parts, strict=True)}
         screens = {name: dict(own.screens) for name, own in ranges.items()}
         rows_by_name, status = dict(zip(ranges, antennas.parts, strict=True)), solution.status.copy()
         for name, verdicts in position_verdicts(self.screens, pair, published).items():
@@ -357,7 +359,7 @@ class EpochProcessor:
                 doubtful = verdict.screened.reject & with_coordinates(self.config.failed_checks)[status[rows]]
                 status[rows] = np.where(doubtful, verdict.status, status[rows])
                 screens[name][verdict.name] = verdict.screened
-        results = antenna_results(corrected, antennas, changed(solution, status=status), self.config)
+        results = antenna_results(corrected, antennas, changed(solution, status=status), chainage, self.config)
         return {name: changed(rows_of(results, rows), screens=screens[name]) for name, rows in rows_by_name.items()}
 
     def _filtered(self, solved: SolvedChunk, state: State) -> dict[str, tuple[AlongTrack, FilterState]]:

@@ -9,7 +9,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.arrays import Datetimes, Floats, Masks, changed
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.features import HALF_LENGTH_M, SCALE_SIGMA
@@ -150,7 +150,7 @@ def sensor_epochs(
     """
     if not (samples or state.samples):
         last = time[-1] if len(time) else state.time
-        return SensorEpochs(), nothing_sensed(len(time)), replace(state, time=last)
+        return SensorEpochs(), nothing_sensed(len(time)), changed(state, time=last)
     state = with_samples(state, samples)
     if not len(time):
         return SensorEpochs(), nothing_sensed(0), state

@@ -141,15 +141,16 @@ def solve(
     on_line, teaching = _fit_on_line(corrected, ranges, antennas, place, config)
     lasting_noise = [changed(state.noise, robust=state.lasting.noise) for state in states]
     raised, raised_sums = _robust_scale(on_line, teaching, antennas, ages, config, lasting_noise)
-    ranges, place, lasting, lasting_states = lasting_errors(
+    ranges, place, model, lasting, lasting_states = lasting_errors(
         corrected, ranges, antennas, place, raised, config, [state.lasting for state in states]
     )
     if lasting.any():
         corrected = corrected.rejected(lasting, Reason.LASTING_ERROR)
         on_line, teaching = _fit_on_line(corrected, ranges, antennas, place, config)
     robust, robust_sums = _robust_scale(on_line, teaching, antennas, ages, config, [state.noise for state in states])
-    ranges, place, raim = fault_free(ranges, antennas, place, robust, on_line.kept, config)
+    tested, (ranges, place, raim) = ranges, fault_free(ranges, antennas, place, robust, on_line.kept, config)
     constrained, redundancy = place.constrained, redundancy_of(ranges)
+    model = model if ranges is tested else line_model(ranges, antennas, constrained)
     off_map = _off_map(ranges, antennas, place, constrained.arc_m, config)
     teaching = ~off_map & ~raim.faulty
     if "raim" not in config.screens:
@@ -173,7 +174,6 @@ def solve(
         time, agreeing, free, OffsetErrors(corrected.nominal_m, np.maximum(scale, 1.0) ** 2), antennas,
         LinePositions(constrained.arc_m, away), [state.map_offset for state in states], limits=config.map_offset,
     )  # fmt: skip
-    model = line_model(ranges, antennas, constrained)
     if "raim" in config.screens and config.raim_protection == "on":
         raim = with_p4_level(raim, model, scale, config)
     corrected = corrected.rejected(raim.excluded, Reason.FAULT_EXCLUDED)
@@ -232,9 +232,9 @@ def solve(
             sums = {"robust": robust_sums[k], "remaining": stated_sums[k]}
             noise = NoiseState(time=time[rows][-1], age=float(ages[k][-1]), **sums)
         after.append(
-            replace(
+            changed(
                 state, offsets=offsets[k], noise=noise, map_offset=map_states[k], off_map=off_map_states[k],
-                lasting=replace(lasting_states[k], noise=raised_sums[k]), carrier=carriers[k],
+                lasting=changed(lasting_states[k], noise=raised_sums[k]), carrier=carriers[k],
             )
         )  # fmt: skip
     return corrected, solution, after

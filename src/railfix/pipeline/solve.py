@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, changed
 from railfix.integrity.raim import (
     Exclusion,
     LinearModel,
@@ -114,10 +114,10 @@ def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, l
         limits=RaimLimits(false_alarm=limits.false_alarm),
     )
     located = np.asarray(np.isfinite(point.ecef_m).all(axis=1))
-    over = np.zeros(len(ranges), dtype=np.bool_)
-    over[located] = ~(position_dilution(ranges.take(located), point.ecef_m[located]) <= limits.dilution_limit)
-    conditions = [~located, test.detected, over]
-    return np.select(conditions, [PointStatus.NO_POSITION, PointStatus.RESIDUALS, PointStatus.DILUTION]).astype(np.int8)
+    over = ~(position_dilution(ranges, point.ecef_m) <= limits.dilution_limit)
+    status = np.where(over, int(PointStatus.DILUTION), int(PointStatus.VALID))
+    status = np.where(test.detected, int(PointStatus.RESIDUALS), status)
+    return np.where(located, status, int(PointStatus.NO_POSITION)).astype(np.int8)
 
 
 def position_dilution(ranges: Ranges, ecef_m: Floats) -> Floats:
@@ -273,32 +273,33 @@ def lasting_errors(
     noise: Floats,
     config: Config,
     states: Sequence[LastingErrorState],
-) -> tuple[Ranges, Place, Masks, list[LastingErrorState]]:
-    """Return ranges and positions without satellites that are wrong for long, these satellites, and the states.
+) -> tuple[Ranges, Place, LinearModel, Masks, list[LastingErrorState]]:
+    """Return ranges, positions and model without satellites that are wrong for long, these satellites, and the states.
 
     The worst satellite is left out, then the worst of the rest, whose residuals are then those without the first.
     `noise` is the noise scale of the receiver, shape (T,); satellites are of shape (T, K), states by antenna.
     """
     limits, time = config.lasting_errors, corrected.time
-    channel = np.char.add(corrected.channels.satellite, corrected.channels.signal)
+    channel, model = corrected.channels.names, line_model(ranges, antennas, place.constrained)
     left_out = np.zeros(ranges.code_m.shape, dtype=np.bool_)
     if "raim" not in config.screens or not limits.most_satellites:
-        return ranges, place, left_out, list(states)
+        return ranges, place, model, left_out, list(states)
     least = {"window_s": limits.memory_s, "least_epochs": limits.memory_s}
-    age = antennas.apart(lambda _, rows, state: ages(time[rows], state.time, state.age, **least), states)
+    step = antennas.apart(lambda _, rows, state: steps_s(time[rows], state.time), states)
+    age = [ages(own, state.age, **least) for own, state in zip(step, states, strict=True)]
+    error = _own_errors(model, noise, limits.clipped)
     sums: list[list[Floats]] = [[] for _ in states]
     for turn in range(limits.most_satellites):
-        error = _own_errors(line_model(ranges, antennas, place.constrained), noise, limits.clipped)
 
         def mean_error(
-            _: SearchIndex, rows: slice, of_antenna: Floats, state: LastingErrorState, values: Floats = error,
-            turn: int = turn,
+            _: SearchIndex, rows: slice, of_antenna: Floats, since: Floats, state: LastingErrorState,
+            values: Floats = error, turn: int = turn,
         ) -> tuple[Floats, Floats]:  # fmt: skip
-            share = np.minimum(steps_s(time[rows], state.time), 1.0) / limits.memory_s
             start = _arrange(state.sums[:, turn : turn + 1], state.channel, channel).sum(axis=1)
+            share = np.minimum(since, 1.0) / limits.memory_s
             return decayed_sums(of_antenna, share[:, None] * values[rows], start, state.age)
 
-        mean, after = antennas.each_with_state(mean_error, age, states)
+        mean, after = antennas.each_with_state(mean_error, age, step, states)
         for k, new in enumerate(after):
             sums[k].append(new)
         worst = np.abs(np.where(ranges.weight > 0, mean, 0.0)).argmax(axis=1) if len(channel) else np.zeros(0, int)
@@ -307,31 +308,37 @@ def lasting_errors(
             rows = np.arange(len(worst))
             found[rows, worst] = np.abs(mean[rows, worst]) > limits.share
             found &= ranges.weight > 0
-            found &= (redundancy_of(without(ranges, found)) >= _LEAST_FREEDOM)[:, None]
+        if not found.any():
+            continue
+        found &= (redundancy_of(without(ranges, found)) >= _LEAST_FREEDOM)[:, None]
         left_out |= found
         if found.any():
             ranges = without(ranges, found)
             for index, epochs in antennas.split(np.flatnonzero(found.any(axis=1))):
                 place = solved_again(ranges, index, place, epochs, config)
+            model = line_model(ranges, antennas, place.constrained)
+            error = _own_errors(model, noise, limits.clipped)
     after_states = [
-        replace(state, time=time[rows][-1], age=float(own[-1]), channel=channel, sums=np.stack(new, axis=1))
+        changed(state, time=time[rows][-1], age=float(own[-1]), channel=channel, sums=np.stack(new, axis=1))
         if len(time[rows])
         else state
         for rows, own, new, state in zip(antennas.parts, age, sums, states, strict=True)
     ]
-    return ranges, place, left_out, after_states
+    return ranges, place, model, left_out, after_states
 
 
 def _own_errors(model: LinearModel, noise: Floats, clipped: float) -> Floats:
     """Return the residuals over their standard deviations, clipped, over `clipped`; 0 where nothing checks a range."""
     checked = model.redundancy > _LEAST_REDUNDANCY
     own = np.where(checked, model.residual / np.sqrt(np.where(checked, model.redundancy, 1.0)), 0.0)
-    own = np.nan_to_num(own) / np.maximum(noise, 1.0)[:, None]
-    return np.asarray(np.clip(own, -clipped, clipped) / clipped)
+    own = np.where(np.isnan(own), 0.0, own) / np.maximum(noise, 1.0)[:, None]
+    return np.asarray(np.minimum(np.maximum(own, -clipped), clipped) / clipped)
 
 
 def _arrange(sums: Floats, of_channel: Strings, channel: Strings) -> Floats:
     """Return sums by channel, in rows, for other channels: 0 for new ones; those that are gone are forgotten."""
+    if of_channel is channel:
+        return sums
     start = np.zeros((len(channel), sums.shape[1]))
     _, here, there = np.intersect1d(channel, of_channel, return_indices=True)
     start[here] = sums[there]

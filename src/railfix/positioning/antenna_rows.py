@@ -6,7 +6,7 @@ each antenna, and what they return is joined.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from itertools import accumulate, pairwise
@@ -101,9 +101,9 @@ def _has_same_channels(first: Observations, other: Observations) -> bool:
 
 
 @cache
-def _members(kind: Any) -> tuple[str, ...]:
-    """Names of the members of a dataclass that have rows, or may have; none for other types."""
-    return tuple(f.name for f in fields(kind) if f.name not in _OF_CHANNELS) if is_dataclass(kind) else ()
+def _members(kind: Any) -> dict[str, bool]:
+    """Whether each member of a dataclass has rows, or may have; none for other types."""
+    return {f.name: f.name not in _OF_CHANNELS for f in fields(kind)} if is_dataclass(kind) else {}
 
 
 def joined(values: Sequence[Value]) -> Value:
@@ -120,14 +120,10 @@ def _join(values: Sequence[Any]) -> Any:
     first = values[0]
     if isinstance(first, np.ndarray):
         return np.concatenate(values)
-    if not (names := _members(cast(Hashable, type(first)))):
+    if not (has_rows := _members(first.__class__)):
         return first
-    of_each = [vars(value) for value in values]
-    members = {name: item for name, item in of_each[0].items() if name in _OF_CHANNELS}
-    for name in names:
-        column = [own[name] for own in of_each]
-        members[name] = np.concatenate(column) if type(column[0]) is np.ndarray else _join(column)
-    return _make(type(first), members)
+    own = [vars(value) for value in values]
+    return _make(type(first), {n: _join([o[n] for o in own]) if rows else own[0][n] for n, rows in has_rows.items()})
 
 
 def rows_of(value: Value, rows: slice | Indices) -> Value:
@@ -138,13 +134,14 @@ def rows_of(value: Value, rows: slice | Indices) -> Value:
 def _rows_of(value: Any, rows: slice | Indices) -> Any:
     if isinstance(value, np.ndarray):
         return value[rows]
-    if not (names := _members(cast(Hashable, type(value)))):
+    if not (has_rows := _members(value.__class__)):
         return value
-    own = vars(value)
-    members = {name: item for name, item in own.items() if name in _OF_CHANNELS}
-    for name in names:
+    own, members = vars(value), {}
+    for name, of_rows in has_rows.items():
         item = own[name]
-        members[name] = item[rows] if type(item) is np.ndarray else _rows_of(item, rows)
+        if of_rows and item is not None:
+            item = item[rows] if type(item) is np.ndarray else _rows_of(item, rows)
+        members[name] = item
     return _make(type(value), members)
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -37,23 +38,18 @@ _SPAN: Final = 50.0
 
 def steps_s(time: Datetimes, last: np.datetime64) -> Floats:
     """Time since the epoch before, shape (T,) [s]; 0 where there is none (`last` NaT)."""
-    return steps_of(time.astype(np.int64), int(np.asarray(last, dtype="datetime64[ns]").astype(np.int64)))
+    every = np.concatenate([np.array([last], dtype="datetime64[ns]"), time])
+    return np.fmax(seconds(every[1:] - every[:-1]), 0.0)
 
 
-def steps_of(time_ns: Integers, last_ns: int) -> Floats:
-    """Compute `steps_s` of instants as numbers of nanoseconds."""
-    time = np.concatenate([[last_ns], time_ns]).astype("datetime64[ns]")
-    return np.fmax(seconds(np.diff(time)), 0.0)
-
-
-def ages(time: Datetimes, last: np.datetime64, last_age: float, *, window_s: float, least_epochs: float) -> Floats:
-    """Age of each epoch since the start of a log, shape (T,) [windows]; `last` and `last_age` are of the epoch before.
+def ages(step_s: Floats, last_age: float, *, window_s: float, least_epochs: float) -> Floats:
+    """Age of each epoch since the start of a log, shape (T,) [windows], by `steps_s` and the age of the epoch before.
 
     A window is `window_s` or `least_epochs` epochs, whichever is longer, so that gaps forget no faster than epochs
     come.
     """
-    step = np.minimum(steps_s(time, last) / window_s, 1.0 / least_epochs)
-    return np.cumsum(np.concatenate([[last_age], step]))[1:]
+    step = np.minimum(step_s / window_s, 1.0 / least_epochs)
+    return np.concatenate([[last_age], step]).cumsum()[1:]
 
 
 def decayed_sums(age: Floats, values: Floats, start: Floats, last_age: float) -> tuple[Floats, Floats]:
@@ -63,7 +59,18 @@ def decayed_sums(age: Floats, values: Floats, start: Floats, last_age: float) ->
     Running sums (K,) are kept in units of the decay since the start of a span of 50 windows, so that the same numbers
     are added in the same order wherever a chunk begins.
     """
-    return decayed(age, np.ascontiguousarray(values), np.asarray(start, dtype=np.float64), float(last_age))
+    span, current, of_current = np.floor(age / _SPAN), start, np.floor(last_age / _SPAN)
+    before = np.empty(values.shape)
+    edges = (np.flatnonzero(span[1:] != span[:-1]) + 1).tolist() if len(span) > 1 else []
+    for first, end in pairwise([0, *edges, len(span)] if len(span) else []):
+        if span[first] != of_current:
+            current = current * np.exp(-_SPAN * (span[first] - of_current))
+            of_current = span[first]
+        growth = np.exp(age[first:end] - _SPAN * of_current)[:, None]
+        sums = np.concatenate([current[None], growth * values[first:end]]).cumsum(axis=0)
+        before[first:end] = sums[:-1] / growth
+        current = sums[-1]
+    return before, current
 
 
 def correlated_sums(
@@ -79,29 +86,14 @@ def correlated_sums(
     """Sums over a window of epochs whose errors are alike for `correlation_s`: each counts by the time since the one
     before.
 
-    Arguments as for `ages` and `decayed_sums`. Returns decayed sums at each epoch, its own values not included (T, K),
-    what each epoch adds (T, K), running sums after the last epoch (K,), and its age.
+    Arguments as for `steps_s` and `decayed_sums`. Returns decayed sums at each epoch, its own values not included
+    (T, K), what each epoch adds (T, K), running sums after the last epoch (K,), and its age.
     """
-    own = np.minimum(steps_s(time, last) / correlation_s, 1.0)[:, None] * values
-    age = ages(time, last, last_age, window_s=window_s, least_epochs=window_s / correlation_s)
+    step = steps_s(time, last)
+    own = np.minimum(step / correlation_s, 1.0)[:, None] * values
+    age = ages(step, last_age, window_s=window_s, least_epochs=window_s / correlation_s)
     before, after = decayed_sums(age, own, start, last_age)
     return before, own, after, float(age[-1]) if len(time) else last_age
-
-
-def decayed(age: Floats, values: Floats, start: Floats, last_age: float) -> tuple[Floats, Floats]:
-    """Compute `decayed_sums`; arrays in C order."""
-    span = np.floor(age / _SPAN)
-    current, of_current = start, np.floor(last_age / _SPAN)
-    before = np.empty(values.shape)
-    edges = np.flatnonzero(np.concatenate([[True], span[1:] != span[:-1], [True]])) if len(span) else np.zeros(1, int)
-    for first, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        current = current * np.exp(-_SPAN * (span[first] - of_current))
-        of_current = span[first]
-        growth = np.exp(age[first:end] - _SPAN * of_current)[:, None]
-        sums = np.cumsum(np.concatenate([current[None], growth * values[first:end]]), axis=0)
-        before[first:end] = sums[:-1] / growth
-        current = sums[-1]
-    return before, current
 
 
 class LastingErrorLimits(Settings):
@@ -226,7 +218,8 @@ class NoiseState:
 
 def noise_age(time: Datetimes, state: NoiseState, *, limits: NoiseScaleLimits) -> Floats:
     """Age of each epoch, shape (T,) [windows]."""
-    return ages(time, state.time, state.age, window_s=limits.window_s, least_epochs=limits.least_epochs)
+    step = steps_s(time, state.time)
+    return ages(step, state.age, window_s=limits.window_s, least_epochs=limits.least_epochs)
 
 
 def robust_scale(
@@ -263,7 +256,7 @@ def _learnt(
     limits: NoiseScaleLimits,
 ) -> tuple[Floats, Floats]:
     """Root mean square with forgetting around a prior scale, and the sums to go on with."""
-    values = np.stack([wsse, freedom.astype(np.float64)], axis=1)
+    values = np.array([wsse, freedom]).T
     before, after = decayed_sums(age, values, start, state.age)
     if np.isinf(limits.prior):
         return prior, after

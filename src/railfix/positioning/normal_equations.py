@@ -60,7 +60,7 @@ class RangeArrays(NamedTuple):
     @property
     def clock(self) -> Indices:
         """Group of each channel."""
-        return np.repeat(np.arange(len(self.starts)), np.diff(np.append(self.starts, self.code_m.shape[1])))
+        return self.starts.searchsorted(np.arange(self.code_m.shape[1]), side="right") - 1
 
     def take(self, epochs: Masks | Indices | slice) -> RangeArrays:
         """The arrays of some epochs."""

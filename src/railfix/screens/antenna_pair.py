@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Strings
+from railfix.core.arrays import Floats, Strings, medians
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Reason
@@ -40,7 +40,6 @@ from railfix.screens.base import (
     clock_medians,
     on_pairs,
     pair_channels,
-    row_median,
 )
 
 #: Treatments of the receiver clocks, as named in the output.
@@ -226,7 +225,7 @@ def antenna_pair_screen(
         clock = _clock_difference(raw, rate, satellite, least=limits.least_satellites)
         raw = raw + rate * clock / SPEED_OF_LIGHT
     else:
-        separate = np.abs(row_median(raw)) > SEPARATE_CLOCKS_M
+        separate = np.abs(medians(raw))[:, None] > SEPARATE_CLOCKS_M
         clock = np.broadcast_to(np.where(separate, np.nan, 0.0), raw.shape)
     metric = raw - clock
     relative = np.asarray(azimuth_deg) - np.asarray(spacing.heading_deg, dtype=np.float64)[..., None]

@@ -95,7 +95,7 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
         self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: AntennaSpacingLimits
     ) -> Screened:
         """Return metric and verdict of the pairs of positions; not ordered where the spacing is unknown."""
-        along = np.nan_to_num(pair.along_m)
+        along = np.where(np.isnan(pair.along_m), 0.0, pair.along_m)
         return antenna_spacing_screen(
             front_chainage_m, rear_chainage_m, np.abs(along), facing=np.sign(along).astype(int), limits=limits
         )

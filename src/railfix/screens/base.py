@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, Protocol,
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks, Strings, read_only
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks, Strings, medians, read_only
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
 from railfix.core.settings import Settings
@@ -286,7 +286,7 @@ def pair_epochs(time_front: ArrayLike, time_rear: ArrayLike, *, tolerance_s: flo
 
 def _nearest(values: Integers, among: Integers) -> Indices:
     """Return the index of the nearest of rising numbers, the earlier of two equally near."""
-    after = np.clip(np.searchsorted(among, values), 1, max(len(among) - 1, 1))
+    after = np.minimum(np.maximum(among.searchsorted(values), 1), max(len(among) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(among) - 1)
     return np.where(np.abs(values - among[before]) <= np.abs(among[after] - values), before, after)
@@ -336,42 +336,29 @@ def pair_antennas(
     )
 
 
-def row_median(values: Floats) -> Floats:
-    """Median of each row over what is not NaN, shape (T, 1); NaN where nothing is."""
-    if not values.shape[1]:
-        return np.full((len(values), 1), np.nan)
-    alike = np.zeros(values.shape[1], dtype=np.intp)
-    return medians_of_clocks(np.ascontiguousarray(values), alike, alike, 0)[:, :1]
-
-
 def clock_medians(values: Floats, satellite: Strings, *, least: int = 0) -> Floats:
     """Median over the channels of one clock, at each channel (T, M); NaN below `least` satellites."""
-    return medians_of_clocks(np.ascontiguousarray(values), *_number(tuple(satellite.tolist())), least)
+    clock, columns, member, of_clock = _clocks(satellite.dtype.str, satellite.tobytes())
+    padded = np.concatenate([values, np.full((len(values), 1), np.nan)], axis=1)
+    median = medians(padded.take(columns, axis=1))
+    if least:
+        seen = (np.isfinite(values).astype(np.float32) @ member > 0).astype(np.float32)
+        median = np.where(seen @ of_clock >= least, median, np.nan)
+    return np.asarray(median[:, clock])
 
 
 @lru_cache(maxsize=256)
-def _number(satellites: tuple[str, ...]) -> tuple[Indices, Indices]:
-    """Receiver clock and satellite of each channel as numbers, shape (M,) each."""
-    clock = np.unique([CLOCK_GROUP[name[0]] for name in satellites], return_inverse=True)[1]
-    number = np.unique(list(satellites), return_inverse=True)[1]
-    return read_only(clock.astype(np.intp)), read_only(number.astype(np.intp))
-
-
-def medians_of_clocks(values: Floats, clock: Indices, satellite: Indices, least: int) -> Floats:
-    """Compute `clock_medians`; clocks and satellites as numbers from 0 on, arrays in C order."""
-    result = np.full(values.shape, np.nan)
-    for one in range(int(clock.max(initial=-1)) + 1):
-        columns = np.flatnonzero(clock == one)
-        part = values[:, columns]
-        ordered = np.sort(part, axis=1)  # NaN last
-        count = np.count_nonzero(~np.isnan(part), axis=1)[:, None]
-        low = np.take_along_axis(ordered, np.maximum((count - 1) // 2, 0), axis=1)
-        high = np.take_along_axis(ordered, np.minimum(count // 2, len(columns) - 1), axis=1)
-        enough = count > 0
-        if least:
-            # small counts are exact as floats, which are multiplied in blocks
-            member = (satellite[columns, None] == np.unique(satellite[columns])).astype(np.float32)
-            seen = np.isfinite(part).astype(np.float32) @ member > 0
-            enough = enough & (np.count_nonzero(seen, axis=1)[:, None] >= least)
-        result[:, columns] = np.where(enough, (low + high) / 2.0, np.nan)
-    return result
+def _clocks(kind: str, satellites: bytes) -> tuple[Indices, Indices, Floats, Floats]:
+    """Return clocks of M channels; channels of G clocks, filled up with M, (G, W); which are of S satellites, (M, S);
+    and which of these of a clock, (S, G): small counts are exact as floats of 32 bits.
+    """
+    names = np.frombuffer(satellites, dtype=kind).tolist()
+    clock = np.unique([CLOCK_GROUP[name[0]] for name in names], return_inverse=True)[1].astype(np.intp)
+    number = np.unique(names, return_inverse=True)[1]
+    rows = [np.flatnonzero(clock == one).tolist() for one in range(int(clock.max(initial=-1)) + 1)]
+    widest = max(map(len, rows), default=0)
+    columns = np.array([row + [len(names)] * (widest - len(row)) for row in rows], dtype=np.intp)
+    member = (number[:, None] == np.arange(int(number.max(initial=-1)) + 1)).astype(np.float32)
+    of_clock = (member.T @ (clock[:, None] == np.arange(len(rows))) > 0).astype(np.float32)
+    columns = columns.reshape(len(rows), widest)
+    return read_only(clock), read_only(columns), read_only(member), read_only(of_clock)

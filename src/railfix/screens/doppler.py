@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Strings, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, Strings, freeze_arrays, medians
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
@@ -35,7 +35,6 @@ from railfix.screens.base import (
     ScreenSetup,
     Verdict,
     clock_medians,
-    row_median,
 )
 
 _MEDIAN_NORMAL: Final = 0.674_489_750_196_081_7  #: Median of the absolute value of a unit normal variable.
@@ -115,12 +114,12 @@ def receiver_limit_m(
     averaged, so that an epoch full of multipath does not carry it).
     """
     growth = _growth(interval_s, limits)
-    shown = row_median(np.abs(metric_m))[:, 0] / _MEDIAN_NORMAL / growth
+    shown = medians(np.abs(metric_m)) / _MEDIAN_NORMAL / growth
     counts = (np.count_nonzero(np.isfinite(metric_m), axis=1) >= _LEAST_CHANGES) & np.isfinite(shown)
     logs = np.where(counts, np.log(np.maximum(np.where(counts, shown, 1.0), _FINEST_M)), 0.0)
     # running sums, one after the other from the carried ones: a cut does not show
-    sums = np.cumsum(np.concatenate([[sum_log], logs]))[1:]
-    weights = np.cumsum(np.concatenate([[weight], counts]))[1:]
+    sums = np.concatenate([[sum_log], logs]).cumsum()[1:]
+    weights = np.concatenate([[weight], counts]).cumsum()[1:]
     prior = limits.prior_epochs
     scale = np.exp((sums + prior * np.log(limits.step_m / limits.factor)) / (weights + prior))
     limit = np.maximum(limits.step_m, limits.factor * scale) * growth + _jerk_m(interval_s, limits)
@@ -234,12 +233,12 @@ def doppler_screen(
         empty = DopplerScreened(metric=nothing, reject=nothing.astype(bool), limit_m=nothing, level_m=nothing)
         return empty, state or DopplerState()
     codes, dopplers, sigmas = (
-        np.vstack([first, rest])
+        np.concatenate([first[None], rest])
         for first, rest in ((before.code_m, code), (before.doppler_hz, doppler), (before.code_sigma_m, sigma))
     )
     interval = _intervals(when, before.time, break_before, limits)
     rate = -SPEED_OF_LIGHT / np.asarray(frequency_hz, dtype=np.float64) * (dopplers[1:] + dopplers[:-1]) / 2.0
-    metric = _jumps(np.diff(codes, axis=0), rate, interval, satellite, least=limits.least_satellites)
+    metric = _jumps(codes[1:] - codes[:-1], rate, interval, satellite, least=limits.least_satellites)
     limit, sum_log, weight = _limit_m(interval, metric, sigmas, before, limits)
     metric = np.where(np.isnan(limit), np.nan, metric)
     limit = np.where(np.isnan(metric), np.nan, limit)
@@ -282,7 +281,8 @@ def _align(state: DopplerState, satellite: Strings, signal: Strings) -> DopplerS
 
 def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | None, limits: DopplerLimits) -> Floats:
     """Interval into each epoch by the tags, shape (T,) [s]; NaN where nothing may be differenced."""
-    interval = seconds(np.diff(np.concatenate([[last], time])))
+    every = np.concatenate([np.array([last], dtype="datetime64[ns]"), time])
+    interval = seconds(every[1:] - every[:-1])
     possible = (interval > 0.0) & (interval <= limits.longest_interval_s)
     if break_before is not None:
         possible &= ~np.asarray(break_before, dtype=bool)
@@ -301,7 +301,7 @@ def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *
 def _limit_m(
     interval: Floats, metric: Floats, sigmas: Floats, before: DopplerState, limits: DopplerLimits
 ) -> tuple[Floats, float, float]:
-    """Limit of each change, shape (T, M) [m], and the sums of the receiver's scale."""
+    """Limit of each change, shape (T, M) or (T, 1) [m], and the sums of the receiver's scale."""
     total, epochs = before.scale_sum, before.scale_epochs
     if limits.mode == "sigma":
         return expected_limit_m(interval, sigmas, limits=limits), total, epochs
@@ -309,7 +309,7 @@ def _limit_m(
         row, total, epochs = receiver_limit_m(interval, metric, total, epochs, limits=limits)
     else:
         row = doppler_limit_m(interval, limits=limits)
-    return np.broadcast_to(row[:, None], metric.shape), total, epochs
+    return row[:, None], total, epochs
 
 
 class DopplerScreen(ObservationScreen[DopplerLimits]):

@@ -13,7 +13,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Floats, Integers, Masks, freeze_arrays, read_only
+from railfix.core.arrays import Floats, Indices, Integers, Masks, freeze_arrays, read_only
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.tables import NotebookTable, plural
 
@@ -219,7 +219,8 @@ def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, kno
         NaN where the nearer point has no kilometrage, and for NaN.
     """
     at = np.asarray(chainage_m, dtype=np.float64)
-    index = np.clip(np.searchsorted(known_chainage_m, at, side="right") - 1, 0, len(known_chainage_m) - 2)
+    last = len(known_chainage_m) - 2
+    index: Indices = np.minimum(np.maximum(known_chainage_m.searchsorted(at, side="right") - 1, 0), last)
     start, end = known_chainage_m[index], known_chainage_m[index + 1]
     before, after = known_kilometrage_m[index], known_kilometrage_m[index + 1]
     length = np.where(end > start, end - start, 1.0)

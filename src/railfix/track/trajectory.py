@@ -28,7 +28,7 @@ def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tu
     """Find the nearest point of segments, broadcast (..., 3): fraction in [0, 1], and distance."""
     offset = points_m - start_m
     squared = np.einsum("...i,...i->...", step_m, step_m)
-    share = np.clip(np.einsum("...i,...i->...", offset, step_m) / squared, 0.0, 1.0)
+    share = np.minimum(np.maximum(np.einsum("...i,...i->...", offset, step_m) / squared, 0.0), 1.0)
     rest = offset - share[..., None] * step_m
     return share, np.sqrt(np.einsum("...i,...i->...", rest, rest))
 
@@ -94,8 +94,8 @@ def nearest_segments(
     best = offset.min(axis=1)
     # independent of the order of the tree that has named the segments
     place = np.where(offset <= best[:, None] * (1 + 1e-12) + 1e-9, segment + share, np.inf)
-    column = np.argmin(place, axis=1)[:, None]
-    return (np.take_along_axis(segment, column, axis=1)[:, 0], np.take_along_axis(share, column, axis=1)[:, 0], best)
+    row, column = np.arange(len(points_m)), place.argmin(axis=1)
+    return segment[row, column], share[row, column], best
 
 
 #: A line goes on where its end comes this close to another place of it [m]: no other track is as near.
@@ -306,7 +306,7 @@ class Trajectory(FrozenArrays, NotebookTable):
             From the segment's first point; negative before the start; NaN for NaN.
         """
         arc = np.asarray(arc_m, dtype=np.float64)
-        index = np.minimum(np.maximum(np.searchsorted(self.arc_m, arc, side="right") - 1, 0), len(self) - 2)
+        index = np.minimum(np.maximum(self.arc_m.searchsorted(arc, side="right") - 1, 0), len(self) - 2)
         return np.asarray(index, dtype=np.intp), arc - self.arc_m[index]
 
     def _interpolate(self, arc_m: ArrayLike, values: Floats) -> Floats:
@@ -373,9 +373,9 @@ class Trajectory(FrozenArrays, NotebookTable):
 
 def interpolate_values(arc: Floats, arc_m: Floats, length_m: Floats, values: Floats, tolerance_m: float) -> Floats:
     """Interpolate values (V, C) of a line at arc lengths (n, C); NaN beyond its ends by the tolerance."""
-    index = np.minimum(np.maximum(np.searchsorted(arc_m, arc, side="right") - 1, 0), len(arc_m) - 2)
-    share = (arc - arc_m[index]) / length_m[index]
-    beyond = tolerance_m / length_m[index]
+    index = np.minimum(np.maximum(arc_m.searchsorted(arc, side="right") - 1, 0), len(arc_m) - 2)
+    length = length_m[index]
+    share, beyond = (arc - arc_m[index]) / length, tolerance_m / length
     share = np.where((share < -beyond) | (share > 1.0 + beyond), np.nan, share)[:, None]
     # exact at both ends of a segment
     return np.asarray((1.0 - share) * values[index] + share * values[index + 1])

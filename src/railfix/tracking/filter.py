@@ -7,7 +7,6 @@ on the unknowns that are in use; the state has all of them.
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import fields
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
@@ -83,9 +82,8 @@ class Recursion:
         self.epochs = layout.Epochs(**arrays, unsigned=sensors.wheel_sign == "unknown")
         self.course = layout.LineArrays(**line.written)
         branch_m = max(limits.map_branch_m, _BRANCH_SIGMAS * line.sigma_plan_m)
-        self.parameters = _parameters(limits)._replace(map_branch_m=branch_m)
-        written = {field.name: getattr(result, field.name) for field in fields(result)}
-        self.answers = layout.Outputs(**{name: written[name] for name in layout.Outputs._fields})
+        self.parameters = _parameters(limits, branch_m)
+        self.answers = layout.Outputs(*(vars(result)[name] for name in layout.Outputs._fields))
 
     def advance(self, state: TrackState, first: int, trace: list[Step] | None) -> tuple[int, bool]:
         """Do epochs from `first` on and change the state; return the next, and whether places have to be sought there.
@@ -191,11 +189,12 @@ def _columns(sensors: SensorEpochs, time: Datetimes) -> dict[str, Floats]:
 
 
 @lru_cache(maxsize=8)
-def _parameters(limits: TrackingLimits) -> layout.Parameters:
+def _parameters(limits: TrackingLimits, branch_m: float) -> layout.Parameters:
     """Settings as the kernel takes them."""
     budget = bank.budget(limits)
     given: dict[str, Any] = {
         "degrees": tuple(limits.tails),
+        "map_branch_m": branch_m,
         "level_risk": budget.risk,
         "level_k": budget.k,
         "level_k_speed": budget.k_speed,

@@ -33,6 +33,8 @@ _SENSORS: Final = (
     (StateIndex.FORCE_OFFSET, layout.FORCE_ROW, FORCE_WALK_MPS2),
     (StateIndex.RADAR, layout.RADAR_ROW, RADAR_WALK),
 )
+#: Fields of the result that these unknowns are.
+_RESULTS: Final = ("wheel_scale", "force_offset_mps2", "radar_scale")
 _OF_SENSORS: Final = np.isin(np.arange(OFFSETS), [unknown for unknown, _, _ in _SENSORS])
 #: Unknowns of an epoch, as the kernel orders them after those in use.
 _OF_EPOCH: Final = np.array([
@@ -87,7 +89,7 @@ class Handover:
         scalars = np.array([
             state.hypotheses, state.weak_motion_s, state.weak_code_s, *state.log_scale, state.distance_since_code_m,
             state.direction, seconds(state.measured - origin), *state.code_shift, state.map_log_variance,
-            *state.speed_range_mps, np.nan_to_num(seconds(state.coded - origin), nan=-np.inf), state.branch_s,
+            *state.speed_range_mps, np.fmax(seconds(state.coded - origin), -np.inf), state.branch_s,
             state.branch_m, state.across, state.step_s, state.withheld_s, state.open_s, state.motion_misfit,
         ])  # fmt: skip
         self.memory = layout.KernelState(
@@ -134,11 +136,7 @@ class Handover:
         idle = self._idle(state, 0.0 if self.predicted else float(chunk.interval_s[first:done].sum()))
         placed = slice(first, done)
         known = np.isfinite(result.arc_m[placed])
-        for name, unknown in (
-            ("wheel_scale", StateIndex.WHEEL),
-            ("force_offset_mps2", StateIndex.FORCE_OFFSET),
-            ("radar_scale", StateIndex.RADAR),
-        ):
+        for name, (unknown, _, _) in zip(_RESULTS, _SENSORS, strict=True):
             if unknown not in self.full:
                 getattr(result, name)[placed][known] = idle[0][unknown]
         count, *scalars = memory.scalars.tolist()

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks
+from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks, changed
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking.constants import SCALE_BOUND
 from railfix.tracking.epochs import BaliseEpochs, GnssEpochs, SensorEpochs
@@ -94,7 +94,7 @@ def thinned(
     size = np.diff(edges)
     size[:1] += since.epochs - 1
     rest = slice(int(edges[-1]), None)
-    left = replace(
+    left = changed(
         since,
         start=start,
         number=int(before[-1]),
@@ -148,7 +148,7 @@ def _unbroken(epochs: GnssEpochs, since: AccumulatedIncrement) -> Masks:
     """Which satellites' phases went on at all epochs since the last one that was taken, shape (K,)."""
     if since.unbroken is None:
         return np.ones(len(epochs.satellite), dtype=np.bool_)
-    return np.isin(epochs.satellite, list(since.unbroken))
+    return np.array([name in since.unbroken for name in epochs.satellite.tolist()], dtype=np.bool_)
 
 
 def _names(epochs: GnssEpochs, unbroken: Masks, *, anew: bool) -> frozenset[str] | None:
@@ -215,10 +215,10 @@ def track_with_levels(
     place, after = track(some, line, state.track, limits=limits, sensors=sensed, levels=True)
     every = state.every and len(taken) == len(epochs)
     if every:
-        tracked, track_state = place, replace(after, bank=None)
+        tracked, track_state = place, changed(after, bank=None)
     else:
         tracked, track_state = track(epochs, line, track_state, limits=limits, sensors=sensors)
-    state = replace(state, track=after, since=since, every=every)
+    state = changed(state, track=after, since=since, every=every)
     tracked, state = carried_levels(tracked, epochs, taken, place, line, state, limits)
     return tracked, track_state, state
 
@@ -276,7 +276,7 @@ def carried_levels(
     explained = np.where(is_bounded(told), np.inf, _EXPLAINED * tracked.sigma_m)
     apart = np.nan_to_num(separation)
     spread = np.where(doubt, apart, np.sqrt(np.maximum(apart**2 - explained**2, 0.0)))
-    tracked = replace(
+    tracked = changed(
         tracked,
         status=told,
         sigma_m=np.hypot(tracked.sigma_m, spread),
@@ -287,7 +287,7 @@ def carried_levels(
         separation_m=np.where(known, separation, np.nan),
         amount_m=np.where(known, amount, np.nan),
     )
-    return tracked, replace(state, time=times[-1], values=values[-1])
+    return tracked, changed(state, time=times[-1], values=values[-1])
 
 
 def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:

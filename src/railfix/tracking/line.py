@@ -70,7 +70,7 @@ class Line:
             Rows: tangent, right, up; interpolated between vertices.
         """
         arc_m = arc_m + self.round_m(arc_m) if self.closed else arc_m
-        index = np.searchsorted(self.arc_m[1:-1], arc_m, side="right")
+        index = self.arc_m[1:-1].searchsorted(arc_m, side="right")
         along = arc_m - self.arc_m[index]
         share = np.minimum(np.maximum(along / (self.arc_m[index + 1] - self.arc_m[index]), 0.0), 1.0)[:, None, None]
         axes = (1.0 - share) * self.axes[index] + share * self.axes[index + 1]

@@ -147,5 +147,5 @@ class Tracked:
             sensed=np.full((size, len(Kind) - 3), np.nan),
             weight=np.full((size, 3, channels), np.nan),
             faulty=np.zeros((size, channels), dtype=np.bool_),
-            **{name: np.full(size, np.nan) for name in names},
+            **dict(zip(names, np.full((len(names), size), np.nan), strict=True)),
         )

@@ -70,7 +70,7 @@ def compute_velocity(
     sat = np.where(np.isfinite(sat_ecef_m), sat_ecef_m, 2.6e7)
     distance, sight = range_with_rotation(sat, receiver)
     previous, _ = range_with_rotation(np.where(has[1][..., None], before_ecef_m, 2.6e7), receiver)
-    motion = np.nan_to_num(sat_velocity_mps)
+    motion = np.where(np.isnan(sat_velocity_mps), 0.0, sat_velocity_mps)
     moving = (sight * motion).sum(axis=-1)
     moving += _TURN * (motion[..., 0] * receiver[..., 1] - motion[..., 1] * receiver[..., 0])
     stretch = 1.0 + moving / SPEED_OF_LIGHT

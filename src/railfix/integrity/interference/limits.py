@@ -9,7 +9,7 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Integers, Masks, Strings
+from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Integers, Masks, Strings, medians
 from railfix.core.settings import Settings
 from railfix.core.timescale import GPS_EPOCH, seconds
 
@@ -240,7 +240,7 @@ def power_signs(
     logarithm = np.log(np.where(gain > 0, gain, np.nan))
     gains = np.fmax.accumulate(np.concatenate([[state.gain], logarithm + forgotten]))[1:]
     signs = PowerSigns(
-        fall_db=np.where(enough, _median(fall), np.nan),
+        fall_db=np.where(enough, medians(fall), np.nan),
         spread_db=np.where(enough, _deviation(fall), np.nan),
         difference_db=np.where(np.count_nonzero(seen, axis=1) >= limits.least_satellites, _deviation(cn0_dbhz), np.nan),
         gain_fall=1.0 - np.exp(logarithm + forgotten - gains),
@@ -249,17 +249,6 @@ def power_signs(
         return signs, state
     after = PowerState(channel=channel, peak_db=peaks[-1], first_s=firsts[-1], last_s=lasts[-1], gain=float(gains[-1]))
     return signs, after
-
-
-def _median(values: Floats) -> Floats:
-    """Return the median of each row over what is not NaN, shape (T,); NaN where nothing is."""
-    if not values.shape[1]:
-        return np.full(len(values), np.nan)
-    ordered, count = np.sort(values, axis=1), np.count_nonzero(~np.isnan(values), axis=1)  # NaN last
-    rows, last = np.arange(len(values)), values.shape[1] - 1
-    return np.asarray(
-        (ordered[rows, np.maximum(count - 1, 0) // 2] + ordered[rows, np.minimum(count // 2, last)]) / 2.0
-    )
 
 
 def _deviation(values: Floats) -> Floats:

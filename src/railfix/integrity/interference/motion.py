@@ -7,10 +7,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, medians
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
-from railfix.integrity.interference.limits import InterferenceLimits, _median
+from railfix.integrity.interference.limits import InterferenceLimits
 
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 #: Steps of receiver clocks by whole milliseconds are none of interference [m].
@@ -110,7 +110,8 @@ def motion_signs(
     """Return the statistics of clock, velocity and position of T epochs, and the state to pass on."""
     if not len(inputs.time):
         return MotionSigns(**{item.name: np.zeros(0) for item in fields(MotionSigns)}), state
-    fixes = fixes_of(inputs)
+    linear = _misfit(inputs)
+    fixes = fixes_of(inputs, linear)
     position, last_position = _before(fixes, state.position, fixes.sigma_m <= limits.largest_sigma_m)
     velocity, last_velocity = _before(fixes, state.velocity, fixes.velocity_sigma_mps <= limits.largest_speed_sigma_mps)
     speed, speed_sigmas, drift, drift_sigmas = _speed_jump(fixes, velocity, limits)
@@ -127,7 +128,7 @@ def motion_signs(
         speed_jump_sigmas=speed_sigmas,
         position_jump_m=jump,
         position_jump_sigmas=jump_sigmas,
-        part_sigmas=_parts(inputs, limits.least_satellites - 1),
+        part_sigmas=_parts(inputs, linear, limits.least_satellites - 1),
         off_line_m=off,
         off_line_sigmas=np.maximum(off - limits.position_jump_m, 0.0) / fixes.sigma_m,
     )
@@ -144,9 +145,9 @@ def motion_signs(
     return signs, after
 
 
-def fixes_of(inputs: MotionInputs) -> Fix:
+def fixes_of(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats]) -> Fix:
     """Return positions and velocities by least squares from all ranges together, no satellite excluded."""
-    near, sight, misfit = _misfit(inputs)
+    near, sight, misfit = linear
     groups = np.arange(inputs.group.max(initial=-1) + 1)
     clocks = (inputs.group[:, None] == groups).astype(np.float64)
     design = np.concatenate([-sight, np.broadcast_to(clocks, (len(near), *clocks.shape))], axis=2)
@@ -199,7 +200,7 @@ def _fit(design: Floats, value: Floats, weight: Floats, *, least: int) -> tuple[
 
 def _length(covariance: Floats) -> Floats:
     """Return the square root of the first three variances together, shape (T,)."""
-    return np.asarray(np.sqrt(np.trace(covariance[:, :3, :3], axis1=1, axis2=2)))
+    return np.asarray(np.sqrt(covariance[:, :3, :3].trace(axis1=1, axis2=2)))
 
 
 def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
@@ -257,16 +258,16 @@ def _clock_jump(
     change = codes[1:] - codes[before, column] - (rates[1:] + rates[before, column]) / 2.0 * dt
     change = np.where(near, change, np.nan)
     enough = np.count_nonzero(np.isfinite(change), axis=1) >= limits.least_satellites
-    step = np.where(enough, _median(change), np.nan)
+    step = np.where(enough, medians(change), np.nan)
     last = row[-1]
     kept = np.where(broken[-1] == broken[last], 0.0, np.nan)  # nothing is compared across a break
     after = codes[last, column] + kept, rates[last, column], when[last, column]
     return np.asarray(step - np.round(step / _MILLISECOND_M) * _MILLISECOND_M), after
 
 
-def _parts(inputs: MotionInputs, least: int) -> Floats:
+def _parts(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats], least: int) -> Floats:
     """Return the largest difference of two constellations' positions and clocks, in standard deviations, shape (T,)."""
-    near, sight, misfit = _misfit(inputs)
+    near, sight, misfit = linear
     design = np.concatenate([-sight, np.ones((*sight.shape[:2], 1))], axis=2)
     found = []
     for clock in range(int(inputs.group.max(initial=-1)) + 1):

@@ -149,10 +149,10 @@ def along_track_level(
     epochs, channels = model.root_weight.shape
     if len(systems) != channels:
         raise ValueError(f"systems names each channel: {channels} channels, got {len(systems)}")
-    scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (epochs,))
+    scale = _broadcast(np.asarray(scale, dtype=np.float64), (epochs,))
     if (scale <= 0).any():
         raise ValueError("the noise scale must be positive")
-    out = np.broadcast_to(np.asarray(n_excluded, dtype=np.int64), (epochs,))
+    out = _broadcast(np.asarray(n_excluded, dtype=np.int64), (epochs,))
     groups = np.zeros((epochs, 0, channels), dtype=bool) if sides is None else sides
     plan = allocate(model, systems, risk, out, groups, wrong_map=map_error.seen is not None)
     given = Errors(
@@ -176,7 +176,11 @@ def _by_epoch(values: ArrayLike | None, epochs: int, width: int) -> Floats:
     """Values for each epoch, shape (T, width); (T, 0) for none."""
     if values is None:
         return np.zeros((epochs, 0))
-    return np.broadcast_to(np.asarray(values, dtype=np.float64), (epochs, width))
+    return _broadcast(np.asarray(values, dtype=np.float64), (epochs, width))
+
+
+def _broadcast(values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    return values if values.shape == shape else np.broadcast_to(values, shape)
 
 
 def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
@@ -320,7 +324,7 @@ def _list_hypotheses(plan: Allocation, rows: Indices, n: int) -> Asked:
 
 def _channels(channel: Indices, place: Indices) -> Indices:
     """Channels at places side by side, shape (T, k); -1 for -1."""
-    return np.where(place >= 0, np.take_along_axis(channel, np.maximum(place, 0), axis=1), -1)
+    return np.where(place >= 0, channel[np.arange(len(channel))[:, None], np.maximum(place, 0)], -1)
 
 
 @lru_cache(maxsize=64)

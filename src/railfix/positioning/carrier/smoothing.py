@@ -18,7 +18,7 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, medians, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
@@ -106,15 +106,7 @@ class Slips:
 
 def median_or_zero(values: Floats) -> Floats:
     """Median over the channels of each epoch, 0 where fewer than three have one; shape (T,)."""
-    count = np.count_nonzero(np.isfinite(values), axis=1)
-    result = np.zeros(len(values))
-    enough = np.flatnonzero(count >= _COMMON)
-    if len(enough):
-        # NaN sorts last: the median is the middle of the finite values.
-        ranked = np.sort(values[enough], axis=1)
-        row, number = np.arange(len(enough)), count[enough]
-        result[enough] = 0.5 * (ranked[row, (number - 1) // 2] + ranked[row, number // 2])
-    return result
+    return np.where(np.isfinite(values).sum(axis=1) >= _COMMON, medians(values), 0.0)
 
 
 def _before(values: Floats, last: Floats) -> Floats:
@@ -153,11 +145,10 @@ def find_slips(
     """
     limits, state = limits or CycleSlipLimits(), state or CycleSlipState()
     channels = channel_keys(observations.satellite, observations.signal)
-    rows = rows_before(state.channels, channels)
-    last = {
-        name: np.append(getattr(state, name), np.nan)[rows]
-        for name in ("code_m", "phase_m", "doppler_mps", "half_cycle")
-    }
+    last = {name: getattr(state, name) for name in ("code_m", "phase_m", "doppler_mps", "half_cycle")}
+    if state.channels != channels:
+        rows = rows_before(state.channels, channels)
+        last = {name: np.append(values, np.nan)[rows] for name, values in last.items()}
     if frequency_hz is None:
         frequency_hz = carrier_frequency_hz(
             observations.satellite, observations.signal, observations.header.glonass_channel
@@ -165,7 +156,7 @@ def find_slips(
     wavelength = SPEED_OF_LIGHT / frequency_hz
     phase, doppler = observations.phase_cycles * wavelength, observations.doppler_hz * wavelength
     times = np.concatenate([np.asarray([state.time], dtype="datetime64[ns]"), observations.time])
-    since, moved = seconds(np.diff(times)), phase - _before(phase, last["phase_m"])
+    since, moved = seconds(times[1:] - times[:-1]), phase - _before(phase, last["phase_m"])
     step, lag_ms, doppler_metric, code_metric = slip_metrics(
         since,
         observations.code_m - _before(observations.code_m, last["code_m"]),
@@ -191,7 +182,7 @@ def find_slips(
     ):
         reason |= np.where(mask & has, int(bit), 0)
     reason[~has] = SlipReason.NO_PHASE
-    total_ms = np.cumsum(np.r_[state.step_ms, lag_ms])
+    total_ms = np.concatenate([[state.step_ms], lag_ms]).cumsum()
     after = state
     if len(observations):
         after = CycleSlipState(
