@@ -252,9 +252,8 @@ def _coarse_to_fine(
     equations = normal_equations(ranges.take(epoch), points[node])
     count = np.bincount(epoch, minlength=len(ranges))[epochs]
     found, every = count > 0, np.arange(len(epoch))
-    return SectionCandidates(epochs[found], count[found], node, q, -equations.vector, equations.matrix, every), tried[
-        epochs
-    ]
+    slope, matrix = np.ascontiguousarray(-equations.vector), np.ascontiguousarray(equations.matrix)
+    return SectionCandidates(epochs[found], count[found], node, q, slope, matrix, every), tried[epochs]
 
 
 def _decide(
