@@ -30,7 +30,7 @@ from railfix.integrity.protection.level import MapDeviation, RangeBounds
 from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.kernels import compiling
-from railfix.kernels.references import by_reference
+from railfix.kernels.compiling import by_reference
 from railfix.kernels.tracking.recursion import advance
 from railfix.kernels.tracking.velocity import fitted_velocities
 from railfix.pipeline.config import Config

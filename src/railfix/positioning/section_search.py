@@ -21,8 +21,8 @@ from scipy.special import chdtri
 
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers
+from railfix.core.constants import CLEAR_M, FAN_OUT, ROTATION_GRADIENT
 from railfix.core.settings import Settings
-from railfix.kernels.layout import CLEAR_M, FAN_OUT, ROTATION_GRADIENT
 from railfix.positioning.normal_equations import Ranges, SinglePoint, fit, normal_equations
 from railfix.track.trajectory import Trajectory
 

@@ -17,8 +17,8 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.simulate.alignment import Alignment, build_alignment
 from railfix.simulate.constellation import SatelliteTable, links, simulated_navigation
-from railfix.simulate.disturbance import CN0_SECOND_DB, Disturbances, SightGeometry
 from railfix.simulate.environment import Environment
+from railfix.simulate.environment.settings import CN0_SECOND_DB, Disturbances, SightGeometry
 from railfix.simulate.errors import CommonErrors, fault_m
 from railfix.simulate.motion import AntennaTruth, BodyMotion, Motion, antenna_truth, build_motion
 from railfix.simulate.receiver import Receiver, ReceiverClocks, group_delay_s, ionosphere_m, signals_of, troposphere_m

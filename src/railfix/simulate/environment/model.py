@@ -12,7 +12,6 @@ from railfix.core.arrays import Complexes, Floats, Indices, Masks, Strings
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import carrier_frequency_hz
-from railfix.simulate.disturbance import CN0_HORIZON_DBHZ, CN0_RISE_DB, Disturbance, SightGeometry
 from railfix.simulate.environment.correlator import (
     TrackedCode,
     cross_polar_gain,
@@ -23,7 +22,14 @@ from railfix.simulate.environment.correlator import (
     strip_field,
     tracked,
 )
-from railfix.simulate.environment.settings import ElectrificationSettings, EnvironmentSettings
+from railfix.simulate.environment.settings import (
+    CN0_HORIZON_DBHZ,
+    CN0_RISE_DB,
+    Disturbance,
+    ElectrificationSettings,
+    EnvironmentSettings,
+    SightGeometry,
+)
 from railfix.simulate.environment.structures import BEYOND_M, build_structures, drawn_sections, tree_rows
 from railfix.simulate.environment.walls import (
     FREE_V,
