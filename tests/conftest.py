@@ -31,12 +31,16 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Tests and modules stay until the end: the collector of garbage need not look at them again and again."""
+    """Tests and modules stay until the end: the collector of garbage need not look at them again and again.
+
+    It would after the first live session, which collects garbage as it begins and unfreezes as it ends.
+    """
     gc.disable()
     try:
         return (yield)
     finally:
         gc.freeze()
+        gc.unfreeze = lambda: None
         gc.enable()
 
 

@@ -74,6 +74,24 @@ def test_the_command_line_stands_over_the_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"elevation": {"mask": 5.0}}, "unknown setting elevation.mask; known are mask_deg"),
+        ({"mask_deg": 5.0}, "is 'elevation.mask_deg' meant?"),
+        ({"largest_sigma_m": -1}, "setting largest_sigma_m: Input should be greater than 0, got -1"),
+        ({"screens": ("rain",)}, "unknown screen 'rain'; known are elevation"),
+    ],
+)
+def test_wrong_settings_in_python_are_named_as_on_the_command_line(values: dict[str, Any], words: str) -> None:
+    with pytest.raises(SettingsError) as of_file:
+        parse_config(values, source="Config")
+    with pytest.raises(SettingsError) as of_class:
+        Config(**values)
+    assert str(of_class.value) == str(of_file.value)
+    assert words in str(of_class.value)
+
+
+@pytest.mark.parametrize(
     ("choices", "words"),
     [
         (Choices(screens="elevation,rain"), ["--screens elevation,rain", "'rain'", *SCREEN_NAMES]),

@@ -118,6 +118,16 @@ def test_concatenate_of_nothing_is_an_error_and_of_one_the_same() -> None:
     np.testing.assert_array_equal(concatenate([one]).code_m, one.code_m)
 
 
+def test_parts_in_the_wrong_order_are_named_with_their_times() -> None:
+    first, second = observations(3, [("G01", "1C")]), observations(2, [("G05", "1C")], begin=3)
+    assert len(concatenate([first, first[:0], second])) == 5
+    words = r"part 2 begins at 2024-03-13T08:00:00.*, part 0 before it ends at 2024-03-13T08:00:04.*; give the parts of"
+    with pytest.raises(ValueError, match=words):
+        concatenate([second, first[:0], first])
+    with pytest.raises(ValueError, match=r"part 1 begins at .*, part 0 before it ends at"):
+        concatenate([first, first[2:]])
+
+
 def test_problems_are_kept_up_to_a_number_and_all_counted() -> None:
     sentences = [str(k) for k in range(MAX_PROBLEMS + 7)]
     kept = capped_problems(sentences, count=len(sentences))

@@ -13,6 +13,7 @@ import pytest
 
 import independent_evaluation
 from railfix.evaluate import Evaluation, EvaluationOptions, evaluate_run
+from railfix.pipeline.config import Config
 from railfix.run import run_files
 from railfix.simulate import demo_files
 from railfix.simulate.demonstration import demo_inputs
@@ -33,7 +34,7 @@ TOLERANCE = 1e-6
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demonstration run, positions as CSV alone."""
     out = tmp_path_factory.mktemp("demo") / "run"
-    run_files(demo_inputs(), out=out)
+    run_files(demo_inputs(), Config(filter="off"), out=out)
     (out / "positions.parquet").unlink()
     return out
 

@@ -72,7 +72,8 @@ def processor(
     navigation: Navigation | None = None,
     trajectories: Mapping[str, Trajectory] | None = None,
 ) -> EpochProcessor:
-    config: Config = parse_config(dict(settings or {}))
+    """Single epochs, which most tests are about; the filter along the track where they ask for it."""
+    config: Config = parse_config({"filter": "off", **(settings or {})})
     return EpochProcessor(config, trajectories or clean_trajectories(), navigation=navigation or clean_navigation())
 
 

@@ -20,7 +20,7 @@ from railfix.core.errors import OutputError
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import ObservationHeader, Observations, concatenate
 from railfix.io.rinex import read_navigation, read_observations, write_navigation, write_observations
-from railfix.io.rinex.write import RinexVersion, _fixed_3, packing_of
+from railfix.io.rinex.write import RinexVersion, _format_f14_3, packing_of
 from railfix.simulate import Scenario, SkySettings, simulated_navigation
 from railfix.simulate.scenario import ReceiverSettings
 
@@ -78,7 +78,7 @@ def columns_of(table: Observations) -> dict[tuple[str, str], int]:
 @given(st.lists(st.floats(-999_999_999.0, 9_999_999_999.0), min_size=1, max_size=20))
 @example([0.0, -0.0, -0.0004, -0.0006, 0.9999, 9.9996, -1.0, -9.9996, 999_999.9996, -999_999_999.0])
 def test_f14_3_is_the_number_in_fourteen_columns(values: list[float]) -> None:
-    text = _fixed_3(np.array(values)).tobytes().decode()
+    text = _format_f14_3(np.array(values)).tobytes().decode()
     for i, value in enumerate(values):
         cell = text[14 * i : 14 * i + 14]
         assert cell == f"{float(cell):14.3f}".replace("-0.000", " 0.000")

@@ -24,16 +24,19 @@ import raim_oracle
 import separation_oracle
 from plain_kernels import plain
 from railfix import kernels
+from railfix.core.arrays import read_only
 from railfix.integrity.protection import RiskBudget, along_track_level
 from railfix.integrity.protection.level import MapDeviation, RangeBounds
 from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.kernels import compiling
-from railfix.kernels.references import by_reference
+from railfix.kernels.compiling import by_reference
 from railfix.kernels.tracking.recursion import advance
 from railfix.kernels.tracking.velocity import fitted_velocities
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import Result
+from railfix.positioning.noise_scale import robust_fit
+from railfix.positioning.normal_equations import constrained_position, fit, normal_equations, single_point
 from railfix.run.processor import processor_of
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
@@ -217,6 +220,26 @@ def compute_nested_sums(given: Given) -> int:
 @compiling.borrowing
 def write_nested_sums(given: Given) -> int:
     return write_sums(given.numbers, given)
+
+
+def test_arrays_of_any_caller_are_of_one_type_for_kernels() -> None:
+    """Writable, read-only and strided arrays: nothing is compiled for them beyond what the first call compiles."""
+    frozen, line = raim_oracle.made(np.full(4, 731.0), "GGGGGEEE", seed=1), raim_oracle.LINE
+    vertex = np.full(4, int(np.argmin(np.abs(line.arc_m - 731.0))))
+    place = line.ecef_m[vertex]
+    places = [read_only(place), place, np.asfortranarray(place)]
+    others = [replace(frozen, code_m=frozen.code_m.copy()), replace(frozen, weight=np.asfortranarray(frozen.weight))]
+    used = (kernels.ranges.misfits, kernels.ranges.reduced_equations, kernels.ranges.iterated_points)
+    used += (kernels.ranges.iterated_along, kernels.robust.reweighted)
+    compiled = []
+    for ranges, near in zip([frozen, *others], places, strict=True):
+        fit(ranges, near)
+        normal_equations(ranges, near)
+        single_point(ranges, near)
+        constrained_position(ranges, line, vertex)
+        robust_fit(ranges, near)
+        compiled.append([len(kernel.signatures) for kernel in used])
+    assert compiled[0] == compiled[1] == compiled[2]
 
 
 @pytest.mark.requirement("A8")

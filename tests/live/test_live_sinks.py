@@ -331,7 +331,7 @@ def test_messages_and_rows_of_the_filter_are_those_of_the_run(tmp_path: Path) ->
     files = demo_files()
     parts = {name: tmp_path / f"{name}.rnx" for name in ("front", "rear")}
     for name, path in parts.items():
-        railfix.write_observations(railfix.read_observations(files[name])[:70], path)
+        railfix.write_observations(railfix.read_observations(files[name])[:40], path)
     common = ["--front", str(parts["front"]), "--rear", str(parts["rear"]), "--track", str(files["track"])]
     common += ["--vehicle", str(files["vehicle"]), "--nav", str(files["nav"])]
     common += ["--reference", "centre"]
@@ -344,7 +344,7 @@ def test_messages_and_rows_of_the_filter_are_those_of_the_run(tmp_path: Path) ->
     for name, table in batch.items():
         rows = [json.loads(line) for line in (tmp_path / name).read_text().splitlines()]
         found = {(row["time_gpst"], row["antenna"]): row for row in rows}
-        assert len(found) == len(rows) > 130
+        assert len(found) == len(rows) > 70
         compared = 0
         times = table["time_gpst"].dt.strftime("%Y-%m-%dT%H:%M:%S%.9f").to_list()
         for time_gpst, row in zip(times, table.iter_rows(named=True), strict=True):
@@ -362,7 +362,7 @@ def test_messages_and_rows_of_the_filter_are_those_of_the_run(tmp_path: Path) ->
                     compared += math.isfinite(value)
                 else:
                     assert live[column] == value, column
-        assert compared > 2_000
+        assert compared > 1_100
     rows = {
         (time, row["antenna"]): row
         for time, row in zip(
@@ -382,7 +382,7 @@ def test_messages_and_rows_of_the_filter_are_those_of_the_run(tmp_path: Path) ->
         assert (message.status is MessageStatus.COASTING) == (mine[0]["status"] == "coasting")
         assert message.status is not MessageStatus.POSITION or mine[0]["status"] == "tracking"
         checked += 1
-    assert checked > 60
+    assert checked > 25
 
 
 def up_cm(value: float) -> int:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.motion.radar import radar_speed_mps, two_way_range_m
+from railfix.motion.samples import radar_speed_mps, two_way_range_m
 from railfix.pipeline.along_track import _gated_ranges
 from railfix.pipeline.config import Config
 from railfix.pipeline.filter_result import FilterFix, FilterState

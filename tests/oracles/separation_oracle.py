@@ -22,10 +22,10 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.integrity.protection.level import Asked, Errors
 from railfix.integrity.protection.open_places import one_after_the_other
 from railfix.integrity.raim.model import LinearModel, ModelArrays, compact, regular_inverse
-from railfix.kernels.layout import LEAST_REDUNDANCY
 
 #: Effect on the position, in its own sigmas, below which a satellite has none.
 NO_EFFECT: Final = 1e-6

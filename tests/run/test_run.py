@@ -22,7 +22,7 @@ from railfix.io.rinex import read_navigation, read_observations, scan_observatio
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import Result
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
-from railfix.pipeline.tables import observations_table, positions_table, to_xarray
+from railfix.pipeline.tables import TRAIN_COLUMNS, observations_table, positions_table, to_xarray, train_table
 from railfix.run import RunInputs, RunOptions, RunSummary, run_files
 from railfix.run.processor import processor_of
 from railfix.simulate.demonstration import demo_inputs, demo_truth
@@ -57,7 +57,7 @@ def result() -> Result:
         "front": antenna_trajectory(track, vehicle, "front"),
         "rear": antenna_trajectory(track, vehicle, "rear"),
     }
-    return processor_of(Config(filter="off"), read_navigation(inputs.nav), trajectories).process(observations)[0]
+    return processor_of(Config(), read_navigation(inputs.nav), trajectories).process(observations)[0]
 
 
 def inputs_of(bench: Bench) -> RunInputs:
@@ -310,15 +310,20 @@ def test_xarray_has_named_axes(result: Result) -> None:
 def test_xarray_has_every_column_with_unit_and_meaning(result: Result) -> None:
     pytest.importorskip("xarray")
     front = result.antennas["front"]
-    data, table = to_xarray(front), positions_table(result).filter(antenna="front")
-    for name, column in POSITION_COLUMNS.items():
-        if name in ("time_gpst", "antenna"):
-            continue
-        assert data[name].attrs == {"units": column.unit, "long_name": column.meaning}
-        expected = table[name]
-        if not expected.dtype.is_integer():
-            expected = expected.fill_null(np.nan if expected.dtype == pl.Float64 else "")
-        np.testing.assert_array_equal(data[name].values, expected.to_numpy(), err_msg=name)
+    data = to_xarray(front, result.fusion["front"])
+    tables = {"": (POSITION_COLUMNS, positions_table(result)), "filter_": (TRAIN_COLUMNS, train_table(result))}
+    for prefix, (columns, table) in tables.items():
+        for name, column in columns.items():
+            if name in ("time_gpst", "antenna"):
+                continue
+            assert data[prefix + name].attrs == {"units": column.unit, "long_name": column.meaning}
+            expected = table.filter(antenna="front")[name]
+            if expected.dtype == pl.Float64:
+                expected = expected.fill_null(np.nan)
+            elif not expected.dtype.is_integer() and expected.dtype != pl.Boolean:
+                expected = expected.fill_null("")
+            np.testing.assert_array_equal(data[prefix + name].values, expected.to_numpy(), err_msg=prefix + name)
+    assert "filter_status" not in to_xarray(front)
     rows = observations_table(result).filter(pl.col("antenna") == "front", pl.col("satellite") == "G01")
     (channel,) = np.flatnonzero(front.satellite == "G01")
     for name in ("reason", "metric_doppler_m", "raim_own_error_m", "sigma_m", "weight_code"):

@@ -20,7 +20,7 @@ import numpy as np
 GAP_S, SIGMA_M, STANDING_MPS, SECTION_M = 2.5, 0.5, 0.3, 500.0
 SPEEDS = (20.0, 60.0, 100.0)
 SATELLITES = (4, 5, 6, 7, 8, 10, 12, 15, 20)
-BLOCK_S, DRAWS, SEED, CONFIDENCE = 20.0, 60, 0, 0.95
+BLOCK_S, DRAWS, SEED, CONFIDENCE = 20.0, 20, 0, 0.95
 NAN = math.nan
 ALARM_LIMITS = (10.0, 20.0, 40.0)
 BEYOND = ("misleading", "hazardously_misleading", "unavailable_misleading")

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from railfix.simulate import Scenario, write_run
-from railfix.simulate.disturbance import Disturbance, SightGeometry
+from railfix.simulate.environment.settings import Disturbance, SightGeometry
 
 
 @dataclass(frozen=True, kw_only=True)

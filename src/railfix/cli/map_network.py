@@ -173,7 +173,7 @@ def route(
     files = [*maps, choice.positions, choice.heights, reading.jgd_parameters]
     check_outputs((out, "csv"), overwrite=overwrite, inputs=files)
     net = _network(maps, reading, connecting)
-    passed, notes = _passed(net, choice, columns, connecting, reading)
+    passed, notes = _route_tracks(net, choice, columns, connecting, reading)
     track = track_of_segments(
         [net.tracks[k] for k in passed],
         heights=choice.heights,
@@ -189,7 +189,7 @@ def route(
     console.print(f"track map: {out}", markup=False, soft_wrap=True)
 
 
-def _passed(
+def _route_tracks(
     net: Network, choice: RouteChoice, columns: ColumnNames, connecting: Connecting, reading: TrackReading
 ) -> tuple[list[int], list[str]]:
     """Tracks of the route asked for, and notes on it."""
@@ -267,7 +267,7 @@ def match_command(
     if not (matched.track >= 0).any():
         raise MismatchError(f"{log}: no position lies near a track of the network; is it the map of this region?")
     write_whole(
-        out, _matched_csv(net, positions, matched, fill_gaps(net, matched, positions, rows_to_fill=options.fill))
+        out, _write_matches(net, positions, matched, fill_gaps(net, matched, positions, rows_to_fill=options.fill))
     )
     console = console_of_tables()
     on = matched.track >= 0
@@ -289,7 +289,7 @@ def match_command(
     console.print(f"positions: {out}", markup=False, soft_wrap=True)
 
 
-def _matched_csv(net: Network, log: PlanLog, matched: Matched, filled: Filled) -> str:
+def _write_matches(net: Network, log: PlanLog, matched: Matched, filled: Filled) -> str:
     names = (*net.names, "")
     kilometrage = net.kilometrage_on(filled.track, filled.chainage_m)
     other = np.where(matched.candidates.track == matched.track[:, None], -1.0, matched.probabilities)

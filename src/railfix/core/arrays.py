@@ -31,6 +31,11 @@ def read_only(array: NDArray[Any]) -> NDArray[Any]:
     return view
 
 
+def kernel_array(array: NDArray[Any]) -> Floats:
+    """A read-only view of numbers in C order: kernels are compiled once for all callers."""
+    return read_only(np.ascontiguousarray(array, dtype=np.float64))
+
+
 def freeze_arrays(instance: DataclassInstance) -> None:
     """Replace the array fields of a dataclass by read-only views; to be called in its `__post_init__`."""
     vars(instance).update({n: read_only(v) for n, v in vars(instance).items() if isinstance(v, np.ndarray)})

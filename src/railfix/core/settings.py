@@ -90,21 +90,25 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> 
     try:
         return model.model_validate(dict(values))
     except ValidationError as error:
-        # a misspelt name before the name that is missing in its place
-        first = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
-        where = ".".join(str(part) for part in first["loc"] if part != "[key]")
-        if first["type"] == "extra_forbidden":
-            known = sorted(_fields_at(model, first["loc"][:-1]))
-            close = [*misspelt([str(first["loc"][-1])], known).values()] or _in_groups(model, str(first["loc"][-1]))
-            hint = "".join(f"; is {name!r} meant?" for name in close)
-            names = f"; known are {', '.join(known)}" if known else ""
-            raise SettingsError(f"{source}: unknown setting {where}{names}{hint}") from None
-        if first["type"] == "missing":
-            raise SettingsError(f"{source}: setting {where} is missing") from None
-        message = first["msg"].removeprefix("Value error, ").replace("a valid tuple", "a list")
-        given = "" if isinstance(first["input"], (Mapping, BaseModel)) else f", got {first['input']!r}"
-        place = f"setting {where}: " if where else ""
-        raise SettingsError(f"{source}: {place}{message}{given}") from None
+        raise SettingsError(f"{source}: {first_fault(model, error)}") from None
+
+
+def first_fault(model: type[BaseModel], error: ValidationError) -> str:
+    """Return the sentence for the first fault: setting, what was expected, what is known or meant."""
+    # a misspelt name before the name that is missing in its place
+    first = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
+    where = ".".join(str(part) for part in first["loc"] if part != "[key]")
+    if first["type"] == "extra_forbidden":
+        known = sorted(_fields_at(model, first["loc"][:-1]))
+        close = [*misspelt([str(first["loc"][-1])], known).values()] or _in_groups(model, str(first["loc"][-1]))
+        hint = "".join(f"; is {name!r} meant?" for name in close)
+        names = f"; known are {', '.join(known)}" if known else ""
+        return f"unknown setting {where}{names}{hint}"
+    if first["type"] == "missing":
+        return f"setting {where} is missing"
+    message = first["msg"].removeprefix("Value error, ").replace("a valid tuple", "a list")
+    given = "" if isinstance(first["input"], (Mapping, BaseModel)) else f", got {first['input']!r}"
+    return f"{f'setting {where}: ' if where else ''}{message}{given}"
 
 
 def _in_groups(model: type[BaseModel], name: str) -> list[str]:

@@ -153,7 +153,7 @@ def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> s
         return "no row of RTKLIB: the log is not RINEX (railfix convert makes it so)"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        files = [*_unpacked(inputs.front, folder, "obs"), *_unpacked(inputs.nav, folder, "nav")]
+        files = [*_unpack(inputs.front, folder, "obs"), *_unpack(inputs.nav, folder, "nav")]
         (folder / "single.conf").write_text(
             f"pos1-posmode=single\npos1-frequency=l1\npos1-elmask={config.elevation.mask_deg:g}\npos1-ionoopt=brdc\n"
             f"pos1-tropopt=saas\npos1-sateph=brdc\npos1-navsys={sum(_SYSTEMS[name] for name in config.systems)}\n"
@@ -169,7 +169,7 @@ def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> s
     return None
 
 
-def _unpacked(paths: Sequence[Path], folder: Path, kind: str) -> list[Path]:
+def _unpack(paths: Sequence[Path], folder: Path, kind: str) -> list[Path]:
     """Write files uncompressed, as RTKLIB reads them; return where."""
     written = [folder / f"{number}.{kind}" for number in range(len(paths))]
     for path, target in zip(paths, written, strict=True):

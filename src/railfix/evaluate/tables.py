@@ -173,7 +173,7 @@ def error_tables(evaluation: Evaluation) -> list[Table]:
         tables.append(listing("limits", _in_order(limited), [*_where(limited), *_LIMITS], caption))
     if len(intervals := evaluation.intervals):
         caption = "Metres run and seconds passed between two positions"
-        intervals = _pooled(intervals).filter(new)
+        intervals = _pool_runs(intervals).filter(new)
         columns = [*_where(intervals), *_INTERVALS]
         tables.append(listing("intervals", intervals.with_columns(_POSITION, _OF), columns, caption))
     if evaluation.outages is not None and len(evaluation.outages):
@@ -193,7 +193,7 @@ def group_tables(evaluation: Evaluation) -> list[Table]:
             continue
         rows = evaluation.figures.filter(grouping=grouping, epochs_of="own")
         if grouping in ("environment", "speed"):
-            rows = _pooled(rows)
+            rows = _pool_runs(rows)
         trivial = {"environment": "unknown", "signals": WITH_SATELLITES}.get(grouping)
         if len(rows) and rows["group"].unique().to_list() != [trivial]:
             tables.append(_group(grouping, rows, caption))
@@ -208,10 +208,10 @@ def level_tables(evaluation: Evaluation, *, worst: int) -> list[Table]:
         caption = "Protection levels in metres, and errors above them"
         tables.append(listing("levels", rows.with_columns(_POSITION, _OF), columns, caption))
     for kind, found in evaluation.integrity.items():
-        overall = _pooled(found.stanford.filter(grouping="all"))
+        overall = _pool_runs(found.stanford.filter(grouping="all"))
         caption = f"Protection levels ({kind}) against errors: epochs in each region of the Stanford diagram. "
         tables.append(_stanford(f"stanford-{kind}", overall, f"{caption}{_LEVELS_OF}; {_AVAILABLE}"))
-        by = _pooled(found.stanford.filter(pl.col("own_limit"), grouping="environment", levels_of="usable"))
+        by = _pool_runs(found.stanford.filter(pl.col("own_limit"), grouping="environment", levels_of="usable"))
         by = by.filter(antenna="all") if "all" in by["antenna"] else by
         if by["group"].n_unique() > 1:
             caption = "The same by environment, usable, at the alarm limit of the run"
@@ -238,7 +238,7 @@ def _where(rows: pl.DataFrame) -> list[Column]:
     return [antenna] if rows["run"].n_unique() == 1 and "all" not in rows["run"] else [("run", "of", str), antenna]
 
 
-def _pooled(rows: pl.DataFrame) -> pl.DataFrame:
+def _pool_runs(rows: pl.DataFrame) -> pl.DataFrame:
     """Return the rows of all runs of a configuration together, those of the runs where each has its own."""
     runs = rows.filter(pl.col("run") != "all")
     several = "all" in rows["run"] and runs["run"].n_unique() > runs["configuration"].n_unique()

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -260,7 +260,24 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     Observations
         Channels sorted by satellite, then signal. The header is that of the first part, with the
         signals and GLONASS channels of the others added; problems are joined, counters added.
+
+    Raises
+    ------
+    ValueError
+        A part begins before the end of the one before it, or there is none.
     """
+    with_epochs = [(k, part.time) for k, part in enumerate(parts) if len(part)]
+    for (one, before), (other, time) in pairwise(with_epochs):
+        if time[0] <= before[-1]:
+            raise ValueError(
+                f"part {other} begins at {time[0]}, part {one} before it ends at {before[-1]}; "
+                "give the parts of one log in order of time"
+            )
+    return stack_parts(parts)
+
+
+def stack_parts(parts: Sequence[Observations]) -> Observations:
+    """Stack observations of one or several receivers as `concatenate` does, in any order of time."""
     if not parts:
         raise ValueError("concatenate needs at least one part")
     of_parts = [list(zip(p.satellite.tolist(), p.signal.tolist(), strict=True)) for p in parts]

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.kernels.compiling import inner, kernel
-from railfix.kernels.layout import LEAST_REDUNDANCY
 
 #: Effect on the position, in its own sigmas, below which a satellite has none.
 _NO_EFFECT = 1e-6

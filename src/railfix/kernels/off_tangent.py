@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.constants import ALONG, CLEAR_M, LEAST_REDUNDANCY, ON_TANGENT_M
 from railfix.kernels.compiling import inner, kernel
-from railfix.kernels.layout import ALONG, CLEAR_M, LEAST_REDUNDANCY, ON_TANGENT_M
 
 
 @kernel

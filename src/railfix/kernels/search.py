@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
+from railfix.core.constants import FAN_OUT, ROTATION_GRADIENT
 from railfix.kernels.compiling import inner, kernel
-from railfix.kernels.layout import FAN_OUT, ROTATION_GRADIENT
 
 #: Half the inverse of the shortest range to a navigation satellite, rounded down (GLONASS at the zenith) [1/m].
 _CURVATURE = 1.0 / (2.0 * 1.9e7)

@@ -14,8 +14,7 @@ from railfix.core.reasons import Status
 from railfix.core.timescale import GPS_EPOCH
 from railfix.live.engine import LiveOutput
 from railfix.live.stream import FOREVER, Sensed
-from railfix.motion.radar import RadarWatch
-from railfix.motion.samples import SensorSamples
+from railfix.motion.samples import RadarWatch, SensorSamples
 from railfix.pipeline.processor import EpochProcessor
 from railfix.run.checks import ENOUGH_TO_STOP, check_same_place
 from railfix.run.sensor_checks import SensorChecks

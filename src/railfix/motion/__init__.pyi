@@ -1,8 +1,15 @@
 # The names of `railfix.motion`, imported at their first use (lazy-loader).
 
 from .features import Feature, LineSeries, LocatedFeature, line_series, locate, map_features
-from .radar import radar_speed_mps, two_way_range_m
-from .samples import InertialSamples, RadarSpeeds, SensorSamples, StationRanges, TachometerPulses
+from .samples import (
+    InertialSamples,
+    RadarSpeeds,
+    SensorSamples,
+    StationRanges,
+    TachometerPulses,
+    radar_speed_mps,
+    two_way_range_m,
+)
 from .slip import MotionState, SlipLimits, SlipResult, find_slips
 from .tachometer import (
     PulseSpeeds,

@@ -117,16 +117,17 @@ def to_xarray(
     ----------
     result : AntennaResult
     tracked : AlongTrack, optional
-        Of the filter along the track: gives the innovations.
+        Of the filter along the track (`Result.fusion`).
     attributes : mapping, optional
         Put on the dataset (name of the antenna, provenance).
 
     Returns
     -------
     xarray.Dataset
-        Every column of `POSITION_COLUMNS` over ``time`` and of `CHANNEL_COLUMNS` over ``time`` and ``channel``, each
-        with its ``units`` and meaning (``long_name``); the positions also as ``ecef_m`` and ``conventional_ecef_m``
-        over ``xyz`` and along the trajectory (``arc_m``). ``satellite`` and ``signal`` are coordinates of ``channel``.
+        Every column of `POSITION_COLUMNS` over ``time``, with `tracked` those of `TRAIN_COLUMNS` as ``filter_...``, and
+        of `CHANNEL_COLUMNS` over ``time`` and ``channel``, each with its ``units`` and meaning (``long_name``); the
+        positions also as ``ecef_m`` and ``conventional_ecef_m`` over ``xyz`` and along the trajectory (``arc_m``).
+        ``satellite`` and ``signal`` are coordinates of ``channel``.
 
     Raises
     ------
@@ -147,6 +148,8 @@ def to_xarray(
         }
 
     data = variables(POSITION_COLUMNS, result, ("time",))
+    if tracked is not None:
+        data |= {f"filter_{name}": values for name, values in variables(TRAIN_COLUMNS, tracked, ("time",)).items()}
     data |= variables(CHANNEL_COLUMNS, Observed(result, tracked), ("time", "channel"))
     data["arc_m"] = (("time",), result.arc_m, {"units": "m", "long_name": "distance along the antenna's trajectory"})
     for name, values in (("ecef_m", result.ecef_m), ("conventional_ecef_m", result.conventional_ecef_m)):

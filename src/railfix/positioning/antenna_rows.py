@@ -15,7 +15,7 @@ from typing import Any, Final, TypeVar, cast
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices
-from railfix.gnss.observations import Observations, concatenate
+from railfix.gnss.observations import Observations, stack_parts
 from railfix.positioning.section_search import SearchIndex
 
 Value = TypeVar("Value")
@@ -87,7 +87,7 @@ def stack_observations(observations: Sequence[Observations]) -> tuple[Observatio
         return first, (EVERY,)
     ends = [0, *accumulate(map(len, observations))]
     same = all(_has_same_channels(first, other) for other in others)
-    stacked = joined(observations) if same else concatenate(observations)
+    stacked = joined(observations) if same else stack_parts(observations)
     return stacked, tuple(slice(a, b) for a, b in pairwise(ends))
 
 

@@ -16,7 +16,7 @@ from pydantic import Field
 from scipy.special import chdtri, chndtrinc
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.arrays import Datetimes, Floats, Masks, kernel_array
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.noise_scale import correlated_sums
@@ -204,7 +204,7 @@ def terms_of_epochs(
     """
     offset = np.einsum("tij,tj->ti", axes, ecef_m - place_ecef_m)
     gain = (axes @ covariance_m2) @ (
-        kernels.ranges.reduced_equations(ranges, ecef_m)[2][:, :3] * ranges.weight[:, None]
+        kernels.ranges.reduced_equations(ranges, kernel_array(ecef_m))[2][:, :3] * ranges.weight[:, None]
     )
     nominal = gain * np.where(ranges.weight > 0, np.fmax(nominal_m, 0.0), 0.0)[:, None]
     bias = nominal @ nominal.swapaxes(1, 2)

@@ -25,7 +25,7 @@ from pydantic import Field
 from scipy.special import ndtri, stdtrit
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, kernel_array
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.positioning.antenna_rows import EVERY
@@ -169,8 +169,8 @@ def robust_fit(
     freedom = ranges.n_used - ranges.n_clocks - (3 if information is None else 1)
     kept, wsse, solved = kernels.robust.reweighted(
         ranges.arrays,
-        np.ascontiguousarray(place_ecef_m, dtype=np.float64),
-        np.empty((0, 3, 3)) if information is None else np.ascontiguousarray(information),
+        kernel_array(place_ecef_m),
+        kernel_array(np.empty((0, 3, 3)) if information is None else information),
         np.sqrt(ranges.n_used / np.maximum(freedom, 1)) / _NORMAL_MEDIAN,
         limits.keep,
         limits.reject,

@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import Field
 
 from railfix import kernels
-from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings
+from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings, kernel_array
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.settings import Settings
 from railfix.track.trajectory import Trajectory
@@ -43,7 +43,7 @@ class ClockTies:
 
 
 class RangeArrays(NamedTuple):
-    """Arrays of `Ranges` in C order, as compiled functions take them: T epochs, M channels, G groups."""
+    """Arrays of `Ranges` as `kernel_array`: T epochs, M channels, G groups."""
 
     sat_ecef_m: Floats  # (T, M, 3)
     code_m: Floats  # (T, M)
@@ -65,7 +65,9 @@ class RangeArrays(NamedTuple):
     def take(self, epochs: Masks | Indices | slice) -> RangeArrays:
         """The arrays of some epochs."""
         ties = (self.offset_m[epochs], self.sigma_m[epochs]) if self.tied else (self.offset_m, self.sigma_m)
-        return RangeArrays(self.sat_ecef_m[epochs], self.code_m[epochs], self.weight[epochs], self.starts, *ties)
+        arrays = (self.sat_ecef_m[epochs], self.code_m[epochs], self.weight[epochs], *ties)
+        sat_ecef_m, code_m, weight, *known = map(kernel_array, arrays)
+        return RangeArrays(sat_ecef_m, code_m, weight, self.starts, *known)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,10 +97,8 @@ class Ranges:
     def arrays(self) -> RangeArrays:
         """The same as plain arrays."""
         ties = np.empty((2, 0, len(self.groups))) if self.ties is None else (self.ties.offset_m, self.ties.sigma_m)
-        sat_ecef_m, code_m, weight, *known = (
-            np.ascontiguousarray(array, dtype=np.float64)
-            for array in (self.sat_ecef_m, self.code_m, self.weight, *ties)
-        )
+        arrays = (self.sat_ecef_m, self.code_m, self.weight, *ties)
+        sat_ecef_m, code_m, weight, *known = map(kernel_array, arrays)
         return RangeArrays(sat_ecef_m, code_m, weight, self.starts, *known)
 
     @cached_property
@@ -145,9 +145,7 @@ def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
 
 def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     """Return the normal equations of `ranges` linearised at one place an epoch, shape (T, 3) [m]."""
-    system, means, rows, seen = kernels.ranges.reduced_equations(
-        ranges.arrays, np.ascontiguousarray(place_ecef_m, dtype=np.float64)
-    )
+    system, means, rows, seen = kernels.ranges.reduced_equations(ranges.arrays, kernel_array(place_ecef_m))
     return NormalEquations(
         matrix=system[:, :3, :3],
         vector=system[:, :3, 3],
@@ -176,8 +174,8 @@ def fit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> 
     -------
     ndarray, shape (n,)
     """
-    place = np.ascontiguousarray(place_ecef_m, dtype=np.float64)
-    return kernels.ranges.misfits(ranges.arrays, place, np.arange(len(ranges)) if epochs is None else epochs)
+    of = np.arange(len(ranges)) if epochs is None else epochs
+    return kernels.ranges.misfits(ranges.arrays, kernel_array(place_ecef_m), of)
 
 
 def inverse_3x3(matrix: Floats) -> Floats:
@@ -328,7 +326,7 @@ def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLim
     limits = limits or SinglePointLimits()
     place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterated_points(
         ranges.arrays,
-        np.ascontiguousarray(start_ecef_m, dtype=np.float64),
+        kernel_array(start_ecef_m),
         np.asarray(ranges.n_used - ranges.n_clocks >= 3),
         limits.tolerance_m,
         limits.max_iterations,

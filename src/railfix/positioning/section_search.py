@@ -21,8 +21,8 @@ from scipy.special import chdtri
 
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers
+from railfix.core.constants import CLEAR_M, FAN_OUT, ROTATION_GRADIENT
 from railfix.core.settings import Settings
-from railfix.kernels.layout import CLEAR_M, FAN_OUT, ROTATION_GRADIENT
 from railfix.positioning.normal_equations import Ranges, SinglePoint, fit, normal_equations
 from railfix.track.trajectory import Trajectory
 
@@ -252,9 +252,8 @@ def _coarse_to_fine(
     equations = normal_equations(ranges.take(epoch), points[node])
     count = np.bincount(epoch, minlength=len(ranges))[epochs]
     found, every = count > 0, np.arange(len(epoch))
-    return SectionCandidates(epochs[found], count[found], node, q, -equations.vector, equations.matrix, every), tried[
-        epochs
-    ]
+    slope, matrix = np.ascontiguousarray(-equations.vector), np.ascontiguousarray(equations.matrix)
+    return SectionCandidates(epochs[found], count[found], node, q, slope, matrix, every), tried[epochs]
 
 
 def _decide(

@@ -90,7 +90,7 @@ class Cn0Mean:
             raise ValueError("elevation_deg must rise, over at least two bins")
 
     @cached_property
-    def _interpolated(self) -> PchipInterpolator:
+    def _interpolate(self) -> PchipInterpolator:
         from scipy.interpolate import PchipInterpolator
 
         return PchipInterpolator(self.elevation_deg, self.mean_dbhz)
@@ -101,7 +101,7 @@ class Cn0Mean:
         lowest, highest = self.elevation_deg[0], self.elevation_deg[-1]
         half = (self.elevation_deg[1] - lowest) / 2.0
         inside = np.where(elevation >= lowest - half, np.clip(elevation, lowest, highest), np.nan)
-        return np.asarray(self._interpolated(inside), dtype=np.float64)
+        return np.asarray(self._interpolate(inside), dtype=np.float64)
 
 
 class SourceFile(Settings):

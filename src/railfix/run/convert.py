@@ -315,7 +315,10 @@ def result_tables(train: pl.DataFrame, passings: pl.DataFrame | None, track: Tra
         "L_DOUBTOVER": doubt["OVER"],
         "L_DOUBTUNDER": doubt["UNDER"],
     }
-    return {"R_TRACK": _written("R_TRACK", rows, on_track), "R_ETCS_TPR": _written("R_ETCS_TPR", rows, to_etcs)}
+    return {
+        "R_TRACK": _columns_of_schema("R_TRACK", rows, on_track),
+        "R_ETCS_TPR": _columns_of_schema("R_ETCS_TPR", rows, to_etcs),
+    }
 
 
 def add_mate_results(folder: OutputFolder, track: Track, log: Path) -> None:
@@ -342,6 +345,6 @@ def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFr
     return found.with_columns(pl.col("chainage_m").fill_null(np.nan))
 
 
-def _written(table: str, rows: pl.DataFrame, values: dict[str, Any]) -> pl.DataFrame:
+def _columns_of_schema(table: str, rows: pl.DataFrame, values: dict[str, Any]) -> pl.DataFrame:
     """The columns of a table of the schema in their order; those that railfix has not are empty."""
     return rows.select(**{name: values.get(name, pl.lit(None)) for name in WRITTEN[table]})

@@ -271,7 +271,7 @@ class Tally:
             if name in result.fusion:
                 tally.add_filter(result.fusion[name], antenna.satellite[antenna.columns])
         if self.order is not None and len(result.antennas) > 1:
-            self.order.add(*(_placed(result.antennas[name]) for name in ("front", "rear")))
+            self.order.add(*(_read_places(result.antennas[name]) for name in ("front", "rear")))
         self.notes.update(dict.fromkeys(result.notes))
 
     @property
@@ -297,7 +297,7 @@ class Tally:
         return sum(a.positioned for a in self.antennas.values())
 
 
-def _placed(result: AntennaResult) -> tuple[Datetimes, Floats, Floats]:
+def _read_places(result: AntennaResult) -> tuple[Datetimes, Floats, Floats]:
     """Return time tags, chainages and their sigmas."""
     return result.time, result.chainage_m, result.along_sigma_m
 

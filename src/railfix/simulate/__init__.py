@@ -11,7 +11,7 @@ use, by the same published formulas, so that an error in either shows as a posit
 from railfix.simulate.alignment import Alignment, build_alignment
 from railfix.simulate.constellation import simulated_navigation
 from railfix.simulate.demonstration import DEMO_FILES, demo_files, demo_folder
-from railfix.simulate.disturbance import Disturbance, Disturbances, SightGeometry
+from railfix.simulate.environment.settings import Disturbance, Disturbances, SightGeometry
 from railfix.simulate.line_file import Element, GeneratedLine, Gradient, LineFile, LineSettings, MapError, Terrain
 from railfix.simulate.motion import AntennaTruth, Motion, antenna_truth, build_motion, run_curve, shuttle
 from railfix.simulate.run import section_table, truth_table, write_run

@@ -10,8 +10,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from railfix.core.errors import SettingsError
-from railfix.simulate.disturbance import CN0_HORIZON_DBHZ, CN0_RISE_DB, Disturbances
-from railfix.simulate.environment.settings import EnvironmentSettings
+from railfix.simulate.environment.settings import CN0_HORIZON_DBHZ, CN0_RISE_DB, Disturbances, EnvironmentSettings
 from railfix.simulate.line_file import LineSettings
 from railfix.simulate.settings import (
     SYSTEMS,

@@ -17,8 +17,8 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.simulate.alignment import Alignment, build_alignment
 from railfix.simulate.constellation import SatelliteTable, links, simulated_navigation
-from railfix.simulate.disturbance import CN0_SECOND_DB, Disturbances, SightGeometry
 from railfix.simulate.environment import Environment
+from railfix.simulate.environment.settings import CN0_SECOND_DB, Disturbances, SightGeometry
 from railfix.simulate.errors import CommonErrors, fault_m
 from railfix.simulate.motion import AntennaTruth, BodyMotion, Motion, antenna_truth, build_motion
 from railfix.simulate.receiver import Receiver, ReceiverClocks, group_delay_s, ionosphere_m, signals_of, troposphere_m
@@ -313,7 +313,7 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     weak = 10.0 ** ((_SIGMA_AT_DBHZ - np.minimum(cn0, _BEST_DBHZ)) / 20.0)
     sigma = settings.code_sigma_m * weak / sine
     grown = weak if scenario.errors.noise.weak_signals == "all" else 1.0
-    bad = ~_tracked(now.elevation_deg, scenario)[:, column] | np.isnan(added_code) | receiver.tracking.too_weak(cn0)
+    bad = ~_is_tracked(now.elevation_deg, scenario)[:, column] | np.isnan(added_code) | receiver.tracking.too_weak(cn0)
     tracked = receiver.tracking.follow(bad)
     added_code = receiver.smoothing.next(added_code, tracked.lost)
     phase = path - ionosphere + added_phase + settings.phase_sigma_m * grown * noise[:, :, 1]
@@ -351,7 +351,7 @@ def _faults(simulation: Simulation, receiver: Receiver, tag_s: Floats) -> tuple[
     return fault, rate
 
 
-def _tracked(elevation_deg: Floats, scenario: Scenario) -> Masks:
+def _is_tracked(elevation_deg: Floats, scenario: Scenario) -> Masks:
     """Satellites that a receiver tracks, shape (T, S)."""
     tracked = elevation_deg >= scenario.sky.cutoff_deg
     most = scenario.sky.satellites_at_most

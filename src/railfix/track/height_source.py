@@ -45,7 +45,7 @@ def check_raster(
     path: str | PathLike[str], *, geoid: str | None, height_datum: str | None, sigma_m: float | None
 ) -> None:
     """Raise SettingsError with all options that a raster needs besides; InputFileError where it is none."""
-    with _opened(path) as (_, crs):
+    with _open_raster(path) as (_, crs):
         own = crs.is_compound
     asked = []
     if height_datum is None and not own:
@@ -116,7 +116,7 @@ def _dense(track: Track) -> Track:
 
 
 @contextmanager
-def _opened(path: str | PathLike[str]) -> Iterator[tuple[Any, CRS]]:
+def _open_raster(path: str | PathLike[str]) -> Iterator[tuple[Any, CRS]]:
     """A raster and its CRS; InputFileError where there is none."""
     try:
         import rasterio
@@ -138,7 +138,7 @@ def _from_raster(
 ) -> Track:
     """Heights of a raster at the points of the track, linear between the middles of its cells."""
     check_raster(path, geoid=geoid, height_datum=height_datum, sigma_m=sigma_m)
-    with _opened(path) as (raster, crs):
+    with _open_raster(path) as (raster, crs):
         height_datum, geoid = own_height_datum(crs.to_wkt(), height_datum, geoid, path=str(path))
         to_raster = Transformer.from_crs(
             CRS.from_user_input(track.provenance.frame).to_2d(), crs.to_2d(), always_xy=True

@@ -204,7 +204,7 @@ def _forms(path: str, row: Row) -> list[PlanElement]:
         raise InputFileError(path, f"a segment is a {kind!r}; line, circle and clothoid are read")
     if not forms:
         raise InputFileError(path, f"edge {row.get('TRACK_EDGE_ID')!r}: its clothoid has a radius below 10 m")
-    return [_turned(form) for form in forms] if _number(path, row, "TRACK_SEGMENT_DIRECTION") < 0.0 else forms
+    return [_turn(form) for form in forms] if _number(path, row, "TRACK_SEGMENT_DIRECTION") < 0.0 else forms
 
 
 def _element(x: float, y: float, azimuth: float, first: float, last: float, length: float) -> PlanElement:
@@ -223,7 +223,7 @@ def _clothoid(east: float, north: float, azimuth: float, rate: float, arc: float
     return _element(x, y, azimuth + rate * arc**2 / 2.0, rate * arc, rate * (arc + length), length)
 
 
-def _turned(element: PlanElement) -> PlanElement:
+def _turn(element: PlanElement) -> PlanElement:
     """An element from its end to its start."""
     (x, y), direction = _end(element)
     return replace(

@@ -198,7 +198,7 @@ class Network:
         ]
         return Candidates(
             **{
-                name: np.concatenate([_padded(getattr(part, name), parts, empty) for part in parts])
+                name: np.concatenate([_pad(getattr(part, name), parts, empty) for part in parts])
                 for name, empty in (("track", -1), ("chainage_m", np.nan), ("offset_m", np.inf))
             }
         )
@@ -314,7 +314,7 @@ class Network:
         return min(best.values(), key=lambda item: item[0])[1]
 
 
-def _padded(values: Any, parts: Sequence[Candidates], empty: float) -> Any:
+def _pad(values: Any, parts: Sequence[Candidates], empty: float) -> Any:
     """Columns of candidates, with empty ones to the most that a part has."""
     width = max(part.track.shape[1] for part in parts)
     return np.pad(values, ((0, 0), (0, width - values.shape[1])), constant_values=empty)

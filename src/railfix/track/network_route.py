@@ -55,7 +55,7 @@ def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill:
     filled = Filled(
         track=matched.track.copy(), chainage_m=matched.chainage_m.copy(), bound_m=np.full(len(matched.track), np.nan)
     )
-    travelled = _travelled_m(log)
+    travelled = _distance_m(log)
     known = np.flatnonzero(matched.track >= 0)
     for first, last in pairwise(known):
         drifting = not np.isnan(matched.probability[first + 1 : last]).all()
@@ -105,7 +105,7 @@ def _place(matched: Matched, row: int | np.intp) -> tuple[int, float]:
     return int(matched.track[row]), float(matched.chainage_m[row])
 
 
-def _travelled_m(log: PlanLog) -> Floats:
+def _distance_m(log: PlanLog) -> Floats:
     """Distance by the steps between positions, each the median of `_STEPS`, as positions jump; NaN without position."""
     ecef = ecef_from_geodetic(log.latitude_deg, log.longitude_deg, np.zeros(len(log.time)))
     step = np.linalg.norm(np.diff(ecef, axis=0), axis=1)

@@ -312,7 +312,7 @@ def read_csv_segment(path: str | PathLike[str], reading: MapReading) -> Segment:
             "'railfix map check' lists them all",
         )
     crs = used_crs(path, reading.crs, table.metadata.get("crs"))
-    latitude, longitude, frame = _checked_degrees(crs, latitude, longitude, path=table.path)
+    latitude, longitude, frame = _check_degrees(crs, latitude, longitude, path=table.path)
     geoid, geoid_m = reading.geoid, None
     if datum == "orthometric" and "geoid_m" in table:
         geoid_m = table.numbers("geoid_m")
@@ -392,7 +392,7 @@ def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floa
         raise table.error(0, "all coordinates lie within a few degrees of 0, 0: radians were given, degrees expected")
 
 
-def _checked_degrees(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> tuple[Floats, Floats, str]:
+def _check_degrees(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> tuple[Floats, Floats, str]:
     """Degrees of a geographic system, and the modern frame they are in."""
     if crs is None:
         return latitude, longitude, "EPSG:4979"

@@ -108,7 +108,7 @@ def _landxml(path: str, root: Any, reading: MapReading) -> list[Segment]:
             plan = [_landxml_plan(path, e, scale) for e in _elements(geometry)]
             profile = _landxml_profile(path, alignment.find(".//{*}ProfAlign"), scale, start)
             cant, notes = _landxml_cant(alignment.find(".//{*}Cant"), scale, start)
-            notes += _ignored(alignment, name)
+            notes += _unused_notes(alignment, name)
         except KeyError as error:
             raise InputFileError(
                 path, f"alignment {name!r}: cant of transition type {error} is not read; {', '.join(_SPIRALS)} are"
@@ -133,7 +133,7 @@ def _landxml(path: str, root: Any, reading: MapReading) -> list[Segment]:
     return segments
 
 
-def _ignored(alignment: Any, name: str) -> tuple[str, ...]:
+def _unused_notes(alignment: Any, name: str) -> tuple[str, ...]:
     """Notes on what of an alignment is not used."""
     notes = []
     if (count := len(alignment.findall(".//{*}ProfAlign"))) > 1:
@@ -394,11 +394,11 @@ def read_rinf_relations(path: str | PathLike[str]) -> list[Relation]:
 
 
 def _graph(path: str | PathLike[str]) -> Graph:
-    return _parsed(str(path), file_sha256(path))
+    return _parse(str(path), file_sha256(path))
 
 
 @lru_cache(maxsize=2)
-def _parsed(path: str, _: str) -> Graph:
+def _parse(path: str, _: str) -> Graph:
     """The triples of a file, kept for its relations."""
     try:
         from rdflib import Graph

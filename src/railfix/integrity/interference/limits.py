@@ -227,7 +227,7 @@ def power_signs(
         In the receiver's unit, + for more gain; NaN where unknown.
     """
     seen, now = np.isfinite(cn0_dbhz), seconds(time - GPS_EPOCH)[:, None]
-    peak, first, last = _arranged(state, channel)
+    peak, first, last = _rearrange(state, channel)
     decay = limits.peak_decay_db_per_min / _MINUTE_S
     peaks = np.maximum.accumulate(np.vstack([peak, np.where(seen, cn0_dbhz + decay * now, -np.inf)]), axis=0)[1:]
     lasts = np.fmax.accumulate(np.vstack([last, np.where(seen, now, np.nan)]), axis=0)
@@ -259,7 +259,7 @@ def _deviation(values: Floats) -> Floats:
     return np.asarray(np.sqrt(np.where(has, (values - mean[:, None]) ** 2, 0.0).sum(axis=1) / count))
 
 
-def _arranged(state: PowerState, channel: Strings) -> tuple[Floats, Floats, Floats]:
+def _rearrange(state: PowerState, channel: Strings) -> tuple[Floats, Floats, Floats]:
     """Return peaks, beginnings and last observations on other channels."""
     peak, first, last = np.full(len(channel), -np.inf), np.full(len(channel), np.nan), np.full(len(channel), np.nan)
     _, here, there = np.intersect1d(channel, state.channel, return_indices=True)

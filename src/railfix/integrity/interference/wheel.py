@@ -105,7 +105,7 @@ def wheel_signs(
     """
     if not len(time):
         return WheelSigns(difference_m=np.empty(0), bound_m=np.empty(0), parted=np.empty(0, dtype=np.bool_)), state
-    rolled, after = _rolled(time, wheel_m, state, limits)
+    rolled, after = _wheel_distances(time, wheel_m, state, limits)
     second = ((time - GPS_EPOCH + _TAG) // _SECOND).astype(np.int64)
     due = second != np.concatenate([[state.second], second[:-1]])
     usable = due & np.isfinite(arc_m) & (sigma_m <= limits.largest_sigma_m)
@@ -129,7 +129,7 @@ def wheel_signs(
     return WheelSigns(difference_m=of_epoch, bound_m=bounds, parted=stays[:, 0]), after
 
 
-def _rolled(
+def _wheel_distances(
     time: Datetimes, wheel_m: Floats, state: WheelState, limits: InterferenceLimits
 ) -> tuple[WheelSamples, WheelState]:
     """Return the wheel's distance at epochs, and the state; after slips and unknown distances a part begins."""

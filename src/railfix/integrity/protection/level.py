@@ -27,6 +27,9 @@ from railfix import kernels
 from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings
 from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, Allocation, RiskBudget, allocate
 from railfix.integrity.raim import LinearModel
+from railfix.integrity.raim.model import constrained_model
+from railfix.positioning.normal_equations import Ranges
+from railfix.track.trajectory import Trajectory
 
 _BLOCK_SIZE: Final = 80_000  #: Numbers of a pair array that a block of epochs holds.
 _OF_MORE: Final = 3  #: Number of the tails of three faults and more among those of all kinds.
@@ -367,3 +370,30 @@ def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayL
     status[level <= alarm_limit_m] = LevelStatus.AVAILABLE
     status[~np.isnan(level) & ~np.asarray(consistent)] = LevelStatus.ALARM
     return status
+
+
+def protection_level(
+    ranges: Ranges,
+    trajectory: Trajectory,
+    arc_m: Floats,
+    *,
+    satellite: Strings,
+    risk: RiskBudget | None = None,
+    scale: ArrayLike = 1.0,
+    n_excluded: ArrayLike = 0,
+) -> ProtectionLevel:
+    """Compute the protection level along the line: faults of satellites and constellations, without those of the map.
+
+    Parameters
+    ----------
+    ranges, trajectory, arc_m, scale
+        As for `railfix.integrity.exclude_faults`, after the exclusions.
+    satellite : ndarray of str, shape (M,)
+        Names, for the priors of their constellations.
+    risk : RiskBudget, optional
+    n_excluded : array_like of int, shape (T,) or ()
+        Satellites that `exclude_faults` took out.
+    """
+    model = constrained_model(ranges, trajectory, arc_m)
+    systems = [name[0] for name in np.asarray(satellite).tolist()]
+    return along_track_level(model, systems, risk=risk, scale=scale, n_excluded=n_excluded)

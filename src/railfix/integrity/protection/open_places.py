@@ -17,10 +17,10 @@ from scipy.special import ndtr
 
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.constants import ALONG, LEAST_REDUNDANCY
 from railfix.integrity.protection.risk import RiskBudget, one_sided_k
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.model import Compact, compact
-from railfix.kernels.layout import ALONG, LEAST_REDUNDANCY
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.normal_equations import inverse_3x3
 from railfix.positioning.section_search import SearchIndex

@@ -201,7 +201,7 @@ class _EphemerisBuilder:
         if number >= BCNAV1_FROM:
             return self._bcnav1
         if number > FNAV_FROM:
-            return {"E": self._galileo_f, "C": self._bcnav2}.get(letter, self._modernised)
+            return {"E": self._galileo_f, "C": self._bcnav2}.get(letter, self._cnav_record)
         if letter == "C":
             return self._d2 if number > 100 else self._d1
         return {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}[letter]
@@ -263,7 +263,7 @@ class _EphemerisBuilder:
         values = {**parts[3], **parts[2], **parts[1], **parts[0], "source": float(E5A_SOURCE)}
         return galileo_record(satellite, values, time) if f"E{int(values['number']):02d}" == satellite else None
 
-    def _modernised(self, satellite: str, _: np.datetime64) -> Record | None:
+    def _cnav_record(self, satellite: str, _: np.datetime64) -> Record | None:
         """Record of CNAV; its three messages are of one issue where their reference times are one."""
         parts = self._parts(satellite, tuple(CNAV_FROM + k for k in nav_messages.CNAV))
         if parts is None or not parts[0]["toe_sow_s"] == parts[1]["toe_sow_s"] == parts[2]["toc_s"]:

@@ -294,7 +294,7 @@ def _satellite_lines(part: Observations, row: _WrittenRows) -> tuple[Bytes, Mask
         at = 3 + _FIELD_WIDTH * k
         value = np.where(channel >= 0, getattr(part, KINDS[column[0]])[:, channel], np.nan)
         present = np.isfinite(value)
-        text[:, :, at : at + 14] = _fixed_3(value)
+        text[:, :, at : at + 14] = _format_f14_3(value)
         end[present] = at + 14
         if column[0] == "L":
             lock = np.where(channel >= 0, part.loss_of_lock[:, channel], 0)
@@ -307,7 +307,7 @@ def _satellite_lines(part: Observations, row: _WrittenRows) -> tuple[Bytes, Mask
     return text, keep
 
 
-def _fixed_3(value: Floats) -> Bytes:
+def _format_f14_3(value: Floats) -> Bytes:
     """Format values as F14.3, rounded half to even, shape (..., 14); NaN is blank."""
     present = np.isfinite(value)
     thousandths = np.rint(np.abs(np.where(present, value, 0.0)) * 1e3).astype(np.int64)

@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 
 from railfix.core.arrays import Floats
-from railfix.kernels.compiling import borrowing, borrowing_kernel
-from railfix.kernels.references import by_reference
+from railfix.kernels.compiling import borrowing, borrowing_kernel, by_reference
 from railfix.kernels.tracking.algebra import invert, restart
 from railfix.kernels.tracking.branches import keep_hypotheses, leading, reweigh
 from railfix.kernels.tracking.constants import (

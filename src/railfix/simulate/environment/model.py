@@ -12,7 +12,6 @@ from railfix.core.arrays import Complexes, Floats, Indices, Masks, Strings
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import carrier_frequency_hz
-from railfix.simulate.disturbance import CN0_HORIZON_DBHZ, CN0_RISE_DB, Disturbance, SightGeometry
 from railfix.simulate.environment.correlator import (
     TrackedCode,
     cross_polar_gain,
@@ -23,7 +22,14 @@ from railfix.simulate.environment.correlator import (
     strip_field,
     tracked,
 )
-from railfix.simulate.environment.settings import ElectrificationSettings, EnvironmentSettings
+from railfix.simulate.environment.settings import (
+    CN0_HORIZON_DBHZ,
+    CN0_RISE_DB,
+    Disturbance,
+    ElectrificationSettings,
+    EnvironmentSettings,
+    SightGeometry,
+)
 from railfix.simulate.environment.structures import BEYOND_M, build_structures, drawn_sections, tree_rows
 from railfix.simulate.environment.walls import (
     FREE_V,
@@ -272,7 +278,7 @@ class Environment:
         for first in range(0, len(epoch), _BLOCK):
             e, c = epoch[first : first + _BLOCK], channel[first : first + _BLOCK]
             rays = _rays(geometry, e, c, wavelength, self.settings.antenna_height_m)
-            got = self._tracked(rays, platform[e], geometry.speed_mps[e], chip[c], clock_s[e])
+            got = self._track_paths(rays, platform[e], geometry.speed_mps[e], chip[c], clock_s[e])
             clear = self._clear_cn0_dbhz[0] + self._clear_cn0_dbhz[1] * rays.z
             lost = clear + got.gain_db < receiver.tracking_cn0_dbhz
             code[e, c] = np.where(lost, np.nan, got.code_m)
@@ -283,7 +289,9 @@ class Environment:
                 cn0[e, c] += self.settings.antenna.ripple_sigma_db * self._ripple.at(rays, geometry.antenna)
         return Disturbance(code_m=code, phase_m=phase, doppler_hz=doppler, cn0_db=cn0)
 
-    def _tracked(self, rays: Rays, platform: Masks, speed_mps: Floats, chip_m: Floats, clock_s: Floats) -> TrackedCode:
+    def _track_paths(
+        self, rays: Rays, platform: Masks, speed_mps: Floats, chip_m: Floats, clock_s: Floats
+    ) -> TrackedCode:
         receiver, paths = self.settings.receiver, self._paths(rays, platform, clock_s)
         return tracked(
             paths.field,

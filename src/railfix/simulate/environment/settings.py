@@ -15,12 +15,15 @@ or, instead of the sections, ``[environment.shares]`` of each kind from which th
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 from math import inf
 from typing import Annotated, Any, Final, Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
+from railfix.core.arrays import Datetimes, Floats, Strings
 from railfix.simulate.settings import (
     AngleBetween,
     Between,
@@ -256,3 +259,40 @@ class EnvironmentSettings(ScenarioSettings):
         parts = (self.electrification, self.side_streets)
         lists = (self.sections, self.shares, self.trees, self.neighbours, self.equipment)
         return all(part is None for part in parts) and not any(lists)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SightGeometry:
+    """Positions of one antenna and directions to its satellites at T epochs, M channels."""
+
+    antenna: str  #: "front" or "rear".
+    time: Datetimes  #: Shape (T,).
+    #: Shape (M,).
+    satellite: Strings
+    signal: Strings
+    chainage_m: Floats  #: Of the centreline point abeam the antenna, shape (T,).
+    speed_mps: Floats  #: Negative toward falling chainage, shape (T,).
+    antenna_ecef_m: Floats  #: Shape (T, 3).
+    heading_deg: Floats  #: Azimuth of the vehicle's forward axis, shape (T,).
+    #: Shape (T, M).
+    elevation_deg: Floats
+    azimuth_deg: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Disturbance:
+    """Terms added to the observations, shapes (T, M)."""
+
+    code_m: Floats  #: NaN where the signal is lost; all observables are then absent.
+    phase_m: Floats
+    doppler_hz: Floats
+    cn0_db: Floats  #: Negative where the signal is attenuated.
+
+
+#: A source of disturbances: a function of the geometry alone, so that results do not depend on the chunks.
+Disturbances = Callable[[SightGeometry], Disturbance]
+
+
+CN0_HORIZON_DBHZ: Final = 34.0
+CN0_RISE_DB: Final = 16.0
+CN0_SECOND_DB: Final = -3.0

@@ -133,7 +133,7 @@ def _solve(
         for system, weight, scale in zip(systems, weights, scales, strict=True):
             factor = np.repeat(weight * system.share / scale**2, system.size)
             right += system.matrix.T @ (factor * system.value)
-        solution = _factorised(_normal_matrix(systems, weights, scales, unknowns)).solve(right)
+        solution = _factorise(_normal_matrix(systems, weights, scales, unknowns)).solve(right)
         for i, system in enumerate(systems):
             norm = np.linalg.norm((system.value - system.matrix @ solution).reshape(-1, system.size), axis=1)
             if system.scaled and len(norm):
@@ -157,7 +157,7 @@ def _normal_matrix(
     return sp.csc_array(matrix.T @ weighted + sp.eye_array(unknowns) / _ANYWHERE_M**2)
 
 
-def _factorised(normal: sp.csc_array) -> Any:
+def _factorise(normal: sp.csc_array) -> Any:
     """Factorise a symmetric positive definite matrix."""
     return splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
@@ -182,7 +182,7 @@ def _line_sigmas(
         for system, weight in zip(systems, weights, strict=True)
     ]
     lower = [np.minimum(a, b) for a, b in zip(expected, weights, strict=True)]
-    factor = _factorised(_normal_matrix(systems, lower, scales, unknowns))
+    factor = _factorise(_normal_matrix(systems, lower, scales, unknowns))
     count = (unknowns - start) // 2
     chosen = np.unique(np.linspace(0, count - 1, min(count, _SIGMAS)).astype(np.intp))
     sigma = np.empty((len(chosen), 2))
@@ -238,7 +238,7 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
     latitude, longitude, _ = geodetic_from_ecef(origin)
     axes = np.asarray(enu_axes(latitude, longitude))
     plain = [replace(run, signals=None) for run in runs]
-    near = adjust(plain, [_filled(run) for run in runs], limits=limits).ecef_m
+    near = adjust(plain, [_interpolate_positions(run) for run in runs], limits=limits).ecef_m
     adjusted = adjust(runs, near, limits=limits) if any(run.signals is not None for run in runs) else None
     positions = near if adjusted is None else adjusted.ecef_m
     course: Course | None = None
@@ -264,7 +264,7 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
         positions = adjusted.ecef_m
     assert adjusted is not None
     assert course is not None
-    order, count = _kept_points(course, ties)
+    order, count = _crossed_points(course, ties)
     sigma = adjusted.line_sigma_m[order]
     sigma_plan, sigma_height = (float(np.percentile(sigma[:, axis], _OF_THE_MAP)) for axis in range(2))
     notes = _notes(runs, legs, passes, count, moved[order], (sigma_plan, sigma_height), beside, apart)
@@ -287,7 +287,7 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
     )
 
 
-def _filled(run: SurveyRun) -> Floats:
+def _interpolate_positions(run: SurveyRun) -> Floats:
     """Positions with those that lack interpolated in time, shape (n, 3) [m]."""
     known = np.isfinite(run.ecef_m[:, 0])
     return np.stack([np.interp(run.seconds, run.seconds[known], run.ecef_m[known, i]) for i in range(3)], axis=1)
@@ -343,7 +343,7 @@ def _length(step_m: Floats) -> float:
     return float(np.linalg.norm(step_m))
 
 
-def _kept_points(course: Course, ties: Ties) -> tuple[Indices, Integers]:
+def _crossed_points(course: Course, ties: Ties) -> tuple[Indices, Integers]:
     """Points of the line that a pass crosses, a closed one ending where it began, and the number of passes of each."""
     count = np.bincount(ties.point, minlength=len(course))
     kept = np.flatnonzero(count > 0)

@@ -125,7 +125,7 @@ def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, t
     return legs
 
 
-def _sampled(leg: Leg, spacing_m: float) -> tuple[Floats, Floats]:
+def _sample(leg: Leg, spacing_m: float) -> tuple[Floats, Floats]:
     """Return arc lengths and points of a leg at even spacing."""
     arc = np.arange(0.0, leg.arc_m[-1], spacing_m)
     return arc, leg.at(arc)
@@ -135,13 +135,13 @@ def find_course(legs: Sequence[Leg], limits: SurveyLimits) -> Course:
     """Find the course of the line: the longest leg until it repeats itself, extended by the other legs at its ends."""
     spacing_m, width_m = limits.spacing_m, limits.same_line_m
     order = sorted(range(len(legs)), key=lambda i: -float(legs[i].arc_m[-1]))
-    first = _sampled(legs[order[0]], spacing_m)[1]
+    first = _sample(legs[order[0]], spacing_m)[1]
     course = _until_repeated(first, spacing_m, width_m)
     grown = True
     while grown and not course.closed:
         grown = False
         for i in order:
-            longer = _extended(course, _sampled(legs[i], spacing_m)[1], spacing_m, width_m)
+            longer = _extend(course, _sample(legs[i], spacing_m)[1], spacing_m, width_m)
             if longer is not None:
                 course, grown = longer, True
                 break
@@ -167,12 +167,12 @@ def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
         if len(stretch) == least and stretch.mean() >= _MOSTLY:
             j = int(earlier[i])
             if j * spacing_m < 2.0 * width_m and float(way[j] @ way[i]) > 0.0:
-                return _closed_course(points, i, j, spacing_m)
+                return _close_course(points, i, j, spacing_m)
             return Course(point_m=points[:i])
     return Course(point_m=points)
 
 
-def _closed_course(points: Floats, end: int, start: int, spacing_m: float) -> Course:
+def _close_course(points: Floats, end: int, start: int, spacing_m: float) -> Course:
     """Return one turn of a closed line: from point `start` to `end`, which is the same place; the gap is evened out."""
     turn = points[start : end + 1].copy()
     gap = turn[0] - turn[-1]
@@ -187,7 +187,7 @@ def _closed_course(points: Floats, end: int, start: int, spacing_m: float) -> Co
     return Course(point_m=turn[: past[0]] if len(past) else turn, closed=True)
 
 
-def _extended(course: Course, points: Floats, spacing_m: float, width_m: float) -> Course | None:
+def _extend(course: Course, points: Floats, spacing_m: float, width_m: float) -> Course | None:
     """Return the course with the part of a leg that leads beyond one of its ends, None where none does."""
     place, sign, _ = match_points(course, points, width_m)
     least = int(_APART_WIDTHS * width_m / spacing_m)
@@ -271,7 +271,7 @@ def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tu
     turn = float(len(course))
     jump = _APART_WIDTHS * width_m / spacing_m
     for number, leg in enumerate(legs):
-        arc, points = _sampled(leg, spacing_m)
+        arc, points = _sample(leg, spacing_m)
         if len(points) < 3:
             continue
         place, sign, _ = match_points(course, points, width_m)
