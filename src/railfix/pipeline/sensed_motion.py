@@ -297,8 +297,6 @@ class SensedMotion:
     @classmethod
     def joined(cls, parts: Sequence[SensedMotion]) -> SensedMotion:
         """Return parts one after the other."""
-        if len(parts) == 1:
-            return parts[0]
         return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
 
 
@@ -320,8 +318,7 @@ class SensedState:
 
 def nothing_sensed(intervals: int) -> SensedMotion:
     """Motion without a sensor."""
-    names = [field.name for field in fields(SensedMotion)]
-    absent = dict(zip(names, np.full((len(names), intervals), np.nan), strict=True))
+    absent = {field.name: np.full(intervals, np.nan) for field in fields(SensedMotion)}
     still = {"doubt_mps": np.zeros(intervals), "swing_mps2": np.zeros(intervals)}
     return SensedMotion(**{**absent, **still, "state": np.zeros(intervals, dtype=np.int8)})
 
