@@ -205,6 +205,62 @@ def test_positions_go_to_the_centre_and_authorities_come_back(folder: Path, tmp_
     assert lines[-1] == {"brake": True, "reason": "no fresh authority"}
 
 
+def test_a_train_whose_positions_end_waits_for_its_last_answer(folder: Path, tmp_path: Path) -> None:
+    simulated = SimulatedTrain(number=1, front_m=300.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=300.0))
+    (tmp_path / "line.toml").write_text((folder / "line.toml").read_text().replace('"keys"', f'"{folder / "keys"}"'))
+    lines: list[dict[str, Any]] = []
+
+    async def positions() -> AsyncIterator[str]:
+        yield to_json(simulated.message(0.0)) + "\n"
+
+    async def work() -> tuple[int, int]:
+        begun = asyncio.Event()
+        centre = asyncio.create_task(
+            run_centre(tmp_path / "line.toml", password="secret", announce=lambda _: begun.set())
+        )
+        await begun.wait()
+        counts = await run_train(
+            1, folder / "keys", bearers_of(addresses(folder), LOCAL), lines=positions(),
+            write=lambda line: lines.append(json.loads(line)),
+        )  # fmt: skip
+        centre.cancel()
+        with suppress(asyncio.CancelledError):
+            await centre
+        return counts
+
+    reports, authorities = asyncio.run(asyncio.wait_for(work(), 60.0))
+    assert reports == 1
+    assert authorities > 0
+    assert any(line.get("report", 0) > 1 for line in lines)
+
+
+@pytest.mark.parametrize("taken", ["page", "bearer B"])
+def test_an_address_that_is_in_use_is_named(folder: Path, tmp_path: Path, taken: str) -> None:
+    (tmp_path / "line.toml").write_text((folder / "line.toml").read_text().replace('"keys"', f'"{folder / "keys"}"'))
+    host, port = addresses(folder)["B"]
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM if taken == "page" else socket.SOCK_DGRAM) as other:
+        other.bind((host, port))
+        page = f"{host}:{port}" if taken == "page" else "127.0.0.1:0"
+        done = CliRunner().invoke(app, ["centre", str(tmp_path / "line.toml"), "--page", page, "--for", "1"])
+    assert done.exit_code == 4
+    named = f"cannot listen at {host}:{port} (Address already in use); end the program that does"
+    assert named in " ".join(done.output.split())
+
+
+@pytest.mark.slow
+def test_a_centre_ends_within_a_second(folder: Path) -> None:
+    """With a page that is open, whose events have no end."""
+    process = started(folder)
+    try:
+        begin = time.monotonic()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10.0) == 128 + signal.SIGTERM
+        assert time.monotonic() - begin < 1.0
+    finally:
+        process.kill()
+        process.communicate()
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 @pytest.mark.slow
 def test_a_train_ends_within_a_second(folder: Path, number: signal.Signals) -> None:
