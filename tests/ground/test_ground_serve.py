@@ -17,10 +17,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from railfix.cli.ground import app
+from railfix.ground.centre import ReferenceCurve
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import HEAD, Interlocking, TrainInterval, from_documents
 from railfix.ground.links import BEARERS, LinkLimits, TrainLinks, bearers_of, first_sequence
@@ -373,7 +375,7 @@ def test_routes_and_the_release_by_hand(
 def test_an_order_to_stop_is_acknowledged_and_timed(
     centre: tuple[ControlCentre, list[Authority], list[float]],
 ) -> None:
-    """A section is closed from the page: the train in it has the order, says so, and comes to rest."""
+    """A section is closed from the page: the train in it has the order, says so, and comes to rest; then it is lost."""
     control, sent, now = centre
     control.supervision.state, control.monitor = replace(control.supervision.state, stopped=False), None
     train = SimulatedTrain(number=1, front_m=400.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=400.0))
@@ -401,6 +403,11 @@ def test_an_order_to_stop_is_acknowledged_and_timed(
     assert shown["stop"] == "A is closed; acknowledged after 2.0 s, at rest after 3.0 s"
     assert [section["name"] for section in shown["sections"] if section["closed"]] == ["A"]
     assert any("order to stop acknowledged after 2.0 s, at rest after 3.0 s" in line for line in control.lines)
+    control.curves = {1: ReferenceCurve.between_stations(np.array([250.0, 1750.0, 3250.0]), speed_mps=20.0)}
+    now[0] += 60.0
+    control.step()
+    lost = control.snapshot()["trains"][0]
+    assert (lost["state"], lost["shown"]) == ("simulated", shown["shown"])
     assert orders["release-train"]({"train": 1}) == "the section where train 1 is or may run is closed"
     assert orders["open-section"]({"section": "A"}) is None
     assert orders["release-train"]({"train": 1}) is None
