@@ -224,8 +224,12 @@ class PageServer:
     ) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        with named_address(host, port):
-            self._socket.bind((host, port))
+        try:
+            with named_address(host, port):
+                self._socket.bind((host, port))
+        except OSError:
+            self._socket.close()
+            raise
         secured = {} if certificate is None else {"ssl_certfile": certificate[0], "ssl_keyfile": str(certificate[1])}
         address = "{}:{}".format(*self._socket.getsockname()[:2])
         self.url = f"{'https' if secured else 'http'}://{address}/"
