@@ -223,8 +223,13 @@ async def run_centre(
     gc.set_threshold(*COLLECTION)
     end, terminated = asyncio.Event(), asyncio.Event()
     loop = asyncio.get_running_loop()
+
+    def terminate() -> None:
+        terminated.set()
+        end.set()
+
     loop.add_signal_handler(signal.SIGINT, end.set)
-    loop.add_signal_handler(signal.SIGTERM, lambda: (end.set(), terminated.set()))
+    loop.add_signal_handler(signal.SIGTERM, terminate)
     with Store(database) as store:
         field_points = SimulatedPoints(move_s=settings.points_s, clock=time.monotonic)
         store.take_charge()
