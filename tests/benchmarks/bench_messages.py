@@ -6,8 +6,8 @@ pace to `railfix live` in a process of its own; the messages come back as datagr
     python tests/benchmarks/bench_messages.py [--seconds 600] [--filter track|off] [--channels 1|2] [--mqtt]
 
 With --mqtt they come back over a broker (mosquitto) instead.
-Prints percentiles of the time between two messages, for each quarter as well, how many were missing, and their
-statuses.
+Prints percentiles of the time between two messages, for each quarter as well, and of their age; how many were missing,
+and their statuses.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from pathlib import Path
 import numpy as np
 
 import railfix
+from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.observations import Observations
 from railfix.io.train_message import MessageStatus, decode
 
@@ -124,6 +125,7 @@ def measure(options: argparse.Namespace, folder: Path, target: str, receive: Cal
     words += ["--front", f"tcp://127.0.0.1:{ports[0]}", "--rear", f"tcp://127.0.0.1:{ports[1]}"]
     words += ["--filter", options.filter, "--channels", options.channels]
     words += ["--send", f"cbor@{target}"]
+    first_ns = (railfix.read_observations(folder / "front.rnx")[:1].time[0] - GPS_EPOCH).astype(int)
     process = subprocess.Popen(words, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
     arrived, messages = [], []
     try:
@@ -144,6 +146,10 @@ def measure(options: argparse.Namespace, folder: Path, target: str, receive: Cal
     print(f"{len(between) + 1} messages in {at[within][-1] - at[within][0]:.1f} s, {silent} of them without input,")
     print(f"{int(np.sum(np.diff(sequence) - 1))} missing; filter {options.filter}, {options.channels} channel(s)")
     print(", ".join(f"{kind.name.lower()} {count}" for kind, count in Counter(kinds).most_common()))
+    measured = [(t, m) for t, m in zip(arrived, messages, strict=True) if m.status is not MessageStatus.NO_INPUT]
+    ages = [1e3 * (t - began) - (m.time_ns - first_ns) / 1e6 for t, m in measured if began + 5.0 < t < until - 1.0]
+    shown = "  ".join(f"p{q:g} {np.percentile(ages, q):6.1f}" for q in (50, 99, 99.9, 100))
+    print(f"age from the epoch on: {shown} ms")
     quantiles = (0.1, 1, 50, 99, 99.9)
     for name, part in [("all", between), *((f"quarter {k + 1}", q) for k, q in enumerate(np.array_split(between, 4)))]:
         values = "  ".join(f"p{q:g} {np.percentile(part, q):6.1f}" for q in quantiles)

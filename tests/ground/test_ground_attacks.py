@@ -60,6 +60,7 @@ RULES["agreed"] = {
     }
 }
 RULES["clock"] = {supervision.compute_contradiction: {"latest_ns is not None and": "False and"}}
+RULES["place covered"] = {supervision.stop_contradicted: {"reason.startswith(WRONG_PLACE)": "True"}}
 RULES["turns"] = {OnBoard.receive: {"authority.report <= self.before_turn": "False"}}
 
 
@@ -397,6 +398,7 @@ def test_no_sequence_leads_to_an_authority_into_a_train(seeds: Sequence[int]) ->
         ("way", 305, "authority into another train"),
         ("roll-back", 7, "authority into another train"),
         ("clock", 95, "impossible way believed"),
+        ("place covered", 19855, "authority into another train"),
     ],
 )
 def test_without_a_rule_a_sequence_breaks_a_promise(

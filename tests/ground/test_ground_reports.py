@@ -38,7 +38,6 @@ RULES["unknown before"] = {OnBoard.receive: {"authority.shortens and not (agrees
 RULES["station reached"] = {
     interlocking.route_requested: {"layout.is_reached(target, here.front_m, direction)": "False"}
 }
-RULES["place covered"] = {supervision.stop_contradicted: {"reason.startswith(WRONG_PLACE)": "True"}}
 RULES["points under"] = {
     stops.release_train: {
         "not points[name].wanted == points[name].detected == known.tracks.get(name[0])": "False",

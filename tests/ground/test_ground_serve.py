@@ -17,10 +17,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from railfix.cli.ground import app
+from railfix.ground.centre import ReferenceCurve
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import HEAD, Interlocking, TrainInterval, from_documents
 from railfix.ground.links import BEARERS, LinkLimits, TrainLinks, bearers_of, first_sequence
@@ -205,6 +207,62 @@ def test_positions_go_to_the_centre_and_authorities_come_back(folder: Path, tmp_
     assert lines[-1] == {"brake": True, "reason": "no fresh authority"}
 
 
+def test_a_train_whose_positions_end_waits_for_its_last_answer(folder: Path, tmp_path: Path) -> None:
+    simulated = SimulatedTrain(number=1, front_m=300.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=300.0))
+    (tmp_path / "line.toml").write_text((folder / "line.toml").read_text().replace('"keys"', f'"{folder / "keys"}"'))
+    lines: list[dict[str, Any]] = []
+
+    async def positions() -> AsyncIterator[str]:
+        yield to_json(simulated.message(0.0)) + "\n"
+
+    async def work() -> tuple[int, int]:
+        begun = asyncio.Event()
+        centre = asyncio.create_task(
+            run_centre(tmp_path / "line.toml", password="secret", announce=lambda _: begun.set())
+        )
+        await begun.wait()
+        counts = await run_train(
+            1, folder / "keys", bearers_of(addresses(folder), LOCAL), lines=positions(),
+            write=lambda line: lines.append(json.loads(line)),
+        )  # fmt: skip
+        centre.cancel()
+        with suppress(asyncio.CancelledError):
+            await centre
+        return counts
+
+    reports, authorities = asyncio.run(asyncio.wait_for(work(), 60.0))
+    assert reports == 1
+    assert authorities > 0
+    assert any(line.get("report", 0) > 1 for line in lines)
+
+
+@pytest.mark.parametrize("taken", ["page", "bearer B"])
+def test_an_address_that_is_in_use_is_named(folder: Path, tmp_path: Path, taken: str) -> None:
+    (tmp_path / "line.toml").write_text((folder / "line.toml").read_text().replace('"keys"', f'"{folder / "keys"}"'))
+    host, port = addresses(folder)["B"]
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM if taken == "page" else socket.SOCK_DGRAM) as other:
+        other.bind((host, port))
+        page = f"{host}:{port}" if taken == "page" else "127.0.0.1:0"
+        done = CliRunner().invoke(app, ["centre", str(tmp_path / "line.toml"), "--page", page, "--for", "1"])
+    assert done.exit_code == 4
+    named = f"cannot listen at {host}:{port} (Address already in use); end the program that does"
+    assert named in " ".join(done.output.split())
+
+
+@pytest.mark.slow
+def test_a_centre_ends_within_a_second(folder: Path) -> None:
+    """With a page that is open, whose events have no end."""
+    process = started(folder)
+    try:
+        begin = time.monotonic()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10.0) == 128 + signal.SIGTERM
+        assert time.monotonic() - begin < 1.0
+    finally:
+        process.kill()
+        process.communicate()
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 @pytest.mark.slow
 def test_a_train_ends_within_a_second(folder: Path, number: signal.Signals) -> None:
@@ -317,7 +375,7 @@ def test_routes_and_the_release_by_hand(
 def test_an_order_to_stop_is_acknowledged_and_timed(
     centre: tuple[ControlCentre, list[Authority], list[float]],
 ) -> None:
-    """A section is closed from the page: the train in it has the order, says so, and comes to rest."""
+    """A section is closed from the page: the train in it has the order, says so, and comes to rest; then it is lost."""
     control, sent, now = centre
     control.supervision.state, control.monitor = replace(control.supervision.state, stopped=False), None
     train = SimulatedTrain(number=1, front_m=400.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=400.0))
@@ -345,6 +403,11 @@ def test_an_order_to_stop_is_acknowledged_and_timed(
     assert shown["stop"] == "A is closed; acknowledged after 2.0 s, at rest after 3.0 s"
     assert [section["name"] for section in shown["sections"] if section["closed"]] == ["A"]
     assert any("order to stop acknowledged after 2.0 s, at rest after 3.0 s" in line for line in control.lines)
+    control.curves = {1: ReferenceCurve.between_stations(np.array([250.0, 1750.0, 3250.0]), speed_mps=20.0)}
+    now[0] += 60.0
+    control.step()
+    lost = control.snapshot()["trains"][0]
+    assert (lost["state"], lost["shown"]) == ("simulated", shown["shown"])
     assert orders["release-train"]({"train": 1}) == "the section where train 1 is or may run is closed"
     assert orders["open-section"]({"section": "A"}) is None
     assert orders["release-train"]({"train": 1}) is None

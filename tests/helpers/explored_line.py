@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from copy import copy, deepcopy
+from copy import copy
 from dataclasses import dataclass, field, replace
 
 from railfix.ground.interlocking import InterlockingLimits, from_documents, to_documents
@@ -74,7 +74,9 @@ class World:
 
     def copied(self) -> World:
         """A world to go on from: states of the interlocking are never written to."""
-        trains = {n: replace(t, on_board=deepcopy(t.on_board)) for n, t in self.trains.items()}
+        trains = {n: replace(t, on_board=copy(t.on_board)) for n, t in self.trains.items()}
+        for train in trains.values():
+            train.on_board._sent = train.on_board._sent.copy()
         centre = copy(self.centre)
         centre.records, centre.refusals = dict(centre.records), Counter()
         centre._clocks = dict(centre._clocks)
@@ -247,7 +249,7 @@ def explore(start: World, length: int, *, events: int = 10**9) -> tuple[int, lis
     """Explore all sequences of up to so many events; return the worlds seen, and the first sequence that violates."""
     seen = {start.key()}
     level: list[tuple[World, list[str]]] = [(start, [])]
-    for _ in range(length):
+    for left in reversed(range(length)):
         later: list[tuple[World, list[str]]] = []
         for world, path in level:
             for event, after in following(world):
@@ -255,7 +257,8 @@ def explore(start: World, length: int, *, events: int = 10**9) -> tuple[int, lis
                     return len(seen), [*path, event, after.violation]
                 if (key := after.key()) not in seen:
                     seen.add(key)
-                    later.append((after, [*path, event]))
+                    if left:
+                        later.append((after, [*path, event]))
                     if len(seen) >= events:
                         return len(seen), None
         level = later

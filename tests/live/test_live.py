@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import gzip
 import json
-from collections.abc import Iterable
+from collections.abc import AsyncIterator, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.observations import Observations
 from railfix.io import read_any_positions
 from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_json
+from railfix.live import session
 from railfix.live.channels import TwoChannels, compare, digests
 from railfix.live.console import Metrics
 from railfix.live.engine import LiveEngine, LiveOutput
@@ -30,7 +31,7 @@ from railfix.live.forms import nmea_bytes, tpv_bytes
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
 from railfix.live.sources import _Chunks, check_source
-from railfix.live.stream import Lag, ReceiverState, receive_bytes, single_epochs
+from railfix.live.stream import Lag, ReceivedData, ReceiverState, receive_bytes, single_epochs
 from railfix.simulate.demonstration import demo_files
 
 pytestmark = pytest.mark.requirement("A8")
@@ -203,6 +204,36 @@ def test_a_session_that_falls_behind_says_so_and_skips_to_the_present(
     played(stepped, [(at, "front", epoch) for at, epoch in zip(times, epochs, strict=True)])
     assert stepped.counts["skipped, behind the receivers"] == 21
     assert any("the receivers' time is 3.0 s later than before" in text for text in stepped.told)
+
+
+def test_a_session_that_is_behind_says_so_while_data_wait(
+    logs: dict[str, tuple[Observations, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sixty epochs come together, 0.7 s after the one before: said at the first, and few polls for those skipped."""
+    engine = LiveEngine(processor("front"), LiveSettings(behind_s=0.5))
+    poll, polls, said = engine.poll, list[int](), dict[str, int]()
+
+    def skipped() -> int:
+        return engine.counts["skipped, behind the receivers"]
+
+    def counted(**keywords: Any) -> list[LiveOutput]:
+        polls.append(skipped())
+        return poll(**keywords)
+
+    async def arrivals(_source: str, state: ReceiverState, *_: object) -> AsyncIterator[ReceivedData]:
+        first = logs["front"][0]
+        yield ReceivedData(epochs=(first,), after=state)
+        await asyncio.sleep(0.7)
+        for k, epoch in enumerate(logs["front"][1:61]):
+            yield ReceivedData(epochs=(replace(epoch, time=first.time + np.timedelta64(k + 1, "ms")),), after=state)
+
+    monkeypatch.setattr(engine, "poll", counted)
+    monkeypatch.setattr(session, "arrivals", arrivals)
+    monkeypatch.setattr(session._LOG, "warning", lambda form, text: said.setdefault(form % text, skipped()))
+    asyncio.run(run_session(engine, {"front": "tcp://127.0.0.1:1"}, [], speed=None))
+    (at,) = (count for text, count in said.items() if "behind the receivers: epochs are skipped" in text)
+    assert at < skipped() == 60
+    assert len([count for count in polls if 0 < count < 60]) < 20
 
 
 def test_a_computer_too_busy_to_skip_is_no_step_of_the_tags() -> None:

@@ -2,9 +2,9 @@
 
 Four trains run over links on a line of twelve stations, a report a second each. SIGKILL ends the `centre`, the server
 of its `database` (PostgreSQL, which Debian installs in /usr/lib/postgresql; psycopg from the package index), or what
-the `trains` have on board (``railfix ground train``), one in turn, at a random instant; it is started again. After each
-kill the database has every report that an authority has answered, the number of every authority and its end, and no
-two trains hold track in common. Printed: what was lost, and times.
+the `trains` have on board (``railfix ground train``), one to all four at once, at a random instant; it is started
+again. After each kill the database has every report that an authority has answered, the number of every authority and
+its end, and no two trains hold track in common. Printed: what was lost, and times.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import multiprocessing
 import os
 import random
 import shutil
+import socket
 import subprocess
 import sys
 import tempfile
@@ -24,6 +25,7 @@ from collections import Counter
 from collections.abc import Callable
 from itertools import combinations
 from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Final
 
@@ -31,6 +33,7 @@ import numpy as np
 import psutil
 
 from ground_load import BEARERS_OF, centre_file
+from railfix.cli import main as main_of_railfix
 from railfix.ground.interlocking import HEAD, Interlocking, from_documents
 from railfix.ground.layout import overlap
 from railfix.ground.links import TrainLinks, first_sequence
@@ -48,6 +51,15 @@ LINE = line_with_loops(12)
 def serve(path: Path, ready: Connection) -> None:
     """Run a centre until it is killed."""
     asyncio.run(run_centre(path, password="secret", announce=ready.send))
+
+
+def carry(words: list[str], there: Connection) -> None:
+    """Run ``railfix`` with a connection as its standard input and output, until it is killed."""
+    for number in (0, 1):
+        os.dup2(there.fileno(), number)
+    sys.stdin, sys.stdout = open(0), open(1, "w")  # noqa: SIM115
+    sys.argv[1:] = words
+    main_of_railfix()
 
 
 class Server:
@@ -87,52 +99,64 @@ class Server:
 class TrainProgram:
     """``railfix ground train`` as a process, which a simulated train gives its positions and obeys."""
 
-    def __init__(self, train: SimulatedTrain, folder: Path) -> None:
-        self.train, self._folder = train, folder
-        self.running: asyncio.subprocess.Process | None = None
-        self.authorities = 0
+    def __init__(self, train: SimulatedTrain, folder: Path, context: ForkServerContext) -> None:
+        self.train, self._folder, self._context = train, folder, context
+        self._process: multiprocessing.process.BaseProcess | None = None
+        self._reader: asyncio.StreamReader | None = None
+        self._writer: asyncio.StreamWriter | None = None
 
     async def start(self) -> None:
         """Start it; the train has no authority before the program says so."""
         self.train.on_board = OnBoard(direction=self.train.direction, end_m=self.train.front_m)
         addresses = [word for bearer in BEARERS_OF.values() for word in ("--centre", "{}:{}".format(*bearer.centre))]
         local = [word for bearer in BEARERS_OF.values() for word in ("--local", bearer.local)]
-        self.running = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "railfix", "ground", "train", str(self.train.number),
-            "--keys", str(self._folder / "keys"), *addresses, *local,
-            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
-        )  # fmt: skip
+        words = ["ground", "train", str(self.train.number), "--keys", str(self._folder / "keys"), *addresses, *local]
+        here, there = self._context.Pipe()
+        self._process = self._context.Process(target=carry, args=(words, there), daemon=True)
+        self._process.start()
+        there.close()
+        mine = socket.socket(fileno=os.dup(here.fileno()))
+        here.close()
+        self._reader, self._writer = await asyncio.open_connection(sock=mine)
 
     async def kill(self) -> None:
         """End it by SIGKILL; the train has no authority any more."""
-        assert self.running is not None
-        self.running.kill()
-        await self.running.wait()
+        assert self._process is not None
+        assert self._writer is not None
+        self._process.kill()
+        await asyncio.to_thread(self._process.join)
+        self._writer.close()
         self.train.on_board = OnBoard(direction=self.train.direction, end_m=self.train.front_m)
 
     def report(self) -> None:
         """Give it a position; a program that has just been killed takes none."""
-        assert self.running is not None
-        assert self.running.stdin is not None
-        if self.running.returncode is None and not self.running.stdin.is_closing():
-            self.running.stdin.write(to_json(self.train.message(time.monotonic())).encode() + b"\n")
+        if self._writer is not None and not self._writer.is_closing():
+            self._writer.write(to_json(self.train.message(time.monotonic())).encode() + b"\n")
 
     async def listen(self, received: Callable[[int, Authority], None]) -> None:
         """Obey what it writes, and what the one says that is started after it."""
         while True:
-            program = self.running
-            assert program is not None
-            assert program.stdout is not None
-            while line := await program.stdout.readline():
+            reader = self._reader
+            assert reader is not None
+            while line := await self._line(reader):
                 said = json.loads(line)
                 age_s = said.pop("age_s", None)
-                if age_s is not None and program is self.running:
+                if age_s is not None and reader is self._reader:
                     authority = Authority.model_validate(said)
                     assert self.train.on_board.receive(authority)
                     self.train.on_board.answered_s = time.monotonic() - age_s
                     received(self.train.number, authority)
-            while program is self.running:
+            while reader is self._reader:
                 await asyncio.sleep(0.05)
+
+    @staticmethod
+    async def _line(reader: asyncio.StreamReader) -> bytes:
+        """The next whole line; nothing where the program has ended, in a line or not."""
+        try:
+            line = await reader.readline()
+        except ConnectionError:
+            return b""
+        return line if line.endswith(b"\n") else b""
 
 
 class KilledCentre:
@@ -154,8 +178,11 @@ class KilledCentre:
         self.path = centre_file(folder, LINE, self.trains)
         if self.server is not None:
             self.path.write_text(f'database = "{self.address}"\n' + self.path.read_text())
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload(["railfix.cli", "railfix.ground.serve", "railfix.ground.traffic"])
+        self._context = context
         if of == "trains":
-            self.programs = {number: TrainProgram(train, folder) for number, train in self.trains.items()}
+            self.programs = {n: TrainProgram(train, folder, context) for n, train in self.trains.items()}
         self.newest: dict[int, Authority] = {}
         self.lost: Counter[str] = Counter(
             dict.fromkeys(("reports", "authorities", "ends", "track in common", "order"), 0)
@@ -163,9 +190,6 @@ class KilledCentre:
         self.counted: Counter[str] = Counter()
         self.without_s: list[float] = []
         self.until_authorities_s: list[float] = []
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["railfix.ground.serve", "railfix.ground.traffic"])
-        self._context = context
         self.process: multiprocessing.process.BaseProcess | None = None
 
     async def start(self) -> None:
@@ -241,23 +265,27 @@ class KilledCentre:
         for one, other in combinations(held.values(), 2):
             self.lost["track in common"] += overlap(one, other)
 
-    async def kill(self) -> None:
-        """Kill, compare the database with what trains know, and start again."""
+    async def kill(self, rng: random.Random) -> int:
+        """Kill, compare the database with what trains know, and start again; return how many were killed."""
         if self.server is not None:
             self.server.kill()
             await asyncio.to_thread(self.server.start)
             self.check()
         elif self.programs:
-            program = self.programs[self.counted["kills"] % len(self.programs) + 1]
-            await program.kill()
+            programs = rng.sample(list(self.programs.values()), rng.randint(1, len(self.programs)))
+            for program in programs:
+                await program.kill()
             self.check()
-            await program.start()
+            for program in programs:
+                await program.start()
+            return len(programs)
         else:
             assert self.process is not None
             self.process.kill()
             self.process.join()
             self.check()
             await self.start()
+        return 1
 
     async def run(self, kills: int, seconds: float) -> None:
         """Kill and start again, so often or for so long."""
@@ -275,9 +303,8 @@ class KilledCentre:
                 self.until_authorities_s.append(time.monotonic() - killed)
             await asyncio.sleep(rng.uniform(0.0, 1.0))
             killed = time.monotonic()
-            await self.kill()
+            self.counted["kills"] += await self.kill(rng)
             self.without_s.append(time.monotonic() - killed)
-            self.counted["kills"] += 1
         for task in running:
             task.cancel()
         await asyncio.gather(*running, return_exceptions=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from railfix.cli.command import Command, command_group
+from railfix.cli.command import SIGNALLED, Command, command_group
 from railfix.cli.console import console_of_tables, show_files, show_table
 from railfix.cli.options import check_outputs, from_models
 from railfix.core.errors import MismatchError, OutputError, SettingsError
@@ -319,7 +320,7 @@ def centre(
 
     Example: `railfix ground centre line.toml --password secret.txt`
 
-    Exit codes as `railfix --help` says.
+    Exit codes as `railfix --help` says; 143 at the end by SIGTERM.
     """
     import asyncio
     import secrets
@@ -338,8 +339,11 @@ def centre(
         if password is None:
             console.print(f"password for orders: {word}", soft_wrap=True)
 
-    figures = asyncio.run(run_centre(path, page=address, password=word, for_s=choices.for_s, announce=announce))
+    work = run_centre(path, page=address, password=word, for_s=choices.for_s, announce=announce)
+    terminated, figures = asyncio.run(work)
     _show_figures(figures)
+    if terminated:
+        raise SystemExit(SIGNALLED + signal.SIGTERM)
 
 
 class TrainChoices(Settings):
@@ -367,11 +371,12 @@ def train(
     """Carry the positions of a train to the centre over two links, and its authorities back.
 
     Reads position messages as lines of JSON from standard input (`railfix live ... --send json@-`), reports the newest
-    every second, and writes each authority, and each beginning and end of braking, as a line of JSON.
+    every second, and writes each authority, and each beginning and end of braking, as a line of JSON. Ends with its
+    input, once the last report is answered or after 5 s.
 
     Example: `railfix live ... | railfix ground train 1 --keys keys --centre 10.0.1.1:4433 --centre 10.0.2.1:4433`
 
-    Exit codes as `railfix --help` says.
+    Exit codes as `railfix --help` says; 0 also where no authority came, said on standard error.
     """
     import asyncio
 

@@ -200,9 +200,9 @@ class ControlCentre:
                 station = self.supervision.layout.stations[train.station].name
                 self.log(f"train {number}: route to {station}, track {train.tracks[train.station]}", train=number)
         for number, record in self.supervision.records.items():
-            after = time_passed(
-                record, now, curves=self.curves, authority_m=state.trains[number].end_m, limits=self.limits
-            )
+            rests = number in self.stops and state.trains[number].standstill  # it is not shown as running on
+            curves = {} if rests else self.curves
+            after = time_passed(record, now, curves=curves, authority_m=state.trains[number].end_m, limits=self.limits)
             if after.state is not record.state:
                 self.log(f"train {number}: {after.state.value}", train=number)
             self.supervision.records[number] = after

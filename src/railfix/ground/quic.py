@@ -9,10 +9,11 @@ alone.
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import ssl
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final, cast
@@ -156,6 +157,19 @@ class LinkProtocol(QuicConnectionProtocol):
         self.transmit()
 
 
+@contextmanager
+def named_address(host: str, port: int) -> Iterator[None]:
+    """Name the address in an OSError of listening there, and what to do."""
+    try:
+        yield
+    except OSError as error:
+        todo = {
+            errno.EADDRINUSE: "end the program that does, or choose another port",
+            errno.EACCES: "choose a port above 1023",
+        }.get(error.errno or 0, "choose an address of this computer")
+        raise OSError(error.errno, f"cannot listen at {host}:{port} ({error.strerror}); {todo}") from None
+
+
 async def listen(
     address: tuple[str, int],
     settings: QuicConfiguration,
@@ -168,13 +182,14 @@ async def listen(
 
     What is owed to a verified peer, answers and acknowledgements, waits up to `wait_s` to go with what is sent.
     """
-    server = await serve(
-        *address,
-        configuration=settings,
-        create_protocol=lambda quic, stream_handler=None: LinkProtocol(
-            quic, stream_handler, received=received, rejected=rejected, wait_s=wait_s
-        ),
-    )
+    with named_address(*address):
+        server = await serve(
+            *address,
+            configuration=settings,
+            create_protocol=lambda quic, stream_handler=None: LinkProtocol(
+                quic, stream_handler, received=received, rejected=rejected, wait_s=wait_s
+            ),
+        )
     transport: Any = server._transport
     return server, transport.get_extra_info("sockname")[:2]
 

@@ -206,8 +206,10 @@ async def run_centre(
     password: str,
     for_s: float | None = None,
     announce: Callable[[str], None] = lambda _: None,
-) -> dict[str, Any]:
-    """Run the centre of a file (`CentreFile`) until SIGINT or SIGTERM, or for a time; return figures of what happened.
+) -> tuple[bool, dict[str, Any]]:
+    """Run the centre of a file (`CentreFile`) until SIGINT or SIGTERM, or for a time.
+
+    Returns whether SIGTERM ended it, and figures of what happened.
 
     The page is at a host and port, port 0 takes a free one; beyond loopback addresses it is served by TLS with the
     centre's certificate. `password` is for orders; `announce` is called with its address once trains can connect.
@@ -219,10 +221,15 @@ async def run_centre(
     check_keys(keys, "centre")
     database = settings.database if "://" in settings.database else f"sqlite:///{path.parent / settings.database}"
     gc.set_threshold(*COLLECTION)
-    end = asyncio.Event()
+    end, terminated = asyncio.Event(), asyncio.Event()
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, end.set)
+
+    def terminate() -> None:
+        terminated.set()
+        end.set()
+
+    loop.add_signal_handler(signal.SIGINT, end.set)
+    loop.add_signal_handler(signal.SIGTERM, terminate)
     with Store(database) as store:
         field_points = SimulatedPoints(move_s=settings.points_s, clock=time.monotonic)
         store.take_charge()
@@ -242,7 +249,7 @@ async def run_centre(
             server = PageServer(app, host=page[0], port=page[1], certificate=certificate)
         except OSError as error:
             await links.stop()
-            raise SettingsError(f"{path}: an address of listen or --page cannot be used ({error.strerror})") from None
+            raise SettingsError(f"{path}: {error.strerror}") from None
         await server.start()
         announce(server.url)
         try:
@@ -260,7 +267,7 @@ async def run_centre(
             done = True
             await links.stop()
             await server.stop()
-        return {
+        return terminated.is_set(), {
             "reports used": control.reports,
             "routes set": control.supervision.routes_set,
             "reports rejected": dict(control.rejected),

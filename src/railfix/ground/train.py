@@ -12,6 +12,7 @@ import sys
 import time
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -196,6 +197,8 @@ class OnBoard:
 
 #: Time between two reports, and between two looks at the age of the authority [s].
 REPORT_S, LOOK_S = 1.0, 0.1
+#: Longest wait for the answer to the last report, after the end of the positions [s].
+ANSWER_S: Final = 5.0
 #: Largest age of what the integrity device has written [s].
 INTEGRITY_S = 2.0
 #: Longest line of a position message [bytes].
@@ -215,7 +218,8 @@ async def run_train(
 ) -> tuple[int, int]:
     """Send the newest position every second, and write authorities and braking as lines of JSON.
 
-    Returns the number of reports and of authorities.
+    Ends with the positions, once the last report is answered or `ANSWER_S` after it. Returns the number of reports and
+    of authorities.
 
     With the train's own two files and ``authority.pem`` of the folder `keys`. The positions are messages as
     `railfix.io.train_message.to_json` writes them, from the standard input by default. With `integrity`, a file of the
@@ -259,7 +263,7 @@ class _Desk:
     ) -> None:
         self._train, self._write, self._limits, self._integrity = train, write, limits, integrity
         self._newest: TrainMessage | None = None
-        self._sequence = first_sequence()
+        self._sequence = self._answered = first_sequence()
         self._on_board: OnBoard | None = None
         self._reason: str | None = ""
         self.reports = self.authorities = 0
@@ -268,6 +272,10 @@ class _Desk:
         async for line in lines:
             if line.strip():
                 self._newest = from_json(line)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(ANSWER_S):
+                while self._newest is not None or self._answered < self._sequence:
+                    await asyncio.sleep(LOOK_S)
 
     async def work(self, links: TrainLinks) -> None:
         due = time.monotonic()
@@ -313,6 +321,7 @@ class _Desk:
         except MessageError as error:
             self._line(rejected=str(error))
             return
+        self._answered = max(self._answered, authority.report)
         if self._on_board is not None and authority.train == self._train and self._on_board.receive(authority):
             self.authorities += 1
             self._line(**authority.model_dump(), age_s=round(self._on_board.age_s(time.monotonic()), 3))

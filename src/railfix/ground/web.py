@@ -24,6 +24,8 @@ from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingR
 from starlette.routing import Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from railfix.ground.quic import named_address
+
 #: Time between two events of the page [s].
 EVENT_S: Final = 0.5
 #: A log-in ends after this time without an order [s].
@@ -222,7 +224,12 @@ class PageServer:
     ) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        self._socket.bind((host, port))
+        try:
+            with named_address(host, port):
+                self._socket.bind((host, port))
+        except OSError:
+            self._socket.close()
+            raise
         secured = {} if certificate is None else {"ssl_certfile": certificate[0], "ssl_keyfile": str(certificate[1])}
         address = "{}:{}".format(*self._socket.getsockname()[:2])
         self.url = f"{'https' if secured else 'http'}://{address}/"

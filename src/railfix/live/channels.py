@@ -66,20 +66,21 @@ def _digest(arrays: list[Any]) -> str:
 def _second_channel(
     connection: Connection, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str]
 ) -> None:
-    """The second process: carries out calls until the connection closes."""
+    """The second process: carries out calls, in lists, until the connection closes."""
     engine = LiveEngine(processor, settings, sensors)
     kernels.load()
     gc.freeze()  # as the first channel's
     connection.send(_READY)
     while True:
         try:
-            name, arguments, keywords = connection.recv()
+            calls = connection.recv()
         except EOFError:
             return
-        if name == "poll":
-            connection.send(digests(engine.poll(**keywords)))
-        else:
-            getattr(engine, name)(*arguments, **keywords)
+        for name, arguments, keywords in calls:
+            if name == "poll":
+                connection.send(digests(engine.poll(**keywords)))
+            else:
+                getattr(engine, name)(*arguments, **keywords)
 
 
 def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Concatenate[TwoChannels, P], None]:
@@ -88,7 +89,7 @@ def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Co
     @wraps(method)
     def in_both(self: TwoChannels, /, *arguments: P.args, **keywords: P.kwargs) -> None:
         method(self, *arguments, **keywords)
-        self._call(method.__name__, *arguments, **keywords)
+        self._calls.append((method.__name__, arguments, keywords))
 
     return in_both
 
@@ -98,6 +99,7 @@ class TwoChannels(LiveEngine):
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
         super().__init__(processor, settings, sensors)
+        self._calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []  # go with the next poll
         context = multiprocessing.get_context("spawn")
         self._connection, other = context.Pipe()
         self._process = context.Process(target=_second_channel, args=(other, processor, settings, sensors), daemon=True)
@@ -120,7 +122,12 @@ class TwoChannels(LiveEngine):
 
         ChannelsDisagreeError: when a message or a stage differs, or the second channel has ended.
         """
-        self._call("poll", now_ns=now_ns, sent_ns=sent_ns)
+        self._calls.append(("poll", (), {"now_ns": now_ns, "sent_ns": sent_ns}))
+        try:
+            self._connection.send(self._calls)
+        except OSError:
+            raise ChannelsDisagreeError("the second channel has ended; no message is sent") from None
+        self._calls.clear()
         outputs = super().poll(now_ns=now_ns, sent_ns=sent_ns)
         compare(digests(outputs), self._recv())
         return outputs
@@ -129,12 +136,6 @@ class TwoChannels(LiveEngine):
         try:
             return self._connection.recv()
         except (EOFError, OSError):
-            raise ChannelsDisagreeError("the second channel has ended; no message is sent") from None
-
-    def _call(self, name: str, *arguments: Any, **keywords: Any) -> None:
-        try:
-            self._connection.send((name, arguments, keywords))
-        except OSError:
             raise ChannelsDisagreeError("the second channel has ended; no message is sent") from None
 
     def close(self) -> None:

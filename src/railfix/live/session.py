@@ -152,7 +152,7 @@ class _Session:
 
     async def process(self, queue: _Queue, pumps: list[asyncio.Task[None]], *, replay: bool) -> None:
         """Process what the pumps bring until all have ended; a restart can continue from there."""
-        read_to_ns = self.read_to_ns
+        read_to_ns, due = self.read_to_ns, 0
         self.reserved_from = self.engine.saved().sequence
         self.save(reserved=self.reserved)
         try:
@@ -177,6 +177,9 @@ class _Session:
                     else:
                         tag_ns = self.take(name, received, None if replay else now)
                         read_to_ns[name] = max(read_to_ns[name], tag_ns)
+                if self.engine.lag.skipped and not queue.empty() and now < due:
+                    continue  # epochs that are skipped cost no answer of a second channel
+                due = now + round(5e8 * self.engine.settings.period_s)
                 # In a replay the clock is the tag up to which all files have been read: no pair is torn, whatever file
                 # is ahead.
                 clock, sent = (min(read_to_ns.values(), default=END_NS), None) if replay else (now, _gps_now_ns())
@@ -268,12 +271,12 @@ class _Session:
                 sink.send(output)
             if self.hooks.observe is not None:
                 self.hooks.observe(output)
+        while self.engine.told:
+            _LOG.warning("%s", self.engine.told.popleft())
         return outputs
 
     def in_idle_time(self, outputs: Sequence[LiveOutput]) -> None:
-        """Log, status, state and garbage, while no data wait."""
-        while self.engine.told:
-            _LOG.warning("%s", self.engine.told.popleft())
+        """Status, state and garbage, while no data wait."""
         now = time.monotonic()
         if self.hooks.show is not None and outputs and now - self.shown >= _STATUS_S:
             self.shown = now
