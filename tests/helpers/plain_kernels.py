@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from railfix import kernels
+from railfix.kernels import compiling
 from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits
 from railfix.tracking.bank import SENSORS, budget, kind_of
@@ -31,6 +32,7 @@ def plain(name: str) -> ModuleType:
     """A module of `railfix.kernels` that the compiler has left alone."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(numba.config, "DISABLE_JIT", True)
+        patch.setattr(compiling, "by_reference", compiling._as_it_is)
         for attribute, value in list(vars(kernels).items()):
             if isinstance(value, ModuleType):
                 patch.setattr(kernels, attribute, value)  # an import sets it
@@ -49,7 +51,7 @@ def named_tuple(kind: type, **values: Any) -> Any:
 
 
 def parameters(limits: TrackingLimits) -> layout.Parameters:
-    return _parameters(limits)
+    return _parameters(limits, limits.map_branch_m)
 
 
 def work_space(hypotheses: int, sources: int = 0) -> layout.Work:

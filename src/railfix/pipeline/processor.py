@@ -59,8 +59,7 @@ class SolvedChunk:
     """Single epochs of a chunk, and what the filter along the track takes from them."""
 
     results: Mapping[str, AntennaResult]
-    #: After all screens and exclusions, by antenna, where the filter is on.
-    ranges: Mapping[str, CorrectedRanges]
+    ranges: Mapping[str, CorrectedRanges]  #: After all screens and exclusions, by antenna.
     off_map: Mapping[str, Masks]  #: The train is away from the line, shape (T,).
     pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.
     sensors: SensorSamples | None  #: Of the sensors on board since the chunk before.
@@ -271,10 +270,9 @@ class EpochProcessor:
         )
         own_states = [changed(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
         solution = with_araim(corrected, solution, antennas, self._support, self.config)
-        wanted = names if self.config.filter == "track" else ()
         solved = SolvedChunk(
             results=self._results(antennas, corrected, solution, pair, ranges),
-            ranges={name: rows_of(corrected, rows) for name, rows in zip(wanted, parts, strict=bool(wanted))},
+            ranges={name: rows_of(corrected, rows) for name, rows in zip(names, parts, strict=True)},
             off_map={name: solution.off_map[rows] for name, rows in zip(names, parts, strict=True)},
             pair=pair,
             sensors=sensors,
