@@ -14,7 +14,7 @@ import pytest
 
 from disturbed_traffic import Conditions, DisturbedTraffic, traffic
 from network_made import made_network
-from railfix.core.errors import MismatchError
+from railfix.core.errors import MismatchError, SettingsError
 from railfix.ground.interlocking import (
     Interlocking,
     InterlockingLimits,
@@ -561,5 +561,5 @@ def test_a_stopped_train_gives_no_route_back() -> None:
 
 def test_names_of_stations_are_different() -> None:
     """Sections are closed by them."""
-    with pytest.raises(ValueError, match="two stations have the same name"):
+    with pytest.raises(SettingsError, match="two stations have the same name"):
         Layout(stations=tuple(LoopStation(name="A", begin_m=m, end_m=m + 400.0) for m in (0.0, 2000.0)))

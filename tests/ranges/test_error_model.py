@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from railfix.cli.evaluate import priors_text
 from railfix.cli.options import Choices, settings_of
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, SettingsError
 from railfix.ranges.error_model import (
     POOLED,
     BinStatistics,
@@ -105,7 +105,7 @@ def test_bins_by_hand() -> None:
 
 @pytest.mark.parametrize("edges", [(0.0,), (0.0, 30.0, 30.0), (30.0, 0.0), (-1.0, 90.0), (0.0, 91.0)])
 def test_edges_of_bins_rise_within_the_sky(edges: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match="elevation_deg"):
+    with pytest.raises(SettingsError, match="elevation_deg"):
         ErrorBins(elevation_deg=edges)
     assert ErrorBins(elevation_deg=(0.0, 90.0), sectors=1).shape == (1, 1, 5)
 

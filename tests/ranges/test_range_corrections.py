@@ -9,10 +9,10 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 import pipeline_cases as cases
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotation
 from railfix.core.reasons import Reason
 from railfix.gnss.orbits import SatelliteStates
@@ -196,9 +196,9 @@ def test_nominal_sigma_by_hand() -> None:
 
 @pytest.mark.parametrize("settings", [{"zenith_sigma_m": 0.0}, {"floor_sigma_m": -0.1}, {"model": "cn0"}])
 def test_impossible_noise_is_rejected(settings: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError):
+    with pytest.raises(SettingsError):
         CodeNoise(**settings)
-    with pytest.raises(ValidationError):
+    with pytest.raises(SettingsError):
         NominalErrors(satellite_sigma_m=-1.0)
 
 

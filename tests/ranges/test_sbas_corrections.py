@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import sbas_cases as cases
+from railfix.core.errors import SettingsError
 from railfix.io.rinex.navigation import read_navigation
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, SbasLimits, read_sbas
 from railfix.ranges.sbas.standard import FAST_DEGRADATION_MPS2, FAST_TIMEOUT_S
@@ -540,9 +541,9 @@ def test_tables_are_those_of_do_229d() -> None:
 
 
 def test_misspelt_limits_are_refused() -> None:
-    with pytest.raises(ValueError, match="mode\n  Input should be 'precision' or 'en_route'"):
+    with pytest.raises(SettingsError, match="setting mode: Input should be 'precision' or 'en_route'"):
         SbasLimits(mode="pa")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="max_udrei\n  Input should be less than or equal to 13"):
+    with pytest.raises(SettingsError, match="setting max_udrei: Input should be less than or equal to 13"):
         SbasLimits(max_udrei=15)
 
 

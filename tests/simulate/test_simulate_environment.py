@@ -13,6 +13,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import max_len_seq
 
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, enu_axes
 from railfix.simulate import Disturbance, Scenario, SightGeometry, Simulation
 from railfix.simulate.environment import (
@@ -644,5 +645,5 @@ def test_settings_come_from_plain_values_and_misspelt_ones_are_refused() -> None
     ],
 )
 def test_what_cannot_stand_there_is_refused(make, said: str) -> None:
-    with pytest.raises(ValidationError, match=said):
+    with pytest.raises(SettingsError, match=said):
         make()

@@ -9,6 +9,7 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.errors import SettingsError
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.observations import carrier_frequency_hz, concatenate
 from railfix.simulate import (
@@ -573,5 +574,5 @@ def test_settings_are_read_from_plain_tables() -> None:
     ],
 )
 def test_settings_out_of_range_are_refused(settings: object, names: str) -> None:
-    with pytest.raises(ValidationError, match=names):
+    with pytest.raises(SettingsError, match=names):
         settings()  # type: ignore[operator]

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from conftest import ROOT
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
@@ -342,7 +342,7 @@ def test_a_time_outside_of_the_file_is_refused(tmp_path: Path) -> None:
     write_navigation(navigation, tmp_path / "bare.rnx")
     with pytest.raises(MismatchError, match="Klobuchar"):
         simulated_navigation(Scenario(sky=sky.replaced(nav=str(tmp_path / "bare.rnx"))))
-    with pytest.raises(ValidationError, match="unhealthy"):
+    with pytest.raises(SettingsError, match="unhealthy"):
         SkySettings(nav="x")
 
 

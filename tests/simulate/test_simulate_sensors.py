@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
+from railfix.core.errors import SettingsError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate import RunSettings, Scenario, Simulation
 from railfix.simulate.body_sensors import gravity_mps2, wheel_slips
@@ -354,7 +355,7 @@ def test_settings_are_read_from_plain_tables() -> None:
     ],
 )
 def test_settings_out_of_range_are_refused(settings: Any, names: str) -> None:
-    with pytest.raises(ValidationError, match=names):
+    with pytest.raises(SettingsError, match=names):
         settings()
 
 

@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import NoneType
-from typing import Any, Final, Self, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, get_args, get_origin
 
 import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
@@ -38,6 +38,16 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    if not TYPE_CHECKING:  # checkers see the settings
+
+        def __init__(self, **values: Any) -> None:
+            try:
+                super().__init__(**values)
+            except ValidationError as error:
+                raise SettingsError(f"{type(self).__name__}: {first_fault(type(self), error)}") from None
+
+        __init__.__pydantic_base_init__ = True  # validation of files does without it
+
     @field_validator("*", mode="before")
     @classmethod
     def _no_switch_for_a_number(cls, value: Any, info: ValidationInfo) -> Any:
@@ -54,7 +64,7 @@ class Settings(BaseModel):
 
         Raises
         ------
-        ValidationError
+        SettingsError
             A value is out of range or a name unknown.
         """
         values = {name: getattr(self, name) for name in type(self).model_fields}

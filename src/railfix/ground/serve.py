@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
@@ -145,9 +145,8 @@ class CentreFile(Settings):
         stations = layout_of(read_network([folder / name for name in self.network]), drive=self.drive).layout.stations
         try:
             return self.replaced(stations=stations, network=())
-        except ValidationError as error:
-            message = error.errors()[0]["msg"].removeprefix("Value error, ")
-            raise SettingsError(f"trains: {message}") from None
+        except SettingsError as error:
+            raise SettingsError(f"trains: {str(error).partition(': ')[2]}") from None
 
     @property
     def layout(self) -> Layout:

@@ -64,7 +64,7 @@ class Authority(Settings):
         if version != VERSION:
             raise MessageError(f"is an authority of version {version}, {VERSION} was expected")
         try:
-            return cls(**dict(zip(cls.model_fields, values, strict=True)))
+            return cls.model_validate(dict(zip(cls.model_fields, values, strict=True)))
         except ValidationError as error:
             first = error.errors()[0]
             raise MessageError(f"{first['loc'][0]}: {first['msg']}") from None

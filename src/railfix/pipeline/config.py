@@ -24,10 +24,9 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
-from pydantic import Field, ValidationError, create_model, field_validator, model_validator
+from pydantic import Field, create_model, field_validator, model_validator
 
-from railfix.core.errors import SettingsError
-from railfix.core.settings import Settings, first_fault, load_settings, validated
+from railfix.core.settings import Settings, load_settings, validated
 from railfix.integrity.interference import InterferenceLimits
 from railfix.integrity.protection import RiskBudget
 from railfix.integrity.protection.araim import AraimBudget
@@ -210,16 +209,6 @@ class Config(ScreenSettings):
     single_point: SinglePointLimits = SinglePointLimits()
     section: SectionLimits = SectionLimits()
     constrained: ConstrainedLimits = ConstrainedLimits()
-
-    if not TYPE_CHECKING:  # checkers see the settings
-
-        def __init__(self, **values: Any) -> None:
-            try:
-                super().__init__(**values)
-            except ValidationError as error:
-                raise SettingsError(f"Config: {first_fault(Config, error)}") from None
-
-        __init__.__pydantic_base_init__ = True  # validation of files does without it
 
     @model_validator(mode="before")
     @classmethod
