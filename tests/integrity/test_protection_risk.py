@@ -12,6 +12,7 @@ from scipy.stats import chi2, norm
 
 import raim_oracle as oracle
 from protection_oracle import Event, hypotheses, kind_of, products
+from railfix.core.errors import SettingsError
 from railfix.integrity.protection import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, RiskBudget, k_factor
 from railfix.integrity.protection.risk import allocate, pair_sum, set_sums
 
@@ -91,15 +92,15 @@ def test_priors_and_what_they_leave():
     ],
 )
 def test_budgets_that_are_refused(wrong):
-    with pytest.raises(ValueError, match=rf"{next(iter(wrong))}|shares"):
+    with pytest.raises(SettingsError, match=rf"{next(iter(wrong))}|shares"):
         RiskBudget(**wrong)
 
 
 def test_measured_priors_are_given():
     """Nothing else takes the word "assumed" from a level; default values do not count as measured."""
-    with pytest.raises(ValueError, match="local_prior and side_prior not given"):
+    with pytest.raises(SettingsError, match="local_prior and side_prior not given"):
         RiskBudget(priors="measured")
-    with pytest.raises(ValueError, match="measured, but side_prior not given"):
+    with pytest.raises(SettingsError, match="measured, but side_prior not given"):
         RiskBudget(priors="measured", local_prior=2e-5)
     stated = RiskBudget(priors="measured", local_prior=2e-5, side_prior=3e-6)
     assert stated.replaced(map_prior=0.0).priors == "measured"

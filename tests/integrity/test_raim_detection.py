@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import binom, chi2
 
 import raim_oracle as oracle
+from railfix.core.errors import SettingsError
 from railfix.integrity.raim import RaimLimits, detect, threshold
 
 pytestmark = pytest.mark.requirement("B6")
@@ -73,7 +74,7 @@ def test_scale_multiplies_the_sigmas():
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
-        ({"mode": "chi"}, "mode\n.*'chi_square' or 'fixed'"),
+        ({"mode": "chi"}, "setting mode: .*'chi_square' or 'fixed'"),
         ({"false_alarm": 0.0}, "false_alarm"),
         ({"missed_detection": 1.0}, "missed_detection"),
         ({"false_alarm": 0.6, "missed_detection": 0.5}, "add up to less than 1"),
@@ -88,7 +89,7 @@ def test_scale_multiplies_the_sigmas():
     ],
 )
 def test_limits_out_of_range(setting, words):
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(SettingsError, match=words):
         RaimLimits(**setting)
 
 

@@ -7,6 +7,7 @@ import pytest
 
 import carrier_cases
 import synthetic
+from railfix.core.errors import SettingsError
 from railfix.positioning.carrier import ContinuityLimits, ContinuityState, TrackedPhases, track_jumps
 from railfix.positioning.carrier.continuity import TrackJumps
 
@@ -117,5 +118,5 @@ def test_chunks_give_the_same_bits(cut):
 
 @pytest.mark.parametrize("name", ["phase_m", "drift_mps", "aside_m", "across_share", "up_share", "sigmas", "max_gap_s"])
 def test_limits_must_be_positive(name):
-    with pytest.raises(ValueError, match=name):
+    with pytest.raises(SettingsError, match=name):
         ContinuityLimits(**{name: 0.0})

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import carrier_cases
+from railfix.core.errors import SettingsError
 from railfix.gnss.observations import Observations
 from railfix.positioning.carrier import CycleSlipLimits, SlipReason, find_slips, number_arcs
 from railfix.positioning.carrier.continuity import NO_ARC, channel_of
@@ -206,5 +207,5 @@ def test_arcs_have_names_of_their_own():
 
 @pytest.mark.parametrize("name", ["max_gap_s", "doppler_m", "doppler_mps", "jerk_mps3", "code_m"])
 def test_limits_must_be_positive(name):
-    with pytest.raises(ValueError, match=name):
+    with pytest.raises(SettingsError, match=name):
         CycleSlipLimits(**{name: 0.0})

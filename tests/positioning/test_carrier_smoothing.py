@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import carrier_cases
+from railfix.core.errors import SettingsError
 from railfix.gnss.observations import Observations
 from railfix.positioning.carrier import SmoothedCodes, SmoothingLimits, SmoothingState, find_slips, smooth_codes
 from railfix.positioning.carrier.smoothing import linear_recursion
@@ -165,5 +166,5 @@ def test_a_day_keeps_its_digits():
 
 @pytest.mark.parametrize("wrong", [{"window_s": 0.0}, {"window_s": float("nan")}, {"clocks": "none"}])
 def test_limits_are_checked(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
+    with pytest.raises(SettingsError, match=next(iter(wrong))):
         SmoothingLimits(**wrong)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import reference_gaps
+from railfix.core.errors import SettingsError
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import concatenate
 from railfix.pipeline.config import DEFAULT_SIGNALS
@@ -132,9 +133,9 @@ def test_epochs_do_not_touch_each_other_but_by_the_scale(quiet: Simulated) -> No
 
 
 def test_limits_are_checked() -> None:
-    with pytest.raises(ValueError, match="greater than or equal to 3"):
+    with pytest.raises(SettingsError, match="greater than or equal to 3"):
         DopplerSpeedLimits(min_satellites=2)
-    with pytest.raises(ValueError, match="greater than 0"):
+    with pytest.raises(SettingsError, match="greater than 0"):
         DopplerSpeedLimits(zenith_mps=0.0)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from railfix.core.arrays import Datetimes, Floats, Masks
-from railfix.core.errors import MismatchError, NoPositionError
+from railfix.core.errors import MismatchError, NoPositionError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.observations import concatenate
@@ -460,5 +460,5 @@ def test_pulses_of_another_day_or_wheel_do_not_belong() -> None:
         build_references(replace(data, pulses=other))
     with pytest.raises(MismatchError, match="does the counter wrap"):
         build_references(data, ReferenceSettings(pulse_m=0.5))
-    with pytest.raises(ValueError, match="max_gap_s"):
+    with pytest.raises(SettingsError, match="max_gap_s"):
         ReferenceSettings(max_gap_s=-1.0)

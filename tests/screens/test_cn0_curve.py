@@ -114,7 +114,7 @@ def test_too_few_samples_make_no_curve() -> None:
     with pytest.raises(ValueError, match="bins"):
         fit_cn0_curve([(cn0, elevation, satellite, signal)], fit=CurveFit(least_bins=5))
     for wrong in ({"bin_deg": 0.0}, {"least_samples": 0}, {"clip_sigma": 0.0}):
-        with pytest.raises(ValueError, match=next(iter(wrong))):
+        with pytest.raises(SettingsError, match=next(iter(wrong))):
             CurveFit(**wrong)
 
 

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from pipeline_cases import clean_files, clean_observations, processor
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, enu_axes
 from railfix.core.timescale import timedelta
 from railfix.gnss.observations import Observations, carrier_frequency_hz
@@ -293,7 +294,7 @@ def test_order_and_cutting_do_not_matter(seed: int) -> None:
     "wrong", [{"limit_m": 0.0}, {"clocks": "rubidium"}, {"least_satellites": 2}, {"azimuth_error_deg": -1.0}]
 )
 def test_pair_limits_are_checked(wrong: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=next(iter(wrong))):
+    with pytest.raises(SettingsError, match=next(iter(wrong))):
         AntennaPairLimits(**wrong)  # type: ignore[arg-type]
 
 
@@ -449,7 +450,7 @@ def test_turning_the_line_round_changes_nothing(front: float, rear: float, spaci
 
 @pytest.mark.requirement("B5")
 def test_positions_are_checked() -> None:
-    with pytest.raises(ValueError, match="limit_m"):
+    with pytest.raises(SettingsError, match="limit_m"):
         AntennaSpacingLimits(limit_m=-1.0)
     with pytest.raises(ValueError, match="facing"):
         antenna_spacing_screen([1.0], [2.0], 3.0, facing=2)

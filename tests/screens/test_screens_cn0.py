@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from railfix.core.errors import SettingsError
 from railfix.io.rinex import read_observations
 from railfix.ranges.cn0_curve import Cn0Curve, Cn0Mean
 from railfix.screens import Cn0Limits, cn0_screen
@@ -97,7 +98,7 @@ def test_a_weaker_signal_is_never_better(cn0: list[float], weaker: float, elevat
 
 @pytest.mark.parametrize("wrong", [{"deficit_dbhz": 0.0}, {"floor_dbhz": 0.0}, {"deficit_dbhz": np.nan}])
 def test_limits_are_checked(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=next(iter(wrong))):
+    with pytest.raises(SettingsError, match=next(iter(wrong))):
         Cn0Limits(**wrong)
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from conftest import ROOT
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.errors import SettingsError
 from railfix.core.timescale import timedelta
 from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.io.rinex import read_observations
@@ -298,7 +299,7 @@ def test_no_epochs_leave_the_state() -> None:
     ],
 )
 def test_limits_are_checked(wrong: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=next(iter(wrong))):
+    with pytest.raises(SettingsError, match=next(iter(wrong))):
         DopplerLimits(**wrong)  # type: ignore[arg-type]
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from railfix.core.arrays import Floats
+from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.track import Finding, MapLimits, Track, check_track
 
@@ -203,5 +204,5 @@ def test_the_report_orders_errors_first_and_tells_the_marking() -> None:
 
 
 def test_limits_must_be_positive() -> None:
-    with pytest.raises(ValueError, match="mid_chord_m"):
+    with pytest.raises(SettingsError, match="mid_chord_m"):
         MapLimits(mid_chord_m=0.0)
