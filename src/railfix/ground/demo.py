@@ -365,7 +365,9 @@ async def _run(traffic: LinkedTraffic, relays: dict[tuple[int, LinkName], Relay]
             alone = OUTAGE_A_S[0] <= now < OUTAGE_A_S[1] and bearer == "A"
             relay.disturbance.up = not (alone or (both and number == 1))
         traffic.step()
-        await asyncio.sleep(max(0.0, start + traffic.now_s / speed - loop.time()))
+        # What a busy machine loses is not caught up: the links would have less time than they simulate.
+        start = max(start, loop.time() - traffic.now_s / speed)
+        await asyncio.sleep(start + traffic.now_s / speed - loop.time())
 
 
 def _figures(traffic: LinkedTraffic, trains: dict[int, TrainLinks], centre: CentreLinks) -> dict[str, Any]:
