@@ -71,7 +71,7 @@ def copied(value: Any) -> Any:
 KERNELS = {
     "hypotheses": ("tails_of_hypotheses",),
     "level": ("solve_level",),
-    "off_tangent": ("clear_of_sections", "risk_off_tangent"),
+    "off_tangent": ("clear_of_sections", "risk_beyond", "risk_off_tangent"),
     "ranges": ("reduced_equations", "misfits", "iterated_points", "iterated_along"),
     "reading": ("decoded_fields", "placed_fields", "line_ends"),
     "robust": ("reweighted",),
@@ -98,7 +98,7 @@ def calls() -> dict[str, list[tuple[Any, ...]]]:
         for module, name in NAMES:
             of = getattr(kernels, module)
             patch.setattr(of, name, recording(name, getattr(of, name)))
-        result_of(60, filter="off")
+        result_of(330, filter="off")  # until the line turns within reach of a level
         # Too few satellites for a 3-D position: coarse to fine.
         result_of(5, systems=("G",), elevation={"mask_deg": 45.0}, protection="off", filter="off")
     return found

@@ -359,3 +359,60 @@ def risk_off_tangent(
                 spent += p * _tail_of(xx, xy, xz, yy, yz, zz, form, clear_m[t])
         total[t] = spent
     return total
+
+
+@kernel
+def risk_beyond(
+    forms: Any,
+    radius_m: Floats,
+    first: Indices,
+    start_m: Floats,
+    tangent: Floats,
+    length_m: Floats,
+    beyond_m: Floats,
+) -> Floats:
+    """Return the probability that the true place lies beyond a level off the tangent, over K hypotheses, shape (T,).
+
+    Parameters
+    ----------
+    forms : Forms
+        Sums of squared residuals over the place d, ``q(d) = constant - 2 d . slope + d^T matrix d``, with their priors.
+    radius_m : ndarray, shape (T, K)
+        A hypothesis counts where a place beyond the level is nearer.
+    first : ndarray of int, shape (T + 1,)
+        First section of each epoch.
+    start_m, tangent : ndarray, shape (P, 3)
+    length_m : ndarray, shape (P,)
+    beyond_m : ndarray, shape (P,)
+        Distance of the sections beyond the level; others infinite.
+    """
+    prior, constant, slope, matrix = forms
+    epochs, hypotheses = prior.shape
+    spent = np.zeros(epochs)
+    for t in range(epochs):
+        nearest = np.inf
+        for p in range(first[t], first[t + 1]):
+            nearest = min(nearest, beyond_m[p])
+        for k in range(hypotheses):
+            if not (prior[t, k] > 0.0 and radius_m[t, k] > nearest):
+                continue
+            sx, sy, sz, m = slope[t, k, 0], slope[t, k, 1], slope[t, k, 2], matrix[t, k]
+            least, beyond = np.inf, np.inf
+            for p in range(first[t], first[t + 1]):
+                x, y, z = start_m[p, 0], start_m[p, 1], start_m[p, 2]
+                a, b, c = tangent[p, 0], tangent[p, 1], tangent[p, 2]
+                gx = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z - sx
+                gy = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z - sy
+                gz = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z - sz
+                value = constant[t, k] + x * (gx - sx) + y * (gy - sy) + z * (gz - sz)
+                rise = 2.0 * (a * gx + b * gy + c * gz)
+                curvature = a * (m[0, 0] * a + m[0, 1] * b + m[0, 2] * c) + b * (m[1, 0] * a + m[1, 1] * b)
+                curvature += b * m[1, 2] * c + c * (m[2, 0] * a + m[2, 1] * b + m[2, 2] * c)
+                step = min(max(-0.5 * rise / curvature, 0.0), length_m[p]) if curvature > 0.0 else 0.0
+                value += step * (rise + step * curvature)
+                least = min(least, value)
+                if beyond_m[p] < np.inf:
+                    beyond = min(beyond, value)
+            excess = beyond - least
+            spent[t] += prior[t, k] * (0.5 * math.erfc(math.sqrt(0.5 * excess)) if excess > 0.0 else 1.0)
+    return spent

@@ -21,6 +21,7 @@ import numpy as np
 
 from railfix import kernels
 from railfix.gnss.observations import Observations
+from railfix.integrity.protection.open_places import Forms
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.kernels.compiling import resolved_once
 from railfix.pipeline.config import parse_config
@@ -30,8 +31,8 @@ from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 _Settings: TypeAlias = tuple[tuple[dict[str, Any], int], ...]
-#: Settings and numbers of epochs that together call every kernel of single epochs; the second has too few satellites
-#: for 3-D positions.
+#: Settings and numbers of epochs that together call every kernel of single epochs but `risk_beyond`; the second has too
+#: few satellites for 3-D positions.
 _STAGES: Final[_Settings] = (
     ({"filter": "off"}, 60),
     ({"filter": "off", "systems": ["G"], "elevation": {"mask_deg": 45.0}, "protection": "off"}, 5),
@@ -89,6 +90,8 @@ def _run(settings: _Settings) -> None:
     try:
         with resolved_once():
             _process(settings)
+            if settings is _STAGES:
+                _look_beyond()
     finally:
         gc.enable()
 
@@ -109,6 +112,13 @@ def _process(settings: _Settings) -> None:
         processor.process({name: log[:epochs] for name, log in logs.items()})
         for epoch in range(epochs):
             _, state = processor.process({name: log[epoch : epoch + 1] for name, log in logs.items()}, state)
+
+
+def _look_beyond() -> None:
+    """Look for places beyond a level: the line does not turn where these epochs are."""
+    forms = Forms(*(np.zeros((1, 1, *of_place)) for of_place in ((), (), (3,), (3, 3))))
+    sections = np.zeros(2, dtype=np.intp), np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1), np.zeros(1)
+    kernels.off_tangent.risk_beyond(forms, np.zeros((1, 1)), *sections)
 
 
 def _first_epochs(log: Path, count: int) -> Observations:

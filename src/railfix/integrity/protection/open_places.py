@@ -8,12 +8,11 @@ residuals, a quadratic form in the place, is evaluated along the line where a bo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from itertools import chain
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
 
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Masks
@@ -29,8 +28,7 @@ _FURTHEST_M: Final = 5000.0  #: Furthest places looked at [m]: the linear model 
 _NEGLIGIBLE: Final = 0.01  #: Share of the risk of a sample below which places are not looked for.
 
 
-@dataclass(frozen=True)
-class Forms:
+class Forms(NamedTuple):
     """Sum of squared residuals in variances, over the place d from the position, under K hypotheses, T epochs.
 
     ``q(d) = constant - 2 d . slope + d^T matrix d``, d along, across and up at the position.
@@ -41,33 +39,25 @@ class Forms:
     slope: Floats  # (T, K, 3) [1/m]
     matrix: Floats  # (T, K, 3, 3) [1/m^2]
 
-    def take(self, epochs: Indices) -> Forms:
-        """Return the forms of some epochs, by index."""
-        return Forms(self.prior[epochs], self.constant[epochs], self.slope[epochs], self.matrix[epochs])
-
     def beside(self, *others: Forms) -> Forms:
         """Return these and other hypotheses of the same epochs together."""
-        every = (self, *others)
-        return Forms(*(np.concatenate([getattr(f, item.name) for f in every], axis=1) for item in fields(Forms)))
-
-    def coefficients(self) -> Floats:
-        """Return the coefficients of `open_places._Sections.monomials`, shape (T, 10, K)."""
-        of_squares = [self.matrix[..., i, i] for i in range(3)]
-        of_products = [2.0 * self.matrix[..., i, j] for i, j in ((0, 1), (0, 2), (1, 2))]
-        return np.stack([self.constant, *np.moveaxis(-2.0 * self.slope, 2, 0), *of_squares, *of_products], axis=1)
+        return Forms(*(np.concatenate(arrays, axis=1) for arrays in zip(self, *others, strict=True)))
 
     def radius_m(self, risk: float) -> Floats:
-        """Return the distance within which all open places lie, but for 1 % of the risk, shape (T,)."""
+        """Return the distance within which the open places of each hypothesis lie, shape (T, K); 0 without a prior.
+
+        Beyond them all have 1 % of the risk, the same for each.
+        """
         covariance = inverse_3x3(self.matrix)
         centre = np.einsum("tkij,tkj->tki", covariance, self.slope)
         form = np.maximum(np.einsum("tki,tki->tk", centre, self.slope), 0.0)
         # The trace of a covariance is above its largest eigenvalue.
         widest = np.trace(covariance, axis1=2, axis2=3)
-        total = self.prior.sum(axis=1, keepdims=True)
-        sigmas = np.maximum(one_sided_k(_NEGLIGIBLE * risk / np.where(total > 0, total, 1.0)), 0.0)
+        each = _NEGLIGIBLE * risk / np.maximum(np.count_nonzero(self.prior, axis=1, keepdims=True), 1)
+        sigmas = np.maximum(one_sided_k(each / np.where(self.prior > 0, self.prior, 1.0)), 0.0)
         radius = np.linalg.norm(centre, axis=2) + np.sqrt((form + sigmas**2) * widest)
         radius = np.where(self.prior > 0, np.nan_to_num(radius, nan=_FURTHEST_M), 0.0)
-        return np.asarray(np.minimum(radius.max(axis=1), _FURTHEST_M))
+        return np.asarray(np.minimum(radius, _FURTHEST_M))
 
 
 def whiten_residuals(model: LinearModel, plan: float, height: float, scale: Floats) -> tuple[Compact, Floats, Forms]:
@@ -137,35 +127,7 @@ def one_after_the_other(columns: Floats, members: Masks) -> tuple[Floats, Floats
     return rows, scaled, checked
 
 
-#: Numbers that a block of epochs by pairs of satellites, or of sections by hypotheses holds.
-_BLOCK_SIZE: Final = 300_000
 _BOUND_SIZE: Final = 100_000  #: Numbers that a block of epochs by channels squared holds.
-
-
-@dataclass(frozen=True)
-class _Sections:
-    """Sections of the line around the positions: P pairs of an epoch and a section, sorted by epoch."""
-
-    epoch: Indices  # (P,)
-    start_m: Floats  # (P, 3) first point, along, across and up from the position
-    tangent: Floats  # (P, 3)
-    length_m: Floats  # (P,)
-    beyond: Masks  # (P,) with a part beyond the level that the tangent does not lead to
-
-    def take(self, pairs: Masks | Indices) -> _Sections:
-        """Return some of the sections."""
-        return _Sections(
-            self.epoch[pairs], self.start_m[pairs], self.tangent[pairs], self.length_m[pairs], self.beyond[pairs]
-        )
-
-    def monomials(self) -> Floats:
-        """Return the monomials of q at the start, of its slope and of its curvature along each section, (P, 3, 10)."""
-        (x, y, z), (a, b, c) = self.start_m.T, self.tangent.T
-        none, one = np.zeros(len(x)), np.ones(len(x))
-        start = [one, x, y, z, x * x, y * y, z * z, x * y, x * z, y * z]
-        slope = [none, a, b, c, 2 * x * a, 2 * y * b, 2 * z * c, x * b + y * a, x * c + z * a, y * c + z * b]
-        curvature = [none, none, none, none, a * a, b * b, c * c, a * b, a * c, b * c]
-        return np.moveaxis(np.array([start, slope, curvature]), 2, 0)
 
 
 def places_beyond_the_level(
@@ -226,7 +188,9 @@ def places_beyond_the_level(
 
 def _risk_of_block(index: SearchIndex, arc_m: Floats, level_m: Floats, forms: Forms, risk: RiskBudget) -> Floats:
     """Return the probability that the true place lies beyond the level off the tangent, shape (T,)."""
-    return _risk_beyond(forms, _around(index, arc_m, level_m, forms.radius_m(risk.risk_per_sample)))
+    radius = forms.radius_m(risk.risk_per_sample)
+    sections = _around(index, arc_m, level_m, radius.max(axis=1))
+    return kernels.off_tangent.risk_beyond(forms, radius, *sections)
 
 
 def _without_one(parts: Compact, design: Floats, none: Forms, prior: Floats) -> Forms:
@@ -264,8 +228,21 @@ def _without_two(parts: Compact, design: Floats, none: Forms, prior: Floats) -> 
     )
 
 
-def _around(index: SearchIndex, arc_m: Floats, level_m: Floats, radius_m: Floats) -> _Sections:
-    """Sections within a radius of each position that have any off the tangent beyond its level, divided there."""
+def _around(
+    index: SearchIndex, arc_m: Floats, level_m: Floats, radius_m: Floats
+) -> tuple[Indices, Floats, Floats, Floats, Floats]:
+    """Return the sections within a radius of each position, divided at its level, epoch after epoch.
+
+    Returns
+    -------
+    first : ndarray of int, shape (T + 1,)
+        First section of each epoch, then their number P.
+    start_m, tangent : ndarray, shape (P, 3)
+        Along, across and up from the position.
+    length_m : ndarray, shape (P,)
+    beyond_m : ndarray, shape (P,)
+        Distance of what lies beyond the level where the tangent does not lead to; others infinite.
+    """
     line = index.trajectory
     here, place = line.segment_at(arc_m)[0], line.at_arc(arc_m)
     axes = line.axes_of(here)
@@ -288,36 +265,7 @@ def _around(index: SearchIndex, arc_m: Floats, level_m: Floats, radius_m: Floats
     low, high = edges[pair, piece], edges[pair, piece + 1]
     ends = start[pair, None] + np.stack([low, high], axis=1)[..., None] * tangent[pair, None]
     off = (np.abs(ends[..., 0]) < ALONG * np.linalg.norm(ends, axis=2)).any(axis=1)
-    beyond = (piece != 1) & off
-    turning = np.zeros(len(arc_m), dtype=bool)
-    turning[epoch[pair[beyond]]] = True
-    return _Sections(epoch[pair], ends[:, 0], tangent[pair], high - low, beyond).take(turning[epoch[pair]])
-
-
-def _risk_beyond(forms: Forms, sections: _Sections) -> Floats:
-    """Probability that the true place lies beyond the level, summed over the hypotheses, shape (T,)."""
-    spent = np.zeros(len(forms.prior))
-    epochs, starts, count = np.unique(sections.epoch, return_index=True, return_counts=True)
-    if not len(epochs):
-        return spent
-    forms = forms.take(epochs)
-    coefficients = forms.coefficients()
-    # Epochs of like numbers of sections together: no block is wider than it must be.
-    order = np.argsort(count, kind="stable")
-    size = max(1, _BLOCK_SIZE // max(1, int(count.max()) * forms.prior.shape[1]))
-    for first in range(0, len(order), size):
-        some = order[first : first + size]
-        place = np.arange(count[some].max())
-        there = place < count[some, None]
-        part = sections.take(np.where(there, starts[some, None] + place, starts[some, None]).ravel())
-        width = 3 * len(place)
-        values = part.monomials().reshape(len(some), width, 10) @ coefficients[some]
-        start, slope, curvature = np.moveaxis(values.reshape(len(some), len(place), 3, -1), 2, 0)
-        length = part.length_m.reshape(there.shape)[..., None]
-        step = np.clip(-0.5 * slope / np.where(curvature > 0, curvature, np.inf), 0.0, length)
-        least = start + step * (slope + step * curvature)
-        beyond = np.where(part.beyond.reshape(there.shape)[..., None], least, np.inf).min(axis=1)
-        excess = beyond - least.min(axis=1)
-        tail = np.where(excess > 0, ndtr(-np.sqrt(np.maximum(excess, 0.0))), 1.0)
-        spent[epochs[some]] = (forms.prior[some] * tail).sum(axis=1)
-    return spent
+    nearest = start[pair] + np.clip(middle[pair], low, high)[:, None] * tangent[pair]
+    beyond = np.where((piece != 1) & off, np.linalg.norm(nearest, axis=1), np.inf)
+    first = np.searchsorted(epoch[pair], np.arange(len(arc_m) + 1))
+    return first, np.ascontiguousarray(ends[:, 0]), tangent[pair], high - low, beyond
