@@ -49,7 +49,7 @@ def output(sequence: int, **values: Any) -> LiveOutput:
 
 
 def test_a_slow_reader_delays_nothing_and_loses_what_does_not_fit() -> None:
-    """A pipe that nobody reads: 5000 messages are handed over in a moment, the rest is counted."""
+    """A pipe that nobody reads: 5000 messages are handed over meanwhile, the rest is counted."""
     release, taken = threading.Event(), list[int]()
 
     def stuck(item: int) -> None:
@@ -57,10 +57,9 @@ def test_a_slow_reader_delays_nothing_and_loses_what_does_not_fit() -> None:
         taken.append(item)
 
     outlet = Outlet("slow", stuck, waiting=100)
-    began = time.perf_counter()
     for k in range(5000):
         outlet.send(k)
-    assert time.perf_counter() - began < 0.5
+    assert not taken
     assert outlet.dropped >= 5000 - 102
     release.set()
     outlet.close()

@@ -40,15 +40,10 @@ def test_a_run_starts_without_the_large_parts_of_scipy() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_the_import_is_quick_and_loads_no_array_library() -> None:
-    program = (
-        "import time, sys; began = time.process_time(); import railfix; "
-        "print(time.process_time() - began, 'numpy' in sys.modules, 'EpochProcessor' in dir(railfix))"
-    )
-    runs = [subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True) for _ in "123"]
-    shown = [run.stdout.split() for run in runs]
-    assert min(float(seconds) for seconds, _, _ in shown) < 0.05
-    assert {(loaded, listed) for _, loaded, listed in shown} == {("False", "True")}
+def test_the_import_loads_no_array_library() -> None:
+    program = "import sys, railfix; print('numpy' in sys.modules, 'EpochProcessor' in dir(railfix))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "True"]
 
 
 @pytest.fixture(scope="module")
