@@ -26,7 +26,7 @@ from railfix.simulate.environment import (
     SectionSettings,
     drawn_sections,
 )
-from railfix.simulate.environment.correlator import edge_amplitude, strip_field, tracked
+from railfix.simulate.environment.correlator import edge_amplitude, strip_field, track_paths
 from railfix.simulate.environment.model import Electrification
 from railfix.simulate.environment.structures import build_structures
 from railfix.simulate.environment.walls import Rays, reflections, shadow
@@ -151,13 +151,13 @@ def numerical_correlator(fields: np.ndarray, late_chips: np.ndarray, spacing: fl
 def track(amplitude: list[float], extra_m: list[float], turn: list[float], rate: list[float] | None = None, **other):
     """One signal of several paths; `turn` is the phase that is not the extra path's."""
     field = np.array(amplitude)[:, None] * np.exp(1j * np.array(turn))[:, None]
-    return tracked(
+    return track_paths(
         field,
         np.array(extra_m)[:, None],
         np.array(rate or [0.0] * len(amplitude))[:, None],
         wavelength_m=np.array([WAVE]),
         chip_m=np.array([293.05]),
-        **{"spacing_chips": 0.1, "code_loop_hz": 1.0, "carrier_loop_hz": 10.0} | other,
+        receiver=CorrelatorSettings(**other),
     )
 
 

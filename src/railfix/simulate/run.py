@@ -158,7 +158,7 @@ def truth_table(simulation: Simulation) -> pl.DataFrame:
     mapped = line.track().chainage_m
     tables = []
     for antenna in ANTENNAS:
-        instant = tags - simulation.clock_s(antenna, tags)
+        instant = tags - simulation.clocks.bias_s(antenna, tags)
         truth, speed = simulation.truth(antenna, instant)
         tables.append(
             pl.DataFrame(
@@ -238,10 +238,8 @@ def write_run(
 
     Raises
     ------
-    OutputError
-        A file cannot be written.
-    InputFileError, MismatchError, SettingsError
-        A track or navigation file that the scenario names does not serve.
+    OutputError, InputFileError, MismatchError, SettingsError
+        A file cannot be written; a track or navigation file that the scenario names does not serve.
     """
     simulation = Simulation(scenario)
     tables = sensor_tables(simulation)
@@ -286,9 +284,9 @@ def _write_files(
     )
     write_track_csv(simulation.line.track(), files["track"])
     write_toml(files["vehicle"], vehicle_table(scenario.vehicle))
-    content = _csv(truth_table(simulation), TRUTH_DECIMALS)
-    _write(files["truth"], gzip.compress(content, compresslevel=6, mtime=0) if packed else content)
-    _write(files["sections"], _csv(section_table(simulation), TRUTH_DECIMALS))
+    truth, sections = (_csv(make(simulation), TRUTH_DECIMALS) for make in (truth_table, section_table))
+    _write(files["truth"], gzip.compress(truth, compresslevel=6, mtime=0) if packed else truth)
+    _write(files["sections"], sections)
     if scenario.sbas is not None:
         write_sbas(sbas_messages(simulation, scenario.sbas), files["sbas"])
     for name, table in tables.items():

@@ -14,6 +14,7 @@ from railfix.ranges.sbas.ionosphere import BANDS, COLUMNS, POINT_OF_BIT
 from railfix.ranges.sbas.messages import DATA_BITS, PREAMBLES, with_parity
 from railfix.ranges.sbas.standard import DO_NOT_USE, NOT_MONITORED
 from railfix.simulate.constellation import newest_record
+from railfix.simulate.errors import fault_m
 from railfix.simulate.receiver import ionosphere_m
 from railfix.simulate.settings import SbasSettings
 
@@ -178,7 +179,8 @@ class Service:
         """UDREI (L5: DFREI) of `satellites`: as set, do not use during a fault."""
         settings = self._settings
         usual = settings.udrei if settings.band == "L1" else settings.dfrei
-        fault, _ = self._errors.fault_m(self._instant(second - settings.alert_s + settings.latency_s), self.satellites)
+        at = self._instant(second - settings.alert_s + settings.latency_s)
+        fault, _ = fault_m(self._simulation.scenario.errors.faults, at, self.satellites)
         return [DO_NOT_USE if abs(f) > settings.alert_m else usual for f in fault[0].tolist()]
 
     def orbits(self, second: float) -> list[LongTerm]:

@@ -13,14 +13,13 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import carrier_frequency_hz
 from railfix.simulate.environment.correlator import (
-    TrackedCode,
     cross_polar_gain,
     edge_amplitude,
     per_metre,
     received_amplitude,
     roughness_loss,
     strip_field,
-    tracked,
+    track_paths,
 )
 from railfix.simulate.environment.settings import (
     CN0_HORIZON_DBHZ,
@@ -200,15 +199,6 @@ _BLOCK: Final = 8192  #: Signals computed at once, so that their arrays stay in 
 _LEAST_ELEVATION_DEG: Final = 0.5  #: Lowest elevation that is computed [deg].
 
 
-@dataclass(frozen=True, kw_only=True)
-class Paths:
-    """Paths of N signals, the direct one first, shapes (P, N)."""
-
-    field: Complexes  #: Relative to the unobstructed direct signal, without the phase of the extra path.
-    extra_m: Floats
-    growth: Floats  #: Of the extra path with the antenna's chainage [m/m].
-
-
 class Environment:
     """Multipath and blockage along a line.
 
@@ -278,7 +268,8 @@ class Environment:
         for first in range(0, len(epoch), _BLOCK):
             e, c = epoch[first : first + _BLOCK], channel[first : first + _BLOCK]
             rays = _rays(geometry, e, c, wavelength, self.settings.antenna_height_m)
-            got = self._track_paths(rays, platform[e], geometry.speed_mps[e], chip[c], clock_s[e])
+            field, extra, growth = self._paths(rays, platform[e], clock_s[e])
+            got = track_paths(field, extra, growth * geometry.speed_mps[e], rays.wavelength_m, chip[c], receiver)
             clear = self._clear_cn0_dbhz[0] + self._clear_cn0_dbhz[1] * rays.z
             lost = clear + got.gain_db < receiver.tracking_cn0_dbhz
             code[e, c] = np.where(lost, np.nan, got.code_m)
@@ -289,23 +280,12 @@ class Environment:
                 cn0[e, c] += self.settings.antenna.ripple_sigma_db * self._ripple.at(rays, geometry.antenna)
         return Disturbance(code_m=code, phase_m=phase, doppler_hz=doppler, cn0_db=cn0)
 
-    def _track_paths(
-        self, rays: Rays, platform: Masks, speed_mps: Floats, chip_m: Floats, clock_s: Floats
-    ) -> TrackedCode:
-        receiver, paths = self.settings.receiver, self._paths(rays, platform, clock_s)
-        return tracked(
-            paths.field,
-            paths.extra_m,
-            paths.growth * speed_mps,
-            wavelength_m=rays.wavelength_m,
-            chip_m=chip_m,
-            spacing_chips=receiver.spacing_chips,
-            code_loop_hz=receiver.code_loop_hz,
-            carrier_loop_hz=receiver.carrier_loop_hz,
-        )
+    def _paths(self, rays: Rays, platform: Masks, clock_s: Floats) -> tuple[Complexes, Floats, Floats]:
+        """Paths of N signals: the direct one, and those reflected and scattered by what is along the line.
 
-    def _paths(self, rays: Rays, platform: Masks, clock_s: Floats) -> Paths:
-        """Direct path, and the paths reflected and scattered by ground, masts, walls, streets, vehicles and trees."""
+        Returns the fields relative to the unobstructed direct signal, without the phase of the extra path, the extra
+        paths [m], and their growth with the antenna's chainage [m/m], shapes (P, N).
+        """
         field, delay = self._direct(rays, clock_s)
         nothing = np.zeros(len(rays.x))
         rows: list[tuple[Floats | Complexes, Floats, Floats]] = [(field, delay, nothing)]
@@ -319,11 +299,8 @@ class Environment:
             left, scatter, extra = foliage(trees, rays)
             rows[0] = (rows[0][0] * left, *rows[0][1:])
             rows.append((scatter * np.abs(rows[0][0]), extra, rays.x - 0.5))
-        return Paths(
-            field=np.stack([row[0].astype(np.complex128) for row in rows]),
-            extra_m=np.stack([row[1] for row in rows]),
-            growth=np.stack([row[2] for row in rows]),
-        )
+        fields, extra_m, growth = zip(*rows, strict=True)
+        return np.stack([field.astype(np.complex128) for field in fields]), np.stack(extra_m), np.stack(growth)
 
     def _further(self, rays: Rays, clock_s: Floats) -> list[tuple[Floats | Complexes, Floats, Floats]]:
         """Reflections by side streets, by both sides one after the other, and by vehicles on parallel tracks."""
