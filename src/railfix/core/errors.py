@@ -26,15 +26,9 @@ from typing import ClassVar
 
 
 class RailfixError(Exception):
-    """Base of all errors that a user can correct: input files, settings, outputs.
+    """Base of all errors that a user can correct: input files, settings, outputs."""
 
-    Attributes
-    ----------
-    exit_code : int
-        Exit code of the command line for this class of error.
-    """
-
-    exit_code: ClassVar[int] = 1
+    exit_code: ClassVar[int] = 1  #: Of the command line for this class of error.
 
 
 class InputFileError(RailfixError):

@@ -238,7 +238,7 @@ def _count(
                     "available": round(diagram.available_rate * len(spanned)),
                     "available_observed": int(np.count_nonzero(observed & (level <= limit))),
                     "beyond": len(diagram.beyond),
-                    "beyond_blocks": int(np.count_nonzero(diagram.blocks.misleading)),
+                    "beyond_blocks": diagram.misleading_blocks,
                 }
                 for window in diagram.continuity:
                     row |= {

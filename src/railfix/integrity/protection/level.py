@@ -16,7 +16,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
-from itertools import combinations
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -253,7 +252,7 @@ def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: 
     one, two = worst[:, 1], worst[:, 2]
     # After the channels: constellations, then the sides, a wrong map, and none.
     letters = np.array([*plan.groups, *[""] * (len(plan.shared) + 1)])
-    pairs = np.concatenate([_sets(n, 2).T if asked.first[0, 2] >= 0 else np.empty((0, 2), dtype=np.intp), [[-1, -1]]])
+    pairs = np.concatenate([_pairs(n) if asked.first[0, 2] >= 0 else np.empty((0, 2), dtype=np.intp), [[-1, -1]]])
     infinite = np.full(len(rows), Cause.BUDGET)
     if (unchecked := np.isinf(level) & (plan.fault_free[rows] > 0)).any():
         infinite[unchecked] = _find_unchecked(plan, asked, np.where(np.isinf(sigma), weight, 0.0), n)[unchecked]
@@ -331,9 +330,9 @@ def _channels(channel: Indices, place: Indices) -> Indices:
 
 
 @lru_cache(maxsize=64)
-def _sets(n: int, size: int) -> Indices:
-    """Return all sets of places, shape (size, K)."""
-    return np.array(list(combinations(range(n), size)), dtype=np.intp).reshape(math.comb(n, size), size).T
+def _pairs(n: int) -> Indices:
+    """Return all pairs of n places, shape (K, 2)."""
+    return np.stack(np.triu_indices(n, 1), axis=1)
 
 
 class LevelStatus(IntEnum):

@@ -180,11 +180,6 @@ class RiskBudget(Settings):
         return np.asarray(left * np.select([out == e for e in range(len(each))], each, 0.0))
 
 
-def pair_sum(prior: Floats) -> Floats:
-    """Sum over pairs of the product of their priors, shape (T, M) to (T,)."""
-    return set_sums(prior, 2)[:, 2]
-
-
 def set_sums(prior: Floats, most: int) -> Floats:
     """Sums over sets of 0, 1, ..., `most` faults of the product of their priors, shape (T, M) to (T, most + 1).
 
@@ -319,7 +314,7 @@ def _allocate(
     more = (order + [s.kind for s in shared] >= 3).any(axis=1, where=order >= 0)
     left = np.where(more, 0.75, 1.0) * left
     parts = [s * left for s in (risk.fault_free_share, risk.one_fault_share, risk.two_fault_share)]
-    of_pairs = pair_sum(prior)
+    of_pairs = set_sums(prior, 2)[:, 2]
     pairs = (of_pairs > parts[2]) | (order[:, 0] > 2)
     order[:, 0] = np.where(pairs, order[:, 0], 1)
     mapped = np.array([s.wrong_map for s in shared])

@@ -190,7 +190,6 @@ class Exclusion:
     #: Error of the channels of `best` against the rest: + where the range is too long; NaN elsewhere; shape (T, M).
     own_error_m: Floats
     statistic_after: Floats  #: Of the rest without `best`; the statistic itself where there is none; shape (T,).
-    threshold_after: Floats  #: What it is compared with, shape (T,).
     #: By leaving out `best`: along the line (k = 1), or east and north (k = 2); 0 where there is none; shape (T, k).
     position_change_m: Floats
     #: Distance between the positions without `best` and without `alternative`; NaN where either is none; shape (T,).
@@ -238,7 +237,6 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
         alternative=np.full((epochs, 2), -1, dtype=np.intp),
         own_error_m=np.full((epochs, channels), np.nan),
         statistic_after=detection.statistic.copy(),
-        threshold_after=detection.threshold.copy(),
         position_change_m=np.zeros((epochs, model.interest)),
         alternative_shift_m=np.full(epochs, np.nan),
         detection=detection,
@@ -367,7 +365,6 @@ def _choose(
         result.excluded[where[~inseparable], chosen[~inseparable]] = True
         result.own_error_m[where, chosen] = trial.own[k][rows, best] * parts.sigma_m[rows, place]
     result.statistic_after[where] = statistic[at, best]
-    result.threshold_after[where] = after[rows]
     result.position_change_m[where] = shift[at, best]
     result.alternative_shift_m[where] = np.where(has_second, apart[at, second], np.nan)
 

@@ -285,13 +285,12 @@ def _regions(diagram: Stanford, top_m: float) -> Marks:
     def place(value: float) -> float:
         return limit * min(value, 1.0) + max(value - 1.0, 0.0) * (top_m - limit)
 
-    shown = [region for region in _REGIONS if top_m > 1.2 * limit or max(region[2:]) < 1.0]
     return Marks(
         label="",
         colour=BLACK,
-        x=np.array([place(x) for _, _, x, _ in shown]),
-        y=np.array([place(y) for _, _, _, y in shown]),
-        words=tuple(f"{name}\n{diagram.counts[region]:,}" for region, name, _, _ in shown),
+        x=np.array([place(x) for _, _, x, _ in _REGIONS]),
+        y=np.array([place(y) for _, _, _, y in _REGIONS]),
+        words=tuple(f"{name}\n{diagram.counts[region]:,}" for region, name, _, _ in _REGIONS),
         place="on",
     )
 
