@@ -251,15 +251,7 @@ class Choices(Settings):
 
 
 def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
-    """Return the settings of the file, overridden by those of the command line; and those that were given.
-
-    Raises
-    ------
-    SettingsError
-        A setting is misspelt, out of range, or not written as KEY=VALUE; a screen or preset is unknown.
-    InputFileError
-        The file cannot be read.
-    """
+    """Return the settings of the file, overridden by those of the command line; and those that were given."""
     values: dict[str, Any] = {}
     source = "command line"
     if choices.config is not None:

@@ -34,14 +34,7 @@ class RailfixError(Exception):
 class InputFileError(RailfixError):
     """An input file is missing, unreadable or malformed.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    message : str
-        What is wrong, what was expected, what to do; without a full stop at the end.
-    line : int, optional
-        1-based line number of the fault.
+    The message is what is wrong, what was expected, what to do, without a full stop at the end; `line` counts from 1.
     """
 
     exit_code = 3

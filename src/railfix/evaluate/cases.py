@@ -32,20 +32,7 @@ class OtherPositions(Settings):
 
 
 class RecordedScenario(Settings):
-    """Description of a test scenario for record and replay (EN 16803-2, EN 16803-1: set-up, trajectory, environment).
-
-    Attributes
-    ----------
-    date, place, environment, trajectory : str
-        Of the recording; "deep urban", "line with two tunnels".
-    vehicle, antenna, receiver, signals : str
-        Set-up conditions.
-    rate_hz, duration_s : float or None [Hz], [s]
-    reference : str
-        System of the ground truth.
-    reference_accuracy_m : float or None [m]
-        Its standard deviation.
-    """
+    """Description of a recorded test scenario (EN 16803-2, EN 16803-1: set-up, trajectory, environment)."""
 
     date: str = ""
     place: str = ""
@@ -57,7 +44,7 @@ class RecordedScenario(Settings):
     signals: str = ""
     rate_hz: float | None = Field(default=None, gt=0.0)
     duration_s: float | None = Field(default=None, gt=0.0)
-    reference: str = ""
+    reference: str = ""  #: System of the ground truth; its standard deviation follows.
     reference_accuracy_m: float | None = Field(default=None, gt=0.0)
 
 

@@ -43,28 +43,14 @@ Reference = Path | Mapping[str, AntennaReference] | None
 
 @dataclass(frozen=True, kw_only=True)
 class RunAndReference:
-    """A table of positions of a run, with its reference trajectory.
-
-    Attributes
-    ----------
-    run : Path
-        Folder of `railfix run`.
-    reference : Path or mapping of str to AntennaReference or None
-        A file, or references by antenna; None: the file of `BESIDE_THE_LOG` beside the run's log.
-    configuration : str or None
-        Name of its settings; None: composed of the settings that differ between the runs.
-    table : str
-        Table of positions (`railfix.evaluate.inputs.tables_of`): "positions" for single epochs, "train" for
-        the filter along the track.
-    conventional : Path or None
-        Folder of another run on the same log, whose conventional positions take the place of the run's own: one
-        with the screens elevation and C/N0 alone gives those that P1 compares with.
-    """
+    """A table of positions of a run, with its reference trajectory."""
 
     run: Path
-    reference: Reference = None
-    configuration: str | None = None
-    table: str = POSITIONS_TABLE
+    reference: Reference = None  #: None: the file of `BESIDE_THE_LOG` beside the run's log.
+    configuration: str | None = None  #: Name of its settings; None: composed of those that differ between the runs.
+    table: str = POSITIONS_TABLE  #: See `railfix.evaluate.inputs.tables_of`.
+    #: Another run on the same log, whose conventional positions take the place of the run's own: one with the screens
+    #: elevation and C/N0 alone gives those that P1 compares with.
     conventional: Path | None = None
 
 
@@ -91,54 +77,25 @@ class EvaluatedRun:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """Evaluation of runs against reference trajectories.
-
-    Attributes
-    ----------
-    runs : tuple of EvaluatedRun
-    epochs : polars.DataFrame
-        One row an epoch, antenna and run: `railfix.evaluate.EPOCH_COLUMNS`, then protection levels.
-    figures : polars.DataFrame
-        Figures of every grouping: `railfix.evaluate.FIGURE_COLUMNS`.
-    intervals : polars.DataFrame
-        `railfix.evaluate.INTERVAL_COLUMNS`.
-    levels : polars.DataFrame or None
-        `railfix.evaluate.LEVEL_COLUMNS`; None where no run has a protection level.
-    integrity : mapping of str to Integrity
-        Levels against errors, by what the levels rest on; empty where no run has a level.
-    outages, branches : polars.DataFrame or None
-        `railfix.evaluate.intervals.OUTAGE_COLUMNS`, `railfix.evaluate.intervals.BRANCH_COLUMNS`; None where no table of
-        the filter along the track is among the runs.
-    options : EvaluationOptions
-    inputs : tuple of mapping
-        Files of all runs, with size and hash.
-    """
+    """Evaluation of runs against reference trajectories."""
 
     runs: tuple[EvaluatedRun, ...]
-    epochs: pl.DataFrame
-    figures: pl.DataFrame
-    intervals: pl.DataFrame
-    levels: pl.DataFrame | None
-    integrity: Mapping[str, Integrity]
+    epochs: pl.DataFrame  #: One row an epoch, antenna and run: `EPOCH_COLUMNS`, then protection levels.
+    figures: pl.DataFrame  #: Figures of every grouping: `FIGURE_COLUMNS`.
+    intervals: pl.DataFrame  #: `INTERVAL_COLUMNS`.
+    levels: pl.DataFrame | None  #: `LEVEL_COLUMNS`; None where no run has a protection level.
+    integrity: Mapping[str, Integrity]  #: Levels against errors, by what the levels rest on.
+    #: `OUTAGE_COLUMNS`, `BRANCH_COLUMNS`; None where no table of the filter along the track is among the runs.
     outages: pl.DataFrame | None
     branches: pl.DataFrame | None
     options: EvaluationOptions
-    inputs: tuple[Mapping[str, Any], ...] = ()
+    inputs: tuple[Mapping[str, Any], ...] = ()  #: Files of all runs, with size and hash.
 
     def figure(self, name: str, **where: str) -> Any:
-        """One figure of the table of figures.
+        """One figure of the table of figures, of the row whose other columns have these values.
 
-        Parameters
-        ----------
-        name : str
-            A column of it.
-        **where : str
-            Values of its other columns; without them the grouping "all", own epochs, constrained.
-
-        Raises
-        ------
-        LookupError
-            Not exactly one row is meant.
+        Without values it is that of the grouping "all", own epochs, constrained. LookupError: not exactly one row is
+        meant.
         """
         chosen = {"grouping": ALL, "epochs_of": "own", "position": "constrained"} | where
         rows = self.figures.filter(*(pl.col(key) == value for key, value in chosen.items()))
@@ -191,27 +148,11 @@ def evaluate_runs(
 ) -> Evaluation:
     """Evaluate runs against their reference trajectories.
 
-    Parameters
-    ----------
-    runs : sequence of RunAndReference
-    sections : Path, optional
-        Environment by chainage (``from_m,to_m,environment``) where a reference does not tell it.
-    files : TrackFiles, optional
-        In place of the track and the vehicle that ``run.json`` names.
-    options : EvaluationOptions, optional
+    `sections`: the environment by chainage (``from_m,to_m,environment``) where a reference does not tell it. `files`:
+    in place of the track and the vehicle that ``run.json`` names.
 
-    Returns
-    -------
-    Evaluation
-
-    Raises
-    ------
-    InputFileError
-        A file is missing, or not what it should be.
-    MismatchError
-        A run and its reference have no time in common, or the errors cannot be worked out as asked.
-    SettingsError
-        The same run twice, or none.
+    InputFileError: a file is missing, or not what it should be. MismatchError: a run and its reference have no time in
+    common, or the errors cannot be worked out as asked. SettingsError: the same run twice, or none.
     """
     options, files = options or EvaluationOptions(), files or TrackFiles()
     if not runs:

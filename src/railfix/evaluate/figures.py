@@ -41,13 +41,7 @@ class Score:
 
 
 def score(error_m: Floats, observed: Masks) -> Score:
-    """Figures of merit from signed errors, NaN where there is no position, at the epochs that are observed.
-
-    Raises
-    ------
-    ValueError
-        No epoch is observed.
-    """
+    """Figures of merit from signed errors, NaN without a position, at the observed epochs; ValueError without any."""
     if not observed.any():
         raise ValueError("no epoch with observations lies inside the time of the reference")
     values = error_m[observed & np.isfinite(error_m)]

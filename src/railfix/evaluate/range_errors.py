@@ -105,19 +105,10 @@ class StationErrors:
 def base_station(
     parts: Iterable[Observations], processor: EpochProcessor, position_ecef_m: Floats, *, name: str
 ) -> StationErrors:
-    """Common range errors from the log of a station at a known position.
+    """Common range errors from the parts of the log of a station at a known position, in order of time.
 
-    Its pseudoranges are corrected like those of the train, with the same settings, and smoothed by carrier phase
-    where available, which reduces the station's own noise. The station's own multipath remains.
-
-    Parameters
-    ----------
-    parts : iterable of Observations
-        Parts of its log, in order of time.
-    processor : EpochProcessor
-        Of the train; its settings, ephemerides, ionosphere and SBAS also correct the station's pseudoranges.
-    position_ecef_m : ndarray, shape (3,) [m]
-    name : str
+    Its pseudoranges are corrected like those of the train, by the `processor` of the train, and smoothed by carrier
+    phase where available, which reduces the station's own noise. The station's own multipath remains.
     """
     station, carrier, phases = BaseStation(processor.config, position_ecef_m), CarrierState(), False
     times: list[Datetimes] = []
@@ -152,10 +143,7 @@ def base_station_from_files(
 ) -> StationErrors:
     """Common range errors from RINEX files; the position is that of the header where none is given.
 
-    Raises
-    ------
-    InputFileError
-        No position is known, or no error could be computed.
+    InputFileError: no position is known, or no error could be computed.
     """
     parts = list(scan_observations(paths, epochs=20_000))
     place = position_ecef_m if position_ecef_m is not None else parts[0].header.approximate_ecef_m
@@ -186,25 +174,14 @@ def range_errors(
     limits: GatherLimits | None = None,
     block_s: float = 30.0,
 ) -> RangeErrors:
-    """Pseudorange errors of one antenna over one chunk of T epochs.
+    """Pseudorange errors of one antenna over one chunk of T epochs, in blocks of `block_s`.
 
-    The clock of each constellation is the robust mean of the ranges that passed the screens. Each range
-    contributes to its clock estimate, which shrinks its residual; ``1 / sqrt(1 - share)`` restores the size. An
-    error common to all satellites stays in the clock and does not affect the position.
+    The clock of each constellation is the robust mean of the ranges that passed the screens. Each range contributes to
+    its clock estimate, which shrinks its residual; ``1 / sqrt(1 - share)`` restores the size. An error common to all
+    satellites stays in the clock and does not affect the position. Without `base`, satellite and atmospheric errors
+    remain.
 
-    Parameters
-    ----------
-    trajectory : Trajectory
-        Of the antenna; gives the azimuth of the vehicle.
-    base : StationErrors, optional
-        Without one, satellite and atmospheric errors remain.
-    block_s : float [s]
-        Length of the blocks of `ErrorSamples.block`.
-
-    Raises
-    ------
-    MismatchError
-        Fewer than two reference positions have a sigma within the limit.
+    MismatchError: fewer than two reference positions have a sigma within the limit.
     """
     limits = limits or GatherLimits()
     columns = result.columns
@@ -313,16 +290,11 @@ def error_model_from_runs(
 ) -> tuple[ErrorModel, ErrorSamples]:
     """Error model of the pseudoranges of several runs, before and after the screens, and its samples.
 
-    Each run is processed again with its own settings, which gives corrected pseudoranges, satellites and the
-    verdict of every screen. All runs have a reference station, or none has.
+    Each run is processed again with its own settings, which gives corrected pseudoranges, satellites and the verdict of
+    every screen. All runs have a reference station, or none has.
 
-    Raises
-    ------
-    MismatchError
-        Some runs have a reference station and others have none, their conditions differ, or no range error
-        could be computed.
-    RailfixError
-        A file is not what it should be, or has changed since the run.
+    MismatchError: some runs have a reference station and others have none, their conditions differ, or no range error
+    could be computed; or a file has changed since the run.
     """
     fit, limits = fit or ErrorModelFit(), limits or GatherLimits()
     with_base = {bool(source.base) for source in inputs}

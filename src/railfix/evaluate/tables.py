@@ -344,7 +344,7 @@ MOST_BEYOND: Final = 200
 
 
 def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, Path]:
-    """Write an evaluation and commit the folder.
+    """Write an evaluation and commit the folder; return the path of each file. OutputError: one cannot be written.
 
     ==================== ================================================================
     evaluation.json      all figures with their units, options, inputs with their hashes
@@ -357,16 +357,6 @@ def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, 
     outages.csv          stretches without satellites, where a table of the filter is evaluated
     branches.csv         stated probabilities of the place against its correctness, the same
     ==================== ================================================================
-
-    Returns
-    -------
-    dict of str to Path
-        Where each file stands.
-
-    Raises
-    ------
-    OutputError
-        A file cannot be written.
     """
     folder.append_parquet("errors.parquet", evaluation.epochs)
     folder.append_csv("tables.csv", evaluation.figures)

@@ -231,32 +231,10 @@ def write_report(
     title: str = "",
     options: EvaluationOptions | None = None,
 ) -> Path:
-    """Write the report on runs.
+    """Write the report on runs into the file `out`, which is replaced by the complete page or not at all.
 
-    Parameters
-    ----------
-    runs : sequence of Path
-        Folders that `railfix run` wrote.
-    out : Path
-        The page; an existing file is replaced, by the complete page or not at all.
-    references, conventional : sequence of Path
-        See `railfix.report.read_runs`.
-    background : Path, optional
-        GeoJSON file with lines to draw below the plan (`railfix.report.charts_page`).
-    title : str
-    options : EvaluationOptions, optional
-
-    Returns
-    -------
-    Path
-        `out`.
-
-    Raises
-    ------
-    InputFileError, MismatchError, SettingsError
-        See `railfix.report.read_runs`.
-    OutputError
-        The page cannot be written.
+    `references`, `conventional` and the errors are as for `railfix.report.read_runs`; `background` is a GeoJSON file
+    with lines to draw below the plan. OutputError: the page cannot be written.
     """
     folders, others, unscreened = ([Path(name) for name in names] for names in (runs, references, conventional))
     reported, evaluation = read_runs(folders, others, conventional=unscreened, options=options)

@@ -47,36 +47,17 @@ class Progress(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class RunSummary:
-    """Summary of a run.
-
-    Attributes
-    ----------
-    tally : Tally
-    sigma : mapping of str to AlongSigma
-        Percentiles of the along-track standard deviation by antenna.
-    levels : mapping of str to Levels
-        Protection levels by antenna; empty where they are off.
-    tracks : mapping of str to Filtered
-        Statuses and sigmas of the filter along the track by antenna; empty where it is off.
-    level_basis : str
-        "indicative protection" where the priors of the levels are assumed, "protection" where they are measured.
-    notes : tuple of str
-    files : mapping of str to Path
-        The results.
-    wall_s : float
-    causes : mapping of str to str
-        Likely cause by antenna, of those without a position on the line.
-    """
+    """Summary of a run; mappings are by antenna, and empty where levels or the filter are off."""
 
     tally: Tally
     sigma: Mapping[str, AlongSigma]
     levels: Mapping[str, Levels]
     tracks: Mapping[str, Filtered]
-    level_basis: str
+    level_basis: str  #: "protection" where the priors of the levels are measured, else "indicative protection".
     notes: tuple[str, ...]
     files: Mapping[str, Path]
     wall_s: float
-    causes: Mapping[str, str] = field(default_factory=dict)
+    causes: Mapping[str, str] = field(default_factory=dict)  #: Likely cause where no position is on the line.
 
 
 def run_files(
@@ -88,28 +69,10 @@ def run_files(
     asked: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
-    """Position the logs of one run along its line and write the results.
+    """Position the logs of one run along its line and write the results into the folder `out`.
 
-    Parameters
-    ----------
-    inputs : RunInputs
-    config : Config, optional
-        Settings used; the defaults unless given.
-    out : Path
-        Folder for the results.
-    options : RunOptions, optional
-    asked : mapping, optional
-        Settings that were given, as opposed to defaults; goes into ``run.json``.
-    progress : Progress, optional
-
-    Returns
-    -------
-    RunSummary
-
-    Raises
-    ------
-    RailfixError
-        See `railfix.core.errors`; nothing is left in `out` then.
+    `config` are all settings, `asked` those that were given as opposed to defaults, for ``run.json``. RailfixError: see
+    `railfix.core.errors`; nothing is left in `out` then.
     """
     began = clock.perf_counter()
     options = options or RunOptions()

@@ -105,38 +105,7 @@ Entries = Sequence[Future[dict[str, Any]]]
 
 
 class RunInputs(InputFiles):
-    """Input files of a run.
-
-    Attributes
-    ----------
-    front, rear : tuple of Path
-        RINEX observation files of each antenna, in order of time; `rear` may be empty.
-    base : tuple of Path
-        Observations of a base station; may be empty.
-    nav, sp3 : tuple of Path
-        Navigation files; precise orbits, which may be empty.
-    track : tuple of Path
-        Track map, joined to a route in this order.
-    mate : None
-        Folder of tables of EGNSS MATE, replaced by those in it.
-    heights : Path or None
-        Heights of a track map without; `OF_LOG`: those of the log's own positions.
-    vehicle : Path or None
-    tachometer, inertial, radar, ranging : Path or None
-        Tables of the sensors on board.
-    ranging_units : Path or None
-        Surveyed positions of the ground units that `ranging` names.
-    balises, balise_list : Path or None
-        Readings of balises, and their places along the line.
-    virtual_balises : Path or None
-        Places along the line whose passing is reported.
-    truth : Path or None
-        Reference positions, for `ablate` alone.
-    config : Path or None
-    cn0_curve, error_model, integrity_support : Path or None
-    sbas : tuple of Path
-        Named by the settings (`with_settings`).
-    """
+    """Input files of a run, each described by its option; those without one are named by the settings."""
 
     front: tuple[Path, ...] = input_option(
         "RINEX observation file of the front (or only) antenna; repeat it for a log in several files.",
@@ -248,13 +217,7 @@ class RunInputs(InputFiles):
         return logs_by_antenna(self.front, self.rear)
 
     def check(self) -> None:
-        """Check every file before the work begins.
-
-        Raises
-        ------
-        InputFileError
-            A file is missing, a folder, or cannot be opened; or the same log is given twice.
-        """
+        """Raise InputFileError where a file is missing or cannot be read, or the same log is given twice."""
         self.check_files()
         logs = [("base", self.base), *self.logs.items()]
         check_given_once((f"--{name}", path) for name, paths in logs for path in paths)

@@ -231,13 +231,7 @@ class RunRecord:
     record: Mapping[str, Any]  #: ``run.json``.
 
     def part(self, name: str) -> dict[str, Any]:
-        """Return a table of the record.
-
-        Raises
-        ------
-        InputFileError
-            It is missing or not a table.
-        """
+        """Return a table of the record; InputFileError: it is missing or not a table."""
         table = self.record.get(name)
         if not isinstance(table, dict):
             raise InputFileError(self.path / "run.json", f"has no table {name}; repeat the run with this version")
@@ -247,12 +241,8 @@ class RunRecord:
     def config(self) -> Config:
         """Settings that were used, with the files they name where these are now.
 
-        Settings that earlier versions recorded and that never changed a result are left out.
-
-        Raises
-        ------
-        InputFileError
-            The record lacks them, or they are not settings of this version.
+        Settings that earlier versions recorded and that never changed a result are left out. InputFileError: the record
+        lacks them, or they are not settings of this version.
         """
         used = dict(self.part("settings_used"))
         for group, name in WITHOUT_EFFECT:
@@ -284,15 +274,7 @@ class RunRecord:
             raise InputFileError(path, f"does not fit this version ({error}); repeat the run with it") from None
 
     def check_inputs(self) -> None:
-        """Check that the input files are there and unchanged.
-
-        Raises
-        ------
-        InputFileError
-            One is missing.
-        MismatchError
-            One has changed since the run.
-        """
+        """Raise InputFileError where an input file is missing, MismatchError where one has changed since the run."""
         self.inputs.check()
         for entry in self.entries:
             path = located(entry, self.path)
@@ -307,13 +289,7 @@ class RunRecord:
 
     @property
     def entries(self) -> list[Mapping[str, Any]]:
-        """Input files with kind, path and SHA-256.
-
-        Raises
-        ------
-        InputFileError
-            The record has no such list.
-        """
+        """Input files with kind, path and SHA-256; InputFileError: the record has no such list."""
         entries = self.record.get("inputs", [])
         complete = isinstance(entries, list) and all(
             isinstance(entry, dict) and {"input", "path", "sha256"} <= set(entry) for entry in entries
@@ -326,18 +302,7 @@ class RunRecord:
 
 
 def read_record(folder: Path) -> RunRecord:
-    """Read the record of a run.
-
-    Parameters
-    ----------
-    folder : Path
-        That `railfix run` wrote.
-
-    Raises
-    ------
-    InputFileError
-        There is no record, or it is not one.
-    """
+    """Read the record of a run from its folder; InputFileError: there is none, or it is not one."""
     if not folder.is_dir():
         problem = "is a file" if folder.exists() else "there is no such folder"
         raise InputFileError(folder, f"{problem}, expected the folder that railfix run wrote; name that")

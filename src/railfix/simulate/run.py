@@ -200,7 +200,7 @@ def write_run(
     overwrite: Overwrite = "refuse",
     progress: Callable[[str, int], None] | None = None,
 ) -> dict[str, Path]:
-    """Simulate a run and write its files, all together at the end.
+    """Simulate a run and write its files, all together at the end; return their paths by name.
 
     ============================ ===================================================
     front.crx.gz, rear.crx.gz    observations (front.rnx, rear.rnx when plain)
@@ -216,30 +216,10 @@ def write_run(
     README.md                    contents and settings of the run
     ============================ ===================================================
 
-    Parameters
-    ----------
-    scenario : Scenario
-    folder : path-like
-        Created where it does not exist.
-    packing : {"packed", "plain"}
-        Plain: nothing is compressed, and sensors are CSV.
-    command : str
-        The command that made it, for the README.
-    overwrite : {"refuse", "replace"}
-        What to do with a folder that has files in it already.
-    progress : callable, optional
-        Called with the antenna and the number of epochs written since the last call.
-
-    Returns
-    -------
-    dict of str to Path
-        The files, by ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, ``sbas``, the
-        sensors' names, ``scenario``, ``readme``.
-
-    Raises
-    ------
-    OutputError, InputFileError, MismatchError, SettingsError
-        A file cannot be written; a track or navigation file that the scenario names does not serve.
+    With `packing` "plain" nothing is compressed, and sensors are CSV. `command` made the run, for the README.
+    `progress` is called with the antenna and the number of epochs written since the last call. The names of the paths
+    are ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, ``sbas``, those of the sensors,
+    ``scenario``, ``readme``.
     """
     simulation = Simulation(scenario)
     tables = sensor_tables(simulation)

@@ -236,13 +236,7 @@ class Scenario(ScenarioSettings):
         return self
 
     def check_room(self, length_m: float) -> None:
-        """Check that the train stays within a line of this length.
-
-        Raises
-        ------
-        SettingsError
-            The vehicle or a station would stand beyond an end.
-        """
+        """Raise SettingsError where the vehicle or a station would stand beyond an end of a line of this length."""
         if problem := self._room_problem(length_m):
             raise SettingsError(problem)
 

@@ -46,23 +46,7 @@ class Piece:
 
 
 class Simulation:
-    """Simulation of a scenario: line, motion, satellites, and observations in chunks.
-
-    Attributes
-    ----------
-    scenario : Scenario
-    line : Alignment
-    motion : Motion
-        Of the vehicle's middle.
-    body : BodyMotion
-        Roll and pitch of the vehicle's body.
-    environment : Environment
-        Structures along the line.
-    disturbances : tuple of Disturbances
-        The environment where there is any, then the scenario's `multipath`.
-    navigation : Navigation
-    clocks : ReceiverClocks
-    """
+    """Simulation of a scenario: line, motion, satellites, and observations in chunks."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario

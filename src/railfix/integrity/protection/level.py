@@ -347,20 +347,9 @@ class LevelStatus(IntEnum):
 
 
 def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayLike = True) -> Codes:
-    """LevelStatus of epochs.
+    """LevelStatus of epochs, int8 of shape (T,), from protection levels [m], NaN where there is no position.
 
-    Parameters
-    ----------
-    level_m : array_like, shape (T,) [m]
-        Protection level; NaN where there is no position.
-    alarm_limit_m : float [m]
-    consistent : array_like of bool, shape (T,) or ()
-        `ProtectionLevel.consistent`. An epoch with a position and without consistency alarms.
-
-    Returns
-    -------
-    ndarray of int8, shape (T,)
-        `LevelStatus`.
+    An epoch with a position and without consistency (`ProtectionLevel.consistent`) alarms.
     """
     if not alarm_limit_m > 0.0:
         raise ValueError(f"alarm_limit_m must be positive, got {alarm_limit_m}")
@@ -383,13 +372,12 @@ def protection_level(
 ) -> ProtectionLevel:
     """Compute the protection level along the line: faults of satellites and constellations, without those of the map.
 
+    `ranges`, `trajectory`, `arc_m` and `scale` are as for `railfix.integrity.exclude_faults`, after the exclusions.
+
     Parameters
     ----------
-    ranges, trajectory, arc_m, scale
-        As for `railfix.integrity.exclude_faults`, after the exclusions.
     satellite : ndarray of str, shape (M,)
         Names, for the priors of their constellations.
-    risk : RiskBudget, optional
     n_excluded : array_like of int, shape (T,) or ()
         Satellites that `exclude_faults` took out.
     """

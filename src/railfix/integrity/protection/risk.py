@@ -45,15 +45,9 @@ MOST_TOGETHER: Final = 4  #: Faulty satellites at a time that can be hypotheses 
 
 
 def k_factor(risk: float) -> float:
-    """Sigmas that an error in one dimension exceeds, on either side, with this probability.
+    """Sigmas that an error in one dimension exceeds, on either side, with this probability of one sample.
 
-    Two-sided, along a line: 1e-7 gives 5.33, 1e-8 gives 5.73. Not the Rayleigh factor of a
-    horizontal position.
-
-    Parameters
-    ----------
-    risk : float
-        Of one sample, both sides together.
+    Two-sided, along a line: 1e-7 gives 5.33, 1e-8 gives 5.73. Not the Rayleigh factor of a horizontal position.
     """
     if not 0.0 < risk <= 1.0:
         raise ValueError(f"a risk is a probability above 0, at most 1, got {risk}")
@@ -142,10 +136,7 @@ class RiskBudget(Settings):
     def prior(self, systems: Sequence[str]) -> Floats:
         """Fault probability of each channel, shape (M,): of the satellite and of what is around the antenna.
 
-        Raises
-        ------
-        ValueError
-            Where a constellation has no prior.
+        ValueError: a constellation has no prior.
         """
         unknown = sorted(set(systems) - set(self.satellite_prior))
         if unknown:
@@ -155,18 +146,9 @@ class RiskBudget(Settings):
     def sample_risk(self, n_used: ArrayLike, n_excluded: ArrayLike, beyond: ArrayLike = 0.0) -> Floats:
         """Return the risk of an epoch in the set that is left after exclusions, any shape.
 
-        More faults than are checked are taken off once. Every set that exclusion could have left is a way
-        to fail, so the share of the risk for e exclusions is divided by the number of sets of e among all
+        More faults than are checked, of probability `beyond`, are taken off once. Every set that exclusion could have
+        left is a way to fail, so the share of the risk for e exclusions is divided by the number of sets of e among all
         satellites. 0 beyond `MOST_EXCLUDED`, and where nothing is left.
-
-        Parameters
-        ----------
-        n_used : array_like of int
-            Satellites left.
-        n_excluded : array_like of int
-            Satellites that fault detection took out.
-        beyond : array_like
-            Probability of more faults than are checked, among all satellites.
         """
         used, out = np.asarray(n_used, dtype=np.float64), np.asarray(n_excluded, dtype=np.int64)
         if (out < 0).any():

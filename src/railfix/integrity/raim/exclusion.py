@@ -126,18 +126,9 @@ def detect(
 
 
 def threshold(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
-    """Threshold of the statistic by degrees of freedom; NaN below 1.
+    """Threshold of the statistic by degrees of freedom, of any shape; NaN below 1.
 
     P4: false alarm 0.001 and 3 degrees of freedom give T_CS = 16.27, T_D = sqrt(T_CS) = 4.03.
-
-    Parameters
-    ----------
-    freedom : array_like of int, any shape
-    limits : RaimLimits, optional
-
-    Returns
-    -------
-    ndarray, same shape
     """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)

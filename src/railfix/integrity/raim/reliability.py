@@ -104,18 +104,7 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
 
 
 def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
-    """Noncentrality lambda that the chi-square test misses with `missed_detection` (P4).
-
-    Parameters
-    ----------
-    freedom : array_like of int, any shape
-    limits : RaimLimits, optional
-
-    Returns
-    -------
-    ndarray, same shape
-        NaN below 1 degree of freedom.
-    """
+    """Noncentrality that the chi-square test misses with `missed_detection` (P4); NaN below 1 degree of freedom."""
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)
     values, which = np.unique(freedom, return_inverse=True)

@@ -87,10 +87,7 @@ def draw_chart(chart: Chart, axes: Axes) -> Axes:
 def draw_sky(sky: SkyEpochs, time: np.datetime64, axes: Axes | None = None) -> Axes:
     """Draw the satellites over an antenna at the epoch nearest to a GPS time, into polar axes.
 
-    Raises
-    ------
-    ValueError
-        There is no epoch.
+    ValueError: there is no epoch.
     """
     from matplotlib.figure import Figure
 

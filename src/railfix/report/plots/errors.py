@@ -60,10 +60,7 @@ def error_over_time(
 ) -> Chart:
     """Errors on the map and of the conventional position, with sigma and protection level (P1 figures 7, 10).
 
-    Parameters
-    ----------
-    errors, filtered : polars.DataFrame
-        Of one antenna, in order of time; `filtered` of the filter along the track.
+    Both tables are of one antenna, in order of time; `filtered` is of the filter along the track.
     """
     start = start_of(errors)
     return _errors(errors, filtered, name="error-time", title=title, x_label="GPS time", start=start)
@@ -296,14 +293,7 @@ def _regions(diagram: Stanford, top_m: float) -> Marks:
 
 
 def levels_over_time(positions: pl.DataFrame, alarm_limit_m: float, *, title: str = "Protection level") -> Chart:
-    """Protection level and its parts over time, against the alarm limit; empty where the run has no levels.
-
-    Parameters
-    ----------
-    positions : polars.DataFrame
-        Of one antenna, columns of `railfix.pipeline.result_columns.POSITION_COLUMNS`.
-    alarm_limit_m : float [m]
-    """
+    """Protection level of one antenna and its parts over time; empty where the run has no levels."""
     start = start_of(positions)
     x = since(positions, start)
     return _levels(positions, x, alarm_limit_m, name="levels", title=title, x_label="GPS time", start=start)

@@ -59,23 +59,13 @@ def plan(
     background: Sequence[Floats] = (),
     title: str = "Plan of the line",
 ) -> Chart:
-    """Positions and line in local metres, with marks of the kilometrage (P1 figure 6); no layers without a position.
+    """Positions of one antenna and line in local metres, with marks of the kilometrage (P1 figure 6).
 
-    Parameters
-    ----------
-    positions : polars.DataFrame
-        Of one antenna, columns of `railfix.pipeline.result_columns.POSITION_COLUMNS`.
-    error_m, level_m : ndarray, shape (rows,), optional [m]
-        Errors along the line, or protection levels: the positions are coloured by the size of the first that is
-        given, and by their status without either.
-    filtered : polars.DataFrame, optional
-        Positions by the filter along the track; those of epochs without a position of their own are drawn.
-    track : Track, optional
-        Line to draw, also where there are no positions; without it the line is drawn through the positions.
-    tunnels_m : sequence of (float, float) [m]
-        Chainages between which the line runs in a tunnel.
-    background : sequence of ndarray, shape (P, 2) [deg]
-        Longitude and latitude of lines to draw below, see `railfix.report.charts_page`.
+    No layers without a position. The positions are coloured by `error_m` or `level_m`, shape (rows,), by the size of
+    the first that is given, and by their status without either. Of `filtered`, by the filter along the track, those of
+    epochs without a position of their own are drawn. Without `track` the line is drawn through the positions.
+    `tunnels_m` are chainages between which the line runs in a tunnel; `background` are longitudes and latitudes of
+    lines to draw below, each of shape (P, 2) [deg].
     """
     ecef, conventional = points(positions, *ECEF), points(positions, *(f"conventional_{name}" for name in ECEF))
     has = np.isfinite(ecef[:, 0])

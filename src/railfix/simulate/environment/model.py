@@ -202,21 +202,8 @@ _LEAST_ELEVATION_DEG: Final = 0.5  #: Lowest elevation that is computed [deg].
 class Environment:
     """Multipath and blockage along a line.
 
-    Parameters
-    ----------
-    settings : EnvironmentSettings
-    line_length_m : float
-    clear_cn0_dbhz : (float, float)
-        C/N0 of an unobstructed signal at the horizon, and its rise to the zenith.
-    seed : int
-        The same seed gives the same structures and, where they are drawn, the same sections.
-
-    Attributes
-    ----------
-    settings : EnvironmentSettings
-    sections : tuple of SectionSettings
-        As given, or as drawn.
-    structures : Structures
+    `clear_cn0_dbhz` is the C/N0 of an unobstructed signal at the horizon, and its rise to the zenith. The same seed
+    gives the same structures and, where they are drawn, the same sections.
     """
 
     def __init__(
