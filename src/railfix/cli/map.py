@@ -135,7 +135,7 @@ def features(
     import polars as pl
 
     from railfix.motion.features import line_series, map_features
-    from railfix.run.locate import centred, measured_features, read_measured
+    from railfix.run.locate import centre_features, measured_features, read_measured
     from railfix.track.trajectory import Trajectory
 
     tables = [folder / "train.parquet" for folder in run or ()]
@@ -145,7 +145,7 @@ def features(
     series = line_series(trajectory)
     found = map_features(series)
     if run:
-        found = centred(found, series)
+        found = centre_features(found, series)
     at = trajectory.chainage_at(np.array([feature.arc_m for feature in found]))
     found = [replace(feature, arc_m=float(chainage)) for feature, chainage in zip(found, at, strict=True)]
     beside: dict[str, list[float]] = {}

@@ -151,7 +151,7 @@ def ablate_files(
     """
     began = clock.perf_counter()
     options = options or RunOptions()
-    inputs, config = inputs.checked(config or Config())
+    inputs, config = inputs.prepare(config or Config())
     with (
         OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths) as folder,
         ThreadPoolExecutor(max_workers=1) as pool,

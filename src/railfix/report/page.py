@@ -33,6 +33,7 @@ from railfix.report.headline import headline
 from railfix.report.plots.errors import error_ranges
 from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.runs import ReportedRun, figures_of, read_runs
+from railfix.run.budget import budget_tables, level_basis
 
 
 def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table:
@@ -125,49 +126,6 @@ def settings(run: ReportedRun) -> list[Block]:
 def budget(run: ReportedRun) -> list[Block]:
     """Epochs by status, and pseudoranges by the first reason for their rejection."""
     antennas = _antennas(run)
-    names = list(antennas)
-    statuses = dict.fromkeys(s for facts in antennas.values() for s, n in (facts.get("status") or {}).items() if n)
-    rows = [
-        ["epochs", *(count(antennas[n].get("epochs")) for n in names)],
-        ["with observations", *(count(antennas[n].get("epochs_with_observations")) for n in names)],
-        ["with position", *(count(antennas[n].get("epochs_with_position")) for n in names)],
-        *([f"  {s}", *(count((antennas[n].get("status") or {}).get(s, 0)) for n in names)] for s in statuses),
-        ["positioning rate", *(share(antennas[n].get("positioning_rate")) for n in names)],
-        ["rate of ok", *(share(antennas[n].get("ok_rate")) for n in names)],
-    ]
-    few = dict.fromkeys(r for f in antennas.values() for r in f.get("too_few_satellites_by_first_reason") or {})
-    rows += [
-        [
-            f"too few satellites, by {r}",
-            *(count((antennas[n].get("too_few_satellites_by_first_reason") or {}).get(r, 0)) for n in names),
-        ]
-        for r in few
-    ]
-    first, only = "observations_rejected_by_first_reason", "observations_rejected_by_one_reason_alone"
-    reasons = dict.fromkeys(r for facts in antennas.values() for r in facts.get(first) or {})
-    head = ["", *(word for n in names for word in (n, "share", "only reason"))]
-    observed = {n: antennas[n].get("observations") or 0 for n in names}
-
-    def cells(ranges: Mapping[str, float], alone: Mapping[str, float] | None) -> list[str]:
-        return [
-            word
-            for n in names
-            for word in (
-                count(ranges[n]),
-                share(ranges[n] / observed[n] if observed[n] else None),
-                "" if alone is None else count(alone[n]),
-            )
-        ]
-
-    ranges = [
-        ["observed", *cells(observed, None)],
-        ["used", *cells({n: antennas[n].get("observations_used") or 0 for n in names}, None)],
-    ]
-    for reason in reasons:
-        counts = {n: (antennas[n].get(first) or {}).get(reason, 0) for n in names}
-        alone = {n: (antennas[n].get(only) or {}).get(reason, 0) for n in names}
-        ranges.append([f"  {reason}", *cells(counts, alone)])
-    caption = "Pseudoranges by the first reason for their rejection, and those with this reason only"
     signs = [
         [name, sign, count(seen["epochs"]), str(seen["first"])]
         for name, facts in antennas.items()
@@ -181,8 +139,7 @@ def budget(run: ReportedRun) -> list[Block]:
     ] if signs else [Sentence("No sign of jamming or spoofing.")]  # fmt: skip
     return [
         *suspected,
-        Table(name="epochs", head=["", *names], rows=rows, caption="Epochs by status", numeric=range(1, 9)),
-        Table(name="pseudoranges", head=head, rows=ranges, caption=caption, numeric=range(1, 9)),
+        *budget_tables(antennas, level_basis(run.record)),
     ]
 
 

@@ -33,46 +33,20 @@ def input_option(text: str, default: Any = ..., *, metavar: str = "FILE") -> Any
     return option(text, default, metavar=metavar, panel=INPUTS)
 
 
-def track_option(default: Any = ...) -> Any:
-    """Return the field for the files of the track."""
-    text = (
-        "Track map; several are joined to a route in the order given. Of one file with a network of tracks the route "
-        "is found from the log."
-    )
-    return input_option(text, default, metavar="TRACK")
-
-
-def heights_option() -> Any:
-    """Return the field for a second source of heights."""
-    text = (
-        "Heights of a map without: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV by chainage_m or kilometrage_m, "
-        "positions of a run, or the word log for those of the log itself."
-    )
-    return input_option(text, None)
-
-
-def vehicle_option() -> Any:
-    """Return the field for the vehicle file."""
-    text = (
-        "Vehicle: bogie distance, gauge, positions of the antennas. Without it the track is taken as the antenna's "
-        "own path."
-    )
-    return input_option(text, None, metavar="TOML")
-
-
-def balise_list_option() -> Any:
-    """Return the field for the list of balises."""
-    text = (
-        "Places of the balises: CSV with balise, chainage_m and, where there are such, track (chainage_m then counts "
-        "from the beginning of that track) and sigma_m."
-    )
-    return input_option(text, None, metavar="CSV")
-
-
-def virtual_balises_option() -> Any:
-    """Return the field for virtual balises."""
-    text = "Places whose passing is reported with its interval: a list as of --balise-list. Needs levels."
-    return input_option(text, None, metavar="CSV")
+#: Texts of options that several commands have.
+TRACK: Final = (
+    "Track map; several are joined to a route in the order given. Of one file with a network of tracks the route is "
+    "found from the log."
+)
+VEHICLE: Final = (
+    "Vehicle: bogie distance, gauge, positions of the antennas. Without it the track is taken as the antenna's own "
+    "path."
+)
+BALISE_LIST: Final = (
+    "Places of the balises: CSV with balise, chainage_m and, where there are such, track (chainage_m then counts from "
+    "the beginning of that track) and sigma_m."
+)
+VIRTUAL_BALISES: Final = "Places whose passing is reported with its interval: a list as of --balise-list. Needs levels."
 
 
 class InputFiles(Settings):
@@ -97,8 +71,8 @@ class InputFiles(Settings):
             _check_file(f"--{name.replace('_', '-')}", path)
 
     def entries(self, pool: Executor, folder: Path) -> Entries:
-        """Hash every file beside other work; the paths are recorded as `recorded_path` has them."""
-        return [pool.submit(fingerprint, kind, path, name=recorded_path(path, folder)) for kind, path in self.named()]
+        """Hash every file beside other work."""
+        return [pool.submit(fingerprint, kind, path, name=record_path(path, folder)) for kind, path in self.named()]
 
 
 Entries = Sequence[Future[dict[str, Any]]]
@@ -113,7 +87,7 @@ class RunInputs(InputFiles):
         metavar="OBS",
     )
     nav: tuple[Path, ...] = input_option("RINEX navigation file; repeat it for several.")
-    track: tuple[Path, ...] = track_option(())
+    track: tuple[Path, ...] = input_option(TRACK, (), metavar="TRACK")
     mate: Path | None = input_option(
         "Folder with tables of EGNSS MATE, in place of --front, --track and the sensors; an option beside it goes "
         "before its table.",
@@ -129,8 +103,12 @@ class RunInputs(InputFiles):
         metavar="OBS",
     )
     sp3: tuple[Path, ...] = input_option("Precise orbits and clocks, used in place of the broadcast ones.", ())
-    heights: Path | None = heights_option()
-    vehicle: Path | None = vehicle_option()
+    heights: Path | None = input_option(
+        "Heights of a map without: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV by chainage_m or kilometrage_m, "
+        "positions of a run, or the word log for those of the log itself.",
+        None,
+    )
+    vehicle: Path | None = input_option(VEHICLE, None, metavar="TOML")
     tachometer: Path | None = input_option(
         "Pulses of a tachometer: CSV or Parquet with time_gpst, pulse and, where it is known, direction; its wheel "
         "stands in the settings sensors.tachometer.",
@@ -146,8 +124,8 @@ class RunInputs(InputFiles):
     balises: Path | None = input_option(
         "Balises that the train has read: CSV or Parquet with time_gpst, balise and, where it is known, sigma_m.", None
     )
-    balise_list: Path | None = balise_list_option()
-    virtual_balises: Path | None = virtual_balises_option()
+    balise_list: Path | None = input_option(BALISE_LIST, None, metavar="CSV")
+    virtual_balises: Path | None = input_option(VIRTUAL_BALISES, None, metavar="CSV")
     config: Path | None = None
     cn0_curve: Path | None = None
     error_model: Path | None = None
@@ -178,11 +156,8 @@ class RunInputs(InputFiles):
             raise ValueError(f"--{missing[0]} is missing; name its file, or a folder with --mate")
         return self
 
-    def checked(self, config: Config) -> tuple[Self, Config]:
-        """Return the inputs with the files that settings name, all checked, and the settings with the logs as files.
-
-        SettingsError, InputFileError: as `_with_own_sbas` and `check`.
-        """
+    def prepare(self, config: Config) -> tuple[Self, Config]:
+        """Return the inputs with the files that settings name, all checked, and the settings with the logs as files."""
         self.check()
         config = self._with_own_sbas(config)
         inputs = self.with_settings(config)
@@ -191,13 +166,8 @@ class RunInputs(InputFiles):
 
     def with_settings(self, config: Config) -> Self:
         """Return the same with the files that settings name."""
-        sbas = () if config.sbas == "stream" else config.sbas
-        return self.replaced(
-            cn0_curve=config.cn0_curve,
-            error_model=config.error_model,
-            integrity_support=config.integrity_support,
-            sbas=sbas,
-        )
+        models = {name: getattr(config, name) for name in ("cn0_curve", "error_model", "integrity_support")}
+        return self.replaced(**models, sbas=() if config.sbas == "stream" else config.sbas)
 
     def _with_own_sbas(self, config: Config) -> Config:
         """Return settings in which ``sbas = "stream"`` is replaced by the receivers' logs, whose messages are meant.
@@ -241,7 +211,7 @@ def check_given_once(files: Iterable[tuple[str, Path]]) -> None:
         seen[resolved] = (name, path)
 
 
-def recorded_path(path: Path, folder: Path) -> str:
+def record_path(path: Path, folder: Path) -> str:
     """Return the path of an input for the record: relative to the results folder, unless it is absolute."""
     if path.is_absolute():
         return str(path)

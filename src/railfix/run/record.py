@@ -6,7 +6,7 @@ import platform
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -28,96 +28,52 @@ from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.level_stage import level_facts
 from railfix.run.inputs import RunInputs, RunOptions, located
 from railfix.run.output import OutputFolder
-from railfix.run.tally import Tally
+from railfix.run.tally import AntennaTally, Tally
 from railfix.tracking import TrackStatus
 
 #: Packages whose version may matter to a result.
 PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka", "georinex", "japan-geoid")
 
 
-@dataclass(frozen=True, kw_only=True)
-class AlongSigma:
-    """Percentiles of the along-track standard deviation of the positions [m]."""
+def figures_of(folder: OutputFolder, tally: Tally, config: Config) -> dict[str, dict[str, Any]]:
+    """Return percentiles of each antenna from the rows written [m]; None in place of what the run has not.
 
-    p50_m: float
-    p95_m: float
-    max_m: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class FilterLevel:
-    """Level of the filter of one antenna: median and 95th percentile of the finite ones [m], and how many these are."""
-
-    p50_m: float | None
-    p95_m: float | None
-    finite: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class Filtered:
-    """Positions of the filter along the track of one antenna: epochs by status, percentiles of sigma and level [m].
-
-    The level: median, 95th percentile and number of the finite ones; None where `tracking.level` is off.
+    Of sigma along the line; of protection levels, the finite ones, with epochs by status; of the filter, with epochs by
+    status, and its levels with the number of finite ones.
     """
-
-    status: dict[str, int]
-    along_sigma_m: AlongSigma | None
-    level: FilterLevel | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Levels:
-    """Protection levels of an antenna: median and 95th percentile of the finite ones [m], and epochs by status.
-
-    `without_budget`: epochs without a level because more faults than can be left out are likelier than the risk allows.
-    """
-
-    p50_m: float | None
-    p95_m: float | None
-    available: int
-    unavailable: int
-    alarm: int
-    without_budget: int
-
-
-def levels(folder: OutputFolder, tally: Tally) -> dict[str, Levels]:
-    """Protection levels by antenna, from the rows written; empty where they are off."""
-    level = pl.col("protection_level_m")
-    finite = level.filter(level.is_finite())
-    figures = {"p50_m": finite.quantile(0.5), "p95_m": finite.quantile(0.95)}
     return {
-        name: Levels(
-            **_one_by_one(_rows(folder, "positions", name), figures),
-            **{word: antenna.level_status[word] for word in ("available", "unavailable", "alarm")},
-            without_budget=antenna.without_budget,
-        )
+        name: {
+            "along_sigma_m": _along_sigma(_rows(folder, "positions", name)),
+            "protection_level": _level(_rows(folder, "positions", name), antenna) if antenna.level_status else None,
+            "filter": _filtered(_rows(folder, "train", name)) if config.filter == "track" and antenna.epochs else None,
+        }
         for name, antenna in tally.antennas.items()
-        if antenna.level_status
     }
 
 
-def along_sigma(folder: OutputFolder, tally: Tally, table: str = "positions") -> dict[str, AlongSigma]:
-    """Percentiles by antenna, from the rows written; an antenna without any is left out."""
+def _along_sigma(rows: pl.LazyFrame) -> dict[str, float] | None:
     sigma = pl.col("along_sigma_m")
-    figures = {"p50_m": sigma.quantile(0.5), "p95_m": sigma.quantile(0.95), "max_m": sigma.max()}
-    found = {name: _one_by_one(_rows(folder, table, name), figures) for name in tally.antennas}
-    return {name: AlongSigma(**row) for name, row in found.items() if row["max_m"] is not None}
+    found = _one_by_one(rows, {"p50_m": sigma.quantile(0.5), "p95_m": sigma.quantile(0.95), "max_m": sigma.max()})
+    return None if found["max_m"] is None else found
 
 
-def filtered(folder: OutputFolder, tally: Tally) -> dict[str, Filtered]:
-    """Epochs of the filter by status and percentiles of its sigma, by antenna, from the rows written."""
+def _level(rows: pl.LazyFrame, antenna: AntennaTally) -> dict[str, Any]:
+    finite = pl.col("protection_level_m").filter(pl.col("protection_level_m").is_finite())
+    return {
+        **_one_by_one(rows, {"p50_m": finite.quantile(0.5), "p95_m": finite.quantile(0.95)}),
+        **{word: antenna.level_status[word] for word in ("available", "unavailable", "alarm")},
+        "without_budget": antenna.without_budget,
+    }
+
+
+def _filtered(rows: pl.LazyFrame) -> dict[str, Any]:
     status, level = pl.col("status"), pl.col("protection_level_m")
     finite = level.filter(level.is_finite())
     words = {word.text: (status == word.text).sum() for word in TrackStatus}
+    counts = rows.select(**words, levels=level.count()).collect().row(0, named=True)
     figures = {"p50_m": finite.quantile(0.5), "p95_m": finite.quantile(0.95), "finite": finite.len()}
-    along = along_sigma(folder, tally, "train")
-    found = {}
-    for name in (name for name, antenna in tally.antennas.items() if antenna.epochs):
-        rows = _rows(folder, "train", name)
-        counts = rows.select(**words, levels=level.count()).collect().row(0, named=True)
-        bound = FilterLevel(**_one_by_one(rows, figures)) if counts.pop("levels") else None
-        found[name] = Filtered(status=counts, along_sigma_m=along.get(name), level=bound)
-    return found
+    bound = _one_by_one(rows, figures) if counts.pop("levels") else None
+    return {"status": counts, "along_sigma_m": _along_sigma(rows), "level": bound}
 
 
 def _rows(folder: OutputFolder, table: str, antenna: str) -> pl.LazyFrame:
@@ -142,26 +98,14 @@ class RunProvenance:
     navigation: Navigation
 
 
-@dataclass(frozen=True, kw_only=True)
-class Figures:
-    """Percentiles of a run by antenna; empty where there are none."""
-
-    sigma: Mapping[str, AlongSigma] = field(default_factory=dict)
-    levels: Mapping[str, Levels] = field(default_factory=dict)
-    tracks: Mapping[str, Filtered] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, folder: OutputFolder, tally: Tally, config: Config) -> Figures:
-        """Figures of the rows written."""
-        tracks = filtered(folder, tally) if config.filter == "track" else {}
-        return cls(sigma=along_sigma(folder, tally), levels=levels(folder, tally), tracks=tracks)
-
-
 def run_record(
-    made_from: RunProvenance, tally: Tally, notes: Sequence[str], *, wall_s: float, figures: Figures | None = None
+    made_from: RunProvenance,
+    tally: Tally,
+    notes: Sequence[str],
+    figures: Mapping[str, Mapping[str, Any]],
+    wall_s: float,
 ) -> dict[str, Any]:
-    """Return the content of ``run.json`` as plain values."""
-    figures = figures or Figures()
+    """Return the content of ``run.json`` as plain values; `figures` are those of `figures_of`."""
     navigation, config = made_from.navigation, made_from.config
     observed = sum(antenna.observed for antenna in tally.antennas.values())
     ok = sum(antenna.status[Status.OK.text] for antenna in tally.antennas.values())
@@ -190,15 +134,7 @@ def run_record(
         "notes": list(notes),
         "positioning_rate": tally.positioned / observed if observed else None,
         "ok_rate": ok / observed if observed else None,
-        "antennas": {
-            name: {
-                **antenna.as_dict(),
-                "along_sigma_m": asdict(figures.sigma[name]) if name in figures.sigma else None,
-                "protection_level": asdict(figures.levels[name]) if name in figures.levels else None,
-                "filter": asdict(figures.tracks[name]) if name in figures.tracks else None,
-            }
-            for name, antenna in tally.antennas.items()
-        },
+        "antennas": {name: {**antenna.as_dict(), **figures[name]} for name, antenna in tally.antennas.items()},
         "wall_s": round(wall_s, 3),
         "chunks": {
             "first_epoch_gpst": [str(first) for first, _, _ in tally.chunks],

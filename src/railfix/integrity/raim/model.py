@@ -223,7 +223,7 @@ def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *,
         clock=clock,
         clock_covariance_m2=covariance,
         design=design,
-        covariance_m2=_regular_inverse((normal + normal.swapaxes(1, 2)) / 2.0 + prior),
+        covariance_m2=regular_inverse((normal + normal.swapaxes(1, 2)) / 2.0 + prior),
         prior=prior,
         misfit=root * misfit,
         freedom=ranges.n_used - ranges.n_clocks - unknowns,
@@ -263,7 +263,7 @@ def _clocks(root: Floats, clock: Indices, covariance: Floats, columns: Floats) -
     return np.asarray(np.matmul(covariance, sums)[:, clock])
 
 
-def _regular_inverse(matrix: Floats) -> Floats:
+def regular_inverse(matrix: Floats) -> Floats:
     """Inverse of symmetric 3 x 3 matrices, each scaled to a unit diagonal; NaN where singular."""
     diagonal = np.einsum("tii->ti", matrix)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, np.nan))
