@@ -135,19 +135,26 @@ def prepare_kernels() -> None:
 
 #: Width of tables where the output is no terminal, so that no cell is cut or folded.
 _FILE_WIDTH: Final = 500
+#: Findings of a map printed before the rest is only counted.
+MOST_FINDINGS: Final = 40
 #: Signs of a page in the characters of every terminal.
 _PLAIN: Final = str.maketrans("−–", "--")
 
 
 class TableConsole(Console):
-    """The standard output; a table that is wider than it is printed in parts, and no number is cut or folded."""
+    """The standard output: text as it is; a table that is wider is printed in parts, and no number is cut or folded."""
+
+    def __init__(self) -> None:
+        super().__init__(highlight=False)
+        if not self.is_terminal:
+            self.width = max(self.width, _FILE_WIDTH)
 
     def print(self, *objects: Any, **options: Any) -> None:
         """Print as `rich` does, tables in parts that fit."""
         for item in objects or ("",):
             if isinstance(item, RichTable):
                 for part in split_table(item, self):
-                    super().print(part, crop=False, **options)
+                    super().print(part, crop=False, soft_wrap=False, **options)
             else:
                 super().print(item, **options)
 
@@ -184,18 +191,10 @@ def _with_columns(table: RichTable, columns: Sequence[TableColumn]) -> RichTable
     return part
 
 
-def console_of_tables() -> Console:
-    """Return the standard output for tables, wide enough for whole rows in a log file."""
-    console = TableConsole(highlight=False)
-    if not console.is_terminal:
-        console.width = max(console.width, _FILE_WIDTH)
-    return console
-
-
 def show_table(console: Console, table: Table, *, most: int | None = None) -> None:
     """Print a table of results under its caption, at most so many rows."""
     if table.caption:
-        console.print(table.caption, markup=False, soft_wrap=True)
+        console.print(table.caption)
     if not table.rows:
         return
     plain = RichTable(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
@@ -207,26 +206,26 @@ def show_table(console: Console, table: Table, *, most: int | None = None) -> No
         shown.add_row(*(Text(cell.translate(_PLAIN)) for cell in row))
     console.print(shown)
     if most is not None and len(table.rows) > most:
-        console.print(f"  the first {most} of {len(table.rows)}; all are in the files (--out)")
+        console.print(f"... and {len(table.rows) - most} more")
 
 
 def show_verdict(console: Console, lines: Iterable[str]) -> None:
     """Print the first lines of a command, and a blank one."""
     for line in lines:
-        console.print(line, markup=False, soft_wrap=True)
+        console.print(line)
     console.print()
 
 
 def show_notes(console: Console, notes: Iterable[str]) -> None:
     """Print notes, one per line."""
     for note in notes:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
+        console.print(f"note: {note}")
 
 
 def show_files(console: Console, paths: Iterable[Path]) -> None:
     """Print the files that were written."""
     for path in paths:
-        console.print(f"wrote {path}", markup=False, soft_wrap=True)
+        console.print(f"wrote {path}")
 
 
 @contextmanager
@@ -257,7 +256,7 @@ def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
 
 def show_summary(summary: RunSummary) -> None:
     """Epochs, positions, statuses, the budget of reasons, and where the results are."""
-    console = console_of_tables()
+    console = TableConsole()
     show_verdict(console, verdict_of_run(summary))
     for table in budget_tables(summary.record["antennas"], level_basis(summary.record)):
         show_table(console, table)
