@@ -27,7 +27,7 @@ from railfix.run.driver import Progress, notes_of, open_inputs, sensors_of
 from railfix.run.inputs import RunInputs, RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
-from railfix.run.record import RunProvenance, package_versions, run_record
+from railfix.run.record import NO_FIGURES, RunProvenance, package_versions, run_record
 from railfix.run.sensors import balises_of
 from railfix.run.sources import aligned
 from railfix.run.tally import Tally
@@ -213,7 +213,7 @@ def ablate_files(
             line=line.facts,
             navigation=navigation,
         )
-        record = run_record(made_from, tallies[ALL], notes, wall_s=wall)
+        record = run_record(made_from, tallies[ALL], notes, dict.fromkeys(antennas, NO_FIGURES), wall)
         rows = [effect.as_row() for effect in effects]
         folder.append_csv("ablation.csv", pl.DataFrame(rows, infer_schema_length=None))
         folder.write_json("ablation.json", record | {"choices": rows})

@@ -83,7 +83,7 @@ class RunFolder(RunRecord):
     @property
     def settings(self) -> dict[str, Any]:
         """Settings in force and kinds of input, by dotted name."""
-        flat = flattened(self.record.get("settings_used") or {})
+        flat = flat_settings(self.record.get("settings_used") or {})
         kinds = {str(entry["input"]) for entry in self.entries}
         return flat | {f"input {kind}": "given" for kind in sorted(kinds - {"front", "nav", "track", "config"})}
 
@@ -137,13 +137,13 @@ class RunFolder(RunRecord):
         return self.record.get("line") or {}
 
 
-def flattened(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat_settings(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested settings by dotted name; lists as text."""
     flat: dict[str, Any] = {}
     for key, value in values.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping):
-            flat |= flattened(value, f"{name}.")
+            flat |= flat_settings(value, f"{name}.")
         else:
             flat[name] = " ".join(str(v) for v in value) if isinstance(value, list | tuple) else value
     return flat
@@ -327,7 +327,6 @@ class EvaluationOptions(Settings):
     speed_edges_kmh: RisingEdges = option(
         "Limits between the speed classes.", (20.0, 60.0, 100.0), name="--speed-classes", metavar="KMH,..."
     )
-    over_m: RisingEdges = (5.0, 10.0, 20.0, 50.0)  #: Error sizes; the share of errors above each is counted.
     alarm_limits_m: tuple[Positive, ...] = option(
         "Alarm limits that protection levels are compared with, besides the run's own.",
         (10.0, 20.0, 40.0),

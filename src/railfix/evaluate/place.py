@@ -234,7 +234,9 @@ def errors_of(
     if method != "trajectory":
         if against is None:
             if files.track or files.vehicle is not None:
-                find_trajectory(run, antenna, answers, files)  # what was given is that of the run
+                find_trajectory(
+                    run, antenna, answers.chainage_m, answers.ecef_m, files
+                )  # what was given is that of the run
             return PlaceErrors(
                 method="chainage",
                 error_m=short_way_m(answers.chainage_m - answers.reference_chainage_m, turn),
@@ -248,7 +250,7 @@ def errors_of(
         notes: tuple[str, ...] = (f"{antenna}: errors are along the trajectory: {against}",)
     else:
         notes = (f"{antenna}: errors are along the trajectory, as asked",)
-    trajectory, used, more = find_trajectory(run, antenna, answers, files)
+    trajectory, used, more = find_trajectory(run, antenna, answers.chainage_m, answers.ecef_m, files)
     arc, other = (_arc(trajectory, c) for c in (answers.chainage_m, answers.conventional_chainage_m))
     place = answers.reference_chainage_m
     if not trusted:
@@ -320,9 +322,9 @@ def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
 
 
 def find_trajectory(
-    run: RunFolder, antenna: str, answers: Answers, files: TrackFiles
+    run: RunFolder, antenna: str, chainage_m: Floats, ecef_m: Floats, files: TrackFiles
 ) -> tuple[Trajectory, tuple[tuple[str, Path], ...], tuple[str, ...]]:
-    """Return the trajectory that the run used, from its track and vehicle; with the files and notes.
+    """Return the trajectory of a run's positions, shape (T,), (T, 3), from its track and vehicle; files and notes.
 
     MismatchError: the positions do not lie on it: another track or vehicle, or other reading options.
     """
@@ -343,9 +345,9 @@ def find_trajectory(
         except RailfixError as error:
             faults.append(error)
             continue
-        arc = _arc(trajectory, answers.chainage_m)
-        off = np.linalg.norm(trajectory.at_arc(arc) - answers.ecef_m, axis=1)
-        off = np.where(np.isfinite(answers.chainage_m), np.nan_to_num(off, nan=np.inf), 0.0)
+        arc = _arc(trajectory, chainage_m)
+        off = np.linalg.norm(trajectory.at_arc(arc) - ecef_m, axis=1)
+        off = np.where(np.isfinite(chainage_m), np.nan_to_num(off, nan=np.inf), 0.0)
         if off.max(initial=0.0) <= SAME_TRAJECTORY_M:
             return trajectory, used, trajectory.notes
         farthest.append(float(off.max()))

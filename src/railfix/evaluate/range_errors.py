@@ -42,7 +42,7 @@ from railfix.run.sources import aligned
 from railfix.track.trajectory import Trajectory
 
 __all__ = [
-    "GatherLimits", "ModelInputs", "RangeErrors", "RobustClock", "StationBeside", "StationErrors", "base_station",
+    "ModelInputs", "RangeErrors", "RobustClock", "StationBeside", "StationErrors", "base_station",
     "base_station_from_files", "error_model_from_runs", "range_errors", "robust_clock",
 ]  # fmt: skip
 
@@ -69,13 +69,8 @@ _LARGEST_REFERENCE_SIGMA_M: Final = 0.5
 #: Longest gap of the reference trajectory and of the reference station that is interpolated over.
 _LARGEST_REFERENCE_GAP_S: Final = 2.5
 _LARGEST_BASE_GAP_S: Final = 35.0
-
-
-class GatherLimits(Settings):
-    """Limits for the range errors of a run."""
-
-    #: Fewest ranges of one constellation, after the screens, from which its receiver clock is estimated.
-    least_ranges: int = Field(default=4, ge=1)
+#: Fewest ranges of one constellation, after the screens, from which its receiver clock is estimated.
+_LEAST_RANGES: Final = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +166,6 @@ def range_errors(
     reference: AntennaReference,
     base: StationErrors | None = None,
     *,
-    limits: GatherLimits | None = None,
     block_s: float = 30.0,
 ) -> RangeErrors:
     """Pseudorange errors of one antenna over one chunk of T epochs, in blocks of `block_s`.
@@ -183,7 +177,6 @@ def range_errors(
 
     MismatchError: fewer than two reference positions have a sigma within the limit.
     """
-    limits = limits or GatherLimits()
     columns = result.columns
     good = ~(reference.sigma_m > _LARGEST_REFERENCE_SIGMA_M)
     if np.count_nonzero(good) < 2:
@@ -207,7 +200,7 @@ def range_errors(
             used &= ~result.screens[name].reject
     groups = clock_groups(satellite.astype("<U1"))
     clock = robust_clock(
-        np.where(used, residual, np.nan), result.sigma_m[:, columns], groups, least_ranges=limits.least_ranges
+        np.where(used, residual, np.nan), result.sigma_m[:, columns], groups, least_ranges=_LEAST_RANGES
     )
     widths = [group.stop - group.start for group in groups]
     error = (residual - np.repeat(clock.clock_m, widths, axis=1)) / np.sqrt(1.0 - clock.share)
@@ -238,13 +231,6 @@ def _level_sigma_m(result: AntennaResult) -> Floats:
     columns = result.columns
     stated = result.sigma_m[:, columns] * np.maximum(result.noise_scale, 1.0)[:, None]
     return np.asarray(np.fmax(stated, result.bound_sigma_m[:, columns]))
-
-
-def joined(parts: list[ErrorSamples]) -> ErrorSamples:
-    """Samples of several chunks, antennas and runs concatenated."""
-    return ErrorSamples(
-        **{item.name: np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(ErrorSamples)}
-    )
 
 
 class StationBeside(Settings):
@@ -286,7 +272,7 @@ class _RunErrors:
 
 
 def error_model_from_runs(
-    inputs: Sequence[ModelInputs], *, fit: ErrorModelFit | None = None, limits: GatherLimits | None = None
+    inputs: Sequence[ModelInputs], *, fit: ErrorModelFit | None = None
 ) -> tuple[ErrorModel, ErrorSamples]:
     """Error model of the pseudoranges of several runs, before and after the screens, and its samples.
 
@@ -296,15 +282,17 @@ def error_model_from_runs(
     MismatchError: some runs have a reference station and others have none, their conditions differ, or no range error
     could be computed; or a file has changed since the run.
     """
-    fit, limits = fit or ErrorModelFit(), limits or GatherLimits()
+    fit = fit or ErrorModelFit()
     with_base = {bool(source.base) for source in inputs}
     if len(with_base) != 1:
         raise MismatchError("give a reference station for every run or for none: the errors are of different kinds")
-    runs = [_run_errors(source, number, fit, limits) for number, source in enumerate(inputs)]
+    runs = [_run_errors(source, number, fit) for number, source in enumerate(inputs)]
     parts = [samples for run in runs for samples in run.samples]
     if not any(len(part.error_m) for part in parts):
         raise MismatchError("no pseudorange error could be computed; do run, reference and station belong together?")
-    samples = joined(parts)
+    samples = ErrorSamples(
+        **{item.name: np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(ErrorSamples)}
+    )
     conditions = runs[0].conditions
     for source, run in zip(inputs[1:], runs[1:], strict=True):
         if differences := condition_differences(
@@ -333,7 +321,7 @@ def error_model_from_runs(
     return model, samples
 
 
-def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit, limits: GatherLimits) -> _RunErrors:
+def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit) -> _RunErrors:
     """Range errors of one run, chunk by chunk."""
     past = read_record(source.run)
     past.check_inputs()
@@ -352,9 +340,7 @@ def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit, limits: Ga
         for antenna, (name, positions) in enumerate(result.antennas.items()):
             if not len(positions):
                 continue
-            errors = range_errors(
-                positions, line.trajectories[name], references[name], base, limits=limits, block_s=fit.block_s
-            )
+            errors = range_errors(positions, line.trajectories[name], references[name], base, block_s=fit.block_s)
             # satellite passes of different runs and antennas are independent blocks
             offset = (2 * number + antenna) * 10**16
             parts.append(replace(errors.samples, block=errors.samples.block + offset))

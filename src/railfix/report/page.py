@@ -14,7 +14,7 @@ from railfix.core.arrays import Floats
 from railfix.core.files import write_whole
 from railfix.core.tables import Table, count, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
-from railfix.evaluate.inputs import flattened
+from railfix.evaluate.inputs import flat_settings
 from railfix.evaluate.tables import error_tables, evaluation_of, group_tables
 from railfix.report.charts_page import (
     Absent,
@@ -42,7 +42,7 @@ def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table
     judged = ["mean", "std", "p95", "largest", "conventional p95", "largest"] if evaluation else []
     rows = []
     for run in runs:
-        asked = flattened(run.record.get("settings_asked") or {})
+        asked = flat_settings(run.record.get("settings_asked") or {})
         chosen = [run.config.preset, *(f"{name} {_word(value)}" for name, value in asked.items() if name != "preset")]
         for antenna, facts in _antennas(run).items():
             sigma = facts.get("along_sigma_m") or {}
@@ -112,8 +112,8 @@ def provenance(run: ReportedRun) -> list[Block]:
 
 def settings(run: ReportedRun) -> list[Block]:
     """Settings asked for beside those used."""
-    asked = flattened(run.record.get("settings_asked") or {})
-    used = flattened(run.record.get("settings_used") or {})
+    asked = flat_settings(run.record.get("settings_asked") or {})
+    used = flat_settings(run.record.get("settings_used") or {})
     names = [*(name for name in used if name in asked), *(name for name in asked if name not in used)]
     names += [name for name in used if name not in asked]
     rows = [[name, _word(asked.get(name, "")), _word(used.get(name, ""))] for name in names]

@@ -35,6 +35,10 @@ from railfix.tracking import TrackStatus
 PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka", "georinex", "japan-geoid")
 
 
+#: Figures of an antenna without rows.
+NO_FIGURES: Final = {"along_sigma_m": None, "protection_level": None, "filter": None}
+
+
 def figures_of(folder: OutputFolder, tally: Tally, config: Config) -> dict[str, dict[str, Any]]:
     """Return percentiles of each antenna from the rows written [m]; None in place of what the run has not.
 
