@@ -257,7 +257,7 @@ def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
 _FIXES: Final = (("conventional", "conventional_", CONVENTIONAL, "square"), ("on the map", "", CONSTRAINED, "dot"))
 
 
-def interval_over_chainage(table: pl.DataFrame, *, title: str = "Positioning interval") -> Chart:
+def interval_over_chainage(table: pl.DataFrame) -> Chart:
     """Distance from each position to the previous one, over chainage (P1 figure 12), of the table of `interval`."""
     layers: list[Layer] = []
     shown = total = 0
@@ -271,7 +271,7 @@ def interval_over_chainage(table: pl.DataFrame, *, title: str = "Positioning int
             longest.append(f"{label} {y.max():.2f} m")
     return Chart(
         name="interval-chainage",
-        title=title,
+        title="Positioning interval",
         caption=f"Distance along the line from each position to the previous one. {_by(table)} "
         f"Longest: {', '.join(longest)}.{counts_sentence(shown, total)}",
         x_label="chainage [m]",
@@ -281,7 +281,7 @@ def interval_over_chainage(table: pl.DataFrame, *, title: str = "Positioning int
     )
 
 
-def interval_distribution(table: pl.DataFrame, *, title: str = "Positioning interval, distribution") -> Chart:
+def interval_distribution(table: pl.DataFrame) -> Chart:
     """Distribution of the distances from the previous position (P1 figure 12), of the table of `interval`."""
     distances = {label: interval(table, prefix)[1] for label, prefix, _, _ in _FIXES}
     largest = max((float(y.max()) for y in distances.values() if len(y)), default=1.0)
@@ -296,7 +296,7 @@ def interval_distribution(table: pl.DataFrame, *, title: str = "Positioning inte
         )
     return Chart(
         name="interval-distribution",
-        title=title,
+        title="Positioning interval, distribution",
         caption=f"Number of positions by their distance from the previous one, in classes of {step:g} m. {_by(table)}",
         x_label="distance from the previous position [m]",
         y_label="positions",
@@ -312,7 +312,7 @@ def _by(table: pl.DataFrame) -> str:
     return "Without a reference the distances are those of the positions, with their noise."
 
 
-def satellites_over_time(positions: pl.DataFrame, *, title: str = "Satellites") -> Chart:
+def satellites_over_time(positions: pl.DataFrame) -> Chart:
     """Satellites used and rejected at each epoch of one antenna."""
     start = start_of(positions)
     x = since(positions, start)
@@ -325,7 +325,7 @@ def satellites_over_time(positions: pl.DataFrame, *, title: str = "Satellites") 
         layers.append(Points(label=label, colour=colour, x=x[rows], y=y[rows], epoch_s=x[rows]))
     return Chart(
         name="satellites",
-        title=title,
+        title="Satellites",
         caption=f"Satellites with a pseudorange.{counts_sentence(shown, total)}",
         x_label="GPS time",
         y_label="satellites",

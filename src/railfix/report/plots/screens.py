@@ -65,25 +65,18 @@ def draw_screen(
 def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[np.integer] | None = None) -> Chart:
     """Chart of a metric against its limit over T times; `epoch`, shape (T,), gives the time of each row."""
     start = time.min() if len(time) else np.datetime64(0, "ns")
-    return _screen(picture, seconds(time - start), epoch, name="time", x_label="GPS time", start=start)
+    return _screen(picture, seconds(time - start), epoch, start)
 
 
 def screen_over_chainage(
     picture: ScreenPicture, chainage_m: Floats, *, epoch: NDArray[np.integer] | None = None
 ) -> Chart:
     """The same over the chainage, shape (T,), or (E,) with `epoch` [m]; see `screen_over_time`."""
-    return _screen(picture, chainage_m, epoch, name="chainage", x_label="chainage [m]", start=None)
+    return _screen(picture, chainage_m, epoch, None)
 
 
-def _screen(
-    picture: ScreenPicture,
-    x: Floats,
-    epoch: NDArray[np.integer] | None,
-    *,
-    name: str,
-    x_label: str,
-    start: np.datetime64 | None,
-) -> Chart:
+def _screen(picture: ScreenPicture, x: Floats, epoch: NDArray[np.integer] | None, start: np.datetime64 | None) -> Chart:
+    """Metric over the time since `start`, or over the chainage without one."""
     judged = int(np.count_nonzero(np.isfinite(picture.metric)))
     rejected = int(np.count_nonzero(picture.reject))
     share = f"{100 * rejected / judged:.2f} %" if judged else "none"
@@ -118,10 +111,10 @@ def _screen(
         if top > 0.0 and max(float(np.nanmax(picture.metric)), -float(np.nanmin(picture.metric))) > top:
             scale = {"y_scale": "symlog", "y_linear": nice_step(top / 2.0)}
     return Chart(
-        name=name,
+        name="chainage" if start is None else "time",
         title=f"{picture.title}: {judged:,} tested, {rejected:,} rejected ({share})",
         caption=(("" if same else "Line: the tightest limit of each epoch.") + counts_sentence(shown, total)).strip(),
-        x_label=x_label,
+        x_label="chainage [m]" if start is None else "GPS time",
         y_label=picture.label,
         layers=tuple(layers),
         start=start,

@@ -48,7 +48,6 @@ def cn0_over_elevation(
     limits: Cn0Limits | None = None,
     curve: Cn0Curve | None = None,
     mask_deg: float | None = None,
-    title: str = "C/N0 over elevation",
 ) -> list[Chart]:
     """C/N0 over elevation with mean and thresholds, one chart per constellation and signal (P1 figure 3).
 
@@ -76,7 +75,7 @@ def cn0_over_elevation(
         drawn = mine.filter(pl.col("up").is_between(0, counts.shape[1] - 1), pl.col("across") < len(counts))
         np.add.at(counts, (drawn["across"].to_numpy(), drawn["up"].to_numpy()), drawn["count"].to_numpy())
         caption = f"{size:,} observations, the more the darker."
-        charts.append(_cn0_chart(kind, signal, counts, lines, title=f"{title}: ", caption=caption))
+        charts.append(_cn0_chart(kind, signal, counts, lines, title="C/N0 over elevation: ", caption=caption))
     return charts
 
 
