@@ -127,7 +127,7 @@ def test_used_satellites_agree_between_the_two_tables(whole: RunSummary) -> None
 def test_the_record_names_what_was_read(record: dict[str, Any]) -> None:
     inputs = demo_inputs()
     named = {(item["input"], item["path"]): item for item in record["inputs"]}
-    assert set(named) == {(name, str(path)) for name, path in inputs.named()}
+    assert set(named) == {(name, str(path)) for name, path in inputs.files_by_name()}
     for (_, path), item in named.items():
         content = Path(path).read_bytes()
         assert item["bytes"] == len(content)

@@ -17,7 +17,7 @@ from railfix.io.positions_export import style_file, write_positions
 from railfix.pipeline.tables import rounded
 from railfix.run.checks import examine_files
 from railfix.run.convert import write_mcap
-from railfix.run.inputs import LogReading, located
+from railfix.run.inputs import LogReading, input_path
 from railfix.run.locate import LocateInputs, locate_files
 from railfix.run.which_track import WhichTrackInputs, WhichTrackOptions, which_track_files, write_last_place
 
@@ -185,7 +185,7 @@ def export(
     table = "train" if filtered or (filtered is None and "train" in tables) else "positions"
     folder = read_run(run, table=table)
     results = [run / f"{name}.parquet" for name in (*TABLES, "observations", "tracks")]
-    inputs = [run / "run.json", *results, *(located(entry, run) for entry in folder.entries)]
+    inputs = [run / "run.json", *results, *(input_path(entry, run) for entry in folder.entries)]
     style = style_file(out)
     check_outputs((out, "map"), (style, "any"), overwrite=overwrite, inputs=inputs)
     used = folder.track_facts.get("frame", {}).get("used", "")

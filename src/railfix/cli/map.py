@@ -128,7 +128,7 @@ def features(
     import polars as pl
 
     from railfix.motion.features import line_series, map_features
-    from railfix.run.locate import centre_features, measured_features, read_measured
+    from railfix.run.locate import centre_features, find_features, read_measured
     from railfix.track.trajectory import Trajectory
 
     tables = [folder / "train.parquet" for folder in run or ()]
@@ -143,7 +143,7 @@ def features(
     found = [replace(feature, arc_m=float(chainage)) for feature, chainage in zip(found, at, strict=True)]
     beside: dict[str, list[float]] = {}
     if run:
-        measured = measured_features([read_measured(folder) for folder in run], found)
+        measured = find_features([read_measured(folder) for folder in run], found)
         found = [each.feature for each in measured]
         beside = {
             "runs": [float(len(each.places_m)) for each in measured],

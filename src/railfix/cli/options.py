@@ -103,16 +103,16 @@ def from_models(command: Callable[..., None]) -> Callable[..., None]:
         parameters |= {option.parameter.name: option.parameter for option in models[name][1]}
 
     @wraps(command)
-    def expanded(**values: Any) -> None:
+    def run(**values: Any) -> None:
         built = {name: _built(model, options, values) for name, (model, options) in models.items()}
         used = {option.parameter.name for _, options in models.values() for option in options}
         command(**{name: value for name, value in values.items() if name not in used}, **built)
 
     # typer takes both the signature and the annotations
-    expanded.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
-    expanded.__annotations__ = {name: parameter.annotation for name, parameter in parameters.items()}
-    del expanded.__wrapped__
-    return expanded
+    run.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
+    run.__annotations__ = {name: parameter.annotation for name, parameter in parameters.items()}
+    del run.__wrapped__
+    return run
 
 
 def _options(model: type[Settings], excluded: list[str], path: tuple[str, ...] = ()) -> list[_Option]:

@@ -29,7 +29,7 @@ from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import NO_FIGURES, RunProvenance, package_versions, run_record
 from railfix.run.sensors import balises_of
-from railfix.run.sources import aligned
+from railfix.run.sources import align_logs
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS, ScreenSetup
 from railfix.track.trajectory import Trajectory
@@ -180,7 +180,7 @@ def ablate_files(
         states = dict.fromkeys(processors, State())
         tallies = {name: Tally(min_satellites=config.min_satellites) for name in processors}
         parts: dict[tuple[str, str], list[dict[str, Floats]]] = {}
-        for chunk in aligned({name: log.parts() for name, log in logs.items()}):
+        for chunk in align_logs({name: log.parts() for name, log in logs.items()}):
             end = max(part.time[-1] for part in chunk.values() if len(part))
             since = sensors.between(received, end)
             received = end

@@ -118,7 +118,7 @@ def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) 
     kept = [
         {**entry, "path": str(path.absolute())}
         for kind in ("track", "vehicle")
-        for entry, path in zip((e for e in own.entries if e["input"] == kind), own.located(kind), strict=True)
+        for entry, path in zip((e for e in own.entries if e["input"] == kind), own.input_paths(kind), strict=True)
     ]
     with OutputFolder(out, overwrite="replace", inputs=[Path(log.path)]) as folder:
         folder.append_parquet("positions.parquet", table)

@@ -62,7 +62,7 @@ class CaseFile(Settings):
     options: RunOptions = RunOptions()
     evaluation: EvaluationOptions = EvaluationOptions()
 
-    def named(self) -> Iterator[Path]:
+    def every_file(self) -> Iterator[Path]:
         """Every file, as written."""
         yield from self.files.paths
         yield from (other.file for other in self.positions.values())
@@ -82,7 +82,7 @@ class Case:
         """Raise InputFileError where a file is missing or not the one that the case was made of, SettingsError without
         a hash.
         """
-        for name in self.content.named():
+        for name in self.content.every_file():
             path, stated = self.folder / name, self.content.sha256.get(str(name))
             if stated is None:
                 raise SettingsError(f"{self.folder / CASE_FILE}: sha256 has no entry for {name}; add its SHA-256")
@@ -128,7 +128,7 @@ def read_cases(folder: Path) -> list[Case]:
 def write_case(folder: Path, content: Mapping[str, Any]) -> None:
     """Write the ``case.toml`` of a folder from its content without hashes; errors as `read_case`."""
     case = validated(CaseFile, {**content, "sha256": {}}, source=str(folder / CASE_FILE))
-    hashes = {str(name): file_sha256(folder / name) for name in case.named()}
+    hashes = {str(name): file_sha256(folder / name) for name in case.every_file()}
     write_toml(folder / CASE_FILE, {**content, "sha256": hashes}, what=_KIND)
 
 

@@ -147,7 +147,7 @@ def evaluate_runs(
     read: dict[tuple[Path, tuple[str, ...]], Mapping[str, AntennaReference]] = {}
     parts = [_evaluate(item, read, sections=sections, files=files, options=options) for item in runs]
     read.clear()
-    evaluated = _named([run for run, _, _ in parts])
+    evaluated = _name_runs([run for run, _, _ in parts])
     levels = {run.name: level for run, (_, _, level) in zip(evaluated, parts, strict=True) if level is not None}
     tables = [
         table.with_columns(
@@ -256,7 +256,7 @@ def _evaluate(
 
 def reference_beside(run: RunFolder) -> Path:
     """Return the reference beside the log of the front antenna; InputFileError unless there is exactly one."""
-    logs = run.located("front")
+    logs = run.input_paths("front")
     if not logs:
         raise InputFileError(run.path / "run.json", "names no log of the front antenna; name the reference")
     folder = logs[0].parent
@@ -286,7 +286,7 @@ def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) 
     return names
 
 
-def _named(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
+def _name_runs(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
     """Return runs with short names that tell them apart, the table in it where it is not that of single epochs."""
     settings = [dict(run.settings) | {"table": run.table} for run in runs]
     labels = configurations(settings, [run.configuration for run in runs])

@@ -78,7 +78,7 @@ class RunFolder(RunRecord):
     def tracks(self) -> list[Path]:
         """Files of the track: that in the folder where the run moved, joined or raised it, else its inputs."""
         name = self.track_facts.get("file")
-        return [self.path / str(name)] if name else self.located("track")
+        return [self.path / str(name)] if name else self.input_paths("track")
 
     @property
     def settings(self) -> dict[str, Any]:

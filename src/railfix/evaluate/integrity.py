@@ -105,7 +105,7 @@ def level_name(kind: str) -> str:
     return f"{kind}_protection_level_m"
 
 
-def counted_levels(level_m: Floats, has: Masks, status: Strings, verdict: Strings, *, levels_of: LevelsOf) -> Floats:
+def effective_levels(level_m: Floats, has: Masks, status: Strings, verdict: Strings, *, levels_of: LevelsOf) -> Floats:
     """Return levels as counted, shape (T,) [m]: infinite without a usable level, NaN without a position.
 
     `status` of the position and `verdict` of the level are blank where there is none, `level_m` is NaN.
@@ -142,7 +142,7 @@ def _judge(spanned: pl.DataFrame, kind: str, levels_of: LevelsOf) -> tuple[Float
     """Errors and levels as counted of epochs inside the reference, NaN where there is none."""
     has = spanned["positioned"].to_numpy()
     error = np.where(has & spanned["reference_good"].to_numpy(), floats(spanned, "error_m"), np.nan)
-    level = counted_levels(
+    level = effective_levels(
         floats(spanned, level_name(kind)),
         has,
         _words(spanned, "status"),
@@ -159,7 +159,7 @@ def positions_diagram(
 
     Of one antenna, columns of `railfix.pipeline.result_columns.POSITION_COLUMNS`, in order of time.
     """
-    level = counted_levels(
+    level = effective_levels(
         floats(positions, "protection_level_m"),
         np.isfinite(floats(positions, "chainage_m")),
         _words(positions, "status"),

@@ -329,7 +329,7 @@ def find_trajectory(
     MismatchError: the positions do not lie on it: another track or vehicle, or other reading options.
     """
     tracks = list(files.track) or run.tracks
-    vehicles = [files.vehicle] if files.vehicle is not None else run.located("vehicle")
+    vehicles = [files.vehicle] if files.vehicle is not None else run.input_paths("vehicle")
     if not tracks:
         raise InputFileError(run.path / "run.json", "names no track; give it with --track")
     used = (*(("track", path) for path in tracks), *(("vehicle", path) for path in vehicles))

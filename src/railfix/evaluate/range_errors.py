@@ -38,7 +38,7 @@ from railfix.run.driver import open_inputs
 from railfix.run.inputs import ColumnNames, input_option
 from railfix.run.processor import processor_of
 from railfix.run.record import read_record
-from railfix.run.sources import aligned
+from railfix.run.sources import align_logs
 from railfix.track.trajectory import Trajectory
 
 __all__ = [
@@ -335,7 +335,7 @@ def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit) -> _RunErr
     parts: list[ErrorSamples] = []
     times: list[np.datetime64] = []
     epochs = 0
-    for chunk in aligned({name: log.parts() for name, log in logs.items()}):
+    for chunk in align_logs({name: log.parts() for name, log in logs.items()}):
         result, state = processor.process(chunk, state)
         for antenna, (name, positions) in enumerate(result.antennas.items()):
             if not len(positions):

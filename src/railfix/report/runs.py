@@ -193,7 +193,7 @@ def _curve(folder: RunFolder, config: Config) -> tuple[Cn0Curve | None, tuple[st
     """C/N0 curve that the run used, or a note on why it is not drawn."""
     if config.cn0_curve is None:
         return None, ()
-    path = next(iter(folder.located("cn0_curve")), Path(config.cn0_curve))
+    path = next(iter(folder.input_paths("cn0_curve")), Path(config.cn0_curve))
     try:
         return read_cn0_curve(path), ()
     except RailfixError as error:

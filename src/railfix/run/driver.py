@@ -31,7 +31,7 @@ from railfix.run.processor import BaseLog, base_log, processor_of
 from railfix.run.record import RunProvenance, figures_of, package_versions, run_record
 from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sensors import balises_of, check_filter, read_sensors, units_of_ranges
-from railfix.run.sources import TRACK_FILE, Log, OpenedLine, aligned, open_line, read_ahead, without_beside
+from railfix.run.sources import TRACK_FILE, Log, OpenedLine, align_logs, open_line, read_ahead, without_beside
 from railfix.run.tally import Replays, ResultRows, Tally, add_smoothed, shorten_notes
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
@@ -203,7 +203,7 @@ def _position(
     tally = Tally(min_satellites=processor.config.min_satellites, order=processor.antenna_order())
     state = State()
     written: Future[None] | None = None
-    chunks = read_ahead(aligned({name: log.parts() for name, log in logs.items()}))
+    chunks = read_ahead(align_logs({name: log.parts() for name, log in logs.items()}))
     began = clock.perf_counter()
     for solved in read_ahead(_single_epochs(chunks, others, processor)):
         result, state = processor.along_track(solved, state)

@@ -52,7 +52,7 @@ VIRTUAL_BALISES: Final = "Places whose passing is reported with its interval: a 
 class InputFiles(Settings):
     """Input files of a command, each field a path, several paths, or None."""
 
-    def named(self) -> Iterator[tuple[str, Path]]:
+    def files_by_name(self) -> Iterator[tuple[str, Path]]:
         """Each file with the name of its field."""
         for name in type(self).model_fields:
             value = getattr(self, name)
@@ -63,16 +63,18 @@ class InputFiles(Settings):
     @property
     def paths(self) -> tuple[Path, ...]:
         """All files."""
-        return tuple(path for _, path in self.named())
+        return tuple(path for _, path in self.files_by_name())
 
     def check_files(self) -> None:
         """Raise InputFileError where a file is missing, a folder, or cannot be opened."""
-        for name, path in self.named():
+        for name, path in self.files_by_name():
             _check_file(f"--{name.replace('_', '-')}", path)
 
     def entries(self, pool: Executor, folder: Path) -> Entries:
         """Hash every file beside other work."""
-        return [pool.submit(fingerprint, kind, path, name=record_path(path, folder)) for kind, path in self.named()]
+        return [
+            pool.submit(fingerprint, kind, path, name=record_path(path, folder)) for kind, path in self.files_by_name()
+        ]
 
 
 Entries = Sequence[Future[dict[str, Any]]]
@@ -218,7 +220,7 @@ def record_path(path: Path, folder: Path) -> str:
     return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
 
 
-def located(entry: Mapping[str, Any], folder: Path) -> Path:
+def input_path(entry: Mapping[str, Any], folder: Path) -> Path:
     """Return where a recorded input is now: relative paths count from the results folder."""
     path = folder / str(entry["path"])
     plain = Path(os.path.normpath(path))

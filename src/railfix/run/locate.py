@@ -299,7 +299,7 @@ class MeasuredFeature:
     map_m: float  #: Chainage of the same feature of the map; NaN where the map has none.
 
 
-def measured_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) -> list[MeasuredFeature]:
+def find_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) -> list[MeasuredFeature]:
     """Return the features that all runs (`read_measured`) together show, in order; `of_map`: those of the map."""
     alone = [_features(run) for run in runs]
     found = []

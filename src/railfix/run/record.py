@@ -26,7 +26,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.kernels import numba_version
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.level_stage import level_facts
-from railfix.run.inputs import RunInputs, RunOptions, located
+from railfix.run.inputs import RunInputs, RunOptions, input_path
 from railfix.run.output import OutputFolder
 from railfix.run.tally import AntennaTally, Tally
 from railfix.tracking import TrackStatus
@@ -49,7 +49,9 @@ def figures_of(folder: OutputFolder, tally: Tally, config: Config) -> dict[str, 
         name: {
             "along_sigma_m": _along_sigma(_rows(folder, "positions", name)),
             "protection_level": _level(_rows(folder, "positions", name), antenna) if antenna.level_status else None,
-            "filter": _filtered(_rows(folder, "train", name)) if config.filter == "track" and antenna.epochs else None,
+            "filter": _filter_figures(_rows(folder, "train", name))
+            if config.filter == "track" and antenna.epochs
+            else None,
         }
         for name, antenna in tally.antennas.items()
     }
@@ -70,7 +72,7 @@ def _level(rows: pl.LazyFrame, antenna: AntennaTally) -> dict[str, Any]:
     }
 
 
-def _filtered(rows: pl.LazyFrame) -> dict[str, Any]:
+def _filter_figures(rows: pl.LazyFrame) -> dict[str, Any]:
     status, level = pl.col("status"), pl.col("protection_level_m")
     finite = level.filter(level.is_finite())
     words = {word.text: (status == word.text).sum() for word in TrackStatus}
@@ -189,7 +191,7 @@ class RunRecord:
             if isinstance(used.get(group), dict):
                 used[group] = {key: value for key, value in used[group].items() if key != name}
         config = self._this_version(lambda: parse_config(used, source="settings_used"))
-        files = {name: self.located(name) for name in ("cn0_curve", "error_model", "integrity_support", "sbas")}
+        files = {name: self.input_paths(name) for name in ("cn0_curve", "error_model", "integrity_support", "sbas")}
         changes = {name: tuple(paths) if name == "sbas" else paths[0] for name, paths in files.items() if paths}
         return config.replaced(**changes) if changes else config
 
@@ -198,7 +200,9 @@ class RunRecord:
         """Input files, where they are now."""
         kinds = dict.fromkeys(str(entry["input"]) for entry in self.entries)
         several = {name for name, field in RunInputs.model_fields.items() if field.annotation == tuple[Path, ...]}
-        values = {name: tuple(self.located(name)) if name in several else self.located(name)[0] for name in kinds}
+        values = {
+            name: tuple(self.input_paths(name)) if name in several else self.input_paths(name)[0] for name in kinds
+        }
         return self._this_version(lambda: validated(RunInputs, values, source="inputs"))
 
     @cached_property
@@ -217,15 +221,15 @@ class RunRecord:
         """Raise InputFileError where an input file is missing, MismatchError where one has changed since the run."""
         self.inputs.check()
         for entry in self.entries:
-            path = located(entry, self.path)
+            path = input_path(entry, self.path)
             if file_sha256(path) != entry["sha256"]:
                 raise MismatchError(
                     f"{path}: has changed since the run in {self.path} read it as --{entry['input']}; repeat the run"
                 )
 
-    def located(self, kind: str) -> list[Path]:
-        """Return where the files of one kind of input are now, in order; see `railfix.run.inputs.located`."""
-        return [located(entry, self.path) for entry in self.entries if entry["input"] == kind]
+    def input_paths(self, kind: str) -> list[Path]:
+        """Return where the files of one kind of input are now, in order; see `railfix.run.inputs.input_path`."""
+        return [input_path(entry, self.path) for entry in self.entries if entry["input"] == kind]
 
     @property
     def entries(self) -> list[Mapping[str, Any]]:

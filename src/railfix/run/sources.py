@@ -268,7 +268,7 @@ def _spacing_ns(time: Datetimes) -> int:
     return int(np.median(np.diff(time).astype(np.int64)))
 
 
-def aligned(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Observations]]:
+def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Observations]]:
     """Yield chunks of observations that cover the same span of time for every antenna seen so far.
 
     Each antenna keeps its own epochs, none where it has none in the span. A chunk ends where the first of the current

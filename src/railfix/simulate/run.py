@@ -154,7 +154,7 @@ def truth_table(simulation: Simulation) -> pl.DataFrame:
     """
     line, time = simulation.line, simulation.time()
     tags = seconds(time - simulation.scenario.start)
-    sampled = line.sampled_chainage_m()
+    sampled = line.point_chainage_m()
     mapped = line.track().chainage_m
     tables = []
     for antenna in ANTENNAS:
@@ -187,7 +187,7 @@ def section_table(simulation: Simulation) -> pl.DataFrame:
     kinds = simulation.environment.label_at((edges[:-1] + edges[1:]) / 2.0)
     first = np.append(True, kinds[1:] != kinds[:-1])
     begins = edges[:-1][first]
-    mapped = np.interp([*begins, line.length_m], line.sampled_chainage_m(), line.track().chainage_m)
+    mapped = np.interp([*begins, line.length_m], line.point_chainage_m(), line.track().chainage_m)
     return pl.DataFrame({"from_m": mapped[:-1], "to_m": mapped[1:], "environment": kinds[first]})
 
 

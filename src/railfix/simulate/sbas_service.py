@@ -42,10 +42,10 @@ def message(kind: int, second: int, *fields: Field) -> Bytes:
     The fields (value, length) lie from bit 14 on, negative values in two's complement. ValueError: when a value does
     not fit its field, or the fields are longer than a message.
     """
-    return packed(f"{PREAMBLES['L1'][second % 3]:08b}{kind:06b}", kind, fields)
+    return pack_message(f"{PREAMBLES['L1'][second % 3]:08b}{kind:06b}", kind, fields)
 
 
-def packed(text: str, kind: int, fields: Sequence[Field]) -> Bytes:
+def pack_message(text: str, kind: int, fields: Sequence[Field]) -> Bytes:
     """Message from its first bits as text and its fields, with parity, shape (32,); ValueError: one does not fit."""
     for value, length in fields:
         if not -(1 << length) < 2 * value + 1 <= (1 << (length + 1)):
@@ -104,7 +104,7 @@ def long_term(second: int, satellites: Sequence[LongTerm], iodp: int = 0) -> Byt
     return message(25, second, *half(satellites[:2], iodp), *half(satellites[2:], iodp))
 
 
-def mixed(
+def fast_and_long_term(
     second: int,
     prc: Sequence[float],
     udrei: Sequence[int],
@@ -240,14 +240,14 @@ class Service:
             first = _FAST * block
             part = slice(first, first + _FAST)
 
-            def made(second: int, issue: int) -> Bytes:
+            def compose(second: int, issue: int) -> Bytes:
                 values, grades = self.fast_m(second)[part].tolist(), self.indicators(second)[part]
                 if first > 0 and count - first <= _MIXED:
                     pair = self.orbits(second)[-2:]
-                    return mixed(second, values, grades, pair, block=block, iodf=issue)
+                    return fast_and_long_term(second, values, grades, pair, block=block, iodf=issue)
                 return fast(second, values, grades, kind=2 + block, iodf=issue)
 
-            return made
+            return compose
 
         return [of_block(block) for block in range(-(-count // _FAST))]
 

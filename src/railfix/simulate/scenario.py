@@ -213,7 +213,7 @@ class Scenario(ScenarioSettings):
 
     @field_validator("stations")
     @classmethod
-    def _named_apart(cls, stations: tuple[ReferenceStation, ...]) -> tuple[ReferenceStation, ...]:
+    def _distinct_names(cls, stations: tuple[ReferenceStation, ...]) -> tuple[ReferenceStation, ...]:
         names = [*_FILES, *(station.name for station in stations)]
         if len(set(names)) < len(names):
             raise ValueError(f"must have different names, none of {', '.join(_FILES)}")

@@ -36,7 +36,7 @@ class WheelSamples:
     #: The same where the wheel has turned without slip or a gap.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
-    def joined(self, later: WheelSamples) -> WheelSamples:
+    def join(self, later: WheelSamples) -> WheelSamples:
         """Return these and later ones."""
         return WheelSamples(
             **{name: np.concatenate([getattr(self, name), getattr(later, name)]) for name in vars(self)}
@@ -105,7 +105,7 @@ def wheel_signs(
     usable = due & np.isfinite(arc_m) & (sigma_m <= limits.largest_sigma_m)
     every = replace(rolled, arc_m=arc_m, sigma_m=np.hypot(sigma_m, _LEAST_M))
     before = len(state.samples.time)
-    samples = state.samples.joined(every.take(usable))
+    samples = state.samples.join(every.take(usable))
     difference, bound, beyond = _compare(samples, before, limits, signed=signed)
     latest = np.cumsum(usable)
     of_epoch = np.concatenate([[state.difference_m], difference])[latest]

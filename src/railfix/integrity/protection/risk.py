@@ -114,7 +114,7 @@ class RiskBudget(Settings):
         return self
 
     @model_validator(mode="after")
-    def _measured_priors_are_given(self) -> Self:
+    def _check_measured_priors(self) -> Self:
         missing = [name for name in ("local_prior", "side_prior") if name not in self.model_fields_set]
         if self.priors == "measured" and missing:
             raise ValueError(
@@ -287,7 +287,7 @@ def _allocate(
     n = np.count_nonzero(used, axis=1)
     always = [2] + [-1 if s.size > 1 else int(s.wrong_map or s.events[0] < len(letters)) for s in shared[1:]]
     classes = _Classes(each, within, set_sums(everyone, MOST_TOGETHER + 1), further, always)
-    order = classes.chosen(
+    order = classes.choose(
         risk.unchecked_share * risk.risk_per_sample, likely, float(of_channel.mean()) if len(of_channel) else 0.0, n
     )
     beyond = classes.rest(order)
@@ -356,7 +356,7 @@ class _Classes:
         each = np.where(covered, 0.0, self.each * np.take_along_axis(self.sums, order + 1, axis=1))
         return np.asarray(each.sum(axis=1) + self.further)
 
-    def chosen(self, share: float, likely: Sequence[float], satellite: float, used: Integers) -> Indices:
+    def choose(self, share: float, likely: Sequence[float], satellite: float, used: Integers) -> Indices:
         """Return how many satellites at most are left out with each set of shared faults, shape (T, B).
 
         `share` may stay unchecked; `likely` are the priors of the shared faults, length B, `satellite` that of a

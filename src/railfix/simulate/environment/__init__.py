@@ -14,7 +14,7 @@ from railfix.simulate.environment.settings import (
     RowSettings,
     SectionSettings,
 )
-from railfix.simulate.environment.structures import drawn_sections
+from railfix.simulate.environment.structures import draw_sections
 
 __all__ = [
     "KINDS",
@@ -25,5 +25,5 @@ __all__ = [
     "RoofSettings",
     "RowSettings",
     "SectionSettings",
-    "drawn_sections",
+    "draw_sections",
 ]

@@ -172,7 +172,7 @@ def circular_reflection(cosine: Floats, permittivity: float) -> tuple[Floats, Fl
     return np.abs(parallel + perpendicular) / 2.0, np.abs(parallel - perpendicular) / 2.0
 
 
-def received_amplitude(cosine: Floats, sine_elevation: Floats, antenna: AntennaSettings) -> Floats:
+def reflection_amplitude(cosine: Floats, sine_elevation: Floats, antenna: AntennaSettings) -> Floats:
     """Amplitude of a wall's reflection behind the antenna, over the direct signal from the same elevation.
 
     Both polarisations add in power; the left-handed one is received with the antenna's cross-polar loss, linear in

@@ -16,7 +16,7 @@ from railfix.simulate.environment.correlator import (
     cross_polar_gain,
     edge_amplitude,
     per_metre,
-    received_amplitude,
+    reflection_amplitude,
     roughness_loss,
     strip_field,
     track_paths,
@@ -29,7 +29,7 @@ from railfix.simulate.environment.settings import (
     EnvironmentSettings,
     SightGeometry,
 )
-from railfix.simulate.environment.structures import BEYOND_M, build_structures, drawn_sections, tree_rows
+from railfix.simulate.environment.structures import BEYOND_M, build_structures, draw_sections, tree_rows
 from railfix.simulate.environment.walls import (
     FREE_V,
     Rays,
@@ -79,7 +79,7 @@ class Conductor:
         field[kept] = weight[kept] * strip_field(beside[kept] * scale[kept], self.width_m * scale[kept])
         return field
 
-    def scattered(self, wavelength_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    def scatter(self, wavelength_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Amplitude, extra path [m], and direction (p, q) of the signal scattered to the antenna from behind.
 
         A metal cylinder in geometrical optics: sqrt(a cos(b/2) / (2 rho)) with radius a, distance rho and
@@ -145,7 +145,7 @@ class Electrification:
         side = {"both": sign, "right": 1.0, "left": -1.0}[self.settings.sides]
         return np.where(sign == side, 1.0, 0.0)
 
-    def transmitted(self, rays: Rays) -> Complexes:
+    def transmit(self, rays: Rays) -> Complexes:
         """Direct field behind masts, beam and wires: 1 where nothing obstructs, shape (N,)."""
         s = self.settings
         sign = np.where(rays.y > 0.0, 1.0, -1.0)
@@ -173,7 +173,7 @@ class Electrification:
             width_m=self.settings.wire_width_m,
         )
 
-    def scattered(self, rays: Rays) -> list[tuple[Floats, Floats, Floats]]:
+    def scatter(self, rays: Rays) -> list[tuple[Floats, Floats, Floats]]:
         """Amplitude, extra path and its growth [m/m] of the signals scattered by mast and beam, each of shape (N,)."""
         sign = np.where(rays.y > 0.0, -1.0, 1.0)
         conductors = [(self._mast(rays, sign, rays.chainage_m), self._stands(sign))]
@@ -184,7 +184,7 @@ class Electrification:
             )
         rows = []
         for conductor, stands in conductors:
-            amplitude, extra, toward_x, _ = conductor.scattered(rays.wavelength_m)
+            amplitude, extra, toward_x, _ = conductor.scatter(rays.wavelength_m)
             rows.append((amplitude * stands, extra, rays.x - toward_x))
         return rows
 
@@ -218,7 +218,7 @@ class Environment:
         self._clear_cn0_dbhz = clear_cn0_dbhz
         self.sections = settings.sections
         if settings.shares:
-            self.sections = drawn_sections(
+            self.sections = draw_sections(
                 settings.shares, line_length_m, section_length_m=settings.section_length_m, seed=seed
             )
         self.structures = build_structures(self.sections, line_length_m, seed)
@@ -279,7 +279,7 @@ class Environment:
         if self.settings.ground_reflection > 0.0:
             rows.append((-self._ground(rays), 2.0 * (rays.height_m - PLATFORM_M * platform) * rays.z, nothing))
         if self._conductors is not None:
-            rows += [(-amplitude, extra, growth) for amplitude, extra, growth in self._conductors.scattered(rays)]
+            rows += [(-amplitude, extra, growth) for amplitude, extra, growth in self._conductors.scatter(rays)]
         rows += [self._reflection(r, rays) for r in range(len(self.structures.walls))]
         rows += self._further(rays, clock_s)
         for trees in self._trees:
@@ -297,7 +297,7 @@ class Environment:
             for amplitude, extra, growth, cosine in street_reflections(
                 self._streets, rays, candidates=streets.candidates, roughness_m=streets.roughness_m
             ):
-                gain = 1.0 if antenna is None else received_amplitude(cosine, rays.z, antenna)
+                gain = 1.0 if antenna is None else reflection_amplitude(cosine, rays.z, antenna)
                 rows.append((-amplitude * gain, extra, growth))
         if settings.second_reflections == "opposite" and self.structures.walls:
             rows.append(second_reflection(self.structures.walls, rays, antenna))
@@ -322,7 +322,7 @@ class Environment:
             amplitude = amplitude * roof_amplitude(roofs, rays)
         field = amplitude.astype(np.complex128)
         if self._conductors is not None:
-            field *= self._conductors.transmitted(rays)
+            field *= self._conductors.transmit(rays)
         # h^2 / (2 D) of a clearance h at distance D.
         return field, 0.25 * rays.wavelength_m * np.clip(v, 0.0, 30.0) ** 2
 
@@ -340,7 +340,7 @@ class Environment:
         image = reflections(self.structures.walls[r], rays)
         amplitude = image.amplitude.copy()
         if self.settings.antenna is not None:
-            amplitude *= received_amplitude(image.cosine, rays.z, self.settings.antenna)
+            amplitude *= reflection_amplitude(image.cosine, rays.z, self.settings.antenna)
         kept = np.flatnonzero(amplitude > _NO_FIELD)
         if len(kept):
             some = rays.take(kept)

@@ -83,7 +83,7 @@ ROOFS: Final[Mapping[Kind, tuple[RoofSettings, ...]]] = MappingProxyType(
 TUNNEL_CROWN: Final = RoofSettings(inner_m=0.0, outer_m=200.0, height_m=6.5, loss_db=200.0)
 
 
-def drawn_sections(
+def draw_sections(
     shares: Mapping[Kind, float], length_m: float, *, section_length_m: Between, seed: int
 ) -> tuple[SectionSettings, ...]:
     """Sections with exactly the given shares of a line, which add up to 1, in random order from 0 to its end.
