@@ -75,16 +75,9 @@ def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float 
 def interpolate_reference(
     time: Datetimes, reference_time: Datetimes, reference_ecef_m: Floats, *, largest_gap_s: float = LARGEST_GAP_S
 ) -> Floats:
-    """Reference positions at other times, linearly, shape (T, 3) [m]; NaN outside and in gaps.
+    """Reference positions, shape (R, 3), linearly at other times, shape (T, 3) [m]; NaN outside and in gaps.
 
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    reference_time : ndarray of datetime64[ns], shape (R,)
-        Rising.
-    reference_ecef_m : ndarray, shape (R, 3) [m]
-    largest_gap_s : float
-        Longest step of the reference that is bridged.
+    Times of the reference rise; steps longer than `largest_gap_s` are not bridged.
     """
     return bracket(time, reference_time, largest_gap_s=largest_gap_s).of(reference_ecef_m)
 
@@ -94,24 +87,13 @@ def along_track_error(
 ) -> Floats:
     """Signed distance on the map from the reference's point to the answer, + toward the end of the line (P1 3.3).
 
-    The distance along the line. Where the map passes the reference's place more than once (laps, a
-    road's two carriageways) the pass nearest to the answer counts: which of them it was, one epoch
-    of ranges cannot tell. And where the line comes back to near itself (a crossing), the straight
-    distance between the two points counts if it is shorter. On a line that passes every place once
-    neither has an effect, but for the chord of a curve.
+    The distance along the line. Where the map passes the reference's place more than once (laps, a road's two
+    carriageways) the pass nearest to the answer counts: which of them it was, one epoch of ranges cannot tell. And
+    where the line comes back to near itself (a crossing), the straight distance between the two points counts if it is
+    shorter. On a line that passes every place once neither has an effect, but for the chord of a curve.
 
-    Parameters
-    ----------
-    arc_m : ndarray, shape (T,) [m]
-        Answers along the trajectory; NaN where there is none.
-    reference_ecef_m : ndarray, shape (T, 3) [m]
-    same_place_m : float
-        Passes of the map up to this far from the reference are its place.
-
-    Returns
-    -------
-    ndarray, shape (T,) [m]
-        NaN where either is missing.
+    `arc_m` are the answers along the trajectory, shape (T,), `reference_ecef_m` of shape (T, 3); NaN where either is
+    missing. Passes of the map up to `same_place_m` from the reference are its place.
     """
     error = np.full(len(arc_m), np.nan)
     at = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))

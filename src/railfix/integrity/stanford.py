@@ -86,18 +86,12 @@ def stanford(
     error_m : array_like, shape (T,) [m]
         Along the track, signed or not; NaN where there is no position or no reference.
     level_m : array_like, shape (T,) [m]
-        Protection level; infinite where no error can be excluded, NaN where there is no position.
-        An error without a level counts as an infinite level.
-    alarm_limit_m : float [m]
+        Infinite where no error can be excluded, NaN where there is no position. An error without a level counts as one
+        with an infinite level.
     windows_s : sequence of float [s]
         Lengths of the windows of continuity: 15 s is an approach's in aviation; a minute, a station to the next.
     block_s : float [s]
         Length of the blocks, from the first epoch.
-
-    Raises
-    ------
-    ValueError
-        On arrays of different lengths, times that do not ascend, a negative level, limits that are not positive.
     """
     time = time.astype("datetime64[ns]")
     error, level = np.abs(np.asarray(error_m, dtype=np.float64)), np.asarray(level_m, dtype=np.float64)

@@ -42,7 +42,7 @@ def _filter_table(filtered: Mapping[str, Facts]) -> Table:
     levels = [each["level"] for each in found]
     if any(levels):
         rows += _metres("indicative protection level", levels, _OF_LEVEL)
-        rows.append(["  with a level", *(count(level and level["finite"]) for level in levels)])
+        rows.append(["  with a level", *(count(None if level is None else level["finite"]) for level in levels)])
     return _table("filter", filtered, rows, "Filter along the track (train.csv)")
 
 
@@ -71,7 +71,7 @@ def _epochs_table(antennas: Mapping[str, Facts], basis: str, caption: str) -> Ta
         rows += _metres(f"{basis} level", levels, _OF_LEVEL)
         for word in ("available", "alarm"):
             shares = [
-                share(level and _ratio(level[word], facts["epochs_with_observations"]))
+                share(None if level is None else _ratio(level[word], facts["epochs_with_observations"]))
                 for level, facts in zip(levels, every, strict=True)
             ]
             rows.append([f"  {word}", *shares])
@@ -117,7 +117,7 @@ def _ratio(part: float, whole: float) -> float | None:
 def _metres(what: str, found: Sequence[Facts | None], fields: Mapping[str, str]) -> Iterator[list[str]]:
     """Yield a row for each field of what was found of the antennas, None where nothing was."""
     for label, field in fields.items():
-        yield [f"{what}, {label}", *(number(each and each[field], 2, " m") for each in found)]
+        yield [f"{what}, {label}", *(number(None if each is None else each[field], 2, " m") for each in found)]
 
 
 def _table(name: str, heads: Iterable[str], rows: Sequence[Sequence[str]], caption: str) -> Table:

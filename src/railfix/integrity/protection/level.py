@@ -128,22 +128,14 @@ def along_track_level(
         T epochs on the line (`constrained_model`), after exclusions; 1/weight is the variance of the range.
     systems : sequence of str, length M
         Constellation letter of each channel.
-    risk : RiskBudget, optional
     scale : array_like, shape (T,) or ()
         Noise scale: multiplies the sigmas of the ranges, not the map error.
     overbound : RangeBounds, optional
         By default the sigma of each range is that of its weight times the scale, without bias.
-    map_error : MapDeviation, optional
     sides : ndarray of bool, shape (T, S, M), optional
         Sets of satellites that one reflection can make faulty together, each a hypothesis of `RiskBudget.side_prior`.
     n_excluded : array_like of int, shape (T,) or ()
         Satellites that fault detection left out at this epoch (not: what the screens rejected before).
-
-    Raises
-    ------
-    ValueError
-        A model in space, a number of systems that is not that of the channels, a constellation without prior,
-        a scale that is not positive.
     """
     if model.interest != 1:
         raise ValueError("a level along the track asks for a model on the line (constrained_model)")

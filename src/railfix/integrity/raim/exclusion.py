@@ -101,15 +101,13 @@ def detect(
     wsse : array_like, shape (T,)
         Weighted sum of squared residuals; NaN where there is no position.
     residual_m : array_like, shape (T, M) [m]
-        Residuals, 0 (or NaN) where not used; asked for in fixed mode only. Those of a `LinearModel`
-        allow for the map error, those of a `Constrained` position do not: the same only where the
-        map is taken as exact, as in P1 (a sigma of a millimetre).
+        0 (or NaN) where not used; asked for in fixed mode only. Those of a `LinearModel` allow for the map error, those
+        of a `Constrained` position do not: the same only where the map is taken as exact, as in P1 (a sigma of a
+        millimetre).
     freedom : array_like of int, shape (T,)
         Ranges beyond the unknowns: on the line ``ranges.n_used - ranges.n_clocks - 1``, in space - 3.
-    limits : RaimLimits, optional
     scale : array_like, shape (T,) or ()
-        Noise scale: standard deviation of this receiver's ranges over the sigmas of the weights.
-        Not used in fixed mode.
+        Standard deviation of this receiver's ranges over the sigmas of the weights. Not used in fixed mode.
     """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)
@@ -202,20 +200,11 @@ class _Trial:
 def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: ArrayLike = 1.0) -> Exclusion:
     """Test, and where a fault is detected try every single satellite, then every pair.
 
-    A subset is excluded when the rest passes and has `min_redundancy` degrees of freedom left, and
-    when each of its satellites is in error against the rest: by more than noise of its sigma
-    reaches (chi-square mode), by more than the square root of the limit (fixed mode). One goes
-    before two; of several the least statistic. Where another subset of the same size would be
-    excluded as well and fits worse by no more than noise explains (`separation_risk`), the epoch
-    is inseparable.
-
-    Parameters
-    ----------
-    model : LinearModel
-        T epochs; those without a fault cost next to nothing.
-    limits : RaimLimits, optional
-    scale : array_like, shape (T,) or ()
-        Noise scale, as in `detect`.
+    A subset is excluded when the rest passes and has `min_redundancy` degrees of freedom left, and when each of its
+    satellites is in error against the rest: by more than noise of its sigma reaches (chi-square mode), by more than the
+    square root of the limit (fixed mode). One goes before two; of several the least statistic. Where another subset of
+    the same size would be excluded as well and fits worse by no more than noise explains (`separation_risk`), the epoch
+    is inseparable. The noise scale, shape (T,) or (), is that of `detect`.
     """
     limits = limits or RaimLimits()
     epochs, channels = model.root_weight.shape
@@ -381,20 +370,15 @@ def exclude_faults(
 ) -> Exclusion:
     """Test the ranges of each epoch against each other and name up to two faulty satellites.
 
+    Positions without the excluded satellites are those of `position_on_line` with NaN in their codes.
+
     Parameters
     ----------
     ranges : Ranges
         Of `railfix.positioning.weighted_ranges`.
-    trajectory : Trajectory
     arc_m : ndarray, shape (T,) [m]
         Positions (`Constrained.arc_m` of `railfix.positioning.position_on_line`).
     scale : array_like, shape (T,) or ()
         Noise of the receiver over that of the sigmas.
-    limits : RaimLimits, optional
-
-    Returns
-    -------
-    Exclusion
-        Positions without the excluded satellites are those of `position_on_line` with NaN in their codes.
     """
     return exclude(constrained_model(ranges, trajectory, arc_m), limits=limits, scale=scale)

@@ -169,21 +169,9 @@ def constrained_model(
 ) -> LinearModel:
     """Model of positions along the line: distance d unknown, the map error a prior across and up (P1 2.2(3), P4).
 
-    Parameters
-    ----------
-    ranges : Ranges
-        T epochs.
-    trajectory : Trajectory
-        Its `sigma_plan_m` and `sigma_height_m` are the prior.
-    arc_m : ndarray, shape (T,) [m]
-        Positions, as `constrained_position` gives them; NaN where there is none.
-    section : ndarray of int, shape (T,), optional
-        Section of each position where `arc_m` is a point that two share.
-
-    Returns
-    -------
-    LinearModel
-        NaN in the epochs without a position.
+    The prior is `sigma_plan_m` and `sigma_height_m` of the trajectory. `arc_m`, shape (T,), are positions as
+    `constrained_position` gives them, with `section` where they are points that two sections share. The model is NaN in
+    the epochs without a position.
     """
     at = trajectory.segment_at(arc_m)[0] if section is None else section
     place, axes = trajectory.at_arc(arc_m), trajectory.axes_of(at)

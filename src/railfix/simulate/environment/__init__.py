@@ -17,13 +17,6 @@ from railfix.simulate.environment.settings import (
 from railfix.simulate.environment.structures import draw_sections
 
 __all__ = [
-    "KINDS",
-    "CorrelatorSettings",
-    "ElectrificationSettings",
-    "Environment",
-    "EnvironmentSettings",
-    "RoofSettings",
-    "RowSettings",
-    "SectionSettings",
-    "draw_sections",
-]
+    "KINDS", "CorrelatorSettings", "ElectrificationSettings", "Environment", "EnvironmentSettings", "RoofSettings",
+    "RowSettings", "SectionSettings", "draw_sections",
+]  # fmt: skip
