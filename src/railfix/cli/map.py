@@ -83,7 +83,10 @@ def check(
     if picture is not None:
         from railfix.report.plots.network import plot_track_quality
 
-        _make_folder(picture.parent)
+        try:
+            picture.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{picture.parent}: the folder cannot be made ({error.strerror})") from None
         plot_track_quality(quality, picture)
     _print_quality(quality, picture)
     if quality.errors:
@@ -224,13 +227,6 @@ app.command("service", cls=Command)(service)
 app.command("network", cls=Command)(network)
 app.command("route", cls=Command)(route)
 app.command("match", cls=Command)(match_command)
-
-
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path}: the folder cannot be made ({error.strerror})") from None
 
 
 def _qualities(text: str | None) -> list[int] | None:

@@ -269,12 +269,9 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
         source = "--set"
     if choices.screens is not None:
         values["screens"] = [] if choices.screens.strip() == "none" else _screens("--screens", choices.screens)
-    if choices.filter is not None:
-        values["filter"] = choices.filter
-    if choices.cn0_curve is not None:
-        values["cn0_curve"] = str(choices.cn0_curve)
-    if choices.error_model is not None:
-        values["error_model"] = str(choices.error_model)
+    for name in ("filter", "cn0_curve", "error_model"):
+        if (value := getattr(choices, name)) is not None:
+            values[name] = str(value)
     if choices.sbas:
         words = [str(path) for path in choices.sbas]
         values["sbas"] = "stream" if words == ["stream"] else words

@@ -176,19 +176,19 @@ def read_run(
         rows = rows.with_columns(pl.col("observed").fill_null(value=False))
     if conventional is not None:
         other = read_run(conventional, columns=NO_MORE)
-        _check_same_log(path, record, conventional, other.record)
+        of_run, of_other = (_log_hashes(entries) for entries in (record, other.record))
+        if of_run != of_other:
+            raise MismatchError(
+                f"{conventional}: is not a run on the log of {path}; give one whose observations are the same"
+            )
         unscreened = other.positions.select(*_KEYS, *CONVENTIONAL)
         rows = rows.drop(CONVENTIONAL).join(unscreened, on=_KEYS, how="left", maintain_order="left")
     return RunFolder(path=path, positions_path=file, positions=rows, record=record, table=table)
 
 
-def _check_same_log(path: Path, record: Mapping[str, Any], other: Path, of_other: Mapping[str, Any]) -> None:
-    logs = [
-        sorted(str(entry.get("sha256")) for entry in entries.get("inputs", ()) if entry["input"] in ("front", "rear"))
-        for entries in (record, of_other)
-    ]
-    if logs[0] != logs[1]:
-        raise MismatchError(f"{other}: is not a run on the log of {path}; give one whose observations are the same")
+def _log_hashes(record: Mapping[str, Any]) -> list[str]:
+    logs = [entry for entry in record.get("inputs", ()) if entry["input"] in ("front", "rear")]
+    return sorted(str(entry.get("sha256")) for entry in logs)
 
 
 def read_table(

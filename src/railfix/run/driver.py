@@ -289,9 +289,13 @@ def notes_of(
         *line.notes,
         *error_note(check_track(line.track)),
         *navigation.notes,
-        *_broken_notes(logs),
-        *tally.all_notes,
     ]
+    for name, log in logs.items():
+        notes += log.problems
+        if log.skipped:
+            skipped = ", ".join(f"{count} {what}" for what, count in sorted(log.skipped.items()))
+            notes.append(f"{name}: skipped: {skipped}")
+    notes += tally.all_notes
     for name, antenna in tally.antennas.items():
         notes += [
             f"{name}: screen {screen.name} has judged nothing; it needs {screen.needs}"
@@ -333,14 +337,6 @@ def _describe_detectable(detectable_m: Floats) -> str:
         f"an error of the map below {across:.0f} m across or {up:.0f} m in height is not excluded; where the ranges "
         f"are worst, below {most_across:.0f} m or {most_up:.0f} m (columns map_detectable_*)"
     )
-
-
-def _broken_notes(logs: Mapping[Antenna, Log]) -> Iterator[str]:
-    for name, log in logs.items():
-        yield from log.problems
-        if log.skipped:
-            skipped = ", ".join(f"{count} {what}" for what, count in sorted(log.skipped.items()))
-            yield f"{name}: skipped: {skipped}"
 
 
 def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
