@@ -164,14 +164,9 @@ class AntennaTally:
         self.map_detectable_m = np.stack([np.fmin(known[0], least), np.fmax(known[1], largest)])
         worst = int(np.nanargmax(offset.statistic))
         if self.map_offset is None or offset.statistic[worst] > self.map_offset.statistic:
-            self.map_offset = MapOffsetFound(
-                time=result.time[worst],
-                across_m=float(offset.across_m[worst]),
-                up_m=float(offset.up_m[worst]),
-                across_sigma_m=float(offset.across_sigma_m[worst]),
-                up_sigma_m=float(offset.up_sigma_m[worst]),
-                statistic=float(offset.statistic[worst]),
-            )
+            names = ("across_m", "up_m", "across_sigma_m", "up_sigma_m", "statistic")
+            values = {name: float(getattr(offset, name)[worst]) for name in names}
+            self.map_offset = MapOffsetFound(time=result.time[worst], **values)
 
     def _add_reasons(self, result: AntennaResult) -> None:
         seen = (result.reason & _NOT_A_REJECTION) == 0
