@@ -341,7 +341,7 @@ def _order(table: pl.DataFrame, grouping: str) -> pl.DataFrame:
     rank, group = f"{grouping}_rank", f"{grouping}_group"
     words = [pl.col(name).cast(pl.String) for name in KEYS]
     named = table.with_columns(*words, grouping=pl.lit(grouping), group=pl.col(group).cast(pl.String))
-    return named.sort(rank, "group", maintain_order=True).select(FIGURE_COLUMNS)
+    return named.sort(rank, "group", maintain_order=True).select(*FIGURE_COLUMNS)
 
 
 def at_largest(column: str, by: str) -> pl.Expr:

@@ -38,8 +38,8 @@ def _filter_table(filtered: Mapping[str, Facts]) -> Table:
         [status, *(count(each["status"][status]) for each in found)]
         for status in dict.fromkeys(word for each in found for word, epochs in each["status"].items() if epochs)
     ]
-    rows += _metres("sigma along the line", [each["along_sigma_m"] for each in found], _OF_SIGMA)
-    levels = [each["level"] for each in found]
+    rows += _metres("sigma along the line", [each.get("along_sigma_m") for each in found], _OF_SIGMA)
+    levels = [each.get("level") for each in found]
     if any(levels):
         rows += _metres("indicative protection level", levels, _OF_LEVEL)
         rows.append(["  with a level", *(count(None if level is None else level["finite"]) for level in levels)])
