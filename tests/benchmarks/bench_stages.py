@@ -115,7 +115,7 @@ def watched() -> Stages:
         setattr(holder, function, stages.timed(name, getattr(holder, function)))
     from railfix.run import driver
 
-    driver.aligned = stages.iterated("reading", driver.aligned)
+    driver.align_logs = stages.iterated("reading", driver.align_logs)
     return stages
 
 

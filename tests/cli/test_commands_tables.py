@@ -16,9 +16,9 @@ import pytest
 #: A table as wide as those of `railfix evaluate`, and one with a column an antenna.
 _SCRIPT = """
 from rich.table import Table
-from railfix.cli.console import console_of_tables, show_table
+from railfix.cli.console import TableConsole, show_table
 from railfix.core.tables import Table as Data
-console = console_of_tables()
+console = TableConsole()
 head = ["run", "antenna", *(f"figure {k} m" for k in range(15))]
 rows = [
     ["2024-03-05/results", "front", *(f"{1000 * row + 13.73 * k:.2f}" for k in range(15))] for row in range(3)

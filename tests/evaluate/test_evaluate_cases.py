@@ -32,7 +32,7 @@ from railfix.evaluate import (
     evaluate_run,
     evaluate_runs,
 )
-from railfix.evaluate.epochs import travelled, with_missing
+from railfix.evaluate.epochs import distance_travelled, with_missing
 from railfix.evaluate.figures import block_limits
 from railfix.evaluate.inputs import read_sections, tables_of
 from railfix.evaluate.intervals import BRANCH_COLUMNS, OUTAGE_COLUMNS
@@ -317,12 +317,12 @@ def test_standing_is_no_interval_and_turning_is_one(tmp_path: Path):
 def test_distance_over_a_turn_between_two_positions_is_the_way_and_not_the_displacement():
     time = START + timedelta(np.arange(5.0))
     chainage = np.array([0.0, 10.0, 20.0, 10.0, 0.0])
-    moved = travelled(
+    moved = distance_travelled(
         time, np.abs(np.diff(chainage)), np.ones(5, dtype=bool), np.full(5, np.nan), options=EvaluationOptions()
     )
     assert moved == pytest.approx([0.0, 10.0, 20.0, 30.0, 40.0])
     told = np.array([0.0, 0.1, 0.1, 0.1, 0.0])  # the reference says that it stands
-    moved = travelled(time, np.full(4, 0.4), np.ones(5, dtype=bool), told, options=EvaluationOptions())
+    moved = distance_travelled(time, np.full(4, 0.4), np.ones(5, dtype=bool), told, options=EvaluationOptions())
     assert moved == pytest.approx(np.zeros(5))
 
 

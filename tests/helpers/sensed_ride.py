@@ -164,7 +164,7 @@ def made(scenario: Scenario) -> Ride:
         samples=samples,
         units=units,
         balises=balises_of(simulation),
-        chainage_m=np.interp(geometry.chainage_m, line.sampled_chainage_m(), line.track().chainage_m),
+        chainage_m=np.interp(geometry.chainage_m, line.point_chainage_m(), line.track().chainage_m),
         speed_mps=geometry.speed_mps,
         along=np.cos(np.radians(geometry.elevation_deg))
         * np.cos(np.radians(geometry.azimuth_deg - geometry.heading_deg[:, None])),

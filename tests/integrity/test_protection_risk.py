@@ -14,7 +14,7 @@ import raim_oracle as oracle
 from protection_oracle import Event, hypotheses, kind_of, products
 from railfix.core.errors import SettingsError
 from railfix.integrity.protection import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, RiskBudget, k_factor
-from railfix.integrity.protection.risk import allocate, pair_sum, set_sums
+from railfix.integrity.protection.risk import allocate, set_sums
 
 pytestmark = pytest.mark.requirement("C2")
 
@@ -52,7 +52,7 @@ def test_fault_probabilities_bound_what_counting_gives():
         exact = np.zeros(n + 1)
         for state in product((0, 1), repeat=n):
             exact[sum(state)] += np.prod(np.where(state, prior, 1.0 - prior))
-        assert exact[2:3].sum() <= pair_sum(prior[None])[0] + 1e-15
+        assert exact[2:3].sum() <= set_sums(prior[None], 2)[0, 2] + 1e-15
         assert exact[3:].sum() <= set_sums(prior[None], 3)[0, 3] + 1e-15
         assert set_sums(prior[None], 3)[0, 3] <= 1.6 * exact[3:].sum() + 1e-15
     assert set_sums(np.full((1, 20), 2e-5), 3)[0, 3] == pytest.approx(1140 * 8e-15, rel=1e-9)

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from railfix.cli import app
 from railfix.core.errors import InputFileError
 from railfix.motion.features import Feature
-from railfix.run.locate import measured_features, read_measured
+from railfix.run.locate import find_features, read_measured
 
 pytestmark = pytest.mark.requirement("E3")
 RUNNER = CliRunner(env={"COLUMNS": "160", "TERM": "dumb", "NO_COLOR": "1"})
@@ -44,7 +44,7 @@ def test_changes_are_found_at_their_middles_and_repeat() -> None:
         Feature(arc_m=331.0, quantity="curvature", change=0.002),
         Feature(arc_m=802.0, quantity="gradient", change=-0.01),
     ]
-    found = measured_features(runs, of_map)
+    found = find_features(runs, of_map)
     assert [each.feature.quantity for each in found] == ["curvature", "curvature", "gradient"]
     places = [each.feature.arc_m for each in found]
     np.testing.assert_allclose(places, [330.0, 630.0, 800.0], atol=0.5)
@@ -59,10 +59,10 @@ def test_noise_and_a_gap_make_no_feature() -> None:
     flat = measured(1).with_columns(measured_curvature_1pm=pl.lit(0.0), measured_gradient_permille=pl.lit(0.0))
     random = np.random.default_rng(5)
     noisy = flat.with_columns(pl.Series("measured_gradient_permille", 10.0 * random.standard_normal(len(flat))))
-    assert measured_features([flat]) == []
-    assert measured_features([noisy]) == []
+    assert find_features([flat]) == []
+    assert find_features([noisy]) == []
     apart = pl.concat([flat.head(100), flat.tail(100).with_columns(pl.col("measured_gradient_permille") + 20.0)])
-    assert measured_features([apart]) == []  # nothing is known of what lies between
+    assert find_features([apart]) == []  # nothing is known of what lies between
 
 
 def test_slips_and_what_comes_just_before_them_are_left_out(tmp_path: Path) -> None:

@@ -315,7 +315,7 @@ def tails_of_hypotheses(
         `ProtectionLevel.separation`.
     """
     epochs = len(errors.scale)
-    whole = LinearModel.on_line(model)
+    whole = LinearModel(**model._asdict(), freedom=np.full(epochs, -1), interest=1)
     full = all_in_view(whole, errors.scale, errors.least_sigma_m, errors.bias_m, errors.map_bias_m)
     n = full.channel.shape[1]
     prior = np.take_along_axis(asked.prior, full.channel, axis=1) * full.used

@@ -176,7 +176,7 @@ def test_corrected_codes_are_true_ranges() -> None:
         found.time, satellite, found.signal[columns], code, simulation.navigation, record=fixes.record
     )
     tag = np.arange(30.0)
-    truth = simulation.truth("front", tag - simulation.clock_s("front", tag))[0].ecef_m
+    truth = simulation.truth("front", tag - simulation.clocks.bias_s("front", tag))[0].ecef_m
     distance, _ = range_with_rotation(states.position_ecef_m + fixes.position_m, truth[:, None])
     error = found.corrected_code_m[:, columns] - distance
     good = (found.reason[:, columns] == 0) & (found.elevation_deg[:, columns] > 30.0)

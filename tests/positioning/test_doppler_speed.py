@@ -41,7 +41,7 @@ class Simulated:
         simulation = Simulation(scenario)
         obs = concatenate(list(simulation.observations("front")))
         tags = seconds(obs.time - scenario.start)
-        true = tags - simulation.clock_s("front", tags)
+        true = tags - simulation.clocks.bias_s("front", tags)
         place, train_mps = simulation.truth("front", true)
         # The antenna is beyond the bogie: in curves its path is not the body's axis. Hence by difference.
         step = simulation.truth("front", true + 0.01)[0].ecef_m - simulation.truth("front", true - 0.01)[0].ecef_m

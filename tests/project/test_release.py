@@ -20,7 +20,7 @@ from packaging.requirements import Requirement
 from conftest import ROOT
 from public_names import KEPT, public_names
 from python_matrix import PROJECT, interpreter, supported_versions
-from railfix.core.commit import checked_out_commit
+from railfix.core.commit import read_commit
 from railfix.core.files import file_sha256
 from reproducible_build import built_twice
 from sbom import bill_of_materials
@@ -36,20 +36,20 @@ def git(folder: Path, *words: str) -> str:
 def test_the_commit_of_a_checkout_is_what_git_says(tmp_path: Path) -> None:
     root, other = tmp_path / "root", tmp_path / "other"
     root.mkdir()
-    assert checked_out_commit(root) == ""
+    assert read_commit(root) == ""
     git(root, "init", "-q")
-    assert checked_out_commit(root) == ""  # a branch without a commit
+    assert read_commit(root) == ""  # a branch without a commit
     git(root, "commit", "-q", "--allow-empty", "-m", "one")
     first = git(root, "rev-parse", "HEAD")
-    assert checked_out_commit(root) == first
+    assert read_commit(root) == first
     git(root, "worktree", "add", "-q", "-b", "area/side", str(other))
     git(other, "commit", "-q", "--allow-empty", "-m", "two")
-    assert checked_out_commit(other) == git(other, "rev-parse", "HEAD") != first
+    assert read_commit(other) == git(other, "rev-parse", "HEAD") != first
     git(root, "pack-refs", "--all")
     git(other, "pack-refs", "--all")
-    assert (checked_out_commit(root), checked_out_commit(other)) == (first, git(other, "rev-parse", "HEAD"))
+    assert (read_commit(root), read_commit(other)) == (first, git(other, "rev-parse", "HEAD"))
     git(root, "checkout", "-q", "--detach")
-    assert checked_out_commit(root) == first
+    assert read_commit(root) == first
 
 
 def commit_in_build(root: Path, *, version: str = "standard", target: str = "wheel") -> dict[str, str]:

@@ -227,7 +227,7 @@ class DopplerRun:
             obs, self.simulation.navigation, systems=("G", "J", "E"), signals=DEFAULT_SIGNALS
         )
         tags = seconds(obs.time - self.scenario.start)
-        true, _ = self.simulation.truth("front", tags - self.simulation.clock_s("front", tags))
+        true, _ = self.simulation.truth("front", tags - self.simulation.clocks.bias_s("front", tags))
         self.time, self.ecef_m = obs.time, true.ecef_m
         self.arc_m, _ = self.trajectory.nearest(true.ecef_m)
 

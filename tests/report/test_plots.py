@@ -168,8 +168,8 @@ def test_stanford_regions_are_written_where_they_are() -> None:
     """The words of each region stand inside it and tell its epochs; the limit may be anywhere."""
     rng = np.random.default_rng(3)
     error, level = rng.exponential(6.0, 500), rng.exponential(12.0, 500)
-    for limit, bin_m in ((10.0, None), (17.0, 0.5)):
-        diagram = sorted_epochs(times(np.arange(500)), error, level, alarm_limit_m=limit, bin_m=bin_m)
+    for limit in (10.0, 17.0):
+        diagram = sorted_epochs(times(np.arange(500)), error, level, alarm_limit_m=limit)
         chart = plots.stanford(diagram)
         marks = layer(chart, Marks)
         assert marks.place == "on"
@@ -192,9 +192,6 @@ def test_stanford_regions_are_written_where_they_are() -> None:
             assert y < chart.y_range[1]
         assert told == {name: int(mask.sum()) for name, mask in expected.items()}
         assert all(told.values())
-    # bins that end at the limit have no room for the regions beyond it
-    small = plots.stanford(sorted_epochs(times(np.arange(500)), error, level, alarm_limit_m=40.0, bin_m=0.4))
-    assert [words.split("\n")[0] for words in layer(small, Marks).words] == ["nominal", "misleading"]
 
 
 def test_levels_over_time(positions: pl.DataFrame) -> None:

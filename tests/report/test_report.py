@@ -21,7 +21,7 @@ from railfix.evaluate import Evaluation
 from railfix.evaluate.tables import error_tables, evaluation_of, group_tables, level_tables
 from railfix.pipeline.config import parse_config
 from railfix.report import read_runs, report_page, write_report
-from railfix.report.charts_page import packed, script_json
+from railfix.report.charts_page import pack_array, script_json
 from railfix.report.figures import NO_LEVELS, NO_OBSERVATIONS, NO_REFERENCE, NO_TIMES
 from railfix.report.runs import ReportedRun
 from railfix.run import RunOptions, RunSummary, run_files
@@ -534,8 +534,8 @@ def test_pieces_of_html() -> None:
     assert script_json({"a": "</script>\u2028"}) == '{"a":"\\u003c/script\\u003e\\u2028"}'
     with pytest.raises(ValueError, match="JSON"):
         script_json({"a": float("nan")})
-    np.testing.assert_array_equal(unpacked(packed(np.array([1.5, np.nan, -np.inf]))), [1.5, np.nan, -np.inf])
-    assert unpacked(packed(np.array([0, 70_000]), "i")).tolist() == [0, 70_000]
+    np.testing.assert_array_equal(unpacked(pack_array(np.array([1.5, np.nan, -np.inf]))), [1.5, np.nan, -np.inf])
+    assert unpacked(pack_array(np.array([0, 70_000]), "i")).tolist() == [0, 70_000]
     assert number(-1234.5) == "−1,234.50"
     assert number(None) == number(float("nan")) == share(None) == "–"
 

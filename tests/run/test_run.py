@@ -127,7 +127,7 @@ def test_used_satellites_agree_between_the_two_tables(whole: RunSummary) -> None
 def test_the_record_names_what_was_read(record: dict[str, Any]) -> None:
     inputs = demo_inputs()
     named = {(item["input"], item["path"]): item for item in record["inputs"]}
-    assert set(named) == {(name, str(path)) for name, path in inputs.named()}
+    assert set(named) == {(name, str(path)) for name, path in inputs.files_by_name()}
     for (_, path), item in named.items():
         content = Path(path).read_bytes()
         assert item["bytes"] == len(content)
@@ -371,6 +371,6 @@ def test_a_run_says_what_speaks_against_its_levels(whole: RunSummary, tmp_path: 
     assert any("RAIM has excluded" in note and "see risk.local_prior" in note for note in whole.notes)
     small = Config.model_validate({"risk": {"local_prior": 0.02}, "protection": "on"})
     summary = run_files(demo_inputs(), small, out=tmp_path / "out")
-    assert summary.levels["front"].without_budget > 1000
+    assert summary.record["antennas"]["front"]["protection_level"]["without_budget"] > 1000
     assert any("epochs without a protection level" in note for note in summary.notes)
     assert not any("RAIM has excluded" in note for note in summary.notes)

@@ -20,7 +20,7 @@ from railfix.core.errors import OutputError
 from railfix.gnss.observations import Observations
 from railfix.pipeline.tables import rounded
 from railfix.run.output import OutputFolder
-from railfix.run.sources import aligned
+from railfix.run.sources import align_logs
 
 START = np.datetime64("2026-05-12T03:00:00", "ns")
 
@@ -58,7 +58,7 @@ def times(chunks: list[dict[str, Observations]], name: str) -> list[int]:
 def test_every_epoch_comes_once_and_in_order(front: set[int], rear: set[int], sizes: tuple[int, int]) -> None:
     grids = {"front": sorted(100 * k for k in front), "rear": sorted(100 * k for k in rear)}
     logs = {n: parts(log(grids[n]), size) for n, size in zip(grids, sizes, strict=True)}
-    chunks = list(aligned(logs))
+    chunks = list(align_logs(logs))
     for name, grid in grids.items():
         assert times(chunks, name) == grid
     # Equal tags of the two antennas stand in the same chunk.
@@ -73,7 +73,7 @@ def test_every_epoch_comes_once_and_in_order(front: set[int], rear: set[int], si
 def test_tags_a_little_apart_stay_together() -> None:
     front = log([100 * k for k in range(40)])
     rear = log([100 * k + 3 for k in range(40)])
-    for chunk in aligned({"front": parts(front, 7), "rear": parts(rear, 5)}):
+    for chunk in align_logs({"front": parts(front, 7), "rear": parts(rear, 5)}):
         assert len(chunk["front"]) == len(chunk["rear"])
 
 
@@ -86,7 +86,7 @@ def test_an_antenna_that_starts_late_does_not_pile_up() -> None:
             read.append(len(part))
             yield part
 
-    chunks = aligned({"front": parts(front, 10), "rear": watched(rear)})
+    chunks = align_logs({"front": parts(front, 10), "rear": watched(rear)})
     for _ in range(50):
         next(chunks)
     assert sum(read) <= 20

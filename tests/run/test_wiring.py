@@ -207,7 +207,8 @@ def test_a_reason_alone_is_counted_apart_from_one_among_others() -> None:
 def test_the_report_states_both_rates() -> None:
     facts: Mapping[str, Any] = {
         "epochs": 200, "epochs_with_observations": 100, "epochs_with_position": 90, "status": {"ok": 60},
-        "positioning_rate": 0.9, "ok_rate": 0.6, "along_sigma_m": {"p50_m": 1.25, "p95_m": 2.75, "max_m": 3.5},
+        "positioning_rate": 0.9, "ok_rate": 0.6, "epochs_with_position_by_status": {"ok": 60, "map_offset": 30},
+        "along_sigma_m": {"p50_m": 1.25, "p95_m": 2.75, "max_m": 3.5},
     }  # fmt: skip
     run = cast(
         "ReportedRun",
@@ -224,7 +225,7 @@ def test_the_report_states_both_rates() -> None:
     epochs = {str(row[0]).strip(): str(row[1]) for row in tables[0].rows}
     assert epochs["positioning rate"] == "90.00 %"
     assert epochs["rate of ok"] == "60.00 %"
-    assert [epochs[name] for name in ("epochs", "with observations", "with position")] == ["200", "100", "90"]
+    assert [epochs[name] for name in ("epochs", "with observations", "with coordinates")] == ["200", "100", "90"]
 
 
 @pytest.mark.requirement("D2")

@@ -11,7 +11,7 @@ from railfix.core.arrays import Floats
 from railfix.gnss.observations import concatenate
 from railfix.simulate import ReceiverSettings, Scenario, Simulation, SkySettings
 from railfix.simulate.environment import Environment, EnvironmentSettings
-from railfix.simulate.environment.correlator import circular_reflection, received_amplitude
+from railfix.simulate.environment.correlator import circular_reflection, reflection_amplitude
 from railfix.simulate.environment.settings import (
     AntennaSettings,
     NeighbourSettings,
@@ -59,7 +59,7 @@ def test_a_wall_turns_the_polarisation_at_normal_incidence_and_keeps_it_at_grazi
 
 def test_the_antenna_weakens_the_left_handed_part_more_the_higher_it_is() -> None:
     antenna = AntennaSettings(cross_polar_zenith_db=20.0, cross_polar_horizon_db=6.0, wall_permittivity=9.0)
-    at = received_amplitude(np.array([1.0, 1.0, 1.0]), np.array([0.0, 0.5, 1.0]), antenna)
+    at = reflection_amplitude(np.array([1.0, 1.0, 1.0]), np.array([0.0, 0.5, 1.0]), antenna)
     assert 20.0 * np.log10(at / 0.5) == pytest.approx([-6.0, -13.0, -20.0])
 
 

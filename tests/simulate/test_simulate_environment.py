@@ -24,9 +24,9 @@ from railfix.simulate.environment import (
     RoofSettings,
     RowSettings,
     SectionSettings,
-    drawn_sections,
+    draw_sections,
 )
-from railfix.simulate.environment.correlator import edge_amplitude, strip_field, tracked
+from railfix.simulate.environment.correlator import edge_amplitude, strip_field, track_paths
 from railfix.simulate.environment.model import Electrification
 from railfix.simulate.environment.structures import build_structures
 from railfix.simulate.environment.walls import Rays, reflections, shadow
@@ -151,13 +151,13 @@ def numerical_correlator(fields: np.ndarray, late_chips: np.ndarray, spacing: fl
 def track(amplitude: list[float], extra_m: list[float], turn: list[float], rate: list[float] | None = None, **other):
     """One signal of several paths; `turn` is the phase that is not the extra path's."""
     field = np.array(amplitude)[:, None] * np.exp(1j * np.array(turn))[:, None]
-    return tracked(
+    return track_paths(
         field,
         np.array(extra_m)[:, None],
         np.array(rate or [0.0] * len(amplitude))[:, None],
         wavelength_m=np.array([WAVE]),
         chip_m=np.array([293.05]),
-        **{"spacing_chips": 0.1, "code_loop_hz": 1.0, "carrier_loop_hz": 10.0} | other,
+        receiver=CorrelatorSettings(**other),
     )
 
 
@@ -441,14 +441,14 @@ def test_a_mast_is_passed_under_where_the_satellite_stands_above_it() -> None:
     """The top is 5 m over the antenna and 3 m away: 59 deg."""
     bars = Electrification(MASTS)
     for elevation, least, most in ((30.0, 0.5, 0.85), (75.0, 0.97, 1.03)):
-        assert least < abs(bars.transmitted(rays(500.0, elevation, 90.0))[0]) < most
+        assert least < abs(bars.transmit(rays(500.0, elevation, 90.0))[0]) < most
 
 
 def test_a_beam_is_passed_when_it_is_in_the_line_of_sight() -> None:
     """3.5 m over the antenna, satellite 45 deg ahead: the beam of mast 500 stands in its way from 496.5 m."""
     settings = MASTS.replaced(beam_every=1, sides="right", lateral_m=4.0)
     bars = Electrification(settings)
-    there, before, after = (abs(bars.transmitted(rays(s, 45.0, 0.0))[0]) for s in (496.5, 493.0, 500.5))
+    there, before, after = (abs(bars.transmit(rays(s, 45.0, 0.0))[0]) for s in (496.5, 493.0, 500.5))
     assert there < 0.85
     assert before == pytest.approx(1.0, abs=0.15)
     assert after == pytest.approx(1.0, abs=0.15)
@@ -458,7 +458,7 @@ def test_a_beam_is_passed_when_it_is_in_the_line_of_sight() -> None:
 def test_what_a_mast_throws_goes_the_shortest_way(relative_deg: float, elevation_deg: float) -> None:
     """Fermat: the extra path is the least of |P| - P . u over the points P of the mast."""
     ray = rays(501.0, elevation_deg, relative_deg)
-    amplitude, extra, growth = Electrification(MASTS).scattered(ray)[0]
+    amplitude, extra, growth = Electrification(MASTS).scatter(ray)[0]
     u = np.array([ray.x[0], ray.y[0], ray.z[0]])
     foot = np.array([-1.0, -3.0 if relative_deg > 0.0 else 3.0, 0.0])
 
@@ -597,7 +597,7 @@ def test_the_simulator_takes_it_at_its_seam() -> None:
 
 def test_shares_become_sections_of_that_length() -> None:
     shares = {"open": 0.25, "suburban": 0.4, "urban": 0.25, "tunnel": 0.1}
-    sections = drawn_sections(shares, 20_000.0, section_length_m=(150.0, 800.0), seed=4)  # type: ignore[arg-type]
+    sections = draw_sections(shares, 20_000.0, section_length_m=(150.0, 800.0), seed=4)  # type: ignore[arg-type]
     assert sections[0].from_m == 0.0
     assert sections[-1].to_m == pytest.approx(20_000.0)
     for kind, share in shares.items():

@@ -377,7 +377,7 @@ def test_receiver_clocks_walk() -> None:
         scenario = Scenario(**base | {"receiver": QUIET.replaced(clocks=clocks)})  # type: ignore[arg-type]
         on = Simulation(scenario.replaced(errors=ErrorSettings(clock=errors)))
         off = Simulation(scenario)
-        return (on.clock_s(antenna, time) - off.clock_s(antenna, time)) * SPEED_OF_LIGHT
+        return (on.clocks.bias_s(antenna, time) - off.clocks.bias_s(antenna, time)) * SPEED_OF_LIGHT
 
     walk = wander(ClockWalkSettings(walk_m_per_sqrt_s=0.05))
     assert walk[0] == 0.0

@@ -56,7 +56,7 @@ def radius_through(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
 def test_the_map_is_like_the_test_line_of_the_paper() -> None:
     track = LINE.track()
     spacing = np.diff(track.chainage_m)
-    curved = (LINE.curvature_at(LINE.sampled_chainage_m()[:-1] + 0.1)) != 0.0
+    curved = (LINE.curvature_at(LINE.point_chainage_m()[:-1] + 0.1)) != 0.0
     assert len(track) == 189
     assert track.chainage_m[-1] == pytest.approx(756.0, abs=0.01)
     assert spacing.max() < 20.01
@@ -126,7 +126,7 @@ def test_the_antenna_is_where_the_map_says(tmp_path: Path, antenna: str) -> None
     # Bodies whose antenna stands abeam the chainages of the path's own points.
     middle = np.linspace(8.0, 748.0, 7401)
     truth = antenna_truth(LINE, vehicle, offset, middle)
-    mapped = np.interp(truth.chainage_m, LINE.sampled_chainage_m(), LINE.track().chainage_m)
+    mapped = np.interp(truth.chainage_m, LINE.point_chainage_m(), LINE.track().chainage_m)
     place = np.stack([np.interp(path.chainage_m, mapped, truth.ecef_m[:, k]) for k in range(3)], axis=1)
     inside = (path.chainage_m > mapped[0]) & (path.chainage_m < mapped[-1])
     assert inside.sum() > 185
@@ -321,7 +321,7 @@ def test_the_map_is_off_by_the_error_that_was_asked_for() -> None:
     error = MapError(plan_sigma_m=0.3, height_sigma_m=0.6, correlation_m=200.0, seed=3)
     line = build_alignment(LineSettings(length_m=60_000.0, map_error=error))
     clean = build_alignment(LineSettings(length_m=60_000.0))
-    s = line.sampled_chainage_m()
+    s = line.point_chainage_m()
     np.testing.assert_array_equal(line.at(s[:50]), clean.at(s[:50]), "the truth is the same")
     latitude, longitude, _ = geodetic_from_ecef(clean.at(s))
     off = np.einsum("nij,nj->ni", enu_axes(latitude, longitude), line.track().ecef_m - clean.at(s))

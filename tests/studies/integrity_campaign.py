@@ -104,7 +104,7 @@ class Played:
     def true_chainage_m(self, piece: Any) -> np.ndarray:
         """Chainage of the truth as the track map counts."""
         line = self.simulation.line
-        return np.interp(piece.geometry.chainage_m, line.sampled_chainage_m(), line.track().chainage_m)
+        return np.interp(piece.geometry.chainage_m, line.point_chainage_m(), line.track().chainage_m)
 
 
 def gather(run: int, runs: Runs, folder: Path) -> None:

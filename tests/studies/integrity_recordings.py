@@ -460,14 +460,14 @@ def table(groups: list[Group]) -> list[str]:
         level, error = _joined(group, "level_m"), np.abs(_joined(group, "error_m"))
         alone, sigma = _joined(group, "fault_free_m"), _joined(group, "sigma_m")
         finite, both = np.isfinite(level), np.isfinite(level) & np.isfinite(error)
-        blocks = [one.diagram(20.0, one.level_m).blocks for one in group]
+        diagrams = [one.diagram(20.0, one.level_m) for one in group]
         words = [
             f"{_name(group)} {len(level):6d} {finite.sum():6d} {sum(one.alarms.sum() for one in group):6d}",
             f"{_percentile(level, 50):7.1f} {_percentile(level, 95):6.1f} {_percentile(alone[finite], 50):7.1f}",
             f"{_percentile(error, 50):6.2f} {_percentile(error, 95):5.1f} {np.nanmax(error):5.1f}",
             f"{_percentile(error[both] / sigma[both], 68):10.2f} {(error[both] / level[both]).max():13.2f}",
             f"{np.count_nonzero(error[both] > level[both]):7d}",
-            f"{sum(np.count_nonzero(b.misleading) for b in blocks):3d}/{sum(len(b.start) for b in blocks):3d}",
+            f"{sum(d.misleading_blocks for d in diagrams):3d}/{sum(d.blocks for d in diagrams):3d}",
             f"{np.count_nonzero(error[both] > alone[both]):7d}",
         ]
         rows.append(" ".join(words))

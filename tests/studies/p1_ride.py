@@ -165,7 +165,7 @@ class Bench:
         self.name = name
         line = self.simulation.line
         track = line.track()
-        self.sampled, self.mapped = line.sampled_chainage_m(), track.chainage_m
+        self.sampled, self.mapped = line.point_chainage_m(), track.chainage_m
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "vehicle.toml"
             write_toml(path, vehicle_table(scenario.vehicle))

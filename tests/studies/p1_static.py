@@ -142,7 +142,7 @@ def subsets(start: np.datetime64, seed: int, size: int, place: Place, places: Se
     observations, geometry = piece.observations, piece.geometry
     still = np.flatnonzero(np.abs(geometry.speed_mps) < 1e-6)
     line = simulation.line
-    true = np.interp(geometry.chainage_m, line.sampled_chainage_m(), line.track().chainage_m)
+    true = np.interp(geometry.chainage_m, line.point_chainage_m(), line.track().chainage_m)
     kind = classes_of(simulation, geometry.chainage_m)
     high = np.isfinite(observations.code_m) & (geometry.elevation_deg > MASK_DEG + 0.1)
     wanted = [k for k, name in enumerate(observations.satellite) if name[0] == "G" and name != "G02"]

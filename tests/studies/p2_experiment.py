@@ -26,7 +26,7 @@ from railfix.motion.samples import InertialSamples, SensorSamples, TachometerPul
 from railfix.motion.slip import MotionSamples, MotionState, SlipLimits, SlipResult, find_slips
 from railfix.motion.tachometer import TachometerLimits, pulse_speeds, way_m
 from railfix.pipeline import sensed_motion as stage
-from railfix.run.locate import measured_features
+from railfix.run.locate import find_features
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario_file import load_recipe
@@ -269,7 +269,7 @@ def measured(seed: int) -> tuple[pl.DataFrame, stage.SensedMotion]:
 def feature_lines(seeds: Sequence[int] = (1, 2)) -> Iterator[str]:
     """Table 1: gaps between the features that two runs show, by the wheel; figures 7 and 8: cant and curvature."""
     runs = [measured(seed)[0] for seed in seeds]
-    found = measured_features(runs)
+    found = find_features(runs)
     for quantity in ("gradient", "curvature"):
         places = [f.places_m for f in found if f.feature.quantity == quantity and len(f.places_m) == len(seeds)]
         gaps = [(b - a) @ [1.0, -1.0] for a, b in combinations(places, 2)]

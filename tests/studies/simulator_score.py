@@ -76,7 +76,9 @@ def receivers() -> Iterator[Row]:
     settings = {"duration_s": 7200.0, "rate_hz": 1.0, "run": STANDING}
     walks = ErrorSettings(clock=ClockWalkSettings(walk_m_per_sqrt_s=0.05))
     seconds = np.arange(7200.0)
-    on, off = (Simulation(Scenario(**settings, errors=e)).clock_s("front", seconds) for e in (walks, ErrorSettings()))  # type: ignore[arg-type]
+    on, off = (
+        Simulation(Scenario(**settings, errors=e)).clocks.bias_s("front", seconds) for e in (walks, ErrorSettings())
+    )  # type: ignore[arg-type]
     steps = np.diff(on - off) * SPEED_OF_LIGHT
     yield "receiver clock, walk [m/sqrt(s)]", 0.05, float(steps.std())
     offset = ErrorSettings(intersystem={"E": InterSystemSettings(offset_m=-4.0, drift_mps=0.02)})

@@ -88,7 +88,7 @@ def scored(simulation: Simulation, scores: dict[str, Score]) -> None:
         return slope / np.sqrt(1.0 + slope**2)
 
     edges_s = np.arange(1.0, scenario.duration_s, STRETCH_S)
-    true = np.interp(simulation.motion.at(edges_s)[0], line.sampled_chainage_m(), line.track().chainage_m)
+    true = np.interp(simulation.motion.at(edges_s)[0], line.point_chainage_m(), line.track().chainage_m)
     noise = np.random.default_rng(scenario.seed).normal(size=len(edges_s)) * PLACE_SIGMA_M
     place = trajectory.arc_at_chainage(np.clip(true, *trajectory.chainage_m[[0, -1]])) + noise
     slips = wheel_slips(simulation, scenario.sensors.tachometer)  # type: ignore[union-attr, arg-type]

@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 
 from railfix.cli.console import (
-    console_of_tables,
+    TableConsole,
     prepare_kernels,
     progress_bar,
     show_files,
@@ -69,9 +69,7 @@ def campaign(
     a row with its error.
     Runs whose results are there, of the same inputs and settings, are not repeated.
 
-    Example:
-
-        railfix campaign line.toml --out results --workers 8
+    Example: `railfix campaign line.toml --out results --workers 8`
 
     Exit codes as `railfix --help` says; 5 where some runs have failed, 7 where every one has.
     """
@@ -81,7 +79,7 @@ def campaign(
     failed = table.filter(status="failed")
     report = report_campaign(table, out)
     page = write_campaign_page(report, out / "campaign.html", title=f"railfix campaign: {path.stem}")
-    console = console_of_tables()
+    console = TableConsole()
     show_verdict(console, [*report.sentences, f"next: open {page}"])
     for found in report.tables:
         show_table(console, found)
@@ -160,9 +158,7 @@ def benchmark(
     Into DIR come `benchmark.csv`, `benchmark.json` and `benchmark.md`, and the folders of the runs; a run that is
     there, of the same inputs and settings, is not repeated.
 
-    Example:
-
-        railfix benchmark cases --out benchmark
+    Example: `railfix benchmark cases --out benchmark`
 
     Exit codes as `railfix --help` says; 5 where some cases have failed, 7 where every one has.
     """
@@ -170,7 +166,7 @@ def benchmark(
     with executor_of(workers, None) as (executor, lost):
         prepare_kernels()
         table, notes = run_benchmark(folder, config, out=out, executor=executor, progress=show_progress, lost=lost)
-    console = console_of_tables()
+    console = TableConsole()
     head = ["\n".join(pair) for pair in zip(*heads(), strict=True)]
     caption = "Errors in metres along the line and straight; second line: performance feature of EN 16803-1"
     show_table(console, listed(head, shown_rows(table), caption, texts=2))
@@ -213,9 +209,7 @@ def ablate(
 
         railfix ablate ... --tachometer pulses.csv --inertial imu.csv --filter track --out sources
 
-    Exit codes: 0 done; 2 the command line was misused; 3 an input file is not what it should be;
-    4 a setting is wrong; 5 the inputs do not match each other; 7 not one position; 8 DIR cannot be
-    written; 1 a defect of railfix.
+    Exit codes as `railfix --help` says.
     """
     settings, asked = settings_of(choices)
     inputs = inputs.replaced(config=choices.config)
@@ -228,7 +222,7 @@ def ablate(
 
 def show_ablation(ablation: Ablation) -> None:
     """One table an antenna, the notes, and where the results are."""
-    console = console_of_tables()
+    console = TableConsole()
     for antenna in dict.fromkeys(effect.antenna for effect in ablation.effects):
         _show(console, [effect for effect in ablation.effects if effect.antenna == antenna])
     show_notes(console, ablation.notes)

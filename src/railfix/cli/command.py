@@ -147,10 +147,10 @@ class LazyCommands(Commands):
         if near:
             ctx.fail(f"there is no command {word!r}; is {near[0]!r} meant?")
         name, command, rest = super().resolve_command(ctx, args)
-        return name, loaded(str(name), self.modules.get(str(name))) if name in self.summaries else command, rest
+        return name, load_command(str(name), self.modules.get(str(name))) if name in self.summaries else command, rest
 
 
-def loaded(name: str, module_name: str | None = None) -> Any:
+def load_command(name: str, module_name: str | None = None) -> Any:
     """Return a command, imported from its module in `railfix.cli`: by default that of its name."""
     word = name.replace("-", "_")
     gc.disable()  # nothing of what an import makes is garbage: looking for it takes a tenth of the start

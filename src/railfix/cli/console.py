@@ -21,14 +21,13 @@ from rich.text import Text
 
 from railfix import kernels
 from railfix.core.reasons import Status
-from railfix.core.tables import Table, listed, plural
+from railfix.core.tables import Table, plural
+from railfix.run.budget import budget_tables, level_basis
 
 if TYPE_CHECKING:
     from railfix.evaluate import Evaluation
     from railfix.run import RunSummary
     from railfix.run.driver import Progress as ProgressCall
-    from railfix.run.record import Filtered
-    from railfix.run.tally import AntennaTally
 
 
 #: Statuses of the filter whose places are vouched for.
@@ -41,11 +40,10 @@ _OVERCONFIDENT: Final = 3.0
 
 def verdict_of_run(summary: RunSummary) -> list[str]:
     """Say where a run was, how good and how sure its positions are, what is wrong, and what to do next."""
-    table = "train" if summary.tracks else "positions"
-    file = summary.files[f"{table}.parquet"]
+    file = summary.files.get("train.parquet", summary.files["positions.parquet"])
     chainage = pl.scan_parquet(file).select("antenna", "chainage_m")
     lines = []
-    for name, antenna in summary.tally.antennas.items():
+    for name, facts in summary.record["antennas"].items():
         of_antenna = chainage.filter(antenna=name).select(
             pl.len().alias("epochs"),
             pl.col("chainage_m").count().alias("positions"),
@@ -53,16 +51,16 @@ def verdict_of_run(summary: RunSummary) -> list[str]:
             pl.col("chainage_m").max().alias("last"),
         )
         found = of_antenna.collect().row(0, named=True)
-        track = summary.tracks.get(name)
-        sigma = summary.sigma.get(name) if track is None else track.along_sigma_m
-        level = summary.levels.get(name) if track is None else track.level
-        text = f"{name}: a position in {found['positions']:,} of {antenna.epochs:,} epochs"
+        filtered = facts["filter"]
+        sigma = (filtered or facts)["along_sigma_m"]
+        level = filtered["level"] if filtered else facts["protection_level"]
+        text = f"{name}: a position in {found['positions']:,} of {facts['epochs']:,} epochs"
         if found["positions"]:
             text += f", chainage {found['first']:.0f} to {found['last']:.0f} m"
         if sigma is not None:
-            text += f"; standard deviation {sigma.p50_m:.1f} m, largest {sigma.max_m:.1f} m"
-        if level is not None and level.p50_m is not None:
-            text += f"; {summary.level_basis} level {level.p50_m:.0f} m at the median"
+            text += f"; standard deviation {sigma['p50_m']:.1f} m, largest {sigma['max_m']:.1f} m"
+        if level is not None and level["p50_m"] is not None:
+            text += f"; {level_basis(summary.record)} level {level['p50_m']:.0f} m at the median"
         lines.append(text)
     lines.append(_doubts(summary))
     lines += [f"likely cause: {cause}" for cause in summary.causes.values() if cause][:1]
@@ -72,18 +70,18 @@ def verdict_of_run(summary: RunSummary) -> list[str]:
 
 def _doubts(summary: RunSummary) -> str:
     """Say how many single epochs failed a check, of which kind most are, and how many notes there are."""
-    statuses: Counter[str] = Counter()
-    for antenna in summary.tally.antennas.values():
-        statuses.update(antenna.status)
+    statuses, of_filter = Counter[str](), Counter[str]()
+    for facts in summary.record["antennas"].values():
+        statuses.update(facts["status"])
+        of_filter.update(
+            {word: n for word, n in (facts["filter"] or {"status": {}})["status"].items() if word not in _SOUND}
+        )
     lost = statuses.pop(Status.NO_OBSERVATION.text, 0)
     passed = statuses.pop(Status.OK.text, 0)
     failed = statuses.total()
     text = f"in doubt: {failed:,} of {failed + passed:,} single epochs with observations did not pass every check"
     if failed:
         text += f", most of them {statuses.most_common(1)[0][0]}"
-    of_filter: Counter[str] = Counter()
-    for track in summary.tracks.values():
-        of_filter.update({word: count for word, count in track.status.items() if word not in _SOUND})
     if of_filter.total():
         text += "; of the filter " + ", ".join(f"{count:,} {word}" for word, count in of_filter.items() if count)
     if lost:
@@ -137,19 +135,26 @@ def prepare_kernels() -> None:
 
 #: Width of tables where the output is no terminal, so that no cell is cut or folded.
 _FILE_WIDTH: Final = 500
+#: Findings of a map printed before the rest is only counted.
+MOST_FINDINGS: Final = 40
 #: Signs of a page in the characters of every terminal.
 _PLAIN: Final = str.maketrans("−–", "--")
 
 
 class TableConsole(Console):
-    """The standard output; a table that is wider than it is printed in parts, and no number is cut or folded."""
+    """The standard output: text as it is; a table that is wider is printed in parts, and no number is cut or folded."""
+
+    def __init__(self) -> None:
+        super().__init__(highlight=False)
+        if not self.is_terminal:
+            self.width = max(self.width, _FILE_WIDTH)
 
     def print(self, *objects: Any, **options: Any) -> None:
         """Print as `rich` does, tables in parts that fit."""
         for item in objects or ("",):
             if isinstance(item, RichTable):
                 for part in split_table(item, self):
-                    super().print(part, crop=False, **options)
+                    super().print(part, crop=False, soft_wrap=False, **options)
             else:
                 super().print(item, **options)
 
@@ -186,18 +191,10 @@ def _with_columns(table: RichTable, columns: Sequence[TableColumn]) -> RichTable
     return part
 
 
-def console_of_tables() -> Console:
-    """Return the standard output for tables, wide enough for whole rows in a log file."""
-    console = TableConsole(highlight=False)
-    if not console.is_terminal:
-        console.width = max(console.width, _FILE_WIDTH)
-    return console
-
-
 def show_table(console: Console, table: Table, *, most: int | None = None) -> None:
     """Print a table of results under its caption, at most so many rows."""
     if table.caption:
-        console.print(table.caption, markup=False, soft_wrap=True)
+        console.print(table.caption)
     if not table.rows:
         return
     plain = RichTable(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
@@ -209,26 +206,26 @@ def show_table(console: Console, table: Table, *, most: int | None = None) -> No
         shown.add_row(*(Text(cell.translate(_PLAIN)) for cell in row))
     console.print(shown)
     if most is not None and len(table.rows) > most:
-        console.print(f"  the first {most} of {len(table.rows)}; all are in the files (--out)")
+        console.print(f"... and {len(table.rows) - most} more")
 
 
 def show_verdict(console: Console, lines: Iterable[str]) -> None:
     """Print the first lines of a command, and a blank one."""
     for line in lines:
-        console.print(line, markup=False, soft_wrap=True)
+        console.print(line)
     console.print()
 
 
 def show_notes(console: Console, notes: Iterable[str]) -> None:
     """Print notes, one per line."""
     for note in notes:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
+        console.print(f"note: {note}")
 
 
 def show_files(console: Console, paths: Iterable[Path]) -> None:
     """Print the files that were written."""
     for path in paths:
-        console.print(f"wrote {path}", markup=False, soft_wrap=True)
+        console.print(f"wrote {path}")
 
 
 @contextmanager
@@ -259,98 +256,11 @@ def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
 
 def show_summary(summary: RunSummary) -> None:
     """Epochs, positions, statuses, the budget of reasons, and where the results are."""
-    console = console_of_tables()
-    names = list(summary.tally.antennas)
+    console = TableConsole()
     show_verdict(console, verdict_of_run(summary))
-    if summary.tracks:
-        show_table(console, _filter(summary.tracks))
-    show_table(console, _positions(summary, names))
-    show_table(console, _reasons(summary, names))
+    for table in budget_tables(summary.record["antennas"], level_basis(summary.record)):
+        show_table(console, table)
     show_notes(console, summary.notes)
     show_files(console, summary.files.values())
     rate = summary.tally.epochs / summary.wall_s
     console.print(f"{summary.tally.epochs:,} epochs in {summary.wall_s:.2f} s ({rate:,.0f} epochs/s, reading included)")
-
-
-def _positions(summary: RunSummary, names: list[str]) -> Table:
-    tally, sigma, levels = summary.tally.antennas, summary.sigma, summary.levels
-    rows = [
-        ["epochs", *(f"{tally[n].epochs:,}" for n in names)],
-        ["with observations", *(f"{tally[n].observed:,}" for n in names)],
-    ]
-    for head, of_antenna in (
-        ("with coordinates", {n: tally[n].status_positioned for n in names}),
-        ("without coordinates", {n: _without(tally[n]) for n in names}),
-    ):
-        if any(of_antenna[n].total() for n in names):
-            rows.append([head, *(f"{of_antenna[n].total():,}" for n in names)])
-        for status in Status:
-            if any(of_antenna[n][status.text] for n in names):
-                rows.append([f"  {status.text}", *(f"{of_antenna[n][status.text]:,}" for n in names)])
-                if status is Status.TOO_FEW_SATELLITES:
-                    rows += _rows_of_few([tally[n] for n in names])
-    rows.append(["positioning rate", *(_percent(tally[n].positioned, tally[n].observed) for n in names)])
-    rows.append(["rate of ok", *(_percent(tally[n].status[Status.OK.text], tally[n].observed) for n in names)])
-    rows += _metres("sigma along the line", [sigma.get(n) for n in names], _OF_SIGMA)
-    if levels:
-        rows += _metres(f"{summary.level_basis} level", [levels.get(n) for n in names], _OF_LEVEL)
-        for word in ("available", "alarm"):
-            shown = [_percent(getattr(levels[n], word), tally[n].observed) if n in levels else "-" for n in names]
-            rows.append([f"  {word}", *shown])
-    caption = "Each epoch by itself (positions.csv)" if summary.tracks else ""
-    return listed(["", *names], rows, caption, boxed=True)
-
-
-def _filter(tracks: Mapping[str, Filtered]) -> Table:
-    rows = []
-    for status in dict.fromkeys(word for found in tracks.values() for word in found.status):
-        if any(found.status[status] for found in tracks.values()):
-            rows.append([status, *(f"{found.status[status]:,}" for found in tracks.values())])
-    rows += _metres("sigma along the line", [found.along_sigma_m for found in tracks.values()], _OF_SIGMA)
-    levels = [found.level for found in tracks.values()]
-    if any(levels):
-        rows += _metres("indicative protection level", levels, _OF_LEVEL)
-        rows.append(["  with a level", *("-" if level is None else f"{level.finite:,}" for level in levels)])
-    return listed(["", *tracks], rows, "Filter along the track (train.csv)", boxed=True)
-
-
-#: Fields of `AlongSigma`, and of `Levels` and `FilterLevel`, by their names in the tables.
-_OF_SIGMA: Final = {"p50": "p50_m", "p95": "p95_m", "largest": "max_m"}
-_OF_LEVEL: Final = {"p50": "p50_m", "p95": "p95_m"}
-
-
-def _metres(what: str, found: Sequence[Any], fields: Mapping[str, str]) -> Iterator[list[str]]:
-    """Yield a row for each field of what was found of the antennas, None where nothing was."""
-    for label, field in fields.items():
-        values = [None if of_antenna is None else getattr(of_antenna, field) for of_antenna in found]
-        yield [f"{what}, {label}", *("-" if value is None else f"{value:.2f} m" for value in values)]
-
-
-def _without(antenna: AntennaTally) -> Counter[str]:
-    """Epochs with observations and without coordinates, by status."""
-    counts = antenna.status - antenna.status_positioned
-    del counts[Status.NO_OBSERVATION.text]
-    return counts
-
-
-def _rows_of_few(antennas: list[AntennaTally]) -> Iterator[list[str]]:
-    """Yield epochs with too few satellites: the reason that left too few, and those that it alone did."""
-    for reason in dict.fromkeys(name for a in antennas for name, count in a.short_first.most_common() if count):
-        yield [f"    by {reason}", *(f"{a.short_first[reason]:,} ({a.short_only[reason]:,} alone)" for a in antennas)]
-
-
-def _reasons(summary: RunSummary, names: list[str]) -> Table:
-    tally = summary.tally.antennas
-    rows = [
-        ["observed", *(cell for n in names for cell in (f"{tally[n].observations:,}", ""))],
-        ["used", *(cell for n in names for cell in (f"{tally[n].used:,}", ""))],
-    ]
-    for reason in dict.fromkeys(reason for n in names for reason, _ in tally[n].first_reason.most_common()):
-        cells = [f"{counts[reason]:,}" for n in names for counts in (tally[n].first_reason, tally[n].only_reason)]
-        rows.append([f"  {reason}", *cells])
-    caption = "Rejected pseudoranges by their first reason, and by that reason alone"
-    return listed(["", *(head for n in names for head in (n, "alone"))], rows, caption, boxed=True)
-
-
-def _percent(part: int, total: int) -> str:
-    return f"{100 * part / total:.2f} %" if total else "-"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
@@ -12,7 +11,7 @@ import typer
 from rich.console import Console
 
 from railfix.cli.console import (
-    console_of_tables,
+    TableConsole,
     show_files,
     show_notes,
     show_table,
@@ -56,19 +55,20 @@ _MOST_BEYOND: Final = 5
 
 def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: Literal["nothing", "p1"]) -> None:
     """Figures of each run, then by groups, then where the files are."""
-    console = console_of_tables()
+    console = TableConsole()
     show_verdict(console, verdict_of_evaluation(evaluation))
-    write = partial(console.print, markup=False, soft_wrap=True)
     for run in evaluation.runs:
-        write(f"{run.name}: {run.configuration}; line {run.line}")
+        console.print(f"{run.name}: {run.configuration}; line {run.line}")
         for antenna, method in run.method.items():
             by = "differences of chainage" if method == "chainage" else "along the trajectory"
-            write(f"  {antenna}: against {run.reference}, {by}; {run.outside[antenna]:,} epochs outside the reference")
+            console.print(
+                f"  {antenna}: against {run.reference}, {by}; {run.outside[antenna]:,} epochs outside the reference"
+            )
         show_notes(console, run.notes)
     for table in error_tables(evaluation):
         show_table(console, table)
     for text in dict.fromkeys(prior_basis_text(run.protection) for run in evaluation.runs if run.protection):
-        write(f"Protection levels: {text}")
+        console.print(f"Protection levels: {text}")
     for table in level_tables(evaluation, worst=_MOST_BEYOND):
         show_table(console, table)
     for table in group_tables(evaluation):
@@ -128,9 +128,7 @@ def evaluate(
 
         railfix evaluate gps gps-qzs --reference auto --label GPS --label GPS+QZS
 
-    Exit codes: 0 done; 2 the command line was misused; 3 an input file is not what it should be;
-    4 a setting is wrong; 5 run, reference and line do not match each other; 8 DIR cannot be written;
-    1 a defect of railfix.
+    Exit codes as `railfix --help` says.
     """
     if unknown := [name for name in inputs.table if name not in TABLES]:
         raise SettingsError(f"--table {unknown[0]}: no such table; known are {', '.join(TABLES)}")
@@ -193,9 +191,7 @@ def reference(
         railfix reference --rtk rtk.pos --track line.csv --vehicle car.toml \
             --front front.obs --nav brdc.nav --pulses tacho.csv --out reference
 
-    Exit codes: 0 done; 2 the command line was misused; 3 an input file is not what it should be;
-    4 a setting is wrong; 5 the inputs do not match each other; 7 fewer than two good fixes; 8 DIR cannot be
-    written; 1 a defect of railfix.
+    Exit codes as `railfix --help` says; 7 where there are fewer than two good fixes.
     """
     asked = settings.model_dump(mode="json", exclude_unset=True)
     show_reference(reference_files(inputs, settings, out=out, options=options, asked=asked))
@@ -216,10 +212,9 @@ def show_reference(summary: ReferenceSummary) -> None:
         )
         left = ", ".join(f"{count:,} {what.replace('_', ' ')}" for what, count in part.left_out.items() if count)
         typer.echo(f"{name}: left out: {left or 'none'}")
-    for note in summary.notes:
-        typer.echo(f"note: {note}")
-    for path in summary.files.values():
-        typer.echo(f"wrote {path}")
+    console = TableConsole()
+    show_notes(console, summary.notes)
+    show_files(console, summary.files.values())
 
 
 @from_models
@@ -280,12 +275,10 @@ def priors_text(rate: FaultRate) -> str:
 
 
 def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
-    console = console_of_tables()
+    console = TableConsole()
     base = model.source.base or "none: errors of satellites and atmosphere are in the model"
     console.print(
-        f"{len(samples.error_m):,} pseudoranges of {model.source.epochs:,} epochs; reference station: {base}; "
-        "in metres",
-        markup=False,
+        f"{len(samples.error_m):,} pseudoranges of {model.source.epochs:,} epochs; reference station: {base}; in metres"
     )
     figures = [[f"{when}\ncount", "\nbias", "\nsigma", "\nbound"] for when in ("before", "after")]
     head = ["before and\nafter screens", *figures[0], *figures[1]]
@@ -296,16 +289,12 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
             f"level ({rate.prior:.2g}; {rate.faulty_blocks} of {rate.blocks:,} blocks; at most {rate.upper:.2g} with "
             f"95 % confidence); two satellites at a time {rate.together:.1f} times as often as independent ones, low "
             f"ones of one side of the track in {rate.side_faulty_blocks} of {rate.side_blocks:,} blocks (side_prior at "
-            f"most {rate.side_upper:.2g}). {priors_text(rate)}",
-            markup=False,
-            soft_wrap=True,
+            f"most {rate.side_upper:.2g}). {priors_text(rate)}"
         )
         if stretches := ", ".join(f"[{start:g}, {end:g}]" for start, end in rate.no_level_m):
             console.print(
                 f"local faults are more frequent than on the line at chainages [m] {stretches}: runs that take the "
-                "priors of this model have no level there",
-                markup=False,
-                soft_wrap=True,
+                "priors of this model have no level there"
             )
 
 
@@ -356,15 +345,14 @@ def cn0_curve(
         draw_cn0_curve(plot, fitted.curve, fitted.samples)
     write_cn0_curve(fitted.curve, out)
     _print_curve(fitted.curve, fitted.notes)
-    show_files(console_of_tables(), outputs)
+    show_files(TableConsole(), outputs)
 
 
 def _print_curve(curve: Cn0Curve, notes: tuple[str, ...]) -> None:
-    console, source = console_of_tables(), curve.source
+    console, source = TableConsole(), curve.source
     console.print(
         f"antenna {source.antenna or 'not named'}, receiver {source.receiver or 'not named'}; "
-        f"{source.epochs:,} epochs from {source.start[:19]} to {source.end[:19]}; mean C/N0 in dB-Hz over elevation",
-        markup=False,
+        f"{source.epochs:,} epochs from {source.start[:19]} to {source.end[:19]}; mean C/N0 in dB-Hz over elevation"
     )
     rows = []
     for mean in curve.means:

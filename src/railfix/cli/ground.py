@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from railfix.cli.command import SIGNALLED, Command, command_group
-from railfix.cli.console import console_of_tables, show_files, show_table
+from railfix.cli.console import TableConsole, show_files, show_table
 from railfix.cli.options import check_outputs, from_models
 from railfix.core.errors import MismatchError, OutputError, SettingsError
 from railfix.core.settings import Settings, option
@@ -118,7 +118,7 @@ def monitor(
         draw_triangle(files[1], result, limits=limits)
     except OSError as error:
         raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
-    console = console_of_tables()
+    console = TableConsole()
     counted = zip(*np.unique(result.triangle.verdict, return_counts=True), strict=True)
     rows = [[TriangleVerdict(int(value)).name.lower(), str(count)] for value, count in counted]
     show_table(console, listed(["verdict", "epochs"], rows, texts=2, boxed=True))
@@ -149,14 +149,14 @@ def _monitor_live(
         check_source(source)
     points = np.stack([place_of(text, "--point") for text in choices.point])
     navigation = read_navigation(choices.nav) if choices.nav else None
-    monitor, counts, console = LiveMonitor(limits=limits, times=times), Counter[str](), console_of_tables()
+    monitor, counts, console = LiveMonitor(limits=limits, times=times), Counter[str](), TableConsole()
     recorded = all(is_file(source) for source in sources)
 
     def show(orders: tuple[Order, ...], when: str) -> None:
         for order in orders:
             cause = "" if monitor.state.cause is None else f": {monitor.state.cause.name.lower()}"
             named = "" if monitor.state.receiver < 0 else f", receiver {monitor.state.receiver}"
-            console.print(f"{when} {order.value}{cause}{named}", soft_wrap=True)
+            console.print(f"{when} {order.value}{cause}{named}")
 
     async def work() -> None:
         async for fixes in stream_fixes(sources, points, navigation=navigation):
@@ -224,7 +224,7 @@ def keys(
 
     if not all(0 < number < 1 << 32 for number in choices.train):
         raise SettingsError("--train: a number from 1 to 4294967295 was expected")
-    show_files(console_of_tables(), write_keys(out, sorted(set(choices.train)), valid_days=choices.days))
+    show_files(TableConsole(), write_keys(out, sorted(set(choices.train)), valid_days=choices.days))
 
 
 class DemoChoices(Settings):
@@ -259,11 +259,11 @@ def demo(choices: DemoChoices) -> None:
     from railfix.ground.demo import run_demo
 
     check_outputs((choices.coverage, "picture"), overwrite=choices.overwrite == "replace", inputs=[])
-    console, password = console_of_tables(), secrets.token_urlsafe(12)
+    console, password = TableConsole(), secrets.token_urlsafe(12)
 
     def announce(url: str) -> None:
-        console.print(f"the page, to open in a browser: {url}", soft_wrap=True)
-        console.print(f"password for orders: {password}", soft_wrap=True)
+        console.print(f"the page, to open in a browser: {url}")
+        console.print(f"password for orders: {password}")
 
     async def keep(_: str) -> None:
         await asyncio.sleep(choices.hold)
@@ -327,7 +327,7 @@ def centre(
 
     from railfix.ground.serve import parse_address, read_password, run_centre
 
-    console, password = console_of_tables(), choices.password
+    console, password = TableConsole(), choices.password
     try:
         address = parse_address(choices.page)
     except ValueError as error:
@@ -335,9 +335,9 @@ def centre(
     word = secrets.token_urlsafe(12) if password is None else read_password(password)
 
     def announce(url: str) -> None:
-        console.print(f"the page, to open in a browser: {url}", soft_wrap=True)
+        console.print(f"the page, to open in a browser: {url}")
         if password is None:
-            console.print(f"password for orders: {word}", soft_wrap=True)
+            console.print(f"password for orders: {word}")
 
     work = run_centre(path, page=address, password=word, for_s=choices.for_s, announce=announce)
     terminated, figures = asyncio.run(work)
@@ -417,4 +417,4 @@ def _show_figures(figures: dict[str, Any]) -> None:
         [name, (", ".join(f"{k} {v}" for k, v in value.items()) or "none") if isinstance(value, dict) else str(value)]
         for name, value in figures.items()
     ]
-    show_table(console_of_tables(), listed(["what happened", ""], rows, texts=2, boxed=True))
+    show_table(TableConsole(), listed(["what happened", ""], rows, texts=2, boxed=True))

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 import typer
 
-from railfix.cli.console import console_of_tables, show_files, show_notes, show_table
+from railfix.cli.console import TableConsole, show_files, show_notes, show_table
 from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs, from_models, overwriting, settings_of
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.tables import listed, plural
@@ -17,7 +17,7 @@ from railfix.io.positions_export import style_file, write_positions
 from railfix.pipeline.tables import rounded
 from railfix.run.checks import examine_files
 from railfix.run.convert import write_mcap
-from railfix.run.inputs import LogReading, located
+from railfix.run.inputs import LogReading, input_path
 from railfix.run.locate import LocateInputs, locate_files
 from railfix.run.which_track import WhichTrackInputs, WhichTrackOptions, which_track_files, write_last_place
 
@@ -43,14 +43,14 @@ def locate(
     check_outputs((out, "pos"), overwrite=overwrite, inputs=inputs.paths)
     settings, _ = settings_of(choices)
     summary = locate_files(inputs, settings, out=out, reading=reading)
-    console = console_of_tables()
+    console = TableConsole()
     north, east, up = summary.sigma_m
     console.print(
         f"{summary.epochs} epochs, {summary.positions} positions; median sigma {north:.2f} m north, {east:.2f} m east, "
         f"{up:.2f} m up"
     )
     show_notes(console, summary.notes)
-    console.print(f"positions: {out}", markup=False, soft_wrap=True)
+    console.print(f"positions: {out}")
 
 
 @from_models
@@ -82,10 +82,10 @@ def which_track(
     check_outputs((out, "picture"), (save_last, "any"), overwrite=overwrite, inputs=inputs.paths)
     settings, _ = settings_of(choices)
     decision = which_track_files(inputs, options, settings)
-    console = console_of_tables()
+    console = TableConsole()
     last = decision.posteriors[-1]
     decided = "" if np.isnan(decision.decided_s) else f", decided after {decision.decided_s:.0f} s"
-    console.print(f"track: {decision.track}{decided} (risk {options.risk:g})", markup=False)
+    console.print(f"track: {decision.track}{decided} (risk {options.risk:g})")
     if not last.fits:
         console.print("the codes do not fit the error model (--code-bias-m, --code-noise-m): no decision is taken")
     rows = []
@@ -97,12 +97,12 @@ def which_track(
     show_notes(console, decision.notes)
     if save_last is not None:
         write_last_place(last, decision.end, save_last)
-        console.print(f"last place: {save_last}", markup=False, soft_wrap=True)
+        console.print(f"last place: {save_last}")
     if out is not None:
         from railfix.report.plots.network import plot_track_decision
 
         plot_track_decision(decision, out, risk=options.risk)
-        console.print(f"picture: {out}", markup=False, soft_wrap=True)
+        console.print(f"picture: {out}")
 
 
 @from_models
@@ -175,8 +175,7 @@ def export(
 
     Example: `railfix export results --out positions.gpkg`
 
-    Exit codes: 0 done; 3 RUN is not what it should be; 4 a package is not installed; 7 no epoch has a position;
-    8 the file cannot be written.
+    Exit codes as `railfix --help` says; 4 where a package is not installed, 7 where no epoch has a position.
     """
     tables = tables_of(run)
     if filtered and tables and "train" not in tables:
@@ -186,7 +185,7 @@ def export(
     table = "train" if filtered or (filtered is None and "train" in tables) else "positions"
     folder = read_run(run, table=table)
     results = [run / f"{name}.parquet" for name in (*TABLES, "observations", "tracks")]
-    inputs = [run / "run.json", *results, *(located(entry, run) for entry in folder.entries)]
+    inputs = [run / "run.json", *results, *(input_path(entry, run) for entry in folder.entries)]
     style = style_file(out)
     check_outputs((out, "map"), (style, "any"), overwrite=overwrite, inputs=inputs)
     used = folder.track_facts.get("frame", {}).get("used", "")
@@ -195,9 +194,9 @@ def export(
     description = f"Antenna positions of railfix, {what}, {folder.line_name}; {frame}, heights above the ellipsoid"
     write = write_mcap if out.suffix.lower() == ".mcap" else write_positions
     written = write(rounded(folder.positions), out, description=description)
-    console = console_of_tables()
-    console.print(f"{written:,} positions of {len(folder.positions):,} epochs and antennas, {what}", markup=False)
-    console.print(f"{frame}, heights above the ellipsoid", markup=False)
+    console = TableConsole()
+    console.print(f"{written:,} positions of {len(folder.positions):,} epochs and antennas, {what}")
+    console.print(f"{frame}, heights above the ellipsoid")
     show_files(console, [path for path in (out, style) if path is not None])
 
 
@@ -217,20 +216,20 @@ def doctor(
     Exit codes: 0 everything fits; 3 a file is missing; 5 something does not fit, is missing or of no known kind.
     """
     diagnosis = examine_files(files)
-    console = console_of_tables()
+    console = TableConsole()
     problems = diagnosis.problems
     verdict = f"{plural(problems, 'thing')} to mend" if problems else "the files fit together"
-    console.print(f"{len(diagnosis.findings)} files: {verdict}", markup=False)
+    console.print(f"{len(diagnosis.findings)} files: {verdict}")
     for problem in problems:
-        console.print(f"- {problem}", markup=False, soft_wrap=True)
+        console.print(f"- {problem}")
     if diagnosis.command:
-        console.print(f"run: {diagnosis.command}", markup=False, soft_wrap=True)
+        console.print(f"run: {diagnosis.command}")
     for finding in diagnosis.findings:
-        console.print(f"\n{finding.path}: {finding.kind}", markup=False, soft_wrap=True)
+        console.print(f"\n{finding.path}: {finding.kind}")
         if finding.span is not None:
             first, last = (str(time)[:19].replace("T", " ") for time in finding.span)
-            console.print(f"  {first} to {last} GPS time", markup=False)
+            console.print(f"  {first} to {last} GPS time")
         for fact in finding.facts:
-            console.print(f"  {fact}", markup=False, soft_wrap=True)
+            console.print(f"  {fact}")
     if problems:
         raise typer.Exit(5)

@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 from railfix.cli.command import Command, command_group
-from railfix.cli.console import console_of_tables, show_notes, show_table
+from railfix.cli.console import MOST_FINDINGS, TableConsole, show_notes, show_table
 from railfix.cli.map_network import Columns, MapReading, match_command, network, route
 from railfix.cli.map_runs import service, survey
 from railfix.cli.options import OverwriteOption, check_outputs, from_models
@@ -37,8 +37,6 @@ TracksArgument = Annotated[
     list[Path],
     typer.Argument(metavar="TRACK...", help="CSV or GeoJSON track map; several are joined in this order to a route."),
 ]
-#: Findings printed before the rest is only counted.
-_SHOWN = 40
 
 
 @app.command("check", cls=Command)
@@ -64,13 +62,9 @@ def check(
     where given, else from the circle through neighbouring points), kinks, jumps and reversals of the
     kilometrage, gradients and height spikes, cant, and curve attributes against the points.
 
-    Example:
+    Example: `railfix map check line.csv --out report`
 
-        railfix map check line.csv --out report
-
-    Exit codes: 0 nothing, or warnings only; 6 the track map has errors; 2 the command line was misused;
-    3 a file is not a track map; 4 an option is wrong; 8 the picture cannot be written; 1 a defect of
-    railfix.
+    Exit codes as `railfix --help` says; 6 where the track map has errors.
     """
     if not mid_chord > 0.0 or not max_gap > 0.0:
         raise SettingsError("--mid-chord and --max-gap must be positive")
@@ -89,7 +83,10 @@ def check(
     if picture is not None:
         from railfix.report.plots.network import plot_track_quality
 
-        _make_folder(picture.parent)
+        try:
+            picture.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{picture.parent}: the folder cannot be made ({error.strerror})") from None
         plot_track_quality(quality, picture)
     _print_quality(quality, picture)
     if quality.errors:
@@ -129,13 +126,12 @@ def features(
 
         railfix map features line.csv --run results-1 --run results-2
 
-    Exit codes: 0 done; 2 the command line was misused; 3 a file is not a track map, or a run has measured nothing; 4 an
-    option is wrong; 8 the file cannot be written; 1 a defect of railfix.
+    Exit codes as `railfix --help` says; 3 also where a run has measured nothing.
     """
     import polars as pl
 
     from railfix.motion.features import line_series, map_features
-    from railfix.run.locate import centred, measured_features, read_measured
+    from railfix.run.locate import centre_features, find_features, read_measured
     from railfix.track.trajectory import Trajectory
 
     tables = [folder / "train.parquet" for folder in run or ()]
@@ -145,12 +141,12 @@ def features(
     series = line_series(trajectory)
     found = map_features(series)
     if run:
-        found = centred(found, series)
+        found = centre_features(found, series)
     at = trajectory.chainage_at(np.array([feature.arc_m for feature in found]))
     found = [replace(feature, arc_m=float(chainage)) for feature, chainage in zip(found, at, strict=True)]
     beside: dict[str, list[float]] = {}
     if run:
-        measured = measured_features([read_measured(folder) for folder in run], found)
+        measured = find_features([read_measured(folder) for folder in run], found)
         found = [each.feature for each in measured]
         beside = {
             "runs": [float(len(each.places_m)) for each in measured],
@@ -169,7 +165,7 @@ def features(
         rows.write_csv(out)
     columns = ["chainage m", "quantity", "change", *(["runs", "spread m", "from the map m"] if run else [])]
     shown = []
-    for chainage, quantity, change, *others in rows.head(_SHOWN).iter_rows():
+    for chainage, quantity, change, *others in rows.iter_rows():
         unit = f"{1e3 * change:+.1f} permille" if quantity == "gradient" else f"{1e3 * change:+.2f} / km"
         if others:
             runs, spread, there = others
@@ -177,9 +173,7 @@ def features(
             others = [f"{runs:.0f} of {len(run or ())}", "" if spread is None else f"{spread:.2f}", gap]
         shown.append([f"{chainage:.1f}", quantity, unit, *others])
     caption = f"{track.name}: {len(found)} features"
-    show_table(console_of_tables(), listed(columns, shown, caption, texts=len(columns), boxed=True))
-    if len(found) > _SHOWN:
-        typer.echo(f"and {len(found) - _SHOWN} more")
+    show_table(TableConsole(), listed(columns, shown, caption, texts=len(columns), boxed=True), most=MOST_FINDINGS)
 
 
 @app.command("from-positions", cls=Command)
@@ -213,12 +207,9 @@ def from_positions_command(
     between two points stay within 0.30 m. The map is the path of that antenna: use it without a vehicle file.
     A run over several laps gives several laps.
 
-    Example:
+    Example: `railfix map from-positions rtk.pos --out line.csv --quality 1`
 
-        railfix map from-positions rtk.pos --out line.csv --quality 1
-
-    Exit codes: 0 done; 2 the command line was misused; 3 the file is not a position log, or its
-    positions form no line; 4 an option is wrong; 8 the map cannot be written; 1 a defect of railfix.
+    Exit codes as `railfix --help` says; 3 also where the positions form no line.
     """
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")
@@ -238,13 +229,6 @@ app.command("route", cls=Command)(route)
 app.command("match", cls=Command)(match_command)
 
 
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path}: the folder cannot be made ({error.strerror})") from None
-
-
 def _qualities(text: str | None) -> list[int] | None:
     if text is None:
         return None
@@ -255,44 +239,39 @@ def _qualities(text: str | None) -> list[int] | None:
 
 
 def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
-    console, track, geometry = console_of_tables(), quality.track, quality.geometry
+    console, track, geometry = TableConsole(), quality.track, quality.geometry
     spacing = geometry.spacing_m
     console.print(
         f"{track.name}: {len(track)} points, {track.chainage_m[-1]:,.1f} m, {plural(track.sections, 'section')}; "
         f"heights {track.provenance.height_datum_used}"
-        + (f" + geoid {track.provenance.geoid}" if track.provenance.geoid else ""),
-        markup=False,
+        + (f" + geoid {track.provenance.geoid}" if track.provenance.geoid else "")
     )
     deviation = np.abs(geometry.mid_chord_m[np.isfinite(geometry.mid_chord_m)])
     console.print(
         f"spacing {spacing.min():.2f} / {np.median(spacing):.2f} / {spacing.max():.2f} m (least, median, largest); "
-        + (f"mid-chord deviation up to {deviation.max():.3f} m" if len(deviation) else "no mid-chord deviation"),
-        markup=False,
+        + (f"mid-chord deviation up to {deviation.max():.3f} m" if len(deviation) else "no mid-chord deviation")
     )
     show_notes(console, track.provenance.notes)
-    if quality.findings:
-        rows = []
-        for finding in quality.findings[:_SHOWN]:
-            marking = "" if finding.kilometrage_m != finding.kilometrage_m else f"{finding.kilometrage_m:.0f}"
-            points = f"{finding.first}-{finding.last}" if finding.last > finding.first else f"{finding.first}"
-            rows.append([finding.severity, finding.kind, points, marking, finding.sentence])
-        show_table(console, listed(["severity", "kind", "points", "kilometrage", "finding"], rows, texts=5))
-    rest = len(quality.findings) - _SHOWN
-    if rest > 0:
-        console.print(f"... and {rest} more")
+    rows = []
+    for finding in quality.findings:
+        marking = "" if finding.kilometrage_m != finding.kilometrage_m else f"{finding.kilometrage_m:.0f}"
+        points = f"{finding.first}-{finding.last}" if finding.last > finding.first else f"{finding.first}"
+        rows.append([finding.severity, finding.kind, points, marking, finding.sentence])
+    head = ["severity", "kind", "points", "kilometrage", "finding"]
+    show_table(console, listed(head, rows, texts=5), most=MOST_FINDINGS)
     console.print(f"{plural(quality.errors, 'error')}, {plural(quality.warnings, 'warning')}")
     if picture is not None:
-        console.print(f"picture: {picture}", markup=False, soft_wrap=True)
+        console.print(f"picture: {picture}")
 
 
 def _print_thinned(track: Track, thinned: Thinned, rows: int, out: Path) -> None:
-    console = console_of_tables()
+    console = TableConsole()
     console.print(f"{rows} positions, {len(track)} points kept, {track.chainage_m[-1]:,.1f} m")
     show_notes(console, track.provenance.notes)
     quality = check_track(track)
     console.print(f"map check: {plural(quality.errors, 'error')}, {plural(quality.warnings, 'warning')}")
-    for finding in quality.errors[:_SHOWN]:
-        console.print(f"error: {finding.sentence}", markup=False)
+    for finding in quality.errors[:MOST_FINDINGS]:
+        console.print(f"error: {finding.sentence}")
     if quality.errors:
         console.print(
             "a larger --spacing smooths noisy positions; a road turns more sharply than the checks allow a line"
@@ -300,10 +279,10 @@ def _print_thinned(track: Track, thinned: Thinned, rows: int, out: Path) -> None
     for reason, count in thinned.dropped.items():
         if count:
             console.print(f"dropped {count} {reason}")
-    for point, distance in zip(thinned.jumps[:_SHOWN], thinned.jump_m[:_SHOWN], strict=True):
+    for point, distance in zip(thinned.jumps[:MOST_FINDINGS], thinned.jump_m[:MOST_FINDINGS], strict=True):
         console.print(
             f"gap of {distance:.1f} m at chainage {track.chainage_m[point]:.1f} m, bridged by a straight line"
         )
-    for point in thinned.turns[:_SHOWN]:
+    for point in thinned.turns[:MOST_FINDINGS]:
         console.print(f"the path turns back at chainage {track.chainage_m[point]:.1f} m")
-    console.print(f"track map: {out}", markup=False, soft_wrap=True)
+    console.print(f"track map: {out}")

@@ -9,7 +9,7 @@ import numpy as np
 import typer
 from pydantic import model_validator
 
-from railfix.cli.console import console_of_tables, show_notes, show_table
+from railfix.cli.console import MOST_FINDINGS, TableConsole, show_notes, show_table
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
 from railfix.core.files import write_whole
@@ -23,9 +23,6 @@ from railfix.track.network_read import TOLERANCE_M, check_network, read_network
 from railfix.track.network_route import Filled, Rows, fill_gaps, route_of
 from railfix.track.quality import error_note
 from railfix.track.read import track_of_segments
-
-#: Findings printed before the rest is only counted.
-_SHOWN = 40
 
 Maps = Annotated[list[Path], typer.Argument(metavar="MAP...", help="Map files; all their tracks form the network.")]
 Columns = Annotated[
@@ -122,30 +119,27 @@ def network(
     check_outputs((out, "picture"), (page, "page"), overwrite=overwrite, inputs=maps)
     tracks = _network(maps, reading, connecting)
     quality = check_network(tracks)
-    console = console_of_tables()
+    console = TableConsole()
     console.print(
         f"{quality.tracks} tracks, {quality.length_m / 1e3:,.1f} km, {quality.switches} switches, {quality.ends} ends "
         f"without connection, {plural(quality.parts, 'separate part')}"
     )
     show_notes(console, dict.fromkeys([*tracks.notes, *(n for t in tracks.tracks for n in t.notes)]))
-    if quality.findings:
-        rows = [
-            [found.kind, f"{found.latitude_deg:.6f}", f"{found.longitude_deg:.6f}", found.sentence]
-            for found in quality.findings[:_SHOWN]
-        ]
-        show_table(console, listed(["kind", "latitude", "longitude", "finding"], rows, texts=4))
-        if len(quality.findings) > _SHOWN:
-            console.print(f"... and {len(quality.findings) - _SHOWN} more")
+    rows = [
+        [found.kind, f"{found.latitude_deg:.6f}", f"{found.longitude_deg:.6f}", found.sentence]
+        for found in quality.findings
+    ]
+    show_table(console, listed(["kind", "latitude", "longitude", "finding"], rows, texts=4), most=MOST_FINDINGS)
     if out is not None:
         from railfix.report.plots.network import plot_network
 
         plot_network(tracks, out, quality=quality)
-        console.print(f"picture: {out}", markup=False, soft_wrap=True)
+        console.print(f"picture: {out}")
     if page is not None:
         from railfix.report.charts_page import write_network_page
 
         write_network_page(tracks, quality, page)
-        console.print(f"page: {page}", markup=False, soft_wrap=True)
+        console.print(f"page: {page}")
     faults = [f for f in quality.findings if f.kind in ("gap", "joint", "kink")]
     if faults:
         raise MapQualityError(f"the network has {plural(faults, 'fault')}, the first: {faults[0].sentence}")
@@ -182,11 +176,11 @@ def route(
         sigma_height_m=reading.height_sigma,
     )
     write_track_csv(track, out)
-    console = console_of_tables()
-    console.print(f"route: {', '.join(net.names[k] for k in passed)}", markup=False, soft_wrap=True)
+    console = TableConsole()
+    console.print(f"route: {', '.join(net.names[k] for k in passed)}")
     console.print(f"{len(track)} points, {track.chainage_m[-1]:,.1f} m")
     show_notes(console, [*notes, *track.provenance.notes, *error_note(check_track(track))])
-    console.print(f"track map: {out}", markup=False, soft_wrap=True)
+    console.print(f"track map: {out}")
 
 
 def _route_tracks(
@@ -269,7 +263,7 @@ def match_command(
     write_whole(
         out, _write_matches(net, positions, matched, fill_gaps(net, matched, positions, rows_to_fill=options.fill))
     )
-    console = console_of_tables()
+    console = TableConsole()
     on = matched.track >= 0
     console.print(
         f"{len(on)} positions, {on.sum()} on a track ({on.mean():.1%}), {(np.abs(matched.offset_m) <= 5.0).mean():.1%} "
@@ -280,13 +274,13 @@ def match_command(
         from railfix.report.plots.network import plot_network
 
         plot_network(net, picture, run=(positions, matched))
-        console.print(f"picture: {picture}", markup=False, soft_wrap=True)
+        console.print(f"picture: {picture}")
     if page is not None:
         from railfix.report.charts_page import write_network_page
 
         write_network_page(net, check_network(net), page, run=(positions, matched))
-        console.print(f"page: {page}", markup=False, soft_wrap=True)
-    console.print(f"positions: {out}", markup=False, soft_wrap=True)
+        console.print(f"page: {page}")
+    console.print(f"positions: {out}")
 
 
 def _write_matches(net: Network, log: PlanLog, matched: Matched, filled: Filled) -> str:

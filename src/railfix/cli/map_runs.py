@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 import typer
 
-from railfix.cli.console import console_of_tables, show_files, show_notes, show_table, show_verdict
+from railfix.cli.console import TableConsole, show_files, show_notes, show_table, show_verdict
 from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs, from_models, settings_of
 from railfix.core.errors import SettingsError
 from railfix.core.files import BrokenLines
@@ -69,7 +69,7 @@ def service(
         plot_service(found, picture, title=", ".join(path.name for path in runs), limit_m=limit)
     served = found.filter(pl.col("within_limit_share") >= _SERVED)
     worst = found.sort("within_limit_share", "tracking_share", "ok_share", nulls_last=True).row(0, named=True)
-    console = console_of_tables()
+    console = TableConsole()
     verdict = [f"{len(found)} stretches of {stretch:g} m passed by {plural(runs, 'run')}"]
     if worst["within_limit_share"] is not None:
         verdict.append(
@@ -145,7 +145,7 @@ def survey(
         from railfix.report.plots.network import plot_survey
 
         plot_survey(surveyed, picture)
-    console = console_of_tables()
+    console = TableConsole()
     closed = "closed line" if result.closed else "line"
     weak = result.sigma_plan_m > 2.0 * np.median(result.sigma_plan_m)
     verdict = [
@@ -173,5 +173,5 @@ def survey(
     show_table(console, listed(head, rows, caption))
     show_notes(console, [*track.provenance.notes, *surveyed.notes])
     if picture is not None:
-        console.print(f"picture: {picture}", markup=False, soft_wrap=True)
-    console.print(f"track map: {out}", markup=False, soft_wrap=True)
+        console.print(f"picture: {picture}")
+    console.print(f"track map: {out}")

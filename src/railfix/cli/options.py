@@ -103,16 +103,16 @@ def from_models(command: Callable[..., None]) -> Callable[..., None]:
         parameters |= {option.parameter.name: option.parameter for option in models[name][1]}
 
     @wraps(command)
-    def expanded(**values: Any) -> None:
+    def run(**values: Any) -> None:
         built = {name: _built(model, options, values) for name, (model, options) in models.items()}
         used = {option.parameter.name for _, options in models.values() for option in options}
         command(**{name: value for name, value in values.items() if name not in used}, **built)
 
     # typer takes both the signature and the annotations
-    expanded.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
-    expanded.__annotations__ = {name: parameter.annotation for name, parameter in parameters.items()}
-    del expanded.__wrapped__
-    return expanded
+    run.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
+    run.__annotations__ = {name: parameter.annotation for name, parameter in parameters.items()}
+    del run.__wrapped__
+    return run
 
 
 def _options(model: type[Settings], excluded: list[str], path: tuple[str, ...] = ()) -> list[_Option]:
@@ -251,15 +251,7 @@ class Choices(Settings):
 
 
 def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
-    """Return the settings of the file, overridden by those of the command line; and those that were given.
-
-    Raises
-    ------
-    SettingsError
-        A setting is misspelt, out of range, or not written as KEY=VALUE; a screen or preset is unknown.
-    InputFileError
-        The file cannot be read.
-    """
+    """Return the settings of the file, overridden by those of the command line; and those that were given."""
     values: dict[str, Any] = {}
     source = "command line"
     if choices.config is not None:
@@ -277,12 +269,9 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
         source = "--set"
     if choices.screens is not None:
         values["screens"] = [] if choices.screens.strip() == "none" else _screens("--screens", choices.screens)
-    if choices.filter is not None:
-        values["filter"] = choices.filter
-    if choices.cn0_curve is not None:
-        values["cn0_curve"] = str(choices.cn0_curve)
-    if choices.error_model is not None:
-        values["error_model"] = str(choices.error_model)
+    for name in ("filter", "cn0_curve", "error_model"):
+        if (value := getattr(choices, name)) is not None:
+            values[name] = str(value)
     if choices.sbas:
         words = [str(path) for path in choices.sbas]
         values["sbas"] = "stream" if words == ["stream"] else words

@@ -12,7 +12,7 @@ from typing import Annotated, Final
 
 import typer
 
-from railfix.cli.console import console_of_tables, show_table
+from railfix.cli.console import TableConsole, show_table
 from railfix.cli.options import OverwriteOption, check_outputs, from_models, overwriting
 from railfix.core.tables import Column, digits, listing
 from railfix.evaluate import EvaluationOptions
@@ -73,13 +73,9 @@ def report(
 
     The page contains everything it shows: it opens without a network and can be sent and printed.
 
-    Example:
+    Example: `railfix report results --reference truth.csv --out report.html`
 
-        railfix report results --reference truth.csv --out report.html
-
-    Exit codes: 0 done; 2 the command line was misused; 3 a RUN or REF is not what it should be;
-    4 the number of references fits neither one nor each run; 5 a reference is of another time;
-    8 the page cannot be written; 1 a defect of railfix.
+    Exit codes as `railfix --help` says; 4 where the number of references does not fit, 5 where one is of another time.
     """
     in_runs = [
         path
@@ -128,19 +124,18 @@ def explain(
 
     Example: `railfix explain results --at 06:34:12 --html epoch.html`
 
-    Exit codes: 0 done; 3 RUN is not what it should be; 4 no such time or antenna; 5 no epoch near the time; 8 the page
-    cannot be written.
+    Exit codes as `railfix --help` says; 4 where there is no such time or antenna, 5 no epoch near the time.
     """
     inputs = sorted(run.iterdir()) if run.is_dir() else []
     check_outputs((html, "page"), overwrite=overwrite, inputs=[path for path in inputs if path.suffix != ".html"])
     found = explain_epoch(run, at, antenna=antenna)
-    console = console_of_tables()
-    console.print(f"{found.antenna} antenna, {time_text(found.time)} GPS time (asked: {at})", markup=False)
+    console = TableConsole()
+    console.print(f"{found.antenna} antenna, {time_text(found.time)} GPS time (asked: {at})")
     for sentence in found.sentences:
-        console.print(sentence, markup=False, soft_wrap=True)
+        console.print(sentence)
     show_table(console, replace(listing("satellites", found.satellites, _SATELLITES, "Satellites"), boxed=True))
     if html is not None:
-        console.print(f"wrote {write_explanation(found, html)}", markup=False, soft_wrap=True)
+        console.print(f"wrote {write_explanation(found, html)}")
 
 
 def plot_screens(
@@ -155,12 +150,9 @@ def plot_screens(
     none for screens that were off or inactive. Rejected observations have another colour, and their share is
     in the title.
 
-    Example:
+    Example: `railfix plot-screens results --out results/screens`
 
-        railfix plot-screens results --out results/screens
-
-    Exit codes: 0 done; 2 the command line was misused; 3 DIR is not the folder of a run with observations;
-    8 the pictures cannot be written; 1 a defect of railfix.
+    Exit codes as `railfix --help` says.
     """
     with OutputFolder(out, overwrite=overwriting(overwrite)) as folder:
         with reading_table(run / "observations.parquet"):

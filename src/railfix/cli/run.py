@@ -46,9 +46,7 @@ def run(
         railfix run --front front.obs --rear rear.obs --nav brdc.nav \
             --track line.csv --vehicle car.toml --out results
 
-    Exit codes: 0 done; 2 the command line was misused; 3 an input file is not what it should be;
-    4 a setting is wrong; 5 the inputs do not match each other; 7 not one position; 8 DIR cannot be
-    written; 1 a defect of railfix.
+    Exit codes as `railfix --help` says.
     """
     settings, asked = settings_of(choices)
     inputs = inputs.replaced(config=choices.config)

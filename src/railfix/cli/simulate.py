@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.console import Console
 
-from railfix.cli.console import console_of_tables, prepare_kernels, progress_bar, show_summary, show_table
+from railfix.cli.console import TableConsole, prepare_kernels, progress_bar, show_summary, show_table
 from railfix.cli.options import OverwriteOption, check_set_once, from_models, overwriting, set_value
 from railfix.core.errors import SettingsError
 from railfix.core.settings import Settings, option
@@ -82,13 +82,9 @@ def simulate(
     sensors on board. A recipe lists many runs, each written to its own folder. The same scenario gives the same
     files.
 
-    Example:
+    Example: `railfix simulate demo --out simulated`
 
-        railfix simulate demo --out simulated
-
-    Exit codes: 0 done; 2 the command line was misused; 3 a file that the scenario names is not what it
-    should be; 4 a setting is wrong; 5 the navigation file does not serve the scenario's time; 8 DIR
-    cannot be written, or has files in it; 1 a defect of railfix.
+    Exit codes as `railfix --help` says; 5 where the navigation file does not serve the scenario's time.
     """
     if list_shipped:
         for name in shipped_scenarios():
@@ -181,11 +177,9 @@ def demo(
     `run.json`, the folder `unscreened` of the run for the conventional positions, and `report.html`, the page
     to open in a browser.
 
-    Example:
+    Example: `railfix demo --out first-look`
 
-        railfix demo --out first-look
-
-    Exit codes: 0 done; 8 DIR cannot be written; 1 a defect of railfix.
+    Exit codes as `railfix --help` says.
     """
     inputs = demo_inputs()
     prepare_kernels()
@@ -206,7 +200,7 @@ def demo(
 
 def show_errors(evaluation: Evaluation) -> None:
     """Print errors along the line: on the map, of those that passed every check, and of the conventional position."""
-    console = console_of_tables()
+    console = TableConsole()
     for table in error_tables(evaluation):
         show_table(console, table)
     show_levels(evaluation, console)
@@ -226,11 +220,10 @@ def show_levels(evaluation: Evaluation, console: Console) -> None:
                 f"within the alarm limit of {row['alarm_limit_m']:g} m at "
                 f"{100 * (row['availability_of_observed'] or 0.0):.2f} % of the epochs with observations, errors over "
                 f"it: {int(over['usable'].sum())} of {row['judged']:,}, and "
-                f"{int((~over['usable']).sum())} where the run had raised an alarm or a doubt",
-                soft_wrap=True,
+                f"{int((~over['usable']).sum())} where the run had raised an alarm or a doubt"
             )
     for text in dict.fromkeys(prior_basis_text(run.protection) for run in evaluation.runs if run.protection):
-        console.print(f"protection level: {text}", soft_wrap=True)
+        console.print(f"protection level: {text}")
 
 
 def median_level(evaluation: Evaluation, kind: str, antenna: str) -> float | None:

@@ -21,7 +21,7 @@ def source_commit() -> str:
     """
     if FROM_BUILD.is_file():
         return FROM_BUILD.read_text(encoding="ascii").strip()
-    return checked_out_commit(Path(__file__).parents[3]) or "unknown"
+    return read_commit(Path(__file__).parents[3]) or "unknown"
 
 
 def version_text() -> str:
@@ -29,7 +29,7 @@ def version_text() -> str:
     return f"railfix {__version__} (commit {source_commit()})"
 
 
-def checked_out_commit(root: Path) -> str:
+def read_commit(root: Path) -> str:
     """Return the commit that is checked out in a folder (or a further work tree), from git's files; "" without any."""
     git = root / ".git"
     if git.is_file():

@@ -26,28 +26,15 @@ from typing import ClassVar
 
 
 class RailfixError(Exception):
-    """Base of all errors that a user can correct: input files, settings, outputs.
+    """Base of all errors that a user can correct: input files, settings, outputs."""
 
-    Attributes
-    ----------
-    exit_code : int
-        Exit code of the command line for this class of error.
-    """
-
-    exit_code: ClassVar[int] = 1
+    exit_code: ClassVar[int] = 1  #: Of the command line for this class of error.
 
 
 class InputFileError(RailfixError):
     """An input file is missing, unreadable or malformed.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    message : str
-        What is wrong, what was expected, what to do; without a full stop at the end.
-    line : int, optional
-        1-based line number of the fault.
+    The message is what is wrong, what was expected, what to do, without a full stop at the end; `line` counts from 1.
     """
 
     exit_code = 3

@@ -201,13 +201,7 @@ def ending(path: FilePath) -> str:
 
 
 def file_sha256(path: FilePath) -> str:
-    """Return the SHA-256 of a file as hexadecimal digits.
-
-    Raises
-    ------
-    InputFileError
-        The file cannot be read.
-    """
+    """Return the SHA-256 of a file as hexadecimal digits; InputFileError where it cannot be read."""
     try:
         with Path(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -237,17 +231,7 @@ def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
 def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
     """Write a text file under a temporary name, then rename it: a failed write leaves no file.
 
-    Parameters
-    ----------
-    path : path
-    text : str
-    what : str
-        Kind of file, for the message.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
+    `what` is the kind of file, for the message of the OutputError where it cannot be written.
     """
     with staged_file(path, what=what) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -60,20 +60,12 @@ class Settings(BaseModel):
         return value
 
     def replaced(self, **changes: Any) -> Self:
-        """Return a validated copy with some settings changed.
-
-        Raises
-        ------
-        SettingsError
-            A value is out of range or a name unknown.
-        """
+        """Return a copy with some settings changed; SettingsError where a value is out of range or a name unknown."""
         values = {name: getattr(self, name) for name in type(self).model_fields}
         return type(self)(**{**values, **changes})
 
 
 Model = TypeVar("Model", bound=BaseModel)
-
-
 INPUTS: Final = "Inputs"  #: Heading of the options that name input files.
 
 
@@ -151,18 +143,9 @@ def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[s
 
 
 def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
-    """Read the values of a TOML file.
+    """Read the values of a TOML file; `what` is the kind of file expected, with its article ("a vehicle file").
 
-    Parameters
-    ----------
-    path : path
-    what : str
-        Kind of file expected, with its article ("a vehicle file").
-
-    Raises
-    ------
-    InputFileError
-        The file is missing, unreadable, not UTF-8, or not TOML.
+    InputFileError: the file is missing, unreadable, not UTF-8, or not TOML.
     """
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
@@ -177,26 +160,12 @@ def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
 
 
 def load_settings(model: type[Model], path: FilePath, *, what: str = "a settings file") -> Model:
-    """Read settings from a TOML file.
-
-    Raises
-    ------
-    InputFileError
-        As `read_toml`.
-    SettingsError
-        As `validated`.
-    """
+    """Read settings from a TOML file; InputFileError as `read_toml`, SettingsError as `validated`."""
     return validated(model, read_toml(path, what=what), source=str(path))
 
 
 def write_toml(path: FilePath, values: Mapping[str, Any], *, what: str = "file", comment: str = "") -> None:
-    """Write values as TOML below an optional comment; a failed write leaves no file.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
+    """Write values as TOML below an optional comment; OutputError, and no file, where it cannot be written."""
     head = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
     write_whole(path, head + tomli_w.dumps(dict(values)), what=what)
 

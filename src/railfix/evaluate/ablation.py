@@ -27,9 +27,9 @@ from railfix.run.driver import Progress, notes_of, open_inputs, sensors_of
 from railfix.run.inputs import RunInputs, RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
-from railfix.run.record import RunProvenance, package_versions, run_record
+from railfix.run.record import NO_FIGURES, RunProvenance, package_versions, run_record
 from railfix.run.sensors import balises_of
-from railfix.run.sources import aligned
+from railfix.run.sources import align_logs
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS, ScreenSetup
 from railfix.track.trajectory import Trajectory
@@ -151,7 +151,7 @@ def ablate_files(
     """
     began = clock.perf_counter()
     options = options or RunOptions()
-    inputs, config = inputs.checked(config or Config())
+    inputs, config = inputs.prepare(config or Config())
     with (
         OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths) as folder,
         ThreadPoolExecutor(max_workers=1) as pool,
@@ -180,7 +180,7 @@ def ablate_files(
         states = dict.fromkeys(processors, State())
         tallies = {name: Tally(min_satellites=config.min_satellites) for name in processors}
         parts: dict[tuple[str, str], list[dict[str, Floats]]] = {}
-        for chunk in aligned({name: log.parts() for name, log in logs.items()}):
+        for chunk in align_logs({name: log.parts() for name, log in logs.items()}):
             end = max(part.time[-1] for part in chunk.values() if len(part))
             since = sensors.between(received, end)
             received = end
@@ -213,7 +213,7 @@ def ablate_files(
             line=line.facts,
             navigation=navigation,
         )
-        record = run_record(made_from, tallies[ALL], notes, wall_s=wall)
+        record = run_record(made_from, tallies[ALL], notes, dict.fromkeys(antennas, NO_FIGURES), wall)
         rows = [effect.as_row() for effect in effects]
         folder.append_csv("ablation.csv", pl.DataFrame(rows, infer_schema_length=None))
         folder.write_json("ablation.json", record | {"choices": rows})

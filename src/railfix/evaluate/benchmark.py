@@ -26,9 +26,9 @@ from railfix.core.timescale import seconds
 from railfix.evaluate.cases import Case, check_not_fitted, read_cases
 from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_runs
 from railfix.evaluate.figures import ALL, FIGURE_COLUMNS, positioned
-from railfix.evaluate.inputs import CONVENTIONAL, POSITIONS_TABLE, RunFolder, floats, read_run, tables_of
+from railfix.evaluate.inputs import CONVENTIONAL, POSITIONS_TABLE, floats, read_run, tables_of
 from railfix.evaluate.integrity import STANFORD_COLUMNS
-from railfix.evaluate.place import Answers, TrackFiles, find_trajectory
+from railfix.evaluate.place import TrackFiles, find_trajectory
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog
 from railfix.io.receiver.framing import head_of, is_receiver_log
@@ -107,7 +107,9 @@ def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) 
     epochs = own.positions.filter(pl.col("antenna") == antenna)
     if len(epochs) < 2:
         raise MismatchError(f"{log.path}: is of the {antenna} antenna, of which the run has no epochs")
-    table = table_of_positions(log, epochs, _trajectory_of(own, antenna, epochs))
+    places = np.stack([floats(epochs, name) for name in ("x_m", "y_m", "z_m")], axis=1)
+    trajectory, _, _ = find_trajectory(own, antenna, floats(epochs, "chainage_m"), places, TrackFiles())
+    table = table_of_positions(log, epochs, trajectory)
     if table["chainage_m"].null_count() == len(table):
         raise MismatchError(f"{log.path}: has no position at the epochs of the log of {run}; give that of the same run")
     line: dict[str, Any] = own.part("line")
@@ -116,28 +118,13 @@ def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) 
     kept = [
         {**entry, "path": str(path.absolute())}
         for kind in ("track", "vehicle")
-        for entry, path in zip(
-            [entry for entry in own.entries if entry["input"] == kind], own.located(kind), strict=True
-        )
+        for entry, path in zip((e for e in own.entries if e["input"] == kind), own.input_paths(kind), strict=True)
     ]
     with OutputFolder(out, overwrite="replace", inputs=[Path(log.path)]) as folder:
         folder.append_parquet("positions.parquet", table)
         record = {"railfix": __version__, "inputs": [*kept, fingerprint("positions", Path(log.path))], "line": line}
         folder.write_json("run.json", record)
         folder.commit({"railfix": __version__})
-
-
-def _trajectory_of(run: RunFolder, antenna: str, epochs: pl.DataFrame) -> Trajectory:
-    """Return the trajectory on which the run's positions of an antenna lie."""
-    unknown = np.full(len(epochs), np.nan)
-    answers = Answers(
-        chainage_m=floats(epochs, "chainage_m"),
-        conventional_chainage_m=unknown,
-        ecef_m=np.stack([floats(epochs, name) for name in ("x_m", "y_m", "z_m")], axis=1),
-        reference_chainage_m=unknown,
-        reference_ecef_m=np.full((len(epochs), 3), np.nan),
-    )
-    return find_trajectory(run, antenna, answers, TrackFiles())[0]
 
 
 def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> str | None:
@@ -171,10 +158,10 @@ def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> s
 
 def _unpack(paths: Sequence[Path], folder: Path, kind: str) -> list[Path]:
     """Write files uncompressed, as RTKLIB reads them; return where."""
-    written = [folder / f"{number}.{kind}" for number in range(len(paths))]
-    for path, target in zip(paths, written, strict=True):
+    unpacked = {folder / f"{number}.{kind}": path for number, path in enumerate(paths)}
+    for target, path in unpacked.items():
         target.write_bytes(read_bytes(path))
-    return written
+    return list(unpacked)
 
 
 #: Rows of railfix: name, table and kind of position.

@@ -32,20 +32,7 @@ class OtherPositions(Settings):
 
 
 class RecordedScenario(Settings):
-    """Description of a test scenario for record and replay (EN 16803-2, EN 16803-1: set-up, trajectory, environment).
-
-    Attributes
-    ----------
-    date, place, environment, trajectory : str
-        Of the recording; "deep urban", "line with two tunnels".
-    vehicle, antenna, receiver, signals : str
-        Set-up conditions.
-    rate_hz, duration_s : float or None [Hz], [s]
-    reference : str
-        System of the ground truth.
-    reference_accuracy_m : float or None [m]
-        Its standard deviation.
-    """
+    """Description of a recorded test scenario (EN 16803-2, EN 16803-1: set-up, trajectory, environment)."""
 
     date: str = ""
     place: str = ""
@@ -57,7 +44,7 @@ class RecordedScenario(Settings):
     signals: str = ""
     rate_hz: float | None = Field(default=None, gt=0.0)
     duration_s: float | None = Field(default=None, gt=0.0)
-    reference: str = ""
+    reference: str = ""  #: System of the ground truth; its standard deviation follows.
     reference_accuracy_m: float | None = Field(default=None, gt=0.0)
 
 
@@ -75,7 +62,7 @@ class CaseFile(Settings):
     options: RunOptions = RunOptions()
     evaluation: EvaluationOptions = EvaluationOptions()
 
-    def named(self) -> Iterator[Path]:
+    def every_file(self) -> Iterator[Path]:
         """Every file, as written."""
         yield from self.files.paths
         yield from (other.file for other in self.positions.values())
@@ -95,7 +82,7 @@ class Case:
         """Raise InputFileError where a file is missing or not the one that the case was made of, SettingsError without
         a hash.
         """
-        for name in self.content.named():
+        for name in self.content.every_file():
             path, stated = self.folder / name, self.content.sha256.get(str(name))
             if stated is None:
                 raise SettingsError(f"{self.folder / CASE_FILE}: sha256 has no entry for {name}; add its SHA-256")
@@ -141,7 +128,7 @@ def read_cases(folder: Path) -> list[Case]:
 def write_case(folder: Path, content: Mapping[str, Any]) -> None:
     """Write the ``case.toml`` of a folder from its content without hashes; errors as `read_case`."""
     case = validated(CaseFile, {**content, "sha256": {}}, source=str(folder / CASE_FILE))
-    hashes = {str(name): file_sha256(folder / name) for name in case.named()}
+    hashes = {str(name): file_sha256(folder / name) for name in case.every_file()}
     write_toml(folder / CASE_FILE, {**content, "sha256": hashes}, what=_KIND)
 
 

@@ -124,7 +124,7 @@ def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
     return whole[order], (np.arange(len(whole)) < len(time))[order], step
 
 
-def travelled(
+def distance_travelled(
     time: Datetimes, step_m: Floats, known: Masks, speed_mps: Floats, *, options: EvaluationOptions
 ) -> Floats:
     """Return the distance travelled since the first epoch with a known reference position, shape (T,) [m].
@@ -193,7 +193,7 @@ def antenna_epochs(
     known = at.inside & (np.isfinite(chainage) if errors.method == "chainage" else np.isfinite(place[:, 0]))
     along = _steps(chainage if np.isfinite(chainage[known]).all() else place, known)
     stated_speed = at.of(reference.speed_mps)
-    moved = travelled(time, along, known, stated_speed, options=options)
+    moved = distance_travelled(time, along, known, stated_speed, options=options)
     speed = np.where(np.isfinite(stated_speed), np.abs(stated_speed), _own_speed(time, along, known))
     sigma = at.of(reference.sigma_m)
     status = np.append(mine["status"].to_numpy().astype(str), NOT_LOGGED)[rows]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,7 +25,7 @@ from railfix.evaluate.inputs import (
     read_run,
     read_sections,
 )
-from railfix.evaluate.integrity import Integrity, LevelledRun, integrity_of
+from railfix.evaluate.integrity import Integrity, Level, integrity_of
 from railfix.evaluate.intervals import branch_table, interval_table, level_table, outage_table
 from railfix.evaluate.place import TrackFiles
 from railfix.io.reference_log import AntennaReference, read_reference
@@ -43,28 +43,14 @@ Reference = Path | Mapping[str, AntennaReference] | None
 
 @dataclass(frozen=True, kw_only=True)
 class RunAndReference:
-    """A table of positions of a run, with its reference trajectory.
-
-    Attributes
-    ----------
-    run : Path
-        Folder of `railfix run`.
-    reference : Path or mapping of str to AntennaReference or None
-        A file, or references by antenna; None: the file of `BESIDE_THE_LOG` beside the run's log.
-    configuration : str or None
-        Name of its settings; None: composed of the settings that differ between the runs.
-    table : str
-        Table of positions (`railfix.evaluate.inputs.tables_of`): "positions" for single epochs, "train" for
-        the filter along the track.
-    conventional : Path or None
-        Folder of another run on the same log, whose conventional positions take the place of the run's own: one
-        with the screens elevation and C/N0 alone gives those that P1 compares with.
-    """
+    """A table of positions of a run, with its reference trajectory."""
 
     run: Path
-    reference: Reference = None
-    configuration: str | None = None
-    table: str = POSITIONS_TABLE
+    reference: Reference = None  #: None: the file of `BESIDE_THE_LOG` beside the run's log.
+    configuration: str | None = None  #: Name of its settings; None: composed of those that differ between the runs.
+    table: str = POSITIONS_TABLE  #: See `railfix.evaluate.inputs.tables_of`.
+    #: Another run on the same log, whose conventional positions take the place of the run's own: one with the screens
+    #: elevation and C/N0 alone gives those that P1 compares with.
     conventional: Path | None = None
 
 
@@ -91,54 +77,25 @@ class EvaluatedRun:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """Evaluation of runs against reference trajectories.
-
-    Attributes
-    ----------
-    runs : tuple of EvaluatedRun
-    epochs : polars.DataFrame
-        One row an epoch, antenna and run: `railfix.evaluate.EPOCH_COLUMNS`, then protection levels.
-    figures : polars.DataFrame
-        Figures of every grouping: `railfix.evaluate.FIGURE_COLUMNS`.
-    intervals : polars.DataFrame
-        `railfix.evaluate.INTERVAL_COLUMNS`.
-    levels : polars.DataFrame or None
-        `railfix.evaluate.LEVEL_COLUMNS`; None where no run has a protection level.
-    integrity : mapping of str to Integrity
-        Levels against errors, by what the levels rest on; empty where no run has a level.
-    outages, branches : polars.DataFrame or None
-        `railfix.evaluate.intervals.OUTAGE_COLUMNS`, `railfix.evaluate.intervals.BRANCH_COLUMNS`; None where no table of
-        the filter along the track is among the runs.
-    options : EvaluationOptions
-    inputs : tuple of mapping
-        Files of all runs, with size and hash.
-    """
+    """Evaluation of runs against reference trajectories."""
 
     runs: tuple[EvaluatedRun, ...]
-    epochs: pl.DataFrame
-    figures: pl.DataFrame
-    intervals: pl.DataFrame
-    levels: pl.DataFrame | None
-    integrity: Mapping[str, Integrity]
+    epochs: pl.DataFrame  #: One row an epoch, antenna and run: `EPOCH_COLUMNS`, then protection levels.
+    figures: pl.DataFrame  #: Figures of every grouping: `FIGURE_COLUMNS`.
+    intervals: pl.DataFrame  #: `INTERVAL_COLUMNS`.
+    levels: pl.DataFrame | None  #: `LEVEL_COLUMNS`; None where no run has a protection level.
+    integrity: Mapping[str, Integrity]  #: Levels against errors, by what the levels rest on.
+    #: `OUTAGE_COLUMNS`, `BRANCH_COLUMNS`; None where no table of the filter along the track is among the runs.
     outages: pl.DataFrame | None
     branches: pl.DataFrame | None
     options: EvaluationOptions
-    inputs: tuple[Mapping[str, Any], ...] = ()
+    inputs: tuple[Mapping[str, Any], ...] = ()  #: Files of all runs, with size and hash.
 
     def figure(self, name: str, **where: str) -> Any:
-        """One figure of the table of figures.
+        """One figure of the table of figures, of the row whose other columns have these values.
 
-        Parameters
-        ----------
-        name : str
-            A column of it.
-        **where : str
-            Values of its other columns; without them the grouping "all", own epochs, constrained.
-
-        Raises
-        ------
-        LookupError
-            Not exactly one row is meant.
+        Without values it is that of the grouping "all", own epochs, constrained. LookupError: not exactly one row is
+        meant.
         """
         chosen = {"grouping": ALL, "epochs_of": "own", "position": "constrained"} | where
         rows = self.figures.filter(*(pl.col(key) == value for key, value in chosen.items()))
@@ -149,23 +106,6 @@ class Evaluation:
                 f"{len(rows)} rows of the figures have {chosen}; name one{f' of {several}' if several else ''}"
             )
         return rows[name].item()
-
-
-@dataclass(kw_only=True)
-class _EvaluatedPart:
-    """One run with its reference and the epochs of each antenna; `facts` are of each antenna, see `EvaluatedRun`.
-
-    Its folder has no rows, `level` is the kind and the alarm limit of its protection levels.
-    """
-
-    folder: RunFolder
-    level: tuple[str, float | None] | None
-    reference: str
-    configuration: str | None
-    tables: list[pl.DataFrame]
-    facts: dict[str, dict[str, Any]]
-    inputs: list[dict[str, Any]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
 
 
 def evaluate_run(
@@ -191,27 +131,11 @@ def evaluate_runs(
 ) -> Evaluation:
     """Evaluate runs against their reference trajectories.
 
-    Parameters
-    ----------
-    runs : sequence of RunAndReference
-    sections : Path, optional
-        Environment by chainage (``from_m,to_m,environment``) where a reference does not tell it.
-    files : TrackFiles, optional
-        In place of the track and the vehicle that ``run.json`` names.
-    options : EvaluationOptions, optional
+    `sections`: the environment by chainage (``from_m,to_m,environment``) where a reference does not tell it. `files`:
+    in place of the track and the vehicle that ``run.json`` names.
 
-    Returns
-    -------
-    Evaluation
-
-    Raises
-    ------
-    InputFileError
-        A file is missing, or not what it should be.
-    MismatchError
-        A run and its reference have no time in common, or the errors cannot be worked out as asked.
-    SettingsError
-        The same run twice, or none.
+    InputFileError: a file is missing, or not what it should be. MismatchError: a run and its reference have no time in
+    common, or the errors cannot be worked out as asked. SettingsError: the same run twice, or none.
     """
     options, files = options or EvaluationOptions(), files or TrackFiles()
     if not runs:
@@ -221,38 +145,30 @@ def evaluate_runs(
     if twice:
         raise SettingsError(f"{twice[0]}: the run is given twice; give each run once")
     read: dict[tuple[Path, tuple[str, ...]], Mapping[str, AntennaReference]] = {}
-    parts = [_part(item, read, sections=sections, files=files, options=options) for item in runs]
+    parts = [_evaluate(item, read, sections=sections, files=files, options=options) for item in runs]
     read.clear()
-    names = _names([part.folder for part in parts])
-    settings = [part.folder.settings | {"table": part.folder.table} for part in parts]
-    labels = configurations(settings, [part.configuration for part in parts])
-    tables = []
-    for number, (part, name, label) in enumerate(zip(parts, names, labels, strict=True)):
-        tables += [
-            table.with_columns(
-                run=pl.lit(name),
-                configuration=pl.lit(label),
-                line=pl.lit(part.folder.line_name),
-                block=pl.col("block") + number * _BLOCKS_APART,
-            )
-            for table in part.tables
-        ]
-        part.tables = []
+    evaluated = _name_runs([run for run, _, _ in parts])
+    levels = {run.name: level for run, (_, _, level) in zip(evaluated, parts, strict=True) if level is not None}
+    tables = [
+        table.with_columns(
+            run=pl.lit(run.name),
+            configuration=pl.lit(run.configuration),
+            line=pl.lit(run.line),
+            block=pl.col("block") + number * _BLOCKS_APART,
+        )
+        for number, (run, (_, own, _)) in enumerate(zip(evaluated, parts, strict=True))
+        for table in own
+    ]
+    del parts
     epochs = below(tables)
     del tables
-    evaluated = tuple(_evaluate(*item) for item in zip(parts, names, labels, strict=True))
-    levelled = [
-        LevelledRun(name=name, kind=part.level[0], alarm_limit_m=part.level[1])
-        for part, name in zip(parts, names, strict=True)
-        if part.level is not None
-    ]
     return Evaluation(
-        runs=evaluated,
+        runs=tuple(evaluated),
         epochs=epochs,
         figures=_figures(epochs, options),
         intervals=_intervals(epochs),
         levels=level_table(epochs, list(KEYS)),
-        integrity=integrity_of(epochs, levelled, options),
+        integrity=integrity_of(epochs, levels, options),
         outages=outage_table(epochs),
         branches=branch_table(epochs),
         options=options,
@@ -260,15 +176,15 @@ def evaluate_runs(
     )
 
 
-def _part(
+def _evaluate(
     item: RunAndReference,
     read: dict[tuple[Path, tuple[str, ...]], Mapping[str, AntennaReference]],
     *,
     sections: Path | None,
     files: TrackFiles,
     options: EvaluationOptions,
-) -> _EvaluatedPart:
-    """Epochs of one run; a reference that was read is kept in `read`."""
+) -> tuple[EvaluatedRun, list[pl.DataFrame], Level | None]:
+    """Return one run, not yet named, the epochs of its antennas, and its level; a reference is kept in `read`."""
     folder = read_run(item.run, table=item.table, conventional=item.conventional, columns=_COLUMNS)
     kind = folder.level_kind if "protection_level_m" in folder.positions.columns else None
     inputs = [fingerprint("positions", folder.positions_path), fingerprint("record", folder.path / "run.json")]
@@ -320,21 +236,27 @@ def _part(
     if folder.level_kind is not None and not stated:
         notes.append("the run has no protection_status: levels are taken as usable where the status is ok")
     more = [note for antenna in antennas.values() for note in antenna.errors.notes]
-    return _EvaluatedPart(
-        folder=replace(folder, positions=folder.positions.clear()),
-        level=None if kind is None else (kind, folder.alarm_limit_m),
+    facts = {fact: {name: getattr(antenna, fact) for name, antenna in antennas.items()} for fact in _FACTS}
+    run = EvaluatedRun(
+        name="",
+        configuration=item.configuration or "",
+        line=folder.line_name,
+        path=folder.path,
+        table=folder.table,
         reference=source,
-        configuration=item.configuration,
-        tables=[antenna.table for antenna in antennas.values()],
-        facts={fact: {name: getattr(antenna, fact) for name, antenna in antennas.items()} for fact in _FACTS},
-        inputs=inputs + entries,
-        notes=list(dict.fromkeys([*notes, *more])),
+        **facts,
+        protection=folder.protection,
+        settings=folder.settings,
+        inputs=tuple(inputs + entries),
+        notes=tuple(dict.fromkeys([*notes, *more])),
     )
+    level = None if kind is None else (kind, folder.alarm_limit_m)
+    return run, [antenna.table for antenna in antennas.values()], level
 
 
 def reference_beside(run: RunFolder) -> Path:
     """Return the reference beside the log of the front antenna; InputFileError unless there is exactly one."""
-    logs = run.located("front")
+    logs = run.input_paths("front")
     if not logs:
         raise InputFileError(run.path / "run.json", "names no log of the front antenna; name the reference")
     folder = logs[0].parent
@@ -349,7 +271,7 @@ def reference_beside(run: RunFolder) -> Path:
     return paths[0]
 
 
-def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str | None]) -> list[str]:
+def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) -> list[str]:
     """A name for the settings of each run: its preset and the settings that differ between the runs."""
     keys = dict.fromkeys(key for run_settings in settings for key in run_settings)
     differ = [
@@ -364,10 +286,16 @@ def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str | 
     return names
 
 
-def _names(folders: Sequence[RunFolder]) -> list[str]:
-    """Short names of the folders that tell them apart, with the table where it is not that of single epochs."""
-    ends = ["" if folder.table == POSITIONS_TABLE else f" ({folder.table})" for folder in folders]
-    return [name + end for name, end in zip(short_names([folder.path for folder in folders]), ends, strict=True)]
+def _name_runs(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
+    """Return runs with short names that tell them apart, the table in it where it is not that of single epochs."""
+    settings = [dict(run.settings) | {"table": run.table} for run in runs]
+    labels = configurations(settings, [run.configuration for run in runs])
+    ends = ["" if run.table == POSITIONS_TABLE else f" ({run.table})" for run in runs]
+    names = zip(short_names([run.path for run in runs]), ends, strict=True)
+    return [
+        replace(run, name=name + end, configuration=label)
+        for run, (name, end), label in zip(runs, names, labels, strict=True)
+    ]
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:
@@ -377,22 +305,6 @@ def short_names(paths: Sequence[Path]) -> list[str]:
     while len({part[-depth:] for part in parts}) < len(set(parts)):
         depth += 1
     return ["/".join(part[-depth:]) for part in parts]
-
-
-def _evaluate(part: _EvaluatedPart, name: str, label: str) -> EvaluatedRun:
-    return EvaluatedRun(
-        name=name,
-        configuration=label,
-        line=part.folder.line_name,
-        path=part.folder.path,
-        table=part.folder.table,
-        reference=part.reference,
-        **part.facts,
-        protection=part.folder.protection,
-        settings=part.folder.settings,
-        inputs=tuple(part.inputs),
-        notes=tuple(part.notes),
-    )
 
 
 def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:

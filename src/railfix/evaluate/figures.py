@@ -21,6 +21,8 @@ from railfix.evaluate.inputs import EvaluationOptions, floats
 
 #: Distance on the map from which on an answer is in the wrong place [m].
 WRONG_PLACE_M = 50.0
+#: Error sizes; the share of errors above each is counted [m].
+OVER_M: Final = (5, 10, 20, 50)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,13 +43,7 @@ class Score:
 
 
 def score(error_m: Floats, observed: Masks) -> Score:
-    """Figures of merit from signed errors, NaN where there is no position, at the epochs that are observed.
-
-    Raises
-    ------
-    ValueError
-        No epoch is observed.
-    """
+    """Figures of merit from signed errors, NaN without a position, at the observed epochs; ValueError without any."""
     if not observed.any():
         raise ValueError("no epoch with observations lies inside the time of the reference")
     values = error_m[observed & np.isfinite(error_m)]
@@ -206,7 +202,7 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "highest_m": "error furthest toward the end of the line",
     "max_at_time": "GPS time of the largest error",
     "max_at_chainage_m": "chainage of the reference there",
-    "over_5_m": "share of errors above this size",
+    **dict.fromkeys((f"over_{limit}_m" for limit in OVER_M), "share of errors above this size"),
     "wrong_places": "errors above 50 m",
     "reference_sigma_p50_m": "median standard deviation of the reference",
     "along_sigma_p50_m": "median standard deviation that the run states",
@@ -230,7 +226,7 @@ USED: Final = (
 )  # fmt: skip
 
 
-def classed(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
+def classify_epochs(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
     """Epochs inside the reference, with a class and its rank (``section``, ``section_rank``) for every grouping."""
     section = (pl.col("chainage_m") / options.section_m).floor().cast(pl.Int64)
     speed = pl.col("speed_mps") * 3.6
@@ -328,26 +324,24 @@ def figures_by(parts: Iterable[pl.DataFrame], groupings: Sequence[str], options:
     kinds = [(position, "own") for position in POSITIONS] + [("constrained", "common"), ("conventional", "common")]
     tables: dict[str, list[list[pl.DataFrame]]] = {grouping: [[] for _ in kinds] for grouping in groupings}
     for epochs in parts:
-        ranked = classed(epochs, options)
+        ranked = classify_epochs(epochs, options)
         for kind, (position, epochs_of) in enumerate(kinds):
             part = series(ranked, position, epochs_of)
             for grouping in groupings:
                 by = [*KEYS, f"{grouping}_rank", f"{grouping}_group"]
-                table = part.group_by(by, maintain_order=True).agg(_figures(options))
+                table = part.group_by(by, maintain_order=True).agg(_figures())
                 limited = epochs_of == "own" and grouping in WITH_LIMITS
                 tables[grouping][kind].append(_with_limits(table, part if limited else None, by, options))
     whole = {grouping: pl.concat([table for kind in found for table in kind]) for grouping, found in tables.items()}
-    return pl.concat([_order(table, grouping, options) for grouping, table in whole.items()], how="vertical")
+    return pl.concat([_order(table, grouping) for grouping, table in whole.items()], how="vertical")
 
 
-def _order(table: pl.DataFrame, grouping: str, options: EvaluationOptions) -> pl.DataFrame:
+def _order(table: pl.DataFrame, grouping: str) -> pl.DataFrame:
     """The table of one grouping in the order of its groups, with the columns of `FIGURE_COLUMNS`."""
     rank, group = f"{grouping}_rank", f"{grouping}_group"
-    columns = [name for name in FIGURE_COLUMNS if not name.startswith("over_5_m")]
-    columns[columns.index("wrong_places") : columns.index("wrong_places")] = [f"over_{x:g}_m" for x in options.over_m]
     words = [pl.col(name).cast(pl.String) for name in KEYS]
     named = table.with_columns(*words, grouping=pl.lit(grouping), group=pl.col(group).cast(pl.String))
-    return named.sort(rank, "group", maintain_order=True).select(columns)
+    return named.sort(rank, "group", maintain_order=True).select(*FIGURE_COLUMNS)
 
 
 def at_largest(column: str, by: str) -> pl.Expr:
@@ -355,7 +349,7 @@ def at_largest(column: str, by: str) -> pl.Expr:
     return pl.col(column).get(pl.col(by).arg_max())
 
 
-def _figures(options: EvaluationOptions) -> list[pl.Expr]:
+def _figures() -> list[pl.Expr]:
     """Every figure of a group of rows of `series`."""
     error, size, has = pl.col("error"), pl.col("size"), pl.col("has")
     good = error.is_not_null()
@@ -380,7 +374,7 @@ def _figures(options: EvaluationOptions) -> list[pl.Expr]:
         error.max().alias("highest_m"),
         at_largest("time_gpst", "size").alias("max_at_time"),
         at_largest("chainage_m", "size").alias("max_at_chainage_m"),
-        *((size > limit).mean().alias(f"over_{limit:g}_m") for limit in options.over_m),
+        *((size > limit).mean().alias(f"over_{limit}_m") for limit in OVER_M),
         (size > WRONG_PLACE_M).sum().cast(pl.Int64).alias("wrong_places"),
         pl.col("reference_sigma_m").filter(good).median().alias("reference_sigma_p50_m"),
         pl.col("sigma").filter(good).median().alias("along_sigma_p50_m"),

@@ -78,12 +78,12 @@ class RunFolder(RunRecord):
     def tracks(self) -> list[Path]:
         """Files of the track: that in the folder where the run moved, joined or raised it, else its inputs."""
         name = self.track_facts.get("file")
-        return [self.path / str(name)] if name else self.located("track")
+        return [self.path / str(name)] if name else self.input_paths("track")
 
     @property
     def settings(self) -> dict[str, Any]:
         """Settings in force and kinds of input, by dotted name."""
-        flat = flattened(self.record.get("settings_used") or {})
+        flat = flat_settings(self.record.get("settings_used") or {})
         kinds = {str(entry["input"]) for entry in self.entries}
         return flat | {f"input {kind}": "given" for kind in sorted(kinds - {"front", "nav", "track", "config"})}
 
@@ -137,13 +137,13 @@ class RunFolder(RunRecord):
         return self.record.get("line") or {}
 
 
-def flattened(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat_settings(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested settings by dotted name; lists as text."""
     flat: dict[str, Any] = {}
     for key, value in values.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping):
-            flat |= flattened(value, f"{name}.")
+            flat |= flat_settings(value, f"{name}.")
         else:
             flat[name] = " ".join(str(v) for v in value) if isinstance(value, list | tuple) else value
     return flat
@@ -176,19 +176,19 @@ def read_run(
         rows = rows.with_columns(pl.col("observed").fill_null(value=False))
     if conventional is not None:
         other = read_run(conventional, columns=NO_MORE)
-        _check_same_log(path, record, conventional, other.record)
+        of_run, of_other = (_log_hashes(entries) for entries in (record, other.record))
+        if of_run != of_other:
+            raise MismatchError(
+                f"{conventional}: is not a run on the log of {path}; give one whose observations are the same"
+            )
         unscreened = other.positions.select(*_KEYS, *CONVENTIONAL)
         rows = rows.drop(CONVENTIONAL).join(unscreened, on=_KEYS, how="left", maintain_order="left")
     return RunFolder(path=path, positions_path=file, positions=rows, record=record, table=table)
 
 
-def _check_same_log(path: Path, record: Mapping[str, Any], other: Path, of_other: Mapping[str, Any]) -> None:
-    logs = [
-        sorted(str(entry.get("sha256")) for entry in entries.get("inputs", ()) if entry["input"] in ("front", "rear"))
-        for entries in (record, of_other)
-    ]
-    if logs[0] != logs[1]:
-        raise MismatchError(f"{other}: is not a run on the log of {path}; give one whose observations are the same")
+def _log_hashes(record: Mapping[str, Any]) -> list[str]:
+    logs = [entry for entry in record.get("inputs", ()) if entry["input"] in ("front", "rear")]
+    return sorted(str(entry.get("sha256")) for entry in logs)
 
 
 def read_table(
@@ -327,7 +327,6 @@ class EvaluationOptions(Settings):
     speed_edges_kmh: RisingEdges = option(
         "Limits between the speed classes.", (20.0, 60.0, 100.0), name="--speed-classes", metavar="KMH,..."
     )
-    over_m: RisingEdges = (5.0, 10.0, 20.0, 50.0)  #: Error sizes; the share of errors above each is counted.
     alarm_limits_m: tuple[Positive, ...] = option(
         "Alarm limits that protection levels are compared with, besides the run's own.",
         (10.0, 20.0, 40.0),

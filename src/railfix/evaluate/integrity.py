@@ -6,7 +6,7 @@ other position counts as having an infinite level. `all`: every level counts, wh
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -88,13 +88,8 @@ BEYOND_COLUMNS: Final[dict[str, str]] = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class LevelledRun:
-    """A run with protection levels of a kind, the prefix of their columns, and its alarm limit."""
-
-    name: str
-    kind: str
-    alarm_limit_m: float | None
+#: Kind of the protection levels of a run, the prefix of their columns, and its alarm limit [m].
+Level = tuple[str, float | None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +105,7 @@ def level_name(kind: str) -> str:
     return f"{kind}_protection_level_m"
 
 
-def counted_levels(level_m: Floats, has: Masks, status: Strings, verdict: Strings, *, levels_of: LevelsOf) -> Floats:
+def effective_levels(level_m: Floats, has: Masks, status: Strings, verdict: Strings, *, levels_of: LevelsOf) -> Floats:
     """Return levels as counted, shape (T,) [m]: infinite without a usable level, NaN without a position.
 
     `status` of the position and `verdict` of the level are blank where there is none, `level_m` is NaN.
@@ -147,7 +142,7 @@ def _judge(spanned: pl.DataFrame, kind: str, levels_of: LevelsOf) -> tuple[Float
     """Errors and levels as counted of epochs inside the reference, NaN where there is none."""
     has = spanned["positioned"].to_numpy()
     error = np.where(has & spanned["reference_good"].to_numpy(), floats(spanned, "error_m"), np.nan)
-    level = counted_levels(
+    level = effective_levels(
         floats(spanned, level_name(kind)),
         has,
         _words(spanned, "status"),
@@ -164,7 +159,7 @@ def positions_diagram(
 
     Of one antenna, columns of `railfix.pipeline.result_columns.POSITION_COLUMNS`, in order of time.
     """
-    level = counted_levels(
+    level = effective_levels(
         floats(positions, "protection_level_m"),
         np.isfinite(floats(positions, "chainage_m")),
         _words(positions, "status"),
@@ -187,31 +182,32 @@ def _sort(
     )
 
 
-def integrity_of(epochs: pl.DataFrame, runs: Sequence[LevelledRun], options: EvaluationOptions) -> dict[str, Integrity]:
+def integrity_of(epochs: pl.DataFrame, runs: Mapping[str, Level], options: EvaluationOptions) -> dict[str, Integrity]:
     """Levels against errors by kind, of all runs; empty where no run has levels.
 
     Every run is counted at the alarm limits of the options and at those of all runs, so that rows of several runs
     together include each of them.
     """
-    own = {run.alarm_limit_m for run in runs if run.alarm_limit_m is not None}
+    own = {limit for _, limit in runs.values() if limit is not None}
     limits = sorted({*options.alarm_limits_m, *own})
     by_kind = {}
-    for kind in dict.fromkeys(run.kind for run in runs):
-        mine = [run for run in runs if run.kind == kind]
+    for kind in dict.fromkeys(kind for kind, _ in runs.values()):
+        mine = [name for name, (of_run, _) in runs.items() if of_run == kind]
         rows: list[dict[str, Any]] = []
         needed = (*_JUDGED, level_name(kind), f"{kind}_protection_status")
         slim = epochs.select(*KEYS, "environment", "observed", *(name for name in needed if name in epochs.columns))
-        for run in mine:
-            for part in slim.filter(pl.col("run") == run.name).partition_by("antenna", maintain_order=True):
-                rows += _count(part, run, limits, options)
-        by_kind[kind] = Integrity(stanford=_pool(rows), beyond=_beyond(epochs, [run.name for run in mine], kind))
+        for name in mine:
+            for part in slim.filter(pl.col("run") == name).partition_by("antenna", maintain_order=True):
+                rows += _count(part, runs[name], limits, options)
+        by_kind[kind] = Integrity(stanford=_pool(rows), beyond=_beyond(epochs, mine, kind))
     return by_kind
 
 
 def _count(
-    part: pl.DataFrame, run: LevelledRun, limits: Sequence[float], options: EvaluationOptions
+    part: pl.DataFrame, of_run: Level, limits: Sequence[float], options: EvaluationOptions
 ) -> Iterator[dict[str, Any]]:
     """Counts of one antenna of a run: all epochs, then by environment."""
+    kind, own_limit = of_run
     keys = dict(zip(KEYS, part.select(KEYS).row(0), strict=True))
     part = part.filter("in_reference")
     groups = [(ALL, ALL, part)]
@@ -220,7 +216,7 @@ def _count(
     for grouping, group, spanned in groups:
         observed = spanned["observed"].to_numpy()
         for levels_of in LEVELS_OF:
-            error, level = _judge(spanned, run.kind, levels_of)
+            error, level = _judge(spanned, kind, levels_of)
             for limit in limits:
                 diagram = _sort(spanned, error, level, limit, options)
                 regions = {name: diagram.counts[region] for region, name in _REGIONS.items()}
@@ -230,7 +226,7 @@ def _count(
                     "group": group,
                     "levels_of": levels_of,
                     "alarm_limit_m": limit,
-                    "own_limit": limit == run.alarm_limit_m,
+                    "own_limit": limit == own_limit,
                     "epochs": len(spanned),
                     "observed": int(observed.sum()),
                     "judged": int(diagram.histogram.sum()),
@@ -238,7 +234,7 @@ def _count(
                     "available": round(diagram.available_rate * len(spanned)),
                     "available_observed": int(np.count_nonzero(observed & (level <= limit))),
                     "beyond": len(diagram.beyond),
-                    "beyond_blocks": int(np.count_nonzero(diagram.blocks.misleading)),
+                    "beyond_blocks": diagram.misleading_blocks,
                 }
                 for window in diagram.continuity:
                     row |= {

@@ -75,16 +75,9 @@ def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float 
 def interpolate_reference(
     time: Datetimes, reference_time: Datetimes, reference_ecef_m: Floats, *, largest_gap_s: float = LARGEST_GAP_S
 ) -> Floats:
-    """Reference positions at other times, linearly, shape (T, 3) [m]; NaN outside and in gaps.
+    """Reference positions, shape (R, 3), linearly at other times, shape (T, 3) [m]; NaN outside and in gaps.
 
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    reference_time : ndarray of datetime64[ns], shape (R,)
-        Rising.
-    reference_ecef_m : ndarray, shape (R, 3) [m]
-    largest_gap_s : float
-        Longest step of the reference that is bridged.
+    Times of the reference rise; steps longer than `largest_gap_s` are not bridged.
     """
     return bracket(time, reference_time, largest_gap_s=largest_gap_s).of(reference_ecef_m)
 
@@ -94,24 +87,13 @@ def along_track_error(
 ) -> Floats:
     """Signed distance on the map from the reference's point to the answer, + toward the end of the line (P1 3.3).
 
-    The distance along the line. Where the map passes the reference's place more than once (laps, a
-    road's two carriageways) the pass nearest to the answer counts: which of them it was, one epoch
-    of ranges cannot tell. And where the line comes back to near itself (a crossing), the straight
-    distance between the two points counts if it is shorter. On a line that passes every place once
-    neither has an effect, but for the chord of a curve.
+    The distance along the line. Where the map passes the reference's place more than once (laps, a road's two
+    carriageways) the pass nearest to the answer counts: which of them it was, one epoch of ranges cannot tell. And
+    where the line comes back to near itself (a crossing), the straight distance between the two points counts if it is
+    shorter. On a line that passes every place once neither has an effect, but for the chord of a curve.
 
-    Parameters
-    ----------
-    arc_m : ndarray, shape (T,) [m]
-        Answers along the trajectory; NaN where there is none.
-    reference_ecef_m : ndarray, shape (T, 3) [m]
-    same_place_m : float
-        Passes of the map up to this far from the reference are its place.
-
-    Returns
-    -------
-    ndarray, shape (T,) [m]
-        NaN where either is missing.
+    `arc_m` are the answers along the trajectory, shape (T,), `reference_ecef_m` of shape (T, 3); NaN where either is
+    missing. Passes of the map up to `same_place_m` from the reference are its place.
     """
     error = np.full(len(arc_m), np.nan)
     at = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
@@ -234,7 +216,9 @@ def errors_of(
     if method != "trajectory":
         if against is None:
             if files.track or files.vehicle is not None:
-                find_trajectory(run, antenna, answers, files)  # what was given is that of the run
+                find_trajectory(
+                    run, antenna, answers.chainage_m, answers.ecef_m, files
+                )  # what was given is that of the run
             return PlaceErrors(
                 method="chainage",
                 error_m=short_way_m(answers.chainage_m - answers.reference_chainage_m, turn),
@@ -248,7 +232,7 @@ def errors_of(
         notes: tuple[str, ...] = (f"{antenna}: errors are along the trajectory: {against}",)
     else:
         notes = (f"{antenna}: errors are along the trajectory, as asked",)
-    trajectory, used, more = find_trajectory(run, antenna, answers, files)
+    trajectory, used, more = find_trajectory(run, antenna, answers.chainage_m, answers.ecef_m, files)
     arc, other = (_arc(trajectory, c) for c in (answers.chainage_m, answers.conventional_chainage_m))
     place = answers.reference_chainage_m
     if not trusted:
@@ -320,14 +304,14 @@ def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
 
 
 def find_trajectory(
-    run: RunFolder, antenna: str, answers: Answers, files: TrackFiles
+    run: RunFolder, antenna: str, chainage_m: Floats, ecef_m: Floats, files: TrackFiles
 ) -> tuple[Trajectory, tuple[tuple[str, Path], ...], tuple[str, ...]]:
-    """Return the trajectory that the run used, from its track and vehicle; with the files and notes.
+    """Return the trajectory of a run's positions, shape (T,), (T, 3), from its track and vehicle; files and notes.
 
     MismatchError: the positions do not lie on it: another track or vehicle, or other reading options.
     """
     tracks = list(files.track) or run.tracks
-    vehicles = [files.vehicle] if files.vehicle is not None else run.located("vehicle")
+    vehicles = [files.vehicle] if files.vehicle is not None else run.input_paths("vehicle")
     if not tracks:
         raise InputFileError(run.path / "run.json", "names no track; give it with --track")
     used = (*(("track", path) for path in tracks), *(("vehicle", path) for path in vehicles))
@@ -343,9 +327,9 @@ def find_trajectory(
         except RailfixError as error:
             faults.append(error)
             continue
-        arc = _arc(trajectory, answers.chainage_m)
-        off = np.linalg.norm(trajectory.at_arc(arc) - answers.ecef_m, axis=1)
-        off = np.where(np.isfinite(answers.chainage_m), np.nan_to_num(off, nan=np.inf), 0.0)
+        arc = _arc(trajectory, chainage_m)
+        off = np.linalg.norm(trajectory.at_arc(arc) - ecef_m, axis=1)
+        off = np.where(np.isfinite(chainage_m), np.nan_to_num(off, nan=np.inf), 0.0)
         if off.max(initial=0.0) <= SAME_TRAJECTORY_M:
             return trajectory, used, trajectory.notes
         farthest.append(float(off.max()))

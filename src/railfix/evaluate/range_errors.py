@@ -38,11 +38,11 @@ from railfix.run.driver import open_inputs
 from railfix.run.inputs import ColumnNames, input_option
 from railfix.run.processor import processor_of
 from railfix.run.record import read_record
-from railfix.run.sources import aligned
+from railfix.run.sources import align_logs
 from railfix.track.trajectory import Trajectory
 
 __all__ = [
-    "GatherLimits", "ModelInputs", "RangeErrors", "RobustClock", "StationBeside", "StationErrors", "base_station",
+    "ModelInputs", "RangeErrors", "RobustClock", "StationBeside", "StationErrors", "base_station",
     "base_station_from_files", "error_model_from_runs", "range_errors", "robust_clock",
 ]  # fmt: skip
 
@@ -69,13 +69,8 @@ _LARGEST_REFERENCE_SIGMA_M: Final = 0.5
 #: Longest gap of the reference trajectory and of the reference station that is interpolated over.
 _LARGEST_REFERENCE_GAP_S: Final = 2.5
 _LARGEST_BASE_GAP_S: Final = 35.0
-
-
-class GatherLimits(Settings):
-    """Limits for the range errors of a run."""
-
-    #: Fewest ranges of one constellation, after the screens, from which its receiver clock is estimated.
-    least_ranges: int = Field(default=4, ge=1)
+#: Fewest ranges of one constellation, after the screens, from which its receiver clock is estimated.
+_LEAST_RANGES: Final = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,19 +100,10 @@ class StationErrors:
 def base_station(
     parts: Iterable[Observations], processor: EpochProcessor, position_ecef_m: Floats, *, name: str
 ) -> StationErrors:
-    """Common range errors from the log of a station at a known position.
+    """Common range errors from the parts of the log of a station at a known position, in order of time.
 
-    Its pseudoranges are corrected like those of the train, with the same settings, and smoothed by carrier phase
-    where available, which reduces the station's own noise. The station's own multipath remains.
-
-    Parameters
-    ----------
-    parts : iterable of Observations
-        Parts of its log, in order of time.
-    processor : EpochProcessor
-        Of the train; its settings, ephemerides, ionosphere and SBAS also correct the station's pseudoranges.
-    position_ecef_m : ndarray, shape (3,) [m]
-    name : str
+    Its pseudoranges are corrected like those of the train, by the `processor` of the train, and smoothed by carrier
+    phase where available, which reduces the station's own noise. The station's own multipath remains.
     """
     station, carrier, phases = BaseStation(processor.config, position_ecef_m), CarrierState(), False
     times: list[Datetimes] = []
@@ -152,10 +138,7 @@ def base_station_from_files(
 ) -> StationErrors:
     """Common range errors from RINEX files; the position is that of the header where none is given.
 
-    Raises
-    ------
-    InputFileError
-        No position is known, or no error could be computed.
+    InputFileError: no position is known, or no error could be computed.
     """
     parts = list(scan_observations(paths, epochs=20_000))
     place = position_ecef_m if position_ecef_m is not None else parts[0].header.approximate_ecef_m
@@ -183,30 +166,17 @@ def range_errors(
     reference: AntennaReference,
     base: StationErrors | None = None,
     *,
-    limits: GatherLimits | None = None,
     block_s: float = 30.0,
 ) -> RangeErrors:
-    """Pseudorange errors of one antenna over one chunk of T epochs.
+    """Pseudorange errors of one antenna over one chunk of T epochs, in blocks of `block_s`.
 
-    The clock of each constellation is the robust mean of the ranges that passed the screens. Each range
-    contributes to its clock estimate, which shrinks its residual; ``1 / sqrt(1 - share)`` restores the size. An
-    error common to all satellites stays in the clock and does not affect the position.
+    The clock of each constellation is the robust mean of the ranges that passed the screens. Each range contributes to
+    its clock estimate, which shrinks its residual; ``1 / sqrt(1 - share)`` restores the size. An error common to all
+    satellites stays in the clock and does not affect the position. Without `base`, satellite and atmospheric errors
+    remain.
 
-    Parameters
-    ----------
-    trajectory : Trajectory
-        Of the antenna; gives the azimuth of the vehicle.
-    base : StationErrors, optional
-        Without one, satellite and atmospheric errors remain.
-    block_s : float [s]
-        Length of the blocks of `ErrorSamples.block`.
-
-    Raises
-    ------
-    MismatchError
-        Fewer than two reference positions have a sigma within the limit.
+    MismatchError: fewer than two reference positions have a sigma within the limit.
     """
-    limits = limits or GatherLimits()
     columns = result.columns
     good = ~(reference.sigma_m > _LARGEST_REFERENCE_SIGMA_M)
     if np.count_nonzero(good) < 2:
@@ -230,7 +200,7 @@ def range_errors(
             used &= ~result.screens[name].reject
     groups = clock_groups(satellite.astype("<U1"))
     clock = robust_clock(
-        np.where(used, residual, np.nan), result.sigma_m[:, columns], groups, least_ranges=limits.least_ranges
+        np.where(used, residual, np.nan), result.sigma_m[:, columns], groups, least_ranges=_LEAST_RANGES
     )
     widths = [group.stop - group.start for group in groups]
     error = (residual - np.repeat(clock.clock_m, widths, axis=1)) / np.sqrt(1.0 - clock.share)
@@ -261,13 +231,6 @@ def _level_sigma_m(result: AntennaResult) -> Floats:
     columns = result.columns
     stated = result.sigma_m[:, columns] * np.maximum(result.noise_scale, 1.0)[:, None]
     return np.asarray(np.fmax(stated, result.bound_sigma_m[:, columns]))
-
-
-def joined(parts: list[ErrorSamples]) -> ErrorSamples:
-    """Samples of several chunks, antennas and runs concatenated."""
-    return ErrorSamples(
-        **{item.name: np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(ErrorSamples)}
-    )
 
 
 class StationBeside(Settings):
@@ -309,30 +272,27 @@ class _RunErrors:
 
 
 def error_model_from_runs(
-    inputs: Sequence[ModelInputs], *, fit: ErrorModelFit | None = None, limits: GatherLimits | None = None
+    inputs: Sequence[ModelInputs], *, fit: ErrorModelFit | None = None
 ) -> tuple[ErrorModel, ErrorSamples]:
     """Error model of the pseudoranges of several runs, before and after the screens, and its samples.
 
-    Each run is processed again with its own settings, which gives corrected pseudoranges, satellites and the
-    verdict of every screen. All runs have a reference station, or none has.
+    Each run is processed again with its own settings, which gives corrected pseudoranges, satellites and the verdict of
+    every screen. All runs have a reference station, or none has.
 
-    Raises
-    ------
-    MismatchError
-        Some runs have a reference station and others have none, their conditions differ, or no range error
-        could be computed.
-    RailfixError
-        A file is not what it should be, or has changed since the run.
+    MismatchError: some runs have a reference station and others have none, their conditions differ, or no range error
+    could be computed; or a file has changed since the run.
     """
-    fit, limits = fit or ErrorModelFit(), limits or GatherLimits()
+    fit = fit or ErrorModelFit()
     with_base = {bool(source.base) for source in inputs}
     if len(with_base) != 1:
         raise MismatchError("give a reference station for every run or for none: the errors are of different kinds")
-    runs = [_run_errors(source, number, fit, limits) for number, source in enumerate(inputs)]
+    runs = [_run_errors(source, number, fit) for number, source in enumerate(inputs)]
     parts = [samples for run in runs for samples in run.samples]
     if not any(len(part.error_m) for part in parts):
         raise MismatchError("no pseudorange error could be computed; do run, reference and station belong together?")
-    samples = joined(parts)
+    samples = ErrorSamples(
+        **{item.name: np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(ErrorSamples)}
+    )
     conditions = runs[0].conditions
     for source, run in zip(inputs[1:], runs[1:], strict=True):
         if differences := condition_differences(
@@ -361,7 +321,7 @@ def error_model_from_runs(
     return model, samples
 
 
-def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit, limits: GatherLimits) -> _RunErrors:
+def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit) -> _RunErrors:
     """Range errors of one run, chunk by chunk."""
     past = read_record(source.run)
     past.check_inputs()
@@ -375,14 +335,12 @@ def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit, limits: Ga
     parts: list[ErrorSamples] = []
     times: list[np.datetime64] = []
     epochs = 0
-    for chunk in aligned({name: log.parts() for name, log in logs.items()}):
+    for chunk in align_logs({name: log.parts() for name, log in logs.items()}):
         result, state = processor.process(chunk, state)
         for antenna, (name, positions) in enumerate(result.antennas.items()):
             if not len(positions):
                 continue
-            errors = range_errors(
-                positions, line.trajectories[name], references[name], base, limits=limits, block_s=fit.block_s
-            )
+            errors = range_errors(positions, line.trajectories[name], references[name], base, block_s=fit.block_s)
             # satellite passes of different runs and antennas are independent blocks
             offset = (2 * number + antenna) * 10**16
             parts.append(replace(errors.samples, block=errors.samples.block + offset))

@@ -134,19 +134,16 @@ _STANFORD: Final[Sequence[Column]] = (
 def evaluation_of(evaluation: Evaluation, name: str) -> Evaluation:
     """Return the part of an evaluation that is on one of its runs."""
 
-    def own(rows: pl.DataFrame) -> pl.DataFrame:
-        return rows.filter(pl.col("run") == name) if "run" in rows.columns else rows
-
-    def own_or_none(rows: pl.DataFrame | None) -> pl.DataFrame | None:
-        return None if rows is None else own(rows)
+    def own(rows: Any) -> Any:
+        return rows if rows is None or "run" not in rows.columns else rows.filter(run=name)
 
     return replace(
         evaluation,
         figures=own(evaluation.figures),
         intervals=own(evaluation.intervals),
-        levels=own_or_none(evaluation.levels),
-        outages=own_or_none(evaluation.outages),
-        branches=own_or_none(evaluation.branches),
+        levels=own(evaluation.levels),
+        outages=own(evaluation.outages),
+        branches=own(evaluation.branches),
         integrity={
             kind: replace(found, stanford=stanford, beyond=own(found.beyond))
             for kind, found in evaluation.integrity.items()
@@ -344,7 +341,7 @@ MOST_BEYOND: Final = 200
 
 
 def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, Path]:
-    """Write an evaluation and commit the folder.
+    """Write an evaluation and commit the folder; return the path of each file. OutputError: one cannot be written.
 
     ==================== ================================================================
     evaluation.json      all figures with their units, options, inputs with their hashes
@@ -357,16 +354,6 @@ def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, 
     outages.csv          stretches without satellites, where a table of the filter is evaluated
     branches.csv         stated probabilities of the place against its correctness, the same
     ==================== ================================================================
-
-    Returns
-    -------
-    dict of str to Path
-        Where each file stands.
-
-    Raises
-    ------
-    OutputError
-        A file cannot be written.
     """
     folder.append_parquet("errors.parquet", evaluation.epochs)
     folder.append_csv("tables.csv", evaluation.figures)

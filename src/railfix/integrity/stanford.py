@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Integers, Masks
 
+_BINS: Final = 100  #: Bins of an axis, up to twice the alarm limit.
 _GAP: Final = 1.5  #: Epochs whose distance is over this many usual intervals stand across a gap.
 
 
@@ -49,16 +50,6 @@ class Continuity:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Blocks:
-    """The run in blocks of time: errors stay alike for tens of seconds, so a block is worth an epoch of statistics."""
-
-    start: Datetimes  #: Blocks with epochs, shape (B,).
-    epochs: Integers  #: Shape (B,).
-    available: Integers  #: Those with a level within the alarm limit, shape (B,).
-    misleading: Integers  #: Those whose error is over the level, shape (B,).
-
-
-@dataclass(frozen=True, kw_only=True)
 class Stanford:
     """Stanford diagram of T epochs."""
 
@@ -66,10 +57,12 @@ class Stanford:
     region: Codes  #: `Region`, shape (T,).
     counts: dict[Region, int]  #: Epochs of each region; they add up to T.
     available_rate: float  #: Epochs with a level within the alarm limit, judged or not / T.
-    misleading_rate: float  #: Epochs whose error is over the level / epochs with both; NaN without any.
     beyond: Indices  #: Indices of the epochs whose error is over the level, the largest excess first.
     continuity: tuple[Continuity, ...]  #: One a window.
-    blocks: Blocks
+    #: Blocks of time with epochs, and of these those with an error over the level: errors stay alike for tens of
+    #: seconds, so that a block is worth an epoch of statistics.
+    blocks: int
+    misleading_blocks: int
     #: Of the bins of error and level alike; the upper edge of the last one is infinite; shape (N + 1,).
     edges_m: Floats
     histogram: Integers  #: Epochs by bin of the absolute error (axis 0) and of the level (axis 1), shape (N, N).
@@ -83,8 +76,6 @@ def stanford(
     alarm_limit_m: float,
     windows_s: Sequence[float] = (15.0, 60.0),
     block_s: float = 60.0,
-    bin_m: float | None = None,
-    bins: int = 100,
 ) -> Stanford:
     """Sort epochs into the diagram.
 
@@ -95,22 +86,12 @@ def stanford(
     error_m : array_like, shape (T,) [m]
         Along the track, signed or not; NaN where there is no position or no reference.
     level_m : array_like, shape (T,) [m]
-        Protection level; infinite where no error can be excluded, NaN where there is no position.
-        An error without a level counts as an infinite level.
-    alarm_limit_m : float [m]
+        Infinite where no error can be excluded, NaN where there is no position. An error without a level counts as one
+        with an infinite level.
     windows_s : sequence of float [s]
         Lengths of the windows of continuity: 15 s is an approach's in aviation; a minute, a station to the next.
     block_s : float [s]
         Length of the blocks, from the first epoch.
-    bin_m : float, optional [m]
-        Width of the bins; default: twice the alarm limit over `bins`.
-    bins : int
-        Bins of an axis.
-
-    Raises
-    ------
-    ValueError
-        On arrays of different lengths, times that do not ascend, a negative level, limits that are not positive.
     """
     time = time.astype("datetime64[ns]")
     error, level = np.abs(np.asarray(error_m, dtype=np.float64)), np.asarray(level_m, dtype=np.float64)
@@ -120,9 +101,8 @@ def stanford(
         raise ValueError("times must ascend")
     if (level < 0).any():
         raise ValueError("a level cannot be negative")
-    width = 2.0 * alarm_limit_m / bins if bin_m is None else bin_m
-    if not min(alarm_limit_m, block_s, width, bins, *windows_s) > 0:
-        raise ValueError("alarm_limit_m, windows_s, block_s, bin_m and bins must be positive")
+    if not min(alarm_limit_m, block_s, *windows_s) > 0:
+        raise ValueError("alarm_limit_m, windows_s and block_s must be positive")
     judged = ~np.isnan(error)
     bound = np.where(np.isnan(level), np.inf, level)
     beyond, within = judged & (error > bound), bound <= alarm_limit_m
@@ -139,21 +119,21 @@ def stanford(
         Region.NOMINAL,
     ).astype(np.int8)
     excess = np.where(beyond, error - bound, -np.inf)
-    edges = np.append(width * np.arange(bins), np.inf)
+    edges = np.append(2.0 * alarm_limit_m / _BINS * np.arange(_BINS), np.inf)
     place = np.searchsorted(edges[1:-1], error[judged], side="right")
     other = np.searchsorted(edges[1:-1], bound[judged], side="right")
-    number = int(judged.sum())
+    block = (time - time[:1]) // _nanoseconds(block_s)
     return Stanford(
         alarm_limit_m=alarm_limit_m,
         region=region,
         counts={r: int(np.count_nonzero(region == r)) for r in Region},
         available_rate=float(np.mean(within)) if len(time) else np.nan,
-        misleading_rate=int(beyond.sum()) / number if number else np.nan,
         beyond=np.argsort(-excess, kind="stable")[: int(beyond.sum())],
         continuity=tuple(_continuity(time, within, window) for window in windows_s),
-        blocks=_blocks(time, within, beyond, block_s),
+        blocks=len(np.unique(block)),
+        misleading_blocks=len(np.unique(block[beyond])),
         edges_m=edges,
-        histogram=np.bincount(place * bins + other, minlength=bins * bins).reshape(bins, bins),
+        histogram=np.bincount(place * _BINS + other, minlength=_BINS * _BINS).reshape(_BINS, _BINS),
     )
 
 
@@ -180,22 +160,4 @@ def _continuity(time: Datetimes, available: Masks, window_s: float) -> Continuit
         windows=windows,
         kept=int(kept.sum()),
         probability=int(kept.sum()) / windows if windows else np.nan,
-    )
-
-
-def _blocks(time: Datetimes, available: Masks, beyond: Masks, block_s: float) -> Blocks:
-    """Counts by block of time."""
-    if not len(time):
-        none = np.zeros(0, dtype=np.int64)
-        return Blocks(start=time, epochs=none, available=none, misleading=none)
-    number, which = np.unique((time - time[0]) // _nanoseconds(block_s), return_inverse=True)
-
-    def count(mask: Masks) -> Integers:
-        return np.bincount(which[mask], minlength=len(number)).astype(np.int64)
-
-    return Blocks(
-        start=time[0] + number * _nanoseconds(block_s),
-        epochs=count(np.ones(len(time), dtype=bool)),
-        available=count(available),
-        misleading=count(beyond),
     )

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from railfix.core.settings import Settings, option
 from railfix.pipeline.config import Config
-from railfix.run.inputs import LogReading, TrackReading, balise_list_option, input_option, virtual_balises_option
+from railfix.run.inputs import BALISE_LIST, VIRTUAL_BALISES, LogReading, TrackReading, input_option
 from railfix.run.output import Overwrite
 
 
@@ -100,8 +100,8 @@ class LiveInputs(Settings):
     ranging: str | None = input_option("The same of two-way ranges to ground units.", None, metavar="SOURCE")
     ranging_units: Path | None = input_option("Surveyed ground units: unit, x_m, y_m, z_m (ECEF).", None, metavar="CSV")
     balises: str | None = input_option("The same of balises that are read.", None, metavar="SOURCE")
-    balise_list: Path | None = balise_list_option()
-    virtual_balises: Path | None = virtual_balises_option()
+    balise_list: Path | None = input_option(BALISE_LIST, None, metavar="CSV")
+    virtual_balises: Path | None = input_option(VIRTUAL_BALISES, None, metavar="CSV")
     send: tuple[str, ...] = option(
         "Where messages go: json, cbor, nmea, tpv, etcs, positions, train or passings at -, a file, udp://HOST:PORT, "
         "tcp-server://HOST:PORT or mqtt://[USER:PASSWORD@]HOST:PORT/TOPIC. Default: json@-.",

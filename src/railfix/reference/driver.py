@@ -31,6 +31,8 @@ from railfix.reference.build import ReferenceData, build_references
 from railfix.reference.fixes import FixRejection, ReferenceSettings
 from railfix.reference.smoother import Built
 from railfix.run.inputs import (
+    TRACK,
+    VEHICLE,
     Antenna,
     ColumnNames,
     InputFiles,
@@ -38,8 +40,6 @@ from railfix.run.inputs import (
     check_given_once,
     input_option,
     logs_by_antenna,
-    track_option,
-    vehicle_option,
 )
 from railfix.run.output import OutputFolder, Overwrite
 from railfix.run.sources import Log, OpenedLine, open_line
@@ -55,8 +55,8 @@ class ReferenceInputs(InputFiles):
     )
     rtk_rear: Path | None = input_option("The same of the rear antenna.", None)
 
-    track: tuple[Path, ...] = track_option()
-    vehicle: Path | None = vehicle_option()
+    track: tuple[Path, ...] = input_option(TRACK, metavar="TRACK")
+    vehicle: Path | None = input_option(VEHICLE, None, metavar="TOML")
     #: Observation files of either antenna and navigation files, for Doppler speeds; may be empty.
     front: tuple[Path, ...] = input_option(
         "RINEX observation file of the front antenna, for Doppler speeds; repeat it for several.", (), metavar="OBS"

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 from numpy.typing import NDArray
 
@@ -50,10 +50,8 @@ def script_json(value: Any) -> str:
     return text
 
 
-def packed(values: NDArray[Any], kind: str = "f") -> str:
-    """An array as base 64, little endian, after the letter of its kind: 32-bit float, unsigned 16-bit, unsigned
-    32-bit.
-    """
+def pack_array(values: NDArray[Any], kind: str = "f") -> str:
+    """An array as base 64, little endian, after the letter of its kind: 32-bit float, unsigned of 16 or 32 bits."""
     dtype = {"f": "<f4", "h": "<u2", "i": "<u4"}[kind]
     return kind + base64.b64encode(np.ascontiguousarray(values, dtype=dtype).tobytes()).decode("ascii")
 
@@ -79,24 +77,29 @@ def _layer(layer: Layer) -> dict[str, Any]:
     match layer:
         case Points():
             values |= {"kind": "points", "shape": layer.shape, "size": layer.size}
-            values |= {"x": packed(layer.x), "y": packed(layer.y)}
+            values |= {"x": pack_array(layer.x), "y": pack_array(layer.y)}
             if layer.epoch_s is not None:
-                values["epoch"] = packed(layer.epoch_s)
+                values["epoch"] = pack_array(layer.epoch_s)
         case Curve():
             values |= {"kind": "line", "width": layer.width, "dash": layer.dash}
-            values |= {"x": packed(layer.x), "y": packed(layer.y)}
+            values |= {"x": pack_array(layer.x), "y": pack_array(layer.y)}
         case Band():
-            values |= {"kind": "band", "x": packed(layer.x), "low": packed(layer.low), "high": packed(layer.high)}
+            values |= {
+                "kind": "band",
+                "x": pack_array(layer.x),
+                "low": pack_array(layer.low),
+                "high": pack_array(layer.high),
+            }
         case Bars():
-            values |= {"kind": "bars", "left": packed(layer.left), "right": packed(layer.right)}
-            values["height"] = packed(layer.height)
+            values |= {"kind": "bars", "left": pack_array(layer.left), "right": pack_array(layer.right)}
+            values["height"] = pack_array(layer.height)
         case Cells():
             values |= _cells(layer)
         case RangeBars():
             values |= {"kind": "ranges", "names": list(layer.names)}
-            values |= {name: packed(getattr(layer, name)) for name in ("low", "mid", "high")}
+            values |= {name: pack_array(getattr(layer, name)) for name in ("low", "mid", "high")}
         case Marks():
-            values |= {"kind": "marks", "x": packed(layer.x), "y": packed(layer.y), "words": list(layer.words)}
+            values |= {"kind": "marks", "x": pack_array(layer.x), "y": pack_array(layer.y), "words": list(layer.words)}
             values["place"] = layer.place
     return values
 
@@ -113,9 +116,9 @@ def _cells(layer: Cells) -> dict[str, Any]:
         "nx": layer.counts.shape[0],
         "ny": layer.counts.shape[1],
         "most": int(layer.counts.max(initial=1)),
-        "a": packed(column, "h"),
-        "b": packed(row, "h"),
-        "n": packed(layer.counts[column, row], "i"),
+        "a": pack_array(column, "h"),
+        "b": pack_array(row, "h"),
+        "n": pack_array(layer.counts[column, row], "i"),
     }
 
 
@@ -123,11 +126,11 @@ def sky_values(sky: SkyEpochs) -> dict[str, Any]:
     """Satellites in view as plain values; angles and C/N0 in hundredths."""
     values: dict[str, Any] = {
         "start": since_1970(sky.start),
-        "epoch": packed(sky.epoch_s),
-        "first": packed(sky.first, "i"),
-        "azimuth": packed(np.round(100.0 * (sky.azimuth_deg % 360.0)), "h"),
-        "elevation": packed(np.round(100.0 * np.clip(sky.elevation_deg, 0.0, 90.0)), "h"),
-        "cn0": packed(np.where(np.isfinite(sky.cn0_dbhz), np.round(100.0 * sky.cn0_dbhz), _UNKNOWN), "h"),
+        "epoch": pack_array(sky.epoch_s),
+        "first": pack_array(sky.first, "i"),
+        "azimuth": pack_array(np.round(100.0 * (sky.azimuth_deg % 360.0)), "h"),
+        "elevation": pack_array(np.round(100.0 * np.clip(sky.elevation_deg, 0.0, 90.0)), "h"),
+        "cn0": pack_array(np.where(np.isfinite(sky.cn0_dbhz), np.round(100.0 * sky.cn0_dbhz), _UNKNOWN), "h"),
     }
     for name, words, first in (
         ("satellite", sky.satellite, ()),
@@ -136,7 +139,7 @@ def sky_values(sky: SkyEpochs) -> dict[str, Any]:
     ):
         known = [*first, *(str(word) for word in np.unique(words) if word not in first)]
         code = {word: number for number, word in enumerate(known)}
-        values[name] = packed(np.array([code[str(word)] for word in words], dtype=np.int64), "h")
+        values[name] = pack_array(np.array([code[str(word)] for word in words], dtype=np.int64), "h")
         values[{"satellite": "names", "signal": "signals", "reason": "reasons"}[name]] = known
     return values
 
@@ -261,16 +264,18 @@ def charts_page(title: str, charts: Sequence[Chart], tables: Sequence[Block], *,
     return render("charts.html.j2", title, charts=figures, tables=tables, lead=lead)
 
 
-def render(template: str, title: str, **content: Any) -> str:
-    """HTML of a template of this package."""
+def read_template(name: str) -> Template:
+    """Return a template of this package."""
+    loader = PackageLoader("railfix.report")
     environment = Environment(
-        loader=PackageLoader("railfix.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    return environment.get_template(template).render(
+    return environment.get_template(name)
+
+
+def render(template: str, title: str, **content: Any) -> str:
+    """HTML of a page of this package, with its style and scripts."""
+    return read_template(template).render(
         title=title,
         created=datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M UTC"),
         version=__version__,

@@ -14,7 +14,6 @@ from typing import Any, Final
 
 import numpy as np
 import polars as pl
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from railfix.core.arrays import Floats, Strings
 from railfix.core.constants import CLOCK_GROUP
@@ -23,6 +22,7 @@ from railfix.core.files import write_whole
 from railfix.core.geodesy import enu_axes
 from railfix.core.timescale import gps_time
 from railfix.evaluate.inputs import RunFolder, read_run
+from railfix.report.charts_page import read_template
 from railfix.run.record import reading_table
 from railfix.track import read_track
 
@@ -267,15 +267,11 @@ def _level_of_single(single: Mapping[str, Any]) -> str:
 
 def write_explanation(explanation: Explanation, path: Path) -> Path:
     """Write an explanation as one HTML page with the sky of the epoch; return its path."""
-    environment = Environment(
-        loader=PackageLoader("railfix.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True,
-    )  # fmt: skip
     sky = []
     for row in explanation.satellites.drop_nulls(("elevation_deg", "azimuth_deg")).iter_rows(named=True):
         radius, azimuth = max(90.0 - row["elevation_deg"], 0.0), np.radians(row["azimuth_deg"])
         sky.append({"x": radius * np.sin(azimuth), "y": -radius * np.cos(azimuth), **row})
-    page = environment.get_template("explain.html.j2").render(
+    page = read_template("explain.html.j2").render(
         title=f"{explanation.antenna} antenna, {time_text(explanation.time)} GPS time",
         explanation=explanation, sky=sky, rows=explanation.satellites.to_dicts(),
     )  # fmt: skip

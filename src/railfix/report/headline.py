@@ -15,6 +15,7 @@ from railfix.evaluate import Evaluation
 from railfix.evaluate.figures import PASSED
 from railfix.evaluate.inputs import floats
 from railfix.report.runs import ReportedRun, figures_of
+from railfix.run.budget import level_basis
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,12 +131,6 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compare
     )
 
 
-def _level_name(run: ReportedRun) -> str:
-    """Return what the level of a run is called: indicative unless its priors were measured."""
-    stated: Mapping[str, Any] = run.record.get("protection") or {}
-    return "protection level" if stated.get("basis") == "measured" else "indicative protection level"
-
-
 def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, own: Mapping[str, Any]) -> KeyFigure:
     """Median protection level with errors above it, or the stated sigma without levels."""
     kind = run.folder.level_kind
@@ -158,7 +153,7 @@ def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, ow
         over = evaluation.integrity["train"].beyond.filter(pl.col("usable"), run=name, antenna=antenna)
         above += f", filtered {len(over):,}"
     return KeyFigure(
-        name=f"{_level_name(run)}, median",
+        name=f"{level_basis(run.record)} level, median",
         value=number(median, 1, " m"),
         filtered=filtered,
         beside=f"usable errors above their level: {above}",
@@ -265,7 +260,7 @@ def _without_errors(run: ReportedRun, antenna: str) -> Headline:
                 filtered=number(float(np.median(placed)), 2, " m") if len(placed) else "",
             ),
             KeyFigure(
-                name=f"{_level_name(run)}, median",
+                name=f"{level_basis(run.record)} level, median",
                 value=number(float(np.median(level)) if len(level) else np.nan, 1, " m"),
             ),
             KeyFigure(name="epochs", value=number(facts.get("epochs", len(positions)), 0)),

@@ -14,7 +14,7 @@ from railfix.core.arrays import Floats
 from railfix.core.files import write_whole
 from railfix.core.tables import Table, count, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
-from railfix.evaluate.inputs import flattened
+from railfix.evaluate.inputs import flat_settings
 from railfix.evaluate.tables import error_tables, evaluation_of, group_tables
 from railfix.report.charts_page import (
     Absent,
@@ -33,6 +33,7 @@ from railfix.report.headline import headline
 from railfix.report.plots.errors import error_ranges
 from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.runs import ReportedRun, figures_of, read_runs
+from railfix.run.budget import budget_tables, level_basis
 
 
 def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table:
@@ -41,7 +42,7 @@ def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table
     judged = ["mean", "std", "p95", "largest", "conventional p95", "largest"] if evaluation else []
     rows = []
     for run in runs:
-        asked = flattened(run.record.get("settings_asked") or {})
+        asked = flat_settings(run.record.get("settings_asked") or {})
         chosen = [run.config.preset, *(f"{name} {_word(value)}" for name, value in asked.items() if name != "preset")]
         for antenna, facts in _antennas(run).items():
             sigma = facts.get("along_sigma_m") or {}
@@ -111,8 +112,8 @@ def provenance(run: ReportedRun) -> list[Block]:
 
 def settings(run: ReportedRun) -> list[Block]:
     """Settings asked for beside those used."""
-    asked = flattened(run.record.get("settings_asked") or {})
-    used = flattened(run.record.get("settings_used") or {})
+    asked = flat_settings(run.record.get("settings_asked") or {})
+    used = flat_settings(run.record.get("settings_used") or {})
     names = [*(name for name in used if name in asked), *(name for name in asked if name not in used)]
     names += [name for name in used if name not in asked]
     rows = [[name, _word(asked.get(name, "")), _word(used.get(name, ""))] for name in names]
@@ -125,49 +126,6 @@ def settings(run: ReportedRun) -> list[Block]:
 def budget(run: ReportedRun) -> list[Block]:
     """Epochs by status, and pseudoranges by the first reason for their rejection."""
     antennas = _antennas(run)
-    names = list(antennas)
-    statuses = dict.fromkeys(s for facts in antennas.values() for s, n in (facts.get("status") or {}).items() if n)
-    rows = [
-        ["epochs", *(count(antennas[n].get("epochs")) for n in names)],
-        ["with observations", *(count(antennas[n].get("epochs_with_observations")) for n in names)],
-        ["with position", *(count(antennas[n].get("epochs_with_position")) for n in names)],
-        *([f"  {s}", *(count((antennas[n].get("status") or {}).get(s, 0)) for n in names)] for s in statuses),
-        ["positioning rate", *(share(antennas[n].get("positioning_rate")) for n in names)],
-        ["rate of ok", *(share(antennas[n].get("ok_rate")) for n in names)],
-    ]
-    few = dict.fromkeys(r for f in antennas.values() for r in f.get("too_few_satellites_by_first_reason") or {})
-    rows += [
-        [
-            f"too few satellites, by {r}",
-            *(count((antennas[n].get("too_few_satellites_by_first_reason") or {}).get(r, 0)) for n in names),
-        ]
-        for r in few
-    ]
-    first, only = "observations_rejected_by_first_reason", "observations_rejected_by_one_reason_alone"
-    reasons = dict.fromkeys(r for facts in antennas.values() for r in facts.get(first) or {})
-    head = ["", *(word for n in names for word in (n, "share", "only reason"))]
-    observed = {n: antennas[n].get("observations") or 0 for n in names}
-
-    def cells(ranges: Mapping[str, float], alone: Mapping[str, float] | None) -> list[str]:
-        return [
-            word
-            for n in names
-            for word in (
-                count(ranges[n]),
-                share(ranges[n] / observed[n] if observed[n] else None),
-                "" if alone is None else count(alone[n]),
-            )
-        ]
-
-    ranges = [
-        ["observed", *cells(observed, None)],
-        ["used", *cells({n: antennas[n].get("observations_used") or 0 for n in names}, None)],
-    ]
-    for reason in reasons:
-        counts = {n: (antennas[n].get(first) or {}).get(reason, 0) for n in names}
-        alone = {n: (antennas[n].get(only) or {}).get(reason, 0) for n in names}
-        ranges.append([f"  {reason}", *cells(counts, alone)])
-    caption = "Pseudoranges by the first reason for their rejection, and those with this reason only"
     signs = [
         [name, sign, count(seen["epochs"]), str(seen["first"])]
         for name, facts in antennas.items()
@@ -181,8 +139,7 @@ def budget(run: ReportedRun) -> list[Block]:
     ] if signs else [Sentence("No sign of jamming or spoofing.")]  # fmt: skip
     return [
         *suspected,
-        Table(name="epochs", head=["", *names], rows=rows, caption="Epochs by status", numeric=range(1, 9)),
-        Table(name="pseudoranges", head=head, rows=ranges, caption=caption, numeric=range(1, 9)),
+        *budget_tables(antennas, level_basis(run.record)),
     ]
 
 
@@ -231,32 +188,10 @@ def write_report(
     title: str = "",
     options: EvaluationOptions | None = None,
 ) -> Path:
-    """Write the report on runs.
+    """Write the report on runs into the file `out`, which is replaced by the complete page or not at all.
 
-    Parameters
-    ----------
-    runs : sequence of Path
-        Folders that `railfix run` wrote.
-    out : Path
-        The page; an existing file is replaced, by the complete page or not at all.
-    references, conventional : sequence of Path
-        See `railfix.report.read_runs`.
-    background : Path, optional
-        GeoJSON file with lines to draw below the plan (`railfix.report.charts_page`).
-    title : str
-    options : EvaluationOptions, optional
-
-    Returns
-    -------
-    Path
-        `out`.
-
-    Raises
-    ------
-    InputFileError, MismatchError, SettingsError
-        See `railfix.report.read_runs`.
-    OutputError
-        The page cannot be written.
+    `references`, `conventional` and the errors are as for `railfix.report.read_runs`; `background` is a GeoJSON file
+    with lines to draw below the plan. OutputError: the page cannot be written.
     """
     folders, others, unscreened = ([Path(name) for name in names] for names in (runs, references, conventional))
     reported, evaluation = read_runs(folders, others, conventional=unscreened, options=options)

@@ -98,31 +98,15 @@ def read_runs(
     conventional: Sequence[Path] = (),
     options: EvaluationOptions | None = None,
 ) -> tuple[tuple[ReportedRun, ...], Evaluation | None]:
-    """Read runs, and evaluate them where there is a reference.
+    """Read runs, and evaluate them where there is a reference; None in place of the evaluation without.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Folders that `railfix run` wrote.
-    references : sequence of Path
-        None, one for all runs, or one for each in order.
-    conventional : sequence of Path
-        None, or for each run in order another run on the same log, whose conventional positions are shown: one with
-        the screens of elevation and C/N0 alone gives the unscreened ones of P1.
-    options : EvaluationOptions, optional
+    `references`: none, one for all runs, or one for each in order. `conventional`: none, or for each run in order
+    another run on the same log, whose conventional positions are shown: one with the screens of elevation and C/N0
+    alone gives the unscreened ones of P1. The table of epochs of the evaluation is empty: the runs have the columns
+    that the report uses.
 
-    Returns
-    -------
-    tuple of ReportedRun
-    Evaluation or None
-        None without a reference. Its table of epochs is empty: the runs have the columns that the report uses.
-
-    Raises
-    ------
-    InputFileError, MismatchError
-        A file is not what it should be, or a reference is not that of the run.
-    SettingsError
-        The number of references or of conventional runs does not fit, or a run is given twice.
+    InputFileError, MismatchError: a file is not what it should be, or a reference is not that of the run.
+    SettingsError: the number of references or of conventional runs does not fit, or a run is given twice.
     """
     if not paths:
         raise SettingsError("no run to report on; name the folders that railfix run wrote")
@@ -209,7 +193,7 @@ def _curve(folder: RunFolder, config: Config) -> tuple[Cn0Curve | None, tuple[st
     """C/N0 curve that the run used, or a note on why it is not drawn."""
     if config.cn0_curve is None:
         return None, ()
-    path = next(iter(folder.located("cn0_curve")), Path(config.cn0_curve))
+    path = next(iter(folder.input_paths("cn0_curve")), Path(config.cn0_curve))
     try:
         return read_cn0_curve(path), ()
     except RailfixError as error:

@@ -23,23 +23,15 @@ _SIGMAS: Final = 5.0
 _PERIOD_NS: Final = 1_000_000_000
 
 
-@dataclass(frozen=True, kw_only=True)
-class CheckedAntenna:
-    """The batch of one antenna, with its trajectory."""
-
-    batch: BatchTrack
-    trajectory: Trajectory
-
-
 #: Columns that the check adds to ``train.*`` (`railfix run --check batch`), at an epoch a second.
-BATCH_COLUMNS: Final[Mapping[str, Column[CheckedAntenna]]] = by_name(
+BATCH_COLUMNS: Final[Mapping[str, Column[tuple[BatchTrack, Trajectory]]]] = by_name(
     (
         Column(
             "batch_chainage_m",
             "distance along the line by a robust fit of codes and Dopplers of the whole log",
-            lambda c: c.trajectory.chainage_at(c.batch.arc_m),
+            lambda found: found[1].chainage_at(found[0].arc_m),
         ),
-        Column("batch_sigma_m", "its standard deviation, that of the map in it", "batch.sigma_m"),
+        Column("batch_sigma_m", "its standard deviation, that of the map in it", lambda found: found[0].sigma_m),
     )
 )
 
@@ -64,7 +56,7 @@ class BatchCheck:
         self._epochs.append(given.take(rows))
         self._places.append(np.stack([result.tracked.arc_m, result.tracked.sigma_m], axis=1)[rows])
 
-    def fitted(self) -> tuple[BatchTrack, Floats, Masks]:
+    def fit(self) -> tuple[BatchTrack, Floats, Masks]:
         """Return the batch, places of the filter less those of it [m], and which both sigmas do not explain."""
         epochs, places = joined_epochs(self._epochs), np.concatenate(self._places)
         batch = fit_batch(epochs, self.trajectory, places[:, 0])
@@ -79,27 +71,27 @@ class BatchCheck:
 
 def add_batch(checks: Mapping[str, BatchCheck], folder: OutputFolder) -> list[str]:
     """Write ``train.*`` again with `BATCH_COLUMNS`, after the last chunk; return a note an antenna."""
-    found: dict[str, CheckedAntenna] = {}
+    found: dict[str, tuple[BatchTrack, Trajectory]] = {}
     notes: list[str] = []
     for name, check in checks.items():
         if check:
-            batch, apart, wrong = check.fitted()
-            found[name] = CheckedAntenna(batch=batch, trajectory=check.trajectory)
+            batch, apart, wrong = check.fit()
+            found[name] = (batch, check.trajectory)
             notes += _note(name, batch, apart, wrong, check.trajectory)
 
-    def widened(table: pl.DataFrame) -> pl.DataFrame:
+    def with_batch(table: pl.DataFrame) -> pl.DataFrame:
         antenna, time = table["antenna"].to_numpy(), table["time_gpst"].to_numpy().astype("datetime64[ns]")
         values = {column: np.full(len(table), np.nan) for column in BATCH_COLUMNS}
         for name, own in found.items():
             rows = np.flatnonzero(antenna == name)
-            at = np.minimum(np.searchsorted(own.batch.time, time[rows]), len(own.batch.time) - 1)
-            known = own.batch.time[at] == time[rows]
+            at = np.minimum(np.searchsorted(own[0].time, time[rows]), len(own[0].time) - 1)
+            known = own[0].time[at] == time[rows]
             for column, spec in BATCH_COLUMNS.items():
                 values[column][rows[known]] = np.asarray(spec.of(own))[at[known]]
         return table.with_columns(**{column: float_column(value) for column, value in values.items()})
 
     if found:
-        folder.change("train", widened)
+        folder.change("train", with_batch)
     return notes
 
 

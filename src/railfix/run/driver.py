@@ -20,19 +20,19 @@ from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
-from railfix.pipeline.level_stage import basis_of, level_facts, prior_basis_text, risk_of
+from railfix.pipeline.level_stage import level_facts, prior_basis_text, risk_of
 from railfix.pipeline.processor import EpochProcessor, SolvedChunk, State
 from railfix.run.batch_check import BatchCheck, add_batch
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.convert import add_mate_results
 from railfix.run.inputs import Antenna, RunInputs, RunOptions
 from railfix.run.output import OutputFolder
-from railfix.run.processor import Beside, base_log, processor_of
-from railfix.run.record import AlongSigma, Figures, Filtered, Levels, RunProvenance, package_versions, run_record
+from railfix.run.processor import BaseLog, base_log, processor_of
+from railfix.run.record import RunProvenance, figures_of, package_versions, run_record
 from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sensors import balises_of, check_filter, read_sensors, units_of_ranges
-from railfix.run.sources import TRACK_FILE, Log, OpenedLine, aligned, open_line, read_ahead, without_beside
-from railfix.run.tally import Replays, ResultRows, Tally, add_smoothed, shortened
+from railfix.run.sources import TRACK_FILE, Log, OpenedLine, align_logs, open_line, read_ahead, without_beside
+from railfix.run.tally import Replays, ResultRows, Tally, add_smoothed, shorten_notes
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
 from railfix.track.quality import error_note
@@ -47,35 +47,14 @@ class Progress(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class RunSummary:
-    """Summary of a run.
-
-    Attributes
-    ----------
-    tally : Tally
-    sigma : mapping of str to AlongSigma
-        Percentiles of the along-track standard deviation by antenna.
-    levels : mapping of str to Levels
-        Protection levels by antenna; empty where they are off.
-    tracks : mapping of str to Filtered
-        Statuses and sigmas of the filter along the track by antenna; empty where it is off.
-    level_basis : str
-        "indicative protection" where the priors of the levels are assumed, "protection" where they are measured.
-    notes : tuple of str
-    files : mapping of str to Path
-        The results.
-    wall_s : float
-    causes : mapping of str to str
-        Likely cause by antenna, of those without a position on the line.
-    """
+    """Summary of a run."""
 
     tally: Tally
-    sigma: Mapping[str, AlongSigma]
-    levels: Mapping[str, Levels]
-    tracks: Mapping[str, Filtered]
-    level_basis: str
+    record: Mapping[str, Any]  #: Content of ``run.json``.
     notes: tuple[str, ...]
     files: Mapping[str, Path]
     wall_s: float
+    #: Likely cause where no position is on the line, by antenna.
     causes: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -88,32 +67,14 @@ def run_files(
     asked: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
-    """Position the logs of one run along its line and write the results.
+    """Position the logs of one run along its line and write the results into the folder `out`.
 
-    Parameters
-    ----------
-    inputs : RunInputs
-    config : Config, optional
-        Settings used; the defaults unless given.
-    out : Path
-        Folder for the results.
-    options : RunOptions, optional
-    asked : mapping, optional
-        Settings that were given, as opposed to defaults; goes into ``run.json``.
-    progress : Progress, optional
-
-    Returns
-    -------
-    RunSummary
-
-    Raises
-    ------
-    RailfixError
-        See `railfix.core.errors`; nothing is left in `out` then.
+    `config` are all settings, `asked` those that were given as opposed to defaults, for ``run.json``. RailfixError: see
+    `railfix.core.errors`; nothing is left in `out` then.
     """
     began = clock.perf_counter()
     options = options or RunOptions()
-    inputs, config = inputs.checked(config or Config())
+    inputs, config = inputs.prepare(config or Config())
     needing = [name for name in SENSORS if getattr(inputs, name) is not None]
     check_filter(config, [*needing, *options.of_filter])
     with (
@@ -139,7 +100,7 @@ def run_files(
             passings=balises is not None,
             replays={name: Replays() for name in logs} if options.smooth == "on" else {},
         )
-        tally = _position(logs, Beside(sensors, base), processor, rows, beside, progress)
+        tally = _position(logs, (sensors, base), processor, rows, beside, progress)
         if rows.replays:
             add_smoothed(rows.replays, processor, folder)
         causes = _causes(tally, logs, processor, config, line)
@@ -148,34 +109,24 @@ def run_files(
             *notes_of(line, navigation, tally, logs, causes, note_statistic=config.map_offset.note_threshold),
             *_notes_of_levels(config, tally),
             *_notes_of_sensors(rows.checks, sensors, units, line, config),
-            *shortened(rows.balise_notes),
+            *shorten_notes(rows.balise_notes),
             *add_batch(rows.batches, folder),
         )
         sources = [entry.result() for entry in entries]
         folder.end_parquet(_footer(sources, notes))
         add_mate_results(folder, line.track, inputs.logs["front"][0])
-        figures = Figures.of(folder, tally, config)
+        figures = figures_of(folder, tally, config)
         wall = clock.perf_counter() - began
         made_from = RunProvenance(
             files=sources, packages=packages.result(), asked=asked or {}, config=config, options=options,
             line=line.facts, navigation=navigation,
         )  # fmt: skip
-        record = run_record(made_from, tally, notes, wall_s=wall, figures=figures)
+        record = run_record(made_from, tally, notes, figures, wall)
         folder.write_json("run.json", record)
         if not line.from_file:
             write_track_csv(line.track, folder.staged(TRACK_FILE))
         files = folder.commit()
-    return RunSummary(
-        tally=tally,
-        sigma=figures.sigma,
-        levels=figures.levels,
-        tracks=figures.tracks,
-        level_basis="protection" if basis_of(config) == "measured" else "indicative protection",
-        notes=notes,
-        files=files,
-        wall_s=wall,
-        causes=causes,
-    )
+    return RunSummary(tally=tally, record=record, notes=notes, files=files, wall_s=wall, causes=causes)
 
 
 def open_inputs(
@@ -238,7 +189,7 @@ def sensors_of(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
 
 def _position(
     logs: Mapping[Antenna, Log],
-    others: Beside,
+    others: tuple[SensorSamples, BaseLog | None],
     processor: EpochProcessor,
     rows: ResultRows,
     beside: Executor,
@@ -252,7 +203,7 @@ def _position(
     tally = Tally(min_satellites=processor.config.min_satellites, order=processor.antenna_order())
     state = State()
     written: Future[None] | None = None
-    chunks = read_ahead(aligned({name: log.parts() for name, log in logs.items()}))
+    chunks = read_ahead(align_logs({name: log.parts() for name, log in logs.items()}))
     began = clock.perf_counter()
     for solved in read_ahead(_single_epochs(chunks, others, processor)):
         result, state = processor.along_track(solved, state)
@@ -274,13 +225,16 @@ def _position(
 
 
 def _single_epochs(
-    chunks: Iterator[dict[str, Observations]], others: Beside, processor: EpochProcessor
+    chunks: Iterator[dict[str, Observations]],
+    others: tuple[SensorSamples, BaseLog | None],
+    processor: EpochProcessor,
 ) -> Iterator[SolvedChunk]:
     """Yield the single epochs of chunks, each with what sensors and base station measured up to its end."""
+    samples, station = others
     after, state = np.datetime64("NaT", "ns"), State()
     for chunk in chunks:
         end = max(own.time[-1] for own in chunk.values() if len(own))
-        sensors, base = others.sensors.between(after, end), None if others.base is None else others.base.until(end)
+        sensors, base = samples.between(after, end), None if station is None else station.until(end)
         solved, state = processor.single_epochs(chunk, state, sensors=sensors, base=base)
         after = end
         yield solved
@@ -335,9 +289,13 @@ def notes_of(
         *line.notes,
         *error_note(check_track(line.track)),
         *navigation.notes,
-        *_broken_notes(logs),
-        *tally.all_notes,
     ]
+    for name, log in logs.items():
+        notes += log.problems
+        if log.skipped:
+            skipped = ", ".join(f"{count} {what}" for what, count in sorted(log.skipped.items()))
+            notes.append(f"{name}: skipped: {skipped}")
+    notes += tally.all_notes
     for name, antenna in tally.antennas.items():
         notes += [
             f"{name}: screen {screen.name} has judged nothing; it needs {screen.needs}"
@@ -379,14 +337,6 @@ def _describe_detectable(detectable_m: Floats) -> str:
         f"an error of the map below {across:.0f} m across or {up:.0f} m in height is not excluded; where the ranges "
         f"are worst, below {most_across:.0f} m or {most_up:.0f} m (columns map_detectable_*)"
     )
-
-
-def _broken_notes(logs: Mapping[Antenna, Log]) -> Iterator[str]:
-    for name, log in logs.items():
-        yield from log.problems
-        if log.skipped:
-            skipped = ", ".join(f"{count} {what}" for what, count in sorted(log.skipped.items()))
-            yield f"{name}: skipped: {skipped}"
 
 
 def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:

@@ -33,52 +33,26 @@ def input_option(text: str, default: Any = ..., *, metavar: str = "FILE") -> Any
     return option(text, default, metavar=metavar, panel=INPUTS)
 
 
-def track_option(default: Any = ...) -> Any:
-    """Return the field for the files of the track."""
-    text = (
-        "Track map; several are joined to a route in the order given. Of one file with a network of tracks the route "
-        "is found from the log."
-    )
-    return input_option(text, default, metavar="TRACK")
-
-
-def heights_option() -> Any:
-    """Return the field for a second source of heights."""
-    text = (
-        "Heights of a map without: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV by chainage_m or kilometrage_m, "
-        "positions of a run, or the word log for those of the log itself."
-    )
-    return input_option(text, None)
-
-
-def vehicle_option() -> Any:
-    """Return the field for the vehicle file."""
-    text = (
-        "Vehicle: bogie distance, gauge, positions of the antennas. Without it the track is taken as the antenna's "
-        "own path."
-    )
-    return input_option(text, None, metavar="TOML")
-
-
-def balise_list_option() -> Any:
-    """Return the field for the list of balises."""
-    text = (
-        "Places of the balises: CSV with balise, chainage_m and, where there are such, track (chainage_m then counts "
-        "from the beginning of that track) and sigma_m."
-    )
-    return input_option(text, None, metavar="CSV")
-
-
-def virtual_balises_option() -> Any:
-    """Return the field for virtual balises."""
-    text = "Places whose passing is reported with its interval: a list as of --balise-list. Needs levels."
-    return input_option(text, None, metavar="CSV")
+#: Texts of options that several commands have.
+TRACK: Final = (
+    "Track map; several are joined to a route in the order given. Of one file with a network of tracks the route is "
+    "found from the log."
+)
+VEHICLE: Final = (
+    "Vehicle: bogie distance, gauge, positions of the antennas. Without it the track is taken as the antenna's own "
+    "path."
+)
+BALISE_LIST: Final = (
+    "Places of the balises: CSV with balise, chainage_m and, where there are such, track (chainage_m then counts from "
+    "the beginning of that track) and sigma_m."
+)
+VIRTUAL_BALISES: Final = "Places whose passing is reported with its interval: a list as of --balise-list. Needs levels."
 
 
 class InputFiles(Settings):
     """Input files of a command, each field a path, several paths, or None."""
 
-    def named(self) -> Iterator[tuple[str, Path]]:
+    def files_by_name(self) -> Iterator[tuple[str, Path]]:
         """Each file with the name of its field."""
         for name in type(self).model_fields:
             value = getattr(self, name)
@@ -89,54 +63,25 @@ class InputFiles(Settings):
     @property
     def paths(self) -> tuple[Path, ...]:
         """All files."""
-        return tuple(path for _, path in self.named())
+        return tuple(path for _, path in self.files_by_name())
 
     def check_files(self) -> None:
         """Raise InputFileError where a file is missing, a folder, or cannot be opened."""
-        for name, path in self.named():
+        for name, path in self.files_by_name():
             _check_file(f"--{name.replace('_', '-')}", path)
 
     def entries(self, pool: Executor, folder: Path) -> Entries:
-        """Hash every file beside other work; the paths are recorded as `recorded_path` has them."""
-        return [pool.submit(fingerprint, kind, path, name=recorded_path(path, folder)) for kind, path in self.named()]
+        """Hash every file beside other work."""
+        return [
+            pool.submit(fingerprint, kind, path, name=record_path(path, folder)) for kind, path in self.files_by_name()
+        ]
 
 
 Entries = Sequence[Future[dict[str, Any]]]
 
 
 class RunInputs(InputFiles):
-    """Input files of a run.
-
-    Attributes
-    ----------
-    front, rear : tuple of Path
-        RINEX observation files of each antenna, in order of time; `rear` may be empty.
-    base : tuple of Path
-        Observations of a base station; may be empty.
-    nav, sp3 : tuple of Path
-        Navigation files; precise orbits, which may be empty.
-    track : tuple of Path
-        Track map, joined to a route in this order.
-    mate : None
-        Folder of tables of EGNSS MATE, replaced by those in it.
-    heights : Path or None
-        Heights of a track map without; `OF_LOG`: those of the log's own positions.
-    vehicle : Path or None
-    tachometer, inertial, radar, ranging : Path or None
-        Tables of the sensors on board.
-    ranging_units : Path or None
-        Surveyed positions of the ground units that `ranging` names.
-    balises, balise_list : Path or None
-        Readings of balises, and their places along the line.
-    virtual_balises : Path or None
-        Places along the line whose passing is reported.
-    truth : Path or None
-        Reference positions, for `ablate` alone.
-    config : Path or None
-    cn0_curve, error_model, integrity_support : Path or None
-    sbas : tuple of Path
-        Named by the settings (`with_settings`).
-    """
+    """Input files of a run, each described by its option; those without one are named by the settings."""
 
     front: tuple[Path, ...] = input_option(
         "RINEX observation file of the front (or only) antenna; repeat it for a log in several files.",
@@ -144,7 +89,7 @@ class RunInputs(InputFiles):
         metavar="OBS",
     )
     nav: tuple[Path, ...] = input_option("RINEX navigation file; repeat it for several.")
-    track: tuple[Path, ...] = track_option(())
+    track: tuple[Path, ...] = input_option(TRACK, (), metavar="TRACK")
     mate: Path | None = input_option(
         "Folder with tables of EGNSS MATE, in place of --front, --track and the sensors; an option beside it goes "
         "before its table.",
@@ -160,8 +105,12 @@ class RunInputs(InputFiles):
         metavar="OBS",
     )
     sp3: tuple[Path, ...] = input_option("Precise orbits and clocks, used in place of the broadcast ones.", ())
-    heights: Path | None = heights_option()
-    vehicle: Path | None = vehicle_option()
+    heights: Path | None = input_option(
+        "Heights of a map without: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV by chainage_m or kilometrage_m, "
+        "positions of a run, or the word log for those of the log itself.",
+        None,
+    )
+    vehicle: Path | None = input_option(VEHICLE, None, metavar="TOML")
     tachometer: Path | None = input_option(
         "Pulses of a tachometer: CSV or Parquet with time_gpst, pulse and, where it is known, direction; its wheel "
         "stands in the settings sensors.tachometer.",
@@ -177,8 +126,8 @@ class RunInputs(InputFiles):
     balises: Path | None = input_option(
         "Balises that the train has read: CSV or Parquet with time_gpst, balise and, where it is known, sigma_m.", None
     )
-    balise_list: Path | None = balise_list_option()
-    virtual_balises: Path | None = virtual_balises_option()
+    balise_list: Path | None = input_option(BALISE_LIST, None, metavar="CSV")
+    virtual_balises: Path | None = input_option(VIRTUAL_BALISES, None, metavar="CSV")
     config: Path | None = None
     cn0_curve: Path | None = None
     error_model: Path | None = None
@@ -209,11 +158,8 @@ class RunInputs(InputFiles):
             raise ValueError(f"--{missing[0]} is missing; name its file, or a folder with --mate")
         return self
 
-    def checked(self, config: Config) -> tuple[Self, Config]:
-        """Return the inputs with the files that settings name, all checked, and the settings with the logs as files.
-
-        SettingsError, InputFileError: as `_with_own_sbas` and `check`.
-        """
+    def prepare(self, config: Config) -> tuple[Self, Config]:
+        """Return the inputs with the files that settings name, all checked, and the settings with the logs as files."""
         self.check()
         config = self._with_own_sbas(config)
         inputs = self.with_settings(config)
@@ -222,13 +168,8 @@ class RunInputs(InputFiles):
 
     def with_settings(self, config: Config) -> Self:
         """Return the same with the files that settings name."""
-        sbas = () if config.sbas == "stream" else config.sbas
-        return self.replaced(
-            cn0_curve=config.cn0_curve,
-            error_model=config.error_model,
-            integrity_support=config.integrity_support,
-            sbas=sbas,
-        )
+        models = {name: getattr(config, name) for name in ("cn0_curve", "error_model", "integrity_support")}
+        return self.replaced(**models, sbas=() if config.sbas == "stream" else config.sbas)
 
     def _with_own_sbas(self, config: Config) -> Config:
         """Return settings in which ``sbas = "stream"`` is replaced by the receivers' logs, whose messages are meant.
@@ -248,13 +189,7 @@ class RunInputs(InputFiles):
         return logs_by_antenna(self.front, self.rear)
 
     def check(self) -> None:
-        """Check every file before the work begins.
-
-        Raises
-        ------
-        InputFileError
-            A file is missing, a folder, or cannot be opened; or the same log is given twice.
-        """
+        """Raise InputFileError where a file is missing or cannot be read, or the same log is given twice."""
         self.check_files()
         logs = [("base", self.base), *self.logs.items()]
         check_given_once((f"--{name}", path) for name, paths in logs for path in paths)
@@ -278,14 +213,14 @@ def check_given_once(files: Iterable[tuple[str, Path]]) -> None:
         seen[resolved] = (name, path)
 
 
-def recorded_path(path: Path, folder: Path) -> str:
+def record_path(path: Path, folder: Path) -> str:
     """Return the path of an input for the record: relative to the results folder, unless it is absolute."""
     if path.is_absolute():
         return str(path)
     return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
 
 
-def located(entry: Mapping[str, Any], folder: Path) -> Path:
+def input_path(entry: Mapping[str, Any], folder: Path) -> Path:
     """Return where a recorded input is now: relative paths count from the results folder."""
     path = folder / str(entry["path"])
     plain = Path(os.path.normpath(path))

@@ -68,11 +68,11 @@ def locate_files(
     )
     write_whole(out, solution_text(time, ecef, sigma, used))
     known = np.isfinite(ecef[:, 0])
-    medians = [float(v) for v in np.median(sigma[known], axis=0)]
+    north, east, up = np.median(sigma[known], axis=0).tolist()
     return LocateSummary(
         epochs=len(time),
         positions=int(known.sum()),
-        sigma_m=(medians[0], medians[1], medians[2]),
+        sigma_m=(north, east, up),
         notes=(*received.notes, *log.problems),
     )
 
@@ -98,10 +98,10 @@ def solution_text(time: Datetimes, ecef_m: Floats, sigma_m: Floats, n_used: Inte
     return "\n".join(lines) + "\n"
 
 
-#: Epochs that are tried, and how near the line a position is on it, in plan [m].
-_EPOCHS: Final = 5
 #: Epochs of a log that are positioned together.
 _CHUNK_EPOCHS: Final = 3000
+#: Epochs that are tried, and how near the line a position is on it, in plan [m].
+_EPOCHS: Final = 5
 _ON_LINE_M: Final = 150.0
 #: Positions so far above or below the line have another cause than errors of ranges [m].
 _HEIGHT_M: Final = 30.0
@@ -228,7 +228,7 @@ def survey_files(
                 raise InputFileError(path, f"{message}; positions are files {', '.join(POSITION_ENDINGS)}")
             of_nav = read_navigation((path,), date=date) if own else of_nav or read_navigation(tuple(nav), date=date)
             received = known_from_start(config, navigation=of_nav)
-            observed = Log(paths=(path,), chunk_epochs=3000, broken_lines=broken_lines, date=date)
+            observed = Log(paths=(path,), chunk_epochs=_CHUNK_EPOCHS, broken_lines=broken_lines, date=date)
             runs.append(survey_run(observed.parts(), received, config, limits, name=str(path)))
             notes += [*received.notes, *observed.problems]
             of_nav = None if own else of_nav
@@ -299,7 +299,7 @@ class MeasuredFeature:
     map_m: float  #: Chainage of the same feature of the map; NaN where the map has none.
 
 
-def measured_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) -> list[MeasuredFeature]:
+def find_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) -> list[MeasuredFeature]:
     """Return the features that all runs (`read_measured`) together show, in order; `of_map`: those of the map."""
     alone = [_features(run) for run in runs]
     found = []
@@ -334,11 +334,11 @@ def _features(rows: pl.DataFrame) -> list[Feature]:
         series = LineSeries(arc_m=grid[part], gradient=gradient[part], curvature_1pm=curvature[part])
         sigma: dict[Quantity, Floats] = {"gradient": gradient_sigma[part], "curvature": curvature_sigma[part]}
         least = {name: _SIGMAS * each for name, each in sigma.items()}
-        found += centred(map_features(series, least=least), series)
+        found += centre_features(map_features(series, least=least), series)
     return found
 
 
-def centred(features: Sequence[Feature], series: LineSeries) -> list[Feature]:
+def centre_features(features: Sequence[Feature], series: LineSeries) -> list[Feature]:
     """Return features at the middle of their change: that of a transition curve is flat, and noise chooses on it."""
     lag = max(round(BASE_M / STEP_M), 1)
     found = []

@@ -328,7 +328,7 @@ class OutputFolder:
                 file.end(metadata)
             del self._parquet[name]
 
-    def change(self, name: str, widened: Callable[[pl.DataFrame], pl.DataFrame]) -> None:
+    def change(self, name: str, transform: Callable[[pl.DataFrame], pl.DataFrame]) -> None:
         """Write a table again, Parquet and CSV, some rows at a time, changed."""
         import polars as pl
 
@@ -340,7 +340,7 @@ class OutputFolder:
             self._parquet.pop(file).end()
             before = pl.scan_parquet(self.staged(file).replace(self.staging / f"{file}.before"))
             for start in range(0, before.select(pl.len()).collect().item(), _ROWS):
-                table = widened(before.slice(start, _ROWS).collect())
+                table = transform(before.slice(start, _ROWS).collect())
                 self.append_parquet(file, table)
                 self.append_csv(f"{name}.csv", rounded(table))
 

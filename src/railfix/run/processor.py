@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +14,7 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.integrity.protection.araim import read_integrity_support
-from railfix.motion.samples import GroundUnits, ListedBalises, SensorSamples
+from railfix.motion.samples import GroundUnits, ListedBalises
 from railfix.pipeline.base_station import Stations
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import Models
@@ -125,14 +124,6 @@ class BaseLog:
                 self._waiting = part[count:]
                 return
             self._waiting = next(self._parts, None)
-
-
-@dataclass(frozen=True)
-class Beside:
-    """What is measured beside the antennas: by sensors on board, and by a base station."""
-
-    sensors: SensorSamples
-    base: BaseLog | None
 
 
 def base_log(paths: tuple[Path, ...], options: RunOptions) -> BaseLog | None:

@@ -6,7 +6,7 @@ import platform
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -26,98 +26,60 @@ from railfix.gnss.navigation import Navigation
 from railfix.kernels import numba_version
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.level_stage import level_facts
-from railfix.run.inputs import RunInputs, RunOptions, located
+from railfix.run.inputs import RunInputs, RunOptions, input_path
 from railfix.run.output import OutputFolder
-from railfix.run.tally import Tally
+from railfix.run.tally import AntennaTally, Tally
 from railfix.tracking import TrackStatus
 
 #: Packages whose version may matter to a result.
 PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka", "georinex", "japan-geoid")
 
 
-@dataclass(frozen=True, kw_only=True)
-class AlongSigma:
-    """Percentiles of the along-track standard deviation of the positions [m]."""
-
-    p50_m: float
-    p95_m: float
-    max_m: float
+#: Figures of an antenna without rows.
+NO_FIGURES: Final = {"along_sigma_m": None, "protection_level": None, "filter": None}
 
 
-@dataclass(frozen=True, kw_only=True)
-class FilterLevel:
-    """Level of the filter of one antenna: median and 95th percentile of the finite ones [m], and how many these are."""
+def figures_of(folder: OutputFolder, tally: Tally, config: Config) -> dict[str, dict[str, Any]]:
+    """Return percentiles of each antenna from the rows written [m]; None in place of what the run has not.
 
-    p50_m: float | None
-    p95_m: float | None
-    finite: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class Filtered:
-    """Positions of the filter along the track of one antenna: epochs by status, percentiles of sigma and level [m].
-
-    The level: median, 95th percentile and number of the finite ones; None where `tracking.level` is off.
+    Of sigma along the line; of protection levels, the finite ones, with epochs by status; of the filter, with epochs by
+    status, and its levels with the number of finite ones.
     """
-
-    status: dict[str, int]
-    along_sigma_m: AlongSigma | None
-    level: FilterLevel | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Levels:
-    """Protection levels of an antenna: median and 95th percentile of the finite ones [m], and epochs by status.
-
-    `without_budget`: epochs without a level because more faults than can be left out are likelier than the risk allows.
-    """
-
-    p50_m: float | None
-    p95_m: float | None
-    available: int
-    unavailable: int
-    alarm: int
-    without_budget: int
-
-
-def levels(folder: OutputFolder, tally: Tally) -> dict[str, Levels]:
-    """Protection levels by antenna, from the rows written; empty where they are off."""
-    level = pl.col("protection_level_m")
-    finite = level.filter(level.is_finite())
-    figures = {"p50_m": finite.quantile(0.5), "p95_m": finite.quantile(0.95)}
     return {
-        name: Levels(
-            **_one_by_one(_rows(folder, "positions", name), figures),
-            **{word: antenna.level_status[word] for word in ("available", "unavailable", "alarm")},
-            without_budget=antenna.without_budget,
-        )
+        name: {
+            "along_sigma_m": _along_sigma(_rows(folder, "positions", name)),
+            "protection_level": _level(_rows(folder, "positions", name), antenna) if antenna.level_status else None,
+            "filter": _filter_figures(_rows(folder, "train", name))
+            if config.filter == "track" and antenna.epochs
+            else None,
+        }
         for name, antenna in tally.antennas.items()
-        if antenna.level_status
     }
 
 
-def along_sigma(folder: OutputFolder, tally: Tally, table: str = "positions") -> dict[str, AlongSigma]:
-    """Percentiles by antenna, from the rows written; an antenna without any is left out."""
+def _along_sigma(rows: pl.LazyFrame) -> dict[str, float] | None:
     sigma = pl.col("along_sigma_m")
-    figures = {"p50_m": sigma.quantile(0.5), "p95_m": sigma.quantile(0.95), "max_m": sigma.max()}
-    found = {name: _one_by_one(_rows(folder, table, name), figures) for name in tally.antennas}
-    return {name: AlongSigma(**row) for name, row in found.items() if row["max_m"] is not None}
+    found = _one_by_one(rows, {"p50_m": sigma.quantile(0.5), "p95_m": sigma.quantile(0.95), "max_m": sigma.max()})
+    return None if found["max_m"] is None else found
 
 
-def filtered(folder: OutputFolder, tally: Tally) -> dict[str, Filtered]:
-    """Epochs of the filter by status and percentiles of its sigma, by antenna, from the rows written."""
+def _level(rows: pl.LazyFrame, antenna: AntennaTally) -> dict[str, Any]:
+    finite = pl.col("protection_level_m").filter(pl.col("protection_level_m").is_finite())
+    return {
+        **_one_by_one(rows, {"p50_m": finite.quantile(0.5), "p95_m": finite.quantile(0.95)}),
+        **{word: antenna.level_status[word] for word in ("available", "unavailable", "alarm")},
+        "without_budget": antenna.without_budget,
+    }
+
+
+def _filter_figures(rows: pl.LazyFrame) -> dict[str, Any]:
     status, level = pl.col("status"), pl.col("protection_level_m")
     finite = level.filter(level.is_finite())
     words = {word.text: (status == word.text).sum() for word in TrackStatus}
+    counts = rows.select(**words, levels=level.count()).collect().row(0, named=True)
     figures = {"p50_m": finite.quantile(0.5), "p95_m": finite.quantile(0.95), "finite": finite.len()}
-    along = along_sigma(folder, tally, "train")
-    found = {}
-    for name in (name for name, antenna in tally.antennas.items() if antenna.epochs):
-        rows = _rows(folder, "train", name)
-        counts = rows.select(**words, levels=level.count()).collect().row(0, named=True)
-        bound = FilterLevel(**_one_by_one(rows, figures)) if counts.pop("levels") else None
-        found[name] = Filtered(status=counts, along_sigma_m=along.get(name), level=bound)
-    return found
+    bound = _one_by_one(rows, figures) if counts.pop("levels") else None
+    return {"status": counts, "along_sigma_m": _along_sigma(rows), "level": bound}
 
 
 def _rows(folder: OutputFolder, table: str, antenna: str) -> pl.LazyFrame:
@@ -142,26 +104,14 @@ class RunProvenance:
     navigation: Navigation
 
 
-@dataclass(frozen=True, kw_only=True)
-class Figures:
-    """Percentiles of a run by antenna; empty where there are none."""
-
-    sigma: Mapping[str, AlongSigma] = field(default_factory=dict)
-    levels: Mapping[str, Levels] = field(default_factory=dict)
-    tracks: Mapping[str, Filtered] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, folder: OutputFolder, tally: Tally, config: Config) -> Figures:
-        """Figures of the rows written."""
-        tracks = filtered(folder, tally) if config.filter == "track" else {}
-        return cls(sigma=along_sigma(folder, tally), levels=levels(folder, tally), tracks=tracks)
-
-
 def run_record(
-    made_from: RunProvenance, tally: Tally, notes: Sequence[str], *, wall_s: float, figures: Figures | None = None
+    made_from: RunProvenance,
+    tally: Tally,
+    notes: Sequence[str],
+    figures: Mapping[str, Mapping[str, Any]],
+    wall_s: float,
 ) -> dict[str, Any]:
-    """Return the content of ``run.json`` as plain values."""
-    figures = figures or Figures()
+    """Return the content of ``run.json`` as plain values; `figures` are those of `figures_of`."""
     navigation, config = made_from.navigation, made_from.config
     observed = sum(antenna.observed for antenna in tally.antennas.values())
     ok = sum(antenna.status[Status.OK.text] for antenna in tally.antennas.values())
@@ -190,15 +140,7 @@ def run_record(
         "notes": list(notes),
         "positioning_rate": tally.positioned / observed if observed else None,
         "ok_rate": ok / observed if observed else None,
-        "antennas": {
-            name: {
-                **antenna.as_dict(),
-                "along_sigma_m": asdict(figures.sigma[name]) if name in figures.sigma else None,
-                "protection_level": asdict(figures.levels[name]) if name in figures.levels else None,
-                "filter": asdict(figures.tracks[name]) if name in figures.tracks else None,
-            }
-            for name, antenna in tally.antennas.items()
-        },
+        "antennas": {name: {**antenna.as_dict(), **figures[name]} for name, antenna in tally.antennas.items()},
         "wall_s": round(wall_s, 3),
         "chunks": {
             "first_epoch_gpst": [str(first) for first, _, _ in tally.chunks],
@@ -231,13 +173,7 @@ class RunRecord:
     record: Mapping[str, Any]  #: ``run.json``.
 
     def part(self, name: str) -> dict[str, Any]:
-        """Return a table of the record.
-
-        Raises
-        ------
-        InputFileError
-            It is missing or not a table.
-        """
+        """Return a table of the record; InputFileError: it is missing or not a table."""
         table = self.record.get(name)
         if not isinstance(table, dict):
             raise InputFileError(self.path / "run.json", f"has no table {name}; repeat the run with this version")
@@ -247,19 +183,15 @@ class RunRecord:
     def config(self) -> Config:
         """Settings that were used, with the files they name where these are now.
 
-        Settings that earlier versions recorded and that never changed a result are left out.
-
-        Raises
-        ------
-        InputFileError
-            The record lacks them, or they are not settings of this version.
+        Settings that earlier versions recorded and that never changed a result are left out. InputFileError: the record
+        lacks them, or they are not settings of this version.
         """
         used = dict(self.part("settings_used"))
         for group, name in WITHOUT_EFFECT:
             if isinstance(used.get(group), dict):
                 used[group] = {key: value for key, value in used[group].items() if key != name}
         config = self._this_version(lambda: parse_config(used, source="settings_used"))
-        files = {name: self.located(name) for name in ("cn0_curve", "error_model", "integrity_support", "sbas")}
+        files = {name: self.input_paths(name) for name in ("cn0_curve", "error_model", "integrity_support", "sbas")}
         changes = {name: tuple(paths) if name == "sbas" else paths[0] for name, paths in files.items() if paths}
         return config.replaced(**changes) if changes else config
 
@@ -268,7 +200,9 @@ class RunRecord:
         """Input files, where they are now."""
         kinds = dict.fromkeys(str(entry["input"]) for entry in self.entries)
         several = {name for name, field in RunInputs.model_fields.items() if field.annotation == tuple[Path, ...]}
-        values = {name: tuple(self.located(name)) if name in several else self.located(name)[0] for name in kinds}
+        values = {
+            name: tuple(self.input_paths(name)) if name in several else self.input_paths(name)[0] for name in kinds
+        }
         return self._this_version(lambda: validated(RunInputs, values, source="inputs"))
 
     @cached_property
@@ -284,36 +218,22 @@ class RunRecord:
             raise InputFileError(path, f"does not fit this version ({error}); repeat the run with it") from None
 
     def check_inputs(self) -> None:
-        """Check that the input files are there and unchanged.
-
-        Raises
-        ------
-        InputFileError
-            One is missing.
-        MismatchError
-            One has changed since the run.
-        """
+        """Raise InputFileError where an input file is missing, MismatchError where one has changed since the run."""
         self.inputs.check()
         for entry in self.entries:
-            path = located(entry, self.path)
+            path = input_path(entry, self.path)
             if file_sha256(path) != entry["sha256"]:
                 raise MismatchError(
                     f"{path}: has changed since the run in {self.path} read it as --{entry['input']}; repeat the run"
                 )
 
-    def located(self, kind: str) -> list[Path]:
-        """Return where the files of one kind of input are now, in order; see `railfix.run.inputs.located`."""
-        return [located(entry, self.path) for entry in self.entries if entry["input"] == kind]
+    def input_paths(self, kind: str) -> list[Path]:
+        """Return where the files of one kind of input are now, in order; see `railfix.run.inputs.input_path`."""
+        return [input_path(entry, self.path) for entry in self.entries if entry["input"] == kind]
 
     @property
     def entries(self) -> list[Mapping[str, Any]]:
-        """Input files with kind, path and SHA-256.
-
-        Raises
-        ------
-        InputFileError
-            The record has no such list.
-        """
+        """Input files with kind, path and SHA-256; InputFileError: the record has no such list."""
         entries = self.record.get("inputs", [])
         complete = isinstance(entries, list) and all(
             isinstance(entry, dict) and {"input", "path", "sha256"} <= set(entry) for entry in entries
@@ -326,18 +246,7 @@ class RunRecord:
 
 
 def read_record(folder: Path) -> RunRecord:
-    """Read the record of a run.
-
-    Parameters
-    ----------
-    folder : Path
-        That `railfix run` wrote.
-
-    Raises
-    ------
-    InputFileError
-        There is no record, or it is not one.
-    """
+    """Read the record of a run from its folder; InputFileError: there is none, or it is not one."""
     if not folder.is_dir():
         problem = "is a file" if folder.exists() else "there is no such folder"
         raise InputFileError(folder, f"{problem}, expected the folder that railfix run wrote; name that")

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.navigation import Navigation
@@ -142,10 +142,6 @@ class RouteOfLog:
         return np.asarray(np.clip(1.0 - self.matched.probabilities.sum(axis=1), 0.0, 1.0))
 
     @cached_property
-    def _names(self) -> Strings:
-        return np.array([*self.network.names, None], dtype=object)
-
-    @cached_property
     def _on_route(self) -> Floats:
         return np.isin(self.matched.candidates.track, self.tracks).astype(np.float64)
 
@@ -222,14 +218,14 @@ class RouteOfLog:
         latitude, longitude = np.full(len(table), np.nan), np.full(len(table), np.nan)
         known = np.isfinite(chainage) & np.isfinite(ecef[:, 0])
         if known.any():
-            reading = self.reading
-            place, _ = in_map_frame(ecef[known], self.network.frame, self.time, **reading.motion)
+            place, _ = in_map_frame(ecef[known], self.network.frame, self.time, **self.reading.motion)
             latitude[known], longitude[known], _ = geodetic_from_ecef(place)
-        number = np.where(known, self._section(line, chainage), -1)
+        ends = line.chainage_m[np.flatnonzero(np.diff(line.section))]
+        number = np.where(known, np.array(self.tracks)[np.searchsorted(ends, np.nan_to_num(chainage))], -1)
         along, _ = self.network.place_on(number, latitude, longitude)
         epoch = self._nearest_epoch(table["time_gpst"].to_numpy())
         share = np.where(known, self.probability[epoch], np.nan)
-        names = self._names
+        names: Strings = np.array([*self.network.names, None], dtype=object)
         positions = table.with_columns(
             pl.Series("track", names[number].tolist(), dtype=pl.String),
             pl.Series("track_chainage_m", along, nan_to_null=True),
@@ -258,11 +254,6 @@ class RouteOfLog:
         )
         order = np.lexsort((-long["probability"].to_numpy(), row))
         return positions, long[order]
-
-    def _section(self, line: Track, chainage_m: Floats) -> Integers:
-        """Track of the route at each chainage, shape (n,)."""
-        ends = line.chainage_m[np.flatnonzero(np.diff(line.section))]
-        return np.asarray(np.array(self.tracks)[np.searchsorted(ends, np.nan_to_num(chainage_m))], dtype=np.int64)
 
     def _nearest_epoch(self, time: Any) -> Indices:
         """The matched position nearest in time to each time, shape (n,)."""

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.files import BrokenLines
 from railfix.core.reasons import Status
@@ -28,7 +27,6 @@ from railfix.run.route import RouteOfLog
 from railfix.track import Track
 from railfix.track.frames import FrameShift, track_at
 from railfix.track.read import check_heights, read_segments, track_of_segments
-from railfix.track.route import Segment
 from railfix.track.track import HEIGHTS_M
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import Vehicle, antenna_trajectory, read_vehicle
@@ -163,7 +161,9 @@ def _read_line(
     track: tuple[Path, ...], reading: TrackReading, *, heights: Path | None, log: LogPositions | None
 ) -> tuple[Track, RouteOfLog | None]:
     """Read the track, and find the route in a network."""
-    segments = _segments(track, reading)
+    if not track:
+        raise SettingsError("no track map was given")
+    segments = [segment for path in track for segment in read_segments(path, reading.of_map)]
     options: dict[str, Any] = {
         "geoid": reading.geoid, "height_datum": reading.height_datum, "sigma_height_m": reading.height_sigma
     }  # fmt: skip
@@ -189,12 +189,6 @@ def _read_line(
         **options,
     )
     return centreline, route
-
-
-def _segments(track: tuple[Path, ...], reading: TrackReading) -> list[Segment]:
-    if not track:
-        raise SettingsError("no track map was given")
-    return [segment for path in track for segment in read_segments(path, reading.of_map)]
 
 
 def _paths(
@@ -261,14 +255,7 @@ Item = TypeVar("Item")
 SAME_INSTANT_NS: Final = 20_000_000
 
 
-def _spacing_ns(time: Datetimes) -> int:
-    """Usual spacing of the epochs of a part [ns]; 0 when it has one epoch."""
-    if len(time) < 2:
-        return 0
-    return int(np.median(np.diff(time).astype(np.int64)))
-
-
-def aligned(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Observations]]:
+def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Observations]]:
     """Yield chunks of observations that cover the same span of time for every antenna seen so far.
 
     Each antenna keeps its own epochs, none where it has none in the span. A chunk ends where the first of the current
@@ -284,7 +271,8 @@ def aligned(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Ob
         if part is None:
             del live[name]
             return
-        spacing[name] = _spacing_ns(part.time) or spacing.get(name, 0)
+        if len(part) > 1:
+            spacing[name] = int(np.median(np.diff(part.time).astype(np.int64)))
         rest = waiting.get(name)
         waiting[name] = concatenate([rest, part]) if rest is not None and len(rest) else part
 
@@ -296,7 +284,7 @@ def aligned(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Ob
             return
         cut = {name: len(part) for name, part in waiting.items()}
         if live:
-            slack = min(SAME_INSTANT_NS, *(spacing[name] // 2 for name in live))
+            slack = min(SAME_INSTANT_NS, *(spacing.get(name, 0) // 2 for name in live))
             horizon = min(waiting[name].time[-1] for name in live) + np.timedelta64(slack, "ns")
             cut = {name: int(np.searchsorted(part.time, horizon, side="right")) for name, part in waiting.items()}
         yield {name: part[: cut[name]] for name, part in waiting.items()}

@@ -66,24 +66,17 @@ class StandstillCodes:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class StandstillBase:
-    """Observations of a base station and its place, ECEF [m]."""
-
-    observations: Observations
-    ecef_m: Floats
-
-
 def standstill_codes(
     obs: Observations,
     navigation: Navigation,
     config: Config,
     *,
-    base: StandstillBase | None = None,
+    base: tuple[Observations, Floats] | None = None,
     origin_ecef_m: Floats | None = None,
 ) -> StandstillCodes:
     """Codes, and beside a base station phases, of an antenna at rest about an origin, by default its mean place.
 
+    `base` are the observations of a base station and its place, ECEF, shape (3,) [m].
     MismatchError: the antenna moves, its log has no place, or it shares no epoch or satellite with the base station.
     """
     received, book = known_from_start(config, navigation=navigation), ChannelBook(config)
@@ -105,12 +98,13 @@ def standstill_codes(
     elevation = np.nanmedian(seen.elevation_deg, axis=0)
     nominal = np.hypot(config.nominal.sigma_m(elevation), received.ionosphere_sigma_m * thin_shell_obliquity(elevation))
     if base is not None:
-        other = uncorrected_ranges(base.observations, received, config, book)
-        mine, its = _common_epochs(obs, base.observations)
+        of_base, base_ecef_m = base
+        other = uncorrected_ranges(of_base, received, config, book)
+        mine, its = _common_epochs(obs, of_base)
         columns, opposite = _common_channels(seen, other)
         time = obs.time[mine]
-        residual = residual[mine][:, columns] - _residual(other, base.ecef_m)[its][:, opposite]
-        phases = _phases((obs, seen, origin, mine, columns), (base.observations, other, base.ecef_m, its, opposite))
+        residual = residual[mine][:, columns] - _residual(other, base_ecef_m)[its][:, opposite]
+        phases = _phases((obs, seen, origin, mine, columns), (of_base, other, base_ecef_m, its, opposite))
         nominal = np.full(len(names), _BESIDE_BASE_M)
     kept = np.isfinite(residual).mean(axis=0) >= _SHARE
     if not kept.any():
@@ -244,12 +238,8 @@ def _phases(train: _Side, base: _Side) -> StandstillPhases:
     toward = line @ enu_axes(latitude, longitude).T
     satellite = seen.channels.satellite[columns]
     kept = np.array([not str(name).startswith("R") for name in satellite], dtype=np.bool_)
-    group = np.array(
-        [
-            CLOCK_GROUP[str(name)[0]] + str(signal)
-            for name, signal in zip(satellite, seen.channels.signal[columns], strict=True)
-        ]
-    )
+    signals = zip(satellite, seen.channels.signal[columns], strict=True)
+    group = np.array([CLOCK_GROUP[str(name)[0]] + str(signal) for name, signal in signals])
     return StandstillPhases(
         difference_m=(sides[0] - sides[1])[:, kept],
         lost=(lost[0] | lost[1])[:, kept],

@@ -164,14 +164,9 @@ class AntennaTally:
         self.map_detectable_m = np.stack([np.fmin(known[0], least), np.fmax(known[1], largest)])
         worst = int(np.nanargmax(offset.statistic))
         if self.map_offset is None or offset.statistic[worst] > self.map_offset.statistic:
-            self.map_offset = MapOffsetFound(
-                time=result.time[worst],
-                across_m=float(offset.across_m[worst]),
-                up_m=float(offset.up_m[worst]),
-                across_sigma_m=float(offset.across_sigma_m[worst]),
-                up_sigma_m=float(offset.up_sigma_m[worst]),
-                statistic=float(offset.statistic[worst]),
-            )
+            names = ("across_m", "up_m", "across_sigma_m", "up_sigma_m", "statistic")
+            values = {name: float(getattr(offset, name)[worst]) for name in names}
+            self.map_offset = MapOffsetFound(time=result.time[worst], **values)
 
     def _add_reasons(self, result: AntennaResult) -> None:
         seen = (result.reason & _NOT_A_REJECTION) == 0
@@ -232,10 +227,10 @@ class AntennaTally:
             "first_epoch_gpst": None if self.first is None else str(self.first),
             "last_epoch_gpst": None if self.last is None else str(self.last),
             "status": {s.text: self.status[s.text] for s in Status},
-            "epochs_with_position_by_status": _nonzero(self.status_positioned),
-            "epochs_without_position_by_status": _nonzero(self.status - self.status_positioned),
-            "too_few_satellites_by_first_reason": _nonzero(self.short_first),
-            "too_few_satellites_by_one_reason_alone": _nonzero(self.short_only),
+            "epochs_with_position_by_status": dict(+self.status_positioned),
+            "epochs_without_position_by_status": dict(self.status - self.status_positioned),
+            "too_few_satellites_by_first_reason": dict(+self.short_first),
+            "too_few_satellites_by_one_reason_alone": dict(+self.short_only),
             "observations": self.observations,
             "observations_used": self.used,
             "observations_rejected_by_first_reason": dict(self.first_reason),
@@ -246,10 +241,6 @@ class AntennaTally:
             "satellites_left_out": {s: n for s, (n, _) in sorted(self.lasting.items())},
             "satellites_left_out_by_the_filter": {s: n for s, (n, _) in sorted(self.left_out.items())},
         }
-
-
-def _nonzero(counts: Counter[str]) -> dict[str, int]:
-    return {name: count for name, count in counts.items() if count}
 
 
 @dataclass(kw_only=True)
@@ -271,7 +262,8 @@ class Tally:
             if name in result.fusion:
                 tally.add_filter(result.fusion[name], antenna.satellite[antenna.columns])
         if self.order is not None and len(result.antennas) > 1:
-            self.order.add(*(_read_places(result.antennas[name]) for name in ("front", "rear")))
+            both = (result.antennas["front"], result.antennas["rear"])
+            self.order.add(*((each.time, each.chainage_m, each.along_sigma_m) for each in both))
         self.notes.update(dict.fromkeys(result.notes))
 
     @property
@@ -295,11 +287,6 @@ class Tally:
     def positioned(self) -> int:
         """Epochs with a position, of all antennas."""
         return sum(a.positioned for a in self.antennas.values())
-
-
-def _read_places(result: AntennaResult) -> tuple[Datetimes, Floats, Floats]:
-    """Return time tags, chainages and their sigmas."""
-    return result.time, result.chainage_m, result.along_sigma_m
 
 
 def _count_left_out(
@@ -361,7 +348,7 @@ class ResultRows:
 _MOST_NOTES: Final = 20
 
 
-def shortened(notes: list[str]) -> list[str]:
+def shorten_notes(notes: list[str]) -> list[str]:
     """Return the first notes, and how many there are beside."""
     more = len(notes) - _MOST_NOTES
     return notes if more <= 0 else [*notes[:_MOST_NOTES], f"{more} more notes on balises; see the table of passings"]
@@ -398,7 +385,7 @@ def add_smoothed(replays: Mapping[str, Replays], processor: EpochProcessor, fold
         smoothed[name] = smoothed_table(result, trajectory)
     done = dict.fromkeys(smoothed, 0)
 
-    def widened(table: pl.DataFrame) -> pl.DataFrame:
+    def with_smoother(table: pl.DataFrame) -> pl.DataFrame:
         parts = {}
         for name, whole in smoothed.items():
             count = int((table["antenna"] == name).sum())
@@ -406,4 +393,4 @@ def add_smoothed(replays: Mapping[str, Replays], processor: EpochProcessor, fold
             done[name] += count
         return with_smoothed(table, parts)
 
-    folder.change("train", widened)
+    folder.change("train", with_smoother)

@@ -29,7 +29,7 @@ from railfix.positioning.which_track import NONE, StandstillErrors, TrackPosteri
 from railfix.run.inputs import InputFiles, LogReading, TrackReading, input_option
 from railfix.run.processor import place_of
 from railfix.run.sources import Log
-from railfix.run.standstill import StandstillBase, StandstillCodes, standstill_codes
+from railfix.run.standstill import StandstillCodes, standstill_codes
 from railfix.track.frames import in_map_frame
 from railfix.track.network import Network
 from railfix.track.network_read import read_network
@@ -43,12 +43,8 @@ _ODOMETER_M: Final = 10.0
 _LEAST_UNMAPPED: Final = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrackPrior:
-    """Weights of mapped tracks by name, those not named have none; and probability of one that the map lacks."""
-
-    weights: Mapping[str, float]
-    unmapped: float
+#: Weights of mapped tracks by name; and probability of one that the map lacks.
+TrackPrior = tuple[dict[str, float], float]
 
 
 def write_last_place(posterior: TrackPosterior, time: np.datetime64, path: Path) -> None:
@@ -86,7 +82,7 @@ def prior_of_last_place(
     total, count = sum(weights.values()), len(weights)
     weights = {name: (1.0 - missed_move) * value + missed_move * total / count for name, value in weights.items()}
     off_map = (1.0 - missed_move) * off_map + missed_move * unmapped
-    return TrackPrior(weights=weights, unmapped=max(off_map, _LEAST_UNMAPPED))
+    return weights, max(off_map, _LEAST_UNMAPPED)
 
 
 def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
@@ -272,9 +268,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     navigation = read_navigation(inputs.nav, date=options.logs.instant)
     base = None
     if options.base_place is not None:
-        base = StandstillBase(
-            observations=_observations(inputs.base, options), ecef_m=place_of(options.base_place, "--base-place")
-        )
+        base = _observations(inputs.base, options), place_of(options.base_place, "--base-place")
     codes: list[StandstillCodes] = []
     for paths in (inputs.front, inputs.rear):
         if paths:
@@ -297,19 +291,18 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
                 f"map: {shift.frame} moved by {size:.2f} m (east {shift.east_m:+.2f}, north {shift.north_m:+.2f}) to "
                 f"{shift.used}, the frame of the train's position"
             )
-    half = options.spacing / 2.0
     tracks = yard_tracks(network, origin)
-    prior = _prior(inputs, options, network)
-    if not any(prior.weights[track.name] > 0.0 for track in tracks):
+    prior, unmapped = _prior(inputs, options, network)
+    if not any(prior[track.name] > 0.0 for track in tracks):
         raise MismatchError("none of the tracks near the train is possible by --prior and --last")
     decision = decide_track(
         tracks,
         codes,
-        arms_m=(half, -half) if len(codes) == 2 else (0.0,),
-        errors=options.errors.replaced(unmapped_prior=prior.unmapped),
+        arms_m=(options.spacing / 2.0, -options.spacing / 2.0) if len(codes) == 2 else (0.0,),
+        errors=options.errors.replaced(unmapped_prior=unmapped),
         risk=options.risk,
         least_s=options.least_s,
-        prior=prior.weights,
+        prior=prior,
     )
     return replace(decision, notes=tuple(notes))
 
@@ -326,11 +319,10 @@ def _prior(inputs: WhichTrackInputs, options: WhichTrackOptions, network: Networ
     """Weights of all tracks: the product of what the interlocking and the last place state."""
     weights, unmapped = dict.fromkeys(network.names, 1.0), options.errors.unmapped_prior
     if inputs.last is not None and options.moved is not None:
-        last = prior_of_last_place(
+        weights, unmapped = prior_of_last_place(
             inputs.last, network, moved_m=options.moved, missed_move=options.missed_move, unmapped=unmapped
         )
-        weights, unmapped = dict(last.weights), last.unmapped
     if options.prior is not None:
         stated = prior_of_interlocking(options.prior, network)
         weights = {name: weight * stated.get(name, 0.0) for name, weight in weights.items()}
-    return TrackPrior(weights=weights, unmapped=unmapped)
+    return weights, unmapped

@@ -23,7 +23,7 @@ from railfix.simulate.line_file import (
     FileLine,
     Knots,
     LineSettings,
-    generated_knots,
+    generate_knots,
     knots_of_elements,
     line_of_file,
 )
@@ -109,7 +109,7 @@ class Alignment(Knots):
         right /= np.linalg.norm(right, axis=-1, keepdims=True)
         return np.asarray(place + lateral_m * right + height_m * up)
 
-    def sampled_chainage_m(self) -> Floats:
+    def point_chainage_m(self) -> Floats:
         """Chainage of the map's points: the elements' ends, and even steps between within the spacing; a file's own."""
         if self.file is not None:
             return self.file.point_m
@@ -131,8 +131,8 @@ class Alignment(Knots):
         return np.stack([offset.at(chainage_m) for offset in offsets], axis=-1)
 
     def track(self) -> Track:
-        """The track map: the curve at `sampled_chainage_m`, with its attributes and the map's error."""
-        chainage = self.sampled_chainage_m()
+        """The track map: the curve at `point_chainage_m`, with its attributes and the map's error."""
+        chainage = self.point_chainage_m()
         ecef = self.at(chainage)
         exact = not (self.settings.map_error.plan_sigma_m or self.settings.map_error.height_sigma_m)
         if self.file is not None and exact:
@@ -170,7 +170,7 @@ def build_alignment(settings: LineSettings) -> Alignment:
     if settings.kind == "elements":
         knots = knots_of_elements(settings.elements, settings.gradients)
     elif settings.kind == "generated":
-        knots = generated_knots(settings)
+        knots = generate_knots(settings)
     else:
         knots = _pattern_knots(settings.length_m)
     return Alignment(settings=settings, **vars(knots))

@@ -31,7 +31,6 @@ _SERVES_S: Final = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0}
 #: Time from transmission to reference time, where the transmission time is absent or implausible [s].
 _SENT_BEFORE_S: Final = {"G": 7200.0, "J": 3600.0, "E": 600.0, "C": 3600.0}
 _SIGNALS_MESSAGE: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV",), "C": ("D1", "D2")}
-_WITH_L5: Final = {**_SIGNALS_MESSAGE, "C": ("CNV1",)}  #: Where `ReceiverSettings.has_l5`.
 
 
 def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
@@ -69,8 +68,7 @@ def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
 def no_glonass() -> GlonassRecords:
     """Empty GLONASS records; GLONASS is not simulated."""
     none, times = np.empty(0), np.empty(0, dtype="datetime64[ns]")
-    vectors = np.empty((0, 3))
-    integers = np.empty(0, dtype=np.int64)
+    vectors, integers = np.empty((0, 3)), np.empty(0, dtype=np.int64)
     return GlonassRecords(
         satellite=np.empty(0, dtype="<U3"), toe=times, transmitted=times, clock_bias_s=none, relative_frequency=none,
         position_ecef_m=vectors, velocity_ecef_mps=vectors, acceleration_ecef_mps2=vectors, health=integers,
@@ -83,7 +81,7 @@ def _rows(records: KeplerRecords, rows: Indices | Masks) -> KeplerRecords:
 
 
 def _messages(scenario: Scenario) -> dict[str, tuple[str, ...]]:
-    return _WITH_L5 if scenario.receiver.has_l5 else _SIGNALS_MESSAGE
+    return {**_SIGNALS_MESSAGE, "C": ("CNV1",)} if scenario.receiver.has_l5 else _SIGNALS_MESSAGE
 
 
 def _select_simulated(records: KeplerRecords, systems: str, messages: dict[str, tuple[str, ...]]) -> KeplerRecords:
@@ -122,8 +120,8 @@ def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last:
 KLOBUCHAR: Final = (1.118e-8, 2.235e-8, -5.960e-8, -1.192e-7, 1.044e5, 1.147e5, -6.554e4, -3.277e5)
 #: Seconds between the transmission of the record before and the next (IS-GPS-200: two hours).
 _ISSUE_S: Final = {"G": 7200, "J": 3600, "E": 3600, "C": 3600}
-#: Transmission begins a little after the hour.
-_SENT_AFTER_S: Final = 18
+_SENT_AFTER_S: Final = 18  #: Transmission begins a little after the hour.
+_SYNCHRONOUS_M: Final = (GM_GPS / EARTH_ROTATION_RATE**2) ** (1.0 / 3.0)  #: Radius of a synchronous orbit [m].
 #: Galileo data source: I/NAV of E1-B, clock of E5b and E1 (RINEX 3.04, table A8: bits 0, 2 and 9).
 _INAV_SOURCE: Final = 517
 
@@ -144,9 +142,8 @@ class _Orbit:
 def simulated_navigation(scenario: Scenario) -> Navigation:
     """Broadcast records for the whole of a run, as `railfix.io.write_navigation` writes them.
 
-    All values are already rounded to the digits of the file, so that the file and the arrays are the
-    same satellites. Where the scenario names a navigation file, its records (`railfix.simulate.constellation`).
-    InputFileError, MismatchError: when that file cannot be read, or does not serve the scenario's time.
+    All values are rounded to the digits of the file, so that file and arrays are the same satellites. Where the
+    scenario names a navigation file, its records; errors as `navigation_of_file`.
     """
     if scenario.sky.nav is not None:
         return navigation_of_file(scenario, scenario.sky.nav)
@@ -194,7 +191,8 @@ def _orbits(system: str, scenario: Scenario, rng: np.random.Generator) -> list[_
             _figure_of_eight(name, scenario.line.longitude_deg, phase)
             for name, phase in (("J01", 0.15), ("J02", 2.3), ("J04", -1.9))
         ]
-        orbits.append(_synchronous("J03", 0.0003, 0.05, np.radians(127.0), 0.0))
+        over_equator = {"eccentricity": 0.0003, "tilt": np.radians(0.05), "perigee": 0.0, "node": 0.0}
+        orbits.append(_Orbit(name="J03", semi_major_m=_SYNCHRONOUS_M, mean_anomaly=np.radians(127.0), **over_equator))
     if system == "C":
         orbits += [
             _figure_of_eight(f"C{38 + k}", 110.0 + 4.0 * k, phase, eccentricity=0.004, tilt_deg=55.0)
@@ -214,32 +212,15 @@ def _figure_of_eight(
     name: str, longitude_deg: float, phase: float, *, eccentricity: float = 0.075, tilt_deg: float = 41.0
 ) -> _Orbit:
     """Inclined synchronous orbit, northmost and farthest at a longitude, `phase` radians ago."""
-    node = np.radians(longitude_deg) - np.pi / 2.0 - phase
     return _Orbit(
         name=name,
-        semi_major_m=_synchronous_radius(),
+        semi_major_m=_SYNCHRONOUS_M,
         eccentricity=eccentricity,
         tilt=np.radians(tilt_deg),
         perigee=-np.pi / 2.0,
-        node=node,
+        node=np.radians(longitude_deg) - np.pi / 2.0 - phase,
         mean_anomaly=np.pi + phase,
     )
-
-
-def _synchronous(name: str, eccentricity: float, tilt_deg: float, longitude: float, perigee: float) -> _Orbit:
-    return _Orbit(
-        name=name,
-        semi_major_m=_synchronous_radius(),
-        eccentricity=eccentricity,
-        tilt=np.radians(tilt_deg),
-        perigee=perigee,
-        node=0.0,
-        mean_anomaly=longitude - perigee,
-    )
-
-
-def _synchronous_radius() -> float:
-    return float((GM_GPS / EARTH_ROTATION_RATE**2) ** (1.0 / 3.0))
 
 
 def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Generator) -> list[dict[str, Any]]:

@@ -37,13 +37,7 @@ def demo_folder() -> Path:
 
 
 def demo_files() -> dict[str, Path]:
-    """Files of the demonstration run: ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``readme``.
-
-    Raises
-    ------
-    InputFileError
-        As `demo_folder`.
-    """
+    """Files of the demonstration run: ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``readme``."""
     folder = demo_folder()
     return {name: folder / file for name, file in DEMO_FILES.items()}
 

@@ -219,14 +219,11 @@ class CommonErrors:
         atmosphere = self._settings.ionosphere.vertical_sigma_m, self._settings.ionosphere.gradient_mm_per_km
         return any((*atmosphere, self._settings.troposphere.zenith_sigma_m, self._clocks, self._orbits))
 
-    def _columns(self, letter: str) -> list[int]:
-        return [k for k, name in enumerate(self._satellites) if name[0] == letter]
-
     def _of_satellites(self, stream: int, sigma: str, time: str) -> list[tuple[list[int], GaussMarkov]]:
         """Processes of each constellation that has this error, with the columns of its satellites."""
         found = []
         for letter, table in sorted(self._settings.satellites.items()):
-            columns = self._columns(letter)
+            columns = [k for k, name in enumerate(self._satellites) if name[0] == letter]
             if columns and getattr(table, sigma) > 0.0:
                 keys = [(self._seed, stream, *satellite_key(self._satellites[k])) for k in columns]
                 process = GaussMarkov(
@@ -270,18 +267,15 @@ class CommonErrors:
     @cached_property
     def _vertical(self) -> GaussMarkov:
         atmosphere = self._settings.ionosphere
-        key = (self._seed, _IONOSPHERE)
-        return GaussMarkov(
-            [key], sigma=atmosphere.vertical_sigma_m, time_s=atmosphere.vertical_time_s, duration_s=self._duration_s
-        )
+        return self._process(_IONOSPHERE, atmosphere.vertical_sigma_m, atmosphere.vertical_time_s)
 
     @cached_property
     def _zenith(self) -> GaussMarkov:
         atmosphere = self._settings.troposphere
-        key = (self._seed, _TROPOSPHERE)
-        return GaussMarkov(
-            [key], sigma=atmosphere.zenith_sigma_m, time_s=atmosphere.zenith_time_s, duration_s=self._duration_s
-        )
+        return self._process(_TROPOSPHERE, atmosphere.zenith_sigma_m, atmosphere.zenith_time_s)
+
+    def _process(self, stream: int, sigma_m: float, time_s: float) -> GaussMarkov:
+        return GaussMarkov([(self._seed, stream)], sigma=sigma_m, time_s=time_s, duration_s=self._duration_s)
 
     def orbit_error_m(self, time_s: Floats) -> Floats:
         """True minus broadcast position, shape (T, S, 3) [m], in the Earth-fixed frame."""
@@ -327,20 +321,12 @@ class CommonErrors:
 
     def group_delay_m(self, satellites: Sequence[str], signals: Sequence[str]) -> Floats:
         """Constant error of each channel's code, shape (M,) [m]."""
-        none = SatelliteErrorSettings()
-        return np.array(
-            [
-                self._settings.satellites.get(name[0], none).group_delay_sigma_m
-                * np.random.default_rng(
-                    [self._seed, _DELAY, *satellite_key(name), *(ord(c) for c in signal)]
-                ).standard_normal()
-                for name, signal in zip(satellites, signals, strict=True)
-            ]
-        )
-
-    def fault_m(self, time_s: Floats, satellites: Sequence[str]) -> tuple[Floats, Floats]:
-        """Range errors of satellites' faults [m] and their rates [m/s], shapes (T, M)."""
-        return fault_m(self._settings.faults, time_s, satellites)
+        delays = []
+        for name, signal in zip(satellites, signals, strict=True):
+            rng = np.random.default_rng([self._seed, _DELAY, *satellite_key(name), *(ord(c) for c in signal)])
+            settings = self._settings.satellites.get(name[0], SatelliteErrorSettings())
+            delays.append(settings.group_delay_sigma_m * rng.standard_normal())
+        return np.array(delays)
 
 
 def fault_m(faults: Sequence[SatelliteFault], time_s: Floats, satellites: Sequence[str]) -> tuple[Floats, Floats]:

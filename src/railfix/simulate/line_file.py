@@ -246,7 +246,7 @@ def _vertical(gradients: Sequence[Gradient], length_m: float) -> tuple[Floats, F
     return np.array([*places, length_m]), np.array([*values, current])
 
 
-def generated_knots(settings: LineSettings) -> Knots:
+def generate_knots(settings: LineSettings) -> Knots:
     """Knots of a generated line, straights and curves in turn."""
     rng = np.random.default_rng([settings.generated.seed, 11])
     return knots_of_elements(_plan(settings, rng), _profile(settings, rng))

@@ -247,17 +247,11 @@ def antenna_truth(
     sway_rad: Floats | float = 0.0,
     pitch_rad: Floats | None = None,
 ) -> AntennaTruth:
-    """True position of an antenna at n positions of the vehicle's middle.
+    """True position of an antenna at n positions of the vehicle's middle, midway between the bogies' chainages.
 
-    Parameters
-    ----------
-    offset_m : tuple of float
-        Along, across to the right, above the rail tops [m].
-    middle_m : ndarray, shape (n,) [m]
-        Chainage midway between the bogies' chainages.
-    sway_rad, pitch_rad : ndarray, shape (n,), or float [rad]
-        Lean to the right beyond that of the cant; pitch beyond that of the gradient, about the point between the
-        bogies at the rail tops, positive where the front rises.
+    `offset_m`: along, across to the right, above the rail tops. Sway is the lean to the right beyond that of the cant,
+    pitch that beyond the gradient, about the point between the bogies at the rail tops, positive where the front rises;
+    each of shape (n,) or one number [rad].
     """
     middle = np.asarray(middle_m, dtype=np.float64)
     half = np.full(middle.shape, vehicle.bogie_distance_m / 2.0)

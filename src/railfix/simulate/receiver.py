@@ -318,13 +318,9 @@ class ReceiverClocks:
         steps = self._scenario.receiver.clock_steps == "millisecond"
         return value - np.rint(value * 1e3) * 1e-3 if steps else value
 
-    def drift(self, receiver: str) -> float:
-        """Constant drift [s/s]."""
-        return self._line(receiver)[1]
-
     def rate_mps(self, receiver: str, tag_s: Floats) -> Floats:
         """Rate at tags, steps left out, shape (T,) [m/s]."""
-        even = np.full(np.shape(tag_s), SPEED_OF_LIGHT * self.drift(receiver))
+        even = np.full(np.shape(tag_s), SPEED_OF_LIGHT * self._line(receiver)[1])
         walk = self._walk(receiver)
         return even if walk is None else even + walk.rate(tag_s)[:, 0]
 

@@ -154,11 +154,11 @@ def truth_table(simulation: Simulation) -> pl.DataFrame:
     """
     line, time = simulation.line, simulation.time()
     tags = seconds(time - simulation.scenario.start)
-    sampled = line.sampled_chainage_m()
+    sampled = line.point_chainage_m()
     mapped = line.track().chainage_m
     tables = []
     for antenna in ANTENNAS:
-        instant = tags - simulation.clock_s(antenna, tags)
+        instant = tags - simulation.clocks.bias_s(antenna, tags)
         truth, speed = simulation.truth(antenna, instant)
         tables.append(
             pl.DataFrame(
@@ -187,7 +187,7 @@ def section_table(simulation: Simulation) -> pl.DataFrame:
     kinds = simulation.environment.label_at((edges[:-1] + edges[1:]) / 2.0)
     first = np.append(True, kinds[1:] != kinds[:-1])
     begins = edges[:-1][first]
-    mapped = np.interp([*begins, line.length_m], line.sampled_chainage_m(), line.track().chainage_m)
+    mapped = np.interp([*begins, line.length_m], line.point_chainage_m(), line.track().chainage_m)
     return pl.DataFrame({"from_m": mapped[:-1], "to_m": mapped[1:], "environment": kinds[first]})
 
 
@@ -200,7 +200,7 @@ def write_run(
     overwrite: Overwrite = "refuse",
     progress: Callable[[str, int], None] | None = None,
 ) -> dict[str, Path]:
-    """Simulate a run and write its files, all together at the end.
+    """Simulate a run and write its files, all together at the end; return their paths by name.
 
     ============================ ===================================================
     front.crx.gz, rear.crx.gz    observations (front.rnx, rear.rnx when plain)
@@ -216,32 +216,10 @@ def write_run(
     README.md                    contents and settings of the run
     ============================ ===================================================
 
-    Parameters
-    ----------
-    scenario : Scenario
-    folder : path-like
-        Created where it does not exist.
-    packing : {"packed", "plain"}
-        Plain: nothing is compressed, and sensors are CSV.
-    command : str
-        The command that made it, for the README.
-    overwrite : {"refuse", "replace"}
-        What to do with a folder that has files in it already.
-    progress : callable, optional
-        Called with the antenna and the number of epochs written since the last call.
-
-    Returns
-    -------
-    dict of str to Path
-        The files, by ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, ``sbas``, the
-        sensors' names, ``scenario``, ``readme``.
-
-    Raises
-    ------
-    OutputError
-        A file cannot be written.
-    InputFileError, MismatchError, SettingsError
-        A track or navigation file that the scenario names does not serve.
+    With `packing` "plain" nothing is compressed, and sensors are CSV. `command` made the run, for the README.
+    `progress` is called with the antenna and the number of epochs written since the last call. The names of the paths
+    are ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, ``sbas``, those of the sensors,
+    ``scenario``, ``readme``.
     """
     simulation = Simulation(scenario)
     tables = sensor_tables(simulation)
@@ -286,9 +264,9 @@ def _write_files(
     )
     write_track_csv(simulation.line.track(), files["track"])
     write_toml(files["vehicle"], vehicle_table(scenario.vehicle))
-    content = _csv(truth_table(simulation), TRUTH_DECIMALS)
-    _write(files["truth"], gzip.compress(content, compresslevel=6, mtime=0) if packed else content)
-    _write(files["sections"], _csv(section_table(simulation), TRUTH_DECIMALS))
+    truth, sections = (_csv(make(simulation), TRUTH_DECIMALS) for make in (truth_table, section_table))
+    _write(files["truth"], gzip.compress(truth, compresslevel=6, mtime=0) if packed else truth)
+    _write(files["sections"], sections)
     if scenario.sbas is not None:
         write_sbas(sbas_messages(simulation, scenario.sbas), files["sbas"])
     for name, table in tables.items():

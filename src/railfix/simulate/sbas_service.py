@@ -14,6 +14,7 @@ from railfix.ranges.sbas.ionosphere import BANDS, COLUMNS, POINT_OF_BIT
 from railfix.ranges.sbas.messages import DATA_BITS, PREAMBLES, with_parity
 from railfix.ranges.sbas.standard import DO_NOT_USE, NOT_MONITORED
 from railfix.simulate.constellation import newest_record
+from railfix.simulate.errors import fault_m
 from railfix.simulate.receiver import ionosphere_m
 from railfix.simulate.settings import SbasSettings
 
@@ -41,10 +42,10 @@ def message(kind: int, second: int, *fields: Field) -> Bytes:
     The fields (value, length) lie from bit 14 on, negative values in two's complement. ValueError: when a value does
     not fit its field, or the fields are longer than a message.
     """
-    return packed(f"{PREAMBLES['L1'][second % 3]:08b}{kind:06b}", kind, fields)
+    return pack_message(f"{PREAMBLES['L1'][second % 3]:08b}{kind:06b}", kind, fields)
 
 
-def packed(text: str, kind: int, fields: Sequence[Field]) -> Bytes:
+def pack_message(text: str, kind: int, fields: Sequence[Field]) -> Bytes:
     """Message from its first bits as text and its fields, with parity, shape (32,); ValueError: one does not fit."""
     for value, length in fields:
         if not -(1 << length) < 2 * value + 1 <= (1 << (length + 1)):
@@ -103,7 +104,7 @@ def long_term(second: int, satellites: Sequence[LongTerm], iodp: int = 0) -> Byt
     return message(25, second, *half(satellites[:2], iodp), *half(satellites[2:], iodp))
 
 
-def mixed(
+def fast_and_long_term(
     second: int,
     prc: Sequence[float],
     udrei: Sequence[int],
@@ -178,7 +179,8 @@ class Service:
         """UDREI (L5: DFREI) of `satellites`: as set, do not use during a fault."""
         settings = self._settings
         usual = settings.udrei if settings.band == "L1" else settings.dfrei
-        fault, _ = self._errors.fault_m(self._instant(second - settings.alert_s + settings.latency_s), self.satellites)
+        at = self._instant(second - settings.alert_s + settings.latency_s)
+        fault, _ = fault_m(self._simulation.scenario.errors.faults, at, self.satellites)
         return [DO_NOT_USE if abs(f) > settings.alert_m else usual for f in fault[0].tolist()]
 
     def orbits(self, second: float) -> list[LongTerm]:
@@ -238,14 +240,14 @@ class Service:
             first = _FAST * block
             part = slice(first, first + _FAST)
 
-            def made(second: int, issue: int) -> Bytes:
+            def compose(second: int, issue: int) -> Bytes:
                 values, grades = self.fast_m(second)[part].tolist(), self.indicators(second)[part]
                 if first > 0 and count - first <= _MIXED:
                     pair = self.orbits(second)[-2:]
-                    return mixed(second, values, grades, pair, block=block, iodf=issue)
+                    return fast_and_long_term(second, values, grades, pair, block=block, iodf=issue)
                 return fast(second, values, grades, kind=2 + block, iodf=issue)
 
-            return made
+            return compose
 
         return [of_block(block) for block in range(-(-count // _FAST))]
 

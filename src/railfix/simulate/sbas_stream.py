@@ -17,7 +17,7 @@ from railfix.ranges.sbas import SbasMessages
 from railfix.ranges.sbas.dfmc import AUGMENTED, FIRST, slot_satellite
 from railfix.ranges.sbas.messages import PREAMBLES, message_type
 from railfix.simulate.receiver import group_delay_s, signals_of
-from railfix.simulate.sbas_service import CLOCK, FAST_PERIOD_S, Field, Service, packed
+from railfix.simulate.sbas_service import CLOCK, FAST_PERIOD_S, Field, Service, pack_message
 from railfix.simulate.settings import SbasSettings
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def message(kind: int, second: int, *fields: Field) -> Bytes:
 
     The fields (value, length) lie from bit 10 on, negative values in two's complement. ValueError: one does not fit.
     """
-    return packed(f"{PREAMBLES['L5'][second % 6]:04b}{kind:06b}", kind, fields)
+    return pack_message(f"{PREAMBLES['L5'][second % 6]:04b}{kind:06b}", kind, fields)
 
 
 def mask(second: int, slots: Collection[int], iodm: int = 0) -> Bytes:
@@ -149,7 +149,7 @@ class SimulatedDfmc(Service):
     def _correction(self, k: int, slot: int) -> Callable[[int], Bytes]:
         day_s = float(seconds(self._start - self._start.astype("datetime64[D]")))
 
-        def made(second: int) -> Bytes:
+        def compose(second: int) -> Bytes:
             _, issue, place, _ = self.orbits(second)[k]
             moved = (*place, float(self.clocks_m(second)[k]))
             return correction(
@@ -157,7 +157,7 @@ class SimulatedDfmc(Service):
                 covariance=_COVARIANCE, dfrei=self.indicators(second)[k],
             )  # fmt: skip
 
-        return made
+        return compose
 
 
 LOST: Final = 53  #: Stream of random numbers of lost messages.

@@ -213,7 +213,7 @@ class Scenario(ScenarioSettings):
 
     @field_validator("stations")
     @classmethod
-    def _named_apart(cls, stations: tuple[ReferenceStation, ...]) -> tuple[ReferenceStation, ...]:
+    def _distinct_names(cls, stations: tuple[ReferenceStation, ...]) -> tuple[ReferenceStation, ...]:
         names = [*_FILES, *(station.name for station in stations)]
         if len(set(names)) < len(names):
             raise ValueError(f"must have different names, none of {', '.join(_FILES)}")
@@ -236,13 +236,7 @@ class Scenario(ScenarioSettings):
         return self
 
     def check_room(self, length_m: float) -> None:
-        """Check that the train stays within a line of this length.
-
-        Raises
-        ------
-        SettingsError
-            The vehicle or a station would stand beyond an end.
-        """
+        """Raise SettingsError where the vehicle or a station would stand beyond an end of a line of this length."""
         if problem := self._room_problem(length_m):
             raise SettingsError(problem)
 

@@ -145,19 +145,10 @@ def _run_table(
 
 
 def load_scenario(name: str | PathLike[str]) -> Scenario:
-    """The scenario of a file that holds one run.
+    """The scenario of a file that holds one run: a path, or the name of a shipped scenario.
 
-    Parameters
-    ----------
-    name : path-like
-        A path, or the name of a shipped scenario.
-
-    Raises
-    ------
-    InputFileError
-        The file is missing, unreadable, or no TOML.
-    SettingsError
-        A setting is misspelt, of the wrong kind, or out of range; or the file lists many runs.
+    InputFileError: the file is missing, unreadable, or no TOML. SettingsError: a setting is misspelt, of the wrong
+    kind, or out of range; or the file lists many runs.
     """
     recipe = load_recipe(name)
     if recipe.names[0]:

@@ -24,7 +24,7 @@ _STEP_S = 0.1  #: Spacing of the instants between which a passing is interpolate
 
 def balises_along(simulation: Simulation, settings: BaliseSettings) -> tuple[Balise, ...]:
     """Return the balises that are named, and those every `spacing_m`, in order of chainage."""
-    length = float(simulation.line.sampled_chainage_m()[-1])
+    length = float(simulation.line.point_chainage_m()[-1])
     spaced = np.arange(settings.spacing_m, length, settings.spacing_m) if settings.spacing_m else np.empty(0)
     drawn = [Balise(name=f"B{k + 1:03d}", chainage_m=at) for k, at in enumerate(spaced.tolist())]
     return tuple(sorted([*settings.balises, *drawn], key=lambda balise: balise.chainage_m))
@@ -34,7 +34,7 @@ def balise_list_table(simulation: Simulation, settings: BaliseSettings) -> pl.Da
     """The list of balises, see `railfix.simulate.sensor_tables.COLUMNS`."""
     balises, line = balises_along(simulation, settings), simulation.line
     at = np.array([balise.chainage_m for balise in balises], dtype=np.float64)
-    mapped = np.interp(at, line.sampled_chainage_m(), line.track().chainage_m)
+    mapped = np.interp(at, line.point_chainage_m(), line.track().chainage_m)
     return pl.DataFrame(
         {"balise": pl.Series([b.name for b in balises], dtype=pl.String), "chainage_m": mapped.round(3)}
     )
@@ -130,7 +130,7 @@ def unit_table(simulation: Simulation, settings: RangingSettings) -> pl.DataFram
     line = simulation.line
     place = np.array([unit_ecef_m(line, unit) for unit in settings.units]).reshape(-1, 3)
     chainage = np.array([unit.chainage_m for unit in settings.units])
-    mapped = np.interp(chainage, line.sampled_chainage_m(), line.track().chainage_m)
+    mapped = np.interp(chainage, line.point_chainage_m(), line.track().chainage_m)
     lateral = np.array([unit.lateral_m for unit in settings.units])
     names = [unit.name for unit in settings.units]
     columns = {"chainage_m": mapped, "lateral_m": lateral, "x_m": place[:, 0], "y_m": place[:, 1], "z_m": place[:, 2]}

@@ -46,23 +46,7 @@ class Piece:
 
 
 class Simulation:
-    """Simulation of a scenario: line, motion, satellites, and observations in chunks.
-
-    Attributes
-    ----------
-    scenario : Scenario
-    line : Alignment
-    motion : Motion
-        Of the vehicle's middle.
-    body : BodyMotion
-        Roll and pitch of the vehicle's body.
-    environment : Environment
-        Structures along the line.
-    disturbances : tuple of Disturbances
-        The environment where there is any, then the scenario's `multipath`.
-    navigation : Navigation
-    clocks : ReceiverClocks
-    """
+    """Simulation of a scenario: line, motion, satellites, and observations in chunks."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
@@ -84,10 +68,6 @@ class Simulation:
         """Time tags of epochs `first` to before `last`, GPS time."""
         last = self.scenario.epochs if last is None else last
         return np.asarray(self.scenario.start + np.arange(first, last) * self.scenario.interval)
-
-    def clock_s(self, receiver: str, tag_s: Floats) -> Floats:
-        """Bias of a receiver's clock, tag minus GPS time, at tags counted from the start, shape (T,) [s]."""
-        return self.clocks.bias_s(receiver, tag_s)
 
     @cached_property
     def satellites(self) -> tuple[str, ...]:
@@ -248,7 +228,7 @@ def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ec
 
 def _geometry(simulation: Simulation, antenna: str, time: Datetimes) -> tuple[SightGeometry, _Instant, Floats, Floats]:
     """Geometry by satellite, the instant of the epochs, and rates of path and ionosphere over 10 ms [m/s]."""
-    late = simulation.clock_s(antenna, tags := seconds(time - simulation.scenario.start))
+    late = simulation.clocks.bias_s(antenna, tags := seconds(time - simulation.scenario.start))
     truth, speed = simulation.truth(antenna, tags - late)
     now = _instant(simulation, time, late, truth.ecef_m)
     before, after = (
@@ -286,7 +266,7 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     )
     tags = seconds(time - scenario.start)
     ionosphere = scale * now.ionosphere_m[:, column]
-    clock = SPEED_OF_LIGHT * simulation.clock_s(receiver.antenna, tags)
+    clock = SPEED_OF_LIGHT * simulation.clocks.bias_s(receiver.antenna, tags)
     # Errors of code and phase alike, and their rate.
     fault, fault_rate = _faults(simulation, receiver, tags)
     extra = fault + receiver.offset_m + receiver.offset_drift_mps * tags[:, None]
@@ -343,7 +323,7 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
 def _faults(simulation: Simulation, receiver: Receiver, tag_s: Floats) -> tuple[Floats, Floats]:
     """Range errors of faults of satellites and of a station's receiver [m], and their rates [m/s], shapes (T, M)."""
     names = receiver.names.tolist()
-    fault, rate = simulation.common_errors.fault_m(tag_s, names)
+    fault, rate = fault_m(simulation.scenario.errors.faults, tag_s, names)
     for station in simulation.scenario.stations:
         if station.name == receiver.antenna and station.faults:
             own, own_rate = fault_m(station.faults, tag_s, names)

@@ -142,22 +142,11 @@ class HeldState:
 def held(
     time: Datetimes, signs: Masks, state: HeldState, *, hold_s: Floats, release_s: Floats
 ) -> tuple[Masks, Masks, HeldState]:
-    """Return which conditions have held for their time, and which have within their time of release.
+    """Return which conditions have held for their time, which have within their time of release, and the state.
 
     An interval between epochs counts for half the time of holding at most, so that one epoch after a gap proves
-    nothing.
-
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    signs : ndarray of bool, shape (T, C)
-    hold_s, release_s : ndarray, shape (C,) [s]
-        A time of holding of 0 counts at once.
-
-    Returns
-    -------
-    counts, stays : ndarray of bool, shape (T, C)
-    state : HeldState
+    nothing. Signs and results have the shape (T, C), the times of holding and release (C,) [s]; a time of holding of 0
+    counts at once.
     """
     conditions = signs.shape[1]
     run, last = state.run_ns, state.last
@@ -212,19 +201,11 @@ class PowerSigns:
 def power_signs(
     time: Datetimes, channel: Strings, cn0_dbhz: Floats, gain: Floats, state: PowerState, limits: InterferenceLimits
 ) -> tuple[PowerSigns, PowerState]:
-    """Return the statistics of C/N0 and gain, and the state to pass on.
+    """Return the statistics of C/N0, shape (T, K), and gain, shape (T,), and the state to pass on.
 
     The recent peak of a satellite falls by `peak_decay_db_per_min`: a slow change of the sky passes, a jammer that
-    stays is seen for minutes.
-
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    channel : ndarray of str, shape (K,)
-        Satellite and signal, one signal of each satellite at an epoch.
-    cn0_dbhz : ndarray, shape (T, K)
-    gain : ndarray, shape (T,)
-        In the receiver's unit, + for more gain; NaN where unknown.
+    stays is seen for minutes. `channel` names satellite and signal, one signal of each satellite at an epoch. The gain
+    is in the receiver's unit, + for more gain; NaN where unknown.
     """
     seen, now = np.isfinite(cn0_dbhz), seconds(time - GPS_EPOCH)[:, None]
     peak, first, last = _rearrange(state, channel)

@@ -36,7 +36,7 @@ class WheelSamples:
     #: The same where the wheel has turned without slip or a gap.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
-    def joined(self, later: WheelSamples) -> WheelSamples:
+    def join(self, later: WheelSamples) -> WheelSamples:
         """Return these and later ones."""
         return WheelSamples(
             **{name: np.concatenate([getattr(self, name), getattr(later, name)]) for name in vars(self)}
@@ -91,17 +91,11 @@ def wheel_signs(
     *,
     signed: bool,
 ) -> tuple[WheelSigns, WheelState]:
-    """Compare distances by satellites and wheel, and return the state to pass on.
+    """Compare distances by satellites and wheel, shapes (T,), and return the state to pass on.
 
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    arc_m, sigma_m : ndarray, shape (T,) [m]
-        Positions along the line, of single epochs or of the filter; NaN without one.
-    wheel_m : ndarray, shape (T,) [m]
-        Distance that the wheel has rolled since the epoch before; NaN where it is not known.
-    signed : bool
-        Whether the wheel's distance has the sign of the motion along the line.
+    `arc_m` and `sigma_m` are positions along the line, of single epochs or of the filter, NaN without one; `wheel_m` is
+    the distance that the wheel has rolled since the epoch before, NaN where it is not known, `signed` whether it has
+    the sign of the motion along the line.
     """
     if not len(time):
         return WheelSigns(difference_m=np.empty(0), bound_m=np.empty(0), parted=np.empty(0, dtype=np.bool_)), state
@@ -111,7 +105,7 @@ def wheel_signs(
     usable = due & np.isfinite(arc_m) & (sigma_m <= limits.largest_sigma_m)
     every = replace(rolled, arc_m=arc_m, sigma_m=np.hypot(sigma_m, _LEAST_M))
     before = len(state.samples.time)
-    samples = state.samples.joined(every.take(usable))
+    samples = state.samples.join(every.take(usable))
     difference, bound, beyond = _compare(samples, before, limits, signed=signed)
     latest = np.cumsum(usable)
     of_epoch = np.concatenate([[state.difference_m], difference])[latest]

@@ -105,7 +105,7 @@ def araim_levels(
 ) -> AraimLevels:
     """Return the levels of the first Q unknowns; `phmi` and `false_alarm` are of each component."""
     epochs, count = geometry.sigma_int_m.shape
-    events = _events(geometry)
+    events = np.concatenate([np.eye(count, dtype=bool), geometry.together])  # alone, then faulty together; (E, N)
     sets = [list(s) for size in range(1, budget.most_faults + 1) for s in combinations(range(len(events)), size)]
     masks = np.array([events[s].any(axis=0) for s in sets], dtype=bool).reshape(len(sets), count)
     size = np.array([len(s) for s in sets])
@@ -117,11 +117,6 @@ def araim_levels(
     return AraimLevels(
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in AraimLevels.__dataclass_fields__}
     )
-
-
-def _events(geometry: AraimGeometry) -> Masks:
-    """Return single observations, then those that are faulty together, shape (E, N)."""
-    return np.concatenate([np.eye(len(geometry.prior), dtype=bool), geometry.together])
 
 
 def _block(

@@ -16,7 +16,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
-from itertools import combinations
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -129,22 +128,14 @@ def along_track_level(
         T epochs on the line (`constrained_model`), after exclusions; 1/weight is the variance of the range.
     systems : sequence of str, length M
         Constellation letter of each channel.
-    risk : RiskBudget, optional
     scale : array_like, shape (T,) or ()
         Noise scale: multiplies the sigmas of the ranges, not the map error.
     overbound : RangeBounds, optional
         By default the sigma of each range is that of its weight times the scale, without bias.
-    map_error : MapDeviation, optional
     sides : ndarray of bool, shape (T, S, M), optional
         Sets of satellites that one reflection can make faulty together, each a hypothesis of `RiskBudget.side_prior`.
     n_excluded : array_like of int, shape (T,) or ()
         Satellites that fault detection left out at this epoch (not: what the screens rejected before).
-
-    Raises
-    ------
-    ValueError
-        A model in space, a number of systems that is not that of the channels, a constellation without prior,
-        a scale that is not positive.
     """
     if model.interest != 1:
         raise ValueError("a level along the track asks for a model on the line (constrained_model)")
@@ -253,7 +244,7 @@ def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: 
     one, two = worst[:, 1], worst[:, 2]
     # After the channels: constellations, then the sides, a wrong map, and none.
     letters = np.array([*plan.groups, *[""] * (len(plan.shared) + 1)])
-    pairs = np.concatenate([_sets(n, 2).T if asked.first[0, 2] >= 0 else np.empty((0, 2), dtype=np.intp), [[-1, -1]]])
+    pairs = np.concatenate([_pairs(n) if asked.first[0, 2] >= 0 else np.empty((0, 2), dtype=np.intp), [[-1, -1]]])
     infinite = np.full(len(rows), Cause.BUDGET)
     if (unchecked := np.isinf(level) & (plan.fault_free[rows] > 0)).any():
         infinite[unchecked] = _find_unchecked(plan, asked, np.where(np.isinf(sigma), weight, 0.0), n)[unchecked]
@@ -331,9 +322,9 @@ def _channels(channel: Indices, place: Indices) -> Indices:
 
 
 @lru_cache(maxsize=64)
-def _sets(n: int, size: int) -> Indices:
-    """Return all sets of places, shape (size, K)."""
-    return np.array(list(combinations(range(n), size)), dtype=np.intp).reshape(math.comb(n, size), size).T
+def _pairs(n: int) -> Indices:
+    """Return all pairs of n places, shape (K, 2)."""
+    return np.stack(np.triu_indices(n, 1), axis=1)
 
 
 class LevelStatus(IntEnum):
@@ -348,20 +339,9 @@ class LevelStatus(IntEnum):
 
 
 def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayLike = True) -> Codes:
-    """LevelStatus of epochs.
+    """LevelStatus of epochs, int8 of shape (T,), from protection levels [m], NaN where there is no position.
 
-    Parameters
-    ----------
-    level_m : array_like, shape (T,) [m]
-        Protection level; NaN where there is no position.
-    alarm_limit_m : float [m]
-    consistent : array_like of bool, shape (T,) or ()
-        `ProtectionLevel.consistent`. An epoch with a position and without consistency alarms.
-
-    Returns
-    -------
-    ndarray of int8, shape (T,)
-        `LevelStatus`.
+    An epoch with a position and without consistency (`ProtectionLevel.consistent`) alarms.
     """
     if not alarm_limit_m > 0.0:
         raise ValueError(f"alarm_limit_m must be positive, got {alarm_limit_m}")
@@ -384,13 +364,12 @@ def protection_level(
 ) -> ProtectionLevel:
     """Compute the protection level along the line: faults of satellites and constellations, without those of the map.
 
+    `ranges`, `trajectory`, `arc_m` and `scale` are as for `railfix.integrity.exclude_faults`, after the exclusions.
+
     Parameters
     ----------
-    ranges, trajectory, arc_m, scale
-        As for `railfix.integrity.exclude_faults`, after the exclusions.
     satellite : ndarray of str, shape (M,)
         Names, for the priors of their constellations.
-    risk : RiskBudget, optional
     n_excluded : array_like of int, shape (T,) or ()
         Satellites that `exclude_faults` took out.
     """

@@ -45,15 +45,9 @@ MOST_TOGETHER: Final = 4  #: Faulty satellites at a time that can be hypotheses 
 
 
 def k_factor(risk: float) -> float:
-    """Sigmas that an error in one dimension exceeds, on either side, with this probability.
+    """Sigmas that an error in one dimension exceeds, on either side, with this probability of one sample.
 
-    Two-sided, along a line: 1e-7 gives 5.33, 1e-8 gives 5.73. Not the Rayleigh factor of a
-    horizontal position.
-
-    Parameters
-    ----------
-    risk : float
-        Of one sample, both sides together.
+    Two-sided, along a line: 1e-7 gives 5.33, 1e-8 gives 5.73. Not the Rayleigh factor of a horizontal position.
     """
     if not 0.0 < risk <= 1.0:
         raise ValueError(f"a risk is a probability above 0, at most 1, got {risk}")
@@ -120,7 +114,7 @@ class RiskBudget(Settings):
         return self
 
     @model_validator(mode="after")
-    def _measured_priors_are_given(self) -> Self:
+    def _check_measured_priors(self) -> Self:
         missing = [name for name in ("local_prior", "side_prior") if name not in self.model_fields_set]
         if self.priors == "measured" and missing:
             raise ValueError(
@@ -142,10 +136,7 @@ class RiskBudget(Settings):
     def prior(self, systems: Sequence[str]) -> Floats:
         """Fault probability of each channel, shape (M,): of the satellite and of what is around the antenna.
 
-        Raises
-        ------
-        ValueError
-            Where a constellation has no prior.
+        ValueError: a constellation has no prior.
         """
         unknown = sorted(set(systems) - set(self.satellite_prior))
         if unknown:
@@ -155,18 +146,9 @@ class RiskBudget(Settings):
     def sample_risk(self, n_used: ArrayLike, n_excluded: ArrayLike, beyond: ArrayLike = 0.0) -> Floats:
         """Return the risk of an epoch in the set that is left after exclusions, any shape.
 
-        More faults than are checked are taken off once. Every set that exclusion could have left is a way
-        to fail, so the share of the risk for e exclusions is divided by the number of sets of e among all
+        More faults than are checked, of probability `beyond`, are taken off once. Every set that exclusion could have
+        left is a way to fail, so the share of the risk for e exclusions is divided by the number of sets of e among all
         satellites. 0 beyond `MOST_EXCLUDED`, and where nothing is left.
-
-        Parameters
-        ----------
-        n_used : array_like of int
-            Satellites left.
-        n_excluded : array_like of int
-            Satellites that fault detection took out.
-        beyond : array_like
-            Probability of more faults than are checked, among all satellites.
         """
         used, out = np.asarray(n_used, dtype=np.float64), np.asarray(n_excluded, dtype=np.int64)
         if (out < 0).any():
@@ -178,11 +160,6 @@ class RiskBudget(Settings):
         ]
         left = np.maximum(self.risk_per_sample - np.asarray(beyond, dtype=np.float64), 0.0)
         return np.asarray(left * np.select([out == e for e in range(len(each))], each, 0.0))
-
-
-def pair_sum(prior: Floats) -> Floats:
-    """Sum over pairs of the product of their priors, shape (T, M) to (T,)."""
-    return set_sums(prior, 2)[:, 2]
 
 
 def set_sums(prior: Floats, most: int) -> Floats:
@@ -310,7 +287,7 @@ def _allocate(
     n = np.count_nonzero(used, axis=1)
     always = [2] + [-1 if s.size > 1 else int(s.wrong_map or s.events[0] < len(letters)) for s in shared[1:]]
     classes = _Classes(each, within, set_sums(everyone, MOST_TOGETHER + 1), further, always)
-    order = classes.chosen(
+    order = classes.choose(
         risk.unchecked_share * risk.risk_per_sample, likely, float(of_channel.mean()) if len(of_channel) else 0.0, n
     )
     beyond = classes.rest(order)
@@ -319,7 +296,7 @@ def _allocate(
     more = (order + [s.kind for s in shared] >= 3).any(axis=1, where=order >= 0)
     left = np.where(more, 0.75, 1.0) * left
     parts = [s * left for s in (risk.fault_free_share, risk.one_fault_share, risk.two_fault_share)]
-    of_pairs = pair_sum(prior)
+    of_pairs = set_sums(prior, 2)[:, 2]
     pairs = (of_pairs > parts[2]) | (order[:, 0] > 2)
     order[:, 0] = np.where(pairs, order[:, 0], 1)
     mapped = np.array([s.wrong_map for s in shared])
@@ -379,7 +356,7 @@ class _Classes:
         each = np.where(covered, 0.0, self.each * np.take_along_axis(self.sums, order + 1, axis=1))
         return np.asarray(each.sum(axis=1) + self.further)
 
-    def chosen(self, share: float, likely: Sequence[float], satellite: float, used: Integers) -> Indices:
+    def choose(self, share: float, likely: Sequence[float], satellite: float, used: Integers) -> Indices:
         """Return how many satellites at most are left out with each set of shared faults, shape (T, B).
 
         `share` may stay unchecked; `likely` are the priors of the shared faults, length B, `satellite` that of a

@@ -101,15 +101,13 @@ def detect(
     wsse : array_like, shape (T,)
         Weighted sum of squared residuals; NaN where there is no position.
     residual_m : array_like, shape (T, M) [m]
-        Residuals, 0 (or NaN) where not used; asked for in fixed mode only. Those of a `LinearModel`
-        allow for the map error, those of a `Constrained` position do not: the same only where the
-        map is taken as exact, as in P1 (a sigma of a millimetre).
+        0 (or NaN) where not used; asked for in fixed mode only. Those of a `LinearModel` allow for the map error, those
+        of a `Constrained` position do not: the same only where the map is taken as exact, as in P1 (a sigma of a
+        millimetre).
     freedom : array_like of int, shape (T,)
         Ranges beyond the unknowns: on the line ``ranges.n_used - ranges.n_clocks - 1``, in space - 3.
-    limits : RaimLimits, optional
     scale : array_like, shape (T,) or ()
-        Noise scale: standard deviation of this receiver's ranges over the sigmas of the weights.
-        Not used in fixed mode.
+        Standard deviation of this receiver's ranges over the sigmas of the weights. Not used in fixed mode.
     """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)
@@ -126,18 +124,9 @@ def detect(
 
 
 def threshold(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
-    """Threshold of the statistic by degrees of freedom; NaN below 1.
+    """Threshold of the statistic by degrees of freedom, of any shape; NaN below 1.
 
     P4: false alarm 0.001 and 3 degrees of freedom give T_CS = 16.27, T_D = sqrt(T_CS) = 4.03.
-
-    Parameters
-    ----------
-    freedom : array_like of int, any shape
-    limits : RaimLimits, optional
-
-    Returns
-    -------
-    ndarray, same shape
     """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)
@@ -190,7 +179,6 @@ class Exclusion:
     #: Error of the channels of `best` against the rest: + where the range is too long; NaN elsewhere; shape (T, M).
     own_error_m: Floats
     statistic_after: Floats  #: Of the rest without `best`; the statistic itself where there is none; shape (T,).
-    threshold_after: Floats  #: What it is compared with, shape (T,).
     #: By leaving out `best`: along the line (k = 1), or east and north (k = 2); 0 where there is none; shape (T, k).
     position_change_m: Floats
     #: Distance between the positions without `best` and without `alternative`; NaN where either is none; shape (T,).
@@ -212,20 +200,11 @@ class _Trial:
 def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: ArrayLike = 1.0) -> Exclusion:
     """Test, and where a fault is detected try every single satellite, then every pair.
 
-    A subset is excluded when the rest passes and has `min_redundancy` degrees of freedom left, and
-    when each of its satellites is in error against the rest: by more than noise of its sigma
-    reaches (chi-square mode), by more than the square root of the limit (fixed mode). One goes
-    before two; of several the least statistic. Where another subset of the same size would be
-    excluded as well and fits worse by no more than noise explains (`separation_risk`), the epoch
-    is inseparable.
-
-    Parameters
-    ----------
-    model : LinearModel
-        T epochs; those without a fault cost next to nothing.
-    limits : RaimLimits, optional
-    scale : array_like, shape (T,) or ()
-        Noise scale, as in `detect`.
+    A subset is excluded when the rest passes and has `min_redundancy` degrees of freedom left, and when each of its
+    satellites is in error against the rest: by more than noise of its sigma reaches (chi-square mode), by more than the
+    square root of the limit (fixed mode). One goes before two; of several the least statistic. Where another subset of
+    the same size would be excluded as well and fits worse by no more than noise explains (`separation_risk`), the epoch
+    is inseparable. The noise scale, shape (T,) or (), is that of `detect`.
     """
     limits = limits or RaimLimits()
     epochs, channels = model.root_weight.shape
@@ -238,7 +217,6 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
         alternative=np.full((epochs, 2), -1, dtype=np.intp),
         own_error_m=np.full((epochs, channels), np.nan),
         statistic_after=detection.statistic.copy(),
-        threshold_after=detection.threshold.copy(),
         position_change_m=np.zeros((epochs, model.interest)),
         alternative_shift_m=np.full(epochs, np.nan),
         detection=detection,
@@ -367,7 +345,6 @@ def _choose(
         result.excluded[where[~inseparable], chosen[~inseparable]] = True
         result.own_error_m[where, chosen] = trial.own[k][rows, best] * parts.sigma_m[rows, place]
     result.statistic_after[where] = statistic[at, best]
-    result.threshold_after[where] = after[rows]
     result.position_change_m[where] = shift[at, best]
     result.alternative_shift_m[where] = np.where(has_second, apart[at, second], np.nan)
 
@@ -393,20 +370,15 @@ def exclude_faults(
 ) -> Exclusion:
     """Test the ranges of each epoch against each other and name up to two faulty satellites.
 
+    Positions without the excluded satellites are those of `position_on_line` with NaN in their codes.
+
     Parameters
     ----------
     ranges : Ranges
         Of `railfix.positioning.weighted_ranges`.
-    trajectory : Trajectory
     arc_m : ndarray, shape (T,) [m]
         Positions (`Constrained.arc_m` of `railfix.positioning.position_on_line`).
     scale : array_like, shape (T,) or ()
         Noise of the receiver over that of the sigmas.
-    limits : RaimLimits, optional
-
-    Returns
-    -------
-    Exclusion
-        Positions without the excluded satellites are those of `position_on_line` with NaN in their codes.
     """
     return exclude(constrained_model(ranges, trajectory, arc_m), limits=limits, scale=scale)

@@ -17,7 +17,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.geodesy import range_with_rotation
-from railfix.positioning.normal_equations import RangeArrays, Ranges, inverse_3x3
+from railfix.positioning.normal_equations import Ranges, inverse_3x3
 from railfix.track.trajectory import Trajectory
 
 
@@ -66,11 +66,6 @@ class LinearModel:
     def arrays(self) -> ModelArrays:
         """The same as plain arrays, without `freedom` and `interest`."""
         return ModelArrays(*(np.ascontiguousarray(getattr(self, name)) for name in ModelArrays._fields))
-
-    @classmethod
-    def on_line(cls, arrays: ModelArrays) -> LinearModel:
-        """The model on the line that these are of, its `freedom` not known."""
-        return cls(**arrays._asdict(), freedom=np.full(len(arrays.misfit), -1), interest=1)
 
     @property
     def used(self) -> Masks:
@@ -149,46 +144,23 @@ class Compact:
 
 def compact(model: LinearModel) -> Compact:
     """The residual projector over the channels in use, in their order; (T, n, n) of memory."""
-    channel, used, projector, residual, sigma, gain = side_by_side(
-        np.ascontiguousarray(model.root_weight),
-        np.ascontiguousarray(model.design),
-        np.ascontiguousarray(model.covariance_m2),
-        np.ascontiguousarray(model.clock),
-        np.ascontiguousarray(model.clock_covariance_m2),
-        np.ascontiguousarray(model.residual),
-        np.ascontiguousarray(model.gain_m),
-    )
-    return Compact(channel=channel, used=used, projector=projector, residual=residual, sigma_m=sigma, gain_m=gain)
-
-
-def side_by_side(
-    root_weight: Floats,
-    design: Floats,
-    covariance_m2: Floats,
-    clock: Indices,
-    clock_covariance_m2: Floats,
-    residual: Floats,
-    gain_m: Floats,
-) -> tuple[Indices, Masks, Floats, Floats, Floats, Floats]:
-    """Return the fields of `Compact`; arrays of `LinearModel` in C order."""
-    used = root_weight > 0
-    n = int(np.count_nonzero(used, axis=1).max(initial=0))
-    channel = np.argsort(~used, axis=1, kind="stable")[:, :n]
-    used = np.take_along_axis(used, channel, axis=1)
-    root = np.take_along_axis(root_weight, channel, axis=1)
-    design = np.take_along_axis(design, channel[..., None], axis=1)
-    clocks = root[..., None] * (clock[channel][..., None] == np.arange(clock_covariance_m2.shape[1]))
+    n = int(np.count_nonzero(model.used, axis=1).max(initial=0))
+    channel = np.argsort(~model.used, axis=1, kind="stable")[:, :n]
+    used, root = (np.take_along_axis(values, channel, axis=1) for values in (model.used, model.root_weight))
+    design = np.take_along_axis(model.design, channel[..., None], axis=1)
+    of_place, of_clocks = (np.ascontiguousarray(part) for part in (model.covariance_m2, model.clock_covariance_m2))
+    clocks = root[..., None] * (model.clock[channel][..., None] == np.arange(of_clocks.shape[1]))
     unknowns = np.concatenate([clocks, design], axis=2)
-    spread = np.concatenate([clocks @ clock_covariance_m2, design @ covariance_m2], axis=2)
+    spread = np.concatenate([clocks @ of_clocks, design @ of_place], axis=2)
     projector = -spread @ unknowns.swapaxes(1, 2)
     projector[:, np.arange(n), np.arange(n)] += used
-    return (
-        channel,
-        used,
-        projector,
-        np.take_along_axis(residual, channel, axis=1),
-        np.where(used, 1.0 / np.where(used, root, 1.0), 0.0),
-        np.take_along_axis(gain_m, channel[..., None], axis=1),
+    return Compact(
+        channel=channel,
+        used=used,
+        projector=projector,
+        residual=np.take_along_axis(model.residual, channel, axis=1),
+        sigma_m=np.where(used, 1.0 / np.where(used, root, 1.0), 0.0),
+        gain_m=np.take_along_axis(model.gain_m, channel[..., None], axis=1),
     )
 
 
@@ -197,21 +169,9 @@ def constrained_model(
 ) -> LinearModel:
     """Model of positions along the line: distance d unknown, the map error a prior across and up (P1 2.2(3), P4).
 
-    Parameters
-    ----------
-    ranges : Ranges
-        T epochs.
-    trajectory : Trajectory
-        Its `sigma_plan_m` and `sigma_height_m` are the prior.
-    arc_m : ndarray, shape (T,) [m]
-        Positions, as `constrained_position` gives them; NaN where there is none.
-    section : ndarray of int, shape (T,), optional
-        Section of each position where `arc_m` is a point that two share.
-
-    Returns
-    -------
-    LinearModel
-        NaN in the epochs without a position.
+    The prior is `sigma_plan_m` and `sigma_height_m` of the trajectory. `arc_m`, shape (T,), are positions as
+    `constrained_position` gives them, with `section` where they are points that two sections share. The model is NaN in
+    the epochs without a position.
     """
     at = trajectory.segment_at(arc_m)[0] if section is None else section
     place, axes = trajectory.at_arc(arc_m), trajectory.axes_of(at)
@@ -227,47 +187,36 @@ def model_on_line(
 
 
 def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *, unknowns: int) -> LinearModel:
-    """Whiten, take the clocks out, invert."""
-    root, clock_covariance, design, covariance, misfit = linearised(
-        ranges.arrays, np.ascontiguousarray(place_ecef_m), axes, prior
-    )
-    return LinearModel(
-        root_weight=root,
-        clock=ranges.arrays.clock,
-        clock_covariance_m2=clock_covariance,
-        design=design,
-        covariance_m2=covariance,
-        prior=prior,
-        misfit=misfit,
-        freedom=ranges.n_used - ranges.n_clocks - unknowns,
-        interest=1 if unknowns == 1 else 2,
-    )
-
-
-def linearised(
-    ranges: RangeArrays, place_ecef_m: Floats, axes: Floats, prior: Floats
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Compute root_weight, clock_covariance_m2, design, covariance_m2 and misfit of `LinearModel`.
+    """Whiten, take the clocks out, invert.
 
     `axes`, shape (T, 3, 3): unit vectors of the unknowns at positions (T, 3), NaN without; `prior`, shape (3, 3)
     [1/m^2].
     """
-    weight, groups = ranges.weight, len(ranges.starts)
-    distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
-    root, clock = np.sqrt(weight), ranges.clock
-    totals = weight @ _one_hot(clock, groups)
-    misfit = ranges.code_m - distance
-    if ranges.tied:
-        misfit = misfit - ranges.offset_m[:, clock]
+    arrays = ranges.arrays
+    weight, clock = arrays.weight, arrays.clock
+    distance, los = range_with_rotation(arrays.sat_ecef_m, np.ascontiguousarray(place_ecef_m)[:, None, :])
+    root, totals = np.sqrt(weight), weight @ _one_hot(clock, len(arrays.starts))
+    misfit = arrays.code_m - distance
+    if arrays.tied:
+        misfit = misfit - arrays.offset_m[:, clock]
     # A constant common to all ranges is no residual; subtracting it keeps the digits of the sums.
     total = totals.sum(axis=1, keepdims=True)
     misfit = misfit - (weight * misfit).sum(axis=1, keepdims=True) / np.where(total > 0, total, 1.0)
     rows = root[..., None] * -(los @ axes.swapaxes(1, 2))
-    covariance = _clock_covariance(totals, ranges.sigma_m if ranges.tied else None)
+    covariance = _clock_covariance(totals, arrays.sigma_m if arrays.tied else None)
     design = rows - root[..., None] * _clocks(root, clock, covariance, rows)
     normal = rows.swapaxes(1, 2) @ design
-    inverse = regular_inverse((normal + normal.swapaxes(1, 2)) / 2.0 + prior)
-    return root, covariance, design, inverse, root * misfit
+    return LinearModel(
+        root_weight=root,
+        clock=clock,
+        clock_covariance_m2=covariance,
+        design=design,
+        covariance_m2=regular_inverse((normal + normal.swapaxes(1, 2)) / 2.0 + prior),
+        prior=prior,
+        misfit=root * misfit,
+        freedom=ranges.n_used - ranges.n_clocks - unknowns,
+        interest=1 if unknowns == 1 else 2,
+    )
 
 
 def _clock_covariance(totals: Floats, tie_sigma_m: Floats | None) -> Floats:

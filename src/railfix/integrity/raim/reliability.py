@@ -51,16 +51,10 @@ class Reliability:
 
 
 def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: ArrayLike = 1.0) -> Reliability:
-    """Detectable biases, slopes and protection levels of the satellites that are used.
+    """Detectable biases, slopes and protection levels of the satellites that are used, of a model after exclusions.
 
-    Parameters
-    ----------
-    model : LinearModel
-        T epochs, after exclusions.
-    limits : RaimLimits, optional
-        Of the chi-square test, whatever the mode.
-    scale : array_like, shape (T,) or ()
-        Noise scale, as in `detect`; it does not touch the map error in `position_sigma_m`.
+    The limits are those of the chi-square test, whatever the mode. The noise scale, shape (T,) or (), is that of
+    `detect`; it does not touch the map error in `position_sigma_m`.
     """
     limits = limits or RaimLimits()
     scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(model),))
@@ -104,18 +98,7 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
 
 
 def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
-    """Noncentrality lambda that the chi-square test misses with `missed_detection` (P4).
-
-    Parameters
-    ----------
-    freedom : array_like of int, any shape
-    limits : RaimLimits, optional
-
-    Returns
-    -------
-    ndarray, same shape
-        NaN below 1 degree of freedom.
-    """
+    """Noncentrality that the chi-square test misses with `missed_detection` (P4); NaN below 1 degree of freedom."""
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)
     values, which = np.unique(freedom, return_inverse=True)

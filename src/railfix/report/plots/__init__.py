@@ -11,7 +11,7 @@ from typing import Final
 
 from railfix.report.plots.campaign import processing_time
 from railfix.report.plots.chart import Chart, SkyEpochs
-from railfix.report.plots.draw import draw_chart, draw_figure, draw_sky, drawn
+from railfix.report.plots.draw import draw_chart, draw_figure, draw_sky, plotter
 from railfix.report.plots.errors import (
     error_over_chainage,
     error_over_time,
@@ -31,19 +31,19 @@ from railfix.report.plots.screens import (
 )
 from railfix.report.plots.signals import cn0_over_elevation, sky_epochs
 
-plot_plan: Final = drawn(plan)
-plot_error_over_time: Final = drawn(error_over_time)
-plot_error_over_chainage: Final = drawn(error_over_chainage)
-plot_error_ranges: Final = drawn(error_ranges)
-plot_stanford: Final = drawn(stanford)
-plot_levels_over_time: Final = drawn(levels_over_time)
-plot_levels_over_chainage: Final = drawn(levels_over_chainage)
-plot_interval_over_chainage: Final = drawn(interval_over_chainage)
-plot_interval_distribution: Final = drawn(interval_distribution)
-plot_satellites_over_time: Final = drawn(satellites_over_time)
-plot_processing_time: Final = drawn(processing_time)
-plot_screen_over_time: Final = drawn(screen_over_time)
-plot_screen_over_chainage: Final = drawn(screen_over_chainage)
+plot_plan: Final = plotter(plan)
+plot_error_over_time: Final = plotter(error_over_time)
+plot_error_over_chainage: Final = plotter(error_over_chainage)
+plot_error_ranges: Final = plotter(error_ranges)
+plot_stanford: Final = plotter(stanford)
+plot_levels_over_time: Final = plotter(levels_over_time)
+plot_levels_over_chainage: Final = plotter(levels_over_chainage)
+plot_interval_over_chainage: Final = plotter(interval_over_chainage)
+plot_interval_distribution: Final = plotter(interval_distribution)
+plot_satellites_over_time: Final = plotter(satellites_over_time)
+plot_processing_time: Final = plotter(processing_time)
+plot_screen_over_time: Final = plotter(screen_over_time)
+plot_screen_over_chainage: Final = plotter(screen_over_chainage)
 
 __all__ = [
     "Chart", "SkyEpochs", "cn0_over_elevation", "draw_chart", "draw_cn0_curve", "draw_figure", "draw_run_screens",

@@ -76,7 +76,7 @@ def campaign_bars(names: Sequence[str], low: Floats, middle: Floats, high: Float
     )  # fmt: skip
 
 
-def processing_time(chunks: Mapping[str, Sequence[Any]], *, title: str = "Time an epoch") -> Chart:
+def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
     """Time an epoch over the run, the mean of each chunk; of ``chunks`` of ``run.json``."""
     time = np.array([str(t) for t in chunks["first_epoch_gpst"]], dtype="datetime64[ns]")
     epochs = np.array(chunks["epochs"], dtype=np.float64)
@@ -87,7 +87,7 @@ def processing_time(chunks: Mapping[str, Sequence[Any]], *, title: str = "Time a
     whole = 1e3 * spent.sum() / max(epochs.sum(), 1.0)
     return Chart(
         name="processing-time",
-        title=title,
+        title="Time an epoch",
         caption=f"Mean of each of {len(x):,} chunks of up to {epochs.max(initial=0):,.0f} epochs of all antennas, at "
         f"the time of the first; reading and writing not included. Over the run {whole:.3f} ms an epoch and antenna. A "
         "chunk is positioned as a whole: live, epoch by epoch, each takes longer.",

@@ -7,7 +7,7 @@ from functools import wraps
 from inspect import signature
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, ParamSpec
+from typing import TYPE_CHECKING, Any, Final, ParamSpec, cast
 
 import numpy as np
 
@@ -38,8 +38,8 @@ _MARKERS: Final = {"dot": "o", "square": "s", "cross": "x", "ring": "o"}
 _DASHES: Final = {"solid": "-", "dashed": "--", "dotted": ":"}
 
 
-def drawn(chart_of: Callable[P, Chart]) -> Callable[P, Figure]:
-    """Function that draws the charts of another function as figures, with its parameters."""
+def plotter(chart_of: Callable[P, Chart]) -> Callable[P, Figure]:
+    """Return a function that draws the charts of another function as figures, with its parameters."""
 
     @wraps(chart_of)
     def draw(*args: P.args, **kwargs: P.kwargs) -> Figure:
@@ -87,10 +87,7 @@ def draw_chart(chart: Chart, axes: Axes) -> Axes:
 def draw_sky(sky: SkyEpochs, time: np.datetime64, axes: Axes | None = None) -> Axes:
     """Draw the satellites over an antenna at the epoch nearest to a GPS time, into polar axes.
 
-    Raises
-    ------
-    ValueError
-        There is no epoch.
+    ValueError: there is no epoch.
     """
     from matplotlib.figure import Figure
 
@@ -116,8 +113,7 @@ def draw_sky(sky: SkyEpochs, time: np.datetime64, axes: Axes | None = None) -> A
     moment = np.datetime_as_string(sky.start + timedelta(sky.epoch_s[k]), unit="ms")
     polar.set_title(f"{sky.title}, {moment}; C/N0 in dB-Hz", fontsize="medium")
     polar.legend(loc="lower left", bbox_to_anchor=(-0.1, -0.1), fontsize="small")
-    drawn_axes: Axes = polar
-    return drawn_axes
+    return cast("Axes", polar)
 
 
 def _scales(chart: Chart, axes: Axes) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats
+from railfix.evaluate.epochs import level_columns
 from railfix.evaluate.figures import PASSED
 from railfix.integrity.stanford import Region, Stanford
 from railfix.report.plots.chart import (
@@ -55,37 +56,22 @@ _SERIES: Final = (
 )
 
 
-def error_over_time(
-    errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None, title: str = "Error along the line over time"
-) -> Chart:
+def error_over_time(errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None) -> Chart:
     """Errors on the map and of the conventional position, with sigma and protection level (P1 figures 7, 10).
 
-    Parameters
-    ----------
-    errors, filtered : polars.DataFrame
-        Of one antenna, in order of time; `filtered` of the filter along the track.
+    Both tables are of one antenna, in order of time; `filtered` is of the filter along the track.
     """
-    start = start_of(errors)
-    return _errors(errors, filtered, name="error-time", title=title, x_label="GPS time", start=start)
+    return _errors(errors, filtered, start_of(errors))
 
 
-def error_over_chainage(
-    errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None, title: str = "Error along the line over chainage"
-) -> Chart:
+def error_over_chainage(errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None) -> Chart:
     """Errors over the chainage of the reference (P1 figure 8), of the tables of `error_over_time`."""
-    label = "chainage of the reference [m]"
-    return _errors(errors, filtered, name="error-chainage", title=title, x_label=label, start=None)
+    return _errors(errors, filtered, None)
 
 
-def _errors(
-    errors: pl.DataFrame,
-    filtered: pl.DataFrame | None,
-    *,
-    name: str,
-    title: str,
-    x_label: str,
-    start: np.datetime64 | None,
-) -> Chart:
+def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datetime64 | None) -> Chart:
+    """Errors over the time since `start`, or over the chainage without one."""
+
     def axis(table: pl.DataFrame) -> Floats:
         return floats(table, "chainage_m") if start is None else since(table, start)
 
@@ -97,13 +83,13 @@ def _errors(
         layers.append(Band(label="± stated sigma", colour=CONSTRAINED, x=at, low=-sigma, high=sigma))
         caption.append("Band: the standard deviation that railfix states, the largest of each short piece.")
     levels = []
-    many = len(level_columns(errors))
-    for column, colour in zip(level_columns(errors), (PURPLE, GREEN, BLACK, GREY), strict=False):
+    drawn_levels = [name for name in level_columns(errors) if np.isfinite(floats(errors, name)).any()]
+    for column, colour in zip(drawn_levels, (PURPLE, GREEN, BLACK, GREY), strict=False):
         level = floats(errors, column)
         at, most = _greatest(x, np.where(np.isfinite(level), level, np.nan))
         if len(at):
             levels.append(most)
-            name_of = "protection level" if many == 1 else column.removesuffix("_m").replace("_", " ")
+            name_of = "protection level" if len(drawn_levels) == 1 else column.removesuffix("_m").replace("_", " ")
             for sign, label in ((1.0, f"± {name_of}"), (-1.0, "")):
                 layers.append(Curve(label=label, colour=colour, x=at, y=sign * most, width=1.0, dash="dashed"))
             caption.append(f"The {name_of} is finite at {100 * np.isfinite(level).mean():.1f} % of the epochs.")
@@ -132,11 +118,12 @@ def _errors(
         scale["y_range"] = (-top, top)
         if max(float(np.nanmax(most)) for most in levels) > top:
             caption.append(f"Levels beyond ± {top:.1f} m are cut off.")
+    quantity = "chainage" if start is None else "time"
     return Chart(
-        name=name,
-        title=title,
+        name=f"error-{quantity}",
+        title=f"Error along the line over {quantity}",
         caption=" ".join(caption) + counts_sentence(shown, total),
-        x_label=x_label,
+        x_label="chainage of the reference [m]" if start is None else "GPS time",
         y_label=_ERROR_LABEL,
         layers=tuple(layers),
         start=start,
@@ -148,12 +135,6 @@ def good_errors(errors: pl.DataFrame, column: str) -> Floats:
     """Errors of a column, NaN where the standard deviation of the reference exceeds the limit."""
     values = floats(errors, column)
     return np.where(errors["reference_good"].to_numpy(), values, np.nan) if "reference_good" in errors else values
-
-
-def level_columns(table: pl.DataFrame) -> list[str]:
-    """Names of the columns of protection levels with a finite value."""
-    named = [name for name in table.columns if "protection_level" in name and name.endswith("_m")]
-    return [name for name in named if np.isfinite(floats(table, name)).any()]
 
 
 def error_scale(error_m: Floats) -> dict[str, Any]:
@@ -186,7 +167,7 @@ def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     return np.insert(middle, gap + 1, np.nan), np.insert(most[inside], gap + 1, np.nan)
 
 
-def error_ranges(runs: Mapping[str, pl.DataFrame], *, title: str = "Range of the errors") -> Chart:
+def error_ranges(runs: Mapping[str, pl.DataFrame]) -> Chart:
     """Minimum, mean and maximum error of each run by its name, on the map and conventional (P1 figure 11)."""
     names: list[str] = []
     values: list[Floats] = []
@@ -210,7 +191,7 @@ def error_ranges(runs: Mapping[str, pl.DataFrame], *, title: str = "Range of the
         )
     return Chart(
         name="error-ranges",
-        title=title,
+        title="Range of the errors",
         caption=f"From the lowest to the highest signed error; the mark is the mean. {_SIGN}",
         x_label=_ERROR_LABEL,
         y_label="",
@@ -285,54 +266,33 @@ def _regions(diagram: Stanford, top_m: float) -> Marks:
     def place(value: float) -> float:
         return limit * min(value, 1.0) + max(value - 1.0, 0.0) * (top_m - limit)
 
-    shown = [region for region in _REGIONS if top_m > 1.2 * limit or max(region[2:]) < 1.0]
     return Marks(
         label="",
         colour=BLACK,
-        x=np.array([place(x) for _, _, x, _ in shown]),
-        y=np.array([place(y) for _, _, _, y in shown]),
-        words=tuple(f"{name}\n{diagram.counts[region]:,}" for region, name, _, _ in shown),
+        x=np.array([place(x) for _, _, x, _ in _REGIONS]),
+        y=np.array([place(y) for _, _, _, y in _REGIONS]),
+        words=tuple(f"{name}\n{diagram.counts[region]:,}" for region, name, _, _ in _REGIONS),
         place="on",
     )
 
 
-def levels_over_time(positions: pl.DataFrame, alarm_limit_m: float, *, title: str = "Protection level") -> Chart:
-    """Protection level and its parts over time, against the alarm limit; empty where the run has no levels.
-
-    Parameters
-    ----------
-    positions : polars.DataFrame
-        Of one antenna, columns of `railfix.pipeline.result_columns.POSITION_COLUMNS`.
-    alarm_limit_m : float [m]
-    """
-    start = start_of(positions)
-    x = since(positions, start)
-    return _levels(positions, x, alarm_limit_m, name="levels", title=title, x_label="GPS time", start=start)
+def levels_over_time(positions: pl.DataFrame, alarm_limit_m: float) -> Chart:
+    """Protection level of one antenna and its parts over time; empty where the run has no levels."""
+    return _levels(positions, alarm_limit_m, start_of(positions))
 
 
-def levels_over_chainage(
-    positions: pl.DataFrame, alarm_limit_m: float, *, title: str = "Protection level over chainage"
-) -> Chart:
+def levels_over_chainage(positions: pl.DataFrame, alarm_limit_m: float) -> Chart:
     """The same over the chainage of the positions; those without a position are left out."""
-    x = floats(positions, "chainage_m")
-    x_label = "chainage of the position [m]"
-    return _levels(positions, x, alarm_limit_m, name="levels-chainage", title=title, x_label=x_label, start=None)
+    return _levels(positions, alarm_limit_m, None)
 
 
-def _levels(
-    positions: pl.DataFrame,
-    x: Floats,
-    alarm_limit_m: float,
-    *,
-    name: str,
-    title: str,
-    x_label: str,
-    start: np.datetime64 | None,
-) -> Chart:
+def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 | None) -> Chart:
+    """Levels over the time since `start`, or over the chainage without one."""
     layers: list[Layer] = []
     shown = total = 0
     largest = alarm_limit_m
     epoch = since(positions, start_of(positions))
+    x = floats(positions, "chainage_m") if start is None else epoch
     for (label, column), colour in zip(_PARTS, (*CYCLE[2:6], BLUE), strict=True):
         level = floats(positions, column)
         level = np.where(np.isfinite(level + x), level, np.nan)
@@ -354,10 +314,10 @@ def _levels(
             "Each part spends its share of the risk alone; the level spends the whole and can be below a part."
         )
     return Chart(
-        name=name,
-        title=title,
+        name="levels-chainage" if start is None else "levels",
+        title="Protection level over chainage" if start is None else "Protection level",
         caption=" ".join(caption).strip() + counts_sentence(shown, total),
-        x_label=x_label,
+        x_label="chainage of the position [m]" if start is None else "GPS time",
         y_label="protection level [m]",
         layers=tuple(layers),
         start=start,

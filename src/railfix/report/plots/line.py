@@ -59,23 +59,13 @@ def plan(
     background: Sequence[Floats] = (),
     title: str = "Plan of the line",
 ) -> Chart:
-    """Positions and line in local metres, with marks of the kilometrage (P1 figure 6); no layers without a position.
+    """Positions of one antenna and line in local metres, with marks of the kilometrage (P1 figure 6).
 
-    Parameters
-    ----------
-    positions : polars.DataFrame
-        Of one antenna, columns of `railfix.pipeline.result_columns.POSITION_COLUMNS`.
-    error_m, level_m : ndarray, shape (rows,), optional [m]
-        Errors along the line, or protection levels: the positions are coloured by the size of the first that is
-        given, and by their status without either.
-    filtered : polars.DataFrame, optional
-        Positions by the filter along the track; those of epochs without a position of their own are drawn.
-    track : Track, optional
-        Line to draw, also where there are no positions; without it the line is drawn through the positions.
-    tunnels_m : sequence of (float, float) [m]
-        Chainages between which the line runs in a tunnel.
-    background : sequence of ndarray, shape (P, 2) [deg]
-        Longitude and latitude of lines to draw below, see `railfix.report.charts_page`.
+    No layers without a position. The positions are coloured by `error_m` or `level_m`, shape (rows,), by the size of
+    the first that is given, and by their status without either. Of `filtered`, by the filter along the track, those of
+    epochs without a position of their own are drawn. Without `track` the line is drawn through the positions.
+    `tunnels_m` are chainages between which the line runs in a tunnel; `background` are longitudes and latitudes of
+    lines to draw below, each of shape (P, 2) [deg].
     """
     ecef, conventional = points(positions, *ECEF), points(positions, *(f"conventional_{name}" for name in ECEF))
     has = np.isfinite(ecef[:, 0])
@@ -267,7 +257,7 @@ def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
 _FIXES: Final = (("conventional", "conventional_", CONVENTIONAL, "square"), ("on the map", "", CONSTRAINED, "dot"))
 
 
-def interval_over_chainage(table: pl.DataFrame, *, title: str = "Positioning interval") -> Chart:
+def interval_over_chainage(table: pl.DataFrame) -> Chart:
     """Distance from each position to the previous one, over chainage (P1 figure 12), of the table of `interval`."""
     layers: list[Layer] = []
     shown = total = 0
@@ -281,7 +271,7 @@ def interval_over_chainage(table: pl.DataFrame, *, title: str = "Positioning int
             longest.append(f"{label} {y.max():.2f} m")
     return Chart(
         name="interval-chainage",
-        title=title,
+        title="Positioning interval",
         caption=f"Distance along the line from each position to the previous one. {_by(table)} "
         f"Longest: {', '.join(longest)}.{counts_sentence(shown, total)}",
         x_label="chainage [m]",
@@ -291,7 +281,7 @@ def interval_over_chainage(table: pl.DataFrame, *, title: str = "Positioning int
     )
 
 
-def interval_distribution(table: pl.DataFrame, *, title: str = "Positioning interval, distribution") -> Chart:
+def interval_distribution(table: pl.DataFrame) -> Chart:
     """Distribution of the distances from the previous position (P1 figure 12), of the table of `interval`."""
     distances = {label: interval(table, prefix)[1] for label, prefix, _, _ in _FIXES}
     largest = max((float(y.max()) for y in distances.values() if len(y)), default=1.0)
@@ -306,7 +296,7 @@ def interval_distribution(table: pl.DataFrame, *, title: str = "Positioning inte
         )
     return Chart(
         name="interval-distribution",
-        title=title,
+        title="Positioning interval, distribution",
         caption=f"Number of positions by their distance from the previous one, in classes of {step:g} m. {_by(table)}",
         x_label="distance from the previous position [m]",
         y_label="positions",
@@ -322,7 +312,7 @@ def _by(table: pl.DataFrame) -> str:
     return "Without a reference the distances are those of the positions, with their noise."
 
 
-def satellites_over_time(positions: pl.DataFrame, *, title: str = "Satellites") -> Chart:
+def satellites_over_time(positions: pl.DataFrame) -> Chart:
     """Satellites used and rejected at each epoch of one antenna."""
     start = start_of(positions)
     x = since(positions, start)
@@ -335,7 +325,7 @@ def satellites_over_time(positions: pl.DataFrame, *, title: str = "Satellites") 
         layers.append(Points(label=label, colour=colour, x=x[rows], y=y[rows], epoch_s=x[rows]))
     return Chart(
         name="satellites",
-        title=title,
+        title="Satellites",
         caption=f"Satellites with a pseudorange.{counts_sentence(shown, total)}",
         x_label="GPS time",
         y_label="satellites",

@@ -254,10 +254,6 @@ def _draw_panels(panels: dict[str, Axes], quality: TrackQuality) -> None:
     list(panels.values())[-1].set_xlabel("chainage [m]")
 
 
-_SURVEYED: Final = "#1f4e79"
-_RAW: Final = "#c1272d"
-
-
 def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
     """Draw positions, map and passes in plan, and height and standard deviations along the line."""
     from matplotlib.figure import Figure
@@ -269,9 +265,11 @@ def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
     plan, height, sigma = (figure.add_subplot(grid[i]) for i in range(3))
     for number, run in enumerate(surveyed.runs):
         enu = (run.ecef_m - track.ecef_m[0]) @ axes.T
-        plan.plot(enu[:, 0], enu[:, 1], ".", color=_RAW, markersize=2, label="positions" if not number else None)
+        plan.plot(
+            enu[:, 0], enu[:, 1], ".", color=_COLOURS["error"], markersize=2, label="positions" if not number else None
+        )
     enu = (track.ecef_m - track.ecef_m[0]) @ axes.T
-    plan.plot(enu[:, 0], enu[:, 1], color=_SURVEYED, label="map")
+    plan.plot(enu[:, 0], enu[:, 1], color=_LINE, label="map")
     margin = 0.05 * max(float(enu[:, i].max() - enu[:, i].min()) for i in range(2)) + 20.0
     plan.set(
         xlim=(enu[:, 0].min() - margin, enu[:, 0].max() + margin),
@@ -284,11 +282,11 @@ def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
     plan.legend(loc="best")
     chainage = track.chainage_m
     low, high = track.height_m - survey.sigma_height_m, track.height_m + survey.sigma_height_m
-    height.fill_between(chainage, low, high, color=_SURVEYED, alpha=0.2)
-    height.plot(chainage, track.height_m, color=_SURVEYED)
+    height.fill_between(chainage, low, high, color=_LINE, alpha=0.2)
+    height.plot(chainage, track.height_m, color=_LINE)
     height.set(ylabel="height, one sigma [m]")
-    sigma.plot(chainage, survey.sigma_plan_m, color=_SURVEYED, label="across")
-    sigma.plot(chainage, survey.sigma_height_m, color=_RAW, label="height")
+    sigma.plot(chainage, survey.sigma_plan_m, color=_LINE, label="across")
+    sigma.plot(chainage, survey.sigma_height_m, color=_COLOURS["error"], label="height")
     sigma.set(xlabel="chainage [m]", ylabel="standard deviation [m]", ylim=(0.0, None))
     sigma.legend(loc="best")
     for panel in (height, sigma):

@@ -49,10 +49,7 @@ def draw_screen(
 ) -> Path:
     """Draw a metric against its limit over T times, and over chainage [m] where it is known, as a PNG file.
 
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
+    OutputError: the file cannot be written.
     """
     from matplotlib.figure import Figure
 
@@ -66,34 +63,20 @@ def draw_screen(
 
 
 def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[np.integer] | None = None) -> Chart:
-    """Chart of a metric against its limit over time.
-
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,), or (E,) with `epoch`
-    epoch : ndarray of int, shape (T,), optional
-        Epoch of each row of the picture, where `time` is that of E epochs.
-    """
+    """Chart of a metric against its limit over T times; `epoch`, shape (T,), gives the time of each row."""
     start = time.min() if len(time) else np.datetime64(0, "ns")
-    return _screen(picture, seconds(time - start), epoch, name="time", x_label="GPS time", start=start)
+    return _screen(picture, seconds(time - start), epoch, start)
 
 
 def screen_over_chainage(
     picture: ScreenPicture, chainage_m: Floats, *, epoch: NDArray[np.integer] | None = None
 ) -> Chart:
     """The same over the chainage, shape (T,), or (E,) with `epoch` [m]; see `screen_over_time`."""
-    return _screen(picture, chainage_m, epoch, name="chainage", x_label="chainage [m]", start=None)
+    return _screen(picture, chainage_m, epoch, None)
 
 
-def _screen(
-    picture: ScreenPicture,
-    x: Floats,
-    epoch: NDArray[np.integer] | None,
-    *,
-    name: str,
-    x_label: str,
-    start: np.datetime64 | None,
-) -> Chart:
+def _screen(picture: ScreenPicture, x: Floats, epoch: NDArray[np.integer] | None, start: np.datetime64 | None) -> Chart:
+    """Metric over the time since `start`, or over the chainage without one."""
     judged = int(np.count_nonzero(np.isfinite(picture.metric)))
     rejected = int(np.count_nonzero(picture.reject))
     share = f"{100 * rejected / judged:.2f} %" if judged else "none"
@@ -128,10 +111,10 @@ def _screen(
         if top > 0.0 and max(float(np.nanmax(picture.metric)), -float(np.nanmin(picture.metric))) > top:
             scale = {"y_scale": "symlog", "y_linear": nice_step(top / 2.0)}
     return Chart(
-        name=name,
+        name="chainage" if start is None else "time",
         title=f"{picture.title}: {judged:,} tested, {rejected:,} rejected ({share})",
         caption=(("" if same else "Line: the tightest limit of each epoch.") + counts_sentence(shown, total)).strip(),
-        x_label=x_label,
+        x_label="chainage [m]" if start is None else "GPS time",
         y_label=picture.label,
         layers=tuple(layers),
         start=start,
@@ -171,13 +154,7 @@ def _tightest(x: Floats, limit: Floats) -> tuple[Floats, Floats]:
 
 
 def draw_cn0_curve(path: str | PathLike[str], curve: Cn0Curve, samples: Cn0Samples) -> Path:
-    """Draw C/N0 over elevation with mean and threshold, a panel a constellation and signal (P1 figure 3), as PNG.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
+    """Draw C/N0 over elevation with mean and threshold, a panel a constellation and signal (P1 figure 3), as PNG."""
     from matplotlib.figure import Figure
 
     charts = [open_sky_chart(mean, *samples.of(mean.kind, mean.signal), Cn0Limits()) for mean in curve.means]
@@ -220,12 +197,7 @@ class _ScreenRows:
 def draw_run_screens(run: Path, out: Path) -> list[Path]:
     """Draw every screen of a run that tested anything, one picture per antenna: ``front_doppler.png`` and the like.
 
-    Raises
-    ------
-    InputFileError
-        The folder is not that of a run, or the run wrote no observations (``railfix run --observations``).
-    OutputError
-        A picture cannot be written.
+    InputFileError: the folder is not that of a run, or the run wrote no observations (``railfix run --observations``).
     """
     (reported,), _ = read_runs([run])
     if reported.observations is None:

@@ -48,25 +48,12 @@ def cn0_over_elevation(
     limits: Cn0Limits | None = None,
     curve: Cn0Curve | None = None,
     mask_deg: float | None = None,
-    title: str = "C/N0 over elevation",
 ) -> list[Chart]:
     """C/N0 over elevation with mean and thresholds, one chart per constellation and signal (P1 figure 3).
 
-    Parameters
-    ----------
-    observations : polars.DataFrame or polars.LazyFrame
-        Of one antenna, columns of `railfix.pipeline.result_columns.OBSERVATION_COLUMNS`.
-    limits : Cn0Limits, optional
-        Thresholds that were in force; none are drawn without.
-    curve : Cn0Curve, optional
-        Curve of the open sky. Without it, the mean of these observations themselves is drawn.
-    mask_deg : float, optional [deg]
-        Elevation mask.
-
-    Returns
-    -------
-    list of Chart
-        Of every signal that was taken, the most observed first.
+    `observations` are of one antenna; the charts are of every signal that was taken, the most observed first. `limits`
+    are the thresholds that were in force; none are drawn without. Without the `curve` of the open sky, the mean of
+    these observations themselves is drawn.
     """
     taken = observations.lazy().filter(
         pl.col("reason") & int(Reason.OTHER_SIGNAL_TAKEN) == 0,
@@ -88,7 +75,7 @@ def cn0_over_elevation(
         drawn = mine.filter(pl.col("up").is_between(0, counts.shape[1] - 1), pl.col("across") < len(counts))
         np.add.at(counts, (drawn["across"].to_numpy(), drawn["up"].to_numpy()), drawn["count"].to_numpy())
         caption = f"{size:,} observations, the more the darker."
-        charts.append(_cn0_chart(kind, signal, counts, lines, title=f"{title}: ", caption=caption))
+        charts.append(_cn0_chart(kind, signal, counts, lines, title="C/N0 over elevation: ", caption=caption))
     return charts
 
 
@@ -172,23 +159,10 @@ def sky_epochs(
     start: np.datetime64 | None = None,
     title: str = "Sky",
 ) -> SkyEpochs:
-    """Satellites in view at some epochs, for sky plots.
+    """Satellites in view of one antenna, each once with the signal that was used, at some epochs, for sky plots.
 
-    Parameters
-    ----------
-    observations : polars.DataFrame or polars.LazyFrame
-        Of one antenna, columns of `railfix.pipeline.result_columns.OBSERVATION_COLUMNS`.
-    wanted : ndarray of datetime64[ns], optional
-        Epochs to include, up to half of `epochs`.
-    epochs : int
-        Largest number of epochs, evenly spaced.
-    start : datetime64[ns], optional
-        Origin of the times; the first epoch if not given.
-
-    Returns
-    -------
-    SkyEpochs
-        Each satellite once, with the signal that was used.
+    At most `epochs` epochs, evenly spaced; of these up to half are the `wanted` ones. `start` is the origin of the
+    times, the first epoch if not given.
     """
     rows = observations.lazy().filter(pl.col("elevation_deg") >= 0.0, pl.col("azimuth_deg").is_not_null())
     times = rows.select(pl.col("time_gpst").unique().sort()).collect()["time_gpst"]

@@ -14,16 +14,9 @@ from railfix.simulate.environment.settings import (
     RowSettings,
     SectionSettings,
 )
-from railfix.simulate.environment.structures import drawn_sections
+from railfix.simulate.environment.structures import draw_sections
 
 __all__ = [
-    "KINDS",
-    "CorrelatorSettings",
-    "ElectrificationSettings",
-    "Environment",
-    "EnvironmentSettings",
-    "RoofSettings",
-    "RowSettings",
-    "SectionSettings",
-    "drawn_sections",
-]
+    "KINDS", "CorrelatorSettings", "ElectrificationSettings", "Environment", "EnvironmentSettings", "RoofSettings",
+    "RowSettings", "SectionSettings", "draw_sections",
+]  # fmt: skip

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import fresnel
 
 from railfix.core.arrays import Complexes, Floats, Indices
-from railfix.simulate.environment.settings import AntennaSettings
+from railfix.simulate.environment.settings import AntennaSettings, CorrelatorSettings
 
 Singles = NDArray[np.float32]
 
@@ -37,16 +37,13 @@ class TrackedCode:
     main: Indices  #: Path that the loops lock to.
 
 
-def tracked(
+def track_paths(
     field: Complexes,
     extra_m: Floats,
     rate_mps: Floats,
-    *,
     wavelength_m: Floats,
     chip_m: Floats,
-    spacing_chips: float,
-    code_loop_hz: float,
-    carrier_loop_hz: float,
+    receiver: CorrelatorSettings,
 ) -> TrackedCode:
     """Track the sum of P paths, for N signals; `field`, shape (P, N), is relative to the unobstructed direct signal.
 
@@ -68,14 +65,14 @@ def tracked(
     b = np.asarray((field.imag * anchor.real - field.real * anchor.imag) / size**2, dtype=np.float32)
     real, imaginary = a * cosine + b * sine, b * cosine - a * sine
     turning_hz = np.asarray(rate / wavelength_m, dtype=np.float32)
-    follow = 1.0 / np.sqrt(1.0 + (turning_hz / code_loop_hz) ** 2)
+    follow = 1.0 / np.sqrt(1.0 + (turning_hz / receiver.code_loop_hz) ** 2)
     late = np.asarray(delay / chip_m, dtype=np.float32)
-    error = _zero(real, imaginary, late, follow, spacing_chips)
+    error = _zero(real, imaginary, late, follow, receiver.spacing_chips)
     triangle = _triangle(error - late)
     followed = triangle * follow
     power = (real * followed).sum(axis=0) ** 2 + (imaginary * followed).sum(axis=0) ** 2
     power += (((1.0 - follow**2) * triangle**2) * (real**2 + imaginary**2)).sum(axis=0)
-    passed = triangle / np.sqrt(1.0 + (turning_hz / carrier_loop_hz) ** 2)
+    passed = triangle / np.sqrt(1.0 + (turning_hz / receiver.carrier_loop_hz) ** 2)
     angle, pulled = _carrier(real * passed, imaginary * passed, rate, anchor)
     limit = np.abs(rate * (strength > 0.05 * size)).max(axis=0)
     return TrackedCode(
@@ -128,9 +125,7 @@ CLEAR_V: Final = -0.78  #: Below this the loss of an edge is 0 by the formula of
 
 
 def per_metre(distance_m: Floats, wavelength_m: Floats) -> Floats:
-    """Fresnel parameter [1/m] of a clearance of 1 m, the source infinitely far, the edge so far from the antenna
-    (P.526-15, 4.1).
-    """
+    """Fresnel parameter of a clearance of 1 m [1/m] at an edge so far away, the source at infinity (P.526-15, 4.1)."""
     return np.sqrt(2.0 / (wavelength_m * np.maximum(distance_m, 0.1)))
 
 
@@ -177,7 +172,7 @@ def circular_reflection(cosine: Floats, permittivity: float) -> tuple[Floats, Fl
     return np.abs(parallel + perpendicular) / 2.0, np.abs(parallel - perpendicular) / 2.0
 
 
-def received_amplitude(cosine: Floats, sine_elevation: Floats, antenna: AntennaSettings) -> Floats:
+def reflection_amplitude(cosine: Floats, sine_elevation: Floats, antenna: AntennaSettings) -> Floats:
     """Amplitude of a wall's reflection behind the antenna, over the direct signal from the same elevation.
 
     Both polarisations add in power; the left-handed one is received with the antenna's cross-polar loss, linear in

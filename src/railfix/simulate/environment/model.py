@@ -13,14 +13,13 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import carrier_frequency_hz
 from railfix.simulate.environment.correlator import (
-    TrackedCode,
     cross_polar_gain,
     edge_amplitude,
     per_metre,
-    received_amplitude,
+    reflection_amplitude,
     roughness_loss,
     strip_field,
-    tracked,
+    track_paths,
 )
 from railfix.simulate.environment.settings import (
     CN0_HORIZON_DBHZ,
@@ -30,7 +29,7 @@ from railfix.simulate.environment.settings import (
     EnvironmentSettings,
     SightGeometry,
 )
-from railfix.simulate.environment.structures import BEYOND_M, build_structures, drawn_sections, tree_rows
+from railfix.simulate.environment.structures import BEYOND_M, build_structures, draw_sections, tree_rows
 from railfix.simulate.environment.walls import (
     FREE_V,
     Rays,
@@ -80,7 +79,7 @@ class Conductor:
         field[kept] = weight[kept] * strip_field(beside[kept] * scale[kept], self.width_m * scale[kept])
         return field
 
-    def scattered(self, wavelength_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    def scatter(self, wavelength_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Amplitude, extra path [m], and direction (p, q) of the signal scattered to the antenna from behind.
 
         A metal cylinder in geometrical optics: sqrt(a cos(b/2) / (2 rho)) with radius a, distance rho and
@@ -146,7 +145,7 @@ class Electrification:
         side = {"both": sign, "right": 1.0, "left": -1.0}[self.settings.sides]
         return np.where(sign == side, 1.0, 0.0)
 
-    def transmitted(self, rays: Rays) -> Complexes:
+    def transmit(self, rays: Rays) -> Complexes:
         """Direct field behind masts, beam and wires: 1 where nothing obstructs, shape (N,)."""
         s = self.settings
         sign = np.where(rays.y > 0.0, 1.0, -1.0)
@@ -174,7 +173,7 @@ class Electrification:
             width_m=self.settings.wire_width_m,
         )
 
-    def scattered(self, rays: Rays) -> list[tuple[Floats, Floats, Floats]]:
+    def scatter(self, rays: Rays) -> list[tuple[Floats, Floats, Floats]]:
         """Amplitude, extra path and its growth [m/m] of the signals scattered by mast and beam, each of shape (N,)."""
         sign = np.where(rays.y > 0.0, -1.0, 1.0)
         conductors = [(self._mast(rays, sign, rays.chainage_m), self._stands(sign))]
@@ -185,7 +184,7 @@ class Electrification:
             )
         rows = []
         for conductor, stands in conductors:
-            amplitude, extra, toward_x, _ = conductor.scattered(rays.wavelength_m)
+            amplitude, extra, toward_x, _ = conductor.scatter(rays.wavelength_m)
             rows.append((amplitude * stands, extra, rays.x - toward_x))
         return rows
 
@@ -200,33 +199,11 @@ _BLOCK: Final = 8192  #: Signals computed at once, so that their arrays stay in 
 _LEAST_ELEVATION_DEG: Final = 0.5  #: Lowest elevation that is computed [deg].
 
 
-@dataclass(frozen=True, kw_only=True)
-class Paths:
-    """Paths of N signals, the direct one first, shapes (P, N)."""
-
-    field: Complexes  #: Relative to the unobstructed direct signal, without the phase of the extra path.
-    extra_m: Floats
-    growth: Floats  #: Of the extra path with the antenna's chainage [m/m].
-
-
 class Environment:
     """Multipath and blockage along a line.
 
-    Parameters
-    ----------
-    settings : EnvironmentSettings
-    line_length_m : float
-    clear_cn0_dbhz : (float, float)
-        C/N0 of an unobstructed signal at the horizon, and its rise to the zenith.
-    seed : int
-        The same seed gives the same structures and, where they are drawn, the same sections.
-
-    Attributes
-    ----------
-    settings : EnvironmentSettings
-    sections : tuple of SectionSettings
-        As given, or as drawn.
-    structures : Structures
+    `clear_cn0_dbhz` is the C/N0 of an unobstructed signal at the horizon, and its rise to the zenith. The same seed
+    gives the same structures and, where they are drawn, the same sections.
     """
 
     def __init__(
@@ -241,7 +218,7 @@ class Environment:
         self._clear_cn0_dbhz = clear_cn0_dbhz
         self.sections = settings.sections
         if settings.shares:
-            self.sections = drawn_sections(
+            self.sections = draw_sections(
                 settings.shares, line_length_m, section_length_m=settings.section_length_m, seed=seed
             )
         self.structures = build_structures(self.sections, line_length_m, seed)
@@ -278,7 +255,8 @@ class Environment:
         for first in range(0, len(epoch), _BLOCK):
             e, c = epoch[first : first + _BLOCK], channel[first : first + _BLOCK]
             rays = _rays(geometry, e, c, wavelength, self.settings.antenna_height_m)
-            got = self._track_paths(rays, platform[e], geometry.speed_mps[e], chip[c], clock_s[e])
+            field, extra, growth = self._paths(rays, platform[e], clock_s[e])
+            got = track_paths(field, extra, growth * geometry.speed_mps[e], rays.wavelength_m, chip[c], receiver)
             clear = self._clear_cn0_dbhz[0] + self._clear_cn0_dbhz[1] * rays.z
             lost = clear + got.gain_db < receiver.tracking_cn0_dbhz
             code[e, c] = np.where(lost, np.nan, got.code_m)
@@ -289,41 +267,27 @@ class Environment:
                 cn0[e, c] += self.settings.antenna.ripple_sigma_db * self._ripple.at(rays, geometry.antenna)
         return Disturbance(code_m=code, phase_m=phase, doppler_hz=doppler, cn0_db=cn0)
 
-    def _track_paths(
-        self, rays: Rays, platform: Masks, speed_mps: Floats, chip_m: Floats, clock_s: Floats
-    ) -> TrackedCode:
-        receiver, paths = self.settings.receiver, self._paths(rays, platform, clock_s)
-        return tracked(
-            paths.field,
-            paths.extra_m,
-            paths.growth * speed_mps,
-            wavelength_m=rays.wavelength_m,
-            chip_m=chip_m,
-            spacing_chips=receiver.spacing_chips,
-            code_loop_hz=receiver.code_loop_hz,
-            carrier_loop_hz=receiver.carrier_loop_hz,
-        )
+    def _paths(self, rays: Rays, platform: Masks, clock_s: Floats) -> tuple[Complexes, Floats, Floats]:
+        """Paths of N signals: the direct one, and those reflected and scattered by what is along the line.
 
-    def _paths(self, rays: Rays, platform: Masks, clock_s: Floats) -> Paths:
-        """Direct path, and the paths reflected and scattered by ground, masts, walls, streets, vehicles and trees."""
+        Returns the fields relative to the unobstructed direct signal, without the phase of the extra path, the extra
+        paths [m], and their growth with the antenna's chainage [m/m], shapes (P, N).
+        """
         field, delay = self._direct(rays, clock_s)
         nothing = np.zeros(len(rays.x))
         rows: list[tuple[Floats | Complexes, Floats, Floats]] = [(field, delay, nothing)]
         if self.settings.ground_reflection > 0.0:
             rows.append((-self._ground(rays), 2.0 * (rays.height_m - PLATFORM_M * platform) * rays.z, nothing))
         if self._conductors is not None:
-            rows += [(-amplitude, extra, growth) for amplitude, extra, growth in self._conductors.scattered(rays)]
+            rows += [(-amplitude, extra, growth) for amplitude, extra, growth in self._conductors.scatter(rays)]
         rows += [self._reflection(r, rays) for r in range(len(self.structures.walls))]
         rows += self._further(rays, clock_s)
         for trees in self._trees:
             left, scatter, extra = foliage(trees, rays)
             rows[0] = (rows[0][0] * left, *rows[0][1:])
             rows.append((scatter * np.abs(rows[0][0]), extra, rays.x - 0.5))
-        return Paths(
-            field=np.stack([row[0].astype(np.complex128) for row in rows]),
-            extra_m=np.stack([row[1] for row in rows]),
-            growth=np.stack([row[2] for row in rows]),
-        )
+        fields, extra_m, growth = zip(*rows, strict=True)
+        return np.stack([field.astype(np.complex128) for field in fields]), np.stack(extra_m), np.stack(growth)
 
     def _further(self, rays: Rays, clock_s: Floats) -> list[tuple[Floats | Complexes, Floats, Floats]]:
         """Reflections by side streets, by both sides one after the other, and by vehicles on parallel tracks."""
@@ -333,7 +297,7 @@ class Environment:
             for amplitude, extra, growth, cosine in street_reflections(
                 self._streets, rays, candidates=streets.candidates, roughness_m=streets.roughness_m
             ):
-                gain = 1.0 if antenna is None else received_amplitude(cosine, rays.z, antenna)
+                gain = 1.0 if antenna is None else reflection_amplitude(cosine, rays.z, antenna)
                 rows.append((-amplitude * gain, extra, growth))
         if settings.second_reflections == "opposite" and self.structures.walls:
             rows.append(second_reflection(self.structures.walls, rays, antenna))
@@ -358,7 +322,7 @@ class Environment:
             amplitude = amplitude * roof_amplitude(roofs, rays)
         field = amplitude.astype(np.complex128)
         if self._conductors is not None:
-            field *= self._conductors.transmitted(rays)
+            field *= self._conductors.transmit(rays)
         # h^2 / (2 D) of a clearance h at distance D.
         return field, 0.25 * rays.wavelength_m * np.clip(v, 0.0, 30.0) ** 2
 
@@ -376,7 +340,7 @@ class Environment:
         image = reflections(self.structures.walls[r], rays)
         amplitude = image.amplitude.copy()
         if self.settings.antenna is not None:
-            amplitude *= received_amplitude(image.cosine, rays.z, self.settings.antenna)
+            amplitude *= reflection_amplitude(image.cosine, rays.z, self.settings.antenna)
         kept = np.flatnonzero(amplitude > _NO_FIELD)
         if len(kept):
             some = rays.take(kept)

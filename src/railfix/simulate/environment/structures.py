@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -53,37 +52,24 @@ _CONCOURSE: Final = RoofSettings(
     inner_m=0.0, outer_m=40.0, height_m=8.0, length_m=(12.0, 30.0), gap_m=(150.0, 300.0), loss_db=40.0
 )
 
-#: Rows of walls by kind of section.
-ROWS: Final[Mapping[Kind, tuple[RowSettings, ...]]] = MappingProxyType(
-    {
-        "open": (),
-        "suburban": (_HOUSES, _BLOCKS_BEHIND),
-        "urban": (_BLOCKS, _TOWERS_BEHIND),
-        "canyon": (_CANYON, _TOWERS_BEHIND),
-        "cutting": (_SLOPE,),
-        "mountain": (_RIDGE,),
-        "station": (_BLOCKS, _TOWERS_BEHIND),
-        "tunnel": (),
-    }
-)
-#: Roofs by kind of section.
-ROOFS: Final[Mapping[Kind, tuple[RoofSettings, ...]]] = MappingProxyType(
-    {
-        "open": (),
-        "suburban": (_BRIDGE,),
-        "urban": (_BRIDGE,),
-        "canyon": (_BRIDGE,),
-        "cutting": (_BRIDGE,),
-        "mountain": (),
-        "station": (RoofSettings(), _CONCOURSE),
-        "tunnel": (),
-    }
-)
+#: Rows of walls by kind of section, and roofs; other kinds have none.
+ROWS: Final[Mapping[Kind, tuple[RowSettings, ...]]] = {
+    "suburban": (_HOUSES, _BLOCKS_BEHIND),
+    "urban": (_BLOCKS, _TOWERS_BEHIND),
+    "canyon": (_CANYON, _TOWERS_BEHIND),
+    "cutting": (_SLOPE,),
+    "mountain": (_RIDGE,),
+    "station": (_BLOCKS, _TOWERS_BEHIND),
+}
+ROOFS: Final[Mapping[Kind, tuple[RoofSettings, ...]]] = {
+    **dict.fromkeys(("suburban", "urban", "canyon", "cutting"), (_BRIDGE,)),
+    "station": (RoofSettings(), _CONCOURSE),
+}
 #: The crown of a tunnel and the ground above it, seen from outside.
 TUNNEL_CROWN: Final = RoofSettings(inner_m=0.0, outer_m=200.0, height_m=6.5, loss_db=200.0)
 
 
-def drawn_sections(
+def draw_sections(
     shares: Mapping[Kind, float], length_m: float, *, section_length_m: Between, seed: int
 ) -> tuple[SectionSettings, ...]:
     """Sections with exactly the given shares of a line, which add up to 1, in random order from 0 to its end.
@@ -156,8 +142,8 @@ def build_structures(sections: Sequence[SectionSettings], line_length_m: float, 
     for i, section in enumerate(sections):
         low = section.from_m - (BEYOND_M if i == 0 and section.kind != "tunnel" else 0.0)
         high = section.to_m + (BEYOND_M if i == len(sections) - 1 and section.kind != "tunnel" else 0.0)
-        rows = ROWS[section.kind] if section.rows is None else section.rows
-        over = ROOFS[section.kind] if section.roofs is None else section.roofs
+        rows = ROWS.get(section.kind, ()) if section.rows is None else section.rows
+        over = ROOFS.get(section.kind, ()) if section.roofs is None else section.roofs
         for r, row in enumerate(rows):
             for s, side in enumerate(SIDES):
                 if row.sides in (side, "both"):

@@ -22,7 +22,7 @@ from railfix.simulate.environment.settings import AntennaSettings, NeighbourSett
 from railfix.simulate.environment.structures import Strips
 
 FREE_V: Final = -99.0  #: Fresnel parameter of an unobstructed ray.
-_LEAST_LATERAL: Final = 1e-3  #: Least lateral component of a direction: rays along the line meet no wall.
+_LEAST_LATERAL: Final = 1e-3  #: Least component of a direction: rays along the line meet no wall, tree or vehicle.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +157,7 @@ def roof_amplitude(row: Strips, rays: Rays) -> Floats:
     return np.where(over, np.maximum(edge_amplitude(v), np.where(v > 0.0, row.value["through"][roof], 0.0)), 1.0)
 
 
-_LEAST: float = 0.05
+_LEAST_TWICE: Final = 0.05  #: The same for rays that are reflected twice.
 
 
 def second_reflection(
@@ -171,7 +171,7 @@ def second_reflection(
     """
     row = rows[0]
     side = (rays.y > 0.0).astype(np.intp)
-    lateral = np.maximum(np.abs(rays.y), _LEAST)
+    lateral = np.maximum(np.abs(rays.y), _LEAST_TWICE)
     own = wall_met(row, side, rays.chainage_m, np.zeros_like(lateral), rays.x, lateral)
     near = row.value["distance_m"][own]
     far = near / lateral
@@ -192,11 +192,11 @@ def second_reflection(
     for other in rows:
         amplitude = amplitude * edge_amplitude(shadow(other, rays, y0=image))
     growth = 2.0 * (row.value["slope"][own] + row.value["slope"][opposite]) * lateral
-    seen = (np.abs(rays.y) > _LEAST) & (near > 0.5) & (away > 0.5)
+    seen = (np.abs(rays.y) > _LEAST_TWICE) & (near > 0.5) & (away > 0.5)
     return np.where(seen, amplitude, 0.0), 2.0 * (near + away) * lateral, growth
 
 
-_LEAST_SIDE: float = 0.02  #: Least lateral and longitudinal component of a direction that is computed.
+_LEAST_SIDE: Final = 0.02  #: Least lateral and longitudinal component of a direction that is computed.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,9 +276,7 @@ def street_reflections(
     return found
 
 
-#: Width of the edge of a crown over which the loss rises [m].
-_EDGE_M: float = 0.5
-_LEAST_TREE: float = 1e-3
+_EDGE_M: Final = 0.5  #: Width of the edge of a crown over which the loss rises [m].
 
 
 def foliage(row: Strips, rays: Rays) -> tuple[Floats, Floats, Floats]:
@@ -288,7 +286,7 @@ def foliage(row: Strips, rays: Rays) -> tuple[Floats, Floats, Floats]:
     most `most_db` (ITU-R P.833-9, 2.1: the loss saturates); what is lost is partly scattered forward.
     """
     side = (rays.y > 0.0).astype(np.intp)
-    lateral = np.maximum(np.abs(rays.y), _LEAST_TREE)
+    lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     tree = wall_met(row, side, rays.chainage_m, np.zeros_like(lateral), rays.x, lateral)
     value = {name: column[tree] for name, column in row.value.items()}
     far = value["distance_m"] / lateral
@@ -305,13 +303,12 @@ def foliage(row: Strips, rays: Rays) -> tuple[Floats, Floats, Floats]:
     return left, value["scatter"] * (1.0 - left), 0.5 * way * (1.0 + rays.x)
 
 
-_LEAST_VEHICLE: float = 1e-3
 _SIDE: Final = {"right": 1.0, "left": -1.0}  #: Sign of the lateral component of rays toward a side.
 
 
 def neighbour_clearance(settings: NeighbourSettings, rays: Rays, time_s: Floats) -> Floats:
     """Fresnel parameter of the vehicles on a parallel track, positive where in the way, shape (N,)."""
-    lateral = np.maximum(np.abs(rays.y), _LEAST_VEHICLE)
+    lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     far = settings.lateral_m / lateral
     spacing = settings.spacing_m
     place = np.remainder(rays.chainage_m + far * rays.x - settings.speed_mps * time_s, spacing)
@@ -339,7 +336,7 @@ def equipment_amplitude(equipment: tuple[RoofEquipment, ...], rays: Rays) -> Flo
     """Amplitude left of the direct signal by equipment on the vehicle's own roof, shape (N,)."""
     amplitude = np.ones(len(rays.x))
     for part in equipment:
-        along = np.maximum(np.abs(rays.x), _LEAST_VEHICLE)
+        along = np.maximum(np.abs(rays.x), _LEAST_LATERAL)
         far = abs(part.ahead_m) / along
         rise = along / np.sqrt(along**2 + rays.z**2)
         aside = along / np.sqrt(np.maximum(1.0 - rays.z**2, 1e-9))
