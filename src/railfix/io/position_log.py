@@ -16,7 +16,7 @@ from railfix.core.files import ending, read_text
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import misspelt
 from railfix.core.timescale import from_week, timedelta, utc_to_gpst
-from railfix.io.named_columns import NamedColumns, read_named_columns
+from railfix.io.named_columns import NamedColumns, fails, read_named_columns
 
 _SIGMAS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Standard deviations of a CSV log.
 #: Columns of a CSV log; the time is GPS time, UTC, Unix time, or GPS week and seconds; geodetic or ECEF.
@@ -197,7 +197,7 @@ def _column_of_times(table: NamedColumns, name: str) -> Datetimes:
     try:
         return _times([cell or "NaT" for cell in cells])
     except ValueError:
-        row = next(i for i, cell in enumerate(cells) if not _is_time(cell))
+        row = next(i for i, cell in enumerate(cells) if fails(_times, [cell or "NaT"]))
         raise table.error(row, f"{name} '{cells[row]}' is no ISO 8601 time such as 2021-09-22T06:30:00.2") from None
 
 
@@ -207,14 +207,6 @@ def _from_utc(time: Datetimes) -> Datetimes:
     converted = time.astype("datetime64[ns]")
     converted[known] = utc_to_gpst(converted[known])
     return converted
-
-
-def _is_time(cell: str) -> bool:
-    try:
-        _times([cell or "NaT"])
-    except ValueError:
-        return False
-    return True
 
 
 def _times(texts: list[str]) -> Datetimes:
@@ -299,12 +291,8 @@ def _rtklib_times(path: str | PathLike[str], number: Integers, cells: list[tuple
     except ValueError:
         form = "2021/09/22 06:30:00.000" if calendar else "2176 282600.000"
         for line, (first, second) in zip(number, cells, strict=True):
-            try:
-                if calendar:
-                    _times([f"{first.replace('/', '-')}T{second}"])
-                else:
-                    int(first), float(second)
-            except ValueError:
+            by_calendar = calendar and fails(_times, [f"{first.replace('/', '-')}T{second}"])
+            if by_calendar or (not calendar and (fails(int, first) or fails(float, second))):
                 message = f"'{first} {second}' is not a time such as {form}"
                 raise InputFileError(path, message, line=int(line)) from None
         raise
@@ -318,11 +306,8 @@ def _rtklib_numbers(path: str | PathLike[str], number: Integers, fields: list[li
         return np.array(fields, dtype=np.float64)
     except ValueError:
         for line, row in zip(number, fields, strict=True):
-            for cell in row:
-                try:
-                    float(cell)
-                except ValueError:
-                    raise InputFileError(path, f"'{cell}' is not a number", line=int(line)) from None
+            if wrong := next((cell for cell in row if fails(float, cell)), None):
+                raise InputFileError(path, f"'{wrong}' is not a number", line=int(line)) from None
         raise
 
 
