@@ -13,7 +13,6 @@ from railfix.positioning.carrier.ambiguities import (
     assemble_positions,
     hop_of,
     inverse_of_arcs,
-    moved,
     prepare_start,
     repeats_of,
 )
@@ -78,7 +77,7 @@ def phase_run(
         value, covariance = _solved(lin, index, walk.links)
         among = covariance[index[:, :, None], index[:, None, :]]
         own = own_unknowns(lin, value[index], among, trajectory, repeats=repeats_of(time, limits))
-        after = moved(arc, own, trajectory)
+        after = np.clip(arc + own.step_m, 0.0, trajectory.arc_m[-1])
         step = float(np.abs(after - arc)[started].max(initial=0.0))
         arc, iteration = after, iteration + 1
         if step <= TOLERANCE_M or iteration >= MAX_ITERATIONS:

@@ -76,23 +76,14 @@ class _Stretches:
 
 
 class SearchIndex:
-    """Search structures of a trajectory, built once: a k-d tree, and stretches of rising length.
-
-    Attributes
-    ----------
-    trajectory : Trajectory
-    middle_ecef_m : ndarray, shape (3,) [m]
-        Mean of its points.
-    tree : cKDTree
-        Of its points.
-    """
+    """Search structures of a trajectory, built once: a k-d tree, and stretches of rising length."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
-        self.middle_ecef_m = trajectory.ecef_m.mean(axis=0)
+        self.middle_ecef_m = trajectory.ecef_m.mean(axis=0)  #: Mean of its points, shape (3,).
         self._clear_m = np.full(len(trajectory.length_m), np.nan)
         points = trajectory.ecef_m
-        self.tree = cKDTree(points)
+        self.tree = cKDTree(points)  #: Of its points.
         self.levels: list[_Stretches] = []
         count, size = len(points), 1
         while True:
@@ -149,12 +140,7 @@ class SectionCandidates(NamedTuple):
 def search(ranges: Ranges, index: SearchIndex, point: SinglePoint, *, limits: SectionLimits | None = None) -> Section:
     """Return the point of the trajectory with the least q at each epoch, and the best other place.
 
-    Parameters
-    ----------
-    ranges : Ranges
-        T epochs.
-    point : SinglePoint
-        3-D position from the same ranges and weights; NaN where there is none.
+    `point`: 3-D position from the same ranges and weights; NaN where there is none.
     """
     limits = limits or SectionLimits()
     epochs = len(ranges)
@@ -187,9 +173,8 @@ def _ball(
     if not len(at):
         return radius
     nearest_m, vertex = index.tree.query(point.ecef_m[at])
-    distance = np.asarray(nearest_m, dtype=np.float64)
     radius[at] = kernels.search.radii_of_balls(
-        distance,
+        np.asarray(nearest_m, dtype=np.float64),
         index.trajectory.ecef_m[vertex] - point.ecef_m[at],
         point.matrix[at],
         point.covariance_m2[at],

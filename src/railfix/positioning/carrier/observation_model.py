@@ -181,7 +181,7 @@ def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
 
 @dataclass(frozen=True, kw_only=True)
 class Reduced:
-    """Return the information of each epoch on the ambiguities of its channels."""
+    """Information of each epoch on the ambiguities of its channels."""
 
     matrix: Floats  #: Shape (T, M, M) [1/m^2].
     #: Right-hand sides: of the observations, and of a map that is 1 m off across and in height; shape (T, M, 3) [1/m].
@@ -242,7 +242,8 @@ def own_unknowns(
     from_arcs = np.einsum("ti,tij,tj->t", row, covariance_m2, row)
     from_noise = lin.inverse[:, 0, 0] + from_arcs
     # With the same errors again and again the phases help no more than not at all.
-    most = np.maximum(_variance_of_codes(lin), from_noise)
+    by_codes = np.matmul((lin.code_design * lin.code_weight[..., None]).swapaxes(1, 2), lin.code_design)
+    most = np.maximum(np.linalg.inv(by_codes + lin.known)[:, 0, 0], from_noise)
     from_noise = np.minimum(lin.inverse[:, 0, 0] + repeats * from_arcs, most)
     alone = -lin.inverse[:, 0, 1:PLACE] * lin.prior
     together = alone + np.matmul(row[:, None, :], known[..., 1:])[:, 0]
@@ -259,9 +260,3 @@ def own_unknowns(
         code_residual_m=code,
         phase_residual_m=np.where(used, phase, 0.0),
     )
-
-
-def _variance_of_codes(lin: Linearised) -> Floats:
-    """Variance along the line of each epoch's codes alone, the map's error included, shape (T,) [m^2]."""
-    matrix = np.matmul((lin.code_design * lin.code_weight[..., None]).swapaxes(1, 2), lin.code_design)
-    return np.asarray(np.linalg.inv(matrix + lin.known)[:, 0, 0])
