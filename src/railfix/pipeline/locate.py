@@ -23,7 +23,7 @@ from railfix.positioning.noise_scale import robust_fit
 from railfix.positioning.normal_equations import Ranges, single_point
 from railfix.ranges.atmosphere import SeenFrom, model_delays
 from railfix.ranges.corrected import PLAUSIBLE_CODE_M, code_sigma_m, first_available
-from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, thinned_rows
+from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, rows_apart
 
 _EARTH_RADIUS_M: Final = 6.371e6
 #: Degrees of freedom from which residuals scale the standard deviation of an epoch.
@@ -198,7 +198,7 @@ def survey_epochs(
     phase = corrected_phase_m(slips.phase_m[:, columns], seen.states.clock_m, nothing, nothing)
     rate = -SPEED_OF_LIGHT / seen.channels.frequency_hz * obs.doppler_hz[:, columns]
     broken = np.cumsum(slips.slip[:, columns] | obs.break_before[:, None], axis=0, dtype=np.intp)
-    rows = thinned_rows(obs.time, limits.interval_s)
+    rows = rows_apart(obs.time, limits.interval_s)
     time, cn0_dbhz = obs.time[rows], obs.cn0_dbhz[:, columns]
     weak = 10.0 ** ((45.0 - np.where(np.isnan(cn0_dbhz), 45.0, np.minimum(cn0_dbhz, 50.0))) / 10.0)
     used, position, weak = usable[rows], seen.states.position_ecef_m[rows], weak[rows]

@@ -82,18 +82,14 @@ class DfmcState(IntEnum):
     """Why a satellite has no correction."""
 
     OK = 0
-    #: Type 0: the whole service must not be used.
-    STOPPED = 1
+    STOPPED = 1  #: Type 0: the whole service must not be used.
     NO_MASK = 2
     NOT_IN_MASK = 3
     NO_CORRECTION = 4
     TIMED_OUT = 5
-    #: Indicator 15.
-    DO_NOT_USE = 6
-    #: Type 37 is missing: neither scale nor time-outs are known.
-    NO_DEGRADATION = 7
-    #: No navigation record has the issue of data of the correction.
-    NO_RECORD = 8
+    DO_NOT_USE = 6  #: Indicator 15.
+    NO_DEGRADATION = 7  #: Type 37 is missing: neither scale nor time-outs are known.
+    NO_RECORD = 8  #: No navigation record has the issue of data of the correction.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -126,26 +126,18 @@ class SatelliteState(IntEnum):
     """Whether a satellite may be used, and why not; the first that holds of those listed."""
 
     OK = 0
-    #: Type 0 was received within the last 60 s.
-    GEO_STOPPED = 1
-    #: There is no PRN mask, or it timed out.
-    NO_MASK = 2
+    GEO_STOPPED = 1  #: Type 0 was received within the last 60 s.
+    NO_MASK = 2  #: There is no PRN mask, or it timed out.
     NOT_IN_MASK = 3
     NO_FAST = 4
-    #: UDREI 15.
-    DO_NOT_USE = 5
-    #: UDREI 14.
-    NOT_MONITORED = 6
+    DO_NOT_USE = 5  #: UDREI 15.
+    NOT_MONITORED = 6  #: UDREI 14.
     TIMED_OUT = 7
-    #: UDREI above `SbasLimits.largest_udrei`.
-    UDREI_TOO_LARGE = 8
+    UDREI_TOO_LARGE = 8  #: UDREI above `SbasLimits.largest_udrei`.
     NO_LONG_TERM = 9
-    #: No navigation record has the issue of data of the long-term correction.
-    IODE_MISMATCH = 10
-    #: Degradation data (types 7, 10; 28 where it is sent) are missing.
-    NO_DEGRADATION = 11
-    #: Two fast corrections that give a rate are not there.
-    NO_RANGE_RATE = 12
+    IODE_MISMATCH = 10  #: No navigation record has the issue of data of the long-term correction.
+    NO_DEGRADATION = 11  #: Degradation data (types 7, 10; 28 where it is sent) are missing.
+    NO_RANGE_RATE = 12  #: Two fast corrections that give a rate are not there.
 
 
 class IonosphereState(IntEnum):
@@ -153,15 +145,11 @@ class IonosphereState(IntEnum):
 
     OK = 0
     GEO_STOPPED = 1
-    #: The mask has no cell of grid points around the pierce point.
-    NO_GRID = 2
-    #: A grid point that is needed must not be used.
-    DO_NOT_USE = 3
-    #: A grid point that is needed is not monitored, or was never sent.
-    NOT_MONITORED = 4
+    NO_GRID = 2  #: The mask has no cell of grid points around the pierce point.
+    DO_NOT_USE = 3  #: A grid point that is needed must not be used.
+    NOT_MONITORED = 4  #: A grid point that is needed is not monitored, or was never sent.
     TIMED_OUT = 5
-    #: The delay is there; without type 10 it has no sigma.
-    NO_DEGRADATION = 6
+    NO_DEGRADATION = 6  #: The delay is there; without type 10 it has no sigma.
 
 
 def first_that_holds(cases: Sequence[tuple[Masks, int]], otherwise: int) -> Integers:
