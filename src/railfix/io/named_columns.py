@@ -39,6 +39,10 @@ class NamedColumns:
         """Return an error that names the line of a row."""
         return InputFileError(self.path, message, line=int(self.line[row]))
 
+    def header_error(self, message: str) -> InputFileError:
+        """Return an error that names the line of the header."""
+        return InputFileError(self.path, message, line=self.header_line)
+
     def numbers(self, name: str, *, blank: float | None = None) -> Floats:
         """Parse one column as finite numbers; `blank` is the value of empty cells, and allows ``nan``."""
         given = self.cells[name].str.len_bytes().to_numpy() > 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Final
 
@@ -91,13 +91,10 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
     if not geodetic and not cartesian:
         for name in (*_GEODETIC, *_CARTESIAN):
             if name in absent:
-                message = f"column {absent[name]!r} is unknown; is {name!r} meant?"
-                raise InputFileError(path, message, line=table.header_line)
-        raise InputFileError(
-            path,
+                raise table.header_error(f"column {absent[name]!r} is unknown; is {name!r} meant?")
+        raise table.header_error(
             "no columns latitude_deg, longitude_deg, height_m (ellipsoidal) nor x_m, y_m, z_m (ECEF); the columns are "
-            f"{', '.join(table.cells)}",
-            line=table.header_line,
+            f"{', '.join(table.cells)}"
         )
     if not len(table):
         raise InputFileError(path, "there is no position below the header")
@@ -146,11 +143,9 @@ def rename_columns(table: NamedColumns, columns: Mapping[str, str], *, known: Co
     for ours, theirs in columns.items():
         if theirs not in table.cells:
             message = f"there is no column {theirs!r} (given for {ours}); the columns are {', '.join(table.cells)}"
-            raise InputFileError(table.path, message, line=table.header_line)
+            raise table.header_error(message)
         cells[ours] = table.cells[theirs]
-    return NamedColumns(
-        path=table.path, metadata=table.metadata, header_line=table.header_line, line=table.line, cells=cells
-    )
+    return replace(table, cells=cells)
 
 
 def positions_times(table: NamedColumns) -> Datetimes:
@@ -172,10 +167,8 @@ def positions_times(table: NamedColumns) -> Datetimes:
         wrong = known & ((week != np.floor(week)) | (week < 0) | (seconds < 0) | (seconds > _WEEK_S))
         if wrong.any():
             row = int(np.argmax(wrong))
-            message = (
-                f"week {week[row]:g} and tow_s {seconds[row]:g} are no GPS week and seconds of it (0 to {_WEEK_S})"
-            )
-            raise table.error(row, message)
+            what = f"week {week[row]:g} and tow_s {seconds[row]:g}"
+            raise table.error(row, f"{what} are no GPS week and seconds of it (0 to {_WEEK_S})")
         time = np.full(len(table), np.datetime64("NaT", "ns"))
         time[known] = from_week(week[known].astype(np.int64), seconds[known])
         return time

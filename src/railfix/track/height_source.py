@@ -174,7 +174,7 @@ def _from_profile(track: Track, table: NamedColumns, geoid: str | None, sigma_m:
     datum = "ellipsoidal" if "height_m" in table else "orthometric"
     column = "height_m" if datum == "ellipsoidal" else "elevation_m"
     if column not in table:
-        raise InputFileError(table.path, "there is no column height_m nor elevation_m", line=table.header_line)
+        raise table.header_error("there is no column height_m nor elevation_m")
     known, heights = table.numbers(by), table.numbers(column)
     if len(known) < 2 or not (np.diff(known) > 0.0).all():
         raise InputFileError(table.path, f"{by} must rise from row to row, with at least two rows")

@@ -342,8 +342,7 @@ def _check_columns(table: NamedColumns) -> tuple[str, ...]:
     close = misspelt(table.cells, KNOWN_COLUMNS)
     for wrong, right in close.items():
         if right not in table:
-            message = f"column {wrong!r} is unknown; is {right!r} meant?"
-            raise InputFileError(table.path, message, line=table.header_line)
+            raise table.header_error(f"column {wrong!r} is unknown; is {right!r} meant?")
     for wrong, right in misspelt(table.metadata, KNOWN_METADATA).items():
         if right not in table.metadata:
             raise InputFileError(table.path, f"the line '# {wrong}: {table.metadata[wrong]}': is '# {right}' meant?")
@@ -352,11 +351,11 @@ def _check_columns(table: NamedColumns) -> tuple[str, ...]:
             message = f"there is no column {name!r}; the columns are {', '.join(table.cells)}"
             if any(cell.lower() in RINF_NAMES for cell in table.cells):
                 message += f"; {RINF_SECTIONS}"
-            raise InputFileError(table.path, message, line=table.header_line)
+            raise table.header_error(message)
     if ("height_m" in table) == ("elevation_m" in table):
         what = "both 'height_m' and 'elevation_m'" if "height_m" in table else "neither 'height_m' nor 'elevation_m'"
         message = f"{what}; one is needed: height_m is ellipsoidal, elevation_m is orthometric (levelling)"
-        raise InputFileError(table.path, message, line=table.header_line)
+        raise table.header_error(message)
     used = [name for name in KNOWN_COLUMNS if name != "geoid_m" or "elevation_m" in table]
     extra = [name for name in table.cells if name not in used]
     return (f"{table.path}: columns not used: {', '.join(extra)}",) if extra else ()
@@ -367,10 +366,8 @@ def _datum(table: NamedColumns, asked: str | None) -> str:
     for source, stated in (("height_datum", asked), ("the line '# height_datum'", table.metadata.get("height_datum"))):
         if stated is not None and stated != datum:
             column = "height_m" if datum == "ellipsoidal" else "elevation_m"
-            message = (
-                f"{source} is {stated!r}, but the column {column} is {datum}; rename the column or drop the setting"
-            )
-            raise InputFileError(table.path, message, line=table.header_line)
+            what = f"{source} is {stated!r}, but the column {column} is {datum}"
+            raise table.header_error(f"{what}; rename the column or drop the setting")
     return datum
 
 

@@ -273,15 +273,10 @@ def _scatter(values: Floats, places: Integers, size: int) -> Floats:
 def _plan_steps(track: Track, kept: Integers) -> tuple[Floats, Floats]:
     """Compute the steps between points, east and north, shape (n, 2), and their height differences [m]."""
     latitude, longitude = track.latitude_deg[kept], track.longitude_deg[kept]
-    axes = enu_axes((latitude[1:] + latitude[:-1]) / 2.0, _middle_longitude(longitude))
+    half_step = ((np.diff(longitude) + 180.0) % 360.0 - 180.0) / 2.0  # also across the date line
+    axes = enu_axes((latitude[1:] + latitude[:-1]) / 2.0, longitude[:-1] + half_step)
     steps = np.einsum("nij,nj->ni", axes, np.diff(track.ecef_m[kept], axis=0))
     return steps[:, :2], np.diff(track.height_m[kept])
-
-
-def _middle_longitude(longitude_deg: Floats) -> Floats:
-    """Compute the longitude midway between neighbours, also across the date line."""
-    step = (np.diff(longitude_deg) + 180.0) % 360.0 - 180.0
-    return longitude_deg[:-1] + step / 2.0
 
 
 def _turns(plan: Floats) -> tuple[Floats, Floats]:

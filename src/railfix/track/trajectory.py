@@ -278,10 +278,15 @@ class Trajectory(FrozenArrays, NotebookTable):
         return np.asarray(index, dtype=np.intp), arc - self.arc_m[index]
 
     def _interpolate(self, arc_m: ArrayLike, values: Floats) -> Floats:
-        arc = np.array(arc_m, dtype=np.float64)
-        rows = values.reshape(len(values), -1)
-        result = interpolate_values(arc.reshape(-1), self.arc_m, self.length_m, rows, _END_TOLERANCE_M)
-        return result.reshape(arc.shape + values.shape[1:])
+        """Values (V, ...) at arc lengths of any shape; NaN beyond the ends by more than the tolerance."""
+        given = np.array(arc_m, dtype=np.float64)
+        index, along = self.segment_at(given.reshape(-1))
+        length, rows = self.length_m[index], values.reshape(len(values), -1)
+        share, beyond = along / length, _END_TOLERANCE_M / length
+        share = np.where((share < -beyond) | (share > 1.0 + beyond), np.nan, share)[:, None]
+        # exact at both ends of a segment
+        result = (1.0 - share) * rows[index] + share * rows[index + 1]
+        return np.asarray(result).reshape(given.shape + values.shape[1:])
 
     def at_arc(self, arc_m: ArrayLike) -> Floats:
         """Interpolate the point at an arc length, shape (..., 3) [m]; NaN beyond the ends and for NaN."""
@@ -325,13 +330,3 @@ class Trajectory(FrozenArrays, NotebookTable):
         """
         index, along, offset = self._nearest(ecef_m)
         return self.arc_m[np.maximum(index, 0)] + along, offset  # `along` is NaN where there is no segment
-
-
-def interpolate_values(arc: Floats, arc_m: Floats, length_m: Floats, values: Floats, tolerance_m: float) -> Floats:
-    """Interpolate values (V, C) of a line at arc lengths (n, C); NaN beyond its ends by the tolerance."""
-    index = np.minimum(np.maximum(arc_m.searchsorted(arc, side="right") - 1, 0), len(arc_m) - 2)
-    length = length_m[index]
-    share, beyond = (arc - arc_m[index]) / length, tolerance_m / length
-    share = np.where((share < -beyond) | (share > 1.0 + beyond), np.nan, share)[:, None]
-    # exact at both ends of a segment
-    return np.asarray((1.0 - share) * values[index] + share * values[index + 1])

@@ -251,13 +251,13 @@ def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
 
 def _accumulate(lin: Linearised, index: Indices, memory: Memory) -> tuple[Floats, Floats, Memory]:
     """Normal equations at each epoch, its own part included, and the memory after the last one."""
-    part = reduce(lin)
+    matrix, right = reduce(lin)
     epochs, count = len(index), len(memory.arc_id)
     row = np.arange(epochs)[:, None]
     # One more row and column takes what has no phase.
     own = np.zeros((epochs, count + 1, count + 4))
-    own[row[:, None], index[:, :, None], index[:, None, :]] = part.matrix
-    own[row, index, count + 1 :] = part.right
+    own[row[:, None], index[:, :, None], index[:, None, :]] = matrix
+    own[row, index, count + 1 :] = right
     own = np.delete(own[:, :count], count, axis=2)
     carried = np.concatenate([memory.matrix, memory.right], axis=1)
     # cumsum from the carried sums: the same additions in the same order however epochs are cut.

@@ -179,19 +179,11 @@ def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
     return replace(lin, phase_m=phase, right=lin.right + moved, phase_clock_m=lin.phase_clock_m + clock)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reduced:
-    """Information of each epoch on the ambiguities of its channels."""
+def reduce(lin: Linearised) -> tuple[Floats, Floats]:
+    """Information of each epoch on the ambiguities of its channels: Schur complement of the epoch's own unknowns.
 
-    matrix: Floats  #: Shape (T, M, M) [1/m^2].
-    #: Right-hand sides: of the observations, and of a map that is 1 m off across and in height; shape (T, M, 3) [1/m].
-    right: Floats
-
-
-def reduce(lin: Linearised) -> Reduced:
-    """Schur complement of each epoch's own unknowns.
-
-    A map off by 1 m changes code and phase alike by columns of their designs; against its
+    Returns normal matrices (T, M, M) [1/m^2] and right-hand sides (T, M, 3) [1/m]: of the observations, and of a map
+    that is 1 m off across and in height, which changes code and phase alike by columns of their designs; against its
     prior this leaves ``prior_k C^T L^-1 e_k`` on the right.
     """
     gain = np.matmul(lin.inverse, lin.coupling)
@@ -208,7 +200,7 @@ def reduce(lin: Linearised) -> Reduced:
     right = np.empty((*lin.phase_m.shape, 3))
     right[..., 0] = lin.phase_weight * lin.phase_m - np.matmul(lin.right[:, None, :], gain)[:, 0]
     right[..., 1:] = (gain[:, 1:PLACE] * lin.prior[:, None]).swapaxes(1, 2)
-    return Reduced(matrix=matrix, right=right)
+    return matrix, right
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -155,7 +155,7 @@ class IonosphereState(IntEnum):
 def first_that_holds(cases: Sequence[tuple[Masks, int]], otherwise: int) -> Integers:
     """Value of the first condition that holds, any shape."""
     conditions, values = zip(*cases, strict=True)
-    return np.select(conditions, values, otherwise).astype(np.int64)
+    return np.asarray(np.select(conditions, values, otherwise), dtype=np.int64)
 
 
 class _Frozen:
