@@ -225,7 +225,7 @@ class DfmcService:
         self, own: dict[str, Floats], good: Integers, at: tuple[Datetimes, Integers, Integers, Integers], name: str
     ) -> None:
         """Fill in the corrections of one satellite at the epochs that have one."""
-        time, row, ten, dfrei = (values[good] for values in at)
+        time, (row, ten, dfrei) = at[0][good], (values[good] for values in at[1:])
         sent, scale = {key: values[row] for key, values in self._read[32].items()}, self._read[37]
         moved_s = seconds(time - time_near(sent["time_of_day_s"], self._time[32][row]))
         own["issue"][good] = sent["iodn"]

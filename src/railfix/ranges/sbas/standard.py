@@ -152,7 +152,7 @@ class IonosphereState(IntEnum):
     NO_DEGRADATION = 6  #: The delay is there; without type 10 it has no sigma.
 
 
-def first_that_holds(cases: Sequence[tuple[Masks, int]], otherwise: int) -> Integers:
+def first_that_holds(cases: Sequence[tuple[Masks | np.bool_, int]], otherwise: int) -> Integers:
     """Value of the first condition that holds, any shape."""
     conditions, values = zip(*cases, strict=True)
     return np.asarray(np.select(conditions, values, otherwise), dtype=np.int64)
