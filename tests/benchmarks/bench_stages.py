@@ -33,7 +33,7 @@ STAGES: Final = (
     ("satellite orbits and clocks", "railfix.pipeline.corrected_ranges", "satellite_states"),
     ("anchor", "railfix.pipeline.corrected_ranges", "_anchor"),
     ("angles", "railfix.pipeline.corrected_ranges", "SeenFrom.of"),
-    ("atmosphere", "railfix.pipeline.corrected_ranges", "modelled_delays"),
+    ("atmosphere", "railfix.pipeline.corrected_ranges", "model_delays"),
     ("screens of one antenna", "railfix.pipeline.processor", "EpochProcessor._screened"),
     ("screens of the antenna pair", "railfix.pipeline.processor", "judge_pairs"),
     ("screens of the antenna pair", "railfix.pipeline.processor", "position_verdicts"),

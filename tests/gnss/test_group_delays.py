@@ -88,8 +88,8 @@ def test_each_signal_uses_the_message_with_its_delay() -> None:
 def test_rates_of_axis_and_motion_are_in_position_and_velocity() -> None:
     """The velocity is the derivative of the position, and an hour of both rates moves the satellite by so much."""
     records = kepler({"satellite": "G05", "a_dot": 1e-2, "delta_n_dot": 5e-14}, {"satellite": "G05"})
-    table = Orbits.from_records(records).table
-    moving, still = (Orbits.of_table(table[i : i + 1]) for i in range(2))
+    orbits = Orbits.from_records(records)
+    moving, still = (orbits.take(np.array([i])) for i in range(2))
     at = np.array([3600.0])
     (before, _, _), (_, velocity, _), (after, _, _) = (kepler_state(moving, at + d) for d in (-0.5, 0.0, 0.5))
     assert np.ravel(after) - np.ravel(before) == pytest.approx(np.ravel(velocity), abs=1e-4)
@@ -117,7 +117,7 @@ def test_messages_of_one_satellite_agree(
 ) -> None:
     """Orbit and clock of a message against those of another one, a quarter of an hour after the middle of their toe."""
     records = version_4.kepler
-    table = Orbits.from_records(records).table
+    orbits = Orbits.from_records(records)
     compared = 0
     for i in np.flatnonzero(records.message == message):
         same = np.flatnonzero((records.satellite == records.satellite[i]) & (records.message == other))
@@ -126,7 +126,7 @@ def test_messages_of_one_satellite_agree(
         j = same[np.argmin(np.abs(records.toe[same] - records.toe[i]))]
         time = records.toe[i] + (records.toe[j] - records.toe[i]) // 2 + np.timedelta64(900, "s")
         age, since_toc = (((time - t[[i, j]]) / np.timedelta64(1, "s")) for t in (records.toe, records.toc))
-        position, _, _ = kepler_state(Orbits.of_table(table[[i, j]]), age)
+        position, _, _ = kepler_state(orbits.take(np.array([i, j])), age)
         assert np.linalg.norm(np.diff(position, axis=1)) < position_m
         assert abs(np.diff(records.af0_s[[i, j]] + records.af1[[i, j]] * since_toc)[0]) * SPEED_OF_LIGHT < clock_m
         compared += 1

@@ -346,7 +346,7 @@ def test_layout_of_a_network_map() -> None:
     # the files' order and directions do not matter
     turned = replace(
         network,
-        tracks=tuple(track.reversed() for track in network.tracks),
+        tracks=tuple(track.reverse() for track in network.tracks),
         links=tuple(
             replace(link, first_end=1 - link.first_end, second_end=1 - link.second_end) for link in network.links
         ),

@@ -13,7 +13,6 @@ from railfix.positioning.carrier.ambiguities import (
     assemble_positions,
     hop_of,
     inverse_of_arcs,
-    moved,
     prepare_start,
     repeats_of,
 )
@@ -78,7 +77,7 @@ def phase_run(
         value, covariance = _solved(lin, index, walk.links)
         among = covariance[index[:, :, None], index[:, None, :]]
         own = own_unknowns(lin, value[index], among, trajectory, repeats=repeats_of(time, limits))
-        after = moved(arc, own, trajectory)
+        after = np.clip(arc + own.step_m, 0.0, trajectory.arc_m[-1])
         step = float(np.abs(after - arc)[started].max(initial=0.0))
         arc, iteration = after, iteration + 1
         if step <= TOLERANCE_M or iteration >= MAX_ITERATIONS:
@@ -131,11 +130,11 @@ def _solved(lin: Linearised, index: Indices, links: Floats) -> tuple[Floats, Flo
 
     Shapes (A + 1, 3) and (A + 1, A + 1): the last one stands for channels without a phase.
     """
-    part, count = reduce(lin), len(links)
+    (own_matrix, own_right), count = reduce(lin), len(links)
     matrix = np.zeros((count + 1, count + 1))
     right = np.zeros((count + 1, 3))
-    np.add.at(matrix, (index[:, :, None], index[:, None, :]), part.matrix)
-    np.add.at(right, index, part.right)
+    np.add.at(matrix, (index[:, :, None], index[:, None, :]), own_matrix)
+    np.add.at(right, index, own_right)
     matrix[:-1, :-1] += links
     matrix[-1], matrix[:, -1], right[-1] = 0.0, 0.0, 0.0
     held = np.append(np.ones(count), 0.0) if own_clock(lin) else np.zeros(count + 1)

@@ -26,7 +26,7 @@ from railfix.core.timescale import to_week
 from railfix.gnss.observations import Observations
 from railfix.io.receiver.framing import find_frames
 from railfix.io.receiver.log import StreamState, decode
-from railfix.io.receiver.rtcm import unfinished_epoch
+from railfix.io.receiver.rtcm import find_unfinished_epoch
 from railfix.live.console import Metrics
 from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.session import Hooks, run_session
@@ -369,7 +369,7 @@ def test_a_date_for_rtcm_in_run_and_convert(tmp_path: Path) -> None:
 def test_an_epoch_without_its_last_message_does_not_hold_up_the_stream() -> None:
     """A caster that sets the flag "more messages follow" on all of them: an epoch ends where the next one begins."""
     data = msm7(np.arange(40) * 1000 + 200_000_000, more=True)
-    assert unfinished_epoch(find_frames(np.frombuffer(data, np.uint8))) is not None
+    assert find_unfinished_epoch(find_frames(np.frombuffer(data, np.uint8))) is not None
     state = ReceiverState(stream=StreamState(time=np.datetime64("2025-08-12", "ns")))
     epochs = 0
     for place in range(0, len(data), 50):

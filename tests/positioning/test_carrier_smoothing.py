@@ -8,11 +8,11 @@ import pytest
 import carrier_cases
 from railfix.core.errors import SettingsError
 from railfix.gnss.observations import Observations
-from railfix.positioning.carrier import SmoothedCodes, SmoothingLimits, SmoothingState, find_slips, smooth_codes
+from railfix.positioning.carrier import SmoothingLimits, SmoothingState, find_slips, smooth_codes
 from railfix.positioning.carrier.smoothing import linear_recursion
 
 
-def smoothed(obs: Observations, slip: np.ndarray | None = None, **limits: object) -> SmoothedCodes:
+def smoothed(obs: Observations, slip: np.ndarray | None = None, **limits: object) -> np.ndarray:
     slips, _ = find_slips(obs)
     begins = slips.slip if slip is None else slip
     return smooth_codes(
@@ -56,26 +56,23 @@ def test_equals_the_recursion_written_out(window_s, epochs):
     phase = find_slips(obs)[0].phase_m
     for m in range(obs.code_m.shape[1]):
         expected = written_out(obs.code_m[:, m], phase[:, m], slip[:, m], 1.0, window_s)
-        assert got.code_m[:, m] == pytest.approx(expected, abs=1e-6)
-    assert np.array_equal(got.code_m[slip], obs.code_m[slip])
-    assert (got.sigma_factor[slip] == 1.0).all()
+        assert got[:, m] == pytest.approx(expected, abs=1e-6)
+    assert np.array_equal(got[slip], obs.code_m[slip])
 
 
 @pytest.mark.requirement("A5")
 @pytest.mark.parametrize("clocks", ["own", "shared"])
-def test_noise_falls_by_the_factor_that_it_tells(clocks):
+def test_noise_falls_by_the_number_of_codes_averaged(clocks):
     obs = carrier_cases.log(300, channels=40)
     clean = carrier_cases.log(300, channels=40, code_sigma_m=0.0)
     truth = find_slips(clean)[0].phase_m
     got = smoothed(obs, window_s=50.0, clocks=clocks)
-    apart = got.code_m - truth
+    apart = got - truth
     constant = (clean.code_m - truth).mean(axis=0)
     error = apart - constant
     error -= error.mean(axis=1, keepdims=True)  # what is common is a clock
-    for k in (1, 10, 49, 200):
-        assert np.std(error[k]) / 0.5 == pytest.approx(got.sigma_factor[k].mean(), rel=0.3)
-    assert got.sigma_factor[9] == pytest.approx(10**-0.5)
-    assert got.sigma_factor[-1] == pytest.approx((1 / (2 * 50 - 1)) ** 0.5, rel=1e-3)
+    for k, factor in ((1, 2**-0.5), (10, 11**-0.5), (49, 50**-0.5), (200, (2 * 50 - 1) ** -0.5)):
+        assert np.std(error[k]) / 0.5 == pytest.approx(factor, rel=0.3)
 
 
 @pytest.mark.requirement("A5")
@@ -85,8 +82,8 @@ def test_codes_that_jump_together_are_smoothed_all_the_same():
     common = np.random.default_rng(8).normal(0.0, 30.0, (200, 1))
     jumping = carrier_cases.changed(obs, code_m=obs.code_m + common)
 
-    def spread(result: SmoothedCodes) -> float:
-        apart = result.code_m - obs.phase_cycles * carrier_cases.WAVELENGTH_M
+    def spread(result: np.ndarray) -> float:
+        apart = result - obs.phase_cycles * carrier_cases.WAVELENGTH_M
         late = (apart - apart.mean(axis=1, keepdims=True))[100:]
         return float(np.std(late - late.mean(axis=0)))
 
@@ -118,11 +115,10 @@ def test_chunks_give_the_same(cut, clocks):
             obs.time[rows], *names, code[rows], slips.phase_m[rows], slips.slip[rows], state, limits=limits
         )
         parts.append(part)
-    joined = np.concatenate([p.code_m for p in parts])
-    assert np.array_equal(np.isnan(joined), np.isnan(whole.code_m))
-    assert np.nanmax(np.abs(joined - whole.code_m)) < 1e-7  # codes of 2.5e7 m step by 4e-9 m
-    assert np.nanmax(np.abs((joined - code) - (whole.code_m - code))) < 2e-8
-    assert np.nanmax(np.abs(np.concatenate([p.sigma_factor for p in parts]) - whole.sigma_factor)) < 1e-12
+    joined = np.concatenate(parts)
+    assert np.array_equal(np.isnan(joined), np.isnan(whole))
+    assert np.nanmax(np.abs(joined - whole)) < 1e-7  # codes of 2.5e7 m step by 4e-9 m
+    assert np.nanmax(np.abs((joined - code) - (whole - code))) < 2e-8
 
 
 @pytest.mark.requirement("A5")
@@ -132,12 +128,10 @@ def test_what_absent_observations_do():
     code[20:23, 0], phase[20:23, 1], code[:5, 2] = np.nan, np.nan, np.nan
     obs = carrier_cases.changed(obs, code_m=code, phase_cycles=phase)
     got = smoothed(obs)
-    assert np.isfinite(got.code_m[20:23, 0]).all()  # the arc runs on in the phase
-    assert np.array_equal(got.code_m[20:24, 1], code[20:24, 1])  # raw where no phase is, and where the arc begins
-    assert (got.sigma_factor[20:24, 1] == 1.0).all()
-    assert np.isnan(got.code_m[:5, 2]).all()
-    assert got.code_m[5, 2] == code[5, 2]  # the first code of an arc that began without one
-    assert np.isnan(got.sigma_factor[:5, 2]).all()
+    assert np.isfinite(got[20:23, 0]).all()  # the arc runs on in the phase
+    assert np.array_equal(got[20:24, 1], code[20:24, 1])  # raw where no phase is, and where the arc begins
+    assert np.isnan(got[:5, 2]).all()
+    assert got[5, 2] == code[5, 2]  # the first code of an arc that began without one
 
 
 @pytest.mark.requirement("A5")
@@ -148,7 +142,7 @@ def test_a_millisecond_in_the_codes_alone_passes_through():
     time[50:] += np.timedelta64(1, "ms")
     got = smoothed(carrier_cases.changed(obs, code_m=code, time=time), clocks="shared")
     calm = smoothed(obs, clocks="shared")
-    assert got.code_m[50:] - calm.code_m[50:] == pytest.approx(np.full((50, 8), 299_792.458), abs=1e-4)
+    assert got[50:] - calm[50:] == pytest.approx(np.full((50, 8), 299_792.458), abs=1e-4)
 
 
 def test_a_day_keeps_its_digits():
@@ -161,7 +155,7 @@ def test_a_day_keeps_its_digits():
     slip = np.zeros(phase.shape, dtype=bool)
     slip[0] = True
     got, _ = smooth_codes(time, np.array(["G01", "G02"]), np.array(["1C", "1C"]), code, phase, slip)
-    assert np.abs(got.code_m - code).max() < 2e-7
+    assert np.abs(got - code).max() < 2e-7
 
 
 @pytest.mark.parametrize("wrong", [{"window_s": 0.0}, {"window_s": float("nan")}, {"clocks": "none"}])

@@ -21,13 +21,13 @@ from railfix.pipeline import carrier_stage
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor, Models
 from railfix.positioning.normal_equations import Ranges
-from railfix.ranges.atmosphere import SeenFrom, modelled_delays
+from railfix.ranges.atmosphere import SeenFrom, model_delays
 from railfix.ranges.corrected import (
     CodeNoise,
     NominalErrors,
+    apply_long_term,
     channel_order,
     code_sigma_m,
-    corrected_satellites,
     first_available,
     sbas_delays,
 )
@@ -161,7 +161,7 @@ def test_long_term_corrections_move_satellites_and_their_clocks() -> None:
     state = np.array([[SatelliteState.OK, SatelliteState.DO_NOT_USE]], dtype=np.int64)
     fixes = replace(fixes_of(2, clock_s=1e-9, position_m=0.0), state=state, position_m=np.full((1, 2, 3), 3.0))
     fixes = replace(fixes, clock_s=np.array([[1e-9, np.nan]]))
-    moved, reason = corrected_satellites(states, fixes)
+    moved, reason = apply_long_term(states, fixes)
     assert moved.position_ecef_m == pytest.approx(np.full((1, 2, 3), 3.0))
     assert moved.clock_m == pytest.approx(np.array([[10.299792458, 20.0]]))
     assert reason.tolist() == [[0, int(Reason.SBAS_DO_NOT_USE)]]
@@ -191,7 +191,7 @@ def test_nominal_sigma_by_hand() -> None:
         1.99404, rel=1e-4
     )
     assert np.isnan(nominal.sigma_m(np.array([0.0]))[0])
-    np.testing.assert_array_equal(nominal.stated_m(np.array([2.0, 5.0, 6.85, np.nan])), [0.0, 0.0, 6.85, 0.0])
+    np.testing.assert_array_equal(nominal.unusual_sigma_m(np.array([2.0, 5.0, 6.85, np.nan])), [0.0, 0.0, 6.85, 0.0])
 
 
 @pytest.mark.parametrize("settings", [{"zenith_sigma_m": 0.0}, {"floor_sigma_m": -0.1}, {"model": "cn0"}])
@@ -205,10 +205,10 @@ def test_impossible_noise_is_rejected(settings: dict[str, Any]) -> None:
 def test_models_that_are_off_give_no_delay() -> None:
     seen, l1 = one_satellite(30.0, 1), np.array([FREQUENCY_L1])
     coefficients = np.array([1e-8, 0.0, 0.0, 0.0, 9e4, 0.0, 0.0, 0.0])
-    off = modelled_delays(TIME, seen, l1, klobuchar=None, troposphere="off")
+    off = model_delays(TIME, seen, l1, klobuchar=None, troposphere="off")
     assert (off.ionosphere_m[0, 0], off.troposphere_m[0, 0], off.sigma_m[0, 0]) == (0.0, 0.0, 0.0)
-    on = modelled_delays(TIME, seen, l1, klobuchar=coefficients, troposphere="saastamoinen")
-    zenith = modelled_delays(TIME, one_satellite(90.0, 1), l1, klobuchar=coefficients, troposphere="saastamoinen")
+    on = model_delays(TIME, seen, l1, klobuchar=coefficients, troposphere="saastamoinen")
+    zenith = model_delays(TIME, one_satellite(90.0, 1), l1, klobuchar=coefficients, troposphere="saastamoinen")
     assert on.troposphere_m[0, 0] == pytest.approx(2.0 * zenith.troposphere_m[0, 0])
     assert on.ionosphere_m[0, 0] > zenith.ionosphere_m[0, 0] > 1.0
 
@@ -218,12 +218,12 @@ def test_coefficients_that_were_not_received_widen_sigma() -> None:
     coefficients = np.array([1e-8, 0.0, 0.0, 0.0, 9e4, 0.0, 0.0, 0.0])
     carriers, models = np.array([FREQUENCY_L1, 1_207.14e6]), {"klobuchar": coefficients, "troposphere": "off"}
     found = [
-        modelled_delays(TIME, one_satellite(angle, 2), carriers, ionosphere_sigma_m=2.0, **models).sigma_m[0]
+        model_delays(TIME, one_satellite(angle, 2), carriers, ionosphere_sigma_m=2.0, **models).sigma_m[0]
         for angle in (90.0, 30.0)
     ]
     np.testing.assert_allclose(found[0], [2.0, 2.0 * 1.70328], rtol=1e-4)
     np.testing.assert_allclose(found[1], 1.75143 * found[0], rtol=1e-4)
-    assert not modelled_delays(TIME, one_satellite(30.0, 2), carriers, **models).sigma_m.any()
+    assert not model_delays(TIME, one_satellite(30.0, 2), carriers, **models).sigma_m.any()
 
 
 def test_channels_of_one_clock_stand_together_and_the_best_signal_first() -> None:
@@ -376,9 +376,7 @@ def test_a_corrected_code_is_without_clock_ionosphere_and_troposphere() -> None:
     columns, used = result.columns, result.reason[:, result.columns] == 0
     seen = SeenFrom.of(result.conventional_ecef_m, result.satellites.position_ecef_m)
     frequency = np.full(len(columns), FREQUENCY_L1)
-    delays = modelled_delays(
-        result.time, seen, frequency, klobuchar=navigation.klobuchar["G"], troposphere="saastamoinen"
-    )
+    delays = model_delays(result.time, seen, frequency, klobuchar=navigation.klobuchar["G"], troposphere="saastamoinen")
     states = result.satellites
     code = observations.code_m[:, columns] + states.clock_m - states.group_delay_m
     expected = code - delays.ionosphere_m - delays.troposphere_m

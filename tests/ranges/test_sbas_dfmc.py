@@ -11,12 +11,13 @@ from railfix.core.errors import InputFileError
 from railfix.core.reasons import Reason
 from railfix.gnss.orbits.states import satellite_states
 from railfix.io.rinex import read_navigation
-from railfix.ranges.corrected import dfmc_satellites
+from railfix.ranges.corrected import apply_dfmc
 from railfix.ranges.sbas import SbasMessages, read_sbas
 from railfix.ranges.sbas.dfmc import DfmcService, DfmcState, residual_ionosphere_m, slot_satellite
 from railfix.ranges.sbas.messages import message_type, with_parity
 from railfix.simulate import sbas_stream as stream
 from railfix.simulate.sbas_stream import write_sbas
+from sbas_account import account
 
 pytestmark = pytest.mark.requirement("C5")
 START = np.datetime64("2026-03-01T06:00:00", "ns")
@@ -110,10 +111,10 @@ def test_beidou_is_corrected_by_the_iode_of_b_cnav1_and_glonass_not_at_all() -> 
     assert found.state.tolist() == [[DfmcState.OK, DfmcState.NO_RECORD]]
     assert found.record.tolist() == [[2, -1]]
     states = satellite_states(time, satellite, np.array(["1P", "1C"]), np.full((1, 2), 2.3e7), records)
-    moved, reason = dfmc_satellites(states, found, satellite, np.array(["1P", "1C"]))
+    moved, reason = apply_dfmc(states, found, satellite, np.array(["1P", "1C"]))
     assert reason.tolist() == [[0, int(Reason.SBAS_NOT_COVERED)]]
     assert moved.clock_m[0, 0] - states.clock_m[0, 0] == pytest.approx(0.5)
-    assert dfmc_satellites(states, found, satellite, np.array(["2I", "1C"]))[1][0, 0] == int(Reason.SBAS_NOT_COVERED)
+    assert apply_dfmc(states, found, satellite, np.array(["2I", "1C"]))[1][0, 0] == int(Reason.SBAS_NOT_COVERED)
 
 
 def test_an_hour_of_services_under_test(recordings: Path) -> None:
@@ -204,7 +205,7 @@ def test_broken_and_foreign_messages_are_counted_and_left_out(tmp_path: Path) ->
     written = log((0.0, broken), (1.0, foreign), (2.0, stream.message(61, 2)), (3.0, stream.message(47, 3)))
     write_sbas(written, tmp_path / "l5.sbs")
     read = read_sbas(tmp_path / "l5.sbs", band="L5")
-    assert read.account() == {
+    assert account(read) == {
         "MSAS 137 type 47 almanac, which no range needs, not decoded": 1, "MSAS 137 type 61 reserved, not decoded": 1,
         "rejected: duplicate": 0, "rejected: line": 0, "rejected: parity": 1, "rejected: preamble": 1,
     }  # fmt: skip

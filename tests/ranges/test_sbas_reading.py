@@ -14,7 +14,8 @@ from railfix.core.errors import InputFileError
 from railfix.core.timescale import from_week, to_week
 from railfix.ranges.sbas import SbasMessages, read_sbas
 from railfix.ranges.sbas.messages import carried_parity, message_parity
-from railfix.ranges.sbas.standard import DECODED, system_name, type_name
+from railfix.ranges.sbas.standard import system_name
+from sbas_account import DECODED, account, type_name
 
 pytestmark = pytest.mark.requirement("C1")
 
@@ -213,7 +214,7 @@ def test_the_same_message_from_two_files_counts_once(tmp_path: Path) -> None:
     log = read_sbas([tmp_path / "a.sbs", tmp_path / "b.ems"])
     assert len(log) == 5
     assert log.rejected["duplicate"] == 5
-    assert sum(log.account().values()) == 10
+    assert sum(account(log).values()) == 10
 
 
 BROKEN = {
@@ -262,11 +263,11 @@ def test_a_file_of_another_kind_is_refused(tmp_path: Path, text: str, words: str
 def test_every_recorded_message_is_accounted_for(recordings: Path, name: str, messages: int, decoded: int) -> None:
     path = recordings / "sbas" / LOGS[name]
     log = read_sbas(path)
-    account = log.account()
-    assert sum(account.values()) == messages == len(path.read_text().splitlines())
-    assert sum(n for what, n in account.items() if "type" in what and "not decoded" not in what) == decoded
+    counts = account(log)
+    assert sum(counts.values()) == messages == len(path.read_text().splitlines())
+    assert sum(n for what, n in counts.items() if "type" in what and "not decoded" not in what) == decoded
     assert np.isin(log.type, DECODED["L1"]).sum() == decoded
-    assert not any("rejected" in what and n for what, n in account.items())
+    assert not any("rejected" in what and n for what, n in counts.items())
     assert (log.time[1:] >= log.time[:-1]).all()
 
 
@@ -281,7 +282,7 @@ def test_names_tell_qzss_from_sbas() -> None:
     assert type_name(43, 137) == "reserved"
     assert type_name(26, 186) == type_name(26, 137) == "ionospheric delays"
     rows = [(0, 186, cases.message(43, 0)), (1, 186, cases.message(1, 1))]
-    assert list(cases.message_log(rows).account()) == [
+    assert list(account(cases.message_log(rows))) == [
         "QZSS L1S 186 type 1 PRN mask",
         "QZSS L1S 186 type 43 L1S disaster report of the Japan Meteorological Agency, not decoded",
     ]

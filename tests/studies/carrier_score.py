@@ -33,7 +33,6 @@ from railfix.positioning.carrier import (
     Phases,
     SlipReason,
     Slips,
-    SmoothedCodes,
     TrackedPhases,
     TrackJumps,
     corrected_phase_m,
@@ -75,7 +74,7 @@ class Carried:
     result: AntennaResult
     slips: Slips
     jumps: TrackJumps
-    smoothed: SmoothedCodes
+    smoothed: np.ndarray
     code_ranges: Ranges
     hatch_arc_m: np.ndarray
     live: PhasePositions
@@ -154,7 +153,7 @@ def carried(case: Case, *, limits: PhaseLimits | None = None) -> Carried:
     smoothed, _ = smooth_codes(obs.time, obs.satellite, obs.signal, obs.code_m, slips.phase_m, slips.slip)
     weight = 1.0 / result.sigma_m[:, columns] ** 2
     code_ranges = ranges_of(result, result.corrected_code_m[:, columns], weight)
-    corrected = result.corrected_code_m[:, columns] + (smoothed.code_m - obs.code_m)[:, columns]
+    corrected = result.corrected_code_m[:, columns] + (smoothed - obs.code_m)[:, columns]
     # The weights stay: what the floor and multipath leave is not averaged as white noise is.
     hatch = ranges_of(result, corrected, weight)
 

@@ -13,6 +13,7 @@ from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth
 from railfix.gnss.orbits.states import satellite_states
 from railfix.io.rinex.navigation import read_navigation
 from railfix.ranges.sbas import IonosphereState, SatelliteState, SbasCorrections, SbasLimits, decode, read_sbas
+from sbas_account import account
 
 GPS = np.array([f"G{i:02d}" for i in range(1, 33)])
 PLACES = {"Tokyo": (35.68, 139.77), "Sapporo": (43.06, 141.35), "Fukuoka": (33.59, 130.40), "Naha": (26.21, 127.68)}
@@ -34,7 +35,7 @@ def of_hour(folder: Path) -> None:
     log = read_sbas(folder / "msas_20250215" / "046r_sbas_prn137.txt")
     navigation = read_navigation(folder / "msas_20250215" / "046r_rnx.nav")
     print(f"read {len(log)} messages in {clock.perf_counter() - started:.2f} s")
-    for what, number in log.account().items():
+    for what, number in account(log).items():
         print(f"  {what}: {number}")
     started = clock.perf_counter()
     engine = SbasCorrections.from_log(log)

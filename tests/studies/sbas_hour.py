@@ -30,7 +30,7 @@ from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
 from railfix.pipeline.level_stage import risk_of
 from railfix.positioning.normal_equations import Ranges, clock_groups
 from railfix.ranges.atmosphere import rtca_troposphere_sigma_m
-from railfix.ranges.corrected import CodeNoise, code_sigma_m, corrected_satellites
+from railfix.ranges.corrected import CodeNoise, apply_long_term, code_sigma_m
 from railfix.ranges.error_model import ErrorModel, read_error_model
 from railfix.ranges.sbas import IonosphereState, SatelliteCorrections, SatelliteState, SbasCorrections, read_sbas
 from railfix.track import Track
@@ -113,7 +113,7 @@ def sky(data: Path, *, step_s: int = 10) -> Sky:
     states = satellite_states(
         time, GPS, np.full(len(GPS), "1C"), np.full(fixes.state.shape, 2.3e7), navigation, record=fixes.record
     )
-    states, _ = corrected_satellites(states, fixes)
+    states, _ = apply_long_term(states, fixes)
     good = (fixes.state == SatelliteState.OK) & ~states.unhealthy & ~states.too_old & ~states.no_record
     return Sky(engine, time, GPS, fixes, states.position_ecef_m, good)
 

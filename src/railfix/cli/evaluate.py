@@ -282,7 +282,7 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
     )
     figures = [[f"{when}\ncount", "\nbias", "\nsigma", "\nbound"] for when in ("before", "after")]
     head = ["before and\nafter screens", *figures[0], *figures[1]]
-    show_table(console, listed(head, [[row.name, *row.cells] for row in summary(model)]))
+    show_table(console, listed(head, [list(row) for row in summary(model)]))
     if (rate := model.faults) is not None:
         console.print(
             f"local faults: {rate.faulty} of {rate.ranges:,} used ranges beyond {rate.beyond_sigma:g} sigma of the "

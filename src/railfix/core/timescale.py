@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Integers
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers
 from railfix.core.constants import BDT_MINUS_GPST_S
 
 GPS_EPOCH: Final = np.datetime64("1980-01-06T00:00:00", "ns")  #: Origin of GPS time (IS-GPS-200, 3.3.4).
@@ -98,6 +98,17 @@ def gpst_to_utc(time: ArrayLike) -> Datetimes:
     at = np.asarray(time, dtype="datetime64[ns]")
     leap = np.searchsorted(utc_to_gpst(_LEAP_UTC), at, side="right") - 1
     return np.asarray(at - leap.astype("timedelta64[s]"), dtype="datetime64[ns]")
+
+
+def nearest_rows(time: ArrayLike, wanted: ArrayLike, *, within_ns: int) -> Indices:
+    """Return the row of rising times nearest to each wanted one, the earlier of two; -1 where none is near enough."""
+    have, want = (np.asarray(each, dtype="datetime64[ns]").astype(np.int64) for each in (time, wanted))
+    if not len(have):
+        return np.full(len(want), -1, dtype=np.intp)
+    after = np.minimum(have.searchsorted(want), len(have) - 1)
+    before = np.maximum(after - 1, 0)
+    row = np.where(np.abs(have[before] - want) <= np.abs(have[after] - want), before, after)
+    return np.where(np.abs(have[row] - want) <= within_ns, row, -1)
 
 
 def nearest_week(seconds_of_week: ArrayLike, near: ArrayLike) -> Datetimes:

@@ -117,26 +117,13 @@ class GlonassRecords(_NavigationRecords):
 
 @dataclass(frozen=True, kw_only=True)
 class PreciseEphemeris(NotebookTable):
-    """Positions and clocks from SP3, E epochs by N satellites.
+    """Positions and clocks from SP3, E epochs by N satellites."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (E,)
-        GPS time (files in another time system are converted).
-    satellite : ndarray of str, shape (N,)
-    position_ecef_m : ndarray, shape (E, N, 3) [m]
-        NaN where the file has none (0.000000).
-    clock_s : ndarray, shape (E, N) [s]
-        NaN where the file has none (999999.999999).
-    source : str
-        The files it was read from.
-    """
-
-    time: Datetimes
-    satellite: Strings
-    position_ecef_m: Floats
-    clock_s: Floats
-    source: str = ""
+    time: Datetimes  #: GPS time (files in another time system are converted), shape (E,).
+    satellite: Strings  #: Shape (N,).
+    position_ecef_m: Floats  #: NaN where the file has none (0.000000), shape (E, N, 3).
+    clock_s: Floats  #: NaN where the file has none (999999.999999), shape (E, N).
+    source: str = ""  #: The files it was read from.
 
     def __post_init__(self) -> None:
         expected = (len(self.time), len(self.satellite))
@@ -154,35 +141,19 @@ class PreciseEphemeris(NotebookTable):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Navigation(NotebookTable):
-    """Content of navigation files. Compared and hashed by identity, so that derived tables can be cached.
-
-    Attributes
-    ----------
-    kepler : KeplerRecords
-    glonass : GlonassRecords
-    klobuchar : mapping of str to ndarray, shape (8,)
-        Klobuchar alpha 0-3 and beta 0-3 by constellation letter ("G", "C", "J"), as received.
-        All-zero coefficients mean "not received": they are left out, and `notes` records it.
-    leap_seconds : int or None
-        GPST - UTC [s] from the header.
-    skipped : mapping of str to int
-        Number of records skipped, by kind ("S", "I", "G CNAV", "duplicate").
-    notes : tuple of str
-        Remarks for the user (no ionosphere, week resolved from the clock time).
-    precise : PreciseEphemeris or None
-        When given, used in place of the broadcast orbits and clocks.
-    sources : tuple of str
-        The files it was read from.
-    """
+    """Content of navigation files. Compared and hashed by identity, so that derived tables can be cached."""
 
     kepler: KeplerRecords
     glonass: GlonassRecords
+    #: Klobuchar alpha 0-3 and beta 0-3 by constellation letter ("G", "C", "J"), as received, shape (8,). All-zero
+    #: coefficients mean "not received": they are left out, and `notes` records it.
     klobuchar: Mapping[str, Floats] = field(default_factory=dict)
-    leap_seconds: int | None = None
+    leap_seconds: int | None = None  #: GPST - UTC [s] from the header.
+    #: Number of records skipped, by kind ("S", "I", "G CNAV", "duplicate").
     skipped: Mapping[str, int] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    precise: PreciseEphemeris | None = None
-    sources: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  #: Remarks for the user (no ionosphere, week resolved from the clock time).
+    precise: PreciseEphemeris | None = None  #: When given, used in place of the broadcast orbits and clocks.
+    sources: tuple[str, ...] = ()  #: The files it was read from.
 
     def __repr__(self) -> str:
         satellite = np.concatenate([self.kepler.satellite, self.glonass.satellite])

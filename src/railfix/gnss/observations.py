@@ -38,15 +38,8 @@ def carrier_frequency_hz(
     ndarray, shape (M,) [Hz]
         NaN where the band is not one of the constellation's, or a GLONASS channel is unknown.
     """
-    channels = glonass_channel or {}
-    result = np.full(len(satellite), np.nan)
-    for i, (name, code) in enumerate(zip(satellite.tolist(), signal.tolist(), strict=True)):
-        letter, band = name[0], code[0]
-        frequency = CARRIER_FREQUENCY.get(letter, {}).get(band, np.nan)
-        if letter == "R" and band in GLONASS_STEP:
-            frequency += channels.get(name, np.nan) * GLONASS_STEP[band]
-        result[i] = frequency
-    return result
+    channels = np.array([(glonass_channel or {}).get(name, np.nan) for name in satellite.tolist()], dtype=np.float64)
+    return named_frequency_hz(np.char.add(satellite.astype("<U1"), signal), channels)
 
 
 def named_frequency_hz(name: Strings, glonass_channel: Floats) -> Floats:
@@ -90,59 +83,33 @@ class ObservationHeader:
 
 @dataclass(frozen=True, kw_only=True)
 class Observations(NotebookTable):
-    """Raw observations of one receiver, T epochs by M channels.
+    """Raw observations of one receiver, T epochs by M channels."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-        Receiver time tags in GPS time, not rounded, strictly rising.
-    satellite : ndarray of str, shape (M,)
-        Satellite of each channel, "G01", "J02".
-    signal : ndarray of str, shape (M,)
-        RINEX 3 observation code of each channel without its type letter, "1C", "2I". RINEX 2
-        codes are mapped: C1 -> "1C", P1 -> "1P" (GLONASS) or "1W" (GPS), P2 -> "2W"/"2P", and so on.
-    code_m : ndarray, shape (T, M) [m]
-        Pseudorange.
-    phase_cycles : ndarray, shape (T, M) [cycle]
-    doppler_hz : ndarray, shape (T, M) [Hz]
-        Positive when the satellite approaches.
-    cn0_dbhz : ndarray, shape (T, M) [dB-Hz]
-        Carrier-to-noise density; where only the RINEX 1-9 digit exists, NaN.
-    loss_of_lock : ndarray of uint8, shape (T, M)
-        RINEX loss-of-lock indicator of the phase, 0 where blank or absent.
-    break_before : ndarray of bool, shape (T,)
-        True where epochs must not be differenced with the one before: power failure (epoch flag
-        1), new site or moving antenna (2, 3), start of another file after a gap.
-    receiver_alarm : ndarray of uint8, shape (T,)
-        The receiver's own indicators: 1 jamming, 2 spoofing, 3 both; 0 where there is none, or the log has no such
-        message.
-    front_end_gain : ndarray, shape (T,)
-        Of the front end's gain control, in the receiver's unit; NaN where the log does not have it.
-    header : ObservationHeader
-    problems : tuple of str
-        Messages about faults that were skipped (file, line, fault); at most `MAX_PROBLEMS`, then one
-        with the number of the others. A slice of epochs has none.
-    problem_count : int
-        Number of faults.
-    skipped : mapping of str to int
-        Number of items skipped, by kind: broken epochs and satellite lines, duplicate epochs,
-        external events, satellites of unknown or unselected constellations.
-    """
-
-    time: Datetimes
-    satellite: Strings
+    time: Datetimes  #: Receiver time tags in GPS time, not rounded, strictly rising; shape (T,).
+    satellite: Strings  #: Satellite of each channel, "G01", "J02"; shape (M,).
+    #: RINEX 3 observation code of each channel without its type letter, "1C", "2I"; shape (M,). RINEX 2 codes are
+    #: mapped: C1 -> "1C", P1 -> "1P" (GLONASS) or "1W" (GPS), P2 -> "2W"/"2P", and so on.
     signal: Strings
-    code_m: Floats
-    phase_cycles: Floats
-    doppler_hz: Floats
-    cn0_dbhz: Floats
-    loss_of_lock: Bytes
+    code_m: Floats  #: Pseudorange, shape (T, M).
+    phase_cycles: Floats  #: Shape (T, M).
+    doppler_hz: Floats  #: Positive when the satellite approaches, shape (T, M).
+    cn0_dbhz: Floats  #: Carrier-to-noise density; NaN where only the RINEX 1-9 digit exists; shape (T, M).
+    loss_of_lock: Bytes  #: RINEX loss-of-lock indicator of the phase, 0 where blank or absent; shape (T, M).
+    #: True where epochs must not be differenced with the one before: power failure (epoch flag 1), new site or moving
+    #: antenna (2, 3), start of another file after a gap; shape (T,).
     break_before: Masks
+    #: The receiver's own indicators: 1 jamming, 2 spoofing, 3 both; 0 where there is none, or the log has no such
+    #: message; shape (T,).
     receiver_alarm: Bytes = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
+    #: Of the front end's gain control, in the receiver's unit; NaN where the log does not have it; shape (T,).
     front_end_gain: Floats = field(default_factory=lambda: np.zeros(0))
     header: ObservationHeader = field(default_factory=ObservationHeader)
+    #: Messages about faults that were skipped (file, line, fault); at most `MAX_PROBLEMS`, then one with the number of
+    #: the others. A slice of epochs has none.
     problems: tuple[str, ...] = ()
-    problem_count: int = 0
+    problem_count: int = 0  #: Number of faults.
+    #: Number of items skipped, by kind: broken epochs and satellite lines, duplicate epochs, external events,
+    #: satellites of unknown or unselected constellations.
     skipped: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

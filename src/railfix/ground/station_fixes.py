@@ -25,7 +25,7 @@ from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
 from railfix.pipeline.received import Received as Known
 from railfix.pipeline.received import known_from_start, receive
 from railfix.positioning.normal_equations import Ranges, clock_groups, single_point
-from railfix.ranges.atmosphere import SeenFrom, modelled_delays
+from railfix.ranges.atmosphere import SeenFrom, model_delays
 from railfix.ranges.corrected import PLAUSIBLE_CODE_M, code_sigma_m
 
 #: Median C/N0 over the satellites that is this far below that of the log counts as fallen [dB-Hz].
@@ -94,7 +94,7 @@ def station_fixes(
     for k, point in enumerate(points_ecef_m):
         states = satellite_states(tags[k], satellite, signal, code[k], navigation, max_age_s=config.max_ephemeris_age_s)
         seen = SeenFrom.of(np.broadcast_to(point, (len(time), 3)), states.position_ecef_m)
-        delays = modelled_delays(tags[k], seen, frequency, klobuchar=klobuchar, troposphere=config.troposphere)
+        delays = model_delays(tags[k], seen, frequency, klobuchar=klobuchar, troposphere=config.troposphere)
         clean = code[k] + states.clock_m - states.group_delay_m - delays.ionosphere_m - delays.troposphere_m
         corrected[k], sigma[k] = clean, code_sigma_m(cn0[k], seen.elevation_deg, noise=config.noise)
         plausible = (code[k] > PLAUSIBLE_CODE_M[0]) & (code[k] < PLAUSIBLE_CODE_M[1])

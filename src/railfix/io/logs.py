@@ -17,7 +17,7 @@ from railfix.core.timescale import gps_time
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io import rinex
-from railfix.io.mate import mate_table
+from railfix.io.mate import mate_table, read_mate_observations
 from railfix.io.receiver.framing import head_of, is_receiver_log
 from railfix.io.rinex.observations import (
     DEFAULT_EPOCHS,
@@ -67,7 +67,8 @@ def read_observations(
     if reader not in ("railfix", "georinex"):
         raise ValueError(f"reader is {reader!r}, 'railfix' or 'georinex' was expected")
     if reader == "georinex":
-        return _by_georinex(listed(path), systems, _instant(start), _instant(end))
+        letters = None if systems is None else list(systems)
+        return _by_georinex(listed(path), letters, _instant(start), _instant(end))
     pieces = scan_observations(
         path, broken_lines=broken_lines, systems=systems, start=start, end=end, date=date, epochs=1 << 62
     )
@@ -75,7 +76,7 @@ def read_observations(
 
 
 def _by_georinex(
-    paths: list[str], systems: Iterable[str] | None, start: np.datetime64 | None, end: np.datetime64 | None
+    paths: list[str], systems: list[str] | None, start: np.datetime64 | None, end: np.datetime64 | None
 ) -> Observations:
     """Read RINEX files by georinex, in order of time."""
     try:
@@ -84,7 +85,6 @@ def _by_georinex(
         raise ModuleNotFoundError("georinex is not installed; pip install 'railfix[notebook]'") from error
     from railfix.io.georinex_layout import observations_from_xarray
 
-    letters = None if systems is None else list(systems)
     parts: list[Observations] = []
     for name in paths:
         if is_receiver_log(head_of(name)):
@@ -95,10 +95,7 @@ def _by_georinex(
                 part = observations_from_xarray(georinex.load(Path(name), useindicators=True))
             except (ValueError, LookupError, OSError) as error:
                 raise InputFileError(name, f"georinex cannot read it: {error or type(error).__name__}") from error
-        part = part if letters is None else _of_systems(part, letters)
-        first = 0 if start is None else int(np.searchsorted(part.time, start))
-        stop = len(part) if end is None else int(np.searchsorted(part.time, end))
-        parts.append(part[first:stop])
+        parts.append(_of_systems(part, systems)[start:end])
     parts = sorted((part for part in parts if len(part)), key=lambda part: part.time[0])
     if not parts:
         raise MismatchError(f"{', '.join(paths)}: no epoch lies in the time span asked for")
@@ -121,13 +118,13 @@ def scan_observations(
     progress: Callable[[float], None] | None = None,
 ) -> Iterator[Observations]:
     """Observations of one receiver in pieces of `epochs` epochs; see `read_observations`."""
-    paths = listed(path)
+    paths, letters = listed(path), None if systems is None else list(systems)
     if any(mate_table(p) == "S_GNSS_SAT" for p in paths):
-        return _mate_pieces(paths, systems, (_instant(start), _instant(end)), epochs)
+        return _mate_pieces(paths, letters, (_instant(start), _instant(end)), epochs)
     receiver = [is_receiver_log(head_of(p)) for p in paths]
     if not any(receiver):
         return rinex.scan_observations(
-            paths, epochs=epochs, broken_lines=broken_lines, systems=systems, start=start, end=end, progress=progress
+            paths, epochs=epochs, broken_lines=broken_lines, systems=letters, start=start, end=end, progress=progress
         )
     if not all(receiver):
         raise MismatchError(
@@ -135,23 +132,20 @@ def scan_observations(
             "give files of one kind for one antenna"
         )
     limits = (_instant(start), _instant(end), _instant(date))
-    return in_pieces(_receiver_runs(paths, systems, limits, progress), epochs)
+    return in_pieces(_receiver_runs(paths, letters, limits, progress), epochs)
 
 
 def _mate_pieces(
     paths: list[str],
-    systems: Iterable[str] | None,
+    systems: list[str] | None,
     limits: tuple[np.datetime64 | None, np.datetime64 | None],
     epochs: int,
 ) -> Iterator[Observations]:
-    """Tables S_GNSS_SAT of EGNSS MATE in pieces."""
-    from railfix.io.mate import scan_mate
-
+    """Tables S_GNSS_SAT of EGNSS MATE in order of time, in pieces."""
     if others := [path for path in paths if mate_table(path) != "S_GNSS_SAT"]:
         raise MismatchError(f"{others[0]} is no table S_GNSS_SAT as the others; give files of one kind for one antenna")
-    letters = None if systems is None else list(systems)
-    parts = (part if letters is None else _of_systems(part, letters) for part in scan_mate(paths, *limits))
-    pieces = list(in_pieces(parts, epochs))
+    tables = sorted((read_mate_observations(path) for path in paths), key=lambda part: part.time[0])
+    pieces = list(in_pieces((_of_systems(part[slice(*limits)], systems) for part in tables), epochs))
     if not any(len(piece) for piece in pieces):
         raise MismatchError(f"{', '.join(paths)}: no epoch lies in the time span asked for")
     return iter(pieces)
@@ -163,7 +157,7 @@ def _instant(time: Time) -> np.datetime64 | None:
 
 def _receiver_runs(
     paths: list[str],
-    systems: Iterable[str] | None,
+    systems: list[str] | None,
     limits: tuple[np.datetime64 | None, np.datetime64 | None, np.datetime64 | None],
     progress: Callable[[float], None] | None,
 ) -> Iterator[Observations]:
@@ -171,7 +165,6 @@ def _receiver_runs(
     from railfix.io.receiver.log import scan_receiver_log
 
     start, end, date = limits
-    letters = None if systems is None else list(systems)
     found, last = 0, None
     for k, path in enumerate(_in_order(paths, date)):
 
@@ -181,12 +174,10 @@ def _receiver_runs(
 
         joint = k > 0
         for run in scan_receiver_log(path, date=date, progress=share):
-            chosen = run if letters is None else _of_systems(run, letters)
-            first = 0 if start is None else int(np.searchsorted(chosen.time, start))
-            stop = len(chosen) if end is None else int(np.searchsorted(chosen.time, end))
+            part = _of_systems(run, systems)[start:end]
             if last is not None:
-                first = max(first, int(np.searchsorted(chosen.time, last.time[-1], side="right")))
-            part = replace(chosen[first:stop], skipped=run.skipped)
+                part = part[int(np.searchsorted(part.time, last.time[-1], side="right")) :]
+            part = replace(part, skipped=run.skipped)
             if joint and len(part):
                 part, joint = with_break_at_gap(last, part), False
             found += len(part)
@@ -205,8 +196,9 @@ def _in_order(paths: list[str], date: np.datetime64 | None) -> list[str]:
     return [paths[k] for k in np.argsort(np.array(firsts), kind="stable")]
 
 
-def _of_systems(run: Observations, letters: list[str]) -> Observations:
-    return without_empty_channels(of_channels(run, np.isin(run.system, letters)))
+def _of_systems(run: Observations, letters: list[str] | None) -> Observations:
+    """Observations of some constellations, of all for None."""
+    return run if letters is None else without_empty_channels(of_channels(run, np.isin(run.system, letters)))
 
 
 def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: Time = None) -> Navigation:

@@ -6,7 +6,7 @@ Columns are those of https://github.com/EGNSS-MATE/egnss-mate-schematics (MIT), 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
@@ -131,12 +131,14 @@ _VALUES: Final = {
 }  # fmt: skip
 
 
-def signal_code(satellite: str, signal: str) -> str:
-    """Return the RINEX code of a signal type such as ``GPS_L1CA``, ``E5a`` or ``1C``; blank where it is unknown."""
+def signal_code(satellite: str | None, signal: str) -> str:
+    """Return the RINEX code of a signal type such as ``GPS_L1CA``, ``E5a`` or ``1C``; blank where either is unknown."""
+    if satellite is None or len(satellite) != 3 or satellite[0] not in _CODES or not satellite[1:].isdigit():
+        return ""
     name = signal.replace("-", "_").rsplit("_", 1)[-1]
     if len(name) == 2 and name[0].isdigit() and name[1].isalpha():
         return name.upper()
-    return _CODES.get(satellite[:1], {}).get(name.upper(), "")
+    return _CODES[satellite[0]].get(name.upper(), "")
 
 
 def read_mate_observations(path: str) -> Observations:
@@ -151,11 +153,7 @@ def read_mate_observations(path: str) -> Observations:
     )
     skipped["rows with an error or not tracked"] = len(table) - int(usable.sum())
     pairs = table.select("SAT_ID", "SIGNAL_TYPE").unique()
-    codes = pairs.with_columns(
-        code=pl.Series(
-            [signal_code(*pair) if _is_satellite(pair[0]) else "" for pair in pairs.iter_rows()], dtype=pl.String
-        )
-    )
+    codes = pairs.with_columns(code=pl.Series([signal_code(*pair) for pair in pairs.iter_rows()], dtype=pl.String))
     table = table.filter(usable).join(codes, on=["SAT_ID", "SIGNAL_TYPE"], how="left", nulls_equal=True)
     known = table["code"].fill_null("") != ""
     for name, count in table.filter(~known).group_by("SIGNAL_TYPE").len().iter_rows():
@@ -165,10 +163,6 @@ def read_mate_observations(path: str) -> Observations:
         raise InputFileError(path, "has no row of a known satellite and signal, such as G05 and L1CA")
     time = from_week(table["GPS_WEEK"].to_numpy(), table["GPS_TOW"].cast(pl.Float64).to_numpy())
     return _as_arrays(table, np.round(time.astype(np.int64), -3), problems, skipped)
-
-
-def _is_satellite(name: str | None) -> bool:
-    return name is not None and len(name) == 3 and name[0] in _CODES and name[1:].isdigit()
 
 
 def _one_antenna(path: str, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[str, ...]]:
@@ -211,12 +205,3 @@ def _as_arrays(
         problem_count=len(problems),
         skipped={name: count for name, count in skipped.items() if count},
     )
-
-
-def scan_mate(paths: list[str], start: np.datetime64 | None, end: np.datetime64 | None) -> Iterator[Observations]:
-    """Yield the observations of tables in order of time."""
-    parts = sorted((read_mate_observations(path) for path in paths), key=lambda part: part.time[0])
-    for part in parts:
-        first = 0 if start is None else int(np.searchsorted(part.time, start))
-        stop = len(part) if end is None else int(np.searchsorted(part.time, end))
-        yield part[first:stop]

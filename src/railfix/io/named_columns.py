@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import polars as pl
@@ -39,6 +39,10 @@ class NamedColumns:
         """Return an error that names the line of a row."""
         return InputFileError(self.path, message, line=int(self.line[row]))
 
+    def header_error(self, message: str) -> InputFileError:
+        """Return an error that names the line of the header."""
+        return InputFileError(self.path, message, line=self.header_line)
+
     def numbers(self, name: str, *, blank: float | None = None) -> Floats:
         """Parse one column as finite numbers; `blank` is the value of empty cells, and allows ``nan``."""
         given = self.cells[name].str.len_bytes().to_numpy() > 0
@@ -48,7 +52,7 @@ class NamedColumns:
         try:
             values = np.array(cells, dtype=np.float64)
         except ValueError:
-            row = next(i for i, cell in enumerate(cells) if not _is_number(cell))
+            row = next(i for i, cell in enumerate(cells) if fails(float, cell))
             what = f"'{cells[row]}' is not a number" if cells[row] else "the cell is empty"
             raise self.error(row, f"column {name}: {what}; a number was expected") from None
         bad = given & np.isinf(values) if blank is None or not np.isinf(blank) else np.zeros_like(given)
@@ -59,17 +63,13 @@ class NamedColumns:
         return values
 
 
-def _is_number(cell: str) -> bool:
+def fails(parse: Callable[[Any], object], text: object) -> bool:
+    """Whether parsing a text raises ValueError."""
     try:
-        float(cell)
+        parse(text)
     except ValueError:
-        return False
-    return True
-
-
-def _split_comment(line: str) -> tuple[str, str] | None:
-    key, colon, value = line.lstrip("#").partition(":")
-    return (key.strip().lower(), value.strip()) if colon else None
+        return True
+    return False
 
 
 def read_named_columns(path: FilePath) -> NamedColumns:
@@ -89,8 +89,9 @@ def parse_named_columns(lines: Iterable[str], path: FilePath) -> NamedColumns:
         if not line.strip():
             continue
         if line.startswith("#"):
-            if not header and (pair := _split_comment(line)):
-                key, value = pair
+            key, colon, value = line.lstrip("#").partition(":")
+            if colon and not header:
+                key, value = key.strip().lower(), value.strip()
                 metadata[key] = f"{metadata[key]}; {value}" if key in metadata else value
             continue
         try:
@@ -134,7 +135,7 @@ def _check_header(path: FilePath, header: list[str], line: int) -> None:
         raise InputFileError(
             path, f"has {shown} between its columns; expected commas, and points in numbers", line=line
         )
-    if all(_is_number(cell) for cell in header):
+    if not any(fails(float, cell) for cell in header):
         raise InputFileError(path, "numbers where a header line with the names of the columns was expected", line=line)
     repeated = sorted({name for name in header if header.count(name) > 1})
     if repeated:

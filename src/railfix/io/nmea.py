@@ -37,14 +37,8 @@ def read_gpx_positions(path: str | PathLike[str]) -> PositionLog:
     for node in points:
         texts = {child.tag.rsplit("}", 1)[-1]: (child.text or "").strip() for child in node}
         try:
-            rows.append(
-                (
-                    float(node.attrib["lat"]),
-                    float(node.attrib["lon"]),
-                    float(texts.get("ele") or "nan"),
-                    float(texts.get("geoidheight") or "nan"),
-                )
-            )
+            heights = [texts.get(name) or "nan" for name in ("ele", "geoidheight")]
+            rows.append([float(text) for text in (node.attrib["lat"], node.attrib["lon"], *heights)])
         except (KeyError, ValueError):
             raise InputFileError(path, f"track point {len(rows) + 1} has no latitude and longitude") from None
     stamps = [next((c.text or "" for c in n if c.tag.rsplit("}", 1)[-1] == "time"), "").strip() for n in points]

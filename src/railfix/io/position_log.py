@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Final
 
@@ -16,7 +16,7 @@ from railfix.core.files import ending, read_text
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import misspelt
 from railfix.core.timescale import from_week, timedelta, utc_to_gpst
-from railfix.io.named_columns import NamedColumns, read_named_columns
+from railfix.io.named_columns import NamedColumns, fails, read_named_columns
 
 _SIGMAS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Standard deviations of a CSV log.
 #: Columns of a CSV log; the time is GPS time, UTC, Unix time, or GPS week and seconds; geodetic or ECEF.
@@ -91,13 +91,10 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
     if not geodetic and not cartesian:
         for name in (*_GEODETIC, *_CARTESIAN):
             if name in absent:
-                message = f"column {absent[name]!r} is unknown; is {name!r} meant?"
-                raise InputFileError(path, message, line=table.header_line)
-        raise InputFileError(
-            path,
+                raise table.header_error(f"column {absent[name]!r} is unknown; is {name!r} meant?")
+        raise table.header_error(
             "no columns latitude_deg, longitude_deg, height_m (ellipsoidal) nor x_m, y_m, z_m (ECEF); the columns are "
-            f"{', '.join(table.cells)}",
-            line=table.header_line,
+            f"{', '.join(table.cells)}"
         )
     if not len(table):
         raise InputFileError(path, "there is no position below the header")
@@ -146,11 +143,9 @@ def rename_columns(table: NamedColumns, columns: Mapping[str, str], *, known: Co
     for ours, theirs in columns.items():
         if theirs not in table.cells:
             message = f"there is no column {theirs!r} (given for {ours}); the columns are {', '.join(table.cells)}"
-            raise InputFileError(table.path, message, line=table.header_line)
+            raise table.header_error(message)
         cells[ours] = table.cells[theirs]
-    return NamedColumns(
-        path=table.path, metadata=table.metadata, header_line=table.header_line, line=table.line, cells=cells
-    )
+    return replace(table, cells=cells)
 
 
 def positions_times(table: NamedColumns) -> Datetimes:
@@ -172,10 +167,8 @@ def positions_times(table: NamedColumns) -> Datetimes:
         wrong = known & ((week != np.floor(week)) | (week < 0) | (seconds < 0) | (seconds > _WEEK_S))
         if wrong.any():
             row = int(np.argmax(wrong))
-            message = (
-                f"week {week[row]:g} and tow_s {seconds[row]:g} are no GPS week and seconds of it (0 to {_WEEK_S})"
-            )
-            raise table.error(row, message)
+            what = f"week {week[row]:g} and tow_s {seconds[row]:g}"
+            raise table.error(row, f"{what} are no GPS week and seconds of it (0 to {_WEEK_S})")
         time = np.full(len(table), np.datetime64("NaT", "ns"))
         time[known] = from_week(week[known].astype(np.int64), seconds[known])
         return time
@@ -197,7 +190,7 @@ def _column_of_times(table: NamedColumns, name: str) -> Datetimes:
     try:
         return _times([cell or "NaT" for cell in cells])
     except ValueError:
-        row = next(i for i, cell in enumerate(cells) if not _is_time(cell))
+        row = next(i for i, cell in enumerate(cells) if fails(_times, [cell or "NaT"]))
         raise table.error(row, f"{name} '{cells[row]}' is no ISO 8601 time such as 2021-09-22T06:30:00.2") from None
 
 
@@ -207,14 +200,6 @@ def _from_utc(time: Datetimes) -> Datetimes:
     converted = time.astype("datetime64[ns]")
     converted[known] = utc_to_gpst(converted[known])
     return converted
-
-
-def _is_time(cell: str) -> bool:
-    try:
-        _times([cell or "NaT"])
-    except ValueError:
-        return False
-    return True
 
 
 def _times(texts: list[str]) -> Datetimes:
@@ -299,12 +284,8 @@ def _rtklib_times(path: str | PathLike[str], number: Integers, cells: list[tuple
     except ValueError:
         form = "2021/09/22 06:30:00.000" if calendar else "2176 282600.000"
         for line, (first, second) in zip(number, cells, strict=True):
-            try:
-                if calendar:
-                    _times([f"{first.replace('/', '-')}T{second}"])
-                else:
-                    int(first), float(second)
-            except ValueError:
+            by_calendar = calendar and fails(_times, [f"{first.replace('/', '-')}T{second}"])
+            if by_calendar or (not calendar and (fails(int, first) or fails(float, second))):
                 message = f"'{first} {second}' is not a time such as {form}"
                 raise InputFileError(path, message, line=int(line)) from None
         raise
@@ -318,11 +299,8 @@ def _rtklib_numbers(path: str | PathLike[str], number: Integers, fields: list[li
         return np.array(fields, dtype=np.float64)
     except ValueError:
         for line, row in zip(number, fields, strict=True):
-            for cell in row:
-                try:
-                    float(cell)
-                except ValueError:
-                    raise InputFileError(path, f"'{cell}' is not a number", line=int(line)) from None
+            if wrong := next((cell for cell in row if fails(float, cell)), None):
+                raise InputFileError(path, f"'{wrong}' is not a number", line=int(line)) from None
         raise
 
 

@@ -281,11 +281,8 @@ def read_acceleration(path: str | PathLike[str]) -> Acceleration:
     }
     present = [name for name in kinds if name in table]
     if len(present) != 1:
-        raise InputFileError(
-            path,
-            f"one column of {', '.join(kinds)} was expected; the columns are {', '.join(table.cells)}",
-            line=table.header_line,
-        )
+        there = ", ".join(table.cells)
+        raise table.header_error(f"one column of {', '.join(kinds)} was expected; the columns are {there}")
     return Acceleration(
         path=str(path), time=_rising_times(table), acceleration_mps2=table.numbers(present[0]), kind=kinds[present[0]]
     )
@@ -302,11 +299,7 @@ def _sensor_table(path: str | PathLike[str]) -> NamedColumns:
 
 def _rising_times(table: NamedColumns) -> Datetimes:
     if "time_gpst" not in table:
-        raise InputFileError(
-            table.path,
-            f"there is no column time_gpst; the columns are {', '.join(table.cells)}",
-            line=table.header_line,
-        )
+        raise table.header_error(f"there is no column time_gpst; the columns are {', '.join(table.cells)}")
     time = positions_times(table)
     if len(time) < 2:
         raise InputFileError(table.path, "fewer than two rows")

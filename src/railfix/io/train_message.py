@@ -25,16 +25,11 @@ Signed = Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)]
 class MessageStatus(IntEnum):
     """What the position of a message is worth."""
 
-    #: Position with every check passed.
-    POSITION = 0
-    #: Position carried by sensors alone.
-    COASTING = 1
-    #: Position with a failed check, or several tracks or places possible.
-    DOUBTFUL = 2
-    #: Observations, but no position.
-    NO_POSITION = 3
-    #: Nothing received in this period.
-    NO_INPUT = 4
+    POSITION = 0  #: Position with every check passed.
+    COASTING = 1  #: Position carried by sensors alone.
+    DOUBTFUL = 2  #: Position with a failed check, or several tracks or places possible.
+    NO_POSITION = 3  #: Observations, but no position.
+    NO_INPUT = 4  #: Nothing received in this period.
     #: Satellite positioning is suspended by order of the ground side; railfix itself sends no such message.
     SUSPENDED = 5
 

@@ -113,8 +113,8 @@ def _reduce(diagonal: Floats, upper: Floats, right: Floats) -> tuple[Floats, Flo
 _SERIES_BELOW: Final = 1.0
 _ORDERS: Final = np.arange(32)
 _FACTORIALS: Final = np.cumprod(np.maximum(_ORDERS, 1).astype(np.float64))
+#: Coefficients of exp(-x); of exp(-2 x); of x exp(-x).
 _ONCE: Final = (-1.0) ** _ORDERS / _FACTORIALS
-"""Coefficients of exp(-x); of exp(-2 x); of x exp(-x)."""
 _TWICE: Final = (-2.0) ** _ORDERS / _FACTORIALS
 _X_ONCE: Final = -_ORDERS * _ONCE
 #: Coefficients of the closed forms below from their first power of x on; all lower ones are zero.

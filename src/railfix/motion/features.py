@@ -76,26 +76,21 @@ def line_series(trajectory: Trajectory) -> LineSeries:
 def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None = None) -> list[Feature]:
     """Return the features of a line in order: where gradient or curvature change most within `BASE_M`.
 
-    Parameters
-    ----------
-    series : LineSeries
-    least : mapping of ndarray, shape (N,), optional
-        Of a measured line, by quantity: a change must also be larger than that of either side together (root sum of
-        squares).
+    `least`, by quantity, shape (N,), of a measured line: a change must also be larger than that of either side together
+    (root sum of squares).
     """
-    lag = max(round(BASE_M / STEP_M), 1)
-    found = []
-    for quantity, smallest in (("gradient", _GRADIENT_CHANGE), ("curvature", _CURVATURE_CHANGE_1PM)):
-        values = series.gradient if quantity == "gradient" else series.curvature_1pm
-        change = values[2 * lag :] - values[: -2 * lag] if len(values) > 2 * lag else np.empty(0)
+    reach = 2 * max(round(BASE_M / STEP_M), 1)
+    found: list[Feature] = []
+    smallest: dict[Quantity, float] = {"gradient": _GRADIENT_CHANGE, "curvature": _CURVATURE_CHANGE_1PM}
+    for quantity, limit in smallest.items():
+        change = series.of(quantity)[reach:] - series.of(quantity)[:-reach]
         size = np.abs(change)
-        name: Quantity = "gradient" if quantity == "gradient" else "curvature"
-        if least is not None and len(size):
-            size[size < np.hypot(least[name][2 * lag :], least[name][: -2 * lag])] = 0.0
-        while len(size) and size.max() >= smallest:
+        if least is not None:
+            size[size < np.hypot(least[quantity][reach:], least[quantity][:-reach])] = 0.0
+        while len(size) and size.max() >= limit:
             k = int(np.argmax(size))
-            found.append(Feature(arc_m=float(series.arc_m[k + lag]), quantity=name, change=float(change[k])))
-            size[max(k - 2 * lag, 0) : k + 2 * lag + 1] = 0.0
+            found.append(Feature(arc_m=float(series.arc_m[k + reach // 2]), quantity=quantity, change=float(change[k])))
+            size[max(k - reach, 0) : k + reach + 1] = 0.0
     return sorted(found, key=lambda feature: feature.arc_m)
 
 
@@ -148,31 +143,29 @@ def locate(
     information = float(((slope - slope.mean()) ** 2).sum()) / spread**2
     best = int(np.argmax(likelihood))
     if information < 16.0 / sigma_m**2:
-        return LocatedFeature(
-            verdict="none", arc_m=np.nan, sigma_m=np.nan, reason="no change sharper than the prediction"
-        )
+        return _unplaced("none", np.nan, "no change sharper than the prediction")
     sigma = float(1.0 / np.sqrt(information))
     place = predicted_m + float(offsets[best]) + _vertex(likelihood, best) * 0.25 * STEP_M
     apart = np.abs(offsets - offsets[best]) > max(5.0 * sigma, 2.0 * STEP_M)
     if best in (0, len(offsets) - 1):
-        return LocatedFeature(verdict="ambiguous", arc_m=np.nan, sigma_m=sigma, reason="best at the edge of the window")
+        return _unplaced("ambiguous", sigma, "best at the edge of the window")
     if apart.any() and likelihood[best] - likelihood[apart].max() < np.log(_LIKELIHOOD_RATIO):
-        return LocatedFeature(
-            verdict="ambiguous", arc_m=np.nan, sigma_m=sigma, reason="another place fits nearly as well"
-        )
+        return _unplaced("ambiguous", sigma, "another place fits nearly as well")
     other: Quantity = QUANTITIES[1 - QUANTITIES.index(quantity)]
     rest = measured.of(other) - np.interp(place + measured.arc_m, line.arc_m, line.of(other))
     misfit = float(((rest - rest.mean()) ** 2).mean()) / noise[QUANTITIES.index(other)] ** 2
     if misfit > _FIT_LIMIT:
-        return LocatedFeature(verdict="none", arc_m=np.nan, sigma_m=sigma, reason=f"the {other} does not fit there")
+        return _unplaced("none", sigma, f"the {other} does not fit there")
     if last is not None:
         gap = place - last[0]
         allowed = _GAP_SIGMAS * np.sqrt(sigma**2 + last[1] ** 2 + (SCALE_SIGMA * last[2]) ** 2)
         if abs(gap - last[2]) > allowed:
-            return LocatedFeature(
-                verdict="none", arc_m=np.nan, sigma_m=sigma, reason="distance to the last feature disagrees"
-            )
+            return _unplaced("none", sigma, "distance to the last feature disagrees")
     return LocatedFeature(verdict="accepted", arc_m=place, sigma_m=sigma)
+
+
+def _unplaced(verdict: Literal["ambiguous", "none"], sigma_m: float, reason: str) -> LocatedFeature:
+    return LocatedFeature(verdict=verdict, arc_m=np.nan, sigma_m=sigma_m, reason=reason)
 
 
 def _vertex(values: Floats, best: int) -> float:

@@ -14,13 +14,12 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, freeze_rows
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.timescale import seconds
+from railfix.core.timescale import nearest_rows
 
 #: The ratio is taken over windows of this length [ns] with so many speeds, of a train faster than this [m/s].
 _WINDOW_NS: Final = 30_000_000_000
 _LEAST_SPEEDS: Final = 10
-#: A speed of the radar belongs to one by satellites that is so near [s].
-_NEAR_S: Final = 0.15
+_NEAR_NS: Final = 150_000_000  #: A speed of the radar belongs to one by satellites that is so near [ns].
 _MOVING_MPS: Final = 3.0
 #: Windows before a step that it is a step from, at least and at most, and windows after it that show it.
 _LEAST_BEFORE: Final = 5
@@ -222,14 +221,8 @@ class RadarWatch:
 
     def take_samples(self, radar: RadarSpeeds, time: Datetimes, right_mps: Floats) -> list[RadarAlarm]:
         """Take speeds by satellites with the radar's own that are nearest to each; see `take`."""
-        if not len(radar):
-            return self.take(time, np.full(len(time), np.nan), right_mps)
-        after = np.clip(np.searchsorted(radar.time, time), 1, max(len(radar) - 1, 1))
-        late = np.abs(seconds(radar.time[np.minimum(after, len(radar) - 1)] - time))
-        early = np.abs(seconds(time - radar.time[after - 1]))
-        nearest = np.where(late < early, np.minimum(after, len(radar) - 1), after - 1)
-        near = np.minimum(late, early) <= _NEAR_S
-        return self.take(time, np.where(near, radar.speed_mps[nearest], np.nan), right_mps)
+        row = nearest_rows(radar.time, time, within_ns=_NEAR_NS)
+        return self.take(time, np.append(radar.speed_mps, np.nan)[row], right_mps)
 
     def _close(self) -> list[RadarAlarm]:
         """End a window; the alarm that it completes."""

@@ -16,8 +16,8 @@ integral of the pitch rate, which follows the line slowly, or without the line t
 
 from __future__ import annotations
 
+import copy
 from collections import deque
-from copy import copy
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
@@ -34,22 +34,14 @@ from railfix.core.settings import Settings
 class MotionState(IntEnum):
     """What the speed of a sample rests on."""
 
-    #: Nothing known yet.
-    INIT = 0
-    #: No pulse for a second and the body at rest.
-    STANDING = 1
-    #: Moving too slowly for the tachometer; carried by inertia.
-    LOW_SPEED = 2
-    #: The wheel rolls.
-    NORMAL = 3
-    #: The wheel is faster than the train; carried by inertia.
-    INERTIAL_SPIN = 4
-    #: The wheel is slower than the train; carried by inertia.
-    INERTIAL_SLIDE = 5
-    #: Freed and rolling away below the tachometer's least speed; carried by inertia.
-    ROLLING = 6
-    #: Carried for too long: no speed.
-    EXPIRED = 7
+    INIT = 0  #: Nothing known yet.
+    STANDING = 1  #: No pulse for a second and the body at rest.
+    LOW_SPEED = 2  #: Moving too slowly for the tachometer; carried by inertia.
+    NORMAL = 3  #: The wheel rolls.
+    INERTIAL_SPIN = 4  #: The wheel is faster than the train; carried by inertia.
+    INERTIAL_SLIDE = 5  #: The wheel is slower than the train; carried by inertia.
+    ROLLING = 6  #: Freed and rolling away below the tachometer's least speed; carried by inertia.
+    EXPIRED = 7  #: Carried for too long: no speed.
 
 
 #: Sine of the pitch against the line's: 0.1 m/s2 of wheel against train.
@@ -107,7 +99,6 @@ class SlipResult:
     smooth: Floats  #: Mean of the metric over `SMOOTHING_S` less the accelerometer's offset; shape (N,).
     pitch: Floats  #: Sine of the reference pitch; NaN before it is known; shape (N,).
     gyro_bias_radps: Floats  #: Of the pitch rate, as learnt; 0 without a gyro; shape (N,).
-    offset_mps2: Floats  #: Of the accelerometer, as learnt; shape (N,).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,31 +153,20 @@ def find_slips(
 ) -> tuple[SlipResult, SlipState | None]:
     """Return the state of the motion, its speed and way, each sample from itself and earlier ones.
 
-    Parameters
-    ----------
-    samples : MotionSamples
-    limits : SlipLimits, optional
-    state : SlipState, optional
-        Left by the samples before.
-
-    Returns
-    -------
-    SlipResult
-    SlipState or None
-        To pass on with the next samples; None where there is no sample so far.
+    `state` is what the samples before have left; the one returned goes on with the next samples, None before the first.
     """
     limits, (time_s, *given, body, since_pulse_s) = limits or SlipLimits(), samples
     size = len(time_s)
-    automaton = _Automaton(limits) if state is None else state.automaton.copied(limits)
+    automaton = _Automaton(limits) if state is None else state.automaton.copy(limits)
     steps = np.diff(time_s, prepend=time_s[:1] if state is None else state.time_s).tolist()
     turning = np.full((size, 3), np.nan) if body is None else body
     since = np.full(size, np.nan) if since_pulse_s is None else since_pulse_s
     columns = (*given, turning, since)
-    rows = np.empty((size, 8))
+    rows = np.empty((size, 7))
     for k, (dt, *values) in enumerate(zip(steps, *(column.tolist() for column in columns), strict=True)):
         automaton.step(dt, *values)
         rows[k] = automaton.row()
-    states, speed, way, metric, smooth, pitch, bias, offset = rows.T
+    states, speed, way, metric, smooth, pitch, bias = rows.T
     result = SlipResult(
         state=states.astype(np.int8),
         speed_mps=speed,
@@ -195,7 +175,6 @@ def find_slips(
         smooth=smooth,
         pitch=pitch,
         gyro_bias_radps=bias,
-        offset_mps2=offset,
     )
     return result, SlipState(time_s=float(time_s[-1]), automaton=automaton) if size else state
 
@@ -214,17 +193,15 @@ class _Automaton:
         #: Time since a sample, speed and acceleration by inertia: what a detection looks back on.
         self._past: deque[tuple[float, float, float]] = deque(maxlen=200)
 
-    def copied(self, limits: SlipLimits) -> _Automaton:
+    def copy(self, limits: SlipLimits) -> _Automaton:
         """The same with numbers of its own: states handed on stay as they are."""
-        other = copy(self)
+        other = copy.copy(self)
         other.limits, other._past = limits, self._past.copy()
         return other
 
     def row(self) -> tuple[float, ...]:
         """Values of `SlipResult` at the last sample."""
-        return (
-            self.state, self.speed, self.way, self.metric, self._smooth, self.pitch, self.bias, self.offset,
-        )  # fmt: skip
+        return self.state, self.speed, self.way, self.metric, self._smooth, self.pitch, self.bias
 
     def step(
         self, dt: float, wheel: float, acceleration: float, force: float, sine: float, body: list[float], since: float

@@ -53,27 +53,16 @@ class PulseSpeeds:
     time: Datetimes
     speed_mps: Floats  #: With the sign of the direction; NaN where the pulses say nothing; shape (N,).
     sigma_mps: Floats  #: By jitter and clock; the wheel's scale comes beside it; shape (N,).
-    #: Size that the speed cannot exceed since the last pulse: ``p / (t - t_k)``; NaN before the first; shape (N,).
-    bound_mps: Floats
 
 
 def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerLimits | None = None) -> PulseSpeeds:
-    """Return speeds from the intervals of pulses, each from pulses up to its instant.
-
-    Parameters
-    ----------
-    pulses : TachometerPulses
-    time : ndarray of datetime64[ns], shape (N,)
-    limits : TachometerLimits, optional
-    """
+    """Return speeds from the intervals of pulses, each from pulses up to its instant, shape (N,)."""
     limits = limits or TachometerLimits()
     last = np.searchsorted(pulses.time, time, side="right") - 1
     some = last >= 1
     if not len(pulses) or not some.any():
         nothing = np.full(len(time), np.nan)
-        return PulseSpeeds(
-            time=np.full(len(time), np.datetime64("NaT", "ns")), speed_mps=nothing, sigma_mps=nothing, bound_mps=nothing
-        )
+        return PulseSpeeds(time=np.full(len(time), np.datetime64("NaT", "ns")), speed_mps=nothing, sigma_mps=nothing)
     at = np.maximum(last, 0)
     first = window_start(pulses.time, at, limits.window_s)
     count = np.abs(pulses.pulse[at] - pulses.pulse[first]).astype(np.float64)
@@ -82,17 +71,15 @@ def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: Tachomete
     with np.errstate(divide="ignore", invalid="ignore"):
         size = count * limits.pulse_m / duration
         spread = size * np.sqrt(2.0 * limits.jitter_s**2 + limits.resolution_s**2 / 6.0) / duration
-        bound = np.where(last >= 0, limits.pulse_m / np.maximum(since, 1e-9), np.nan)
     valid = some & (duration > 0) & (size >= LEAST_SPEED_MPS) & (since <= limits.silence_s)
     # A pulse that has not come yet bounds the speed too.
-    valid &= bound >= 0.5 * size
+    valid &= limits.pulse_m / np.maximum(since, 1e-9) >= 0.5 * size
     sign = np.where(pulses.direction[at] == 0, 1.0, pulses.direction[at])
     middle = pulses.time[first] + (pulses.time[at] - pulses.time[first]) // 2
     return PulseSpeeds(
         time=np.where(valid, middle, np.datetime64("NaT", "ns")),
         speed_mps=np.where(valid, sign * size, np.nan),
         sigma_mps=np.where(valid, spread, np.nan),
-        bound_mps=bound,
     )
 
 
@@ -109,16 +96,10 @@ def pulse_acceleration(early: PulseSpeeds, late: PulseSpeeds) -> Floats:
 
 
 def way_m(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerLimits | None = None) -> Floats:
-    """Return the signed way run up to instants, from pulses up to each [m].
+    """Return the signed way run up to instants, from pulses up to each, shape (N,) [m].
 
-    Between pulses the way goes on at the last speed, by less than one pulse. 0 before the first pulse. Where the
-    sensor has no direction every pulse counts forward.
-
-    Parameters
-    ----------
-    pulses : TachometerPulses
-    time : ndarray of datetime64[ns], shape (N,)
-    limits : TachometerLimits, optional
+    Between pulses the way goes on at the last speed, by less than one pulse. 0 before the first pulse. Where the sensor
+    has no direction every pulse counts forward.
     """
     limits = limits or TachometerLimits()
     if not len(pulses):
@@ -175,20 +156,10 @@ class SpeedCheck:
 def check_speeds(
     time: Datetimes, speed_mps: Floats, right_time: Datetimes, right_mps: Floats, *, largest_lag_s: float = 3.0
 ) -> SpeedCheck:
-    """Return scale, unit and lag of logged speeds by the least squares of their sizes over a search of lags.
+    """Return scale, unit and lag of logged speeds (N,) by the least squares of their sizes over a search of lags.
 
-    Parameters
-    ----------
-    time, speed_mps : ndarray, shape (N,)
-        As logged.
-    right_time, right_mps : ndarray, shape (M,)
-        For example by Doppler.
-    largest_lag_s : float
-
-    Raises
-    ------
-    ValueError
-        Fewer than ten speeds over 1 m/s in common.
+    `right_time`, `right_mps`, shape (M,), for example by Doppler. ValueError with fewer than ten speeds over 1 m/s in
+    common.
     """
     known = np.isfinite(right_mps)
     right_t = seconds(right_time[known] - right_time[0])

@@ -69,7 +69,7 @@ def smoothed(ranges: CorrectedRanges, config: Config, state: CarrierState) -> tu
     obs, slips = ranges.observations, ranges.slips
     if slips is None:
         return ranges, state
-    result, after = smooth_codes(
+    code_m, after = smooth_codes(
         obs.time,
         obs.satellite,
         obs.signal,
@@ -79,7 +79,7 @@ def smoothed(ranges: CorrectedRanges, config: Config, state: CarrierState) -> tu
         state.smoothing,
         limits=config.smoothing,
     )
-    change = result.code_m - obs.code_m
+    change = code_m - obs.code_m
     corrected = change[:, ranges.columns]
     if ranges.second is not None and ranges.combined is not None:
         other = np.take_along_axis(change, np.maximum(ranges.second.column, 0), axis=1)

@@ -22,16 +22,16 @@ from railfix.positioning.carrier import Slips
 from railfix.positioning.normal_equations import Ranges, SinglePointLimits, single_point
 from railfix.positioning.section_search import SearchIndex, search
 from railfix.positioning.two_frequencies import Combined, SecondCodes
-from railfix.ranges.atmosphere import SeenFrom, modelled_delays
+from railfix.ranges.atmosphere import SeenFrom, model_delays
 from railfix.ranges.base_station import BaseDifferences
 from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.ranges.corrected import (
     PLAUSIBLE_CODE_M,
     SBAS_SIGNAL,
+    apply_dfmc,
+    apply_long_term,
     code_sigma_m,
-    corrected_satellites,
     dfmc_delays,
-    dfmc_satellites,
     first_available,
     sbas_delays,
 )
@@ -148,9 +148,9 @@ def correct_ranges(
     )
     lacking = np.zeros(code.shape, dtype=np.int64)
     if isinstance(fixes, DfmcCorrections):
-        states, lacking = dfmc_satellites(states, fixes, satellite, signal)
+        states, lacking = apply_dfmc(states, fixes, satellite, signal)
     elif fixes is not None:
-        states, lacking = corrected_satellites(states, fixes)
+        states, lacking = apply_long_term(states, fixes)
         lacking = np.where(signal == SBAS_SIGNAL, lacking, int(Reason.SBAS_NOT_COVERED))
     for mask, bits in (
         (observed, lacking),
@@ -169,7 +169,7 @@ def correct_ranges(
         beyond = nominal = delays.sigma_m
         reason = np.where(observed, reason | delays.reason, reason)
     else:
-        delays = modelled_delays(
+        delays = model_delays(
             obs.time,
             seen,
             frequency,
@@ -177,7 +177,7 @@ def correct_ranges(
             ionosphere_sigma_m=received.ionosphere_sigma_m,
             troposphere=config.troposphere,
         )
-        beyond = np.hypot(delays.sigma_m, config.nominal.stated_m(states.accuracy_m))
+        beyond = np.hypot(delays.sigma_m, config.nominal.unusual_sigma_m(states.accuracy_m))
         nominal = np.hypot(config.nominal.sigma_m(seen.elevation_deg), beyond)
         if isinstance(fixes, DfmcCorrections):
             delays = dfmc_delays(fixes, obs.time, seen, delays)

@@ -21,9 +21,9 @@ from railfix.pipeline.received import Received
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.positioning.noise_scale import robust_fit
 from railfix.positioning.normal_equations import Ranges, single_point
-from railfix.ranges.atmosphere import SeenFrom, modelled_delays
+from railfix.ranges.atmosphere import SeenFrom, model_delays
 from railfix.ranges.corrected import PLAUSIBLE_CODE_M, code_sigma_m, first_available
-from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, thinned_rows
+from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, rows_apart
 
 _EARTH_RADIUS_M: Final = 6.371e6
 #: Degrees of freedom from which residuals scale the standard deviation of an epoch.
@@ -71,7 +71,7 @@ def uncorrected_ranges(obs: Observations, received: Received, config: Config, bo
     raw = usable_ranges(states, clean, np.array(1.0 / ANCHOR_SIGMA_M**2), reason, channels.groups)
     place = single_point(raw, _below(raw), limits=config.single_point).ecef_m
     seen = SeenFrom.of(np.where(np.isnan(place), _below(raw), place), states.position_ecef_m)
-    delays = modelled_delays(
+    delays = model_delays(
         obs.time,
         seen,
         channels.frequency_hz,
@@ -82,7 +82,7 @@ def uncorrected_ranges(obs: Observations, received: Received, config: Config, bo
     clean = clean - delays.ionosphere_m - delays.troposphere_m
     sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), delays.sigma_m)
     sigma = np.hypot(sigma, config.nominal.sigma_m(seen.elevation_deg))
-    sigma = np.hypot(sigma, config.nominal.stated_m(states.accuracy_m))
+    sigma = np.hypot(sigma, config.nominal.unusual_sigma_m(states.accuracy_m))
     usable &= seen.elevation_deg >= config.elevation.mask_deg
     ranges = usable_ranges(states, clean, 1.0 / sigma**2, np.where(usable, 0, 1), channels.groups)
     return UncorrectedRanges(
@@ -198,7 +198,7 @@ def survey_epochs(
     phase = corrected_phase_m(slips.phase_m[:, columns], seen.states.clock_m, nothing, nothing)
     rate = -SPEED_OF_LIGHT / seen.channels.frequency_hz * obs.doppler_hz[:, columns]
     broken = np.cumsum(slips.slip[:, columns] | obs.break_before[:, None], axis=0, dtype=np.intp)
-    rows = thinned_rows(obs.time, limits.interval_s)
+    rows = rows_apart(obs.time, limits.interval_s)
     time, cn0_dbhz = obs.time[rows], obs.cn0_dbhz[:, columns]
     weak = 10.0 ** ((45.0 - np.where(np.isnan(cn0_dbhz), 45.0, np.minimum(cn0_dbhz, 50.0))) / 10.0)
     used, position, weak = usable[rows], seen.states.position_ecef_m[rows], weak[rows]

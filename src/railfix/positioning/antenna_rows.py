@@ -48,9 +48,7 @@ class AntennaRows:
         return self.indices[0].trajectory.sigma_height_m
 
     def apart(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> list[Value]:
-        """Return what a function returns for each antenna: of its search index, rows, and one item of each of
-        `of_antennas`.
-        """
+        """Return what a function gives for each antenna: of its search index, rows, and one item of each list."""
         return [function(*each) for each in zip(self.indices, self.parts, *of_antennas, strict=True)]
 
     def each(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> Value:

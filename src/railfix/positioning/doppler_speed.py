@@ -13,13 +13,13 @@ number of constellations. The ionosphere's change (millimetres a second) is left
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, freeze_arrays
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.core.settings import Settings
@@ -66,8 +66,7 @@ class Dopplers:
     clock_rate_mps: Floats  #: c times the drift of the satellite clock, relativity included; shape (T, K).
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            object.__setattr__(self, item.name, read_only(getattr(self, item.name)))
+        freeze_arrays(self)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -145,7 +144,7 @@ def doppler_speed(
         normalised = np.abs(fit.normalised[redundant])
         scale = float(np.median(normalised)) / _NORMAL_MEDIAN if normalised.size else 1.0
         scale = max(scale, 1e-6)
-        used, fit = _without_outliers(measured, slope, sigma, offered, scale, limits)
+        used, fit = _reject_outliers(measured, slope, sigma, offered, scale, limits)
     count = used.sum(axis=1)
     solved = (count >= limits.min_satellites) & np.isfinite(fit.variance)
     freedom = np.maximum(count - 2, 1)
@@ -219,7 +218,7 @@ def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _SpeedF
     )
 
 
-def _without_outliers(
+def _reject_outliers(
     measured: Floats, slope: Floats, sigma: Floats, offered: Masks, scale: float, limits: DopplerSpeedLimits
 ) -> tuple[Masks, _SpeedFit]:
     """Leave out the worst Doppler of every epoch that has one, until none does."""

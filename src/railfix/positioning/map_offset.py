@@ -159,15 +159,11 @@ def map_offset(
     mean, known, statistic, detectable = means_of_windows(
         sums, antennas.sigma_plan_m, antennas.sigma_height_m, limits.detectable_sigmas
     )
-
-    def judged(values: Floats) -> Floats:
-        return np.where(enough, values, np.nan)
-
     result = MapOffset(
-        across_m=judged(mean[:, 0]),
-        up_m=judged(mean[:, 1]),
+        across_m=np.where(enough, mean[:, 0], np.nan),
+        up_m=np.where(enough, mean[:, 1], np.nan),
         covariance_m2=np.where(enough[:, None, None], known, np.nan),
-        statistic=judged(statistic),
+        statistic=np.where(enough, statistic, np.nan),
         detectable_m=np.where(enough[:, None], detectable, np.nan),
     )
     return result, after

@@ -301,16 +301,10 @@ class RobustClock:
 def robust_clock(
     residual_m: Floats, sigma_m: Floats, groups: tuple[slice, ...], *, least_ranges: int = 4
 ) -> RobustClock:
-    """Receiver clock of each group: Huber-weighted mean of the residuals, starting at their median.
+    """Receiver clock of each group of channels: Huber-weighted mean of the residuals, starting at their median.
 
-    Parameters
-    ----------
-    residual_m, sigma_m : ndarray, shape (T, K) [m]
-        Range errors plus the clock; NaN is ignored.
-    groups : tuple of slice
-        Channels of one receiver clock.
-    least_ranges : int
-        Fewest ranges from which a clock is estimated.
+    `residual_m`, `sigma_m`, shape (T, K): range errors plus the clock, NaN is ignored; `least_ranges`: fewest ranges
+    from which a clock is estimated.
     """
     clock = np.full((len(residual_m), len(groups)), np.nan)
     share = np.zeros(residual_m.shape)

@@ -158,21 +158,10 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
 
 
 def fit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> Floats:
-    """Weighted sum of squared residuals at places, the clocks eliminated.
+    """Weighted sum of squared residuals at places (n, 3) [m], the clocks eliminated, shape (n,):
+    `normal_equations(...).wsse` without the derivatives.
 
-    The ``q`` of the section search: `normal_equations(...).wsse` without the derivatives.
-
-    Parameters
-    ----------
-    ranges : Ranges
-        T epochs.
-    place_ecef_m : ndarray, shape (n, 3) [m]
-    epochs : ndarray of int, shape (n,), optional
-        Epoch of each place; by default one place an epoch, in order.
-
-    Returns
-    -------
-    ndarray, shape (n,)
+    `epochs`: epoch of each place; by default one place an epoch, in order.
     """
     of = np.arange(len(ranges)) if epochs is None else epochs
     return kernels.ranges.misfits(ranges.arrays, kernel_array(place_ecef_m), of)
@@ -320,9 +309,7 @@ class SinglePoint:
 
 
 def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLimits | None = None) -> SinglePoint:
-    """Compute single-point positions of all epochs at once, from starts within a few thousand kilometres, shape (T, 3)
-    [m].
-    """
+    """Compute single-point positions of all epochs at once, from starts (T, 3) [m] within a few thousand kilometres."""
     limits = limits or SinglePointLimits()
     place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterated_points(
         ranges.arrays,

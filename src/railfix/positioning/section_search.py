@@ -67,39 +67,23 @@ class Section:
     evaluations: Integers  #: Points whose q was computed, shape (T,).
 
 
-@dataclass(frozen=True)
-class _Stretches:
-    """Stretches of line of one level: middle point and the radius that covers the rest."""
-
-    middle: Indices
-    radius_m: Floats
-
-
 class SearchIndex:
-    """Search structures of a trajectory, built once: a k-d tree, and stretches of rising length.
-
-    Attributes
-    ----------
-    trajectory : Trajectory
-    middle_ecef_m : ndarray, shape (3,) [m]
-        Mean of its points.
-    tree : cKDTree
-        Of its points.
-    """
+    """Search structures of a trajectory, built once: a k-d tree, and stretches of rising length."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
-        self.middle_ecef_m = trajectory.ecef_m.mean(axis=0)
+        self.middle_ecef_m = trajectory.ecef_m.mean(axis=0)  #: Mean of its points, shape (3,).
         self._clear_m = np.full(len(trajectory.length_m), np.nan)
         points = trajectory.ecef_m
-        self.tree = cKDTree(points)
-        self.levels: list[_Stretches] = []
+        self.tree = cKDTree(points)  #: Of its points.
+        #: Stretches of each level: middle points, and the radii [m] that cover the rest.
+        self.levels: list[tuple[Indices, Floats]] = []
         count, size = len(points), 1
         while True:
             starts = np.arange(0, count, size)
             middle = np.minimum(starts + size // 2, count - 1)
             away = np.linalg.norm(points - points[np.repeat(middle, size)[:count]], axis=1)
-            self.levels.append(_Stretches(middle, np.maximum.reduceat(away, starts)))
+            self.levels.append((middle, np.maximum.reduceat(away, starts)))
             if len(starts) <= FAN_OUT:
                 break
             size *= FAN_OUT
@@ -107,9 +91,8 @@ class SearchIndex:
     @cached_property
     def stretches(self) -> tuple[Indices, Floats, Indices]:
         """Middle points and radii [m] of the stretches of all levels, shape (S,), and the first of each level."""
-        first = np.cumsum([0, *(len(level.middle) for level in self.levels)])
-        middle = np.concatenate([level.middle for level in self.levels])
-        return middle, np.concatenate([level.radius_m for level in self.levels]), first
+        middles, radii = zip(*self.levels, strict=True)
+        return np.concatenate(middles), np.concatenate(radii), np.cumsum([0, *map(len, middles)])
 
     def clear_of_tangent_m(self, arc_m: Floats) -> Floats:
         """Return a distance within which no part of the line lies off the tangent, at positions on it, shape (T,) [m].
@@ -149,12 +132,7 @@ class SectionCandidates(NamedTuple):
 def search(ranges: Ranges, index: SearchIndex, point: SinglePoint, *, limits: SectionLimits | None = None) -> Section:
     """Return the point of the trajectory with the least q at each epoch, and the best other place.
 
-    Parameters
-    ----------
-    ranges : Ranges
-        T epochs.
-    point : SinglePoint
-        3-D position from the same ranges and weights; NaN where there is none.
+    `point`: 3-D position from the same ranges and weights; NaN where there is none.
     """
     limits = limits or SectionLimits()
     epochs = len(ranges)
@@ -187,9 +165,8 @@ def _ball(
     if not len(at):
         return radius
     nearest_m, vertex = index.tree.query(point.ecef_m[at])
-    distance = np.asarray(nearest_m, dtype=np.float64)
     radius[at] = kernels.search.radii_of_balls(
-        distance,
+        np.asarray(nearest_m, dtype=np.float64),
         index.trajectory.ecef_m[vertex] - point.ecef_m[at],
         point.matrix[at],
         point.covariance_m2[at],
@@ -229,22 +206,20 @@ def _coarse_to_fine(
     points = index.trajectory.ecef_m
     upper = np.full(len(ranges), np.inf)
     tried = np.zeros(len(ranges), dtype=np.int64)
-    top = len(index.levels[-1].middle)
+    top = len(index.levels[-1][0])
     epoch, node = np.repeat(epochs, top), np.tile(np.arange(top), len(epochs))
     q = np.empty(0)
     for level in reversed(range(len(index.levels))):
-        stretches = index.levels[level]
-        q = fit(ranges, points[stretches.middle[node]], epoch)
+        middle, radius = index.levels[level]
+        q = fit(ranges, points[middle[node]], epoch)
         np.minimum.at(upper, epoch, q)
         np.add.at(tried, epoch, 1)
         reach = upper + limits.reach * np.maximum(1.0, upper / freedom)
-        nearest = np.maximum(
-            np.sqrt(q) - weight_norm[epoch] * (1.0 + 2.0 * ROTATION_GRADIENT) * stretches.radius_m[node], 0.0
-        )
+        nearest = np.maximum(np.sqrt(q) - weight_norm[epoch] * (1.0 + 2.0 * ROTATION_GRADIENT) * radius[node], 0.0)
         keep = nearest**2 <= reach[epoch]
         epoch, node, q = epoch[keep], node[keep], q[keep]
         if level:
-            below = len(index.levels[level - 1].middle)
+            below = len(index.levels[level - 1][0])
             node = (node[:, None] * FAN_OUT + np.arange(FAN_OUT)).ravel()
             epoch = np.repeat(epoch, FAN_OUT)
             exists = node < below

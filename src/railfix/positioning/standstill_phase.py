@@ -26,26 +26,20 @@ class IntegerSearch:
     """Search for integer vectors near real ones with the same positive definite covariance, shape (n, n) [cycle^2]."""
 
     def __init__(self, covariance: Floats) -> None:
-        lower, variance = _lower_factor(covariance)
+        # unit lower triangular L and variances d with covariance = L' diag(d) L
+        upper = np.linalg.cholesky(covariance[::-1, ::-1])[::-1, ::-1].T
+        diagonal = np.diag(upper)
         #: Transformed unknowns are `transform.T @ N`; their covariance is `lower.T @ diag(variance) @ lower`.
-        self._transform, self._lower, self._variance = _decorrelate(lower, variance)
+        self._transform, self._lower, self._variance = _decorrelate(upper / diagonal[:, None], diagonal**2)
         self._back = np.round(np.linalg.inv(self._transform)).astype(np.int64)
 
     def nearest(self, cycles: Floats, count: int, *, below: float = np.inf) -> tuple[Integers, Floats]:
-        """Return at most `count` integer vectors (m, n), nearest first, and their squares ``(N - cycles)' inv(Q) (N -
-        cycles)``.
+        """Return at most `count` integer vectors (m, n), nearest first, and their squares ``(N - c)' inv(Q) (N - c)``.
 
         None of a square of `below` or more.
         """
         integers, squares = _search(cycles @ self._transform, self._lower, self._variance, count, below)
         return integers @ self._back, squares
-
-
-def _lower_factor(covariance: Floats) -> tuple[Floats, Floats]:
-    """Unit lower triangular L and variances d with covariance = L' diag(d) L."""
-    upper = np.linalg.cholesky(covariance[::-1, ::-1])[::-1, ::-1].T
-    diagonal = np.diag(upper)
-    return np.asarray(upper / diagonal[:, None]), np.asarray(diagonal**2)
 
 
 def _decorrelate(lower: Floats, variance: Floats) -> tuple[Integers, Floats, Floats]:
@@ -152,8 +146,7 @@ def phase_log_likelihood(
     *,
     fault_prior: float,
 ) -> Floats:
-    """Logarithm of the density of the phases of A antennas, given their codes, under U hypotheses of their places,
-    (U,).
+    """Log density of the phases of A antennas, given their codes, under U hypotheses of their places, shape (U,).
 
     `expected_m` (U, 3 A) and covariance `prior_m2` about it. The phases are within a wavelength, as the integers are
     unknown; with the probability `fault_prior` they follow no model (a slip, half a cycle) and are uniform there.

@@ -82,10 +82,8 @@ class TwoFrequencyState:
         information, moment = np.split(self.sums, 2)
         none = np.zeros(len(fresh))
         sums = np.concatenate([information, none, moment, none])
-        own = TwoFrequencyState(
-            names=self.names + fresh, sums=sums, scale=self.scale, last=self.last, age=self.age
-        )  # fmt: skip
-        return own, np.array([known[name] for name in names], dtype=np.intp)
+        numbers = np.array([known[name] for name in names], dtype=np.intp)
+        return replace(self, names=self.names + fresh, sums=sums), numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,14 +173,8 @@ def ionosphere_free(
 ) -> Combined:
     """Return the ionosphere-free combination of two codes, with the test of their difference by `combine_codes`.
 
-    ``P = (ratio P1 - P2) / (ratio - 1)``, whose noise no epoch before makes less.
-
-    Parameters
-    ----------
-    code_m, noise_m : ndarray, shape (T, K) [m]
-        As in `combine_codes`.
-    delays_m : tuple of ndarray, shapes (T, K) [m]
-        Group delays that the corrections contain already, of the first and the second code.
+    ``P = (ratio P1 - P2) / (ratio - 1)``, whose noise no epoch before makes less. `delays_m`: group delays that the
+    corrections contain already, of the first and the second code, shapes (T, K).
     """
     share = np.where(np.isfinite(code_m + second.code_m), -1.0 / (second.ratio - 1.0), np.nan)
     first, other = code_m + delays_m[0], second.code_m + delays_m[1]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Bits, Datetimes, Floats
@@ -77,17 +78,13 @@ def klobuchar_delay_m(
     local = (43_200.0 * longitude + seconds_of_week[:, None]) % SECONDS_PER_DAY
     low = 0.53 - elevation
     slant = 1.0 + 16.0 * low * low * low
-    amplitude = np.maximum(_cubic(alpha, magnetic), 0.0)
-    period = np.maximum(_cubic(beta, magnetic), 72_000.0)
+    amplitude = np.maximum(polyval(magnetic, alpha), 0.0)
+    period = np.maximum(polyval(magnetic, beta), 72_000.0)
     phase = 2.0 * np.pi * (local - 50_400.0) / period
     cosine = 1.0 + phase * phase * (-0.5 + phase * phase / 24.0)
     # Asked this way round, NaN stays NaN and does not become the delay of the night.
     delay = slant * np.where(np.abs(phase) >= 1.57, 5e-9, 5e-9 + amplitude * cosine)
     return np.asarray(SPEED_OF_LIGHT * delay * (FREQUENCY_L1 / frequency_hz) ** 2)
-
-
-def _cubic(coefficients: Floats, x: Floats) -> Floats:
-    return np.asarray(coefficients[0] + x * (coefficients[1] + x * (coefficients[2] + x * coefficients[3])))
 
 
 def saastamoinen_delay_m(
@@ -185,7 +182,7 @@ class Delays:
     reason: Bits  #: Flags of unknown delays (`railfix.core.reasons.Reason`), shape (T, K).
 
 
-def modelled_delays(
+def model_delays(
     time: Datetimes,
     seen: SeenFrom,
     frequency_hz: Floats,

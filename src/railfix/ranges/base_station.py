@@ -97,18 +97,11 @@ class BaseErrors:
     def at(
         self, time: Datetimes, satellite: Strings, signal: Strings, receiver_ecef_m: Floats, limits: BaseLimits
     ) -> BaseDifferences:
-        """Return the newest errors at the epochs of a train, by its channels.
+        """Return the newest errors at the epochs of a train (T,), by its channels (K,), near approximate places (T, 3)
+        [m].
 
         A channel that the station has on another signal of the same band takes that one: a constant of the
         constellation is the difference.
-
-        Parameters
-        ----------
-        time : ndarray of datetime64[ns], shape (T,)
-        satellite, signal : ndarray of str, shape (K,)
-        receiver_ecef_m : ndarray, shape (T, 3) [m]
-            Approximate places of the train.
-        limits : BaseLimits
         """
         shape = (len(time), len(satellite))
         of_band = {(name, code[:1]): k for k, (name, code) in enumerate(self.keys)}

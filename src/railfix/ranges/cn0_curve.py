@@ -213,24 +213,10 @@ def fit_cn0_curve(
     fit: CurveFit | None = None,
     source: Cn0CurveSource | None = None,
 ) -> Cn0Curve:
-    """Fit the mean C/N0 over elevation.
+    """Fit the mean C/N0 over elevation, one curve a kind and signal with bins enough.
 
-    Parameters
-    ----------
-    samples : Cn0Samples or iterable of (cn0_dbhz, elevation_deg, satellite, signal)
-        Arrays of shape (T, M), (T, M), (M,), (M,), from a place with open sky.
-    fit : CurveFit, optional
-    source : Cn0CurveSource, optional
-
-    Returns
-    -------
-    Cn0Curve
-        One curve a kind and signal with bins enough; `Cn0Mean.count` holds the samples of each bin.
-
-    Raises
-    ------
-    ValueError
-        No kind and signal has samples enough.
+    `samples` are collected ones, or C/N0 (T, M), elevation (T, M), satellite and signal (M,), from a place with open
+    sky. ValueError: no kind and signal has samples enough.
     """
     fit = fit or CurveFit()
     if not isinstance(samples, Cn0Samples):
@@ -309,13 +295,7 @@ class _CurveFile(Settings):
 
 
 def write_cn0_curve(curve: Cn0Curve, path: FilePath) -> None:
-    """Write a curve; the file appears whole or not at all.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
+    """Write a curve; the file appears whole or not at all. OutputError: it cannot be written."""
     curves = [
         {
             "kind": mean.kind,
@@ -333,10 +313,7 @@ def write_cn0_curve(curve: Cn0Curve, path: FilePath) -> None:
 def read_cn0_curve(path: FilePath) -> Cn0Curve:
     """Read a curve.
 
-    Raises
-    ------
-    InputFileError
-        The file is missing, unreadable, no curve, or an entry of it is unknown, missing or out of range.
+    InputFileError: the file is missing, unreadable, no curve, or an entry of it is unknown, missing or out of range.
     """
     file = read_model_file(_CurveFile, path, what="a C/N0 curve", format_name=FORMAT, command="railfix cn0-curve")
     means = tuple(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -40,14 +40,7 @@ class Cn0Calibration:
 
 
 def satellite_elevation_deg(observations: Observations, navigation: Navigation, position_ecef_m: Floats) -> Floats:
-    """Elevation of each channel's satellite from a fixed place, shape (T, M) [deg]; NaN without orbit or code.
-
-    Parameters
-    ----------
-    observations : Observations
-    navigation : Navigation
-    position_ecef_m : ndarray, shape (3,) [m]
-    """
+    """Elevation of each channel's satellite from a fixed place (3,), shape (T, M) [deg]; NaN without orbit or code."""
     names, first, which = np.unique(observations.satellite, return_index=True, return_inverse=True)
     code = np.full((len(observations), len(names)), np.nan)
     for m, k in enumerate(which.tolist()):
@@ -65,48 +58,41 @@ def cn0_curve_from_log(
     position_ecef_m: Floats | None = None,
     fit: CurveFit | None = None,
     broken_lines: BrokenLines = "stop",
-    progress: Callable[[float], None] | None = None,
 ) -> Cn0Calibration:
-    """Fit a curve on the log of a receiver whose antenna stood under open sky.
+    """Fit a curve on the log of a receiver, about a day, whose antenna stood under open sky.
 
-    Parameters
-    ----------
-    observations : sequence of Path
-        RINEX observation files of one receiver, about a day.
-    navigation : sequence of Path
-    position_ecef_m : ndarray, shape (3,) [m], optional
-        Position of the antenna, to some kilometres; by default that of the header.
-    fit : CurveFit, optional
-    broken_lines : {"stop", "count"}
-        What to do about broken lines of the log.
-    progress : callable, optional
-        Called with the part that has been read, 0 to 1.
-
-    Raises
-    ------
-    InputFileError
-        A file is missing or of another kind; the log has no C/N0.
-    SettingsError
-        The header has no position and none was given.
-    MismatchError
-        Satellites were tracked that are below the horizon of the position, or the navigation
-        files have none of them, or too few samples for any curve.
+    `position_ecef_m`: position of the antenna, shape (3,), to some kilometres; by default that of the header.
+    InputFileError: a file is missing or of another kind; the log has no C/N0. SettingsError: the header has no position
+    and none was given. MismatchError: satellites were tracked that are below the horizon of the position, or the
+    navigation files have none of them, or too few samples for any curve.
     """
     records = read_navigation(list(navigation), broken_lines=broken_lines)
-    samples, low = Cn0Samples(), _Horizon()
+    samples, seen, below = Cn0Samples(), 0, 0
     header: ObservationHeader | None = None
     start, end, epochs = np.datetime64("NaT", "ns"), np.datetime64("NaT", "ns"), 0
-    for part in scan_observations(list(observations), broken_lines=broken_lines, progress=progress):
+    for part in scan_observations(list(observations), broken_lines=broken_lines):
         if header is None:
             header, start = part.header, part.time[0]
-            place = _position(header, position_ecef_m, observations[0])
+            place = header.approximate_ecef_m if position_ecef_m is None else position_ecef_m
+            if not np.isfinite(place).all():
+                what = "the header has no position (APPROX POSITION XYZ); give it with --position"
+                raise SettingsError(f"{observations[0]}: {what}")
         end, epochs = part.time[-1], epochs + len(part)
         elevation = satellite_elevation_deg(part, records, place)
-        low.count(elevation)
+        seen += int(np.count_nonzero(np.isfinite(elevation)))
+        below += int(np.count_nonzero(elevation < _BELOW_DEG))
         samples.add(part.cn0_dbhz, elevation, part.satellite, part.signal)
     if header is None:
         raise InputFileError(observations[0], "has no epochs")
-    low.check(observations[0])
+    if not seen:
+        raise MismatchError(
+            f"{observations[0]}: the navigation files have no orbit for any satellite and time of this log"
+        )
+    if below > _BELOW_SHARE * seen:
+        raise MismatchError(
+            f"{observations[0]}: {100.0 * below / seen:.0f} % of the satellites tracked stand below the horizon of the "
+            "position; give the position of the antenna, or the navigation files of this day"
+        )
     if not samples.keys():
         raise InputFileError(observations[0], "has no C/N0 (S1C, S2I, ...); log it in the receiver's RINEX output")
     source = Cn0CurveSource(
@@ -125,35 +111,6 @@ def cn0_curve_from_log(
     except ValueError as error:
         raise MismatchError(f"{observations[0]}: {error}; give a longer log") from None
     return Cn0Calibration(curve=curve, samples=samples, notes=_notes(curve, samples, float(seconds(end - start))))
-
-
-class _Horizon:
-    """Count of satellites below the horizon of the position."""
-
-    def __init__(self) -> None:
-        self.seen = 0
-        self.below = 0
-
-    def count(self, elevation_deg: Floats) -> None:
-        self.seen += int(np.count_nonzero(np.isfinite(elevation_deg)))
-        self.below += int(np.count_nonzero(elevation_deg < _BELOW_DEG))
-
-    def check(self, path: Path) -> None:
-        if not self.seen:
-            raise MismatchError(f"{path}: the navigation files have no orbit for any satellite and time of this log")
-        if self.below > _BELOW_SHARE * self.seen:
-            share = 100.0 * self.below / self.seen
-            raise MismatchError(
-                f"{path}: {share:.0f} % of the satellites tracked stand below the horizon of the position; "
-                "give the position of the antenna, or the navigation files of this day"
-            )
-
-
-def _position(header: ObservationHeader, given: Floats | None, path: Path) -> Floats:
-    place = header.approximate_ecef_m if given is None else np.asarray(given, dtype=np.float64)
-    if not np.isfinite(place).all():
-        raise SettingsError(f"{path}: the header has no position (APPROX POSITION XYZ); give it with --position")
-    return place
 
 
 def _notes(curve: Cn0Curve, samples: Cn0Samples, duration_s: float) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ from railfix.gnss.orbits import SatelliteStates, satellite_states
 from railfix.ranges.atmosphere import (
     Delays,
     SeenFrom,
-    modelled_delays,
+    model_delays,
     rtca_troposphere_m,
     rtca_troposphere_sigma_m,
     thin_shell_obliquity,
@@ -119,7 +119,7 @@ class NominalErrors(Settings):
         parts = (self.satellite_sigma_m**2, (self.ionosphere_sigma_m * thin_shell_obliquity(elevation_deg)) ** 2)
         return np.asarray(np.sqrt(sum(parts) + (self.troposphere_sigma_m * wet) ** 2))
 
-    def stated_m(self, accuracy_m: Floats) -> Floats:
+    def unusual_sigma_m(self, accuracy_m: Floats) -> Floats:
         """Accuracies of records, any shape, where they are worse than usual; 0 for the others and for unknown ones."""
         return np.where(accuracy_m > _USUAL_ACCURACY_M, accuracy_m, 0.0)
 
@@ -207,7 +207,7 @@ def corrected_ranges(
     states = satellite_states(observations.time, satellite, signal, code, navigation)
     near = np.broadcast_to(np.asarray(near_ecef_m, dtype=np.float64), (len(observations), 3))
     seen = SeenFrom.of(near, states.position_ecef_m)
-    delays = modelled_delays(
+    delays = model_delays(
         observations.time,
         seen,
         frequency,
@@ -215,7 +215,7 @@ def corrected_ranges(
         troposphere=troposphere,
     )
     clean = code + states.clock_m - states.group_delay_m - delays.ionosphere_m - delays.troposphere_m
-    stated = (nominal or NominalErrors()).stated_m(states.accuracy_m)
+    stated = (nominal or NominalErrors()).unusual_sigma_m(states.accuracy_m)
     sigma = np.hypot(code_sigma_m(observations.cn0_dbhz[:, column], seen.elevation_deg, noise=noise), stated)
     used = first_available(satellite, plausible) & ~states.unhealthy & np.isfinite(sigma)
     return CorrectedCodes(
@@ -236,40 +236,32 @@ def corrected_ranges(
 SBAS_SIGNAL: Final = "1C"  #: The signal that corrections are made for: GPS L1 C/A, as RINEX 3 calls it.
 
 _REASON_OF: Final = {
+    **dict.fromkeys(SatelliteState, Reason.SBAS_NO_CORRECTION),
     SatelliteState.OK: Reason.USED,
-    SatelliteState.GEO_STOPPED: Reason.SBAS_DO_NOT_USE,
-    SatelliteState.NO_MASK: Reason.SBAS_NO_CORRECTION,
     SatelliteState.NOT_IN_MASK: Reason.SBAS_NOT_COVERED,
-    SatelliteState.NO_FAST: Reason.SBAS_NO_CORRECTION,
+    SatelliteState.TIMED_OUT: Reason.SBAS_TIMED_OUT,
+    SatelliteState.GEO_STOPPED: Reason.SBAS_DO_NOT_USE,
     SatelliteState.DO_NOT_USE: Reason.SBAS_DO_NOT_USE,
     SatelliteState.NOT_MONITORED: Reason.SBAS_DO_NOT_USE,
-    SatelliteState.TIMED_OUT: Reason.SBAS_TIMED_OUT,
     SatelliteState.UDREI_TOO_LARGE: Reason.SBAS_DO_NOT_USE,
-    SatelliteState.NO_LONG_TERM: Reason.SBAS_NO_CORRECTION,
-    SatelliteState.IODE_MISMATCH: Reason.SBAS_NO_CORRECTION,
-    SatelliteState.NO_DEGRADATION: Reason.SBAS_NO_CORRECTION,
-    SatelliteState.NO_RANGE_RATE: Reason.SBAS_NO_CORRECTION,
 }
 #: Reason of each state of a satellite, by its number.
 REASONS: Final = np.array([int(_REASON_OF[state]) for state in sorted(SatelliteState)], dtype=np.int64)
 
 
 _DFMC_REASON_OF: Final = {
+    **dict.fromkeys(DfmcState, Reason.SBAS_NO_CORRECTION),
     DfmcState.OK: Reason.USED,
-    DfmcState.STOPPED: Reason.SBAS_DO_NOT_USE,
-    DfmcState.NO_MASK: Reason.SBAS_NO_CORRECTION,
     DfmcState.NOT_IN_MASK: Reason.SBAS_NOT_COVERED,
-    DfmcState.NO_CORRECTION: Reason.SBAS_NO_CORRECTION,
     DfmcState.TIMED_OUT: Reason.SBAS_TIMED_OUT,
+    DfmcState.STOPPED: Reason.SBAS_DO_NOT_USE,
     DfmcState.DO_NOT_USE: Reason.SBAS_DO_NOT_USE,
-    DfmcState.NO_DEGRADATION: Reason.SBAS_NO_CORRECTION,
-    DfmcState.NO_RECORD: Reason.SBAS_NO_CORRECTION,
 }
 #: The same of SBAS on L5.
 DFMC_REASONS: Final = np.array([int(_DFMC_REASON_OF[state]) for state in sorted(DfmcState)], dtype=np.int64)
 
 
-def dfmc_satellites(
+def apply_dfmc(
     states: SatelliteStates, fixes: DfmcCorrections, satellite: Strings, signal: Strings
 ) -> tuple[SatelliteStates, Bits]:
     """Satellites with the corrections of SBAS on L5 applied, and the reasons of those without, shape (T, K)."""
@@ -296,10 +288,8 @@ def dfmc_delays(fixes: DfmcCorrections, time: Datetimes, seen: SeenFrom, modelle
     )
 
 
-def corrected_satellites(states: SatelliteStates, fixes: SatelliteCorrections) -> tuple[SatelliteStates, Bits]:
-    """Satellites with long-term corrections applied to the records they are for, and the reasons of those without, (T,
-    K).
-    """
+def apply_long_term(states: SatelliteStates, fixes: SatelliteCorrections) -> tuple[SatelliteStates, Bits]:
+    """Satellites with long-term corrections applied to the records they are for, and reasons of the others (T, K)."""
     moved = states.position_ecef_m + np.nan_to_num(fixes.position_m)
     clock = states.clock_m + SPEED_OF_LIGHT * np.nan_to_num(fixes.clock_s)
     return replace(states, position_ecef_m=moved, clock_m=clock), REASONS[fixes.state]

@@ -95,10 +95,7 @@ class ErrorBins(Settings):
     def index(self, elevation_deg: ArrayLike, relative_azimuth_deg: ArrayLike, cn0_dbhz: ArrayLike) -> Integers:
         """Flat index of the bin of each observation, any shape; -1 where elevation or azimuth is NaN.
 
-        Parameters
-        ----------
-        elevation_deg, relative_azimuth_deg, cn0_dbhz : array_like, shapes that broadcast
-            Azimuth from the car's forward direction, clockwise.
+        The azimuth is from the car's forward direction, clockwise.
         """
         elevation, azimuth, cn0 = np.broadcast_arrays(
             np.asarray(elevation_deg, dtype=np.float64),
@@ -124,7 +121,7 @@ class BinStatistics:
     #: Mean and standard deviation of the samples used for the bin.
     bias_m: Floats
     sigma_m: Floats
-    #: `overbound.gaussian_overbound` of the same.
+    #: `error_model_fit.gaussian_overbound` of the same.
     bound_bias_m: Floats
     bound_sigma_m: Floats
     pooled: Integers  #: Index into `POOLED`: where the bin has too few blocks, the samples of a wider set of bins.
@@ -240,13 +237,7 @@ class _ErrorModelFile(Settings):
 
 
 def write_error_model(model: ErrorModel, path: FilePath) -> None:
-    """Write a model; the file appears whole or not at all.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
+    """Write a model; the file appears whole or not at all. OutputError: it cannot be written."""
     file = _ErrorModelFile(
         format=FORMAT,
         covers=model.covers,
@@ -269,10 +260,8 @@ def _columns(statistics: BinStatistics) -> _Columns:
 def read_error_model(path: FilePath) -> ErrorModel:
     """Read a model.
 
-    Raises
-    ------
-    InputFileError
-        The file is missing, unreadable, no error model, of version 1, or an entry of it is missing or out of range.
+    InputFileError: the file is missing, unreadable, no error model, of version 1, or an entry is missing or out of
+    range.
     """
     file = read_model_file(
         _ErrorModelFile, path, what="an error model", format_name=FORMAT, command="railfix error-model"

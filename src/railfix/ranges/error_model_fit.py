@@ -23,31 +23,14 @@ from railfix.ranges.error_model import POOLED, BinStatistics, ErrorBins, ErrorMo
 TAIL_SCORE: Final = 1.0  #: Standard scores from which on a sample belongs to the tail, which alone sets sigma.
 
 
-@dataclass(frozen=True, kw_only=True)
-class Overbound:
-    """Pair of normal distributions that bound a sample, one for each half."""
+def gaussian_overbound(error_m: Floats) -> tuple[float, float]:
+    """Bias and sigma of two normal distributions, shifted to either side, that bound a sample (n,), one for each half
+    [m].
 
-    bias_m: float  #: Distance of their means from zero, to either side.
-    sigma_m: float
-
-
-def gaussian_overbound(error_m: Floats) -> Overbound:
-    """The pair that bounds a sample, sigma from the tails and the bias from the middle.
-
-    The k-th of n samples counts as the quantile of probability ``k / (n + 1)``, from either end. Sigma is
-    the least that bounds both tails (beyond one standard score) about the median's distance from zero;
-    the bias is then the least that bounds the rest. Beyond the largest sample the bound is an
-    extrapolation by the normal distribution and nothing else.
-
-    Parameters
-    ----------
-    error_m : ndarray, shape (n,) [m]
-        At least three, finite.
-
-    Raises
-    ------
-    ValueError
-        Fewer than three samples, or one that is not finite.
+    The k-th of n samples counts as the quantile of probability ``k / (n + 1)``, from either end. Sigma is the least
+    that bounds both tails (beyond one standard score) about the median's distance from zero; the bias is then the least
+    that bounds the rest. Beyond the largest sample the bound is an extrapolation by the normal distribution and nothing
+    else. ValueError: fewer than three samples, or one that is not finite.
     """
     if len(error_m) < 3 or not np.isfinite(error_m).all():
         raise ValueError("an overbound needs at least three samples, all finite")
@@ -60,7 +43,7 @@ def gaussian_overbound(error_m: Floats) -> Overbound:
     tail = score >= min(TAIL_SCORE, float(score[-1]))
     sigma = max(0.0, *(float(np.max((size[tail] - center) / score[tail])) for size in sizes))
     bias = max(center, *(float(np.max(size - sigma * score)) for size in sizes))
-    return Overbound(bias_m=bias, sigma_m=sigma)
+    return bias, sigma
 
 
 class ErrorModelFit(Settings):
@@ -93,17 +76,10 @@ class ErrorSamples:
 
 
 def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStatistics:
-    """Statistics of the bins from some of the samples.
+    """Statistics of the bins from some of the samples, a mask of shape (n,).
 
-    A bin with fewer blocks than `ErrorModelFit.least_blocks` takes those of all azimuths of its elevation and
-    C/N0, then of all C/N0 too, then of all elevations of its C/N0, then all.
-
-    Parameters
-    ----------
-    samples : ErrorSamples
-    which : ndarray of bool, shape (n,)
-        Samples to take.
-    fit : ErrorModelFit
+    A bin with fewer blocks than `ErrorModelFit.least_blocks` takes those of all azimuths of its elevation and C/N0,
+    then of all C/N0 too, then of all elevations of its C/N0, then all.
     """
     bins = fit.bins
     kept = which & np.isfinite(samples.error_m)
@@ -156,26 +132,18 @@ def _members(shape: tuple[int, int, int]) -> tuple[Integers, ...]:
 def _figures(error: Floats) -> tuple[float, float, float, float]:
     if len(error) < 3:
         return (float("nan"),) * 4
-    bound = gaussian_overbound(error)
-    return float(error.mean()), float(error.std(ddof=1)), bound.bias_m, bound.sigma_m
+    return float(error.mean()), float(error.std(ddof=1)), *gaussian_overbound(error)
 
 
 _SIDES: Final = {1: ("all round",), 2: ("ahead", "behind"), 4: ("ahead", "right", "behind", "left")}
 
 
-@dataclass(frozen=True, kw_only=True)
-class SummaryRow:
-    """One row: its name, and count, bias, sigma, overbound before and after the screens as text."""
+def summary(model: ErrorModel) -> Iterator[tuple[str, ...]]:
+    """Yield rows by elevation, by sector and by C/N0: name, then count, bias, sigma, overbound before and after the
+    screens.
 
-    name: str
-    cells: tuple[str, ...]
-
-
-def summary(model: ErrorModel) -> Iterator[SummaryRow]:
-    """Rows by elevation, by sector and by C/N0.
-
-    Bias and sigma are those of all samples of the row, from the bins' own figures; the overbound is the span
-    of the bins' sigmas of bounds.
+    Bias and sigma are those of all samples of the row, from the bins' own figures; the overbound is the span of the
+    bins' sigmas of bounds.
     """
     bins = model.bins
     width = 360.0 / bins.sectors
@@ -186,8 +154,7 @@ def summary(model: ErrorModel) -> Iterator[SummaryRow]:
     )
     for axis, labels in enumerate(names):
         for k, name in enumerate(labels):
-            cells = (*_cells(model.before, axis, k), *_cells(model.after, axis, k))
-            yield SummaryRow(name=name, cells=cells)
+            yield name, *_cells(model.before, axis, k), *_cells(model.after, axis, k)
 
 
 def _cells(statistics: BinStatistics, axis: int, k: int) -> tuple[str, str, str, str]:
@@ -213,14 +180,8 @@ def fault_rate(
 ) -> FaultRate:
     """Measure the rate of local faults among the ranges that passed every screen, singly and by sides of the track.
 
-    Parameters
-    ----------
-    samples : ErrorSamples
-    beyond_sigma : float
-    confidence : float
-        Of the upper bounds.
-    side_elevation_deg : float [deg]
-        Elevation up to which satellites count as low, as `RiskBudget.side_elevation_deg`.
+    `confidence` is of the upper bounds, `side_elevation_deg` the elevation up to which satellites count as low, as
+    `RiskBudget.side_elevation_deg`.
     """
     used = samples.used & np.isfinite(samples.error_m) & np.isfinite(samples.sigma_m)
     faulty = used & (np.abs(samples.error_m) > beyond_sigma * samples.sigma_m)
@@ -262,23 +223,11 @@ def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
 def faulty_stretches(
     samples: ErrorSamples, *, length_m: float = 100.0, beyond_sigma: float = 5.0, confidence: float = 0.95
 ) -> tuple[tuple[float, float], ...]:
-    """Stretches of the line where local faults are more frequent than on the whole line.
+    """Stretches of the line, chainages from and to [m], where local faults are more frequent than on the whole line.
 
-    A stretch is one whose share of faulty blocks is, at the lower end of its interval (Clopper and Pearson), above the
-    share of the line at the upper end of its own. Where that holds, no prior of the line bounds the local faults:
-    there the settings leave the train without a level (`Config.no_level_m`).
-
-    Parameters
-    ----------
-    samples : ErrorSamples
-    length_m : float [m]
-    beyond_sigma, confidence : float
-        As `fault_rate`; one-sided.
-
-    Returns
-    -------
-    tuple of (float, float) [m]
-        Chainages from and to; neighbouring stretches are joined.
+    A stretch is one whose share of faulty blocks is, at the lower end of its interval (Clopper and Pearson, one-sided),
+    above the share of the line at the upper end of its own; neighbouring ones are joined. Where that holds, no prior of
+    the line bounds the local faults: there the settings leave the train without a level (`Config.no_level_m`).
     """
     used = samples.used & np.isfinite(samples.error_m) & np.isfinite(samples.sigma_m) & np.isfinite(samples.chainage_m)
     faulty = used & (np.abs(samples.error_m) > beyond_sigma * samples.sigma_m)

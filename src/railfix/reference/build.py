@@ -18,13 +18,13 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Indices
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.errors import MismatchError, NoPositionError
-from railfix.core.timescale import seconds
+from railfix.core.timescale import nearest_rows, seconds
 from railfix.io.position_log import PositionLog
 from railfix.io.reference_log import Acceleration, Pulses
 from railfix.motion.tachometer import Wheel, wheel_of
 from railfix.positioning.doppler_speed import Dopplers, DopplerSpeed, doppler_speed
 from railfix.reference.fixes import Fixes, ReferenceSettings, judge_alone, judge_pair, judge_place, judge_travel
-from railfix.reference.matching import LONGEST_STEP_S, Speeds, fused, instants, nearest
+from railfix.reference.matching import LONGEST_STEP_S, SAME_INSTANT_NS, Speeds, combine_speeds, instants
 from railfix.reference.smoother import (
     WINDOWS,
     Built,
@@ -38,6 +38,8 @@ from railfix.reference.smoother import (
     smooth,
 )
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
+
+SolvedSpeeds = Mapping[str, tuple[Speeds, DopplerSpeed]]  #: Speeds by Doppler, and how they were solved, by antenna.
 
 _ROUNDS: Final = 3  #: Rounds of Dopplers and smoother; the first starts from an even run between the fixes.
 _MOVED: Final = 4.0  #: Fixes show the direction of travel when they are this many standard deviations apart.
@@ -70,11 +72,10 @@ def build_references(data: ReferenceData, settings: ReferenceSettings | None = N
             raise MismatchError(
                 "two logs of positions need the vehicle's antennas to check their distance; name a vehicle"
             )
-        one, other = judged
-        pair = (judged[one], judged[other])
+        others = reversed(list(judged.values()))
         judged = {
-            one: judge_pair(pair[0], pair[1], data.distance_m, settings),
-            other: judge_pair(pair[1], pair[0], data.distance_m, settings),
+            name: judge_pair(fixes, other, data.distance_m, settings)
+            for (name, fixes), other in zip(judged.items(), others, strict=True)
         }
     return {name: _ReferenceBuilder(name, data, settings).built(fixes) for name, fixes in judged.items()}
 
@@ -91,7 +92,10 @@ class _ReferenceBuilder:
         fixes = judge_place(fixes, self.trajectory, self.settings)
         good = self._good(fixes)
         speeds = self._speeds(fixes.time[good], fixes.arc_m[good])
-        wheel = self._wheel(fixes.time[good], fixes.arc_m[good])
+        wheel = None
+        if (pulses := self.data.pulses) is not None:
+            _check_time(pulses.path, pulses.time, fixes.time[good])
+            wheel = wheel_of(pulses, self.settings.pulse_m, fixes.time[good], fixes.arc_m[good])
         if self.data.acceleration is not None:
             _check_time(self.data.acceleration.path, self.data.acceleration.time, fixes.time[good])
         judged, (settings, _) = fixes, self._calibrate(speeds, wheel, fixes)
@@ -121,7 +125,7 @@ class _ReferenceBuilder:
 
     def _excess(
         self,
-        speeds: Mapping[str, tuple[Speeds, DopplerSpeed]],
+        speeds: SolvedSpeeds,
         wheel: Wheel | None,
         smoothed: SmoothedReference,
         time: Datetimes,
@@ -150,15 +154,8 @@ class _ReferenceBuilder:
         missed = np.abs(closing) / np.sqrt(variance)
         return np.where(missed > _TELLING, missed, 1.0)
 
-    def _wheel(self, time: Datetimes, arc_m: Floats) -> Wheel | None:
-        pulses = self.data.pulses
-        if pulses is None:
-            return None
-        _check_time(pulses.path, pulses.time, time)
-        return wheel_of(pulses, self.settings.pulse_m, time, arc_m)
-
     def _calibrate(
-        self, speeds: Mapping[str, tuple[Speeds, DopplerSpeed]], wheel: Wheel | None, fixes: Fixes
+        self, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes
     ) -> tuple[ReferenceSettings, dict[str, Any]]:
         """Return the settings with sensor errors estimated from the log's own fixes, and where each came from."""
         settings, sources, good = self.settings, {}, fixes.good
@@ -202,7 +199,7 @@ class _ReferenceBuilder:
         tied = self.trajectory.body_chainage_m is not None
         return {name: d for name, d in self.data.dopplers.items() if name == self.name or tied}
 
-    def _speeds(self, time: Datetimes, place_m: Floats) -> dict[str, tuple[Speeds, DopplerSpeed]]:
+    def _speeds(self, time: Datetimes, place_m: Floats) -> SolvedSpeeds:
         """Doppler speeds of every receiver, seen from places along this antenna's path."""
         speeds_of = {}
         for name, dopplers in self._sources().items():
@@ -221,7 +218,7 @@ class _ReferenceBuilder:
             speeds_of[name] = (speeds, solved)
         return speeds_of
 
-    def _join(self, speeds: Mapping[str, tuple[Speeds, DopplerSpeed]]) -> Speeds | None:
+    def _join(self, speeds: SolvedSpeeds) -> Speeds | None:
         """All receivers' speeds as one."""
         if not speeds:
             return None
@@ -230,17 +227,12 @@ class _ReferenceBuilder:
         if len(own) > 1:
             apart = np.diff(time, prepend=time[:1] - np.timedelta64(1, "s")) > np.timedelta64(20, "ms")
             time = time[apart]
-        speed, sigma = fused(time, own)
+        speed, sigma = combine_speeds(time, own)
         rows = np.flatnonzero(np.isfinite(speed))
         return Speeds(time=time[rows], speed_mps=speed[rows], sigma_mps=sigma[rows])
 
     def _travel(
-        self,
-        time: Datetimes,
-        speeds: Mapping[str, tuple[Speeds, DopplerSpeed]],
-        wheel: Wheel | None,
-        fixes: Fixes,
-        settings: ReferenceSettings,
+        self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
     ) -> tuple[Floats, Floats]:
         """Way travelled up to instants and its variance: by the wheel where there is one, else by Dopplers."""
         joined = self._join(speeds)
@@ -265,7 +257,7 @@ class _ReferenceBuilder:
         inside = (section >= 0) & (section < len(slope))
         hint = np.where(inside, slope[np.clip(section, 0, len(slope) - 1)], np.nan)
         if joined is not None and len(joined.time):
-            row = nearest(joined.time, time)
+            row = nearest_rows(joined.time, time, within_ns=SAME_INSTANT_NS)
             hint = np.where(row >= 0, joined.speed_mps[np.maximum(row, 0)], hint)
         return np.asarray(hint)
 
@@ -275,14 +267,14 @@ class _ReferenceBuilder:
         at: Indices,
         fixes: Fixes,
         good: Indices,
-        speeds: Mapping[str, tuple[Speeds, DopplerSpeed]],
+        speeds: SolvedSpeeds,
         wheel: Wheel | None,
         place_m: Floats,
     ) -> Evidence:
         blank = np.full(len(time), np.nan)
         fix, sigma, way = blank.copy(), blank.copy(), blank
         fix[at], sigma[at] = fixes.arc_m[good], fixes.sigma_m[good]
-        doppler, doppler_sigma = fused(time, [part for part, _ in speeds.values()])
+        doppler, doppler_sigma = combine_speeds(time, [part for part, _ in speeds.values()])
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, self._join(speeds), fixes))
         acceleration = np.full(len(time) - 1, np.nan)
@@ -306,7 +298,7 @@ class _ReferenceBuilder:
 
     def _facts(
         self,
-        speeds: Mapping[str, tuple[Speeds, DopplerSpeed]],
+        speeds: SolvedSpeeds,
         wheel: Wheel | None,
         smoothed: SmoothedReference,
         sources: Mapping[str, Mapping[str, Any]],

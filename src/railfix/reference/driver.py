@@ -243,9 +243,8 @@ def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) 
         for name, path in inputs.positions.items()
     }
     notes = [note for log in logs.values() for note in log.notes]
-    notes += [
-        f"{log.path}: has no qualities, every row is taken as fixed" for log in logs.values() if not log.has_quality
-    ]
+    unrated = [log.path for log in logs.values() if not log.has_quality]
+    notes += [f"{path}: has no qualities, every row is taken as fixed" for path in unrated]
     dopplers: dict[str, Dopplers] = {}
     if inputs.logs:
         date = None if options.date is None else np.datetime64(options.date, "ns")

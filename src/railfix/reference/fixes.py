@@ -13,7 +13,7 @@ from pydantic import Field
 from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.geodesy import sigma_along
 from railfix.core.settings import Settings, option
-from railfix.core.timescale import seconds
+from railfix.core.timescale import nearest_rows, seconds
 from railfix.io.position_log import PositionLog
 from railfix.positioning.doppler_speed import DopplerSpeedLimits
 from railfix.reference.matching import match
@@ -85,7 +85,7 @@ class ReferenceSettings(Settings):
 
 
 #: Positions of two antennas that are tagged no further apart belong to one instant [ns].
-SAME_INSTANT_NS: Final = 5_000_000
+_PAIR_NS: Final = 5_000_000
 _LOOK_BACK: Final = 60  #: Runs of agreeing fixes that a run may be joined to, back from it.
 #: Standard deviations of the travelled distance that a difference may have.
 _TRAVEL_SIGMAS: Final = 3.0
@@ -190,18 +190,14 @@ def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: Referenc
     """The rows of one antenna by their distance to the other antenna's at the same instant (P2 3.3: 5 cm)."""
     rows = np.flatnonzero(other.rejection & ~np.int64(_OF_THE_PAIR) == 0)
     rejection, spacing = fixes.rejection.copy(), np.full(len(fixes), np.nan)
-    paired = np.zeros(len(fixes), dtype=np.bool_)
+    there, place = other.time[rows], other.ecef_m[rows]
+    nearest = nearest_rows(there, fixes.time, within_ns=_PAIR_NS)
+    paired = (nearest >= 0) & (rejection == 0)
     if len(rows):
-        there = other.time[rows].astype(np.int64)
-        here = fixes.time.astype(np.int64)
-        after = np.clip(np.searchsorted(there, here), 1, max(len(there) - 1, 1))
-        after = np.minimum(after, len(there) - 1)
-        before = np.maximum(after - 1, 0)
-        nearest = np.where(np.abs(there[before] - here) <= np.abs(there[after] - here), before, after)
-        paired = (np.abs(there[nearest] - here) <= SAME_INSTANT_NS) & (rejection == 0)
         # At 30 m/s a millisecond between the two receivers' tags is 3 cm: the other one is moved to the same instant.
-        late_s = (here - there[nearest]) / 1e9
-        moved = other.ecef_m[rows[nearest]] + late_s[:, None] * _velocity(other.time[rows], other.ecef_m[rows])[nearest]
+        velocity = np.gradient(place, seconds(there - there[0]), axis=0) if len(rows) > 1 else np.zeros_like(place)
+        late_s = (fixes.time - there[nearest]).astype(np.int64) / 1e9
+        moved = place[nearest] + late_s[:, None] * velocity[nearest]
         apart = np.linalg.norm(fixes.ecef_m - moved, axis=1) - distance_m
         spacing = np.where(paired, apart, np.nan)
     if settings.unpaired == "reject":
@@ -209,13 +205,6 @@ def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: Referenc
     with np.errstate(invalid="ignore"):
         _reject(rejection, np.abs(spacing) > settings.spacing_m, FixRejection.SPACING)
     return replace(fixes, rejection=rejection, spacing_m=spacing)
-
-
-def _velocity(time: Datetimes, ecef_m: Floats) -> Floats:
-    """Velocities by differences of neighbours, shape (n, 3) [m/s]; 0 for a single position."""
-    if len(time) < 2:
-        return np.zeros_like(ecef_m)
-    return np.asarray(np.gradient(ecef_m, seconds(time - time[0]), axis=0))
 
 
 #: The other antenna's row counts in a pair whatever this check gave it.

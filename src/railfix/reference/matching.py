@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Datetimes, Floats, Indices
-from railfix.core.timescale import seconds, timedelta
+from railfix.core.timescale import nearest_rows, seconds, timedelta
 from railfix.track.trajectory import Trajectory
 
 _OUT_OF_REACH_M = 1e6  #: A pass out of reach costs this much more than any other choice [m].
@@ -151,11 +151,11 @@ class Speeds:
         return ways[0], ways[1]
 
 
-def fused(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
+def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
     """Combine speeds of all sources, weighted by their variances, shapes (N,); NaN where there is none."""
     weight, total = np.zeros(len(time)), np.zeros(len(time))
     for source in sources:
-        at = nearest(time, source.time)
+        at = nearest_rows(time, source.time, within_ns=SAME_INSTANT_NS)
         rows = np.flatnonzero(at >= 0)
         w = source.sigma_mps[rows] ** -2.0
         np.add.at(weight, at[rows], w)
@@ -164,23 +164,12 @@ def fused(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
         return np.where(weight > 0, total / weight, np.nan), np.where(weight > 0, weight**-0.5, np.nan)
 
 
-def nearest(time: Datetimes, wanted: Datetimes) -> Indices:
-    """Return the row of `time` at each wanted instant within `SAME_INSTANT_NS`; -1 where there is none."""
-    if not len(time):
-        return np.full(len(wanted), -1, dtype=np.intp)
-    have, want = time.astype(np.int64), wanted.astype(np.int64)
-    after = np.clip(np.searchsorted(have, want), 0, len(have) - 1)
-    before = np.maximum(after - 1, 0)
-    row = np.where(np.abs(have[before] - want) <= np.abs(have[after] - want), before, after)
-    return np.where(np.abs(have[row] - want) <= SAME_INSTANT_NS, row, -1).astype(np.intp)
-
-
 def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
     """Return the instants of a reference: rows of the log, receiver epochs, regular steps elsewhere."""
     merged = rows
     for other in others:
         new = other[(other > rows[0]) & (other < rows[-1])]
-        merged = np.union1d(merged, new[nearest(merged, new) < 0])
+        merged = np.union1d(merged, new[nearest_rows(merged, new, within_ns=SAME_INSTANT_NS) < 0])
     usual = float(np.median(seconds(np.diff(rows))))
     step = seconds(np.diff(merged))
     pieces = np.where(step > 1.5 * usual, np.ceil(step / usual - 1e-6), 1.0).astype(np.int64)

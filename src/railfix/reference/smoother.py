@@ -155,10 +155,8 @@ def _with_doppler(
     )
     chain = _with_walk(chain, unknowns.doppler, kept, 1.0 / (variance * (1.0 - kept**2)))
     row = _one(unknowns, unknowns.speed) + _one(unknowns, unknowns.doppler)
-    chain = chain.with_observations(
-        seen, row, evidence.doppler_mps[seen], relief * evidence.doppler_sigma_mps[seen] ** -2.0
-    )
-    return chain
+    weight = relief * evidence.doppler_sigma_mps[seen] ** -2.0
+    return chain.with_observations(seen, row, evidence.doppler_mps[seen], weight)
 
 
 def _with_wheel(
@@ -182,8 +180,7 @@ def _with_wheel(
     before[:, 0, unknowns.scale] = -way
     variance = np.where(known, settings.slip_m**2 * np.abs(way) + _LEAST_STEP_M**2, _ANY_DISTANCE_M**2)
     chain = chain.with_steps(before, after, np.zeros((len(way), 1)), (1.0 / variance)[:, None, None])
-    chain = _with_walk(chain, unknowns.scale, np.ones(len(dt)), 1.0 / (_SCALE_DRIFT**2 * dt))
-    return chain
+    return _with_walk(chain, unknowns.scale, np.ones(len(dt)), 1.0 / (_SCALE_DRIFT**2 * dt))
 
 
 def _with_offset(chain: Chain, unknowns: _Unknowns, dt: Floats) -> Chain:
@@ -199,8 +196,7 @@ def _with_walk(chain: Chain, unknown: int, kept: Floats, weight: Floats) -> Chai
     """``x_{k+1} = kept x_k`` with noise, for one unknown."""
     before, after = np.zeros((2, len(kept), 1, chain.right.shape[1]))
     after[:, 0, unknown], before[:, 0, unknown] = 1.0, -kept
-    chain = chain.with_steps(before, after, np.zeros((len(kept), 1)), weight[:, None, None])
-    return chain
+    return chain.with_steps(before, after, np.zeros((len(kept), 1)), weight[:, None, None])
 
 
 def _one(unknowns: _Unknowns, unknown: int) -> Floats:

@@ -222,7 +222,9 @@ def antenna_pair_screen(
     later = np.zeros(len(front)) if tags is None else seconds(tags.later)
     raw = rear - front - expected - rate * later[:, None]
     if limits.clocks == "median":
-        clock = _clock_difference(raw, rate, satellite, least=limits.least_satellites)
+        # the instants that the clocks move are allowed for
+        timed = raw + rate * clock_medians(raw, satellite) / SPEED_OF_LIGHT
+        clock = clock_medians(timed, satellite, least=limits.least_satellites)
         raw = raw + rate * clock / SPEED_OF_LIGHT
     else:
         separate = np.abs(medians(raw))[:, None] > SEPARATE_CLOCKS_M
@@ -244,12 +246,6 @@ def antenna_pair_screen(
         clock_m=clock,
         clocks=CLOCKS[limits.clocks],
     )
-
-
-def _clock_difference(raw: Floats, rate: Floats, satellite: Strings, *, least: int) -> Floats:
-    """Median of each constellation, shape (P, C) [m]; the instants that it moves are allowed for."""
-    first = clock_medians(raw, satellite)
-    return clock_medians(raw + rate * first / SPEED_OF_LIGHT, satellite, least=least)
 
 
 class AntennaPairScreen(PairScreen[AntennaPairLimits]):

@@ -17,10 +17,11 @@ from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, Protocol,
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks, Strings, medians, read_only
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings, medians, read_only
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
 from railfix.core.settings import Settings
+from railfix.core.timescale import nearest_rows
 from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.track.trajectory import Trajectory
 
@@ -76,16 +77,8 @@ class Verdict:
 def suspicion_sigma_m(reject: Masks, error_m: Floats, sigma_m: Floats) -> Floats:
     """Return the standard deviation of ranges of which some are suspected, shape (T, M) [m].
 
-    The error of a suspected range, two sigmas at least, is added as another standard deviation.
-
-    Parameters
-    ----------
-    reject : ndarray of bool, shape (T, M)
-        Suspected ranges.
-    error_m : ndarray, shape (T, M) [m]
-        Size of their errors, as measured by the screen.
-    sigma_m : ndarray, shape (T, M) [m]
-        Without the suspicion.
+    The error of a suspected range (`reject`), as the screen measured it (`error_m`), two sigmas at least, is added to
+    `sigma_m` as another standard deviation.
     """
     if not reject.any():
         return sigma_m
@@ -162,7 +155,7 @@ class Screen(ABC, Generic[Limits]):
     columns: ClassVar[tuple[ScreenColumn, ...]] = ()  #: Columns of the result tables.
     observation_pictures: ClassVar[tuple[ObservationPicture, ...]] = ()
 
-    def unable(self, limits: Limits, setup: ScreenSetup) -> bool:  # noqa: ARG002  for screens that override it
+    def unable(self, limits: Limits, setup: ScreenSetup) -> bool:
         """Return whether the screen can judge nothing in this run."""
         return False
 
@@ -213,7 +206,7 @@ class _OfTwoAntennas(Screen[Limits]):
 
     needs = "two antennas and a vehicle file, which places them on one vehicle"
 
-    def unable(self, limits: Limits, setup: ScreenSetup) -> bool:  # noqa: ARG002
+    def unable(self, limits: Limits, setup: ScreenSetup) -> bool:
         """Return whether there are no two antennas with a known spacing."""
         return setup.antennas < 2 or not setup.spacing_known
 
@@ -258,38 +251,17 @@ class PositionScreen(_OfTwoAntennas[Limits]):
 
 
 def pair_epochs(time_front: ArrayLike, time_rear: ArrayLike, *, tolerance_s: float) -> tuple[Indices, Indices]:
-    """Return the epochs of two receivers that belong together.
+    """Return the epochs of two receivers that belong together, by rising time tags that differ by `tolerance_s` at
+    most.
 
-    Parameters
-    ----------
-    time_front, time_rear : array_like of datetime64[ns], shapes (F,), (R,)
-        Rising.
-    tolerance_s : float [s]
-        Largest difference of the tags.
-
-    Returns
-    -------
-    index_front, index_rear : ndarray of int, shape (P,)
-        Each epoch is in one pair at most: with the nearest of the other that has it nearest too.
+    Each epoch is in one pair at most: with the nearest of the other that has it nearest too.
     """
-    front = np.asarray(time_front, dtype="datetime64[ns]").astype(np.int64)
-    rear = np.asarray(time_rear, dtype="datetime64[ns]").astype(np.int64)
-    if not len(front) or not len(rear):
-        return np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
-    to_rear, to_front = _nearest(front, rear), _nearest(rear, front)
-    at = np.arange(len(front))
-    mutual = to_front[to_rear] == at
-    close = np.abs(front - rear[to_rear]) <= round(tolerance_s * 1e9)
-    index = np.flatnonzero(mutual & close)
+    within_ns = round(tolerance_s * 1e9)
+    to_rear = nearest_rows(time_rear, time_front, within_ns=within_ns)
+    to_front = nearest_rows(time_front, time_rear, within_ns=within_ns)
+    index = np.flatnonzero(to_rear >= 0)
+    index = index[to_front[to_rear[index]] == index]
     return index, to_rear[index]
-
-
-def _nearest(values: Integers, among: Integers) -> Indices:
-    """Return the index of the nearest of rising numbers, the earlier of two equally near."""
-    after = np.minimum(np.maximum(among.searchsorted(values), 1), max(len(among) - 1, 1))
-    before = after - 1
-    after = np.minimum(after, len(among) - 1)
-    return np.where(np.abs(values - among[before]) <= np.abs(among[after] - values), before, after)
 
 
 def pair_channels(

@@ -13,7 +13,7 @@ recordings at 1 Hz: a quarter of the bad codes found at the same loss); neither 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -106,8 +106,7 @@ def expected_limit_m(interval_s: Floats, sigma_m: Floats, *, limits: DopplerLimi
 def receiver_limit_m(
     interval_s: Floats, metric_m: Floats, sum_log: float, weight: float, *, limits: DopplerLimits
 ) -> tuple[Floats, float, float]:
-    """Limit of mode "receiver", shape (T,) [m], and the sum of the logarithms of the scales and their number to go on
-    with.
+    """Limit of mode "receiver", shape (T,) [m], and the sum of the logarithms of the scales and their number so far.
 
     The scale is that of changes at the short interval: what an epoch shows is divided by the growth of the noise. Of a
     dozen satellites it comes out a tenth to a seventh too small (their own median is taken out; logarithms are
@@ -138,18 +137,14 @@ class DopplerScreened(Screened):
     level_m: Floats
 
 
-def _none(kind: str) -> Strings:
-    return np.empty(0, dtype=kind)
-
-
 @dataclass(frozen=True, kw_only=True)
 class DopplerState:
     """The last epoch seen, and the satellites under suspicion then; shapes (M,)."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
     #: Channels; those of the next chunk may be others.
-    satellite: Strings = field(default_factory=lambda: _none("<U3"))
-    signal: Strings = field(default_factory=lambda: _none("<U2"))
+    satellite: Strings = field(default_factory=lambda: np.empty(0, dtype="<U3"))
+    signal: Strings = field(default_factory=lambda: np.empty(0, dtype="<U2"))
     #: NaN where absent.
     code_m: Floats = field(default_factory=lambda: np.empty(0))
     doppler_hz: Floats = field(default_factory=lambda: np.empty(0))
@@ -259,24 +254,10 @@ def _align(state: DopplerState, satellite: Strings, signal: Strings) -> DopplerS
         return state
     row = {key: i for i, key in enumerate(zip(state.satellite.tolist(), state.signal.tolist(), strict=True))}
     found = np.array([row.get(key, -1) for key in zip(satellite.tolist(), signal.tolist(), strict=True)], dtype=int)
-    known = found >= 0
-
-    def moved(values: Floats) -> Floats:
-        return np.where(known, np.append(values, np.nan)[found], np.nan)
-
-    never = np.datetime64("NaT", "ns")
-    return DopplerState(
-        time=state.time,
-        satellite=satellite,
-        signal=signal,
-        code_m=moved(state.code_m),
-        doppler_hz=moved(state.doppler_hz),
-        code_sigma_m=moved(state.code_sigma_m),
-        level_m=moved(state.level_m),
-        since=np.where(known, np.append(state.since, never)[found], never),
-        scale_sum=state.scale_sum,
-        scale_epochs=state.scale_epochs,
-    )
+    names = ("code_m", "doppler_hz", "code_sigma_m", "level_m")
+    aligned: dict[str, Any] = {name: np.append(getattr(state, name), np.nan)[found] for name in names}
+    since = np.append(state.since, np.datetime64("NaT", "ns"))[found]
+    return replace(state, satellite=satellite, signal=signal, since=since, **aligned)
 
 
 def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | None, limits: DopplerLimits) -> Floats:
@@ -339,11 +320,7 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
     )  # fmt: skip
 
     def judge(
-        self,
-        antenna: AntennaRanges,
-        limits: DopplerLimits,
-        setup: ScreenSetup,  # noqa: ARG002
-        state: Any,
+        self, antenna: AntennaRanges, limits: DopplerLimits, setup: ScreenSetup, state: Any
     ) -> tuple[tuple[Verdict, ...], Any]:
         """Return the verdict on a chunk, and the last epoch with the satellites under suspicion."""
         screened, after = doppler_screen(

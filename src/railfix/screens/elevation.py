@@ -28,13 +28,7 @@ class ElevationLimits(Settings):
 
 
 def elevation_screen(elevation_deg: ArrayLike, *, limits: ElevationLimits | None = None) -> Screened:
-    """Reject satellites below the mask; the metric is the elevation [deg].
-
-    Parameters
-    ----------
-    elevation_deg : array_like, shape (T, M) [deg]
-        NaN where unknown: not judged.
-    """
+    """Reject satellites below the mask; the metric is the elevation [deg], which is NaN where unknown: not judged."""
     limits = limits or ElevationLimits()
     metric = np.asarray(elevation_deg, dtype=np.float64)
     return Screened(metric=metric, reject=metric < limits.mask_deg)
@@ -48,22 +42,13 @@ class ElevationScreen(ObservationScreen[ElevationLimits]):
     needs = "navigation records"
     observation_pictures = (
         ObservationPicture(
-            "elevation",
-            "elevation mask",
-            "elevation [deg]",
-            "elevation_deg",
-            Reason.ELEVATION_MASK,
-            "mask_deg",
+            "elevation", "elevation mask", "elevation [deg]", "elevation_deg", Reason.ELEVATION_MASK, "mask_deg",
             "below",
         ),
-    )
+    )  # fmt: skip
 
     def judge(
-        self,
-        antenna: AntennaRanges,
-        limits: ElevationLimits,
-        setup: ScreenSetup,  # noqa: ARG002
-        state: Any,
+        self, antenna: AntennaRanges, limits: ElevationLimits, setup: ScreenSetup, state: Any
     ) -> tuple[tuple[Verdict, ...], Any]:
         """Return the verdict on a chunk; the screen has no memory."""
         screened = elevation_screen(antenna.elevation_deg, limits=limits)

@@ -301,7 +301,7 @@ def record_state(
     records: KeplerRecords, row: Indices, since_toe_s: Floats, since_toc_s: Floats
 ) -> tuple[Floats, Floats]:
     """Position (T, 3) [m] and clock with relativity (T,) [s] by one row of the records for each instant."""
-    position, _, relativity = kepler_state(Orbits.of_table(Orbits.from_records(records).table[row]), since_toe_s)
+    position, _, relativity = kepler_state(Orbits.from_records(records).take(row), since_toe_s)
     dt = since_toc_s
     clock = records.af0_s[row] + records.af1[row] * dt + records.af2[row] * dt**2 + relativity
     return np.stack(position, axis=-1), clock

@@ -22,21 +22,11 @@ from railfix.core.errors import InputFileError, SettingsError
 
 #: Three-dimensional codes of the realisations of the ITRF.
 _ITRF: Final = {
-    "ITRF88": "EPSG:7900",
-    "ITRF89": "EPSG:7901",
-    "ITRF90": "EPSG:7902",
-    "ITRF91": "EPSG:7903",
-    "ITRF92": "EPSG:7904",
-    "ITRF93": "EPSG:7905",
-    "ITRF94": "EPSG:7906",
-    "ITRF96": "EPSG:7907",
-    "ITRF97": "EPSG:7908",
-    "ITRF2000": "EPSG:7909",
-    "ITRF2005": "EPSG:7910",
-    "ITRF2008": "EPSG:7911",
-    "ITRF2014": "EPSG:7912",
+    "ITRF88": "EPSG:7900", "ITRF89": "EPSG:7901", "ITRF90": "EPSG:7902", "ITRF91": "EPSG:7903", "ITRF92": "EPSG:7904",
+    "ITRF93": "EPSG:7905", "ITRF94": "EPSG:7906", "ITRF96": "EPSG:7907", "ITRF97": "EPSG:7908",
+    "ITRF2000": "EPSG:7909", "ITRF2005": "EPSG:7910", "ITRF2008": "EPSG:7911", "ITRF2014": "EPSG:7912",
     "ITRF2020": "EPSG:9989",
-}
+}  # fmt: skip
 #: Frames aligned with a realisation of the ITRF within 1 cm.
 _ALIGNED: Final = {
     "ITRF92": "WGS 84 (G730)",
@@ -80,12 +70,11 @@ class HeldFrame:
         cross = (east - west) * (latitude_deg - south) - (north - south) * (longitude_deg % 360.0 - west)
         return other if cross < 0.0 else self.plate
 
-    def left_out(self, years: float) -> str:
+    def describe_rest(self, years: float) -> str:
         """What is left out after some years, in words."""
         low, high = (abs(years) * rate / 1000.0 for rate in self.rest_mm)
-        return f"its motion against that plate, {low:.2f} to {high:.2f} m, is left out" + (
-            f", {self.but}" * bool(self.but)
-        )
+        but = f", {self.but}" if self.but else ""
+        return f"its motion against that plate, {low:.2f} to {high:.2f} m, is left out{but}"
 
 
 _ANDES: Final = "as are earthquakes, metres in Chile since 2010"
@@ -163,28 +152,17 @@ SAME: Final = {
 WORKING_FRAME: Final = "EPSG:9989"
 #: Frames that maps of a region are usually in: name, three-dimensional code. The first of a place is the likelier one.
 REGIONAL: Final = {
-    "ETRS89": "EPSG:4937",
-    "NAD83(2011)": "EPSG:6319",
-    "NAD83(CSRS)": "EPSG:8254",
-    "GDA2020": "EPSG:7843",
-    "JGD2011": "EPSG:6667",
-    "KGD2002": "EPSG:4927",
-    "TWD97": "EPSG:3823",
-    "CGCS2000": "EPSG:4480",
-    "NZGD2000": "EPSG:4959",
-    "SIRGAS 2000": "EPSG:4989",
-    "Hartebeesthoek94": "EPSG:4941",
-}
+    "ETRS89": "EPSG:4937", "NAD83(2011)": "EPSG:6319", "NAD83(CSRS)": "EPSG:8254", "GDA2020": "EPSG:7843",
+    "JGD2011": "EPSG:6667", "KGD2002": "EPSG:4927", "TWD97": "EPSG:3823", "CGCS2000": "EPSG:4480",
+    "NZGD2000": "EPSG:4959", "SIRGAS 2000": "EPSG:4989", "Hartebeesthoek94": "EPSG:4941",
+}  # fmt: skip
 MARGIN_DEG: Final = 0.5  #: Margin about the area of use of a CRS [deg].
 #: Largest scale of a grid that is the one of a line, less 1: grids of countries have up to 0.005.
 LARGEST_SCALE: Final = 0.01
 #: Projections of web maps and of the world, whose scale is none of a survey.
 _UNEVEN: Final = (
-    "Popular Visualisation Pseudo Mercator",
-    "Mercator (variant A)",
-    "Mercator (variant B)",
-    "Equidistant Cylindrical",
-)
+    "Popular Visualisation Pseudo Mercator", "Mercator (variant A)", "Mercator (variant B)", "Equidistant Cylindrical",
+)  # fmt: skip
 _COVERED: Final = 0.5  #: Share of the area of use of an older datum that a modern frame of its region covers.
 MODERN_M: Final = 0.5  #: Accuracy [m] worse than which a transformation of PROJ is between datums of another age.
 
@@ -211,7 +189,7 @@ def _system(crs: str) -> CRS:
     return CRS.from_user_input(crs)
 
 
-def known_crs(crs: str, *, path: str | PathLike[str] = "") -> CRS:
+def find_crs(crs: str, *, path: str | PathLike[str] = "") -> CRS:
     """The system of a name, asked for in a file; SettingsError when PROJ does not know it."""
     try:
         return _system(crs)
@@ -222,22 +200,22 @@ def known_crs(crs: str, *, path: str | PathLike[str] = "") -> CRS:
         ) from None
 
 
-def used_crs(path: str | PathLike[str], given: str | None, named: str | None) -> str | None:
+def choose_crs(path: str | PathLike[str], given: str | None, named: str | None) -> str | None:
     """The CRS given for a file, or the one that it names itself; SettingsError when they contradict each other."""
     if given is None or named is None:
         used = given or named
         if used is not None:
-            known_crs(used, path=path)
+            find_crs(used, path=path)
         return used
-    one, other = (known_crs(name, path=path).to_2d() for name in (given, named))
+    one, other = (find_crs(name, path=path).to_2d() for name in (given, named))
     if not one.equals(other, ignore_axis_order=True):
         raise SettingsError(f"{path}: --crs {given} contradicts the file's own CRS {named}")
-    return given if known_crs(given).is_compound else named  # with its height datum, where it has one
+    return given if find_crs(given).is_compound else named  # with its height datum, where it has one
 
 
 def unit_of_grid(crs: str, *, path: str) -> float:
     """Metres of the unit of a projected CRS; SettingsError when it is none."""
-    system = known_crs(crs, path=path)
+    system = find_crs(crs, path=path)
     if not system.is_projected and not (system.is_compound and system.sub_crs_list[0].is_projected):
         raise SettingsError(f"{path}: {crs} is {system.name}, no grid; a design is in one, such as EPSG:25832 (--crs)")
     return float(system.axis_info[0].unit_conversion_factor)
@@ -245,20 +223,20 @@ def unit_of_grid(crs: str, *, path: str) -> float:
 
 def unit_of_heights(crs: str | None) -> float:
     """Metres of the unit of the heights of a CRS; 1 where it has none."""
-    axes = [] if crs is None else known_crs(crs).axis_info
+    axes = [] if crs is None else find_crs(crs).axis_info
     return float(axes[2].unit_conversion_factor) if len(axes) > 2 else 1.0
 
 
 def vertical_of(crs: str | None) -> CRS | None:
     """The height datum of a compound CRS, None for others."""
-    system = None if crs is None else known_crs(crs)
+    system = None if crs is None else find_crs(crs)
     return system.sub_crs_list[1] if system is not None and system.is_compound else None
 
 
 @lru_cache(maxsize=64)
 def geodetic_of(crs: str) -> CRS:
     """The geodetic frame that a CRS is based on."""
-    geodetic = known_crs(crs).geodetic_crs
+    geodetic = find_crs(crs).geodetic_crs
     if geodetic is None:
         raise SettingsError(f"the CRS {crs!r} has no geodetic frame; give for example EPSG:4258 (ETRS89)")
     return geodetic
@@ -276,22 +254,26 @@ def operation_of(crs: str) -> Transformer | None:
     return None
 
 
+def operations_between(source: CRS, target: CRS | str, area: Any = None) -> TransformerGroup:
+    """What PROJ knows between two systems over an area; grids that are not installed are no warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return TransformerGroup(source, target, always_xy=True, allow_ballpark=False, area_of_interest=area)
+
+
 def _operations(source: CRS, target: CRS, *, over: CRS | None = None) -> list[Transformer]:
     """Transformations of known accuracy that PROJ has between two frames, over the area of use of a third CRS."""
     area = None if over is None else over.area_of_use
-    within: Any = None if area is None else AreaOfInterest(*area.bounds)
+    within = None if area is None else AreaOfInterest(*area.bounds)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # about missing grids: reported by `older_datum_note`
-            group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False, area_of_interest=within)
+        group = operations_between(source, target, within)
     except (ProjError, IndexError):  # IndexError: pyproj cannot make an operation that is known at one epoch alone
         return []
     return [t for t in group.transformers if t.accuracy >= 0.0]
 
 
 def frame_degrees(crs: str, x: Floats, y: Floats, *, path: str) -> tuple[Floats, Floats, str]:
-    """Latitude and longitude of map coordinates (longitude and latitude, or easting and northing), and the frame's
-    code.
+    """Latitude and longitude of map coordinates (longitude and latitude, or easting and northing), and the frame.
 
     Coordinates of an older datum (Tokyo, Belgian Datum 72) are transformed by PROJ to the modern frame of their region;
     nothing is shifted between modern frames. InputFileError: when the CRS does not reach there.
@@ -300,7 +282,7 @@ def frame_degrees(crs: str, x: Floats, y: Floats, *, path: str) -> tuple[Floats,
     frame = _modern_frame(crs)[0] if kind == "older datum" else _frame_of(crs)
     longitude, latitude = (np.asarray(v, np.float64) for v in _in_plan(crs, frame).transform(x, y))
     _check_area(crs, latitude, longitude, path=path)
-    if known_crs(crs).is_projected:
+    if find_crs(crs).is_projected:
         _check_scale(crs, frame, np.stack([x, y], axis=-1), latitude, longitude, path=path)
     return latitude, longitude, frame
 
@@ -308,12 +290,8 @@ def frame_degrees(crs: str, x: Floats, y: Floats, *, path: str) -> tuple[Floats,
 def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> None:
     """Reject points outside the area of use of a CRS's frame, of which a projection may be used beyond its own."""
     south, north, west, east = _bounds(crs)
-    if (
-        south <= latitude_deg.min()
-        and latitude_deg.max() <= north
-        and west <= longitude_deg.min()
-        and longitude_deg.max() <= east
-    ):
+    of_latitude = south <= latitude_deg.min() and latitude_deg.max() <= north
+    if of_latitude and west <= longitude_deg.min() and longitude_deg.max() <= east:
         return
     finite = np.isfinite(latitude_deg) & np.isfinite(longitude_deg) & (np.abs(latitude_deg) <= 90.0)
     if not finite.all():
@@ -325,7 +303,7 @@ def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: 
     if area is None or not outside.any():
         return
     lat, lon = latitude_deg[outside][:1], longitude_deg[outside][:1]
-    swapped = known_crs(crs).is_geographic and is_in_area(geodetic, lon, lat, margin_deg=MARGIN_DEG).all()
+    swapped = find_crs(crs).is_geographic and is_in_area(geodetic, lon, lat, margin_deg=MARGIN_DEG).all()
     raise InputFileError(
         path,
         f"latitude {lat[0]:.4f}, longitude {lon[0]:.4f} is outside the area of use of {geodetic.name} (latitude "
@@ -345,7 +323,7 @@ def _bounds(crs: str) -> tuple[float, float, float, float]:
 
 def _check_scale(crs: str, frame: str, xy: Floats, latitude: Floats, longitude: Floats, *, path: str) -> None:
     """Reject points of a grid whose unit of length there is not that of the ground: they are of another grid."""
-    system = known_crs(crs)
+    system = find_crs(crs)
     method = "" if system.coordinate_operation is None else system.coordinate_operation.method_name
     if len(xy) < 2 or method in _UNEVEN:
         return
@@ -409,16 +387,10 @@ def older_datum_note(crs: str | None) -> tuple[str, ...]:
     size = f"with an accuracy of {accuracy:g} m" if np.isfinite(accuracy) else "with unknown accuracy"
     older = "is an older datum, transformed" if not accuracy <= MODERN_M else "is transformed"
     grid = ""
-    if not accuracy <= MODERN_M and _has_missing_grids(crs, code):
+    plan = geodetic_of(crs).to_2d(), CRS.from_user_input(code).to_2d()
+    if not accuracy <= MODERN_M and operations_between(*plan).unavailable_operations:
         grid = "; a grid that PROJ knows of would be better and is not installed (projsync)"
     return (f"map: {name} {older} to {to} by PROJ {size}{grid}",)
-
-
-def _has_missing_grids(crs: str, code: str) -> bool:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        group = TransformerGroup(geodetic_of(crs).to_2d(), CRS.from_user_input(code).to_2d(), allow_ballpark=False)
-    return bool(group.unavailable_operations)
 
 
 def is_in_area(crs: CRS, latitude_deg: Floats, longitude_deg: Floats, *, margin_deg: float) -> Masks:

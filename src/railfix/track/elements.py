@@ -18,7 +18,7 @@ from pyproj import CRS, Transformer
 from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import InputFileError
 from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, frame_degrees, is_in_area, older_datum_note, unit_of_grid
-from railfix.track.frames import stated_heights
+from railfix.track.frames import heights_of_file
 from railfix.track.route import NO_HEIGHTS, MapReading, Segment
 
 #: Share of the change of curvature or cant at a share t of the element, and its integral from 0 (IFC 4.3.2).
@@ -90,10 +90,7 @@ class PlanElement:
     def _integral(self, start: Floats, end: Floats) -> Floats:
         half = (end - start)[:, None] / 2.0
         direction = self.direction_at(start[:, None] + half * (1.0 + _NODES))
-        return np.stack(
-            [(half * _WEIGHTS * np.cos(direction)).sum(axis=1), (half * _WEIGHTS * np.sin(direction)).sum(axis=1)],
-            axis=-1,
-        )
+        return np.stack([(half * _WEIGHTS * part(direction)).sum(axis=1) for part in (np.cos, np.sin)], axis=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,9 +110,8 @@ class ProfileElement:
         """Height [m] at places in plan."""
         way = place_m - self.start_m
         if self.arc == "parabola" or self.first == self.last:
-            return np.asarray(
-                self.height_m + self.first * way + (self.last - self.first) * way**2 / (2.0 * self.length_m)
-            )
+            bend = (self.last - self.first) * way**2 / (2.0 * self.length_m)
+            return np.asarray(self.height_m + self.first * way + bend)
         sine = _sine(self.first) + (_sine(self.last) - _sine(self.first)) * way / self.length_m
         radius = self.length_m / (_sine(self.last) - _sine(self.first))
         return np.asarray(self.height_m - radius * (np.sqrt(1.0 - sine**2) - np.sqrt(1.0 - _sine(self.first) ** 2)))
@@ -266,7 +262,7 @@ def segment_of_design(
     height, model, datum = np.full(len(latitude), np.nan), "", NO_HEIGHTS
     if profile:
         joints += _check_profile(plan, profile, path=f"{path} ({name})")
-        height, model, datum = stated_heights(points.height_m + up, latitude, longitude, reading, path=path)
+        height, model, datum = heights_of_file(points.height_m + up, latitude, longitude, reading, path=path)
     radius = np.full(len(latitude), np.inf)
     bent = np.abs(curvature) > 1e-9
     radius[bent] = -1.0 / curvature[bent] * scale

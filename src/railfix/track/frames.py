@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import os
 import re
-import warnings
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -23,7 +22,6 @@ from pyproj import CRS, Transformer
 from pyproj.crs import CompoundCRS
 from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
 from pyproj.exceptions import CRSError, ProjError
-from pyproj.transformer import TransformerGroup
 
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
@@ -40,6 +38,7 @@ from railfix.track.crs import (
     is_in_area,
     kind_of_frame,
     operation_of,
+    operations_between,
     vertical_of,
 )
 from railfix.track.route import MapReading
@@ -105,8 +104,7 @@ def track_at(track: Track, time: np.datetime64, **motion: Unpack[MapMotion]) -> 
 def points_at(
     ecef_m: Floats, crs: str, time: np.datetime64, *, named: bool = True, **motion: Unpack[MapMotion]
 ) -> tuple[Floats, FrameShift]:
-    """Move points of a map, shape (n, 3), to the frame of the satellites at a time; return also the shift at the middle
-    one.
+    """Move points of a map (n, 3) to the frame of the satellites at a time; return also the shift at the middle one.
 
     Where the map does not name its frame `crs` itself, the size of the doubt is noted. SettingsError: when the plate is
     unknown, or an epoch or plate is given for a frame that does not need it.
@@ -139,10 +137,8 @@ def points_at(
         moved, method, notes = _from_held(ecef_m, frame.name, held, year, epoch, plate)
     at = geodetic_from_ecef(middle)
     east, north, up_m = (float(v) for v in enu_axes(float(at[0]), float(at[1])) @ (moved[len(ecef_m) // 2] - middle))
-    shift = FrameShift(
-        frame=frame.name, used=used, method=method, east_m=east, north_m=north, up_m=up_m, notes=tuple(notes)
-    )
-    return moved, shift
+    parts = {"east_m": east, "north_m": north, "up_m": up_m}
+    return moved, FrameShift(frame=frame.name, used=used, method=method, notes=tuple(notes), **parts)
 
 
 def _transform(operation: Transformer, ecef_m: Floats, year: float) -> Floats:
@@ -196,7 +192,7 @@ def _from_held(
     plate = plate or held.plate_at(float(latitude), float(longitude))
     moved = _by_plate(_in_itrf2020(ecef_m, held.code, since), plate, year - since)
     method = f"{held.itrf} at {since:g}, motion of the plate {plate}"
-    return moved, method, (f"map: {name} is {method} to {year:.2f} in ITRF2020; {held.left_out(year - since)}",)
+    return moved, method, (f"map: {name} is {method} to {year:.2f} in ITRF2020; {held.describe_rest(year - since)}",)
 
 
 def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
@@ -342,9 +338,7 @@ def _egm96(latitude_deg: Floats, longitude_deg: Floats) -> tuple[str, Floats]:
 
 def _missing_grids(source: CRS) -> str:
     """Names of the grids that PROJ would need for heights of a compound CRS."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        group = TransformerGroup(source, "EPSG:4979", always_xy=True, allow_ballpark=False)
+    group = operations_between(source, "EPSG:4979")
     names = {grid.short_name for operation in group.unavailable_operations for grid in operation.grids}
     return " or ".join(sorted(names)) or "NAME"
 
@@ -377,7 +371,7 @@ def _proj_transformer(geoid: str) -> tuple[str, Transformer]:
         ) from None
 
 
-def stated_heights(
+def heights_of_file(
     heights_m: Floats, latitude_deg: Floats, longitude_deg: Floats, reading: MapReading, *, path: str
 ) -> tuple[Floats, str, str]:
     """Ellipsoidal heights of a file without a datum of its own, the geoid used, and the datum, which must be given."""
@@ -385,10 +379,7 @@ def stated_heights(
     datum, geoid = own_height_datum(reading.crs, reading.height_datum, reading.geoid, path=path)
     if datum is None:
         raise SettingsError(f"{path}: the height datum is missing; give --height-datum ellipsoidal or orthometric")
-    height, model = ellipsoidal_heights(
-        heights_m, latitude_deg, longitude_deg, datum=datum, geoid=geoid, geoid_m=None, path=path
-    )
-    return height, model, datum
+    return *ellipsoidal_heights(heights_m, latitude_deg, longitude_deg, datum=datum, geoid=geoid, path=path), datum
 
 
 def own_height_datum(
@@ -412,8 +403,8 @@ def ellipsoidal_heights(
     *,
     datum: str,
     geoid: str | None,
-    geoid_m: Floats | None,
     path: str,
+    geoid_m: Floats | None = None,
 ) -> tuple[Floats, str]:
     """Convert heights of a datum to ellipsoidal ones, by a model or the map's `geoid_m`; name the geoid used."""
     if datum == "ellipsoidal":

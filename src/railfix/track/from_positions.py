@@ -22,6 +22,7 @@ from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 
 #: Note of every map of this kind.
 ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
+_TURN: Final = -0.5  #: The path turns back where the cosine of its turn is less: by more than 120 degrees.
 _STANDING_WINDOW_S: Final = 3.0  #: Half of the window of the displacement.
 
 
@@ -73,20 +74,11 @@ def stationary(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: f
 def thin(
     time: Datetimes, ecef_m: Floats, *, usable: Masks | None = None, limits: ThinningLimits | None = None
 ) -> Thinned:
-    """Choose the positions that become points of a map.
+    """Choose the positions (n, 3) [m] that become points of a map; rows with NaN, or not `usable`, are dropped.
 
-    Noise and drift of a stationary antenna make no loops: stationary rows are dropped first, and a point
-    is kept only at full spacing from the last. The last usable position is kept where it is at least a
-    fifth of the spacing further on.
-
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (n,)
-    ecef_m : ndarray, shape (n, 3) [m]
-        Rows with NaN are dropped.
-    usable : ndarray of bool, shape (n,), optional
-        False drops a row for its quality.
-    limits : ThinningLimits, optional
+    Noise and drift of a stationary antenna make no loops: stationary rows are dropped first, and a point is kept only
+    at full spacing from the last. The last usable position is kept where it is at least a fifth of the spacing further
+    on.
     """
     limits = limits or ThinningLimits()
     finite = np.isfinite(ecef_m).all(axis=1)
@@ -98,7 +90,10 @@ def thin(
     stands = _with_short_moves(ecef_m[rows], stands, limits.spacing_m)
     moving = rows[~stands]
     chosen = _at_spacing(ecef_m[moving], limits.spacing_m)
-    back = chosen[_turning_back(ecef_m[moving[chosen]])]
+    steps = np.diff(ecef_m[moving[chosen]], axis=0)
+    length = np.linalg.norm(steps, axis=1)
+    cosine = np.einsum("vi,vi->v", steps[1:], steps[:-1]) / (length[1:] * length[:-1])
+    back = chosen[np.flatnonzero(cosine < _TURN) + 1]
     if not np.isnat(time[moving]).any():
         chosen = _with_bends(ecef_m[moving], chosen, limits.chord_m)
     kept = moving[chosen]
@@ -147,14 +142,6 @@ def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks
         if possible(end - 1, low):
             kept[first:end], low = True, first
     return kept
-
-
-def _turning_back(points: Floats) -> Indices:
-    """Find the points at which the path turns by more than 120 degrees."""
-    steps = np.diff(points, axis=0)
-    length = np.linalg.norm(steps, axis=1)
-    cosine = np.einsum("vi,vi->v", steps[1:], steps[:-1]) / (length[1:] * length[:-1])
-    return np.flatnonzero(cosine < -0.5) + 1
 
 
 def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:
@@ -221,28 +208,11 @@ def from_positions(
     sigma_plan_m: float = SIGMA_PLAN_M,
     sigma_height_m: float = SIGMA_HEIGHT_M,
 ) -> Track:
-    """Create a track from positions, thinned and without stationary positions.
+    """Create a track from positions (n, 3) [m] in the order of travel, thinned and without stationary ones.
 
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (n,)
-        In the order of travel; NaT where unknown.
-    ecef_m : ndarray, shape (n, 3) [m]
-    spacing_m : float [m]
-        Ignored where `limits` is given.
-    usable : ndarray of bool, shape (n,), optional
-        False drops a row.
-    limits : ThinningLimits, optional
-
-    Returns
-    -------
-    Track
-        Its notes record that it is the path of the antenna, and its gaps and reversals.
-
-    Raises
-    ------
-    ValueError
-        Fewer than two points are left.
+    `time` is NaT where unknown; `usable` drops rows; `spacing_m` counts where no `limits` are given. The notes of the
+    track record that it is the path of the antenna, and its gaps and reversals. ValueError: fewer than two points are
+    left.
     """
     thinned = thin(time, ecef_m, usable=usable, limits=limits or ThinningLimits(spacing_m=spacing_m))
     return track_of(ecef_m, thinned, name=name, sigma_plan_m=sigma_plan_m, sigma_height_m=sigma_height_m)
@@ -349,10 +319,7 @@ def from_position_log(
 ) -> tuple[Track, Thinned]:
     """Create a track from the accurate positions of a log, and report the selection of rows.
 
-    Raises
-    ------
-    InputFileError
-        Fewer than two points are left, the times run backwards, or the log has no column for a filter.
+    InputFileError: fewer than two points are left, the times run backwards, or the log has no column for a filter.
     """
     limits = limits or ThinningLimits(spacing_m=spacing_m)
     usable = usable_rows(log, quality=quality, max_sigma_m=max_sigma_m)

@@ -100,19 +100,12 @@ def _dense(track: Track) -> Track:
 
     ecef = np.stack([between(column) for column in track.ecef_m.T], axis=-1)
     latitude, longitude, _ = geodetic_from_ecef(ecef)
-    return Track.from_geodetic(
-        latitude,
-        longitude,
-        between(track.height_m),
-        name=track.name,
-        **{name: between(getattr(track, name)) for name in ("kilometrage_m", "cant_m", "gradient_permille")},
-        radius_m=np.append(track.radius_m[start], track.radius_m[-1]),
-        section=np.append(track.section[start], track.section[-1]),
-        sections=track.sections,
-        sigma_plan_m=track.sigma_plan_m,
-        sigma_height_m=track.sigma_height_m,
-        provenance=track.provenance,
-    )
+    linear = ("height_m", "kilometrage_m", "cant_m", "gradient_permille")
+    columns: dict[str, Any] = {name: between(getattr(track, name)) for name in linear}
+    columns |= {
+        name: np.append(getattr(track, name)[start], getattr(track, name)[-1]) for name in ("radius_m", "section")
+    }
+    return replace(track, latitude_deg=latitude, longitude_deg=longitude, **columns)
 
 
 @contextmanager
@@ -121,9 +114,8 @@ def _open_raster(path: str | PathLike[str]) -> Iterator[tuple[Any, CRS]]:
     try:
         import rasterio
     except ImportError:
-        raise InputFileError(
-            path, "reading a raster needs rasterio; install it with: pip install 'railfix[maps]'"
-        ) from None
+        needed = "reading a raster needs rasterio; install it with: pip install 'railfix[maps]'"
+        raise InputFileError(path, needed) from None
     try:
         with rasterio.open(path) as raster:
             if raster.crs is None:
@@ -154,15 +146,8 @@ def _from_raster(
             f"{len(missing)} of {len(track)} points of the map have no height, the first at chainage "
             f"{track.chainage_m[missing[0]]:.0f} m; give a raster of the whole line",
         )
-    height, model = ellipsoidal_heights(
-        heights,
-        track.latitude_deg,
-        track.longitude_deg,
-        datum=str(height_datum),
-        geoid=geoid,
-        geoid_m=None,
-        path=str(path),
-    )
+    degrees = track.latitude_deg, track.longitude_deg
+    height, model = ellipsoidal_heights(heights, *degrees, datum=str(height_datum), geoid=geoid, path=str(path))
     note = (
         f"heights of the raster {path}, sigma {sigma_m or 0.0:.2f} m: those of the ground, which on bridges and in "
         "tunnels are not the track's"
@@ -189,7 +174,7 @@ def _from_profile(track: Track, table: NamedColumns, geoid: str | None, sigma_m:
     datum = "ellipsoidal" if "height_m" in table else "orthometric"
     column = "height_m" if datum == "ellipsoidal" else "elevation_m"
     if column not in table:
-        raise InputFileError(table.path, "there is no column height_m nor elevation_m", line=table.header_line)
+        raise table.header_error("there is no column height_m nor elevation_m")
     known, heights = table.numbers(by), table.numbers(column)
     if len(known) < 2 or not (np.diff(known) > 0.0).all():
         raise InputFileError(table.path, f"{by} must rise from row to row, with at least two rows")
@@ -203,15 +188,8 @@ def _from_profile(track: Track, table: NamedColumns, geoid: str | None, sigma_m:
             f"the profile runs from {known[0]:g} to {known[-1]:g} m, the map from {places.min():.1f} to "
             f"{places.max():.1f} m",
         )
-    height, model = ellipsoidal_heights(
-        np.interp(places, known, heights),
-        track.latitude_deg,
-        track.longitude_deg,
-        datum=datum,
-        geoid=geoid,
-        geoid_m=None,
-        path=table.path,
-    )
+    heights, degrees = np.interp(places, known, heights), (track.latitude_deg, track.longitude_deg)
+    height, model = ellipsoidal_heights(heights, *degrees, datum=datum, geoid=geoid, path=table.path)
     if sigma_m is not None:
         sigma = sigma_m
     elif "sigma_m" in table:

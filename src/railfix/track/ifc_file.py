@@ -11,7 +11,7 @@ import numpy as np
 
 from railfix.core.errors import InputFileError
 from railfix.core.files import read_text
-from railfix.track.crs import LARGEST_SCALE, used_crs
+from railfix.track.crs import LARGEST_SCALE, choose_crs
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
 from railfix.track.route import MapReading, Segment
 
@@ -145,7 +145,7 @@ def read_ifc_segments(path: str | PathLike[str], reading: MapReading) -> list[Se
                 plan=[p for p in plan if p.length_m > 0.0],
                 profile=[p for p in profile if p.length_m > 0.0],
                 cant=[c for c in cant if c.length_m > 0.0],
-                reading=replace(reading, crs=used_crs(path, reading.crs, system)),
+                reading=replace(reading, crs=choose_crs(path, reading.crs, system)),
                 grid=xy,
                 notes=notes,
             )

@@ -23,7 +23,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import text_lines
 from railfix.io.mate import mate_table, read_mate
 from railfix.io.named_columns import read_named_columns
-from railfix.track.crs import frame_degrees, used_crs
+from railfix.track.crs import choose_crs, frame_degrees
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
 from railfix.track.route import MapReading, Segment
 
@@ -52,7 +52,6 @@ def _segment_of_points(path: Path, edge: str, rows: pl.DataFrame, reading: MapRe
     latitude, longitude, frame = frame_degrees(
         crs, values["LONGITUDE_ETRS89"], values["LATITUDE_ETRS89"], path=f"{path} ({edge})"
     )
-    radius = np.where(np.nan_to_num(values["RADIUS"]) == 0.0, np.inf, values["RADIUS"])
     return Segment(
         source=f"{path} ({edge})",
         file=str(path),
@@ -61,7 +60,7 @@ def _segment_of_points(path: Path, edge: str, rows: pl.DataFrame, reading: MapRe
         height_m=values["ALTITUDE_ETRS89"],
         kilometrage_m=np.full(len(rows), np.nan),
         cant_m=values["CANT"] * 1e-3,
-        radius_m=radius,
+        radius_m=np.where(np.nan_to_num(values["RADIUS"]) == 0.0, np.inf, values["RADIUS"]),
         gradient_permille=values["GRADIENT"],
         crs=crs,
         frame=frame,
@@ -74,6 +73,7 @@ def _segment_of_points(path: Path, edge: str, rows: pl.DataFrame, reading: MapRe
 _POSITION: Final = "S_DM_TRACK_SEGMENT_POSITION"
 _GRADIENT: Final = "S_DM_TRACK_SEGMENT_GRADIENT"
 _CANT: Final = "S_DM_TRACK_SEGMENT_CANT"
+_SPAN: Final = ("TRACK_SEGMENT_REFERENCE_POSITION", "TRACK_SEGMENT_LENGTH")
 #: Segments of an edge that are further apart than this do not meet [m].
 _MEETS_M: Final = 0.5
 Row = dict[str, str]
@@ -91,7 +91,7 @@ def read_mate_segments(path: str | PathLike[str], reading: MapReading) -> list[S
     found = []
     for edge, rows in _rows(path, None).items():
         cell = rows[0].get("UTM_CELL", "")
-        of_edge = replace(reading, crs=used_crs(path, reading.crs, _crs_of(cell)), height_datum="ellipsoidal")
+        of_edge = replace(reading, crs=choose_crs(path, reading.crs, _crs_of(cell)), height_datum="ellipsoidal")
         plan = _plan(str(path), edge, rows)
         profile = [_profile(str(path), row) for row in gradients.get(edge, [])]
         cant = [_cant(str(path), row, plan) for row in cants.get(edge, [])]
@@ -119,10 +119,7 @@ def _rows(path: str | PathLike[str], table: str | None) -> dict[str, list[Row]]:
     for values in zip(*(cells[name] for name in names_of.values()), strict=True):
         row = {name: str(v).strip() for name, v in zip(names_of, values, strict=True) if v is not None}
         edges.setdefault(row.get("TRACK_EDGE_ID", ""), []).append(row)
-    return {
-        edge: sorted(rows, key=lambda row: _number(str(file), row, "TRACK_SEGMENT_REFERENCE_POSITION"))
-        for edge, rows in edges.items()
-    }
+    return {edge: sorted(rows, key=lambda row: _number(str(file), row, _SPAN[0])) for edge, rows in edges.items()}
 
 
 def _number(path: str, row: Row, name: str) -> float:
@@ -232,10 +229,7 @@ def _turn(element: PlanElement) -> PlanElement:
 
 
 def _profile(path: str, row: Row) -> ProfileElement:
-    start, length, height, gradient = (
-        _number(path, row, name)
-        for name in ("TRACK_SEGMENT_REFERENCE_POSITION", "TRACK_SEGMENT_LENGTH", "INITIAL_HEIGHT", "GRADIENT")
-    )
+    start, length, height, gradient = (_number(path, row, name) for name in (*_SPAN, "INITIAL_HEIGHT", "GRADIENT"))
     first = last = gradient * 1e-3
     if row.get("TRACK_SEGMENT_TYPE", "").lower() == "circle":
         sine = np.sin(np.arctan(first)) + length / _number(path, row, "RADIUS")
@@ -249,10 +243,7 @@ def _profile(path: str, row: Row) -> ProfileElement:
 
 def _cant(path: str, row: Row, plan: Sequence[PlanElement]) -> CantElement:
     """The outer rail above the inner one, about the middle, on the side of the sharpest curve within the element."""
-    start, length, first, last = (
-        _number(path, row, name)
-        for name in ("TRACK_SEGMENT_REFERENCE_POSITION", "TRACK_SEGMENT_LENGTH", "INITIAL_CANT", "END_CANT")
-    )
+    start, length, first, last = (_number(path, row, name) for name in (*_SPAN, "INITIAL_CANT", "END_CANT"))
     if _number(path, row, "TRACK_SEGMENT_DIRECTION") < 0.0:
         first, last = last, first
     starts = np.cumsum([0.0, *(element.length_m for element in plan)])

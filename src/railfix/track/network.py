@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Floats, Indices, read_only
+from railfix.core.arrays import Floats, Indices, Masks, read_only
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.track.route import Segment, one_frame, stated_sigma
+from railfix.track.route import Segment, one_frame, sigma_of_files
 from railfix.track.track import SIGMA_PLAN_M, UNNAMED, interpolate_kilometrage
 from railfix.track.trajectory import NearestOnPolyline, project_on_segments
 
@@ -55,6 +55,10 @@ class Candidates:
     chainage_m: Floats
     offset_m: Floats
 
+    def take(self, rows: Indices | Masks) -> Candidates:
+        """Return those of some of the positions."""
+        return Candidates(track=self.track[rows], chainage_m=self.chainage_m[rows], offset_m=self.offset_m[rows])
+
 
 @dataclass(frozen=True, kw_only=True)
 class Network:
@@ -64,7 +68,7 @@ class Network:
     links: tuple[Link, ...]
     notes: tuple[str, ...] = ()
 
-    def connected(self, links: tuple[Link, ...], note: str) -> Network:
+    def connect(self, links: tuple[Link, ...], note: str) -> Network:
         """The network with other connections, and a note on them; what is known of its points is kept."""
         network = replace(self, links=links, notes=(note,))
         vars(network).update({name: vars(self)[name] for name in _OF_POINTS if name in vars(self)})
@@ -153,7 +157,7 @@ class Network:
     @cached_property
     def sigma_plan_m(self) -> float:
         """Standard deviation of the tracks in plan: the worst that the files state, else that of a surveyed map."""
-        return stated_sigma(self.tracks, "sigma_plan_m", None, SIGMA_PLAN_M)
+        return sigma_of_files(self.tracks, "sigma_plan_m", SIGMA_PLAN_M)
 
     @property
     def named(self) -> bool:
@@ -255,11 +259,8 @@ class Network:
 
     def index_of(self, name: str) -> int:
         """Number of the track of a name, of a way of OpenStreetMap also by its id alone; SettingsError without one."""
-        by_id = [
-            k
-            for k, track in enumerate(self.tracks)
-            if "origin" in track.metadata and track.metadata.get("name", "").startswith(f"{name} ")
-        ]
+        drawn = [k for k, track in enumerate(self.tracks) if "origin" in track.metadata]
+        by_id = [k for k in drawn if self.tracks[k].metadata.get("name", "").startswith(f"{name} ")]
         if name not in self.names and len(by_id) == 1:
             return by_id[0]
         if name not in self.names:

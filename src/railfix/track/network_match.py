@@ -115,9 +115,8 @@ class Matched:
 
     def take(self, rows: Indices) -> Matched:
         """Return some of the positions."""
-        near = Candidates(**{name: values[rows] for name, values in vars(self.candidates).items()})
         own = {name: values[rows] for name, values in vars(self).items() if name != "candidates"}
-        return Matched(**own, candidates=near)
+        return Matched(**own, candidates=self.candidates.take(rows))
 
 
 def read_plan_positions(path: str | PathLike[str], *, columns: Mapping[str, str] | None = None) -> PlanLog:
@@ -177,7 +176,7 @@ def match(
     candidates = _candidates(network, log.latitude_deg[given], log.longitude_deg[given], within_m)
     lost = _is_wrong(candidates, log.time[given])
     given, sigma = given[~lost], sigma[~lost]
-    candidates = Candidates(**{name: values[~lost] for name, values in vars(candidates).items()})
+    candidates = candidates.take(~lost)
     most = candidates.track.shape[1]
     point = ecef_from_geodetic(log.latitude_deg[given], log.longitude_deg[given], np.zeros(len(given)))
     step = np.linalg.norm(np.diff(point, axis=0), axis=1)

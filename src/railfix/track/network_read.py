@@ -46,7 +46,7 @@ def network_of(
         return _of_relations(tracks, relations, str(paths[0]))
     network, cuts = _divide(Network(tracks=tuple(tracks), links=()), tolerance_m)
     note = f"connections from ends within {tolerance_m:g} m; {cuts} tracks divided where the end of another meets them"
-    return network.connected(links_of_ends(network, tolerance_m=tolerance_m), note)
+    return network.connect(links_of_ends(network, tolerance_m=tolerance_m), note)
 
 
 def _relations(path: str | PathLike[str]) -> list[Relation]:

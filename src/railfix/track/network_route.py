@@ -14,7 +14,7 @@ from scipy.ndimage import median_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.arrays import Floats, Indices
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog
@@ -38,11 +38,6 @@ class Filled:
     track: Indices
     chainage_m: Floats
     bound_m: Floats
-
-    @property
-    def filled(self) -> Masks:
-        """Rows that were filled."""
-        return ~np.isnan(self.bound_m)
 
 
 def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill: Rows = "gaps") -> Filled:

@@ -17,7 +17,7 @@ from railfix.core.files import read_text, write_whole
 from railfix.core.settings import misspelt
 from railfix.core.tables import plural
 from railfix.io.named_columns import NamedColumns, read_named_columns
-from railfix.track.crs import frame_degrees, known_crs, older_datum_note, unit_of_heights, used_crs
+from railfix.track.crs import choose_crs, find_crs, frame_degrees, older_datum_note, unit_of_heights
 from railfix.track.frames import HEIGHT_DATUMS, check_height_datum, ellipsoidal_heights, own_height_datum
 from railfix.track.route import NO_HEIGHTS, RINF_NAMES, RINF_SECTIONS, MapReading, Segment
 from railfix.track.track import UNNAMED, Track
@@ -163,7 +163,7 @@ def _crs_member(path: str, document: dict[str, Any]) -> str | None:
 
 def _in_frame(path: str, crs: str, values: Floats) -> tuple[Floats, Floats, str]:
     """Latitude, longitude and frame of coordinates in easting-northing or longitude-latitude order."""
-    if known_crs(crs, path=path).is_geographic:
+    if find_crs(crs, path=path).is_geographic:
         over = np.abs(values[:, 1]) > 90.0
         if over.any() or (np.abs(values[:, 0]) > 360.0).any():
             point = values[int(np.argmax(over))]
@@ -188,7 +188,7 @@ def read_geojson_segments(path: str | PathLike[str], reading: MapReading) -> lis
         raise InputFileError(path, "this is JSON, but not a GeoJSON object")
     if "elements" in document and "type" not in document:
         return _of_overpass(str(path), document, reading)
-    used = used_crs(path, reading.crs, _crs_member(str(path), document)) or RFC_CRS
+    used = choose_crs(path, reading.crs, _crs_member(str(path), document)) or RFC_CRS
     lines = list(_lines(str(path), document, "", {}))
     of_openstreetmap = any(is_of_openstreetmap(line.feature) for line in lines)
     reasons = [no_track(line.feature, of_openstreetmap=of_openstreetmap) for line in lines]
@@ -198,7 +198,7 @@ def read_geojson_segments(path: str | PathLike[str], reading: MapReading) -> lis
 
 def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> list[Segment]:
     """Ways of the JSON of Overpass, which is no GeoJSON."""
-    of_file = replace(reading, crs=used_crs(path, reading.crs, "EPSG:4326"))
+    of_file = replace(reading, crs=choose_crs(path, reading.crs, "EPSG:4326"))
     ways = [(way, no_track(way.row, of_openstreetmap=True)) for way in read_overpass(path, document["elements"])]
     segments = [
         plan_segment(way.points_deg, of_file, path=path, name=own["name"], stated=own)
@@ -311,7 +311,7 @@ def read_csv_segment(path: str | PathLike[str], reading: MapReading) -> Segment:
             f"the same point as line {table.line[row - 1]} ({int(same.sum())} such in the file); remove it, "
             "'railfix map check' lists them all",
         )
-    crs = used_crs(path, reading.crs, table.metadata.get("crs"))
+    crs = choose_crs(path, reading.crs, table.metadata.get("crs"))
     latitude, longitude, frame = _check_degrees(crs, latitude, longitude, path=table.path)
     geoid, geoid_m = reading.geoid, None
     if datum == "orthometric" and "geoid_m" in table:
@@ -342,8 +342,7 @@ def _check_columns(table: NamedColumns) -> tuple[str, ...]:
     close = misspelt(table.cells, KNOWN_COLUMNS)
     for wrong, right in close.items():
         if right not in table:
-            message = f"column {wrong!r} is unknown; is {right!r} meant?"
-            raise InputFileError(table.path, message, line=table.header_line)
+            raise table.header_error(f"column {wrong!r} is unknown; is {right!r} meant?")
     for wrong, right in misspelt(table.metadata, KNOWN_METADATA).items():
         if right not in table.metadata:
             raise InputFileError(table.path, f"the line '# {wrong}: {table.metadata[wrong]}': is '# {right}' meant?")
@@ -352,11 +351,11 @@ def _check_columns(table: NamedColumns) -> tuple[str, ...]:
             message = f"there is no column {name!r}; the columns are {', '.join(table.cells)}"
             if any(cell.lower() in RINF_NAMES for cell in table.cells):
                 message += f"; {RINF_SECTIONS}"
-            raise InputFileError(table.path, message, line=table.header_line)
+            raise table.header_error(message)
     if ("height_m" in table) == ("elevation_m" in table):
         what = "both 'height_m' and 'elevation_m'" if "height_m" in table else "neither 'height_m' nor 'elevation_m'"
         message = f"{what}; one is needed: height_m is ellipsoidal, elevation_m is orthometric (levelling)"
-        raise InputFileError(table.path, message, line=table.header_line)
+        raise table.header_error(message)
     used = [name for name in KNOWN_COLUMNS if name != "geoid_m" or "elevation_m" in table]
     extra = [name for name in table.cells if name not in used]
     return (f"{table.path}: columns not used: {', '.join(extra)}",) if extra else ()
@@ -367,10 +366,8 @@ def _datum(table: NamedColumns, asked: str | None) -> str:
     for source, stated in (("height_datum", asked), ("the line '# height_datum'", table.metadata.get("height_datum"))):
         if stated is not None and stated != datum:
             column = "height_m" if datum == "ellipsoidal" else "elevation_m"
-            message = (
-                f"{source} is {stated!r}, but the column {column} is {datum}; rename the column or drop the setting"
-            )
-            raise InputFileError(table.path, message, line=table.header_line)
+            what = f"{source} is {stated!r}, but the column {column} is {datum}"
+            raise table.header_error(f"{what}; rename the column or drop the setting")
     return datum
 
 
@@ -396,7 +393,7 @@ def _check_degrees(crs: str | None, latitude: Floats, longitude: Floats, *, path
     """Degrees of a geographic system, and the modern frame they are in."""
     if crs is None:
         return latitude, longitude, "EPSG:4979"
-    system = known_crs(crs, path=path)
+    system = find_crs(crs, path=path)
     if not system.is_geographic:
         raise SettingsError(
             f"{path}: {crs} is {system.name}, but the columns are latitude and longitude; "

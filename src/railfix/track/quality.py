@@ -15,7 +15,7 @@ from pydantic import Field
 from railfix.core.arrays import Floats, Masks
 from railfix.core.settings import Settings
 from railfix.core.tables import plural
-from railfix.track.track import HEIGHTS_M, Geometry, Track, geometry_of, kilometrage_breaks, windowed_gradients
+from railfix.track.track import HEIGHTS_M, Geometry, Track, geometry_of, kilometrage_breaks, mean_gradients
 
 Severity = Literal["error", "warning"]
 _COARSE_DEG: Final = 1e-5  #: Coordinates rounded to this are up to half of it off [deg]: 0.6 m.
@@ -64,22 +64,12 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackQuality:
-    """Quality report of a track map.
-
-    Attributes
-    ----------
-    track : Track
-    limits : MapLimits
-    geometry : Geometry
-        Spacing, turns, mid-chord deviations and gradients that were checked.
-    findings : tuple of Finding
-        In order of chainage, errors first.
-    """
+    """Quality report of a track map."""
 
     track: Track
     limits: MapLimits
-    geometry: Geometry
-    findings: tuple[Finding, ...]
+    geometry: Geometry  #: Spacing, turns, mid-chord deviations and gradients that were checked.
+    findings: tuple[Finding, ...]  #: In order of chainage, errors first.
 
     @property
     def errors(self) -> tuple[Finding, ...]:
@@ -93,27 +83,15 @@ class TrackQuality:
 
 
 def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQuality:
-    """Check the quality of a track map.
-
-    Parameters
-    ----------
-    track : Track
-        Read with ``duplicates="keep"`` so that duplicates are findings instead of an error.
-    limits : MapLimits, optional
-
-    Returns
-    -------
-    TrackQuality
-    """
+    """Check the quality of a map that was read with ``duplicates="keep"``: duplicates are findings and no error."""
     limits = limits or MapLimits()
     geometry = geometry_of(track)
-    report = _Report(track)
     findings = [
-        *_spacing(report, geometry, limits),
-        *_shape(report, geometry, limits),
-        *_kilometrage(report, track),
-        *_heights(report, track, geometry, limits),
-        *_attributes(report, track, geometry, limits),
+        *_spacing(track, geometry, limits),
+        *_shape(track, geometry, limits),
+        *_kilometrage(track),
+        *_heights(track, geometry, limits),
+        *_attributes(track, geometry, limits),
     ]
     findings.sort(key=lambda finding: (finding.severity != "error", finding.chainage_m))
     return TrackQuality(track=track, limits=limits, geometry=geometry, findings=tuple(findings))
@@ -176,112 +154,104 @@ _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
 }
 
 
-class _Report:
-    """Converter of masks over points or segments to findings, one for each range of neighbours."""
-
-    def __init__(self, track: Track) -> None:
-        self.track = track
-
-    def runs(
-        self,
-        mask: Masks,
-        fault: str,
-        values: Floats | None = None,
-        limit: float = np.nan,
-        *,
-        severity: Severity | None = None,
-    ) -> Iterator[Finding]:
-        """Yield findings of a fault of `_FAULTS` for a mask over V points or V - 1 segments."""
-        track = self.track
-        usual, text = _FAULTS[fault]
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
-        over = 1 if len(mask) == len(track) - 1 else 0
-        for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-            worst = np.nan
-            if values is not None:
-                part = values[first:end]
-                worst = float(part[np.nanargmax(np.abs(part))])
-            last = end - 1 + over
-            where = f"at {track.chainage_m[first]:.1f} m" + (
-                f" to {track.chainage_m[last]:.1f} m" if track.chainage_m[last] > track.chainage_m[first] else ""
-            )
-            yield Finding(
-                severity=severity or usual,
-                kind=fault.removeprefix("small "),
-                first=first,
-                last=last,
-                chainage_m=float(track.chainage_m[first]),
-                kilometrage_m=float(track.kilometrage_m[first]),
-                value=worst,
-                limit=limit,
-                sentence=f"{where}: {text.format(value=worst, limit=limit)}",
-            )
+def _runs(
+    track: Track,
+    mask: Masks,
+    fault: str,
+    values: Floats | None = None,
+    limit: float = np.nan,
+    *,
+    severity: Severity | None = None,
+) -> Iterator[Finding]:
+    """Yield a finding of a fault for each range of neighbours of a mask over V points or V - 1 segments."""
+    usual, text = _FAULTS[fault]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
+    over = 1 if len(mask) == len(track) - 1 else 0
+    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        worst = np.nan
+        if values is not None:
+            part = values[first:end]
+            worst = float(part[np.nanargmax(np.abs(part))])
+        last = end - 1 + over
+        start_m, end_m = track.chainage_m[first], track.chainage_m[last]
+        where = f"at {start_m:.1f} m" + (f" to {end_m:.1f} m" if end_m > start_m else "")
+        yield Finding(
+            severity=severity or usual,
+            kind=fault.removeprefix("small "),
+            first=first,
+            last=last,
+            chainage_m=float(start_m),
+            kilometrage_m=float(track.kilometrage_m[first]),
+            value=worst,
+            limit=limit,
+            sentence=f"{where}: {text.format(value=worst, limit=limit)}",
+        )
 
 
-def _spacing(report: _Report, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
+def _spacing(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
     spacing = geometry.spacing_m
-    yield from report.runs(spacing == 0.0, "duplicate")
+    yield from _runs(track, spacing == 0.0, "duplicate")
     near = (spacing > 0.0) & (spacing < _NEAR_DUPLICATE_M)
-    yield from report.runs(near, "near duplicate", spacing, _NEAR_DUPLICATE_M)
-    degrees = np.stack([report.track.latitude_deg, report.track.longitude_deg]) / _COARSE_DEG
+    yield from _runs(track, near, "near duplicate", spacing, _NEAR_DUPLICATE_M)
+    degrees = np.stack([track.latitude_deg, track.longitude_deg]) / _COARSE_DEG
     rounded = bool((np.abs(degrees - np.round(degrees)) < 1e-4).all())
-    yield from report.runs(np.full(len(report.track), rounded), "rounded")
-    yield from report.runs(spacing > limits.gap_m, "gap", spacing, limits.gap_m)
+    yield from _runs(track, np.full(len(track), rounded), "rounded")
+    yield from _runs(track, spacing > limits.gap_m, "gap", spacing, limits.gap_m)
     wide = (spacing > limits.spacing_m) & (spacing <= limits.gap_m)
-    yield from report.runs(wide, "spacing", spacing, limits.spacing_m)
+    yield from _runs(track, wide, "spacing", spacing, limits.spacing_m)
 
 
-def _shape(report: _Report, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
+def _shape(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
     with np.errstate(invalid="ignore"):
         deviation = np.abs(geometry.mid_chord_m)
-        yield from report.runs(deviation > limits.mid_chord_m, "mid-chord", deviation, limits.mid_chord_m)
+        yield from _runs(track, deviation > limits.mid_chord_m, "mid-chord", deviation, limits.mid_chord_m)
         turn = np.abs(geometry.turn_deg)
         sharp = np.radians(turn) > geometry.reach_m / limits.least_radius_m
         kink = sharp & (turn > _KINK_DEG)
         too_sharp = turn > _SHARP_KINK_DEG
-    yield from report.runs(kink & too_sharp, "kink", turn, _SHARP_KINK_DEG, severity="error")
-    yield from report.runs(kink & ~too_sharp, "kink", turn, _KINK_DEG)
+    yield from _runs(track, kink & too_sharp, "kink", turn, _SHARP_KINK_DEG, severity="error")
+    yield from _runs(track, kink & ~too_sharp, "kink", turn, _KINK_DEG)
 
 
-def _kilometrage(report: _Report, track: Track) -> Iterator[Finding]:
+def _kilometrage(track: Track) -> Iterator[Finding]:
     kilometrage = track.kilometrage_m
     if np.isnan(kilometrage).all():
         return
     broken = kilometrage_breaks(track.chainage_m, kilometrage)
     change = np.diff(kilometrage)
     of_length = float(np.diff(track.chainage_m)[broken].sum() / track.chainage_m[-1])
-    yield from report.runs(broken, "kilometrage break", change, severity="error" if of_length > 0.5 else None)
+    yield from _runs(track, broken, "kilometrage break", change, severity="error" if of_length > 0.5 else None)
     direction = np.where(broken | (change == 0.0), np.nan, np.sign(change))
     known = np.flatnonzero(np.isfinite(direction))
     turned = np.zeros(len(track), dtype=np.bool_)
     turned[known[1:][np.diff(direction[known]) != 0.0]] = True
-    yield from report.runs(turned, "kilometrage reversal")
-    yield from report.runs(np.isnan(kilometrage), "kilometrage absent")
+    yield from _runs(track, turned, "kilometrage reversal")
+    yield from _runs(track, np.isnan(kilometrage), "kilometrage absent")
 
 
-def _heights(report: _Report, track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
+def _heights(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
     impossible = (track.height_m < HEIGHTS_M[0]) | (track.height_m > HEIGHTS_M[1])
-    yield from report.runs(impossible, "height", track.height_m)
+    yield from _runs(track, impossible, "height", track.height_m)
     gradient, spike = geometry.gradient_permille, geometry.height_spike_m
     with np.errstate(invalid="ignore"):
         steep = np.abs(gradient) > limits.gradient_permille
-        yield from report.runs(steep, "gradient", gradient, limits.gradient_permille)
-        yield from report.runs(np.abs(spike) > _HEIGHT_SPIKE_M, "height spike", spike, _HEIGHT_SPIKE_M)
-        attribute, from_heights = windowed_gradients(track, window_m=_GRADIENT_WINDOW_M)
+        yield from _runs(track, steep, "gradient", gradient, limits.gradient_permille)
+        yield from _runs(track, np.abs(spike) > _HEIGHT_SPIKE_M, "height spike", spike, _HEIGHT_SPIKE_M)
+        attribute, from_heights = mean_gradients(track, window_m=_GRADIENT_WINDOW_M)
         difference = attribute - from_heights
         wrong = np.abs(difference) > _GRADIENT_DIFFERENCE_PERMILLE
-        yield from report.runs(wrong, "gradient attribute", difference, _GRADIENT_DIFFERENCE_PERMILLE)
+        yield from _runs(track, wrong, "gradient attribute", difference, _GRADIENT_DIFFERENCE_PERMILLE)
 
 
-def _attributes(report: _Report, track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
+def _attributes(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
     cant = np.abs(track.cant_m)
     with np.errstate(invalid="ignore"):
-        yield from report.runs(cant > limits.cant_m, "cant", track.cant_m, limits.cant_m)
+        yield from _runs(track, cant > limits.cant_m, "cant", track.cant_m, limits.cant_m)
         small = (cant > 0.0) & (np.nanmax(cant, initial=0.0) < _LEAST_CANT_M)
-        yield from report.runs(small, "small cant", track.cant_m)
+        yield from _runs(track, small, "small cant", track.cant_m)
         sharp = np.abs(track.radius_m) < limits.least_radius_m
         radius = np.where(np.isfinite(track.radius_m), track.radius_m, 0.0)
-        yield from report.runs(sharp, "radius", radius, limits.least_radius_m)
+        yield from _runs(track, sharp, "radius", radius, limits.least_radius_m)
         opposite = geometry.map_curvature * geometry.point_curvature < 0.0
         opposite &= (np.abs(geometry.map_curvature) > 1 / 3000) & (np.abs(geometry.point_curvature) > 1 / 3000)
-    yield from report.runs(opposite, "radius side")
+    yield from _runs(track, opposite, "radius side")

@@ -70,11 +70,10 @@ class Segment:
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates here.
     notes: tuple[str, ...] = ()
 
-    def reversed(self) -> Segment:
+    def reverse(self) -> Segment:
         """Return the segment in the opposite direction; the signs of radius and gradient change."""
-        turned = {
-            name: getattr(self, name)[::-1] for name in ("latitude_deg", "longitude_deg", "height_m", *ATTRIBUTES)
-        }
+        names = ("latitude_deg", "longitude_deg", "height_m", *ATTRIBUTES)
+        turned = {name: getattr(self, name)[::-1] for name in names}
         turned |= {name: -turned[name] for name in ("radius_m", "gradient_permille")}
         return replace(self, **turned, notes=(*self.notes, f"{self.source} {BACKWARDS}"))
 
@@ -102,7 +101,7 @@ def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list
             "'railfix map route'",
         )
     turned = _turn(_ends(segments), max_gap_m)
-    return [s.reversed() if backwards else s for s, backwards in zip(segments, turned, strict=True)]
+    return [s.reverse() if backwards else s for s, backwards in zip(segments, turned, strict=True)]
 
 
 def _turn(ends: Floats, max_gap_m: float) -> list[bool]:
@@ -156,8 +155,10 @@ def join(
         **{key: joined[key] for key in ATTRIBUTES},
         section=np.repeat(np.arange(len(pieces)), [len(columns["height_m"]) for columns in kept]),
         sections=tuple(piece.source for piece in pieces),
-        sigma_plan_m=stated_sigma(pieces, "sigma_plan_m", None, SIGMA_PLAN_M),
-        sigma_height_m=stated_sigma(pieces, "sigma_height_m", sigma_height_m, SIGMA_HEIGHT_M),
+        sigma_plan_m=sigma_of_files(pieces, "sigma_plan_m", SIGMA_PLAN_M),
+        sigma_height_m=sigma_of_files(pieces, "sigma_height_m", SIGMA_HEIGHT_M)
+        if sigma_height_m is None
+        else sigma_height_m,
         provenance=Provenance(
             files=_unique(piece.file for piece in pieces),
             crs=", ".join(_unique(piece.crs for piece in pieces)),
@@ -183,10 +184,8 @@ def _unique(values: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(values))
 
 
-def stated_sigma(pieces: Sequence[Segment], key: str, given: float | None, default: float) -> float:
-    """Return the accuracy given, else the worst of the files, else the default of P1 4.1(3)."""
-    if given is not None:
-        return given
+def sigma_of_files(pieces: Sequence[Segment], key: str, default: float) -> float:
+    """Return the worst accuracy that the files state, else the default of P1 4.1(3)."""
     stated: list[float] = []
     for piece in pieces:
         if key in piece.metadata:

@@ -59,44 +59,22 @@ class TrackFields(TypedDict, total=False):
 
 @dataclass(frozen=True, kw_only=True)
 class Track(NotebookTable):
-    """Centreline of a route, V points in the order of the route.
-
-    Attributes
-    ----------
-    name : str
-    latitude_deg, longitude_deg : ndarray, shape (V,) [deg]
-        WGS 84.
-    height_m : ndarray, shape (V,) [m]
-        Ellipsoidal height of the middle between the rail tops.
-    kilometrage_m : ndarray, shape (V,) [m]
-        Kilometrage of the line; may jump or run backwards; NaN where the map has none.
-    cant_m : ndarray, shape (V,) [m]
-        Outer rail above inner rail; NaN where the map has none.
-    radius_m : ndarray, shape (V,) [m]
-        Positive in a curve to the right in the direction of rising chainage, infinite on straight
-        track, NaN where the map has none.
-    gradient_permille : ndarray, shape (V,)
-        Positive where the line rises with chainage; NaN where the map has none.
-    section : ndarray of int, shape (V,)
-        Index in `sections` of each point.
-    sections : tuple of str
-        The files or features that were joined to the route, in order.
-    sigma_plan_m, sigma_height_m : float [m]
-        Standard deviations of the map across the line and in height.
-    provenance : Provenance
-    """
+    """Centreline of a route, V points in the order of the route."""
 
     name: str
-    latitude_deg: Floats
+    latitude_deg: Floats  #: WGS 84, shape (V,).
     longitude_deg: Floats
-    height_m: Floats
+    height_m: Floats  #: Ellipsoidal height of the middle between the rail tops, shape (V,).
+    #: Kilometrage of the line; may jump or run backwards; NaN where the map has none; shape (V,).
     kilometrage_m: Floats
-    cant_m: Floats
+    cant_m: Floats  #: Outer rail above inner rail; NaN where the map has none; shape (V,).
+    #: Positive in a curve to the right in the direction of rising chainage, infinite on straight track, NaN where the
+    #: map has none; shape (V,).
     radius_m: Floats
-    gradient_permille: Floats
-    section: Integers
-    sections: tuple[str, ...] = ("track",)
-    sigma_plan_m: float = SIGMA_PLAN_M
+    gradient_permille: Floats  #: Positive where the line rises with chainage; NaN where the map has none; shape (V,).
+    section: Integers  #: Index in `sections` of each point, shape (V,).
+    sections: tuple[str, ...] = ("track",)  #: The files or features that were joined to the route, in order.
+    sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviations of the map across the line and in height.
     sigma_height_m: float = SIGMA_HEIGHT_M
     provenance: Provenance = field(default_factory=Provenance)
 
@@ -121,14 +99,8 @@ class Track(NotebookTable):
     def from_geodetic(
         cls, latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike, **attributes: Unpack[TrackFields]
     ) -> Track:
-        """Create a track from geodetic coordinates; attributes not given are NaN.
-
-        Parameters
-        ----------
-        latitude_deg, longitude_deg, height_m : array_like, shape (V,)
-            WGS 84, ellipsoidal height.
-        **attributes
-            See `TrackFields`.
+        """Create a track from geodetic coordinates (WGS 84, ellipsoidal height); attributes not given are NaN
+        (`TrackFields`).
         """
         if unknown := attributes.keys() - TrackFields.__annotations__.keys():
             raise TypeError(f"a track has no {', '.join(sorted(unknown))}")
@@ -193,30 +165,19 @@ def section_spans(track: Track) -> list[tuple[float, float]]:
 
 def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
     """Flag segments (V - 1,) whose kilometrage jumps by more than `KILOMETRAGE_BREAK_M` and a twentieth."""
-    return _jumping(np.diff(chainage_m), np.diff(kilometrage_m))
+    return _jumps(np.diff(chainage_m), np.diff(kilometrage_m))
 
 
-def _jumping(length_m: Floats, change_m: Floats) -> Masks:
+def _jumps(length_m: Floats, change_m: Floats) -> Masks:
     """Flag segments whose change of the kilometrage is not their length, any shape."""
     return np.asarray(np.abs(np.abs(change_m) - length_m) > KILOMETRAGE_BREAK_M + 0.05 * length_m)
 
 
 def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, known_kilometrage_m: Floats) -> Floats:
-    """Interpolate the kilometrage at chainages.
+    """Interpolate the kilometrage at chainages of any shape; NaN where the nearer point has none, and for NaN.
 
-    Linear between two points. Inside a segment with a jump, the kilometrage of the nearer point is
-    extrapolated in its own direction, never interpolated across the jump.
-
-    Parameters
-    ----------
-    chainage_m : array_like, any shape [m]
-    known_chainage_m, known_kilometrage_m : ndarray, shape (V,) [m]
-        Rising chainage, and the kilometrage there.
-
-    Returns
-    -------
-    ndarray, same shape as `chainage_m` [m]
-        NaN where the nearer point has no kilometrage, and for NaN.
+    Linear between two points. Inside a segment with a jump, the kilometrage of the nearer point is extrapolated in its
+    own direction, never interpolated across the jump.
     """
     at = np.asarray(chainage_m, dtype=np.float64)
     last = len(known_chainage_m) - 2
@@ -225,7 +186,7 @@ def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, kno
     before, after = known_kilometrage_m[index], known_kilometrage_m[index + 1]
     length = np.where(end > start, end - start, 1.0)
     linear = before + (at - start) / length * (after - before)
-    broken = _jumping(end - start, after - before)
+    broken = _jumps(end - start, after - before)
     if not broken.any():
         return linear
     left, right = _running_direction(known_kilometrage_m, kilometrage_breaks(known_chainage_m, known_kilometrage_m))
@@ -312,15 +273,10 @@ def _scatter(values: Floats, places: Integers, size: int) -> Floats:
 def _plan_steps(track: Track, kept: Integers) -> tuple[Floats, Floats]:
     """Compute the steps between points, east and north, shape (n, 2), and their height differences [m]."""
     latitude, longitude = track.latitude_deg[kept], track.longitude_deg[kept]
-    axes = enu_axes((latitude[1:] + latitude[:-1]) / 2.0, _middle_longitude(longitude))
+    half_step = ((np.diff(longitude) + 180.0) % 360.0 - 180.0) / 2.0  # also across the date line
+    axes = enu_axes((latitude[1:] + latitude[:-1]) / 2.0, longitude[:-1] + half_step)
     steps = np.einsum("nij,nj->ni", axes, np.diff(track.ecef_m[kept], axis=0))
     return steps[:, :2], np.diff(track.height_m[kept])
-
-
-def _middle_longitude(longitude_deg: Floats) -> Floats:
-    """Compute the longitude midway between neighbours, also across the date line."""
-    step = (np.diff(longitude_deg) + 180.0) % 360.0 - 180.0
-    return longitude_deg[:-1] + step / 2.0
 
 
 def _turns(plan: Floats) -> tuple[Floats, Floats]:
@@ -369,7 +325,7 @@ def _bend(track: Track, kept: Integers, turn: Floats) -> Floats:
     return np.where(width > 0.0, change / np.where(width > 0.0, width, 1.0), 0.0)
 
 
-def windowed_gradients(track: Track, *, window_m: float) -> tuple[Floats, Floats]:
+def mean_gradients(track: Track, *, window_m: float) -> tuple[Floats, Floats]:
     """Mean gradients [permille] of attribute and heights over a window, shapes (V,); NaN where unknown."""
     along, gradient = track.chainage_m, track.gradient_permille
     mean = (gradient[1:] + gradient[:-1]) / 2.0

@@ -133,48 +133,25 @@ class Trajectory(FrozenArrays, NotebookTable):
     """Trajectory of one antenna, V points.
 
     Right is positive across the path, seen in the direction of rising chainage.
-
-    Attributes
-    ----------
-    name : str
-        Name of the antenna, or of the track used as its path.
-    ecef_m : ndarray, shape (V, 3) [m]
-    chainage_m : ndarray, shape (V,) [m]
-        Chainage of the track at the reference point, strictly rising.
-    kilometrage_m : ndarray, shape (V,) [m]
-        Kilometrage there; NaN where the map has none.
-    cant_m : ndarray, shape (V,) [m]
-        Cant of the track there; NaN where the map has none.
-    roll_deg : ndarray, shape (V,) [deg]
-        Roll of the car body, positive to the right; 0 where the track is used as the path.
-    reference : str
-        Point of the vehicle to which `chainage_m` refers.
-    body_chainage_m : ndarray, shape (V,), or None [m]
-        Chainage of the middle between the bogies when the antenna is at the point, strictly rising: it
-        relates the positions of two antennas of one vehicle. None without a vehicle.
-    facing : {"rising", "falling"}
-        Direction of the vehicle's front along the line; "rising" without a vehicle.
-    contact_m : float or None [m]
-        Distance of the contact points of the wheels of an axle, over which cant is measured; None without a vehicle.
-    sigma_plan_m, sigma_height_m : float [m]
-        Standard deviations of the map, included in the solution.
-    notes : tuple of str
-        Remarks that every result must carry.
     """
 
-    name: str
-    ecef_m: Floats
-    chainage_m: Floats
-    kilometrage_m: Floats
-    cant_m: Floats
+    name: str  #: Of the antenna, or of the track used as its path.
+    ecef_m: Floats  #: Shape (V, 3).
+    chainage_m: Floats  #: Chainage of the track at the reference point, strictly rising, shape (V,).
+    kilometrage_m: Floats  #: Kilometrage there; NaN where the map has none; shape (V,).
+    cant_m: Floats  #: Cant of the track there; NaN where the map has none; shape (V,).
+    #: Roll of the car body, positive to the right; 0 where the track is used as the path; shape (V,).
     roll_deg: Floats
-    reference: str = "antenna"
+    reference: str = "antenna"  #: Point of the vehicle to which `chainage_m` refers.
+    #: Chainage of the middle between the bogies when the antenna is at the point, strictly rising: it relates the
+    #: positions of two antennas of one vehicle. None without a vehicle; shape (V,).
     body_chainage_m: Floats | None = None
-    facing: Literal["rising", "falling"] = "rising"
+    facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the line.
+    #: Distance of the contact points of the wheels of an axle, over which cant is measured; None without a vehicle.
     contact_m: float | None = None
-    sigma_plan_m: float = SIGMA_PLAN_M
+    sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviations of the map, included in the solution.
     sigma_height_m: float = SIGMA_HEIGHT_M
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  #: Remarks that every result must carry.
 
     def __post_init__(self) -> None:
         points = len(self.ecef_m)
@@ -291,29 +268,25 @@ class Trajectory(FrozenArrays, NotebookTable):
         return NearestOnPolyline(self.ecef_m)
 
     def segment_at(self, arc_m: ArrayLike) -> tuple[Indices, Floats]:
-        """Find the segment of each arc length, and the distance along it.
+        """Find the segment of each arc length, any shape, and the distance along it [m].
 
-        Parameters
-        ----------
-        arc_m : array_like, any shape [m]
-
-        Returns
-        -------
-        index : ndarray of int
-            A point shared by two segments belongs to the later one; 0 before the start; the last segment
-            beyond the end and for NaN.
-        along_m : ndarray [m]
-            From the segment's first point; negative before the start; NaN for NaN.
+        A point shared by two segments belongs to the later one. Before the start it is the first, with a negative
+        distance; beyond the end and for NaN the last, with NaN for NaN.
         """
         arc = np.asarray(arc_m, dtype=np.float64)
         index = np.minimum(np.maximum(self.arc_m.searchsorted(arc, side="right") - 1, 0), len(self) - 2)
         return np.asarray(index, dtype=np.intp), arc - self.arc_m[index]
 
     def _interpolate(self, arc_m: ArrayLike, values: Floats) -> Floats:
-        arc = np.array(arc_m, dtype=np.float64)
-        rows = values.reshape(len(values), -1)
-        result = interpolate_values(arc.reshape(-1), self.arc_m, self.length_m, rows, _END_TOLERANCE_M)
-        return result.reshape(arc.shape + values.shape[1:])
+        """Values (V, ...) at arc lengths of any shape; NaN beyond the ends by more than the tolerance."""
+        given = np.array(arc_m, dtype=np.float64)
+        index, along = self.segment_at(given.reshape(-1))
+        length, rows = self.length_m[index], values.reshape(len(values), -1)
+        share, beyond = along / length, _END_TOLERANCE_M / length
+        share = np.where((share < -beyond) | (share > 1.0 + beyond), np.nan, share)[:, None]
+        # exact at both ends of a segment
+        result = (1.0 - share) * rows[index] + share * rows[index + 1]
+        return np.asarray(result).reshape(given.shape + values.shape[1:])
 
     def at_arc(self, arc_m: ArrayLike) -> Floats:
         """Interpolate the point at an arc length, shape (..., 3) [m]; NaN beyond the ends and for NaN."""
@@ -340,10 +313,8 @@ class Trajectory(FrozenArrays, NotebookTable):
     def arc_at_chainage(self, chainage_m: ArrayLike) -> Floats:
         """Interpolate the arc length at a chainage of the reference point [m]; NaN beyond the ends and for NaN."""
         chainage = np.asarray(chainage_m, dtype=np.float64)
-        inside = np.isfinite(chainage)
-        inside &= (chainage >= self.chainage_m[0] - _END_TOLERANCE_M) & (
-            chainage <= self.chainage_m[-1] + _END_TOLERANCE_M
-        )
+        first, last = self.chainage_m[0] - _END_TOLERANCE_M, self.chainage_m[-1] + _END_TOLERANCE_M
+        inside = (chainage >= first) & (chainage <= last)
         return np.where(inside, np.interp(chainage, self.chainage_m, self.arc_m), np.nan)
 
     def kilometrage_at(self, arc_m: ArrayLike) -> Floats:
@@ -351,31 +322,11 @@ class Trajectory(FrozenArrays, NotebookTable):
         return interpolate_kilometrage(self.chainage_at(arc_m), self.chainage_m, self.kilometrage_m)
 
     def nearest(self, ecef_m: ArrayLike) -> tuple[Floats, Floats]:
-        """Find the nearest point of the trajectory to each position.
+        """Find the nearest point of the trajectory to each position (n, 3): its arc length and its distance, shapes
+        (n,) [m].
 
-        Exact over all segments: a k-d tree gives the candidates, and a bound excludes all others.
-
-        Parameters
-        ----------
-        ecef_m : array_like, shape (n, 3) [m]
-
-        Returns
-        -------
-        arc_m, offset_m : ndarray, shape (n,) [m]
-            Arc length of the nearest point and its distance; NaN where the position is NaN. Of two
-            equally near points the one of smaller arc length.
+        Exact over all segments: a k-d tree gives the candidates, and a bound excludes all others. Of two equally near
+        points the one of smaller arc length; NaN where the position is NaN.
         """
         index, along, offset = self._nearest(ecef_m)
-        known = index >= 0
-        arc = np.where(known, self.arc_m[np.maximum(index, 0)] + along, np.nan)
-        return arc, offset
-
-
-def interpolate_values(arc: Floats, arc_m: Floats, length_m: Floats, values: Floats, tolerance_m: float) -> Floats:
-    """Interpolate values (V, C) of a line at arc lengths (n, C); NaN beyond its ends by the tolerance."""
-    index = np.minimum(np.maximum(arc_m.searchsorted(arc, side="right") - 1, 0), len(arc_m) - 2)
-    length = length_m[index]
-    share, beyond = (arc - arc_m[index]) / length, tolerance_m / length
-    share = np.where((share < -beyond) | (share > 1.0 + beyond), np.nan, share)[:, None]
-    # exact at both ends of a segment
-    return np.asarray((1.0 - share) * values[index] + share * values[index + 1])
+        return self.arc_m[np.maximum(index, 0)] + along, offset  # `along` is NaN where there is no segment

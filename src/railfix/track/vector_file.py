@@ -23,8 +23,8 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import ending, open_stream
-from railfix.track.crs import frame_degrees, older_datum_note, unit_of_heights, used_crs
-from railfix.track.frames import check_height_datum, stated_heights
+from railfix.track.crs import choose_crs, frame_degrees, older_datum_note, unit_of_heights
+from railfix.track.frames import check_height_datum, heights_of_file
 from railfix.track.route import ATTRIBUTES, NO_HEIGHTS, MapReading, Segment
 from railfix.track.track import UNNAMED
 
@@ -253,7 +253,7 @@ def read_vector_segments(path: str | PathLike[str], reading: MapReading) -> list
     segments: list[Segment] = []
     left_out: Counter[str] = Counter()
     for named, rows, parts in _features(path):
-        of_layer = replace(reading, crs=used_crs(path, reading.crs, named))
+        of_layer = replace(reading, crs=choose_crs(path, reading.crs, named))
         for row, lines in zip(rows, parts, strict=True):
             if why := no_track(row, of_openstreetmap=is_of_openstreetmap(row)):
                 left_out[why] += 1
@@ -308,7 +308,7 @@ def plan_segment(
             "mend them, or write the line without heights",
         )
     if known.any() and values[:, 2].any():
-        height, model, datum = stated_heights(
+        height, model, datum = heights_of_file(
             values[:, 2] * unit_of_heights(crs), latitude, longitude, reading, path=source
         )
     return Segment(

@@ -42,26 +42,15 @@ class AntennaOffset(Settings):
 
 
 class Vehicle(Settings):
-    """Vehicle dimensions and antennas, as in a vehicle file (TOML).
-
-    Attributes
-    ----------
-    bogie_distance_m : float
-        Straight distance between the two bogie centres.
-    gauge_m : float
-        Track gauge; cant is measured over the gauge plus `RAIL_HEAD_M`.
-    facing : {"rising", "falling"}
-        Direction of the vehicle's front along the chainage.
-    antennas : dict
-        Offsets by name: ``front``, ``rear``.
-    """
+    """Vehicle dimensions and antennas, as in a vehicle file (TOML)."""
 
     model_config = ConfigDict(strict=True)
     name: str = "vehicle"
-    bogie_distance_m: float = Field(gt=0.5, le=30.0)
+    bogie_distance_m: float = Field(gt=0.5, le=30.0)  #: Straight distance between the two bogie centres.
+    #: Track gauge; cant is measured over the gauge plus `RAIL_HEAD_M`.
     gauge_m: float = Field(default=1.067, ge=0.5, le=2.0)
-    facing: Literal["rising", "falling"] = "rising"
-    antennas: dict[Literal["front", "rear"], AntennaOffset] = Field(min_length=1)
+    facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the chainage.
+    antennas: dict[Literal["front", "rear"], AntennaOffset] = Field(min_length=1)  #: Offsets by name.
 
     @property
     def contact_spacing_m(self) -> float:
@@ -72,12 +61,7 @@ class Vehicle(Settings):
 def read_vehicle(path: str | PathLike[str]) -> Vehicle:
     """Read a vehicle file (TOML).
 
-    Raises
-    ------
-    InputFileError
-        No such file, or not TOML.
-    SettingsError
-        A key is unknown, missing or out of range.
+    InputFileError: no such file, or not TOML. SettingsError: a key is unknown, missing or out of range.
     """
     return load_settings(Vehicle, path, what="a vehicle file")
 
@@ -163,7 +147,7 @@ def _sign_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
     with np.errstate(divide="ignore"):
         side = np.where(np.isfinite(track.radius_m), np.sign(track.radius_m), 0.0)
     if (canted & np.isnan(track.radius_m)).any():
-        side = np.where(np.isnan(track.radius_m), _turning_side(track), side)
+        side = np.where(np.isnan(track.radius_m), _side_of_bends(track), side)
         notes.append("the side of the cant is taken from the bend of the centreline where the map has no radius")
     curved = np.flatnonzero(side)
     if not curved.size:
@@ -173,7 +157,7 @@ def _sign_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
     return cant * side, tuple(notes)
 
 
-def _turning_side(track: Track) -> Floats:
+def _side_of_bends(track: Track) -> Floats:
     """Return +1 where the centreline bends to the right, -1 to the left, 0 where straight, shape (V,)."""
     steps = np.diff(track.ecef_m, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)

@@ -18,7 +18,7 @@ import numpy as np
 
 from railfix.core.errors import InputFileError
 from railfix.core.files import ending, file_sha256, open_stream, read_bytes
-from railfix.track.crs import used_crs
+from railfix.track.crs import choose_crs
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
 from railfix.track.route import RINF_NAMES, RINF_SECTIONS, MapReading, Segment
 from railfix.track.vector_file import INSTALL, plan_segment
@@ -108,7 +108,7 @@ def _landxml(path: str, root: Any, reading: MapReading) -> list[Segment]:
             plan = [_landxml_plan(path, e, scale) for e in _elements(geometry)]
             profile = _landxml_profile(path, alignment.find(".//{*}ProfAlign"), scale, start)
             cant, notes = _landxml_cant(alignment.find(".//{*}Cant"), scale, start)
-            notes += _unused_notes(alignment, name)
+            notes += _notes(alignment, name)
         except KeyError as error:
             raise InputFileError(
                 path, f"alignment {name!r}: cant of transition type {error} is not read; {', '.join(_SPIRALS)} are"
@@ -124,7 +124,7 @@ def _landxml(path: str, root: Any, reading: MapReading) -> list[Segment]:
                 plan=plan,
                 profile=profile,
                 cant=cant,
-                reading=replace(reading, crs=used_crs(path, reading.crs, named)),
+                reading=replace(reading, crs=choose_crs(path, reading.crs, named)),
                 notes=notes,
             )
         )
@@ -133,7 +133,7 @@ def _landxml(path: str, root: Any, reading: MapReading) -> list[Segment]:
     return segments
 
 
-def _unused_notes(alignment: Any, name: str) -> tuple[str, ...]:
+def _notes(alignment: Any, name: str) -> tuple[str, ...]:
     """Notes on what of an alignment is not used."""
     notes = []
     if (count := len(alignment.findall(".//{*}ProfAlign"))) > 1:
@@ -306,7 +306,7 @@ def _railml(path: str, root: Any, reading: MapReading) -> list[Segment]:
             points = points[:, :2]
         definition = systems.get(used.pop(), next(iter(systems.values()), None))
         named = definition.replace("urn:ogc:def:crs:", "").replace("::", ":") if definition else None
-        of_element = replace(reading, crs=used_crs(path, reading.crs, named))
+        of_element = replace(reading, crs=choose_crs(path, reading.crs, named))
         segments.append(plan_segment(points, of_element, path=path, name=name))
     if not segments:
         raise InputFileError(path, "no netElement of this railML file has geometric coordinates; railML 3 was expected")
@@ -361,7 +361,7 @@ def read_rinf_segments(path: str | PathLike[str], reading: MapReading) -> list[S
             points = np.array([[float(v) for v in p.split()] for p in lines[0]["points"].split(",")])
         except ValueError:
             raise InputFileError(path, f"{element}: its WKT has points of other than two or three numbers") from None
-        of_file = MapReading(**{**vars(reading), "crs": used_crs(path, reading.crs, named)})
+        of_file = MapReading(**{**vars(reading), "crs": choose_crs(path, reading.crs, named)})
         segments.append(plan_segment(points, of_file, path=str(path), name=_name(graph, element)))
     if not segments:
         raise InputFileError(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -97,15 +96,9 @@ class Orbits:
             **{name: getattr(records, name) for name in _AS_BROADCAST},
         )
 
-    @cached_property
-    def table(self) -> Floats:
-        """All values of each orbit, shape (n, 22), in the order of the attributes."""
-        return np.stack([getattr(self, item.name) for item in fields(Orbits)], axis=1)
-
-    @classmethod
-    def of_table(cls, table: Floats) -> Orbits:
-        """Return the orbits of rows of a `table`."""
-        return cls(**{item.name: table[:, i] for i, item in enumerate(fields(Orbits))})
+    def take(self, rows: Integers) -> Orbits:
+        """Return the orbits of some records."""
+        return Orbits(**{item.name: getattr(self, item.name)[rows] for item in fields(self)})
 
 
 _AS_BROADCAST: Final = ("eccentricity", "m0", "i_dot", "a_dot", "delta_n_dot", "cuc", "cus", "crc", "crs", "cic", "cis")
@@ -267,19 +260,7 @@ class GlonassStates:
         return cls(position, velocity, luni_solar)
 
     def state(self, row: Integers, since_toe_s: Floats) -> tuple[Floats, Floats]:
-        """Compute states at times since the reference time, from the last multiple of the step.
-
-        Parameters
-        ----------
-        row : ndarray of int, shape (n,)
-            Row of the records.
-        since_toe_s : ndarray, shape (n,) [s]
-            Within `reach_s`.
-
-        Returns
-        -------
-        position, velocity : ndarray, shape (3, n)
-        """
+        """Compute position and velocity (3, n) of records at times since their reference (n,), within `reach_s` [s]."""
         middle = self.position.shape[2] // 2
         node = np.trunc(since_toe_s / STEP_S)
         rest = since_toe_s - node * STEP_S
@@ -345,7 +326,9 @@ def _state(
     place = np.moveaxis(ephemeris.position_ecef_m[index], -1, 0)
     rotated = np.stack(_rotate_axes(EARTH_ROTATION_RATE * since[..., None], place))
     own = seconds(time - nodes[begin]) + offset_s
-    weight, slope = _lagrange_at_zero(since[:, which] - own, _node_products(since)[:, which])
+    difference = since[:, None] - since[None]  # of each node to the others of its window
+    difference[np.arange(POINTS), np.arange(POINTS)] = 1.0
+    weight, slope = _lagrange_at_zero(since[:, which] - own, difference.prod(axis=1)[:, which])
     chosen = rotated[:, :, which, column]
     position = np.stack(_rotate_axes(-EARTH_ROTATION_RATE * own, _sum(weight * chosen)))
     velocity = np.stack(_rotate_axes(-EARTH_ROTATION_RATE * own, _sum(slope * chosen)))
@@ -353,7 +336,8 @@ def _state(
     velocity[1] -= EARTH_ROTATION_RATE * position[0]
 
     # r.v is the same with the Earth-fixed velocity: the difference of the velocities is perpendicular to r.
-    relativity = -2.0 * _sum_axis0(position * velocity) / SPEED_OF_LIGHT**2
+    x, y, z = position * velocity
+    relativity = -2.0 * (x + y + z) / SPEED_OF_LIGHT**2
     clock = precise_clock_s(ephemeris, column, time, offset_s) + relativity
     left = np.clip(right - 1, 0, len(nodes) - 2)
     outside = (column < 0) | (right == 0) | ((right == len(nodes)) & (time != nodes[-1]))
@@ -370,21 +354,10 @@ def _sum(terms: Floats) -> Floats:
     return total
 
 
-def _sum_axis0(terms: Floats) -> Floats:
-    return np.asarray(terms[0] + terms[1] + terms[2])
-
-
 def _rotate_axes(angle: Floats, vector: Floats) -> tuple[Floats, Floats, Floats]:
     """Rotate vectors, components first, about the Earth's axis."""
     cos, sin = np.cos(angle), np.sin(angle)
     return cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1], vector[2]
-
-
-def _node_products(since_s: Floats) -> Floats:
-    """Compute the products of the differences of each node to the others of its window, shape (P, windows)."""
-    difference = since_s[:, None] - since_s[None]
-    difference[np.arange(POINTS), np.arange(POINTS)] = 1.0
-    return np.asarray(difference.prod(axis=1))
 
 
 def _lagrange_at_zero(nodes: Floats, node_products: Floats) -> tuple[Floats, Floats]:

@@ -132,14 +132,12 @@ _ISSUES: Final = 1024  #: Number of different issues of data: 10 bits of Galileo
 #: Time span that a lookup key can hold [ms]: 278 years.
 _ISSUE_SPAN: Final = np.int64(2**43)
 _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
-_MS: Final = np.timedelta64(1, "ms")
 
 
 class _Issues:
     """Records by satellite and issue, each from half-way between the toe before and its own; F/NAV before I/NAV."""
 
-    def __init__(self, navigation: Navigation) -> None:
-        kepler = navigation.kepler
+    def __init__(self, kepler: KeplerRecords) -> None:
         row = np.flatnonzero(np.isin(kepler.message, ("LNAV", "INAV", "FNAV", "CNV1")))
         issue = kepler.iode[row] % np.where(kepler.message[row] == "LNAV", 256, _ISSUES)
         names, number = np.unique(kepler.satellite[row], return_inverse=True)
@@ -156,31 +154,21 @@ class _Issues:
         same[1:] = self.series[1:] == self.series[:-1]
         since[1:] = np.where(same[1:], toe[:-1] + (toe[1:] - toe[:-1]) // 2, _ORIGIN)
         since[:1] = _ORIGIN
-        self.key = self.series * _ISSUE_SPAN + (since - _ORIGIN) // _MS
+        self.key = self.series * _ISSUE_SPAN + (since - _ORIGIN) // _MILLISECOND
         self.toe, self.limit = kepler.toe, timedelta(validity_s(kepler))
 
 
 @lru_cache(maxsize=8)
 def _issues_of(navigation: Navigation) -> _Issues:
-    return _Issues(navigation)
+    return _Issues(navigation.kepler)
 
 
 def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, issue: Integers) -> Integers:
-    """Find the rows of `navigation.kepler` with given issues of data.
+    """Find the rows of `navigation.kepler` with given issues of data, shape (T, M); -1 without one, and for GLONASS.
 
-    Parameters
-    ----------
-    satellite : ndarray of str, shape (M,)
-    time : ndarray of datetime64[ns], shape (T,)
-    issue : ndarray of int, shape (T, M)
-        IODE (BeiDou: of B-CNAV1), of Galileo IODnav; -1 for none. Of IODC, 10 bits, the lower 8 count.
-
-    Returns
-    -------
-    ndarray of int, shape (T, M)
-        The record of that issue whose reference time is nearest, if the epoch lies in its
-        validity; -1 elsewhere, and for GLONASS. The record may
-        have been transmitted after the epoch: see `SatelliteStates.future_record`.
+    `issue`, shape (T, M), is IODE (BeiDou: of B-CNAV1), of Galileo IODnav; -1 for none; of IODC, 10 bits, the lower 8
+    count. The record is the one of that issue whose reference time is nearest, if the epoch lies in its validity; it
+    may have been transmitted after the epoch (`SatelliteStates.future_record`).
     """
     table = _issues_of(navigation)
     number = np.array([table.number.get(str(name), -1) for name in satellite], dtype=np.int64)
@@ -188,7 +176,7 @@ def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, i
     series = np.where((issue >= 0) & (number >= 0), number * _ISSUES + issue, -1)
     if not len(table.key):
         return np.full(series.shape, -1, dtype=np.int64)
-    key = series * _ISSUE_SPAN + np.clip((time - _ORIGIN) // _MS, 0, _ISSUE_SPAN - 1)[:, None]
+    key = series * _ISSUE_SPAN + np.clip((time - _ORIGIN) // _MILLISECOND, 0, _ISSUE_SPAN - 1)[:, None]
     at = np.maximum(np.searchsorted(table.key, key, side="right") - 1, 0)
     record = table.row[at]
     usable = (series >= 0) & (table.series[at] == series)
@@ -239,9 +227,10 @@ def unhealthy(records: KeplerRecords, signal: str) -> Masks:
     return np.asarray(((records.health & bits) != 0) | no_accuracy)
 
 
-def group_delay_s(
-    records: KeplerRecords, signal: str, *, clock: Literal["broadcast", "ionosphere_free"] = "broadcast"
-) -> Floats:
+ClockReference = Literal["broadcast", "ionosphere_free"]
+
+
+def group_delay_s(records: KeplerRecords, signal: str, *, clock: ClockReference = "broadcast") -> Floats:
     """Compute the group delay of a signal relative to the satellite clock, shape (n,) [s].
 
     ======== =====================================================================================
@@ -261,13 +250,13 @@ def group_delay_s(
     """
     delay = np.full(len(records), np.nan)
     system = records.satellite.astype("<U1")
-    band = signal[:1]
-    here = np.isin(system, ["G", "J"])
-    delay[here] = _navstar(records, signal)[here]
-    here = system == "E"
-    delay[here] = _galileo(records, band, always_fnav=clock == "ionosphere_free")[here]
-    here = system == "C"
-    delay[here] = _beidou(records, signal, ionosphere_free=clock == "ionosphere_free")[here]
+    ionosphere_free = clock == "ionosphere_free"
+    for letters, delays in (
+        ("GJ", _navstar(records, signal)),
+        ("E", _galileo(records, signal[:1], always_fnav=ionosphere_free)),
+        ("C", _beidou(records, signal, ionosphere_free=ionosphere_free)),
+    ):
+        delay = np.where(np.isin(system, [*letters]), delays, delay)
     return delay
 
 
@@ -393,15 +382,13 @@ class PreparedRecords:
         glonass = np.array([i for i, s in enumerate(satellite) if s[:1] == "R"], dtype=np.intp)
         names = [(satellite[i], signal[i]) for i in kepler]
         codes = sorted({code for _, code in names})
-        number = self.lookup.number
+        number, glonass_number = self.lookup.number, self.glonass_lookup.number
         first, second = zip(*(_labels(name, code) for name, code in names), strict=True) if names else ((), ())
         pairs = [(number.get(a, -1), number.get(b, -1)) for a, b in zip(first, second, strict=True)]
         preferred, other = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
         # A satellite that has only the other message uses it as the preferred one.
         preferred, other = np.where(preferred < 0, other, preferred), np.where(preferred < 0, -1, other)
-        clock: Literal["broadcast", "ionosphere_free"] = (
-            "ionosphere_free" if self.navigation.precise is not None else "broadcast"
-        )
+        clock: ClockReference = "broadcast" if self.navigation.precise is None else "ionosphere_free"
         records = self.navigation.kepler
         return ChannelRecords(
             kepler=kepler,
@@ -412,9 +399,7 @@ class PreparedRecords:
             signal=np.array([codes.index(code) for _, code in names], dtype=np.int64),
             group_delay_s=_rows(lambda code: group_delay_s(records, code, clock=clock), codes, len(records)),
             unhealthy=_rows(lambda code: unhealthy(records, code), codes, len(records)).astype(bool),
-            glonass_number=np.array(
-                [self.glonass_lookup.number.get(satellite[i], -1) for i in glonass], dtype=np.int64
-            ),
+            glonass_number=np.array([glonass_number.get(satellite[i], -1) for i in glonass], dtype=np.int64),
         )
 
 

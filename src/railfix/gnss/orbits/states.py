@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, freeze_arrays
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds, timedelta
-from railfix.gnss.navigation import Navigation
-from railfix.gnss.orbits.ephemerides import Orbits, kepler_state, precise_clock_s, precise_state
+from railfix.gnss.navigation import Navigation, PreciseEphemeris
+from railfix.gnss.orbits.ephemerides import kepler_state, precise_clock_s, precise_state
 from railfix.gnss.orbits.prepared_records import ChannelRecords, PreparedRecords, prepared_records
 
 #: Chunks of fewer epochs are computed with all channels together, longer ones channel by channel: the same
@@ -23,72 +23,43 @@ _BLOCK: Final = 4096  #: Epochs of a channel computed at once, so that the array
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Arrays:
-    """Arrays of `SatelliteStates`, writable during the computation."""
-
-    position_ecef_m: Floats
-    velocity_ecef_mps: Floats
-    clock_m: Floats
-    group_delay_m: Floats
-    age_s: Floats
-    accuracy_m: Floats
-    record: Integers
-    no_record: Masks
-    too_old: Masks
-    unhealthy: Masks
-    future_record: Masks
-
-    @classmethod
-    def empty(cls, shape: tuple[int, ...]) -> _Arrays:
-        position, velocity = np.full((2, *shape, 3), np.nan)
-        clock, delay, age, accuracy = np.full((4, *shape), np.nan)
-        no_record, too_old, unhealthy, future = np.zeros((4, *shape), dtype=bool)
-        no_record[...] = True
-        record = np.full(shape, -1, dtype=np.int64)
-        return cls(
-            position_ecef_m=position, velocity_ecef_mps=velocity, clock_m=clock, group_delay_m=delay, age_s=age,
-            accuracy_m=accuracy, record=record, no_record=no_record, too_old=too_old, unhealthy=unhealthy,
-            future_record=future,
-        )  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class SatelliteStates(_Arrays):
+class SatelliteStates:
     """Satellite states at the times of transmission, T epochs by M channels.
 
     NaN where a channel has no code, no record, or only records out of their validity.
-
-    Attributes
-    ----------
-    position_ecef_m : ndarray, shape (T, M, 3) [m]
-        In the Earth-fixed frame of the time of transmission, not rotated to that of reception
-        (`railfix.core.geodesy.range_with_rotation` does that).
-    velocity_ecef_mps : ndarray, shape (T, M, 3) [m/s]
-        In the same frame: the derivative of `position_ecef_m`.
-    clock_m : ndarray, shape (T, M) [m]
-        c times the satellite clock with the relativistic correction, without group delay.
-    group_delay_m : ndarray, shape (T, M) [m]
-        Of the channel's signal: corrected code = code + clock_m - group_delay_m - delays. NaN on
-        signals whose delay is not broadcast (see `signal_health.group_delay_s`).
-    age_s : ndarray, shape (T, M) [s]
-        Epoch minus the reference time of the record; 0 for a precise ephemeris.
-    accuracy_m : ndarray, shape (T, M) [m]
-        As broadcast; NaN for GLONASS and for a precise ephemeris.
-    record : ndarray of int, shape (T, M)
-        Row of the record table of the constellation, -1 where there is none. Set also where the
-        record is too old or the channel has no code.
-    no_record : ndarray of bool, shape (T, M)
-        The satellite has no record.
-    too_old : ndarray of bool, shape (T, M)
-        The satellite has records, but none is valid at the epoch (set only where there is a code).
-    unhealthy : ndarray of bool, shape (T, M)
-        The record used flags the signal as unhealthy.
-    future_record : ndarray of bool, shape (T, M)
-        The record used was transmitted after the epoch: usable in post-processing, not live.
     """
 
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
+    #: In the Earth-fixed frame of the time of transmission, not rotated to that of reception
+    #: (`railfix.core.geodesy.range_with_rotation` does that); shape (T, M, 3).
+    position_ecef_m: Floats
+    velocity_ecef_mps: Floats  #: Derivative of `position_ecef_m` in the same frame, shape (T, M, 3).
+    clock_m: Floats  #: c times the satellite clock with the relativistic correction, without group delay; shape (T, M).
+    #: Of the channel's signal: corrected code = code + clock_m - group_delay_m - delays. NaN on signals whose delay is
+    #: not broadcast (`prepared_records.group_delay_s`); shape (T, M).
+    group_delay_m: Floats
+    age_s: Floats  #: Epoch minus the reference time of the record; 0 for a precise ephemeris; shape (T, M).
+    accuracy_m: Floats  #: As broadcast; NaN for GLONASS and for a precise ephemeris; shape (T, M).
+    #: Row of the record table of the constellation, -1 where there is none; set also where the record is too old or the
+    #: channel has no code; shape (T, M).
+    record: Integers
+    no_record: Masks  #: The satellite has no record, shape (T, M).
+    #: The satellite has records, but none is valid at the epoch (set only where there is a code); shape (T, M).
+    too_old: Masks
+    unhealthy: Masks  #: The record used flags the signal as unhealthy, shape (T, M).
+    #: The record used was transmitted after the epoch: usable in post-processing, not live; shape (T, M).
+    future_record: Masks
+
+    @classmethod
+    def empty(cls, shape: tuple[int, ...]) -> SatelliteStates:
+        """Create writable states without any record."""
+        position, velocity = np.full((2, *shape, 3), np.nan)
+        clock, delay, age, accuracy = np.full((4, *shape), np.nan)
+        too_old, unhealthy, future = np.zeros((3, *shape), dtype=bool)
+        return cls(
+            position_ecef_m=position, velocity_ecef_mps=velocity, clock_m=clock, group_delay_m=delay, age_s=age,
+            accuracy_m=accuracy, record=np.full(shape, -1, dtype=np.int64), no_record=np.ones(shape, dtype=bool),
+            too_old=too_old, unhealthy=unhealthy, future_record=future,
+        )  # fmt: skip
 
 
 def satellite_states(
@@ -139,15 +110,16 @@ def satellite_states(
         raise ValueError(f"record has shape {record.shape}, expected {code_m.shape}")
     table = prepared_records(navigation)
     plan = table.channels(satellite, signal)
-    states = _Arrays.empty(code_m.shape)
+    states = SatelliteStates.empty(code_m.shape)
     observed = np.isfinite(code_m)
     if len(plan.kepler) and len(navigation.kepler):
         _fill_kepler(table, plan, time, code_m, observed, max_age_s, states, record)
     if len(plan.glonass) and len(navigation.glonass):
         _fill_glonass(table, plan, time, code_m, observed, max_age_s, states)
     if navigation.precise is not None:
-        _fill_precise(navigation, satellite, time, code_m, observed, states)
-    return SatelliteStates(**vars(states))
+        _fill_precise(navigation.precise, satellite, time, code_m, observed, states)
+    freeze_arrays(states)
+    return states
 
 
 def _limit(validity: NDArray[np.timedelta64], max_age_s: float | None) -> NDArray[np.timedelta64]:
@@ -161,7 +133,7 @@ def _fill_kepler(
     code_m: Floats,
     observed: Masks,
     max_age_s: float | None,
-    states: _Arrays,
+    states: SatelliteStates,
     record: Integers | None,
 ) -> None:
     """Fill in the channels of GPS, QZSS, Galileo and BeiDou."""
@@ -186,78 +158,22 @@ def _fill_kepler(
     usable = seen if precise else seen & valid
     states.too_old[:, channels] = (seen & ~usable).T
     states.future_record[:, channels] = (usable & future).T
-    kepler_channels(
-        time.astype("datetime64[ns]").astype(np.int64),
-        np.ascontiguousarray(code_m),
-        KeplerChannels(channels, rows, usable, plan.signal),
-        SelectedKepler(
-            table.lookup.toe.astype("datetime64[ns]").astype(np.int64),
-            table.orbits.table,
-            table.clock,
-            table.toe_after_toc_s,
-            np.ascontiguousarray(table.navigation.kepler.accuracy_m),
-            plan.group_delay_s,
-            plan.unhealthy,
-        ),
-        KeplerStates(*(getattr(states, name) for name in KeplerStates._fields)),
-    )
+    for k, t, row in _groups(rows, usable):
+        m, signal = channels[k], plan.signal[k]
+        age, clock, ahead = seconds(time[t] - table.lookup.toe[row]), table.clock[:, row], table.toe_after_toc_s[row]
+        since_toe = age - code_m[t, m] / SPEED_OF_LIGHT
+        since_toe = since_toe - _polynomial(clock, since_toe + ahead)
+        place, speed, relativity = kepler_state(table.orbits.take(row), since_toe)
+        for i in range(3):
+            states.position_ecef_m[t, m, i], states.velocity_ecef_mps[t, m, i] = place[i], speed[i]
+        states.clock_m[t, m] = SPEED_OF_LIGHT * (_polynomial(clock, since_toe + ahead) + relativity)
+        states.age_s[t, m], states.accuracy_m[t, m] = age, table.navigation.kepler.accuracy_m[row]
+        states.group_delay_m[t, m] = SPEED_OF_LIGHT * plan.group_delay_s[signal, row]
+        states.unhealthy[t, m] = plan.unhealthy[signal, row]
     if record is not None:
         # The newest record decides on health, also where a correction refers to an older one.
         newest_unhealthy = plan.unhealthy[plan.signal[:, None], np.maximum(newest, 0)] & (newest >= 0)
         states.unhealthy[:, channels] |= newest_unhealthy.T
-
-
-class KeplerChannels(NamedTuple):
-    """Channels on Keplerian records, K of the M, T epochs."""
-
-    channel: Indices  # (K,) which of the M
-    row: Integers  # (K, T) of the record
-    usable: Masks  # (K, T)
-    signal: Integers  # (K,) row of `SelectedKepler.group_delay_s`
-
-
-class SelectedKepler(NamedTuple):
-    """Keplerian records, R of them, as arrays."""
-
-    toe_ns: Integers  # (R,) since 1970
-    orbits: Floats  # (R, 22) `Orbits.table`
-    clock: Floats  # (3, R) clock polynomial
-    toe_after_toc_s: Floats  # (R,)
-    accuracy_m: Floats  # (R,)
-    group_delay_s: Floats  # (signals, R), of `ChannelRecords`
-    unhealthy: Masks  # (signals, R), likewise
-
-
-class KeplerStates(NamedTuple):
-    """Arrays of `SatelliteStates` that `kepler_channels` fills in."""
-
-    position_ecef_m: Floats
-    velocity_ecef_mps: Floats
-    clock_m: Floats
-    age_s: Floats
-    accuracy_m: Floats
-    group_delay_m: Floats
-    unhealthy: Masks
-
-
-def kepler_channels(
-    time_ns: Integers, code_m: Floats, channels: KeplerChannels, records: SelectedKepler, states: KeplerStates
-) -> KeplerStates:
-    """Compute the states of channels on Keplerian records; `states` is filled in place, its arrays are returned."""
-    for k, t, row in _groups(channels.row, channels.usable):
-        m, signal = channels.channel[k], channels.signal[k]
-        age = seconds((time_ns[t] - records.toe_ns[row]).astype("timedelta64[ns]"))
-        since_toe, clock = age - code_m[t, m] / SPEED_OF_LIGHT, records.clock[:, row]
-        ahead = records.toe_after_toc_s[row]
-        since_toe = since_toe - _polynomial(clock, since_toe + ahead)
-        place, speed, relativity = kepler_state(Orbits.of_table(records.orbits[row]), since_toe)
-        for i in range(3):
-            states.position_ecef_m[t, m, i], states.velocity_ecef_mps[t, m, i] = place[i], speed[i]
-        states.clock_m[t, m] = SPEED_OF_LIGHT * (_polynomial(clock, since_toe + ahead) + relativity)
-        states.age_s[t, m], states.accuracy_m[t, m] = age, records.accuracy_m[row]
-        states.group_delay_m[t, m] = SPEED_OF_LIGHT * records.group_delay_s[signal, row]
-        states.unhealthy[t, m] = records.unhealthy[signal, row]
-    return states
 
 
 def _groups(rows: Integers, usable: Masks) -> Iterator[tuple[Any, Any, Integers]]:
@@ -289,7 +205,7 @@ def _fill_glonass(
     code_m: Floats,
     observed: Masks,
     max_age_s: float | None,
-    states: _Arrays,
+    states: SatelliteStates,
 ) -> None:
     """Fill in the channels of GLONASS; code biases between frequency channels are not corrected."""
     records = table.navigation.glonass
@@ -319,12 +235,14 @@ def _fill_glonass(
 
 
 def _fill_precise(
-    navigation: Navigation, satellite: Strings, time: Datetimes, code_m: Floats, observed: Masks, states: _Arrays
+    precise: PreciseEphemeris,
+    satellite: Strings,
+    time: Datetimes,
+    code_m: Floats,
+    observed: Masks,
+    states: SatelliteStates,
 ) -> None:
     """Replace broadcast positions and clocks by those of the precise ephemeris."""
-    precise = navigation.precise
-    if precise is None:
-        raise ValueError("no precise ephemeris is given")
     known = {str(s): i for i, s in enumerate(precise.satellite)}
     column = np.array([known.get(s, -1) for s in satellite.tolist()], dtype=np.intp)
     glonass = np.char.startswith(satellite, "R")

@@ -1,7 +1,7 @@
 """Ephemerides put together from navigation subframes as they are received.
 
 A record needs several subframes of one issue: GPS and QZSS three, Galileo five words, BeiDou three (D1, B-CNAV1,
-B-CNAV2) or ten pages (D2), GLONASS four strings. `assembled` takes the subframes of a piece of a stream and what
+B-CNAV2) or ten pages (D2), GLONASS four strings. `assemble_records` takes the subframes of a piece of a stream and what
 earlier pieces left unfinished, so that a stream cut anywhere gives the same records.
 """
 
@@ -37,7 +37,7 @@ from railfix.io.receiver.nav_messages import (
     E5B_SOURCE,
     FNAV_FROM,
     Values,
-    decoded_pages,
+    decode_pages,
 )
 from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_records, kepler_records
 
@@ -47,7 +47,6 @@ _STRINGS_S: Final = 15.0  #: Time from the beginning of a GLONASS frame in which
 _EPOCH_BEFORE_S: Final = 5.0  #: Longest time from the last epoch to the string that counts as received then.
 #: Time from one GLONASS frame to the next.
 _FRAME_S: Final = 30.0
-_NEVER: Final = np.datetime64("NaT", "ns")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,20 +82,19 @@ class Assembled:
 def assemble_records(
     subframes: Subframes,
     time: Datetimes,
-    state: Unfinished | None = None,
+    state: Unfinished,
     *,
-    after: Datetimes | None = None,
-    first: np.datetime64 = _NEVER,
+    after: Datetimes,
+    first: np.datetime64,
 ) -> tuple[Assembled, Unfinished]:
     """Ephemerides that a piece of a stream completes, and what it leaves unfinished.
 
     `time`, the last epoch before each subframe, shape (N,), resolves weeks and days; `after` is the first one after
     each, NaT where the piece has none, `first` that of the piece.
     """
-    builder = _EphemerisBuilder(state or Unfinished())
+    builder = _EphemerisBuilder(state)
     builder.waiting = {name: first if np.isnat(at) else at for name, at in builder.waiting.items()}
-    after = np.full(len(time), _NEVER) if after is None else after
-    pages, counts = decoded_pages(subframes)
+    pages, counts = decode_pages(subframes)
     for row, satellite, number, values in pages:
         builder.settle(time[row])
         builder.add(satellite, number, values, time[row], after[row])
@@ -104,11 +102,11 @@ def assemble_records(
     return builder.result(counts)
 
 
-def assembled_rtcm(
-    messages: Iterable[tuple[int, int, Mapping[str, float]]], time: Datetimes, state: Unfinished | None = None
+def assemble_rtcm(
+    messages: Iterable[tuple[int, int, Mapping[str, float]]], time: Datetimes, state: Unfinished
 ) -> tuple[Assembled, Unfinished]:
     """Ephemerides of RTCM 3 messages (`rtcm.ephemeris_fields`) received at times, shape (N,), repeated ones once."""
-    builder = _EphemerisBuilder(state or Unfinished())
+    builder = _EphemerisBuilder(state)
     for (_, kind, values), at in zip(messages, time, strict=True):
         satellite = f"{_RTCM_SYSTEMS[kind]}{int(values['number']):02d}"
         if not builder.needs_date(satellite, at):
@@ -132,19 +130,14 @@ def _rtcm_record(kind: int, satellite: str, values: Values, time: np.datetime64)
 
 def navigation_of(parts: Assembled, *, sources: tuple[str, ...] = ()) -> Navigation:
     """Navigation data from assembled records."""
-    klobuchar = {letter: value for letter, value in parts.klobuchar.items() if np.any(value)}
     return Navigation(
         kepler=kepler_records([r for r in parts.records if r.system != "R"]),
         glonass=glonass_records([r for r in parts.records if r.system == "R"]),
-        klobuchar=klobuchar,
+        klobuchar={letter: value for letter, value in parts.klobuchar.items() if np.any(value)},
         leap_seconds=parts.leap_seconds,
         skipped=dict(parts.skipped),
         sources=sources,
     )
-
-
-def _nonzero(counts: Counter[str]) -> dict[str, int]:
-    return {what: number for what, number in counts.items() if number}
 
 
 class _EphemerisBuilder:
@@ -174,7 +167,7 @@ class _EphemerisBuilder:
             complete_at=np.array(self.times, dtype="datetime64[ns]"),
             klobuchar=self.klobuchar,
             leap_seconds=self.leap_seconds,
-            skipped=_nonzero(counts),
+            skipped=dict(+counts),
             undated=frozenset(self.undated),
         )
         return records, Unfinished(latest=self.latest, issued=self.issued, waiting=self.waiting)
@@ -334,7 +327,7 @@ class _EphemerisBuilder:
         return glonass_record(satellite, {**values, "health": float(int(values["health"]) >> 2)}, time)
 
 
-def merged(parts: list[Assembled]) -> Assembled:
+def merge_records(parts: list[Assembled]) -> Assembled:
     """Records of several pieces of one stream."""
     klobuchar: dict[str, np.ndarray] = {}
     leap: int | None = None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import binascii
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
@@ -183,9 +183,7 @@ _CRC24: Final = _crc24_table()
 
 
 def crc24q(data: Bytes, start: Indices, end: Indices) -> Integers:
-    """CRC-24Q of many stretches of a buffer, from `start` to `end`, shape (N,), byte by byte over all of them
-    together.
-    """
+    """CRC-24Q of many stretches of a buffer, from `start` to `end`, shape (N,), byte by byte over all together."""
     crc = np.zeros(len(start), dtype=np.int64)
     order = np.argsort(start - end, kind="stable")  # longest first: the ones still running are a prefix
     first, length = start[order], (end - start)[order]
@@ -320,23 +318,18 @@ class Subframes:
 
     def take(self, rows: Integers | np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Subframes:
         """Some of the rows."""
-        return Subframes(
-            satellite=self.satellite[rows],
-            signal=self.signal[rows],
-            glonass_channel=self.glonass_channel[rows],
-            words=self.words[rows],
-            order=self.order[rows],
-            skipped=self.skipped,
-        )
+        return replace(self, **{name: getattr(self, name)[rows] for name in _SUBFRAME_ARRAYS})
 
 
-def joined_subframes(first: Subframes, second: Subframes) -> Subframes:
+_SUBFRAME_ARRAYS: Final = ("satellite", "signal", "glonass_channel", "words", "order")
+
+
+def join_subframes(first: Subframes, second: Subframes) -> Subframes:
     """Subframes of two formats of one stream, in its order."""
     if not len(second) and not second.skipped:
         return first
-    arrays = ("satellite", "signal", "glonass_channel", "words", "order")
     both = Subframes(
-        **{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in arrays},
+        **{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in _SUBFRAME_ARRAYS},
         skipped={**first.skipped, **second.skipped},
     )
     return both.take(np.argsort(both.order, kind="stable"))
@@ -371,7 +364,7 @@ def sbas_frames(subframes: Subframes, time: Datetimes) -> SbasFrames:
     return SbasFrames(time=time[rows] + np.timedelta64(1, "ns"), prn=prn, octets=octets, on_l5=on_l5)
 
 
-def packed_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]], *, drop: int, keep: int) -> Bytes:
+def unpack_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]], *, drop: int, keep: int) -> Bytes:
     """Bits of words of which the lowest `drop` are left out and the next `keep` kept, shape (N, words * keep)."""
     shift = np.arange(keep - 1, -1, -1, dtype=np.uint32) + np.uint32(drop)
     bits = words[:, :, None] >> shift & np.uint32(1)

@@ -25,12 +25,12 @@ from railfix.io.receiver.ephemerides import (
     Assembled,
     Unfinished,
     assemble_records,
-    assembled_rtcm,
-    merged,
+    assemble_rtcm,
+    merge_records,
     navigation_of,
 )
-from railfix.io.receiver.framing import Frames, SbasFrames, find_frames, joined_subframes, sbas_frames
-from railfix.io.receiver.measurements import Measurements, Tracking, observations_of
+from railfix.io.receiver.framing import Frames, SbasFrames, find_frames, join_subframes, sbas_frames
+from railfix.io.receiver.measurements import Measurements, Tracking, no_measurements, observations_of
 
 MON_RF: Final = 0x0A38
 MON_HW: Final = 0x0A09
@@ -246,7 +246,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Lo
     buffer = np.frombuffer(state.rest + data, dtype=np.uint8)
     frames = find_frames(buffer, at_end=at_end)
     if not at_end:
-        unfinished = rtcm.unfinished_epoch(frames)
+        unfinished = rtcm.find_unfinished_epoch(frames)
         if unfinished is not None:  # the rest of its messages is still to come: kept for the next block
             frames = replace(find_frames(buffer[:unfinished]), data=buffer)
     channels = rtcm.glonass_channels(frames, state.glonass_channels)
@@ -258,7 +258,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Lo
     native = kind if kind in own else max(own, key=lambda name: len(own[name].time))
     raw = own[native]
     taken = {**own, _MSM: msm, "": own[_RAWX]}
-    measurements = taken[kind] if kind in taken else ubx.rawx_measurements(find_frames(buffer[:0]))
+    measurements = taken[kind] if kind in taken else no_measurements("u-blox")
     unused = _of_other_kinds(frames, kind) if kind else {**raw.skipped, **msm.skipped}
     measurements = replace(measurements, skipped={**measurements.skipped, **unused, **_of_old_kinds(frames)})
     places = msm_places if kind == _MSM else _places(frames, native)
@@ -361,7 +361,7 @@ def _navigation(
     frames: Frames, dated: _Dated, msm: _Dated, state: StreamState
 ) -> tuple[Assembled, SbasFrames, Unfinished, Unfinished]:
     """Ephemerides and SBAS messages of a block; `msm` are the epochs of RTCM 3."""
-    subframes = joined_subframes(ubx.sfrbx_subframes(frames), sbf.navigation_subframes(frames))
+    subframes = join_subframes(ubx.sfrbx_subframes(frames), sbf.navigation_subframes(frames))
     received = dated.last_before(subframes.order, state.time if np.isnat(state.clock) else state.clock)
     after = dated.first_after(subframes.order)
     start = dated.first_after(np.zeros(1, dtype=np.int64))[0]
@@ -369,10 +369,10 @@ def _navigation(
     messages = sorted(rtcm.ephemeris_fields(frames))
     places = np.array([place for place, _, _ in messages], dtype=np.int64)
     before = state.clock if np.isnat(state.time) else state.time
-    second, issued = assembled_rtcm(
+    second, issued = assemble_rtcm(
         messages, (msm if len(msm.times) else dated).last_before(places, before), state.messages
     )
-    return merged([first, second]), sbas_frames(subframes, received), unfinished, issued
+    return merge_records([first, second]), sbas_frames(subframes, received), unfinished, issued
 
 
 def scan_pieces(
@@ -432,7 +432,7 @@ def read_receiver_navigation(paths: Iterable[FilePath], *, date: np.datetime64 |
     """Return navigation records of receiver logs; without `date`, satellites without a full date are noted."""
     names = tuple(str(Path(path)) for path in paths)
     parts = [piece.ephemerides for name in names for piece in scan_pieces(name, date=date)]
-    whole = merged(parts)
+    whole = merge_records(parts)
     undated = sorted(whole.undated - {record.satellite for record in whole.records})
     why = f"the ephemerides of {', '.join(undated)} carry no full date (--date gives one)" if undated else ""
     if not whole.records:

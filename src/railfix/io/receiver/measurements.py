@@ -160,17 +160,42 @@ def _header(measurements: Measurements, satellite: Strings, signal: Strings) -> 
     )
 
 
-def joined(parts: Sequence[Measurements]) -> Measurements:
+#: Arrays of `Measurements` with a value for each of N rows, but `epoch`.
+ROW_ARRAYS: Final = (
+    "satellite signal code_m phase_cycles doppler_hz cn0_dbhz lock_s half_cycle polarity glonass_channel".split()
+)
+
+
+def no_measurements(receiver: str) -> Measurements:
+    """Create measurements without a row."""
+    numbers, names = np.zeros(0), np.zeros(0, dtype="<U3")
+    return Measurements(
+        time=np.zeros(0, dtype="datetime64[ns]"),
+        epoch=np.zeros(0, dtype=np.intp),
+        satellite=names,
+        signal=names,
+        code_m=numbers,
+        phase_cycles=numbers,
+        doppler_hz=numbers,
+        cn0_dbhz=numbers,
+        lock_s=numbers,
+        half_cycle=np.zeros(0, dtype=bool),
+        polarity=np.zeros(0, dtype=np.int64),
+        glonass_channel=np.zeros(0, dtype=np.int64),
+        receiver=receiver,
+    )
+
+
+def join_measurements(parts: Sequence[Measurements]) -> Measurements:
     """Measurements of several pieces, epochs with equal tags in neighbouring pieces kept apart."""
     if len(parts) == 1:
         return parts[0]
     shift = np.cumsum([0, *(len(part.time) for part in parts[:-1])])
-    arrays = "satellite signal code_m phase_cycles doppler_hz cn0_dbhz lock_s half_cycle polarity glonass_channel"
     leap = [part.leap_seconds for part in parts if part.leap_seconds is not None]
     return Measurements(
         time=np.concatenate([part.time for part in parts]),
         epoch=np.concatenate([part.epoch + k for part, k in zip(parts, shift.tolist(), strict=True)]),
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays.split()},
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in ROW_ARRAYS},
         leap_seconds=leap[-1] if leap else None,
         receiver=next((part.receiver for part in parts if part.receiver), ""),
         skipped=dict(sum((Counter(part.skipped) for part in parts), Counter())),

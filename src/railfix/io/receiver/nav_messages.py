@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Bytes, Floats, Integers, Masks
-from railfix.io.receiver.framing import BCNAV1_PAGE, Field, Subframes, crc24q, fields, packed_words, unsigned
+from railfix.io.receiver.framing import BCNAV1_PAGE, Field, Subframes, crc24q, fields, unpack_words, unsigned
 
 _PI: Final = np.pi
 Coding = tuple[int, float, str]  #: Number of bits, factor, and how it is coded, of a field (as in `Field`).
@@ -335,7 +335,7 @@ _PREAMBLE: Final = 0x8B
 Pages = Iterator[tuple[int, int, Values]]  #: Row, number among those of the satellite, and fields of each page.
 
 
-def decoded_pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], Counter[str]]:
+def decode_pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], Counter[str]]:
     """Decoded pages in the order of the stream: row, satellite, number, fields."""
     counts = Counter(subframes.skipped)
     pages: list[tuple[int, str, int, Values]] = []
@@ -364,7 +364,7 @@ def _with_crc(
     part: Subframes, here: Masks, checked: int, counts: Counter[str], fault: str, preamble: int | None = None
 ) -> tuple[Bytes, Masks]:
     """Bits of pages, and which of those `here` have their preamble and CRC; the others count as `fault`."""
-    bits = packed_words(part.words, drop=0, keep=32)
+    bits = unpack_words(part.words, drop=0, keep=32)
     if not here.any():
         return bits, here
     valid = here & has_crc(bits, checked)
@@ -384,7 +384,7 @@ def _lnav(part: Subframes, counts: Counter[str]) -> Pages:
     kind = unsigned(bits, 14, 6)
     kind = np.where((kind == 61) & (letter == "J"), 30, kind)  # a message of type 61 of QZSS is one of type 30
     yield from _of_kinds(bits, valid, kind, CNAV, CNAV_FROM)
-    bits = packed_words(part.words, drop=6, keep=24)
+    bits = unpack_words(part.words, drop=6, keep=24)
     yield from _of_kinds(bits, civil & (unsigned(bits, 0, 8) == _PREAMBLE), unsigned(bits, 43, 3), LNAV)
 
 
@@ -410,7 +410,7 @@ def _beidou(part: Subframes, counts: Counter[str]) -> Pages:
     bits, valid = _with_crc(part, b2a, BCNAV2_CHECKED, counts, "C B-CNAV2 without valid CRC")
     yield from _of_kinds(bits, valid, unsigned(bits, 6, 6), BCNAV2, CNAV_FROM)
     yield from _of_kinds(bits, frame, unsigned(bits, 6, 2), BCNAV1, BCNAV1_FROM)
-    bits = packed_words(part.words, drop=0, keep=30)
+    bits = unpack_words(part.words, drop=0, keep=30)
     number = np.array([int(name[1:]) for name in part.satellite.tolist()])
     geo = (number <= 5) | (number >= 59)
     subframe = unsigned(bits, 15, 3)
@@ -423,7 +423,7 @@ def _beidou(part: Subframes, counts: Counter[str]) -> Pages:
 
 
 def _glonass(part: Subframes, counts: Counter[str]) -> Pages:
-    bits = packed_words(part.words[:, :3], drop=0, keep=32)[:, :85]
+    bits = unpack_words(part.words[:, :3], drop=0, keep=32)[:, :85]
     valid = glonass_hamming(bits)
     counts["R strings without valid code"] += int(np.count_nonzero(~valid))
     for row, k, values in _of_kinds(bits, valid, unsigned(bits, 1, 4), GLONASS):

@@ -17,7 +17,7 @@ from railfix.core.timescale import bdt_to_gpst, gpst_minus_utc, nearest_week
 from railfix.gnss.observations import named_frequency_hz
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.framing import Field, Frames, fields, signed, unsigned
-from railfix.io.receiver.measurements import Measurements, joined
+from railfix.io.receiver.measurements import ROW_ARRAYS, Measurements, join_measurements, no_measurements
 from railfix.io.receiver.nav_messages import Coding, layout
 
 #: Constellation letter by tens of the message number of an MSM.
@@ -110,9 +110,9 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
     if not parts:
         undated = {UNDATED: len(messages)} if len(messages) else {}
         skipped = undated if np.isnat(near) else _count_unused(frames, messages, 0)
-        return replace(_no_measurements(), skipped=skipped), np.zeros(0, dtype=np.int64)
+        return replace(no_measurements("RTCM 3"), skipped=skipped), np.zeros(0, dtype=np.int64)
     order = np.concatenate([order for order, _, _ in parts])
-    rows = joined([rows for _, rows, _ in parts])
+    rows = join_measurements([rows for _, rows, _ in parts])
     # Messages of one instant become one epoch; instants stay in the order of the stream.
     by_stream = np.argsort(order, kind="stable")
     glonass = np.concatenate([g for _, _, g in parts])[by_stream]
@@ -121,7 +121,7 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
     epoch_of = np.empty(len(order), dtype=np.intp)
     epoch_of[by_stream] = np.cumsum(starts) - 1
     measurements = Measurements(
-        **{name: getattr(rows, name) for name in _ROW_NAMES},
+        **{name: getattr(rows, name) for name in ROW_ARRAYS},
         time=time[starts],
         epoch=epoch_of[rows.epoch],
         receiver="RTCM 3",
@@ -159,30 +159,6 @@ def _glonass_days(time: Datetimes, glonass: Masks) -> Datetimes:
     return np.asarray(time + np.rint((time[at] - time) / day).astype(np.int64) * day)
 
 
-_ROW_NAMES: Final = (
-    "satellite signal code_m phase_cycles doppler_hz cn0_dbhz lock_s half_cycle polarity glonass_channel".split()
-)
-
-
-def _no_measurements() -> Measurements:
-    nothing, names = np.zeros(0), np.zeros(0, dtype="<U3")
-    return Measurements(
-        time=np.zeros(0, dtype="datetime64[ns]"),
-        epoch=np.zeros(0, dtype=np.intp),
-        satellite=names,
-        signal=names,
-        code_m=nothing,
-        phase_cycles=nothing,
-        doppler_hz=nothing,
-        cn0_dbhz=nothing,
-        lock_s=nothing,
-        half_cycle=np.zeros(0, dtype=bool),
-        polarity=np.zeros(0, dtype=np.int64),
-        glonass_channel=np.zeros(0, dtype=np.int64),
-        receiver="RTCM 3",
-    )
-
-
 def bits_of(frames: Frames, chosen: Indices, length: int) -> Bytes:
     """First bits of some payloads, 0 beyond their ends, shape (N, at least `length`)."""
     octets = np.arange((length + 7) // 8)
@@ -207,7 +183,7 @@ def completes_epoch(frames: Frames, chosen: Indices) -> Masks:
     return np.asarray(bits_of(frames, chosen, 56)[:, 54] == 0)
 
 
-def unfinished_epoch(frames: Frames) -> int | None:
+def find_unfinished_epoch(frames: Frames) -> int | None:
     """Return the place of the first message of a last epoch of which more messages are to follow (DF393)."""
     chosen = frames.of("rtcm3", *MSM_NUMBERS)
     if not len(chosen):
@@ -240,7 +216,9 @@ def _of_number(
     used = np.where(np.arange(64) < cells[:, None], head[:, 169:233], 0)
     keys = np.packbits(np.concatenate([head[:, 73:169], used], axis=1), axis=1)
     length = (frames.end - frames.start)[chosen] * 8
-    needed = _HEADER_BITS + cells + _bits_needed(number % 10, n_satellites, used.sum(axis=1).astype(np.int64))
+    code, _, phase, _, lock, cn0, _, with_rate = _LAYOUT[number % 10]
+    needed = _HEADER_BITS + cells + n_satellites * (36 if with_rate else 18)
+    needed += used.sum(axis=1).astype(np.int64) * (code + phase + lock + 1 + cn0 + (15 if with_rate else 0))
     plausible &= needed <= length
     rows = np.flatnonzero(plausible)
     _, group, inverse = np.unique(keys[rows], axis=0, return_index=True, return_inverse=True)
@@ -253,11 +231,6 @@ def _of_number(
         place = frames.frame_start[chosen[members]]
         known = channels.at(place, satellites)
         yield place, _decode(number, bits, satellites, signals, mask, near, known)
-
-
-def _bits_needed(kind: int, n_satellites: Integers, n_cells: Integers) -> Integers:
-    code, _, phase, _, lock, cn0, _, rate = _LAYOUT[kind]
-    return n_satellites * (36 if rate else 18) + n_cells * (code + phase + lock + 1 + cn0 + (15 if rate else 0))
 
 
 def _decode(

@@ -17,10 +17,10 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week
 from railfix.gnss.observations import named_frequency_hz
-from railfix.io.receiver.framing import BCNAV1_PAGE, SBAS_L5, Frames, Subframes, joined_subframes
+from railfix.io.receiver.framing import BCNAV1_PAGE, SBAS_L5, Frames, Subframes, join_subframes
 from railfix.io.receiver.measurements import Measurements
 from railfix.io.receiver.nav_messages import BCNAV1_PARTS, has_crc
-from railfix.io.receiver.ubx import gathered
+from railfix.io.receiver.ubx import gather_structures
 
 Words = np.ndarray[tuple[int, int], np.dtype[np.uint32]]
 
@@ -71,15 +71,10 @@ _NUMBERS: Final = (
 )  # fmt: skip
 _HEAD: Final = np.dtype(
     [
-        ("tow_ms", "<u4"),
-        ("week", "<u2"),
-        ("count", "u1"),
-        ("size1", "u1"),
-        ("size2", "u1"),
-        ("flags", "u1"),
+        ("tow_ms", "<u4"), ("week", "<u2"), ("count", "u1"), ("size1", "u1"), ("size2", "u1"), ("flags", "u1"),
         ("_", "V2"),
     ]
-)
+)  # fmt: skip
 _FIRST: Final = np.dtype(
     [
         ("channel", "u1"), ("type", "u1"), ("sv", "u1"), ("misc", "u1"), ("code", "<u4"), ("doppler", "<i4"),
@@ -126,20 +121,14 @@ def _names() -> Strings:
 _NAMES: Final = _names()
 
 
-def _signal_names() -> Strings:
-    table = np.full(64, "", dtype="<U3")
-    table[list(SIGNALS)] = list(SIGNALS.values())
-    return table
-
-
-_SIGNAL_NAMES: Final = _signal_names()
+_SIGNAL_NAMES: Final = np.array([SIGNALS.get(number, "") for number in range(64)], dtype="<U3")
 
 
 def meas_epoch_measurements(frames: Frames) -> Measurements:
     """Return the measurements of all MeasEpoch blocks; malformed ones are skipped and counted."""
     chosen = frames.of("sbf", MEAS_EPOCH)
     length = frames.end[chosen] - frames.start[chosen]
-    head = gathered(frames.data, frames.start[chosen][length >= _HEAD.itemsize], _HEAD)
+    head = gather_structures(frames.data, frames.start[chosen][length >= _HEAD.itemsize], _HEAD)
     chosen = chosen[length >= _HEAD.itemsize]
     dated = (head["tow_ms"] != _NO_TIME) & (head["week"] != _NO_WEEK) & (head["size1"] >= 20) & (head["size2"] >= 12)
     scrambled = dated & (head["flags"] & _SCRAMBLED != 0)
@@ -206,8 +195,8 @@ def _sub_blocks(frames: Frames, index: int, head: np.void) -> tuple[Indices, Ind
 
 def _decode(frames: Frames, place: Indices, kind: Indices, master: Indices) -> dict[str, Any]:
     """Measurements of sub-blocks: those of the first type whole, those of the second as offsets from theirs."""
-    first = gathered(frames.data, place[master], _FIRST)
-    other = gathered(frames.data, np.where(kind == 1, place, 0), _OTHER) if len(frames.data) >= 12 else first
+    first = gather_structures(frames.data, place[master], _FIRST)
+    other = gather_structures(frames.data, np.where(kind == 1, place, 0), _OTHER) if len(frames.data) >= 12 else first
     own = kind == 0
     number = _signal_number(np.where(own, first["type"], other["type"]), np.where(own, first["info"], other["info"]))
     name = _SIGNAL_NAMES[number]
@@ -270,7 +259,7 @@ def navigation_subframes(frames: Frames) -> Subframes:
     # The shortest block (GLONASS, three words) has 24 bytes; words that a block lacks are zero.
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= 24]
     data = np.concatenate([frames.data, np.zeros(_PAGE.itemsize, np.uint8)])
-    rows, kind = gathered(data, frames.start[chosen], _PAGE), frames.kind[chosen]
+    rows, kind = gather_structures(data, frames.start[chosen], _PAGE), frames.kind[chosen]
     has = (frames.end - frames.start)[chosen][:, None] >= 16 + 4 * np.arange(10)
     words = np.where(has, rows["words"], 0).astype(np.uint32)
     satellite = _NAMES[rows["sv"]]
@@ -299,14 +288,14 @@ def navigation_subframes(frames: Frames) -> Subframes:
         order=frames.frame_start[chosen],
         skipped={what: number for what, number in counts.items() if number},
     ).take(known & passed)
-    return joined_subframes(pages, _bcnav1_pages(frames))
+    return join_subframes(pages, _bcnav1_pages(frames))
 
 
 def _bcnav1_pages(frames: Frames) -> Subframes:
     """Frames of B-CNAV1 with valid CRCs, each as three pages (`nav_messages.BCNAV1`)."""
     chosen = frames.of("sbf", BDS_RAW_B1C)
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _FRAME.itemsize]
-    rows = gathered(frames.data, frames.start[chosen], _FRAME)
+    rows = gather_structures(frames.data, frames.start[chosen], _FRAME)
     bits = np.unpackbits(rows["words"].astype(">u4").view(np.uint8).reshape(len(rows), 228), axis=1)
     subframe = {2: bits[:, 72:672], 3: bits[:, 1272:1536]}
     valid = (rows["crc"] == 1).all(axis=1) & has_crc(subframe[2], 576) & has_crc(subframe[3], 240)
@@ -331,7 +320,7 @@ def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
     """Places in the stream of navigation pages with a time, and their times."""
     chosen = frames.of("sbf", *_PAGES, BDS_RAW_B1C)
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _TIME.itemsize]
-    rows = gathered(frames.data, frames.start[chosen], _TIME)
+    rows = gather_structures(frames.data, frames.start[chosen], _TIME)
     dated = (rows["tow_ms"] != _NO_TIME) & (rows["week"] != _NO_WEEK)
     times = from_week(rows["week"][dated].astype(np.int64), rows["tow_ms"][dated] * 1e-3)
     return frames.frame_start[chosen[dated]], times
@@ -364,7 +353,7 @@ def positions(frames: Frames) -> dict[str, np.ndarray]:
     geodetic = len(frames.of("sbf", PVT_GEODETIC)) > 0
     chosen = frames.of("sbf", PVT_GEODETIC if geodetic else PVT_CARTESIAN)
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _PVT.itemsize]
-    rows = gathered(frames.data, frames.start[chosen], _PVT)
+    rows = gather_structures(frames.data, frames.start[chosen], _PVT)
     mode = rows["mode"] & 15
     rows = rows[(rows["error"] == 0) & np.isin(mode, list(_QUALITY)) & (rows["tow_ms"] != _NO_TIME)]
     place = rows["place"]

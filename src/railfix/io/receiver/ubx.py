@@ -44,64 +44,29 @@ _LARGEST: Final = 1e10
 #: One measurement of RXM-RAWX.
 _MEASUREMENT: Final = np.dtype(
     [
-        ("code", "<f8"),
-        ("phase", "<f8"),
-        ("doppler", "<f4"),
-        ("gnss", "u1"),
-        ("sv", "u1"),
-        ("signal", "u1"),
-        ("channel", "u1"),
-        ("lock", "<u2"),
-        ("cn0", "u1"),
-        ("code_std", "u1"),
-        ("phase_std", "u1"),
-        ("doppler_std", "u1"),
-        ("tracking", "u1"),
-        ("reserved", "u1"),
+        ("code", "<f8"), ("phase", "<f8"), ("doppler", "<f4"), ("gnss", "u1"), ("sv", "u1"), ("signal", "u1"),
+        ("channel", "u1"), ("lock", "<u2"), ("cn0", "u1"), ("code_std", "u1"), ("phase_std", "u1"),
+        ("doppler_std", "u1"), ("tracking", "u1"), ("reserved", "u1"),
     ]
-)
+)  # fmt: skip
 _RAWX_HEADER: Final = np.dtype(
     [("tow", "<f8"), ("week", "<u2"), ("leap", "i1"), ("count", "u1"), ("status", "u1"), ("version", "u1"), ("_", "V2")]
 )
 _PVT: Final = np.dtype(
     [
-        ("tow_ms", "<u4"),
-        ("year", "<u2"),
-        ("month", "u1"),
-        ("day", "u1"),
-        ("clock", "V3"),
-        ("valid", "u1"),
-        ("_", "V8"),
-        ("fix", "u1"),
-        ("flags", "u1"),
-        ("flags2", "u1"),
-        ("satellites", "u1"),
-        ("longitude", "<i4"),
-        ("latitude", "<i4"),
-        ("height_mm", "<i4"),
-        ("sea_level_mm", "<i4"),
-        ("horizontal_mm", "<u4"),
+        ("tow_ms", "<u4"), ("year", "<u2"), ("month", "u1"), ("day", "u1"), ("clock", "V3"), ("valid", "u1"),
+        ("_", "V8"), ("fix", "u1"), ("flags", "u1"), ("flags2", "u1"), ("satellites", "u1"), ("longitude", "<i4"),
+        ("latitude", "<i4"), ("height_mm", "<i4"), ("sea_level_mm", "<i4"), ("horizontal_mm", "<u4"),
         ("vertical_mm", "<u4"),
     ]
-)
+)  # fmt: skip
 _HPPOSLLH: Final = np.dtype(
     [
-        ("version", "u1"),
-        ("_", "V2"),
-        ("flags", "u1"),
-        ("tow_ms", "<u4"),
-        ("longitude", "<i4"),
-        ("latitude", "<i4"),
-        ("height_mm", "<i4"),
-        ("sea_level_mm", "<i4"),
-        ("longitude_fine", "i1"),
-        ("latitude_fine", "i1"),
-        ("height_fine", "i1"),
-        ("sea_level_fine", "i1"),
-        ("horizontal", "<u4"),
-        ("vertical", "<u4"),
+        ("version", "u1"), ("_", "V2"), ("flags", "u1"), ("tow_ms", "<u4"), ("longitude", "<i4"), ("latitude", "<i4"),
+        ("height_mm", "<i4"), ("sea_level_mm", "<i4"), ("longitude_fine", "i1"), ("latitude_fine", "i1"),
+        ("height_fine", "i1"), ("sea_level_fine", "i1"), ("horizontal", "<u4"), ("vertical", "<u4"),
     ]
-)
+)  # fmt: skip
 _PHASE_VALID, _HALF_CYCLE_KNOWN, _HALF_CYCLE_REMOVED, _CODE_VALID = 2, 4, 8, 1
 #: Largest standard deviation of a phase that is used, in units of 0.004 cycle (as RTKLIB 2.4.3 does).
 _LARGEST_PHASE_STD: Final = 5
@@ -124,7 +89,7 @@ def rawx_measurements(frames: Frames) -> Measurements:
     """Return the raw measurements of all RXM-RAWX messages; malformed ones are counted."""
     chosen = frames.of("ubx", RXM_RAWX)
     length = frames.end[chosen] - frames.start[chosen]
-    header = gathered(frames.data, frames.start[chosen][length >= 16], _RAWX_HEADER)
+    header = gather_structures(frames.data, frames.start[chosen][length >= 16], _RAWX_HEADER)
     chosen, length = chosen[length >= 16], length[length >= 16]
     whole = length == 16 + 32 * header["count"].astype(np.int64)
     plausible = whole & (header["week"] > 0) & (header["week"] <= _LAST_WEEK)
@@ -135,7 +100,7 @@ def rawx_measurements(frames: Frames) -> Measurements:
     count = header["count"].astype(np.int64)
     epoch = np.repeat(np.arange(len(chosen)), count)
     within = np.arange(len(epoch)) - np.repeat(np.cumsum(count) - count, count)
-    rows = gathered(frames.data, frames.start[chosen][epoch] + 16 + 32 * within, _MEASUREMENT)
+    rows = gather_structures(frames.data, frames.start[chosen][epoch] + 16 + 32 * within, _MEASUREMENT)
     system, tracking = rows["gnss"].astype(np.int64), rows["tracking"].astype(np.int64)
     names = np.array([[SIGNALS.get(g, {}).get(s, "") for s in range(16)] for g in range(8)], dtype="<U2")
     signal = names[np.minimum(system, 7), np.minimum(rows["signal"], 15)]
@@ -167,7 +132,7 @@ def rawx_measurements(frames: Frames) -> Measurements:
     )
 
 
-def gathered(data: Bytes, start: np.ndarray, layout: np.dtype) -> np.ndarray:
+def gather_structures(data: Bytes, start: np.ndarray, layout: np.dtype) -> np.ndarray:
     """Structures of one layout at many places of a buffer, shape (N,)."""
     block = data[start[:, None] + np.arange(layout.itemsize)] if len(start) else np.zeros((0, layout.itemsize), "u1")
     return np.ascontiguousarray(block).view(layout)[:, 0]
@@ -227,14 +192,14 @@ def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
     """
     coarse = frames.of("ubx", NAV_PVT)
     coarse = coarse[frames.end[coarse] - frames.start[coarse] >= _PVT.itemsize]
-    pvt = gathered(frames.data, frames.start[coarse], _PVT)
+    pvt = gather_structures(frames.data, frames.start[coarse], _PVT)
     fixed = (pvt["flags"] & 1 == 1) & np.isin(pvt["fix"], [2, 3, 4])
     carrier = pvt["flags"] >> 6
     quality = np.where(carrier > 0, 3 - carrier.astype(np.int64), np.where(pvt["flags"] & 2 != 0, 4, 5))
     fine = frames.of("ubx", NAV_HPPOSLLH)
     fine = fine[frames.end[fine] - frames.start[fine] == _HPPOSLLH.itemsize]
     if len(fine):
-        rows = gathered(frames.data, frames.start[fine], _HPPOSLLH)
+        rows = gather_structures(frames.data, frames.start[fine], _HPPOSLLH)
         kept = rows["flags"] & 1 == 0
         latitude = rows["latitude"] * 1e-7 + rows["latitude_fine"] * 1e-9
         longitude = rows["longitude"] * 1e-7 + rows["longitude_fine"] * 1e-9
@@ -279,7 +244,7 @@ def _date(frames: Frames) -> tuple[Datetimes, np.ndarray, Integers]:
     """Days (UTC), rows and places of NAV-PVT with a valid date."""
     chosen = frames.of("ubx", NAV_PVT)
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _PVT.itemsize]
-    rows = gathered(frames.data, frames.start[chosen], _PVT)
+    rows = gather_structures(frames.data, frames.start[chosen], _PVT)
     valid = rows["valid"] & 3 == 3
     rows = rows[valid]
     year, month, day = (rows[name].astype(np.int64) for name in ("year", "month", "day"))

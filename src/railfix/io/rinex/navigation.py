@@ -139,22 +139,8 @@ _TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z](?:[ \d]\d)?) *(\S*)")
 def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navigation:
     """Read all records of one or several navigation files: plain, gzip, compress.
 
-    Parameters
-    ----------
-    paths : path or sequence of paths
-    broken_lines : {"stop", "count"}
-        A broken record stops the reading, or is counted in `skipped` and described in `notes`.
-
-    Returns
-    -------
-    Navigation
-        `precise` is None; `read_sp3` reads a precise ephemeris, `dataclasses.replace` sets it.
-
-    Raises
-    ------
-    InputFileError
-        A file is missing, is no navigation file, or (with "stop") a record is broken; or no file has
-        a usable record.
+    A broken record stops the reading, or is counted in `skipped` and described in `notes`. InputFileError: a file is
+    missing, is no navigation file, or (with "stop") a record is broken; or no file has a usable record.
     """
     files = listed(paths)
     content = NavigationContent(broken_lines=broken_lines)

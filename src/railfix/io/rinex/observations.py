@@ -226,36 +226,7 @@ def read_observations(
     start: np.datetime64 | str | None = None,
     end: np.datetime64 | str | None = None,
 ) -> Observations:
-    """Read the observation file or files of one receiver.
-
-    Parameters
-    ----------
-    path : path-like or sequence of path-like
-        RINEX 2.10 to 2.12, 3.00 to 3.05, 4.00 to 4.02; plain, ``.gz``, ``.Z``, Hatanaka (CRX) plain
-        or in one of these, recognised by content. Several files are sorted by time and joined.
-    broken_lines : {"stop", "count"}
-        Treatment of broken lines, see above.
-    systems : iterable of str, optional
-        Constellation letters to read ("GEJ"); all by default.
-    start, end : datetime64 or ISO 8601 str, optional
-        Epochs from `start` up to, not including, `end`, GPS time.
-
-    Returns
-    -------
-    Observations
-        Channels with at least one observation. 0.000 and blank are absent (NaN).
-
-    Raises
-    ------
-    InputFileError
-        The file cannot be read, is of another kind, or has no epochs; with "stop" any broken line.
-    MismatchError
-        No epoch lies between `start` and `end`.
-
-    Notes
-    -----
-    Use `scan_observations` for logs that do not fit into memory.
-    """
+    """Read the observation file or files of one receiver, RINEX alone; arguments as `railfix.read_observations`."""
     selection = _selection(broken_lines=broken_lines, systems=systems, start=start, end=end)
     return concatenate(list(_runs(listed(path), selection)))
 
@@ -270,26 +241,11 @@ def scan_observations(
     end: np.datetime64 | str | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Iterator[Observations]:
-    """Read the observation file or files of one receiver piece by piece; the other arguments are as
-    `read_observations`.
+    """Yield the observations of one receiver in pieces of `epochs` epochs; other arguments as
+    `railfix.read_observations`.
 
-    Parameters
-    ----------
-    epochs : int
-        Epochs of a piece; the last may have fewer.
-    progress : callable, optional
-        Called repeatedly with the fraction of the files that has been read, 0 to 1.
-
-    Yields
-    ------
-    Observations
-        Each piece has the channels that occur in it; concatenated they are the log. Memory is that of a piece and one
-        block of text.
-
-    Raises
-    ------
-    InputFileError, MismatchError
-        As `read_observations`, when the faulty line is reached.
+    Each piece has the channels that occur in it; concatenated they are the log. Memory is that of a piece and one block
+    of text. `progress` is called repeatedly with the fraction of the files that has been read, 0 to 1.
     """
     if epochs < 1:
         raise ValueError(f"a piece has at least one epoch, epochs={epochs} was asked for")

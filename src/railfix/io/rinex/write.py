@@ -106,11 +106,7 @@ def header_line(text: str, label: str) -> str:
 
 def program_line(created: np.datetime64 | None) -> str:
     """Format PGM / RUN BY / DATE; the date, in UTC, is blank without `created`."""
-    date = ""
-    if created is not None:
-        date = (
-            str(np.datetime_as_string(created, unit="s")).replace("-", "").replace(":", "").replace("T", " ") + " UTC"
-        )
+    date = "" if created is None else f"{created.astype('datetime64[s]').item():%Y%m%d %H%M%S} UTC"
     return header_line(f"{PROGRAM:<20}{'':20}{date:<20}", "PGM / RUN BY / DATE")
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.constants import BDT_MINUS_GPST_S
-from railfix.core.timescale import BDT_EPOCH, GPS_EPOCH, SECONDS_PER_WEEK, gpst_minus_utc, seconds, timedelta, to_week
+from railfix.core.timescale import BDT_EPOCH, GPS_EPOCH, SECONDS_PER_WEEK, gpst_to_utc, seconds, timedelta, to_week
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.io.rinex.navigation_records import FIELDS
 from railfix.io.rinex.write import Packing, RinexVersion, header_line, open_target, program_line
@@ -238,7 +238,7 @@ def _week_and_transmission(
 
 def _glonass_fields(records: GlonassRecords) -> tuple[Datetimes, list[Floats]]:
     """Time in UTC, and one array for each number of the file."""
-    toe, sent = _utc(records.toe), _utc(records.transmitted)
+    toe, sent = gpst_to_utc(records.toe), gpst_to_utc(records.transmitted)
     frame = seconds(sent - GPS_EPOCH)
     position, velocity, acceleration = (
         values / 1e3 for values in (records.position_ecef_m, records.velocity_ecef_mps, records.acceleration_ecef_mps2)
@@ -252,12 +252,3 @@ def _glonass_fields(records: GlonassRecords) -> tuple[Datetimes, list[Floats]]:
     for axis, extra in enumerate(last):
         fields += [position[:, axis], velocity[:, axis], acceleration[:, axis], extra.astype(np.float64)]
     return toe, fields
-
-
-def _utc(time: Datetimes) -> Datetimes:
-    """Convert GPS time to UTC."""
-    known = np.where(np.isnat(time), GPS_EPOCH, time)
-    leap = gpst_minus_utc(known).astype("timedelta64[s]")
-    # The table is in UTC: repeat the look-up with the corrected time, for times next to a leap second.
-    leap = gpst_minus_utc(known - leap).astype("timedelta64[s]")
-    return np.where(np.isnat(time), np.datetime64("NaT", "ns"), known - leap)

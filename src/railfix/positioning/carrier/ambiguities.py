@@ -115,13 +115,7 @@ def prepare_start(
     at = np.isfinite(arc_m)
     if at.all():
         return ranges, phases, np.clip(arc_m, 0.0, trajectory.arc_m[-1])
-    without = Ranges(
-        sat_ecef_m=ranges.sat_ecef_m,
-        code_m=ranges.code_m,
-        weight=np.where(at[:, None], ranges.weight, 0.0),
-        groups=ranges.groups,
-        ties=ranges.ties,
-    )
+    without = replace(ranges, weight=np.where(at[:, None], ranges.weight, 0.0))
     silent = replace(phases, weight=np.where(at[:, None], phases.weight, 0.0))
     return without, silent, np.where(at, np.clip(arc_m, 0.0, trajectory.arc_m[-1]), 0.0)
 
@@ -138,11 +132,6 @@ def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
     full = matrix + level[..., None, None] * held[..., :, None] * held[..., None, :]
     full = full + np.eye(size) * FREE_AMBIGUITY_M**-2.0
     return np.linalg.inv(full).astype(np.float64, copy=False)
-
-
-def moved(arc_m: Floats, own: OwnUnknowns, trajectory: Trajectory) -> Floats:
-    """Places after a step along the line, within its ends."""
-    return np.asarray(np.clip(arc_m + own.step_m, 0.0, trajectory.arc_m[-1]))
 
 
 def assemble_positions(
@@ -226,7 +215,7 @@ def fix_integers(
         if size > count:
             break
         kept = slice(0, size)
-        fixed = _fix(
+        fixed = _fix_pairs(
             (value_m, covariance_m2), (first[kept], second[kept]), channels.wavelength_m[first[kept]],
             np.array(map_sigma_m), no_integer_prior,
         )  # fmt: skip
@@ -250,7 +239,7 @@ def _differences(strength: Floats, group: Integers) -> tuple[Indices, Indices]:
     return np.array(first, dtype=np.intp)[order], np.array(second, dtype=np.intp)[order]
 
 
-def _fix(
+def _fix_pairs(
     ambiguities: tuple[Floats, Floats],
     pairs: tuple[Indices, Indices],
     wavelength_m: Floats,

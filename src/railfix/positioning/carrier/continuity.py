@@ -69,7 +69,7 @@ def number_arcs(
     ArcState
     """
     before = dict(state.count) if state else {}
-    codes = [channel_code(str(a), str(b)) for a, b in zip(satellite.tolist(), signal.tolist(), strict=True)]
+    codes = [channel_code(*key) for key in channel_keys(satellite, signal)]
     first = np.array([before.get(code, 0) for code in codes], dtype=np.int64)
     count = first + np.cumsum(slip & has_phase, axis=0, dtype=np.int64)
     names = np.array(codes, dtype=np.int64) << COUNT_BITS
@@ -81,7 +81,7 @@ def number_arcs(
 def last_arcs(satellite: Strings, signal: Strings, state: ArcState | None) -> Integers:
     """Return the number of the last arc of each channel, shape (M,); `NO_ARC` for channels without one."""
     count = {} if state is None else state.count
-    codes = [channel_code(str(a), str(b)) for a, b in zip(satellite.tolist(), signal.tolist(), strict=True)]
+    codes = [channel_code(*key) for key in channel_keys(satellite, signal)]
     return np.array([(code << COUNT_BITS) + count[code] if code in count else NO_ARC for code in codes], dtype=np.int64)
 
 
@@ -180,14 +180,17 @@ def track_jumps(
     able = np.isfinite(arc[1:]) & np.isfinite(arc[:-1]) & (dt <= limits.max_gap_s)
     judged = able[:, None] & ~slip & np.isfinite(phase[1:]) & np.isfinite(phase[:-1])
 
-    distance, los, axes = _around(sats, trajectory, arc)
+    section, along = trajectory.segment_at(np.where(np.isfinite(arc), arc, 0.0))
+    where = trajectory.ecef_m[section] + along[:, None] * trajectory.tangent[section]
+    distance, los = range_with_rotation(sats, where[:, None, :])
+    axes = trajectory.axes_of(section)
     change = np.diff(phase - distance, axis=0)
     way = np.diff(arc)
     design = np.concatenate([-np.matmul(los[1:], axes[1:].swapaxes(1, 2)), np.ones((*change.shape, 1))], axis=-1)
     sigma = np.hypot(limits.phase_m, limits.drift_mps * np.where(able, dt, 0.0))
     share = np.array([limits.across_share, limits.up_share])
     aside = np.hypot(limits.aside_m, share * np.where(able, way, 0.0)[:, None])
-    kept, residual, step, variance, decided = _consistent(design, change, judged, sigma, aside, limits)
+    kept, residual, step, variance, decided = _reject_jumps(design, change, judged, sigma, aside, limits)
     jump = judged & ~(kept & decided[:, None])
     known = able & decided & np.isfinite(variance)
     after = state
@@ -209,17 +212,7 @@ def track_jumps(
     return jumps, after
 
 
-def _around(sats: Floats, trajectory: Trajectory, arc: Floats) -> tuple[Floats, Floats, Floats]:
-    """Ranges, lines of sight and axes (along, across, up) at places on the line."""
-    safe = np.where(np.isfinite(arc), arc, 0.0)
-    section, along = trajectory.segment_at(safe)
-    where = trajectory.ecef_m[section] + along[:, None] * trajectory.tangent[section]
-    distance, los = range_with_rotation(sats, where[:, None, :])
-    axes = trajectory.axes_of(section)
-    return distance, los, axes
-
-
-def _consistent(
+def _reject_jumps(
     design: Floats, change: Floats, judged: Masks, sigma: Floats, aside: Floats, limits: ContinuityLimits
 ) -> tuple[Masks, Floats, Floats, Floats, Masks]:
     """Reject the worst channels one by one until the rest agrees; with nothing to check with, all are kept.

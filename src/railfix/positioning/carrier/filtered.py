@@ -24,7 +24,6 @@ from railfix.positioning.carrier.ambiguities import (
     fix_integers,
     hop_of,
     inverse_of_arcs,
-    moved,
     prepare_start,
     repeats_of,
 )
@@ -112,24 +111,15 @@ def phase_positions(
             phases = replace(phases, integers=integers)
         pieces, places, memory = [], [], before
         for rows in cuts:
-            inputs = _Inputs(time[rows], ranges.take(rows), phases.take(rows), arc[rows], started[rows])
-            piece, place, memory = _segment(inputs, trajectory, memory, limits)
+            start = arc[rows], started[rows]
+            piece, place, memory = _segment(
+                time[rows], ranges.take(rows), phases.take(rows), start, trajectory, memory, limits
+            )
             pieces.append(piece)
             places.append(place)
         after.append(memory)
         arc = np.concatenate(places)
     return _join(pieces), PhaseState(memories=tuple(after))
-
-
-@dataclass(frozen=True)
-class _Inputs:
-    """Inputs of one segment."""
-
-    time: Datetimes
-    ranges: Ranges
-    phases: Phases
-    arc_m: Floats
-    started: Masks
 
 
 def _cuts(hop: Integers, phases: Phases) -> list[Indices]:
@@ -151,13 +141,19 @@ def _cuts(hop: Integers, phases: Phases) -> list[Indices]:
 
 
 def _segment(
-    inputs: _Inputs, trajectory: Trajectory, memory: Memory, limits: PhaseLimits
+    time: Datetimes,
+    ranges: Ranges,
+    phases: Phases,
+    start: tuple[Floats, Masks],
+    trajectory: Trajectory,
+    memory: Memory,
+    limits: PhaseLimits,
 ) -> tuple[PhasePositions, Floats, Memory]:
-    """Positions and places of one segment, and the memory it leaves."""
-    phases = inputs.phases
+    """Positions and places of one segment, and the memory it leaves; `start`: places, and epochs that have one."""
+    arc_m, started = start
     used = phases.weight > 0
-    lin = linearise(inputs.ranges, phases, trajectory, inputs.arc_m, clocks=limits.clocks)
-    memory = _walk(memory, inputs.time, limits)
+    lin = linearise(ranges, phases, trajectory, arc_m, clocks=limits.clocks)
+    memory = _walk(memory, time, limits)
     ids, first, column = np.unique(phases.arc_id[used], return_index=True, return_inverse=True)
     memory = _with_arcs(memory, ids, lin.phase_m[used][first])
     place = np.searchsorted(memory.arc_id, ids)
@@ -181,23 +177,25 @@ def _segment(
     fixes = _fix_epochs((base, value, covariance), index, phases, trajectory, limits)
     among = covariance[row[:, None], index[:, :, None], index[:, None, :]]
     before = np.asarray([memory.time], dtype="datetime64[ns]")
-    repeats = repeats_of(np.concatenate([before, inputs.time]), limits)[1:]
+    repeats = repeats_of(np.concatenate([before, time]), limits)[1:]
     own = own_unknowns(lin, value[row, index], among, trajectory, repeats=repeats)
-    arc = moved(inputs.arc_m, own, trajectory)
+    arc = np.clip(arc_m + own.step_m, 0.0, trajectory.arc_m[-1])
     seen = memory.seen.copy()
     if len(ids):
         last_row = np.zeros(len(ids), dtype=np.intp)
         np.maximum.at(last_row, column, np.nonzero(used)[0])
-        seen[place] = inputs.time[last_row]
-    now = inputs.time[-1] if len(inputs.time) else memory.time
-    left = _without(replace(kept, time=now, seen=seen), _find_superseded(memory.arc_id))
+        seen[place] = time[last_row]
+    now = time[-1] if len(time) else memory.time
+    channel = channel_of(memory.arc_id)
+    older = np.append(channel[1:] == channel[:-1], False)[:count]  # sorted: the newest of a channel comes last
+    left = _without(replace(kept, time=now, seen=seen), older)
     last, end = floats
     running = np.isin(memory.arc_id, left.arc_id)
     arcs = ArcAmbiguities(
         arc_id=left.arc_id, ambiguity_m=(memory.first_m + end)[running], covariance_m2=last[np.ix_(running, running)]
     )
     ambiguity = (base[index] + value[row, index, 0], covariance[row, index, index])
-    piece = assemble_positions(arc, inputs.started, own, lin, ambiguity, arcs, fixes, limits)
+    piece = assemble_positions(arc, started, own, lin, ambiguity, arcs, fixes, limits)
     return piece, arc, left
 
 
@@ -253,13 +251,13 @@ def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
 
 def _accumulate(lin: Linearised, index: Indices, memory: Memory) -> tuple[Floats, Floats, Memory]:
     """Normal equations at each epoch, its own part included, and the memory after the last one."""
-    part = reduce(lin)
+    matrix, right = reduce(lin)
     epochs, count = len(index), len(memory.arc_id)
     row = np.arange(epochs)[:, None]
     # One more row and column takes what has no phase.
     own = np.zeros((epochs, count + 1, count + 4))
-    own[row[:, None], index[:, :, None], index[:, None, :]] = part.matrix
-    own[row, index, count + 1 :] = part.right
+    own[row[:, None], index[:, :, None], index[:, None, :]] = matrix
+    own[row, index, count + 1 :] = right
     own = np.delete(own[:, :count], count, axis=2)
     carried = np.concatenate([memory.matrix, memory.right], axis=1)
     # cumsum from the carried sums: the same additions in the same order however epochs are cut.
@@ -283,13 +281,6 @@ def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
     both = np.linalg.solve(np.eye(len(both)) + variance * memory.matrix, both)
     matrix, right = both[:, : len(both)], both[:, len(both) :]
     return replace(memory, matrix=0.5 * (matrix + matrix.T), right=right)
-
-
-def _find_superseded(arc_id: Integers) -> Masks:
-    """Arcs, sorted, that are not the newest of their channel."""
-    older = np.zeros(len(arc_id), dtype=bool)
-    older[:-1] = channel_of(arc_id[1:]) == channel_of(arc_id[:-1])
-    return older
 
 
 def _without(memory: Memory, ends: Masks) -> Memory:

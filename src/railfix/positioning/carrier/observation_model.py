@@ -179,19 +179,11 @@ def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
     return replace(lin, phase_m=phase, right=lin.right + moved, phase_clock_m=lin.phase_clock_m + clock)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reduced:
-    """Return the information of each epoch on the ambiguities of its channels."""
+def reduce(lin: Linearised) -> tuple[Floats, Floats]:
+    """Information of each epoch on the ambiguities of its channels: Schur complement of the epoch's own unknowns.
 
-    matrix: Floats  #: Shape (T, M, M) [1/m^2].
-    #: Right-hand sides: of the observations, and of a map that is 1 m off across and in height; shape (T, M, 3) [1/m].
-    right: Floats
-
-
-def reduce(lin: Linearised) -> Reduced:
-    """Schur complement of each epoch's own unknowns.
-
-    A map off by 1 m changes code and phase alike by columns of their designs; against its
+    Returns normal matrices (T, M, M) [1/m^2] and right-hand sides (T, M, 3) [1/m]: of the observations, and of a map
+    that is 1 m off across and in height, which changes code and phase alike by columns of their designs; against its
     prior this leaves ``prior_k C^T L^-1 e_k`` on the right.
     """
     gain = np.matmul(lin.inverse, lin.coupling)
@@ -208,7 +200,7 @@ def reduce(lin: Linearised) -> Reduced:
     right = np.empty((*lin.phase_m.shape, 3))
     right[..., 0] = lin.phase_weight * lin.phase_m - np.matmul(lin.right[:, None, :], gain)[:, 0]
     right[..., 1:] = (gain[:, 1:PLACE] * lin.prior[:, None]).swapaxes(1, 2)
-    return Reduced(matrix=matrix, right=right)
+    return matrix, right
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,7 +234,8 @@ def own_unknowns(
     from_arcs = np.einsum("ti,tij,tj->t", row, covariance_m2, row)
     from_noise = lin.inverse[:, 0, 0] + from_arcs
     # With the same errors again and again the phases help no more than not at all.
-    most = np.maximum(_variance_of_codes(lin), from_noise)
+    by_codes = np.matmul((lin.code_design * lin.code_weight[..., None]).swapaxes(1, 2), lin.code_design)
+    most = np.maximum(np.linalg.inv(by_codes + lin.known)[:, 0, 0], from_noise)
     from_noise = np.minimum(lin.inverse[:, 0, 0] + repeats * from_arcs, most)
     alone = -lin.inverse[:, 0, 1:PLACE] * lin.prior
     together = alone + np.matmul(row[:, None, :], known[..., 1:])[:, 0]
@@ -259,9 +252,3 @@ def own_unknowns(
         code_residual_m=code,
         phase_residual_m=np.where(used, phase, 0.0),
     )
-
-
-def _variance_of_codes(lin: Linearised) -> Floats:
-    """Variance along the line of each epoch's codes alone, the map's error included, shape (T,) [m^2]."""
-    matrix = np.matmul((lin.code_design * lin.code_weight[..., None]).swapaxes(1, 2), lin.code_design)
-    return np.asarray(np.linalg.inv(matrix + lin.known)[:, 0, 0])

@@ -36,22 +36,14 @@ class SlipReason(IntFlag):
     """Why the phase of an epoch and channel begins anew. 0 = joined to the epoch before."""
 
     JOINED = 0
-    #: No phase at this epoch: nothing begins.
-    NO_PHASE = 1 << 0
-    #: A phase, but none of this channel at the epoch before.
-    FIRST = 1 << 1
-    #: Bit 0 of the receiver's loss-of-lock indicator.
-    LOSS_OF_LOCK = 1 << 2
-    #: Bit 1 of it (half a cycle not resolved) is not what it was at the epoch before.
-    HALF_CYCLE = 1 << 3
-    #: The epoch before is longer ago than the limit.
-    GAP = 1 << 4
-    #: The log marks a break before this epoch.
-    BREAK = 1 << 5
-    #: The phase's change is not that of the Dopplers.
-    DOPPLER = 1 << 6
-    #: The phase's change is not that of the code, where Dopplers cannot judge.
-    CODE = 1 << 7
+    NO_PHASE = 1 << 0  #: No phase at this epoch: nothing begins.
+    FIRST = 1 << 1  #: A phase, but none of this channel at the epoch before.
+    LOSS_OF_LOCK = 1 << 2  #: Bit 0 of the receiver's loss-of-lock indicator.
+    HALF_CYCLE = 1 << 3  #: Bit 1 of it (half a cycle not resolved) is not what it was at the epoch before.
+    GAP = 1 << 4  #: The epoch before is longer ago than the limit.
+    BREAK = 1 << 5  #: The log marks a break before this epoch.
+    DOPPLER = 1 << 6  #: The phase's change is not that of the Dopplers.
+    CODE = 1 << 7  #: The phase's change is not that of the code, where Dopplers cannot judge.
 
 
 class CycleSlipLimits(Settings):
@@ -261,25 +253,11 @@ class SmoothingState:
     base_m: Floats = field(default_factory=lambda: np.empty(0))
     #: Smoothed code less phase, less `base_m`; shape (M,).
     offset_m: Floats = field(default_factory=lambda: np.empty(0))
-    #: Of the smoothed code, in units of that of a code; shape (M,).
-    variance: Floats = field(default_factory=lambda: np.empty(0))
     #: Codes of the running arc, shape (M,).
     count: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     #: Last code less phase, for `clocks="own"`; shape (M,).
     last_m: Floats = field(default_factory=lambda: np.empty(0))
     clock_m: float = 0.0  #: Mean change of the codes against the phases so far.
-
-
-@dataclass(frozen=True, kw_only=True)
-class SmoothedCodes:
-    """Smoothed codes, T epochs by M channels."""
-
-    #: The raw code where there is no phase, and at the first epoch of an arc; NaN where there is no code, unless the
-    #: arc of its phase continues: then the smoothed code continues; shape (T, M).
-    code_m: Floats
-    #: Expected standard deviation against that of one code, for noise that is white in time; multipath lasts for tens
-    #: of seconds and is averaged less. NaN where `code_m` is; shape (T, M).
-    sigma_factor: Floats
 
 
 def _hold(values: Floats, at: Masks, first: Floats) -> Floats:
@@ -306,7 +284,7 @@ def smooth_codes(
     state: SmoothingState | None = None,
     *,
     limits: SmoothingLimits | None = None,
-) -> tuple[SmoothedCodes, SmoothingState]:
+) -> tuple[Floats, SmoothingState]:
     """Codes smoothed by the phase along unbroken arcs.
 
     Weight of the n-th code of an arc: the greater of 1/n and dt / window. A phase times its
@@ -326,7 +304,9 @@ def smooth_codes(
 
     Returns
     -------
-    SmoothedCodes
+    ndarray, shape (T, M) [m]
+        Smoothed codes: the raw code where there is no phase, and at the first epoch of an arc; NaN where there is no
+        code, unless the arc of its phase continues: then the smoothed code continues.
     SmoothingState
         Division into chunks does not change the result beyond rounding (1e-9 m).
     """
@@ -334,10 +314,10 @@ def smooth_codes(
     channels = channel_keys(satellite, signal)
     rows = rows_before(state.channels, channels)
     base0, last0 = (np.append(values, np.nan)[rows] for values in (state.base_m, state.last_m))
-    offset0, variance0 = (np.append(values, 0.0)[rows] for values in (state.offset_m, state.variance))
+    offset0 = np.append(state.offset_m, 0.0)[rows]
     count0 = np.append(state.count, 0)[rows]
     if not len(time):
-        return SmoothedCodes(code_m=code_m, sigma_factor=np.ones(code_m.shape)), state
+        return code_m, state
     has_phase = np.isfinite(phase_m)
     has = has_phase & np.isfinite(code_m)
     # An arc ends with its phase: without one, nothing runs into the next epoch.
@@ -361,20 +341,17 @@ def smooth_codes(
     drive = gain * np.where(has, difference - base, 0.0)
     unchanged = np.ones((1, len(channels)))
     offset = linear_recursion(np.concatenate([unchanged, keep]), np.concatenate([offset0[None], drive]))[1:]
-    variance = linear_recursion(np.concatenate([unchanged, keep**2]), np.concatenate([variance0[None], gain**2]))[1:]
 
     runs = has_phase & (count >= 1)
     smoothed = np.where(runs, phase_m + (base + offset + apart[1:, None]), code_m)
     smoothed = np.where(has & (gain == 1.0), code_m, smoothed)
-    factor = np.where(runs, np.sqrt(variance), np.where(np.isfinite(code_m), 1.0, np.nan))
     after = SmoothingState(
         time=time[-1],
         channels=channels,
         base_m=read_only(np.where(runs[-1], base[-1], np.nan)),
         offset_m=read_only(np.where(runs[-1], offset[-1], 0.0)),
-        variance=read_only(np.where(runs[-1], variance[-1], 0.0)),
         count=read_only(np.where(runs[-1], count[-1], 0.0).astype(np.int64)),
         last_m=read_only(last),
         clock_m=float(apart[-1]),
     )
-    return SmoothedCodes(code_m=smoothed, sigma_factor=factor), after
+    return smoothed, after

@@ -38,6 +38,7 @@ from railfix.ranges.sbas.standard import (
     SatelliteCorrections,
     SatelliteState,
     SbasLimits,
+    first_that_holds,
     mask_satellite,
     system_name,
 )
@@ -69,29 +70,9 @@ def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[
 class SbasCorrections:
     """Corrections by one GEO's messages at any epochs; the tables are built once, then searched.
 
-    A message counts from the moment it had been received (`SbasMessages.time`), never before. Nothing
-    depends on the other epochs or satellites of a call, nor on messages received later.
-
-    Parameters
-    ----------
-    messages : SbasMessages
-        Those of other PRNs are left out; there may be none.
-    prn : int
-        Chosen beforehand, for example by `best_prn`.
-    limits : SbasLimits, optional
-    notes : sequence of str
-        Sentences on the origin of the messages, put before those of the corrections.
-
-    Attributes
-    ----------
-    prn : int
-    limits : SbasLimits
-    notes : tuple of str
-        Corrections asked for and used, one sentence each; of a whole log (`from_log`) also what of it is not used.
-    span : tuple of datetime64[ns]
-        Reception of the first and the last message of that GEO; NaT without messages.
-    unused : mapping of str to int
-        Corrections without a mask of their issue, by kind.
+    A message counts from the moment it had been received (`SbasMessages.time`), never before. Nothing depends on the
+    other epochs or satellites of a call, nor on messages received later. Messages of other PRNs than `prn`, which is
+    chosen beforehand (`best_prn`), are left out; `notes` on their origin are put before those of the corrections.
     """
 
     def __init__(
@@ -100,27 +81,26 @@ class SbasCorrections:
         self.prn, self.limits = prn, limits or SbasLimits()
         of_prn = messages.of(prn)
         never = np.datetime64("NaT", "ns")
+        #: Reception of the first and the last message of that GEO; NaT without messages.
         self.span: tuple[np.datetime64, np.datetime64] = (
             (of_prn.time.min(), of_prn.time.max()) if len(of_prn) else (never, never)
         )
         self._tables = SatelliteTables(of_prn, self.limits)
         self._grid = GridTables(of_prn, self.limits, self._tables.stops)
         self._service = ServiceTable(of_prn, self.limits)
+        #: Corrections without a mask of their issue, by kind.
         self.unused: Mapping[str, int] = {
             kind: number for kind, number in sorted((self._tables.unused + self._grid.unused).items()) if number
         }
+        #: Corrections asked for and used, one sentence each; of a whole log (`from_log`) also what of it is not used.
         self.notes: tuple[str, ...] = (*notes, self._settings_note())
 
     @classmethod
     def from_log(
         cls, messages: SbasMessages, *, prn: int | Literal["best"] = "best", limits: SbasLimits | None = None
     ) -> SbasCorrections:
-        """Corrections from recorded messages, of the PRN asked for or of `best_prn`.
-
-        Raises
-        ------
-        ValueError
-            There is no message of that PRN.
+        """Corrections from recorded messages, of the PRN asked for or of `best_prn`; ValueError: there is no message of
+        it.
         """
         prn, choice = best_prn(messages, limits) if prn == "best" else (prn, messages.choice_of(prn))
         corrections = cls(messages, prn=prn, limits=limits, notes=(*messages.notes, choice))
@@ -149,16 +129,11 @@ class SbasCorrections:
     def satellites(
         self, time: Datetimes, satellite: Strings, navigation: Navigation | None = None
     ) -> SatelliteCorrections:
-        """Fast and long-term corrections.
+        """Fast and long-term corrections of T epochs by K satellites; those that the mask does not know are
+        NOT_IN_MASK.
 
-        Parameters
-        ----------
-        time : ndarray of datetime64[ns], shape (T,)
-        satellite : ndarray of str, shape (K,)
-            "G05"; GLONASS and others that the mask does not know are NOT_IN_MASK.
-        navigation : Navigation, optional
-            A long-term correction is taken only if a record has its issue of data; the one before
-            it, of another issue, is tried next. Without it, the newest is taken as it is.
+        A long-term correction is taken only if a record of `navigation` has its issue of data; the one before it, of
+        another issue, is tried next. Without navigation data the newest is taken as it is.
         """
         number = np.array([_NUMBER_OF.get(str(name), -1) for name in satellite], dtype=np.int64)
         tables, limits, at = self._tables, self.limits, time[:, None]
@@ -169,37 +144,23 @@ class SbasCorrections:
         grown = growth(tables, limits, at, fast, long.row, stop)
         covariance, lacks_covariance = covariance_in_force(tables, limits, time, number, stop)
         incomplete = fast.no_factor | grown.missing | lacks_covariance
-        state = np.select(
+        state = first_that_holds(
             [
-                seconds(at - stop) < STOP_S,
-                ~has_mask[:, None] & np.ones(len(number), dtype=bool),
-                ~in_mask,
-                fast.missing,
-                fast.udrei == DO_NOT_USE,
-                fast.udrei == NOT_MONITORED,
-                fast.timed_out | long.timed_out,
-                fast.udrei > limits.largest_udrei,
-                long.missing,
-                long.mismatch,
-                incomplete & (limits.incomplete == "reject"),
-                fast.no_rate,
-            ],
-            [
-                SatelliteState.GEO_STOPPED,
-                SatelliteState.NO_MASK,
-                SatelliteState.NOT_IN_MASK,
-                SatelliteState.NO_FAST,
-                SatelliteState.DO_NOT_USE,
-                SatelliteState.NOT_MONITORED,
-                SatelliteState.TIMED_OUT,
-                SatelliteState.UDREI_TOO_LARGE,
-                SatelliteState.NO_LONG_TERM,
-                SatelliteState.IODE_MISMATCH,
-                SatelliteState.NO_DEGRADATION,
-                SatelliteState.NO_RANGE_RATE,
+                (seconds(at - stop) < STOP_S, SatelliteState.GEO_STOPPED),
+                (~has_mask[:, None] & np.ones(len(number), dtype=bool), SatelliteState.NO_MASK),
+                (~in_mask, SatelliteState.NOT_IN_MASK),
+                (fast.missing, SatelliteState.NO_FAST),
+                (fast.udrei == DO_NOT_USE, SatelliteState.DO_NOT_USE),
+                (fast.udrei == NOT_MONITORED, SatelliteState.NOT_MONITORED),
+                (fast.timed_out | long.timed_out, SatelliteState.TIMED_OUT),
+                (fast.udrei > limits.largest_udrei, SatelliteState.UDREI_TOO_LARGE),
+                (long.missing, SatelliteState.NO_LONG_TERM),
+                (long.mismatch, SatelliteState.IODE_MISMATCH),
+                (incomplete & (limits.incomplete == "reject"), SatelliteState.NO_DEGRADATION),
+                (fast.no_rate, SatelliteState.NO_RANGE_RATE),
             ],
             SatelliteState.OK,
-        ).astype(np.int64)
+        )
         return self._assemble(time, state, fast, long, grown, incomplete, covariance)
 
     def _assemble(
@@ -259,23 +220,11 @@ class SbasCorrections:
         latitude_deg: Floats,
         longitude_deg: Floats,
     ) -> Floats:
-        """Factor on sigma UDRE at a place, from the service region (type 27) or the covariance (type 28).
+        """Factor on sigma UDRE at a place, from the service region (type 27) or the covariance (type 28), shape (T, K).
 
-        Parameters
-        ----------
-        time : ndarray of datetime64[ns], shape (T,)
-        corrections : SatelliteCorrections
-            Of these epochs.
-        line_of_sight : ndarray, shape (T, K, 3)
-            Unit vectors from the receiver to the satellites, in the Earth-fixed frame.
-        latitude_deg, longitude_deg : ndarray, shape (T,) [deg]
-            Of the receiver.
-
-        Returns
-        -------
-        ndarray, shape (T, K)
-            1 where the GEO sends neither; NaN where the service messages are incomplete and
-            incomplete data are rejected.
+        `corrections` are of these epochs, `line_of_sight`, shape (T, K, 3), unit vectors to the satellites in the
+        Earth-fixed frame, coordinates of the receiver (T,). 1 where the GEO sends neither; NaN where the service
+        messages are incomplete and incomplete data are rejected.
         """
         factor, incomplete = self._service.factor(time, latitude_deg, longitude_deg)
         along = delta_udre_covariance(self._tables, time, corrections.covariance, line_of_sight)
@@ -285,14 +234,7 @@ class SbasCorrections:
     def ionosphere(
         self, time: Datetimes, latitude_deg: Floats, longitude_deg: Floats, elevation_deg: Floats, azimuth_deg: Floats
     ) -> IonosphereDelays:
-        """Slant delays on L1 from the grid.
-
-        Parameters
-        ----------
-        time : ndarray of datetime64[ns], shape (T,)
-        latitude_deg, longitude_deg : ndarray, shape (T,) [deg]
-        elevation_deg, azimuth_deg : ndarray, shape (T, K) [deg]
-        """
+        """Slant delays on L1 from the grid at T places, shape (T,), towards K satellites, angles of shape (T, K)."""
         return ionosphere(
             self._grid, self._tables, self.limits, time, latitude_deg, longitude_deg, elevation_deg, azimuth_deg
         )

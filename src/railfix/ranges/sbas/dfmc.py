@@ -27,12 +27,12 @@ from typing import Final, Literal
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
-from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta
+from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits.prepared_records import issue_records
-from railfix.ranges.sbas.decode import UPPER, BitField, Layout, read_fields
+from railfix.ranges.sbas.decode import UPPER, BitField, Layout, read_fields, time_near
 from railfix.ranges.sbas.messages import SbasMessages
-from railfix.ranges.sbas.standard import system_name
+from railfix.ranges.sbas.standard import first_that_holds, system_name
 
 AUGMENTED: Final = 92  #: Satellites of one mask.
 FIRST: Final = 53  #: Of which type 35 has the first ones, type 36 the others.
@@ -82,18 +82,14 @@ class DfmcState(IntEnum):
     """Why a satellite has no correction."""
 
     OK = 0
-    #: Type 0: the whole service must not be used.
-    STOPPED = 1
+    STOPPED = 1  #: Type 0: the whole service must not be used.
     NO_MASK = 2
     NOT_IN_MASK = 3
     NO_CORRECTION = 4
     TIMED_OUT = 5
-    #: Indicator 15.
-    DO_NOT_USE = 6
-    #: Type 37 is missing: neither scale nor time-outs are known.
-    NO_DEGRADATION = 7
-    #: No navigation record has the issue of data of the correction.
-    NO_RECORD = 8
+    DO_NOT_USE = 6  #: Indicator 15.
+    NO_DEGRADATION = 7  #: Type 37 is missing: neither scale nor time-outs are known.
+    NO_RECORD = 8  #: No navigation record has the issue of data of the correction.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,23 +141,13 @@ def _newest(sent: Datetimes, time: Datetimes) -> tuple[Integers, Floats]:
 class DfmcService:
     """Corrections by the L5 messages of one SBAS satellite at any epochs; a message counts from its reception on.
 
-    Parameters
-    ----------
-    messages : SbasMessages
-        Of L5; those of other PRNs are left out.
-    prn : int
-    notes : tuple of str
-        Sentences on the origin of the messages, put before those of the corrections.
-
-    Attributes
-    ----------
-    span : tuple of datetime64[ns]
-        Reception of the first and the last message; NaT without messages.
+    Messages of other PRNs are left out; `notes` on their origin are put before those of the corrections.
     """
 
     def __init__(self, messages: SbasMessages, *, prn: int, notes: tuple[str, ...] = ()) -> None:
         own, never = messages.of(prn), np.datetime64("NaT", "ns")
         self.prn = prn
+        #: Reception of the first and the last message; NaT without messages.
         self.span: tuple[np.datetime64, np.datetime64] = (own.time[0], own.time[-1]) if len(own) else (never, never)
         self.notes = (
             *notes,
@@ -176,10 +162,7 @@ class DfmcService:
     def from_log(cls, messages: SbasMessages, *, prn: int | Literal["best"] = "best") -> DfmcService:
         """Return the corrections of recorded messages, of the PRN asked for or of that with the most of type 32.
 
-        Raises
-        ------
-        ValueError
-            There is no message of that PRN.
+        ValueError: there is no message of that PRN.
         """
         if prn == "best":
             numbers, count = np.unique(messages.prn[messages.type == 32], return_counts=True)
@@ -193,14 +176,9 @@ class DfmcService:
         return cls(messages, prn=prn, notes=notes)
 
     def satellites(self, time: Datetimes, satellite: Strings, navigation: Navigation | None = None) -> DfmcCorrections:
-        """Return the corrections of satellites at epochs.
+        """Return the corrections of K satellites at T epochs.
 
-        Parameters
-        ----------
-        time : ndarray of datetime64[ns], shape (T,)
-        satellite : ndarray of str, shape (K,)
-        navigation : Navigation, optional
-            A correction is used only if a record has its issue of data; without it, as it is.
+        With navigation data a correction is used only if a record has its issue of data; without, as it is.
         """
         shape = (len(time), len(satellite))
         names = np.array([slot_satellite(int(slot)) for slot in self._read[32]["slot"]], dtype="<U3")
@@ -221,14 +199,18 @@ class DfmcService:
             age = np.where(has, age, np.inf)
             valid = np.append(self._read[37]["valid_32_s"], 0.0)[ten]
             dfrei = self._indicator(time, mask, rank, (row, age))
-            own["state"][:] = np.select(
-                [stop, mask < 0, ~slots, ten < 0, ~has, (age > valid) | (dfrei < 0), dfrei >= DO_NOT_USE],
+            own["state"][:] = first_that_holds(
                 [
-                    DfmcState.STOPPED, DfmcState.NO_MASK, DfmcState.NOT_IN_MASK, DfmcState.NO_DEGRADATION,
-                    DfmcState.NO_CORRECTION, DfmcState.TIMED_OUT, DfmcState.DO_NOT_USE,
+                    (stop, DfmcState.STOPPED),
+                    (mask < 0, DfmcState.NO_MASK),
+                    (~slots, DfmcState.NOT_IN_MASK),
+                    (ten < 0, DfmcState.NO_DEGRADATION),
+                    (~has, DfmcState.NO_CORRECTION),
+                    ((age > valid) | (dfrei < 0), DfmcState.TIMED_OUT),
+                    (dfrei >= DO_NOT_USE, DfmcState.DO_NOT_USE),
                 ],
                 DfmcState.OK,
-            )  # fmt: skip
+            )
             good = np.flatnonzero(own["state"] == DfmcState.OK)
             if len(good):
                 self._correct(own, good, (time, row, ten, dfrei), name)
@@ -243,13 +225,9 @@ class DfmcService:
         self, own: dict[str, Floats], good: Integers, at: tuple[Datetimes, Integers, Integers, Integers], name: str
     ) -> None:
         """Fill in the corrections of one satellite at the epochs that have one."""
-        time, row, ten, dfrei = (values[good] for values in at)
+        time, (row, ten, dfrei) = at[0][good], (values[good] for values in at[1:])
         sent, scale = {key: values[row] for key, values in self._read[32].items()}, self._read[37]
-        reference = self._time[32][row]
-        midnight = reference.astype("datetime64[D]").astype("datetime64[ns]")
-        offset = sent["time_of_day_s"] - seconds(reference - midnight)
-        reference = reference + timedelta(offset - SECONDS_PER_DAY * np.rint(offset / SECONDS_PER_DAY))
-        moved_s = seconds(time - reference)
+        moved_s = seconds(time - time_near(sent["time_of_day_s"], self._time[32][row]))
         own["issue"][good] = sent["iodn"]
         own["position_m"][good] = sent["position_m"] + sent["velocity_mps"] * moved_s[:, None]
         own["clock_m"][good] = sent["clock_m"] + sent["drift_mps"] * moved_s

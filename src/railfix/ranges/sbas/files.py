@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Bytes, Integers, Masks
+from railfix.core.arrays import Bytes, Integers
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath, read_text_lines
 from railfix.core.timescale import GPS_EPOCH, SECONDS_PER_WEEK
@@ -244,14 +244,9 @@ def read_sbas(
 
 
 def from_receiver(frames: SbasFrames, *, source: str = "receiver", band: Band = "L1") -> SbasMessages:
-    """SBAS messages as a receiver passes them on, parity and preamble checked.
+    """SBAS messages as a receiver passes them on, parity and preamble checked; `source` names them in notes and counts.
 
-    Parameters
-    ----------
-    frames : SbasFrames
-        Messages before the receiver knew the time are left out, and counted under "line".
-    source : str
-        Name for notes and counts.
+    Messages before the receiver knew the time are left out, and counted under "line".
     """
     gathered = _Gathered()
     _gather_frames(frames, 0, gathered, band)
@@ -298,7 +293,8 @@ def _check(gathered: _Gathered, sources: tuple[str, ...], band: Band) -> SbasMes
     bits[:, 31] &= 0xC0
     source = np.array(gathered.source, dtype=np.int64)
     carried = _read_bits(np.array([len(item.digits) for item in raw]), source, bits)
-    wrong = _wrong_parity(bits, carried)
+    shift = 24 - carried
+    wrong = (message_parity(bits) >> shift) != (carried_parity(bits) >> shift)
     preamble = preamble_number(bits, band)
     stray = (preamble < 0) & ~wrong
     gathered.rejected["parity"] += int(wrong.sum())
@@ -339,11 +335,6 @@ def _read_bits(digits: NDArray[np.int_], source: Integers, bits: Bytes) -> Integ
         first_six = message_parity(bits[of_file]) >> 18
         carried[of_file] = 6 if (first_six == bits[of_file, 28] & 0x3F).mean() > 0.5 else 0
     return carried
-
-
-def _wrong_parity(bits: Bytes, carried: Integers) -> Masks:
-    shift = 24 - carried
-    return np.asarray((message_parity(bits) >> shift) != (carried_parity(bits) >> shift))
 
 
 def _parity_notes(sources: tuple[str, ...], source: Integers, carried: Integers) -> list[str]:

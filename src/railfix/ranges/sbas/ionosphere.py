@@ -15,7 +15,14 @@ from railfix.core.timescale import seconds, timedelta
 from railfix.ranges.sbas.decode import decode, grid_delays
 from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.satellites import degradation_row
-from railfix.ranges.sbas.standard import GIVE_VARIANCE_M2, STOP_S, IonosphereDelays, IonosphereState, SbasLimits
+from railfix.ranges.sbas.standard import (
+    GIVE_VARIANCE_M2,
+    STOP_S,
+    IonosphereDelays,
+    IonosphereState,
+    SbasLimits,
+    first_that_holds,
+)
 from railfix.ranges.sbas.tables import SatelliteTables, Series, Stops
 
 Answer = TypeVar("Answer", bound=np.generic)
@@ -270,7 +277,6 @@ def _choose(
 
 def _choose_polar(grid: GridTables, time: Datetimes, latitude: Floats, longitude: Floats) -> tuple[Integers, Floats]:
     """Points and weights at 75 degrees and above; all four are needed."""
-    count = len(latitude)
     north = latitude >= 0.0
     sign = np.where(north, 1.0, -1.0)
     west = np.floor(longitude / 10.0) * 10.0
@@ -293,10 +299,8 @@ def _choose_polar(grid: GridTables, time: Datetimes, latitude: Floats, longitude
     belt = np.stack([(1.0 - y) * (1.0 - x), (1.0 - y) * x, y * (1.0 - u), y * u], axis=1)
     v = (np.abs(latitude) - 85.0) / 10.0
     weights = np.where(cap[:, None], _square_weights((longitude - coarse) / 90.0 * (1.0 - 2.0 * v) + v, v), belt)
-    inside_cell = np.asarray(grid.in_mask(point, time[:, None]).all(axis=1))
-    return np.where(inside_cell[:, None], point, _NO_POINT), np.where(inside_cell[:, None], weights, np.nan).reshape(
-        count, 4
-    )
+    inside_cell = np.asarray(grid.in_mask(point, time[:, None]).all(axis=1))[:, None]
+    return np.where(inside_cell, point, _NO_POINT), np.where(inside_cell, weights, np.nan)
 
 
 def ionosphere(
@@ -330,25 +334,17 @@ def ionosphere(
     delay, variance, known = _values(grid, limits, tables, time, t, row)
     total = np.where(used[:, None] & (weights > 0.0), weights * delay, 0.0).sum(axis=1)
     spread = np.where(used[:, None] & (weights > 0.0), weights * variance, 0.0).sum(axis=1)
-    worst = np.select(
+    worst = first_that_holds(
         [
-            (seconds(time - tables.stops.last(time)) < STOP_S)[t],
-            ~(point >= 0).any(axis=1),
-            (state == IonosphereState.DO_NOT_USE).any(axis=1),
-            used & ~known,
-            used,
-            (state == IonosphereState.TIMED_OUT).any(axis=1),
-        ],
-        [
-            IonosphereState.GEO_STOPPED,
-            IonosphereState.NO_GRID,
-            IonosphereState.DO_NOT_USE,
-            IonosphereState.NO_DEGRADATION,
-            IonosphereState.OK,
-            IonosphereState.TIMED_OUT,
+            ((seconds(time - tables.stops.last(time)) < STOP_S)[t], IonosphereState.GEO_STOPPED),
+            (~(point >= 0).any(axis=1), IonosphereState.NO_GRID),
+            ((state == IonosphereState.DO_NOT_USE).any(axis=1), IonosphereState.DO_NOT_USE),
+            (used & ~known, IonosphereState.NO_DEGRADATION),
+            (used, IonosphereState.OK),
+            ((state == IonosphereState.TIMED_OUT).any(axis=1), IonosphereState.TIMED_OUT),
         ],
         IonosphereState.NOT_MONITORED,
-    ).astype(np.int64)
+    )
     good = (worst == IonosphereState.OK) | (worst == IonosphereState.NO_DEGRADATION)
     sigma = np.where(worst == IonosphereState.OK, np.sqrt(spread), np.nan)
     return IonosphereDelays(
@@ -370,24 +366,17 @@ def _judge(
     received = delays.received(row)
     late = seconds(at - received) > limits.timeout_s("grid_delay")
     late |= ~grid.mask_active(np.where(row >= 0, delays["issue"][row], -1), at)
-    state = np.select(
+    state = first_that_holds(
         [
-            point < 0,
-            (row < 0) | (received <= tables.stops.last(time)[:, None]),
-            late,
-            np.isnan(delays["delay_m"][row]),
-            delays["givei"][row] == _NOT_MONITORED,
-        ],
-        [
-            IonosphereState.NO_GRID,
-            IonosphereState.NOT_MONITORED,
-            IonosphereState.TIMED_OUT,
-            IonosphereState.DO_NOT_USE,
-            IonosphereState.NOT_MONITORED,
+            (point < 0, IonosphereState.NO_GRID),
+            ((row < 0) | (received <= tables.stops.last(time)[:, None]), IonosphereState.NOT_MONITORED),
+            (late, IonosphereState.TIMED_OUT),
+            (np.isnan(delays["delay_m"][row]), IonosphereState.DO_NOT_USE),
+            (delays["givei"][row] == _NOT_MONITORED, IonosphereState.NOT_MONITORED),
         ],
         IonosphereState.OK,
     )
-    return row, state.astype(np.int64)
+    return row, state
 
 
 def _weights(

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Final, Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, freeze_rows
 from railfix.io.receiver.framing import crc24q
-from railfix.ranges.sbas.standard import DECODED, system_name, type_name
 
 Band = Literal["L1", "L5"]  #: Frequency that messages are sent on, and corrections made for.
 #: First bits of successive messages: eight, three in turn (DO-229D, A.4.3.1); on L5 four, six in turn.
@@ -24,13 +23,7 @@ _REPEATED_WITHIN: Final = np.timedelta64(1, "s")
 
 
 def message_parity(bits: Bytes) -> Integers:
-    """Parity that belongs to the 226 data bits of each message, shape (N,).
-
-    Parameters
-    ----------
-    bits : ndarray of uint8, shape (N, 32)
-        Messages from their first bit on.
-    """
+    """Parity that belongs to the 226 data bits of each message, shape (N,); `bits` (N, 32) from the first bit on."""
     # Six zero bits in front make whole bytes of 226 bits and do not change the parity.
     data = bits[:, :29].astype(np.int64)
     before = np.concatenate([np.zeros((len(bits), 1), dtype=np.int64), data[:, :-1]], axis=1)
@@ -57,7 +50,7 @@ def with_parity(bits: Bytes) -> Bytes:
     return complete
 
 
-def preamble_number(bits: Bytes, band: Band = "L1") -> Integers:
+def preamble_number(bits: Bytes, band: Band) -> Integers:
     """Place of each preamble among those in turn, -1 for anything else, shape (N,)."""
     number = np.full(len(bits), -1, dtype=np.int64)
     first = bits[:, 0] if band == "L1" else bits[:, 0] >> 4
@@ -74,43 +67,22 @@ def message_type(bits: Bytes, band: Band = "L1") -> Integers:
 
 @dataclass(frozen=True, kw_only=True)
 class SbasMessages:
-    """Messages that passed every check, N rows in the order of their reception.
+    """Messages that passed every check, N rows in the order of their reception."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (N,)
-        GPS time at which the message had been received completely: from here on it may be used.
-    prn : ndarray of int, shape (N,)
-    type : ndarray of int, shape (N,)
-        0 to 63.
-    bits : ndarray of uint8, shape (N, 32)
-        The message from its first preamble bit, eight bits a byte; parity from bit 226 on where
-        the source carries it, zero behind.
-    parity_bits : ndarray of int, shape (N,)
-        How many bits of parity the source carried, and were checked: 24, 6 or 0.
-    source : ndarray of int, shape (N,)
-        Row of `sources`.
-    line : ndarray of int, shape (N,)
-        1-based line of the file.
-    sources : tuple of str
-        Files.
-    rejected : mapping of str to int
-        Messages left out, by reason: "parity", "preamble", "line", "duplicate".
-    notes : tuple of str
-        Warnings for the reader of the results, one sentence each.
-    band : {"L1", "L5"}
-    """
-
+    #: GPS time at which the message had been received completely: from here on it may be used; shape (N,).
     time: Datetimes
-    prn: Integers
-    type: Integers
+    prn: Integers  #: Shape (N,).
+    type: Integers  #: 0 to 63, shape (N,).
+    #: The message from its first preamble bit, eight bits a byte; parity from bit 226 on where the source carries it,
+    #: zero behind; shape (N, 32).
     bits: Bytes
-    parity_bits: Integers
-    source: Integers
-    line: Integers
-    sources: tuple[str, ...] = ()
+    parity_bits: Integers  #: How many bits of parity the source carried, and were checked: 24, 6 or 0; shape (N,).
+    source: Integers  #: Row of `sources`, shape (N,).
+    line: Integers  #: 1-based line of the file, shape (N,).
+    sources: tuple[str, ...] = ()  #: Files.
+    #: Messages left out, by reason: "parity", "preamble", "line", "duplicate".
     rejected: Mapping[str, int] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  #: Warnings for the reader of the results, one sentence each.
     band: Band = "L1"
 
     def __post_init__(self) -> None:
@@ -124,29 +96,16 @@ class SbasMessages:
         """PRNs that sent anything, rising."""
         return tuple(int(prn) for prn in np.unique(self.prn))
 
+    @property
+    def _arrays(self) -> dict[str, Any]:
+        return {name: values for name, values in vars(self).items() if isinstance(values, np.ndarray)}
+
     def choice_of(self, prn: int) -> str:
         """A sentence on a PRN that was asked for; ValueError where none of the messages is of it."""
         known = ", ".join(map(str, self.prns))
         if prn not in self.prns:
             raise ValueError(f"the log has no SBAS message of PRN {prn}; it has {known}")
         return f"SBAS PRN {prn} was asked for; the log has {known}"
-
-    def account(self) -> dict[str, int]:
-        """Counts of all messages: decoded by type, not decoded by type and name, or rejected by reason.
-
-        Returns
-        -------
-        dict of str to int
-            "MSAS 137 type 2 fast corrections": 600, "MSAS 137 type 63 null, not decoded": 569,
-            "rejected: parity": 0 ... The values sum to the messages of the files.
-        """
-        counts = Counter(zip(self.prn.tolist(), self.type.tolist(), strict=True))
-        rows = {
-            f"{system_name(prn)} {prn} type {kind} {type_name(kind, prn, self.band)}"
-            + ("" if kind in DECODED[self.band] else ", not decoded"): number
-            for (prn, kind), number in sorted(counts.items())
-        }
-        return rows | {f"rejected: {reason}": number for reason, number in sorted(self.rejected.items())}
 
     def of(self, prn: int) -> SbasMessages:
         """Messages of one PRN; the counts of rejected messages are those of all PRNs."""
@@ -163,11 +122,7 @@ class SbasMessages:
         """These messages and others, in the order of reception; counts are added, repeated notes dropped."""
         if not len(later):
             return self
-        joined = {
-            item.name: np.concatenate([getattr(self, item.name), getattr(later, item.name)])
-            for item in fields(self)
-            if isinstance(getattr(self, item.name), np.ndarray)
-        }
+        joined = {name: np.concatenate([rows, getattr(later, name)]) for name, rows in self._arrays.items()}
         sources = tuple(dict.fromkeys((*self.sources, *later.sources)))
         number = np.array([sources.index(name) for name in (*self.sources, *later.sources)] or [0], dtype=np.int64)
         own = np.where(np.arange(len(joined["time"])) < len(self), 0, len(self.sources))
@@ -196,11 +151,4 @@ class SbasMessages:
 
     def take(self, rows: Masks | Integers) -> SbasMessages:
         """Some of the messages."""
-        arrays = {
-            item.name: getattr(self, item.name)[rows]
-            for item in fields(self)
-            if isinstance(getattr(self, item.name), np.ndarray)
-        }
-        return SbasMessages(
-            **arrays, sources=self.sources, rejected=self.rejected, notes=self.notes, band=self.band
-        )  # fmt: skip
+        return replace(self, **{name: values[rows] for name, values in self._arrays.items()})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import Final, Literal
@@ -12,63 +13,6 @@ from pydantic import Field
 from railfix.core.arrays import Floats, Integers, Masks, freeze_arrays
 from railfix.core.settings import Settings
 
-#: Types decoded into corrections or into records.
-DECODED: Final = {"L1": (0, 1, 2, 3, 4, 5, 6, 7, 10, 12, 18, 24, 25, 26, 27, 28), "L5": (0, 31, 32, 34, 35, 36, 37)}
-
-#: Message types of L1 (DO-229D, table A-3).
-TYPE_NAMES: Final = {
-    0: "do not use for safety",
-    1: "PRN mask",
-    2: "fast corrections",
-    3: "fast corrections",
-    4: "fast corrections",
-    5: "fast corrections",
-    6: "integrity",
-    7: "fast correction degradation",
-    9: "GEO navigation",
-    10: "degradation parameters",
-    12: "network time",
-    17: "GEO almanacs",
-    18: "ionospheric grid mask",
-    24: "mixed fast and long-term corrections",
-    25: "long-term corrections",
-    26: "ionospheric delays",
-    27: "service region",
-    28: "clock-ephemeris covariance",
-    62: "internal test",
-    63: "null",
-}
-#: Message types of L5 (ICAO Annex 10, 8th edition, appendix B, 3.5.14).
-L5_TYPE_NAMES: Final = {
-    0: "do not use for safety",
-    31: "satellite mask",
-    32: "orbit, clock and covariance",
-    34: "integrity, changes",
-    35: "integrity, first 53 satellites",
-    36: "integrity, the others",
-    37: "degradation and scale",
-    39: "orbit of the SBAS satellite, whose scales differ between public sources",
-    40: "orbit of the SBAS satellite, second part",
-    42: "network time, whose layout is not public",
-    47: "almanac, which no range needs",
-    62: "internal test",
-    63: "null",
-}
-#: Types that QZSS sends beside those of SBAS: L1-SAIF (IS-QZSS), and L1S, which took its place
-#: (IS-QZSS-L1S, IS-QZSS-DCR).
-QZSS_TYPE_NAMES: Final = {
-    43: "L1S disaster report of the Japan Meteorological Agency",
-    44: "L1S disaster report of other organisations",
-    47: "L1S monitoring stations",
-    48: "L1S PRN mask",
-    49: "L1S data issue number",
-    50: "L1S code corrections",
-    51: "L1S satellite health",
-    52: "L1-SAIF tropospheric grid mask",
-    53: "L1-SAIF tropospheric delays",
-    56: "L1-SAIF inter-signal biases",
-    58: "L1-SAIF QZS ephemeris",
-}
 #: Systems by PRN, as assigned (WAAS gave 134 to KASS, 122 to SouthPAN).
 _SYSTEMS: Final = {
     "EGNOS": (120, 121, 123, 124, 126, 136),
@@ -91,15 +35,6 @@ GEO_PRNS: Final = (*range(120, 159), *range(183, 203))
 def system_name(prn: int) -> str:
     """Name of the system that a PRN belongs to ("MSAS"); "SBAS" where it is not assigned."""
     return _SYSTEM_OF.get(prn, "SBAS")
-
-
-def type_name(number: int, prn: int, band: str = "L1") -> str:
-    """Name of a message type as sent by a PRN; "reserved" for a number without meaning."""
-    if band == "L5":
-        return L5_TYPE_NAMES.get(number, "reserved")
-    if prn >= 183 and number in QZSS_TYPE_NAMES:
-        return QZSS_TYPE_NAMES[number]
-    return TYPE_NAMES.get(number, "reserved")
 
 
 def mask_satellite(number: int) -> str:
@@ -191,26 +126,18 @@ class SatelliteState(IntEnum):
     """Whether a satellite may be used, and why not; the first that holds of those listed."""
 
     OK = 0
-    #: Type 0 was received within the last 60 s.
-    GEO_STOPPED = 1
-    #: There is no PRN mask, or it timed out.
-    NO_MASK = 2
+    GEO_STOPPED = 1  #: Type 0 was received within the last 60 s.
+    NO_MASK = 2  #: There is no PRN mask, or it timed out.
     NOT_IN_MASK = 3
     NO_FAST = 4
-    #: UDREI 15.
-    DO_NOT_USE = 5
-    #: UDREI 14.
-    NOT_MONITORED = 6
+    DO_NOT_USE = 5  #: UDREI 15.
+    NOT_MONITORED = 6  #: UDREI 14.
     TIMED_OUT = 7
-    #: UDREI above `SbasLimits.largest_udrei`.
-    UDREI_TOO_LARGE = 8
+    UDREI_TOO_LARGE = 8  #: UDREI above `SbasLimits.largest_udrei`.
     NO_LONG_TERM = 9
-    #: No navigation record has the issue of data of the long-term correction.
-    IODE_MISMATCH = 10
-    #: Degradation data (types 7, 10; 28 where it is sent) are missing.
-    NO_DEGRADATION = 11
-    #: Two fast corrections that give a rate are not there.
-    NO_RANGE_RATE = 12
+    IODE_MISMATCH = 10  #: No navigation record has the issue of data of the long-term correction.
+    NO_DEGRADATION = 11  #: Degradation data (types 7, 10; 28 where it is sent) are missing.
+    NO_RANGE_RATE = 12  #: Two fast corrections that give a rate are not there.
 
 
 class IonosphereState(IntEnum):
@@ -218,15 +145,17 @@ class IonosphereState(IntEnum):
 
     OK = 0
     GEO_STOPPED = 1
-    #: The mask has no cell of grid points around the pierce point.
-    NO_GRID = 2
-    #: A grid point that is needed must not be used.
-    DO_NOT_USE = 3
-    #: A grid point that is needed is not monitored, or was never sent.
-    NOT_MONITORED = 4
+    NO_GRID = 2  #: The mask has no cell of grid points around the pierce point.
+    DO_NOT_USE = 3  #: A grid point that is needed must not be used.
+    NOT_MONITORED = 4  #: A grid point that is needed is not monitored, or was never sent.
     TIMED_OUT = 5
-    #: The delay is there; without type 10 it has no sigma.
-    NO_DEGRADATION = 6
+    NO_DEGRADATION = 6  #: The delay is there; without type 10 it has no sigma.
+
+
+def first_that_holds(cases: Sequence[tuple[Masks | np.bool_, int]], otherwise: int) -> Integers:
+    """Value of the first condition that holds, any shape."""
+    conditions, values = zip(*cases, strict=True)
+    return np.asarray(np.select(conditions, values, otherwise), dtype=np.int64)
 
 
 class _Frozen:
@@ -267,10 +196,7 @@ class SatelliteCorrections(_Frozen):
     def sigma_flt_m(self, delta_udre: Floats | float = 1.0) -> Floats:
         """Standard deviation after fast and long-term correction, shape (T, K) [m] (DO-229D, A.4.5.1 and J.2.2).
 
-        Parameters
-        ----------
-        delta_udre : ndarray, shape (T, K), or float
-            Factor on sigma UDRE (`SbasCorrections.delta_udre`).
+        `delta_udre` is the factor on sigma UDRE (`SbasCorrections.delta_udre`).
         """
         udre = self.sigma_udre_m * delta_udre
         terms = np.stack([udre, self.fast_growth_m, self.rate_growth_m, self.long_term_growth_m, self.en_route_m])

@@ -264,7 +264,7 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
         positions = adjusted.ecef_m
     assert adjusted is not None
     assert course is not None
-    order, count = _crossed_points(course, ties)
+    order, count = _points_of_line(course, ties)
     sigma = adjusted.line_sigma_m[order]
     sigma_plan, sigma_height = (float(np.percentile(sigma[:, axis], _OF_THE_MAP)) for axis in range(2))
     notes = _notes(runs, legs, passes, count, moved[order], (sigma_plan, sigma_height), beside, apart)
@@ -325,7 +325,7 @@ def _without_loose_ends(plan_m: Floats) -> slice:
     return slice(first, last)
 
 
-def _advancing(plan_m: Floats) -> Indices:
+def _points_ahead(plan_m: Floats) -> Indices:
     """Points that lead on from the last by half a spacing or more: where runs stand, noise makes others."""
     reach = _END_POINTS // 2
     index = np.arange(len(plan_m))
@@ -343,14 +343,14 @@ def _length(step_m: Floats) -> float:
     return float(np.linalg.norm(step_m))
 
 
-def _crossed_points(course: Course, ties: Ties) -> tuple[Indices, Integers]:
+def _points_of_line(course: Course, ties: Ties) -> tuple[Indices, Integers]:
     """Points of the line that a pass crosses, a closed one ending where it began, and the number of passes of each."""
     count = np.bincount(ties.point, minlength=len(course))
     kept = np.flatnonzero(count > 0)
     closed = course.closed and len(kept) == len(course)
     plan = course.point_m[kept, :2]
-    kept = kept[_advancing(plan)] if closed else kept[_without_loose_ends(plan)]
-    kept = kept if closed else kept[_advancing(course.point_m[kept, :2])]
+    kept = kept[_points_ahead(plan)] if closed else kept[_without_loose_ends(plan)]
+    kept = kept if closed else kept[_points_ahead(course.point_m[kept, :2])]
     order = np.append(kept, kept[0]) if closed else kept
     if len(order) < 3:
         raise ValueError("the runs have no line in common; give runs over one line")

@@ -150,14 +150,14 @@ def find_course(legs: Sequence[Leg], limits: SurveyLimits) -> Course:
 
 def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
     """Return the beginning of a polyline up to where it lies beside itself for some widths."""
-    apart, least = int(_APART_WIDTHS * width_m / spacing_m), int(_APART_WIDTHS * width_m / spacing_m)
+    least = int(_APART_WIDTHS * width_m / spacing_m)
     way = directions(points)
     tree = cKDTree(points[:, :2])
     repeated = np.zeros(len(points), dtype=np.bool_)
     earlier = np.full(len(points), -1)
     found: Any = tree.query_ball_point(points[:, :2], width_m)
     for i, near in enumerate(found):
-        others = np.array([j for j in near if j < i - apart], dtype=np.intp)
+        others = np.array([j for j in near if j < i - least], dtype=np.intp)
         others = others[np.abs(way[others] @ way[i]) > _SAME_WAY]
         if len(others):
             repeated[i] = True
@@ -210,22 +210,19 @@ def _extend(course: Course, points: Floats, spacing_m: float, width_m: float) ->
             continue
         nearest = course.point_m[round(float(place[at]))]
         gap = nearest - points[at]
-        gap -= _along(points, at) * float(_along(points, at) @ gap)
+        along = np.append(directions(points)[at], 0.0)
+        gap -= along * float(along @ gap)
         fade = np.clip(1.0 - np.arange(len(piece)) * spacing_m / _SEAM_M, 0.0, 1.0)
         piece = piece + gap * fade[:, None]
-        kept = (
-            course.point_m[: round(float(place[at])) + 1] if outward > 0 else course.point_m[round(float(place[at])) :]
-        )
-        joined = np.concatenate([kept, piece]) if outward > 0 else np.concatenate([piece[::-1], kept])
+        end = round(float(place[at]))
+        if outward > 0:
+            joined = np.concatenate([course.point_m[: end + 1], piece])
+        else:
+            joined = np.concatenate([piece[::-1], course.point_m[end:]])
         longer = _until_repeated(joined, spacing_m, width_m)
         if len(longer) > len(course) or longer.closed:
             return longer
     return None
-
-
-def _along(points: Floats, at: int) -> Floats:
-    way = directions(points)[at]
-    return np.array([way[0], way[1], 0.0])
 
 
 def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats, Integers, Floats]:
@@ -248,7 +245,7 @@ def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats
     at = vertex[index, best]
     offset = points[:, :2] - vertices[at]
     along = (offset * line_way[at]).sum(axis=1)
-    step = _mean_spacing(course)
+    step = float(np.mean(np.linalg.norm(np.diff(vertices, axis=0), axis=1)))
     last = len(course) - (0 if course.closed else 1)
     place = at + np.clip(along / step, -0.5, 0.5)
     place = np.where(found & (place >= -1e-9) & (place <= last), place, np.nan)
@@ -257,10 +254,6 @@ def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats
     sign = np.where(found, np.sign(cosine[index, best]), 0.0).astype(np.int64)
     across = offset[:, 0] * line_way[at][:, 1] - offset[:, 1] * line_way[at][:, 0]
     return place, sign, np.where(found, across, np.nan)
-
-
-def _mean_spacing(course: Course) -> float:
-    return float(np.mean(np.linalg.norm(np.diff(course.point_m[:, :2], axis=0), axis=1)))
 
 
 def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tuple[list[Pass], float]:

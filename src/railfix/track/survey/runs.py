@@ -121,7 +121,7 @@ def run_of_log(log: PositionLog, limits: SurveyLimits) -> SurveyRun:
     """
     rows = np.flatnonzero(np.isfinite(log.ecef_m).all(axis=1) & ~np.isnat(log.time))
     rows = rows[np.argsort(log.time[rows], kind="stable")]
-    rows = rows[thinned_rows(log.time[rows], limits.interval_s)]
+    rows = rows[rows_apart(log.time[rows], limits.interval_s)]
     if len(rows) < 3:
         raise ValueError(f"{len(rows)} positions with a time; a run of a survey needs three")
     quality = np.where(log.quality[rows] >= 1, log.quality[rows], _UNKNOWN_QUALITY)
@@ -138,7 +138,7 @@ def run_of_log(log: PositionLog, limits: SurveyLimits) -> SurveyRun:
     )
 
 
-def thinned_rows(time: Datetimes, interval_s: float) -> Indices:
+def rows_apart(time: Datetimes, interval_s: float) -> Indices:
     """Select rows at least an interval apart, to a twentieth of it."""
     since = seconds(time - time[0]) if len(time) else np.zeros(0)
     kept: list[int] = []
