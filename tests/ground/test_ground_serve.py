@@ -410,7 +410,9 @@ def test_an_order_to_stop_is_acknowledged_and_timed(
     assert (lost["state"], lost["shown"]) == ("simulated", shown["shown"])
     assert orders["release-train"]({"train": 1}) == "the section where train 1 is or may run is closed"
     assert orders["open-section"]({"section": "A"}) is None
-    assert orders["release-train"]({"train": 1}) is None
+    assert (orders["release-train"]({"train": 1}) or "").startswith("train 1 is silent")
+    second(delivered=True)
+    assert orders["release-train"]({"train": 1}) is None  # it has reported
     assert second(delivered=True)["stop"] is None
     assert control.stops == {}
 
