@@ -221,11 +221,3 @@ def time_passed(
         place = authority_m if facing * (authority_m - last) > 0.0 else last
     error = at_end or silent > limits.error_s
     return replace(record, state=TrainState.ERROR if error else TrainState.SIMULATED, shown_m=place)
-
-
-def after_restart(record: TrainRecord) -> TrainRecord:
-    """Return a stored record after a restart of the centre: unknown until the train is heard; its last place is kept.
-
-    The clock of the process before says nothing about the time that has passed.
-    """
-    return replace(record, state=TrainState.UNKNOWN, heard_s=0.0, measured_s=0.0, departure_s=None)

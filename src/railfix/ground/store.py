@@ -16,7 +16,7 @@ import sqlalchemy as sql
 from sqlalchemy import event
 
 from railfix.core.errors import InputFileError, OutputError
-from railfix.ground.centre import TrainRecord, after_restart
+from railfix.ground.centre import TrainRecord
 from railfix.io.train_message import decode, encode
 
 _META: Final = sql.MetaData()
@@ -154,17 +154,15 @@ class Store:
         self._notes.append({"time_ns": time_ns, "train": train, "text": text})
 
     def records(self) -> dict[int, TrainRecord]:
-        """Return the records of all trains as after a restart."""
+        """Return the records of all trains: unknown until they are heard, with their last places."""
         with self._connection.begin():
             rows = self._connection.execute(sql.select(TRAINS)).all()
         return {
-            row.train: after_restart(
-                TrainRecord(
-                    train=row.train,
-                    sequence=row.sequence,
-                    message=(message := None if row.message is None else decode(bytes(row.message))),
-                    shown_m=None if message is None or message.chainage_cm is None else message.chainage_cm / 100.0,
-                )
+            row.train: TrainRecord(
+                train=row.train,
+                sequence=row.sequence,
+                message=(message := None if row.message is None else decode(bytes(row.message))),
+                shown_m=None if message is None or message.chainage_cm is None else message.chainage_cm / 100.0,
             )
             for row in rows
         }

@@ -349,12 +349,12 @@ class Supervision:
 
 
 def standing_train(
-    train: int, *, direction: int, front_m: float, length_m: float, bound_m: float, station: int, track: int
+    number: int, *, direction: int, front_m: float, length_m: float, bound_m: float, station: int, track: int
 ) -> TrainInterval:
     """Return the interval of a train at rest in a station, whose front is known within a bound."""
     ahead = front_m + direction * bound_m
     return TrainInterval(
-        train=train,
+        train=number,
         direction=direction,
         rear_m=front_m - direction * (length_m + bound_m),
         front_m=ahead,
