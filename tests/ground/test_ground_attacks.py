@@ -225,20 +225,25 @@ def centre(store: Store, **values: Any) -> ControlCentre:
     trains = [standing_train(1, direction=1, front_m=300.0, length_m=80.0, bound_m=5.0, station=0, track=1)]
     supervision = Supervision(layout=LINE, state=at_start(LINE, trains))
     return ControlCentre.restored(
-        supervision, store, curves={}, send=lambda *_: None, clock=lambda: 10.0, wall_ns=lambda: 0, **values
+        supervision, store, curves={}, send=lambda *_: None, wall_ns=lambda: 0, **{"clock": lambda: 10.0, **values}
     )
 
 
 def test_a_train_is_stopped_and_released_from_the_page(tmp_path: Path) -> None:
     with Store(f"sqlite:///{tmp_path / 'centre.db'}") as store:
-        control = centre(store, judged=False)
+        now = [10.0]
+        control = centre(store, judged=False, clock=lambda: now[0])
         orders = orders_of(control)
         assert orders["stop"]({"train": 9}) == "there is no train 9"
         assert orders["stop"]({"train": 1}) is None
         assert control.snapshot()["trains"][0]["stop"] == "stopped by hand; not sent"
         control.step()
         assert centre(store, judged=False).snapshot()["trains"][0]["stop"] == "stopped by hand; not sent"
-        assert orders["release-train"]({"train": 1}) is None
+        # nothing is heard of it: two orders, neither at once nor much later
+        for wait_s, refused in ((0.0, True), (1.0, True), (61.0, True), (3.0, False)):
+            now[0] += wait_s
+            reason = orders["release-train"]({"train": 1})
+            assert (reason == "train 1 is silent: order it again in 3 to 60 s if it stands, whole") == refused
         assert orders["release-train"]({"train": 1}) == "train 1 is not stopped"
         assert orders["stop-all"]({}) is None
         assert stopped_trains(control.supervision.state) == {1: "stopped by hand"}

@@ -14,6 +14,7 @@ import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import HEAD, Interlocking, TrainInterval, from_documents
 from railfix.ground.links import BEARERS, LinkLimits, TrainLinks, bearers_of, first_sequence
 from railfix.ground.quic import write_keys
-from railfix.ground.serve import run_centre
+from railfix.ground.serve import STEP_S, SimulatedPoints, _work, run_centre
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
@@ -287,6 +288,33 @@ def test_a_train_ends_within_a_second(folder: Path, number: signal.Signals) -> N
     assert time.monotonic() - begin < 1.0
 
 
+def test_steps_that_are_too_long_leave_half_of_the_time_to_the_links() -> None:
+    """Each turn of the event loop takes in one frame; with a step a turn, a busy centre hears nothing any more."""
+    steps, turns, long_s = [], [], 1.5 * STEP_S
+
+    class Slow:
+        def step(self) -> None:
+            steps.append(len(turns))
+            time.sleep(long_s)
+
+    async def frames() -> None:
+        while True:
+            turns.append(1)
+            await asyncio.sleep(0.001)
+
+    async def session() -> None:
+        control: Any = Slow()
+        working = asyncio.create_task(_work(control, SimulatedPoints(move_s=5.0, clock=time.monotonic)))
+        coming = asyncio.create_task(frames())
+        await asyncio.sleep(7.0 * long_s)
+        for task in (working, coming):
+            task.cancel()
+
+    asyncio.run(session())
+    assert 2 <= len(steps) <= 5
+    assert all(later - before > 5 for before, later in pairwise(steps))
+
+
 @pytest.fixture
 def centre(tmp_path: Path) -> Iterator[tuple[ControlCentre, list[Authority], list[float]]]:
     """A centre by hand: train 1 up in A, train 2 down in C, routes by hand; what it sends, and its clock."""
@@ -410,7 +438,9 @@ def test_an_order_to_stop_is_acknowledged_and_timed(
     assert (lost["state"], lost["shown"]) == ("simulated", shown["shown"])
     assert orders["release-train"]({"train": 1}) == "the section where train 1 is or may run is closed"
     assert orders["open-section"]({"section": "A"}) is None
-    assert orders["release-train"]({"train": 1}) is None
+    assert (orders["release-train"]({"train": 1}) or "").startswith("train 1 is silent")
+    second(delivered=True)
+    assert orders["release-train"]({"train": 1}) is None  # it has reported
     assert second(delivered=True)["stop"] is None
     assert control.stops == {}
 

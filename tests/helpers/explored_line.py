@@ -7,7 +7,6 @@ length are explored with each world once.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -78,8 +77,7 @@ class World:
         for train in trains.values():
             train.on_board._sent = train.on_board._sent.copy()
         centre = copy(self.centre)
-        centre.records, centre.refusals = dict(centre.records), Counter()
-        centre._clocks = dict(centre._clocks)
+        centre.records, centre._clocks = dict(centre.records), dict(centre._clocks)
         moved: list[tuple[PointName, int]] = []
         centre.command, centre.heard, centre.sent = lambda *command: moved.append(command), set(), {}
         return World(trains=trains, centre=centre, now_s=self.now_s, moved=moved)

@@ -152,22 +152,6 @@ class Rejection(Enum):
     TOO_OLD = "place too old when it was sent, or the train's clock was stepped"
 
 
-def rejection(record: TrainRecord, message: TrainMessage, *, limits: CentreLimits) -> Rejection | None:
-    """Return why a report does not count, None where it does."""
-    if message.train != record.train:
-        return Rejection.OTHER_TRAIN
-    if message.sequence <= record.sequence:
-        return Rejection.REPEATED
-    far = record.sequence >= 0 and message.sequence > record.sequence + limits.jump
-    if far and not 0 <= record.ahead < message.sequence <= record.ahead + limits.jump:
-        return Rejection.FAR_AHEAD
-    if message.status not in (MessageStatus.POSITION, MessageStatus.COASTING) or message.facing == 0:
-        return Rejection.NO_PLACE
-    if not 0 <= message.sent_ns - message.time_ns <= limits.age_s * 1e9:
-        return Rejection.TOO_OLD
-    return None
-
-
 def report_received(
     record: TrainRecord, message: TrainMessage, now_s: float, *, limits: CentreLimits
 ) -> tuple[TrainRecord, Rejection | None]:
@@ -176,28 +160,26 @@ def report_received(
     The instant of the measurement follows from the age that the train gives (both times by its own clock), so that
     clocks of train and centre need not agree; the delay of the link, which is unknown, is neglected.
     """
-    reason = rejection(record, message, limits=limits)
-    if reason in (Rejection.OTHER_TRAIN, Rejection.REPEATED):
-        return record, reason
-    if reason is Rejection.FAR_AHEAD:
-        return replace(record, ahead=message.sequence), reason
-    record = replace(record, ahead=-1)
-    if reason is not None:
-        return replace(record, sequence=message.sequence), reason
+    if message.train != record.train:
+        return record, Rejection.OTHER_TRAIN
+    if message.sequence <= record.sequence:
+        return record, Rejection.REPEATED
+    far = record.sequence >= 0 and message.sequence > record.sequence + limits.jump
+    if far and not 0 <= record.ahead < message.sequence <= record.ahead + limits.jump:
+        return replace(record, ahead=message.sequence), Rejection.FAR_AHEAD
+    record, age_ns = replace(record, sequence=message.sequence, ahead=-1), message.sent_ns - message.time_ns
+    if message.status not in (MessageStatus.POSITION, MessageStatus.COASTING) or message.facing == 0:
+        return record, Rejection.NO_PLACE
+    if not 0 <= age_ns <= limits.age_s * 1e9:
+        return record, Rejection.TOO_OLD
     assert message.chainage_cm is not None
-    place = message.chainage_cm / 100.0
-    simulated = record.state in (TrainState.SIMULATED, TrainState.ERROR) and record.shown_m is not None
-    jump = message.facing * (place - record.shown_m) if simulated and record.shown_m is not None else record.jump_m
+    place, jump = message.chainage_cm / 100.0, record.jump_m
+    if record.state in (TrainState.SIMULATED, TrainState.ERROR) and record.shown_m is not None:
+        jump = message.facing * (place - record.shown_m)
     after = replace(
-        record,
-        state=TrainState.TRACKED,
-        sequence=message.sequence,
-        message=message,
-        heard_s=now_s,
-        measured_s=now_s - (message.sent_ns - message.time_ns) / 1e9,
-        shown_m=place,
-        jump_m=jump,
-    )
+        record, state=TrainState.TRACKED, message=message, heard_s=now_s, measured_s=now_s - age_ns / 1e9,
+        shown_m=place, jump_m=jump,
+    )  # fmt: skip
     return after, None
 
 
@@ -239,11 +221,3 @@ def time_passed(
         place = authority_m if facing * (authority_m - last) > 0.0 else last
     error = at_end or silent > limits.error_s
     return replace(record, state=TrainState.ERROR if error else TrainState.SIMULATED, shown_m=place)
-
-
-def after_restart(record: TrainRecord) -> TrainRecord:
-    """Return a stored record after a restart of the centre: unknown until the train is heard; its last place is kept.
-
-    The clock of the process before says nothing about the time that has passed.
-    """
-    return replace(record, state=TrainState.UNKNOWN, heard_s=0.0, measured_s=0.0, departure_s=None)

@@ -6,12 +6,13 @@ what its trains know.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from railfix.ground.centre import CentreLimits, ReferenceCurve, TrainRecord, TrainState, time_passed
+from railfix.ground.centre import ReferenceCurve, TrainRecord, TrainState, time_passed
 from railfix.ground.interlocking import HEAD, Interlocking, from_documents, stopped_trains, to_documents
 from railfix.ground.layout import PointName
 from railfix.ground.stops import close_section, open_section, release_train, stop_trains
@@ -24,6 +25,8 @@ from railfix.io.train_message import MessageError, SuspectedInterference, TrainM
 
 #: Time between attempts to write to a database that fails [s].
 RETRY_S = 1.0
+#: The release of a silent train is ordered a second time so long after the first, at least and at most [s].
+AGAIN_S = 3.0, 60.0
 #: Name of the stored document.
 _CAUSE = "cause of the stop"
 
@@ -82,6 +85,7 @@ class ControlCentre:
     #: What the newest report of each train suspects.
     interference: dict[int, SuspectedInterference] = field(default_factory=dict)
 
+    _asked_s: dict[int, float] = field(default_factory=dict)
     _failed_s: float = 0.0
     _routes: dict[int, int] = field(init=False)
     _verdict: tuple[TriangleVerdict, int] | None = None
@@ -134,8 +138,7 @@ class ControlCentre:
         if message.train != number:
             self.rejected["of another train"] += 1
             return
-        known = self.supervision.state.trains.get(number)
-        stop = None if known is None else known.stop
+        trains = self.supervision.state.trains
         before = self.supervision.records.get(number, TrainRecord(train=number))
         if message.sequence > before.sequence:
             self._hear_interference(message)
@@ -143,15 +146,15 @@ class ControlCentre:
         if reason is not None:
             self.rejected[reason.value] += 1
             return
-        after_stop = self.supervision.state.trains[number].stop
-        if after_stop is not None and after_stop != stop:
+        was, known = trains[number], self.supervision.state.trains[number]
+        if known.stop is not None and known.stop != was.stop:
             self.rejected["contradicts what is known of the train"] += 1
-            self.log(f"train {number}: stopped, {after_stop}", train=number)
-        if self.supervision.state.trains[number].direction != message.facing and after_stop is None:
+            self.log(f"train {number}: stopped, {known.stop}", train=number)
+        if known.direction != message.facing and known.stop is None:
             self.rejected["change of ends outside its station, or of an incomplete train"] += 1
-        if known is not None and known.asked_m is not None and self.supervision.state.trains[number].asked_m is None:
-            agreed = self.supervision.state.trains[number].held
-            self.log(f"train {number}: {'has given its route back' if agreed else 'keeps its route'}", train=number)
+        if was.asked_m is not None and known.asked_m is None:
+            what = "has given its route back" if known.held else "keeps its route"
+            self.log(f"train {number}: {what}", train=number)
         if (order := self.stops.get(number)) is not None and order.reported(message, self.clock()):
             self.log(f"train {number}: order to stop {order}", train=number)
         self.reports += 1
@@ -193,7 +196,7 @@ class ControlCentre:
             return
         self._monitor(now)
         authorities = self.supervision.advance(now)
-        state = self.supervision.state
+        state, limits = self.supervision.state, self.supervision.centre
         for number, train in state.trains.items():
             before, self._routes[number] = self._routes[number], train.station
             if train.direction * (train.station - before) > 0:
@@ -202,7 +205,7 @@ class ControlCentre:
         for number, record in self.supervision.records.items():
             rests = number in self.stops and state.trains[number].standstill  # it is not shown as running on
             curves = {} if rests else self.curves
-            after = time_passed(record, now, curves=curves, authority_m=state.trains[number].end_m, limits=self.limits)
+            after = time_passed(record, now, curves=curves, authority_m=state.trains[number].end_m, limits=limits)
             if after.state is not record.state:
                 self.log(f"train {number}: {after.state.value}", train=number)
             self.supervision.records[number] = after
@@ -232,11 +235,6 @@ class ControlCentre:
         self.database, self._saved = None, state
         self._saved_sequences.update((record.train, record.sequence) for record in changed)
         return True
-
-    @property
-    def limits(self) -> CentreLimits:
-        """Times of the centre."""
-        return self.supervision.centre
 
     def release(self) -> str | None:
         """Release a stop by hand; return the reason of a refusal."""
@@ -277,21 +275,31 @@ class ControlCentre:
         return None
 
     def release_train(self, train: int) -> str | None:
-        """Release the stop of a train by hand; return the reason of a refusal."""
-        self.supervision.state, reason = release_train(self.supervision.state, train, self.supervision.layout)
-        self.log(f"train {train}: release asked for by hand{'' if reason is None else f', refused: {reason}'}")
-        return reason
+        """Release the stop of a train by hand; return the reason of a refusal.
+
+        Nothing says of a silent train that it still is where it was: its release is ordered twice (`AGAIN_S`).
+        """
+        now, (least_s, most_s), asked_s = self.clock(), AGAIN_S, self._asked_s.pop(train, -math.inf)
+        silent = self.supervision.records.get(train, TrainRecord(train=train)).state is not TrainState.TRACKED
+        state, reason = release_train(self.supervision.state, train, self.supervision.layout)
+        if reason is None and silent and not least_s <= now - asked_s <= most_s:
+            self._asked_s[train] = now
+            reason = f"train {train} is silent: order it again in {least_s:g} to {most_s:g} s if it stands, whole"
+        else:
+            self.supervision.state = state
+        return self._by_hand(train, "release asked for by hand", reason)
 
     def set_route(self, train: int) -> str | None:
         """Set a train's route to the next station by hand; return the reason of a refusal."""
-        reason = self.supervision.set_route(train)
-        self.log(f"train {train}: route asked for by hand{'' if reason is None else f', refused: {reason}'}")
-        return reason
+        return self._by_hand(train, "route asked for by hand", self.supervision.set_route(train))
 
     def ask_route_back(self, train: int) -> str | None:
         """Ask a train by hand to give its route to the next station back; return the reason of a refusal."""
-        reason = self.supervision.ask_route_back(train)
-        self.log(f"train {train}: asked for its route back{'' if reason is None else f', refused: {reason}'}")
+        return self._by_hand(train, "asked for its route back", self.supervision.ask_route_back(train))
+
+    def _by_hand(self, train: int, order: str, reason: str | None) -> str | None:
+        """Log an order and the reason of its refusal, which is returned."""
+        self.log(f"train {train}: {order}{'' if reason is None else f', refused: {reason}'}", train=train)
         return reason
 
     def _monitor(self, now: float) -> None:

@@ -11,7 +11,7 @@ import zlib
 from collections import Counter
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 from pydantic import Field
 
@@ -67,8 +67,7 @@ class Frame:
         return data + _CHECK.pack(zlib.crc32(data))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Echo:
+class Echo(NamedTuple):
     """Answer to a frame: its number, when it was sent (sender's clock), received and answered (answerer's clock)."""
 
     sequence: int
@@ -78,15 +77,12 @@ class Echo:
 
     def encode(self) -> bytes:
         """Return the payload of an echo frame."""
-        return _ECHO.pack(self.sequence, self.sent_ns, self.received_ns, self.answered_ns)
+        return _ECHO.pack(*self)
 
     @classmethod
     def decode(cls, payload: bytes) -> Echo | None:
         """Return the echo, None where the payload is none."""
-        if len(payload) != _ECHO.size:
-            return None
-        names = ("sequence", "sent_ns", "received_ns", "answered_ns")
-        return cls(**dict(zip(names, _ECHO.unpack(payload), strict=True)))
+        return cls(*_ECHO.unpack(payload)) if len(payload) == _ECHO.size else None
 
     def round_trip_s(self, now_ns: int) -> float:
         """Return the round-trip time at the sender: t4 - t1 - (t3 - t2) [s]."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, Final, Literal, Self
@@ -65,20 +65,12 @@ class Layout(Settings):
         return self
 
     @cached_property
-    def _begins_m(self) -> list[float]:
-        return [station.begin_m for station in self.stations]
-
-    @cached_property
-    def _ends_m(self) -> list[float]:
-        return [station.end_m for station in self.stations]
-
-    @cached_property
     def _borders_m(self) -> list[float]:
         return [border for station in self.stations for border in (station.begin_m, station.end_m)]
 
     def stations_between(self, low_m: float, high_m: float) -> range:
         """Return the numbers of the stations that share some chainage with an interval."""
-        return range(bisect_right(self._ends_m, low_m), bisect_left(self._begins_m, high_m))
+        return range(bisect_right(self._borders_m, low_m) // 2, (bisect_left(self._borders_m, high_m) + 1) // 2)
 
     def points_between(self, low_m: float, high_m: float) -> Iterator[PointName]:
         """Return the points of the stations that share some chainage with an interval."""
@@ -110,8 +102,7 @@ class Layout(Settings):
 
     def points(self) -> Iterator[PointName]:
         """All points; the outer ones of the first and the last station do not exist."""
-        last = len(self.stations) - 1
-        return ((k, side) for k in range(last + 1) for side in (-1, 1) if (k, side) not in ((0, -1), (last, 1)))
+        return self.points_between(-math.inf, math.inf)
 
     def pieces(self, from_m: float, to_m: float, tracks: Mapping[int, int]) -> list[Piece]:
         """Return the pieces of an interval, given the track in each station (1 where none is given)."""
@@ -162,22 +153,14 @@ LENGTHS_M: Final = 20.0
 _STEP_M: Final = 2.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class NetworkLayout:
-    """Layout, and the tracks of the network that it stands for."""
-
-    layout: Layout  #: Chainage from the line's first end along the single line and track 1 of each station.
-    #: Names of the tracks of the line in order: one of the single line, track 1 and track 2 of a station.
-    tracks: tuple[tuple[str, ...], ...]
-
-
-def layout_of(network: Network, *, drive: Literal["left", "right"] = "left") -> NetworkLayout:
+def layout_of(network: Network, *, drive: Literal["left", "right"] = "left") -> Layout:
     """Return the layout of a network that is one single line with passing loops.
 
-    A station is a pair of tracks between the same two switches; single line lies between stations and beyond the outer
-    ones. Points reach from the switch to where the two tracks are `CLEAR_M` apart. Trains of rising chainage pass a
-    station on the side on which they drive: their track is track 1. MismatchError: when the network is something else:
-    several lines, branches, stations of three tracks, loops of unequal length.
+    Its chainage begins at one end and runs along the single line and track 1 of each station. A station is a pair of
+    tracks between the same two switches; single line lies between stations and beyond the outer ones. Points reach
+    from the switch to where the two tracks are `CLEAR_M` apart. Trains of rising chainage pass a station on the side on
+    which they drive: their track is track 1. MismatchError: when the network is something else: several lines,
+    branches, stations of three tracks, loops of unequal length.
     """
     ends = _nodes(network)
     at: dict[int, list[int]] = defaultdict(list)
@@ -189,7 +172,6 @@ def layout_of(network: Network, *, drive: Literal["left", "right"] = "left") -> 
         raise MismatchError(f"the network has {len(outer)} open ends; a single line with passing loops has two")
     node, done, here = outer[0], set[int](), 0.0
     stations: list[LoopStation] = []
-    order: list[tuple[str, ...]] = []
     while ahead := [track for track in at[node] if track not in done]:
         done.update(ahead)
         fars = {ends[track][1] if ends[track][0] == node else ends[track][0] for track in ahead}
@@ -206,13 +188,12 @@ def layout_of(network: Network, *, drive: Literal["left", "right"] = "left") -> 
                 ahead, names, lines = ahead[::-1], names[::-1], lines[::-1]
             stations.append(_station(names, [float(network.length_m[track]) for track in ahead], lines, here))
         here += float(network.length_m[ahead[0]])
-        order.append(names)
         node = far
     if len(done) < len(ends):
         raise MismatchError(f"{len(ends) - len(done)} tracks are not part of the line that begins at an open end")
     if len(stations) < 2:
         raise MismatchError(f"the line has {len(stations)} passing loops; the interlocking needs two stations or more")
-    return NetworkLayout(layout=Layout(stations=tuple(stations)), tracks=tuple(order))
+    return Layout(stations=tuple(stations))
 
 
 def _station(names: tuple[str, ...], lengths_m: list[float], lines: list[Floats], begin_m: float) -> LoopStation:

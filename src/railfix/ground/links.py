@@ -408,10 +408,7 @@ class CentreLinks:
         return frame.encode()
 
     def _echo(self, train: int, answered: Frame, received_ns: int) -> bytes:
-        echo = Echo(
-            sequence=answered.sequence, sent_ns=answered.time_ns, received_ns=received_ns,
-            answered_ns=time.monotonic_ns(),
-        )  # fmt: skip
+        echo = Echo(answered.sequence, answered.time_ns, received_ns, answered_ns=time.monotonic_ns())
         return self._encode(train, FrameKind.ECHO, echo.encode())
 
     def _frame(self, name: LinkName, protocol: LinkProtocol, data: bytes) -> None:

@@ -1,9 +1,8 @@
 """QUIC connections with datagrams, and the keys and certificates of both ends.
 
 aioquic asks a client for its certificate, and lets acknowledgements wait, only by attributes that it names as its own
-(`_request_client_certificate`, `_peer_certificate`, `_ack_delay`, `_spaces`,
-`_loss`, `_datagrams_pending`); they are used in this module
-alone.
+(`_request_client_certificate`, `_peer_certificate`, `_ack_delay`, `_spaces`, `_loss`, `_datagrams_pending`); they are
+used in this module alone.
 """
 
 from __future__ import annotations
@@ -25,6 +24,8 @@ from aioquic.quic.connection import QuicConnection
 from aioquic.quic.events import ConnectionTerminated, DatagramFrameReceived, HandshakeCompleted, QuicEvent
 from aioquic.tls import Alert, Epoch, verify_certificate
 from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from railfix.core.errors import InputFileError, OutputError
 
@@ -255,10 +256,6 @@ def write_keys(folder: Path, trains: list[int], *, valid_days: int = VALID_DAYS)
     The key of the authority is not kept: for another train write a new set. Keys can be read by their owner alone.
     OutputError: when a file is there already, or cannot be written.
     """
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
-
     now = datetime.now(UTC)
 
     def certificate(name: str, public: ec.EllipticCurvePublicKey, *, authority: str) -> x509.Certificate:

@@ -142,7 +142,7 @@ class CentreFile(Settings):
         """
         if not self.network:
             return self
-        stations = layout_of(read_network([folder / name for name in self.network]), drive=self.drive).layout.stations
+        stations = layout_of(read_network([folder / name for name in self.network]), drive=self.drive).stations
         try:
             return self.replaced(stations=stations, network=())
         except SettingsError as error:
@@ -157,15 +157,7 @@ class CentreFile(Settings):
         """Return the intervals of the trains at the first start."""
         names = [station.name for station in self.stations]
         return [
-            standing_train(
-                train.number,
-                direction=train.direction,
-                front_m=train.front_m,
-                length_m=train.length_m,
-                bound_m=train.bound_m,
-                station=names.index(train.station),
-                track=train.track,
-            )
+            standing_train(**train.model_dump(exclude={"station"}), station=names.index(train.station))
             for train in self.trains
         ]
 
@@ -220,15 +212,10 @@ async def run_centre(
     check_keys(keys, "centre")
     database = settings.database if "://" in settings.database else f"sqlite:///{path.parent / settings.database}"
     gc.set_threshold(*COLLECTION)
-    end, terminated = asyncio.Event(), asyncio.Event()
     loop = asyncio.get_running_loop()
-
-    def terminate() -> None:
-        terminated.set()
-        end.set()
-
-    loop.add_signal_handler(signal.SIGINT, end.set)
-    loop.add_signal_handler(signal.SIGTERM, terminate)
+    ended: asyncio.Future[signal.Signals] = loop.create_future()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, lambda given: ended.done() or ended.set_result(given), number)
     with Store(database) as store:
         field_points = SimulatedPoints(move_s=settings.points_s, clock=time.monotonic)
         store.take_charge()
@@ -253,12 +240,11 @@ async def run_centre(
         announce(server.url)
         try:
             work = asyncio.create_task(_work(control, field_points))
-            ending = asyncio.create_task(end.wait())
             judging = asyncio.create_task(_judge(control, settings, path))
-            await asyncio.wait([work, ending], timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait([work, ended], timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
             if work.done():
                 work.result()
-            for task in (work, ending, judging):
+            for task in (work, judging):
                 task.cancel()
                 with contextlib.suppress(asyncio.CancelledError):
                     await task
@@ -266,7 +252,7 @@ async def run_centre(
             done = True
             await links.stop()
             await server.stop()
-        return terminated.is_set(), {
+        return ended.done() and ended.result() is signal.SIGTERM, {
             "reports used": control.reports,
             "routes set": control.supervision.routes_set,
             "reports rejected": dict(control.rejected),
@@ -317,15 +303,17 @@ def _heard(control: ControlCentre, links: CentreLinks) -> list[dict[str, Any]]:
 
 
 async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
-    """Work every `STEP_S`."""
+    """Work every `STEP_S`, at most half of the time: the links take in one frame a turn of the event loop."""
     loop = asyncio.get_running_loop()
     due = loop.time()
     while True:
+        begin = loop.time()
         for point, track in points.detected():
             control.supervision.detected(point, track)
         control.step()
-        due = max(due + STEP_S, loop.time())
-        await asyncio.sleep(due - loop.time())
+        now = loop.time()
+        due = max(due + STEP_S, 2.0 * now - begin)
+        await asyncio.sleep(due - now)
 
 
 async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> None:

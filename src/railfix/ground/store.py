@@ -9,14 +9,13 @@ import fcntl
 import uuid
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any, Final, Self
 
 import sqlalchemy as sql
 from sqlalchemy import event
 
 from railfix.core.errors import InputFileError, OutputError
-from railfix.ground.centre import TrainRecord, after_restart
+from railfix.ground.centre import TrainRecord
 from railfix.io.train_message import decode, encode
 
 _META: Final = sql.MetaData()
@@ -99,9 +98,7 @@ class Store:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -154,17 +151,15 @@ class Store:
         self._notes.append({"time_ns": time_ns, "train": train, "text": text})
 
     def records(self) -> dict[int, TrainRecord]:
-        """Return the records of all trains as after a restart."""
+        """Return the records of all trains: unknown until they are heard, with their last places."""
         with self._connection.begin():
             rows = self._connection.execute(sql.select(TRAINS)).all()
         return {
-            row.train: after_restart(
-                TrainRecord(
-                    train=row.train,
-                    sequence=row.sequence,
-                    message=(message := None if row.message is None else decode(bytes(row.message))),
-                    shown_m=None if message is None or message.chainage_cm is None else message.chainage_cm / 100.0,
-                )
+            row.train: TrainRecord(
+                train=row.train,
+                sequence=row.sequence,
+                message=(message := None if row.message is None else decode(bytes(row.message))),
+                shown_m=None if message is None or message.chainage_cm is None else message.chainage_cm / 100.0,
             )
             for row in rows
         }

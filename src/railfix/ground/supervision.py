@@ -11,10 +11,9 @@ that contradicts what is known of its train stops that train and its neighbours.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 from railfix.ground.centre import CentreLimits, Rejection, TrainRecord
 from railfix.ground.centre import report_received as record_received
@@ -37,10 +36,6 @@ from railfix.ground.layout import Layout, PointName
 from railfix.ground.stops import answer_received, ask_route_back, overlaps_stopped
 from railfix.ground.train import Authority
 from railfix.io.train_message import MessageStatus, TrainMessage
-
-if TYPE_CHECKING:
-    from railfix.ground.interlocking import InterlockingLimits, TrainInterval
-
 
 #: Difference of a reported length from the configured one that is rounding [m].
 LENGTH_ROUNDING_M: Final = 0.02
@@ -239,7 +234,6 @@ class Supervision:
     limits: InterlockingLimits = field(default_factory=InterlockingLimits)
     centre: CentreLimits = field(default_factory=CentreLimits)
     records: dict[int, TrainRecord] = field(default_factory=dict)
-    refusals: Counter[str] = field(default_factory=Counter)  #: Routes refused, by reason.
     routes_set: int = 0
     heard: set[int] = field(default_factory=set)  #: Trains that have reported since the last authorities.
     #: When a train was sent its last authority [s], and whether it was an order to stop.
@@ -284,7 +278,6 @@ class Supervision:
             return f"there is no train {train}"
         self.state, moved, reason = route_requested(self.state, train, self.layout, **step)
         if reason is not None:
-            self.refusals[reason] += 1
             return reason
         self.routes_set += 1
         for point in moved:
@@ -349,12 +342,12 @@ class Supervision:
 
 
 def standing_train(
-    train: int, *, direction: int, front_m: float, length_m: float, bound_m: float, station: int, track: int
+    number: int, *, direction: int, front_m: float, length_m: float, bound_m: float, station: int, track: int
 ) -> TrainInterval:
     """Return the interval of a train at rest in a station, whose front is known within a bound."""
     ahead = front_m + direction * bound_m
     return TrainInterval(
-        train=train,
+        train=number,
         direction=direction,
         rear_m=front_m - direction * (length_m + bound_m),
         front_m=ahead,

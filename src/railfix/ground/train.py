@@ -178,15 +178,11 @@ class OnBoard:
         """Age of the newest authority at most [s]; infinite before the first."""
         return float("inf") if self.answered_s is None else now_s - self.answered_s
 
-    def fresh(self, now_s: float) -> bool:
-        """Whether the newest authority is within its time limit."""
-        return self.age_s(now_s) <= self.limits.fresh_s
-
     def brake_reason(self, now_s: float) -> str | None:
         """Return why the train brakes to a stop, None where it may run up to the end of its authority."""
         if self.stopped:
             return "ordered to stop"
-        return None if self.fresh(now_s) else "no fresh authority"
+        return None if self.age_s(now_s) <= self.limits.fresh_s else "no fresh authority"
 
     def turned(self, direction: int, front_m: float) -> None:
         """Begin in the other direction, without an authority."""

@@ -240,7 +240,6 @@ class MonitorState:
     since_s: float = 0.0  #: When the stop was given.
     complete_s: float = 0.0  #: Time of the last set of three fixes.
     healthy_since_s: float | None = None  #: Start of the present healthy time.
-    warning: int = -1  #: Receiver that drifts inside its circle, -1 where none does.
 
 
 def advance(
@@ -273,7 +272,7 @@ def advance(
             return state, ()
         return _stop(state, now_s, verdict or TriangleVerdict.MONITOR_LOST, -1)
     assert verdict is not None
-    state = replace(state, complete_s=now_s, warning=receiver if verdict is TriangleVerdict.RECEIVER_DRIFTING else -1)
+    state = replace(state, complete_s=now_s)
     if verdict in STOPPING:
         return _stop(replace(state, healthy_since_s=None), now_s, verdict, receiver)
     if verdict is not TriangleVerdict.HEALTHY:

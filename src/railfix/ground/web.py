@@ -124,12 +124,8 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
         return StreamingResponse(stream(), media_type="text/event-stream", headers=_HEADERS)
 
     async def login(request: Request) -> Response:
-        values = await _values(request)
-        token = (
-            None
-            if values is None
-            else sessions.log_in(str(values.get("password", "")), "" if request.client is None else request.client.host)
-        )
+        values, address = await _values(request), "" if request.client is None else request.client.host
+        token = None if values is None else sessions.log_in(str(values.get("password", "")), address)
         if token is None:
             return _answer({"refused": "wrong password, or too many wrong ones within a minute"}, 403)
         answer = _answer({"refused": None})
