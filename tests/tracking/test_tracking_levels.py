@@ -144,11 +144,11 @@ def test_the_bound_of_an_epoch_between_by_hand() -> None:
     np.testing.assert_allclose(levels.amount_m, [7.0 + 0.02 * 2.0, 7.0 + 0.02 * 3.0, np.nan], rtol=0, atol=1e-9)
     np.testing.assert_array_equal(levels.level_noise_m, [3.0, 3.0, np.nan])
     assert after.time == state.time
-    # in doubt the separation, 2 m, is in the standard deviation; without a level what is beyond three of them
+    # in doubt the separation, 2 m, is in the standard deviation; else what is beyond three of them, with a level four
     branches = TrackStatus.SEVERAL_BRANCHES
     for own, before, after_m in (
         (TrackStatus.TRACKING, 1.5, 1.5),
-        (TrackStatus.TRACKING, 0.1, 0.1),
+        (TrackStatus.TRACKING, 0.1, np.sqrt(0.1**2 + 2.0**2 - 0.4**2)),
         (TrackStatus.DOUBTFUL, 1.5, 2.5),
         (branches, 1.5, 1.5),
         (branches, 0.1, np.sqrt(0.1**2 + 2.0**2 - 0.3**2)),

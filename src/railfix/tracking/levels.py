@@ -168,8 +168,9 @@ def _sensors(sensors: SensorEpochs, taken: Indices, total: Floats, sigma: Floats
     return SensorEpochs(**values, wheel_sign=sensors.wheel_sign, ranges=ranges)
 
 
-#: A sub-filter this many standard deviations off is explained by them where a place has no level.
-_EXPLAINED: Final = 3.0
+#: A sub-filter this many standard deviations off is explained by them, where a place has no level and where it has one:
+#: without the satellite that is faulty it lies further away, at any level.
+_EXPLAINED: Final = (3.0, 4.0)
 _KEPT: Final = (
     "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m", "amount_m",
     "status",
@@ -270,10 +271,10 @@ def carried_levels(
     level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
     amount = np.fmax(level, amount + SCALE_BOUND * np.abs(speed) * tau)
     told = _status(tracked.status, status, level)
-    # In doubt the sub-filter furthest off may be the one that is right; without a level one that the standard deviation
-    # does not explain.
+    # In doubt the sub-filter furthest off may be the one that is right; else one that the standard deviation does not
+    # explain.
     doubt = (told == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
-    explained = np.where(is_bounded(told), np.inf, _EXPLAINED * tracked.sigma_m)
+    explained = np.where(is_bounded(told), _EXPLAINED[1], _EXPLAINED[0]) * tracked.sigma_m
     apart = np.nan_to_num(separation)
     spread = np.where(doubt, apart, np.sqrt(np.maximum(apart**2 - explained**2, 0.0)))
     tracked = changed(
