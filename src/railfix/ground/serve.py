@@ -214,8 +214,13 @@ async def run_centre(
     gc.set_threshold(*COLLECTION)
     loop = asyncio.get_running_loop()
     ended: asyncio.Future[signal.Signals] = loop.create_future()
+
+    def end(given: signal.Signals) -> None:
+        if not ended.done():
+            ended.set_result(given)
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, lambda given: ended.done() or ended.set_result(given), number)
+        loop.add_signal_handler(number, end, number)
     with Store(database) as store:
         field_points = SimulatedPoints(move_s=settings.points_s, clock=time.monotonic)
         store.take_charge()
@@ -241,7 +246,8 @@ async def run_centre(
         try:
             work = asyncio.create_task(_work(control, field_points))
             judging = asyncio.create_task(_judge(control, settings, path))
-            await asyncio.wait([work, ended], timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
+            either: list[asyncio.Future[Any]] = [work, ended]
+            await asyncio.wait(either, timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
             if work.done():
                 work.result()
             for task in (work, judging):

@@ -290,11 +290,11 @@ def notes_of(
         *error_note(check_track(line.track)),
         *navigation.notes,
     ]
-    for name, log in logs.items():
+    for antenna_name, log in logs.items():
         notes += log.problems
         if log.skipped:
             skipped = ", ".join(f"{count} {what}" for what, count in sorted(log.skipped.items()))
-            notes.append(f"{name}: skipped: {skipped}")
+            notes.append(f"{antenna_name}: skipped: {skipped}")
     notes += tally.all_notes
     for name, antenna in tally.antennas.items():
         notes += [

@@ -146,7 +146,8 @@ def compact(model: LinearModel) -> Compact:
     """The residual projector over the channels in use, in their order; (T, n, n) of memory."""
     n = int(np.count_nonzero(model.used, axis=1).max(initial=0))
     channel = np.argsort(~model.used, axis=1, kind="stable")[:, :n]
-    used, root = (np.take_along_axis(values, channel, axis=1) for values in (model.used, model.root_weight))
+    used = np.take_along_axis(model.used, channel, axis=1)
+    root = np.take_along_axis(model.root_weight, channel, axis=1)
     design = np.take_along_axis(model.design, channel[..., None], axis=1)
     of_place, of_clocks = (np.ascontiguousarray(part) for part in (model.covariance_m2, model.clock_covariance_m2))
     clocks = root[..., None] * (model.clock[channel][..., None] == np.arange(of_clocks.shape[1]))
