@@ -16,7 +16,7 @@ import typer.main
 
 from conftest import ROOT
 from railfix.cli import app
-from railfix.cli.command import loaded
+from railfix.cli.command import load_command
 
 DOCS = ROOT / "docs"
 NOTEBOOKS = [*sorted((DOCS / "notebooks").glob("*.md")), DOCS / "gallery.md"]
@@ -82,7 +82,7 @@ def commands() -> Iterator[str]:
     """Yield the commands of the command line, those of groups with the name of the group."""
     program = typer.main.get_command(app)
     for name in program.list_commands(program.make_context("railfix", [], resilient_parsing=True)):
-        inner = getattr(loaded(name, program.modules.get(name)), "commands", None)
+        inner = getattr(load_command(name, program.modules.get(name)), "commands", None)
         yield from (f"{name} {sub}" for sub in inner) if inner else (name,)
 
 

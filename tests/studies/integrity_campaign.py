@@ -23,7 +23,7 @@ import numpy as np
 
 from railfix.core.reasons import Status
 from railfix.core.settings import write_toml
-from railfix.evaluate.range_errors import joined, range_errors
+from railfix.evaluate.range_errors import range_errors
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.stanford import Region, stanford
 from railfix.io.reference_log import AntennaReference
@@ -56,6 +56,12 @@ class Runs:
 
     scenario: str
     rate_hz: float | None = None
+
+
+def joined(parts: list[ErrorSamples]) -> ErrorSamples:
+    """Samples of several parts concatenated."""
+    names = [item.name for item in fields(ErrorSamples)]
+    return ErrorSamples(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 def scenario_of(run: int, runs: Runs) -> Scenario:

@@ -104,7 +104,7 @@ def long_term(second: int, satellites: Sequence[LongTerm], iodp: int = 0) -> Byt
     return message(25, second, *half(satellites[:2], iodp), *half(satellites[2:], iodp))
 
 
-def fast_and_long_term(
+def mixed(
     second: int,
     prc: Sequence[float],
     udrei: Sequence[int],
@@ -244,7 +244,7 @@ class Service:
                 values, grades = self.fast_m(second)[part].tolist(), self.indicators(second)[part]
                 if first > 0 and count - first <= _MIXED:
                     pair = self.orbits(second)[-2:]
-                    return fast_and_long_term(second, values, grades, pair, block=block, iodf=issue)
+                    return mixed(second, values, grades, pair, block=block, iodf=issue)
                 return fast(second, values, grades, kind=2 + block, iodf=issue)
 
             return compose
