@@ -111,7 +111,7 @@ async def drive(
 ) -> tuple[list[float], int, float]:
     """Return times from report to authority [s], the number of reports, and the processor time of a second.
 
-    Trains connect one after the other and report from then on; what is counted begins once all do.
+    A train reports once it is connected, and the next one connects; what is counted begins once all do.
     """
     times: list[float] = []
     reported: dict[tuple[int, int], float] = {}
@@ -123,11 +123,9 @@ async def drive(
         if (sent := reported.pop((number, authority.report), float("-inf"))) > begin:
             times.append(now - sent)
 
-    async def run(number: int) -> None:
+    async def run(number: int, link: TrainLinks) -> None:
         nonlocal counted
-        link = TrainLinks(number, folder / "keys", BEARERS_OF, received=lambda payload: received(number, payload))
         due = time.perf_counter()
-        await link.start()
         while due < begin + seconds:
             now = time.perf_counter()
             trains[number].step(now)
@@ -142,8 +140,11 @@ async def drive(
 
     running = []
     for number in trains:
-        running.append(asyncio.create_task(run(number)))
-        await asyncio.sleep(0.021)
+        link = TrainLinks(number, folder / "keys", BEARERS_OF, received=partial(received, number))
+        await link.start()
+        while len(link.protocols) < len(BEARERS_OF):
+            await asyncio.sleep(0.005)
+        running.append(asyncio.create_task(run(number, link)))
     await asyncio.sleep(10.0)
     begin, spent = time.perf_counter(), processor()
     await asyncio.sleep(seconds)

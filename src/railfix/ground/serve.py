@@ -212,15 +212,15 @@ async def run_centre(
     check_keys(keys, "centre")
     database = settings.database if "://" in settings.database else f"sqlite:///{path.parent / settings.database}"
     gc.set_threshold(*COLLECTION)
+    end, terminated = asyncio.Event(), asyncio.Event()
     loop = asyncio.get_running_loop()
-    ended: asyncio.Future[signal.Signals] = loop.create_future()
 
-    def end(given: signal.Signals) -> None:
-        if not ended.done():
-            ended.set_result(given)
+    def terminate() -> None:
+        terminated.set()
+        end.set()
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, end, number)
+    loop.add_signal_handler(signal.SIGINT, end.set)
+    loop.add_signal_handler(signal.SIGTERM, terminate)
     with Store(database) as store:
         field_points = SimulatedPoints(move_s=settings.points_s, clock=time.monotonic)
         store.take_charge()
@@ -245,12 +245,12 @@ async def run_centre(
         announce(server.url)
         try:
             work = asyncio.create_task(_work(control, field_points))
+            ending = asyncio.create_task(end.wait())
             judging = asyncio.create_task(_judge(control, settings, path))
-            either: list[asyncio.Future[Any]] = [work, ended]
-            await asyncio.wait(either, timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait([work, ending], timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
             if work.done():
                 work.result()
-            for task in (work, judging):
+            for task in (work, ending, judging):
                 task.cancel()
                 with contextlib.suppress(asyncio.CancelledError):
                     await task
@@ -258,7 +258,7 @@ async def run_centre(
             done = True
             await links.stop()
             await server.stop()
-        return ended.done() and ended.result() is signal.SIGTERM, {
+        return terminated.is_set(), {
             "reports used": control.reports,
             "routes set": control.supervision.routes_set,
             "reports rejected": dict(control.rejected),
