@@ -7,7 +7,7 @@ it should be ahead.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
@@ -36,6 +36,11 @@ def with_coordinates(failed_checks: str) -> Masks:
     return read_only(np.array([status in POSITIONED and status not in dropped for status in sorted(Status)]))
 
 
+#: Fields of `AntennaResult` that are computed together.
+_COORDINATES: Final = ("latitude_deg", "longitude_deg", "height_m")
+_NEAREST: Final = ("conventional_arc_m", "conventional_offset_m", "conventional_chainage_m")
+
+
 def antenna_results(
     corrected: CorrectedRanges, antennas: AntennaRows, solution: Solution, chainage_m: Floats, config: Config
 ) -> AntennaResult:
@@ -43,10 +48,6 @@ def antenna_results(
     obs, point, constrained = corrected.observations, solution.point, solution.place.constrained
     has = with_coordinates(config.failed_checks)[solution.status]
     arc, chainage = np.where(has, solution.arc_m, np.nan), np.where(has, chainage_m, np.nan)
-    ecef, kilometrage = antennas.each(lambda index, rows: _places(index.trajectory, arc[rows], chainage[rows]))
-    latitude, longitude, height = geodetic_from_ecef(ecef)
-    nearest, offset, beside = antennas.each(lambda index, rows: _nearest(index.trajectory, point.ecef_m[rows]))
-    reason = reason_of_all_channels(corrected)
     protection = solution.protection
 
     def on_all_channels(values: Floats) -> Floats:
@@ -54,36 +55,41 @@ def antenna_results(
         full[:, corrected.columns] = values
         return full
 
-    return AntennaResult(
+    def later(name: str) -> Mapping[str, Any]:
+        if name in _COORDINATES:
+            return dict(zip(_COORDINATES, geodetic_from_ecef(result.ecef_m), strict=True))
+        if name in _NEAREST:
+            found = antennas.each(lambda index, rows: _nearest(index.trajectory, point.ecef_m[rows]))
+            return dict(zip(_NEAREST, found, strict=True))
+        return {name: alone[name]()}
+
+    alone: dict[str, Callable[[], Any]] = {
+        "ecef_m": lambda: antennas.at_arc(arc),
+        "kilometrage_m": lambda: antennas.each(lambda index, rows: _kilometrage(index.trajectory, chainage[rows])),
+        "reason": lambda: reason_of_all_channels(corrected),
+        "n_rejected": lambda: satellites_rejected(corrected.channels.member, result.reason),
+        "n_used": lambda: np.count_nonzero(corrected.reason == 0, axis=1),
+        "elevation_deg": lambda: on_all_channels(corrected.elevation_deg),
+        "azimuth_deg": lambda: on_all_channels(corrected.azimuth_deg),
+        "sigma_m": lambda: on_all_channels(corrected.sigma_m),
+        "bound_sigma_m": lambda: on_all_channels(corrected.bound_sigma_m),
+        "corrected_code_m": lambda: on_all_channels(corrected.corrected_code_m),
+        "residual_m": lambda: on_all_channels(np.where(corrected.reason == 0, constrained.residual_m, np.nan)),
+    }
+    result = AntennaResult.made(
+        later,
         time=obs.time,
         satellite=obs.satellite,
         signal=obs.signal,
         status=solution.status,
         chainage_m=chainage,
-        kilometrage_m=kilometrage,
         arc_m=arc,
         along_sigma_m=np.where(has, solution.along_sigma_m, np.nan),
         own_sigma_m=solution.own_sigma_m,
         noise_scale=solution.noise_scale,
-        ecef_m=ecef,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        height_m=height,
-        n_used=np.count_nonzero(corrected.reason == 0, axis=1),
-        n_rejected=satellites_rejected(corrected.channels.member, reason),
         conventional_status=solution.point_status,
         conventional_ecef_m=point.ecef_m,
-        conventional_arc_m=nearest,
-        conventional_chainage_m=beside,
-        conventional_offset_m=offset,
-        reason=reason,
-        elevation_deg=on_all_channels(corrected.elevation_deg),
-        azimuth_deg=on_all_channels(corrected.azimuth_deg),
         cn0_dbhz=obs.cn0_dbhz,
-        sigma_m=on_all_channels(corrected.sigma_m),
-        bound_sigma_m=on_all_channels(corrected.bound_sigma_m),
-        corrected_code_m=on_all_channels(corrected.corrected_code_m),
-        residual_m=on_all_channels(np.where(corrected.reason == 0, constrained.residual_m, np.nan)),
         satellites=corrected.satellites,
         columns=corrected.columns,
         second=corrected.second,
@@ -102,11 +108,12 @@ def antenna_results(
         clock_offset_m=solution.ties.offset_m,
         clock_offset_sigma_m=solution.ties.sigma_m,
     )
+    return result
 
 
-def _places(line: Trajectory, arc_m: Floats, chainage_m: Floats) -> tuple[Floats, Floats]:
-    """Return points (T, 3) and kilometrage (T,) of a line at arc lengths and their chainages [m]."""
-    return line.at_arc(arc_m), interpolate_kilometrage(chainage_m, line.chainage_m, line.kilometrage_m)
+def _kilometrage(line: Trajectory, chainage_m: Floats) -> Floats:
+    """Return the kilometrage of a line at chainages, shape (T,) [m]."""
+    return interpolate_kilometrage(chainage_m, line.chainage_m, line.kilometrage_m)
 
 
 def _nearest(line: Trajectory, ecef_m: Floats) -> tuple[Floats, Floats, Floats]:

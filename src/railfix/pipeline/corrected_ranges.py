@@ -17,7 +17,7 @@ from railfix.integrity.protection.araim import IntegritySupport
 from railfix.pipeline.channels import Channels, second_codes
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received
-from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.antenna_rows import AntennaRows, OnDemand
 from railfix.positioning.carrier import Slips
 from railfix.positioning.normal_equations import Ranges, SinglePointLimits, single_point
 from railfix.positioning.section_search import SearchIndex, search
@@ -59,7 +59,7 @@ class Models(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrectedRanges(AntennaRanges):
+class CorrectedRanges(AntennaRanges, OnDemand):
     """Corrected pseudoranges before positioning: T epochs by the K channels that the settings allow."""
 
     observations: Observations

@@ -59,8 +59,9 @@ class SolvedChunk:
     """Single epochs of a chunk, and what the filter along the track takes from them."""
 
     results: Mapping[str, AntennaResult]
-    ranges: Mapping[str, CorrectedRanges]  #: After all screens and exclusions, by antenna.
-    off_map: Mapping[str, Masks]  #: The train is away from the line, shape (T,).
+    ranges: CorrectedRanges  #: After all screens and exclusions, epochs of all antennas.
+    off_map: Masks  #: The train is away from the line, shape (T,).
+    rows: Mapping[str, slice]  #: Epochs of each antenna among these.
     pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.
     sensors: SensorSamples | None  #: Of the sensors on board since the chunk before.
     notes: tuple[str, ...]
@@ -272,8 +273,9 @@ class EpochProcessor:
         solution = with_araim(corrected, solution, antennas, self._support, self.config)
         solved = SolvedChunk(
             results=self._results(antennas, corrected, solution, pair, ranges),
-            ranges={name: rows_of(corrected, rows) for name, rows in zip(names, parts, strict=True)},
-            off_map={name: solution.off_map[rows] for name, rows in zip(names, parts, strict=True)},
+            ranges=corrected,
+            off_map=solution.off_map,
+            rows=dict(zip(names, parts, strict=True)),
             pair=pair,
             sensors=sensors,
             notes=(
@@ -364,9 +366,10 @@ class EpochProcessor:
         """Return the places of the filter along the track by antenna, and its states; two antennas in two threads."""
 
         def one_antenna(name: str) -> tuple[AlongTrack, FilterState]:
+            rows = solved.rows[name]
             return along_track(
-                solved.ranges[name],
-                single_epochs(solved.results[name], solved.off_map[name], self.config.map_offset),
+                rows_of(solved.ranges, rows),
+                single_epochs(solved.results[name], solved.off_map[rows], self.config.map_offset),
                 self.trajectories[name],
                 self.config,
                 state.fusion.get(name) or self._before_filter,

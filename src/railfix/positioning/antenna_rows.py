@@ -6,11 +6,11 @@ each antenna, and what they return is joined.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from itertools import accumulate, pairwise
-from typing import Any, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import numpy as np
 
@@ -23,6 +23,27 @@ State = TypeVar("State")
 #: Members that are the same for all rows: of the channels alone.
 _OF_CHANNELS: Final = frozenset({"satellite", "signal", "frequency_hz", "channels", "columns", "header"})
 EVERY: Final = slice(None)  #: All rows.
+
+
+class OnDemand:
+    """Base of dataclasses with fields that are computed when they are first asked for: most are not, epoch by epoch."""
+
+    @classmethod
+    def made(cls: type[Value], later: Callable[[str], Mapping[str, Any]], **members: Any) -> Value:
+        """Return an instance with some fields; `later` returns another by its name, and those made with it."""
+        return cast(Value, _make(cls, {**members, "_later": later}))
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            if name not in _members(type(self)) or "_later" not in vars(self):
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            vars(self).update(vars(self)["_later"](name))
+            return vars(self)[name]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all fields, for another process."""
+        return {name: getattr(self, name) for name in _members(type(self))}
 
 
 @dataclass(frozen=True)
@@ -120,8 +141,10 @@ def _join(values: Sequence[Any]) -> Any:
         return np.concatenate(values)
     if not (has_rows := _members(first.__class__)):
         return first
-    own = [vars(value) for value in values]
-    return _make(type(first), {n: _join([o[n] for o in own]) if rows else own[0][n] for n, rows in has_rows.items()})
+    return _make(
+        type(first),
+        {n: _join([getattr(v, n) for v in values]) if rows else getattr(first, n) for n, rows in has_rows.items()},
+    )
 
 
 def rows_of(value: Value, rows: slice | Indices) -> Value:
@@ -135,6 +158,15 @@ def _rows_of(value: Any, rows: slice | Indices) -> Any:
     if not (has_rows := _members(value.__class__)):
         return value
     own, members = vars(value), {}
+    if isinstance(value, OnDemand):
+        for name, item in own.items():
+            if isinstance(item, np.ndarray) and has_rows[name]:
+                members[name] = item[rows]
+            elif hasattr(value.__class__, name):  # a default would hide that a field is to be taken
+                members[name] = _rows_of(item, rows)
+        return value.made(
+            lambda n: {n: _rows_of(getattr(value, n), rows) if has_rows[n] else getattr(value, n)}, **members
+        )
     for name, of_rows in has_rows.items():
         item = own[name]
         if of_rows and item is not None:
