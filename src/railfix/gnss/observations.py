@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, freeze_arrays
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, changed, freeze_arrays
 from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP
 from railfix.core.tables import NotebookTable, plural, time_span_text
 from railfix.core.timescale import gps_time
@@ -166,7 +166,8 @@ class Observations(NotebookTable):
         epochs = slice(start, stop, rows.step)
         channels = slice(None) if names is None else self._channels_of([names] if isinstance(names, str) else names)
         arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
-        return Observations(
+        part = changed(
+            self,
             time=self.time[epochs],
             satellite=self.satellite[channels],
             signal=self.signal[channels],
@@ -174,8 +175,13 @@ class Observations(NotebookTable):
             break_before=self.break_before[epochs],
             receiver_alarm=self.receiver_alarm[epochs],
             front_end_gain=self.front_end_gain[epochs],
-            header=self.header,
+            problems=(),
+            problem_count=0,
+            skipped={},
         )
+        if names is not None:
+            freeze_arrays(part)
+        return part
 
     def _epoch_at(self, bound: str | datetime | np.datetime64) -> int:
         """Return the number of the first epoch at or after a time."""

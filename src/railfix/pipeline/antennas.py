@@ -19,11 +19,12 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Status
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
+from railfix.pipeline.filter_result import COORDINATES
 from railfix.pipeline.level_stage import judged
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.solution import Solution, reason_of_all_channels, satellites_rejected
 from railfix.positioning.antenna_rows import AntennaRows, joined
-from railfix.screens import FilteredMotion, PairedEpochs, PairScreen, PositionScreen, Screened
+from railfix.screens import FilteredMotion, PairedEpochs, Screened
 from railfix.screens.base import on_pairs, pair_epochs
 from railfix.track.track import interpolate_kilometrage
 from railfix.track.trajectory import Trajectory
@@ -37,7 +38,6 @@ def with_coordinates(failed_checks: str) -> Masks:
 
 
 #: Fields of `AntennaResult` that are computed together.
-_COORDINATES: Final = ("latitude_deg", "longitude_deg", "height_m")
 _NEAREST: Final = ("conventional_arc_m", "conventional_offset_m", "conventional_chainage_m")
 
 
@@ -56,8 +56,8 @@ def antenna_results(
         return full
 
     def later(name: str) -> Mapping[str, Any]:
-        if name in _COORDINATES:
-            return dict(zip(_COORDINATES, geodetic_from_ecef(result.ecef_m), strict=True))
+        if name in COORDINATES:
+            return dict(zip(COORDINATES, geodetic_from_ecef(result.ecef_m), strict=True))
         if name in _NEAREST:
             found = antennas.each(lambda index, rows: _nearest(index.trajectory, point.ecef_m[rows]))
             return dict(zip(_NEAREST, found, strict=True))
@@ -68,7 +68,7 @@ def antenna_results(
         "kilometrage_m": lambda: antennas.each(lambda index, rows: _kilometrage(index.trajectory, chainage[rows])),
         "reason": lambda: reason_of_all_channels(corrected),
         "n_rejected": lambda: satellites_rejected(corrected.channels.member, result.reason),
-        "n_used": lambda: np.count_nonzero(corrected.reason == 0, axis=1),
+        "n_used": lambda: (corrected.reason == 0).sum(axis=1),
         "elevation_deg": lambda: on_all_channels(corrected.elevation_deg),
         "azimuth_deg": lambda: on_all_channels(corrected.azimuth_deg),
         "sigma_m": lambda: on_all_channels(corrected.sigma_m),
@@ -102,7 +102,7 @@ def antenna_results(
         raim=changed(solution.raim, protection_level_m=np.where(has, solution.raim.protection_level_m, np.nan)),
         protection=None if protection is None else judged(protection, solution.status, has, chainage, config),
         map_offset=solution.map_offset,
-        interference=solution.interference,
+        interference=None,  # of each antenna
         araim=solution.araim,
         clocks=corrected.clocks,
         clock_offset_m=solution.ties.offset_m,
@@ -135,10 +135,9 @@ def judge_pairs(
 ) -> dict[str, CorrectedRanges]:
     """Return the ranges after the screens of common observations, by antenna; `screens` are with their limits."""
     judged = dict(ranges)
-    for screen, limits in screens:
-        if pair is not None and isinstance(screen, PairScreen):
-            for name, verdicts in screen.judge(ranges["front"], ranges["rear"], pair, limits).items():
-                judged[name] = judged[name].judged(verdicts)
+    for screen, limits in screens if pair is not None else ():
+        for name, verdicts in screen.judge(ranges["front"], ranges["rear"], pair, limits).items():
+            judged[name] = judged[name].judged(verdicts)
     return judged
 
 
@@ -154,7 +153,7 @@ def position_verdicts(
     """Return the verdicts of the screens of the published positions, by antenna; both antennas get the status."""
     checks: dict[str, tuple[PositionVerdict, ...]] = {}
     for screen, limits in screens:
-        if pair is None or not isinstance(screen, PositionScreen):
+        if pair is None:
             continue
         front, rear = chainage_m["front"][pair.front_epoch], chainage_m["rear"][pair.rear_epoch]
         verdict = screen.judge(front, rear, pair, limits)
@@ -170,7 +169,7 @@ def filter_verdicts(
     """Return the verdicts of the screens of positions on the places by the filter, by antenna."""
     checks: dict[str, Screened] = {}
     for screen, limits in screens:
-        if pair is None or not isinstance(screen, PositionScreen):
+        if pair is None:
             continue
         epochs = {"front": pair.front_epoch, "rear": pair.rear_epoch}
         front, rear = (filtered[name].take(rows) for name, rows in epochs.items())

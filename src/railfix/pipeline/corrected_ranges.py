@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, changed
+from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, changed, kernel_array
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states
@@ -258,11 +258,11 @@ def _anchor(antennas: AntennaRows, config: Config, ranges: Ranges) -> Floats:
     point = single_point(ranges, middle, limits=_rough(config.single_point))
     anchor = point.ecef_m.copy()
     solved = np.isfinite(anchor[:, 0])
-    for index, found in antennas.split(np.flatnonzero(solved)):
+    for index, found in antennas.split(solved.nonzero()[0]):
         distance, vertex = index.tree.query(anchor[found])
         beside = np.asarray(distance) < BESIDE_THE_LINE_M
         anchor[found[beside]] = index.trajectory.ecef_m[np.asarray(vertex)[beside]]
-    for index, rest in antennas.split(np.flatnonzero(~solved)):
+    for index, rest in antennas.split((~solved).nonzero()[0]):
         best = search(ranges.take(rest), index, point.take(rest), limits=config.section).vertex
         anchor[rest] = np.where((best >= 0)[:, None], index.trajectory.ecef_m[best], middle[rest])
     return anchor
@@ -289,9 +289,9 @@ def usable_ranges(
     """Return ranges to be fitted: those with a reason, or without a number, have weight 0 and finite values."""
     used = (reason == 0) & np.isfinite(code) & np.isfinite(weight)
     return Ranges(
-        sat_ecef_m=np.where(used[..., None], states.position_ecef_m, SOMEWHERE_ABOVE_M),
-        code_m=np.where(used, code, 0.0),
-        weight=np.where(used, weight, 0.0),
+        sat_ecef_m=kernel_array(np.where(used[..., None], states.position_ecef_m, SOMEWHERE_ABOVE_M)),
+        code_m=kernel_array(np.where(used, code, 0.0)),
+        weight=kernel_array(np.where(used, weight, 0.0)),
         groups=groups,
     )
 

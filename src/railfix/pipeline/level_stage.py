@@ -135,7 +135,7 @@ def protection_levels(
         risk=risk_of(config),
         scale=level_scale(scale, config),
         overbound=None if config.error_model is None else RangeBounds(corrected.bound_sigma_m, corrected.bias_m),
-        map_error=MapDeviation(np.stack(offset.beyond_m, axis=1), offset.seen),
+        map_error=MapDeviation(np.array(offset.beyond_m).T, offset.seen),
         sides=sides,
         n_excluded=raim.excluded.sum(axis=1),
     )
@@ -182,7 +182,7 @@ def low_sides(corrected: CorrectedRanges, heading_deg: Floats, elevation_deg: fl
     """Return the low satellites left and right of the track, shape (T, 2, K); `heading_deg` is its azimuth (T,)."""
     right = np.sin(np.radians(corrected.azimuth_deg - heading_deg[:, None])) > 0
     low = corrected.elevation_deg < elevation_deg
-    return np.stack([low & ~right, low & right], axis=1)
+    return np.concatenate([(low & ~right)[:, None], (low & right)[:, None]], axis=1)
 
 
 def judged(
@@ -204,9 +204,9 @@ def judged(
         values["cause"] = np.where(near, int(Cause.UNBOUNDED), values["cause"]).astype(np.int8)
     level = ProtectionLevel(**values)
     verdict = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
-    verdict = np.where(_ALARMING[status], LevelStatus.ALARM, verdict)
-    doubtful = status == Status.AMBIGUOUS
-    verdict = np.where(doubtful & (verdict == LevelStatus.AVAILABLE), LevelStatus.UNAVAILABLE, verdict)
+    verdict = np.where(_ALARMING[status], int(LevelStatus.ALARM), verdict)
+    doubtful = status == int(Status.AMBIGUOUS)
+    verdict = np.where(doubtful & (verdict == int(LevelStatus.AVAILABLE)), int(LevelStatus.UNAVAILABLE), verdict)
     return ProtectionResult(level=level, status=verdict.astype(np.int8), kind=protection.kind, basis=protection.basis)
 
 
@@ -253,9 +253,7 @@ def with_araim(
     )
     budget = config.araim
     near = np.nan_to_num(place, nan=1e6)
-    axes = antennas.each(
-        lambda index, rows: index.trajectory.axes_of(np.maximum(solution.place.constrained.section[rows], 0))
-    )
+    axes = antennas.axes_of(np.maximum(solution.place.constrained.section, 0))
     on_line = with_map(_turned(ranges, axes), antennas.sigma_plan_m, antennas.sigma_height_m, budget.map_prior)
     horizontal = budget.phmi_horizontal / 2.0, budget.false_alarm_horizontal / 2.0
     return changed(

@@ -297,6 +297,8 @@ class SensedMotion:
     @classmethod
     def joined(cls, parts: Sequence[SensedMotion]) -> SensedMotion:
         """Return parts one after the other."""
+        if len(parts) == 1:
+            return parts[0]
         return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
 
 
@@ -318,9 +320,11 @@ class SensedState:
 
 def nothing_sensed(intervals: int) -> SensedMotion:
     """Motion without a sensor."""
-    absent = {field.name: np.full(intervals, np.nan) for field in fields(SensedMotion)}
-    still = {"doubt_mps": np.zeros(intervals), "swing_mps2": np.zeros(intervals)}
-    return SensedMotion(**{**absent, **still, "state": np.zeros(intervals, dtype=np.int8)})
+    absent, still = np.full(intervals, np.nan), np.zeros(intervals)
+    return SensedMotion(
+        state=still.astype(np.int8), way_m=absent, doubt_mps=still, swing_mps2=still, gradient=absent,
+        curvature_1pm=absent, cant_m=absent, under_m=absent,
+    )  # fmt: skip
 
 
 def sensed_motion(

@@ -219,11 +219,46 @@ def constrained_position(
     one. Where both neighbours of a point send the step back, the point is the answer. At an open end the position is
     clamped and `overshoot_m` is how far beyond it the ranges pull.
     """
-    limits = limits or ConstrainedLimits()
-    start = np.where(ranges.n_used - ranges.n_clocks >= 1, vertex, -1)
+    return constrained_on_lines(ranges, ((trajectory, slice(None)),), vertex, limits=limits or ConstrainedLimits())
+
+
+def constrained_on_lines(
+    ranges: Ranges, lines: Sequence[tuple[Trajectory, slice]], vertex: Indices, *, limits: ConstrainedLimits
+) -> Constrained:
+    """Compute the same of epochs on several lines; each comes with its epochs, one line's after the other's."""
+    enough = ranges.n_used - ranges.n_clocks >= 1
+    parts = []
+    for trajectory, rows in lines:
+        start = np.full(len(vertex), -1, dtype=np.intp)
+        start[rows] = np.where(enough[rows], vertex[rows], -1)
+        parts.append(_on_line(ranges, trajectory, start, limits))
+    first = parts[0]
+    for part, (_, rows) in zip(parts[1:], lines[1:], strict=True):
+        for whole, own in zip(first, part, strict=True):
+            whole[..., rows] = own[..., rows]
+    arc, section, solved, clock, residual, iterations = first
+    _, sigma, exact, wsse, overshoot, dilution = solved
+    return Constrained(
+        arc_m=arc,
+        section=section,
+        sigma_m=sigma,
+        exact_map_sigma_m=exact,
+        dilution=dilution,
+        overshoot_m=overshoot,
+        clock_m=clock.T,
+        wsse=wsse,
+        residual_m=residual.T,
+        iterations=iterations,
+    )
+
+
+def _on_line(
+    ranges: Ranges, trajectory: Trajectory, start: Indices, limits: ConstrainedLimits
+) -> tuple[Floats, Indices, Floats, Floats, Floats, Integers]:
+    """Return arc lengths (T,), and what `_from` returns with the epochs on the last axis."""
     section, solved, clock, residual, iterations = _from(start, ranges, trajectory, limits)
     for end, join in zip((0, len(trajectory) - 2), trajectory.joins_m, strict=True):
-        pulled = np.flatnonzero((solved[4] > 0.0) & (section == end))
+        pulled = ((solved[4] > 0.0) & (section == end)).nonzero()[0]
         if not np.isnan(join) and len(pulled):
             there = np.full(len(pulled), np.argmin(np.abs(trajectory.arc_m - join)))
             other = _from(there, ranges.take(pulled), trajectory, limits)
@@ -233,19 +268,8 @@ def constrained_position(
             for array, new in zip((section, clock, residual), (other[0], *other[2:4]), strict=True):
                 array[rows] = new[better]
             iterations[pulled] += other[4]
-    along, sigma, exact, wsse, overshoot, dilution = solved
-    return Constrained(
-        arc_m=trajectory.arc_m[np.maximum(section, 0)] + along,
-        section=section,
-        sigma_m=sigma,
-        exact_map_sigma_m=exact,
-        dilution=dilution,
-        overshoot_m=overshoot,
-        clock_m=clock,
-        wsse=wsse,
-        residual_m=residual,
-        iterations=iterations,
-    )
+    arc = trajectory.arc_m[np.maximum(section, 0)] + solved[0]
+    return arc, section, solved, clock.T, residual.T, iterations
 
 
 def _from(

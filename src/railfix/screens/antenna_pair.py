@@ -277,10 +277,10 @@ class AntennaPairScreen(PairScreen[AntennaPairLimits]):
         """Return the verdict on a chunk, the same for both antennas."""
         at_front, at_rear = pair.front_epoch, pair.rear_epoch
         ours, theirs = pair_channels(front.satellite, front.signal, rear.satellite, rear.signal)
-        here = np.ix_(at_front, ours)
+        here = at_front[:, None], ours
         screened = antenna_pair_screen(
             front.corrected_code_m[here],
-            rear.corrected_code_m[np.ix_(at_rear, theirs)],
+            rear.corrected_code_m[at_rear[:, None], theirs],
             front.elevation_deg[here],
             front.azimuth_deg[here],
             satellite=front.satellite[ours],

@@ -138,7 +138,7 @@ class _Issues:
     """Records by satellite and issue, each from half-way between the toe before and its own; F/NAV before I/NAV."""
 
     def __init__(self, kepler: KeplerRecords) -> None:
-        row = np.flatnonzero(np.isin(kepler.message, ("LNAV", "INAV", "FNAV", "CNV1")))
+        row = np.isin(kepler.message, ("LNAV", "INAV", "FNAV", "CNV1")).nonzero()[0]
         issue = kepler.iode[row] % np.where(kepler.message[row] == "LNAV", 256, _ISSUES)
         names, number = np.unique(kepler.satellite[row], return_inverse=True)
         self.number = {str(name): i for i, name in enumerate(names)}

@@ -160,7 +160,7 @@ def along_track_level(
     if 0 < epochs <= FEW and located.all():
         return ProtectionLevel(**_level_of_block(np.arange(epochs), model, plan, given))
     result = _empty(epochs, plan)
-    for block in _blocks(model, plan, np.flatnonzero(located)):
+    for block in _blocks(model, plan, located.nonzero()[0]):
         for name, values in _level_of_block(block, model.take(block), plan, given).items():
             getattr(result, name)[block] = values
     return result
@@ -195,7 +195,7 @@ def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Ind
     """Epochs of like numbers of hypotheses together: no block is wider than it must be."""
     if len(rows) <= FEW:
         return iter([rows] if len(rows) else [])
-    used = np.count_nonzero(model.used[rows], axis=1)
+    used = model.used[rows].sum(axis=1)
     sizes = np.cumsum(comb(used[:, None], np.arange(MOST_TOGETHER + 1)), axis=1)
     sizes = np.concatenate([sizes, np.zeros((len(rows), 1))], axis=1)
     count = np.take_along_axis(sizes, plan.order[rows], axis=1).sum(axis=1)
@@ -232,11 +232,11 @@ class Asked(NamedTuple):
 def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: Errors) -> dict[str, NDArray[Any]]:
     """Return the fields of `ProtectionLevel` of a block of epochs with positions."""
     of_block = Errors(*(np.ascontiguousarray(each[rows]) for each in given))
-    n = int(np.count_nonzero(model.used, axis=1).max())
+    n = int(model.used.sum(axis=1).max())
     channel, offset, sigma, weight, separation = kernels.hypotheses.tails_of_hypotheses(
         model.arrays, of_block, asked := _list_hypotheses(plan, rows, n)
     )
-    share = np.stack([each[rows] for each in (plan.fault_free, plan.one, plan.two, plan.more)], axis=1)
+    share = np.array([plan.fault_free, plan.one, plan.two, plan.more])[:, rows].T.copy()
     level, spender, part, k, worst = kernels.level.solve_level(
         offset, sigma, weight, asked.bounds, share, plan.reserved[rows]
     )

@@ -274,8 +274,8 @@ def _allocate(
     # A constellation has a satellite at least, a side two.
     nominal = np.array([risk.constellation_prior[s] for s in letters] + [risk.side_prior] * sides.shape[1])
     least = np.array([1] * len(letters) + [2] * sides.shape[1])
-    event_prior = nominal * (np.count_nonzero(members & used[:, None], axis=2) >= least)
-    events = np.flatnonzero(event_prior.any(axis=0)).tolist()
+    event_prior = nominal * ((members & used[:, None]).sum(axis=2) >= least)
+    events = event_prior.any(axis=0).nonzero()[0].tolist()
     of_map = risk.map_prior if wrong_map else 0.0
     shared, within = _sets_of(tuple(events), len(letters), wrong_map=of_map > 0.0)
     each = np.stack([event_prior[:, s.events].prod(axis=1) * (of_map if s.wrong_map else 1.0) for s in shared], axis=1)
@@ -284,7 +284,7 @@ def _allocate(
     if len(events) + wrong_map > _MOST_SHARED:
         of_each = np.concatenate([event_prior, np.full((len(used), 1), of_map)], axis=1)
         further = set_sums(of_each, _MOST_SHARED + 1)[:, -1]
-    n = np.count_nonzero(used, axis=1)
+    n = used.sum(axis=1)
     always = [2] + [-1 if s.size > 1 else int(s.wrong_map or s.events[0] < len(letters)) for s in shared[1:]]
     classes = _Classes(each, within, set_sums(everyone, MOST_TOGETHER + 1), further, always)
     order = classes.choose(
@@ -367,7 +367,7 @@ class _Classes:
         alone = (self.each[..., None] * self.sums[:, None, :-1] > share) & feasible[:, None]
         order = np.maximum(np.max(np.where(alone, sizes, -1), axis=2), self.least)
         order = np.where(self.each > 0.0, order, -1)
-        rows = np.flatnonzero(self.rest(order) > share)
+        rows = (self.rest(order) > share).nonzero()[0]
         if not len(rows):
             return np.asarray(order, dtype=np.intp)
         classes = [(-likely[b] * satellite**k, k, b) for b in range(len(likely)) for k in sizes.tolist()]

@@ -58,9 +58,17 @@ class LinearModel:
 
     def take(self, epochs: Masks | Indices) -> LinearModel:
         """The model of some epochs, by mask or index."""
-        common = ("clock", "prior", "interest")
-        values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return LinearModel(**{name: v if name in common else v[epochs] for name, v in values.items()})
+        return LinearModel(
+            root_weight=self.root_weight[epochs],
+            clock=self.clock,
+            clock_covariance_m2=self.clock_covariance_m2[epochs],
+            design=self.design[epochs],
+            covariance_m2=self.covariance_m2[epochs],
+            prior=self.prior,
+            misfit=self.misfit[epochs],
+            freedom=self.freedom[epochs],
+            interest=self.interest,
+        )
 
     @property
     def arrays(self) -> ModelArrays:
@@ -144,7 +152,7 @@ class Compact:
 
 def compact(model: LinearModel) -> Compact:
     """The residual projector over the channels in use, in their order; (T, n, n) of memory."""
-    n = int(np.count_nonzero(model.used, axis=1).max(initial=0))
+    n = int(model.used.sum(axis=1).max(initial=0))
     channel = np.argsort(~model.used, axis=1, kind="stable")[:, :n]
     used = np.take_along_axis(model.used, channel, axis=1)
     root = np.take_along_axis(model.root_weight, channel, axis=1)

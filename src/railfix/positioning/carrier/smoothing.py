@@ -270,7 +270,7 @@ def _hold(values: Floats, at: Masks, first: Floats) -> Floats:
 def _common_change(difference: Floats, begins: Masks, last: Floats) -> Floats:
     """Mean change of code less phase over the channels that run on, 0 where there is none; shape (T,)."""
     change = np.where(begins, np.nan, difference - np.concatenate([last[None], difference[:-1]]))
-    number = np.count_nonzero(np.isfinite(change), axis=1)
+    number = np.isfinite(change).sum(axis=1)
     return np.asarray(np.nansum(change, axis=1) / np.maximum(number, 1))
 
 
