@@ -167,18 +167,11 @@ class Observations(NotebookTable):
         channels = slice(None) if names is None else self._channels_of([names] if isinstance(names, str) else names)
         arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
         part = changed(
-            self,
-            time=self.time[epochs],
-            satellite=self.satellite[channels],
-            signal=self.signal[channels],
+            self, time=self.time[epochs], satellite=self.satellite[channels], signal=self.signal[channels],
             **{name: getattr(self, name)[epochs][:, channels] for name in arrays},
-            break_before=self.break_before[epochs],
-            receiver_alarm=self.receiver_alarm[epochs],
-            front_end_gain=self.front_end_gain[epochs],
-            problems=(),
-            problem_count=0,
-            skipped={},
-        )
+            break_before=self.break_before[epochs], receiver_alarm=self.receiver_alarm[epochs],
+            front_end_gain=self.front_end_gain[epochs], problems=(), problem_count=0, skipped={},
+        )  # fmt: skip
         if names is not None:
             freeze_arrays(part)
         return part
@@ -279,19 +272,14 @@ def stack_parts(parts: Sequence[Observations]) -> Observations:
     for part in parts:
         skipped.update(part.skipped)
     return Observations(
-        time=np.concatenate([p.time for p in parts]),
-        satellite=np.array([k[0] for k in keys], dtype="<U3"),
-        signal=np.array([k[1] for k in keys], dtype="<U2"),
-        loss_of_lock=lock,
+        time=np.concatenate([p.time for p in parts]), satellite=np.array([k[0] for k in keys], dtype="<U3"),
+        signal=np.array([k[1] for k in keys], dtype="<U2"), loss_of_lock=lock,
         break_before=np.concatenate([p.break_before for p in parts]),
         receiver_alarm=np.concatenate([p.receiver_alarm for p in parts]),
-        front_end_gain=np.concatenate([p.front_end_gain for p in parts]),
-        header=_join_header(parts),
+        front_end_gain=np.concatenate([p.front_end_gain for p in parts]), header=_join_header(parts),
         problems=capped_problems(chain.from_iterable(p.problems[:MAX_PROBLEMS] for p in parts), count=count),
-        problem_count=count,
-        skipped=dict(skipped),
-        **floats,
-    )
+        problem_count=count, skipped=dict(skipped), **floats,
+    )  # fmt: skip
 
 
 def _join_header(parts: Sequence[Observations]) -> ObservationHeader:

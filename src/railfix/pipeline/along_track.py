@@ -111,16 +111,10 @@ def along_track(
     speed, sigma = tracked.speed_mps, tracked.speed_sigma_mps
     direction = np.where(np.abs(speed) > _DIRECTION_SIGMAS * sigma, np.sign(speed), 0.0)
     result = AlongTrack.made(
-        later,
-        tracked=tracked,
-        chainage_m=chainage,
-        direction=direction.astype(np.int8),
-        standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS,
-        sensed=sensed,
-        spacing_error_m=np.full(len(tracked), np.nan),
-        wheel=wheel,
-        replay=replays,
-    )
+        later, tracked=tracked, chainage_m=chainage, direction=direction.astype(np.int8),
+        standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS, sensed=sensed,
+        spacing_error_m=np.full(len(tracked), np.nan), wheel=wheel, replay=replays,
+    )  # fmt: skip
     return result, changed(after, line=line)
 
 
@@ -299,7 +293,7 @@ def _begun_anew(state: FilterState, fixed: FilterFix) -> FilterState:
 
 
 def _fixed(tracked: Tracked) -> FilterFix:
-    decided = tracked.status[-1] in (TrackStatus.TRACKING, TrackStatus.COASTING)
+    decided = int(tracked.status[-1]) in (TrackStatus.TRACKING, TrackStatus.COASTING)
     arc, speed = float(tracked.arc_m[-1]), float(tracked.speed_mps[-1])
     sigma = float(tracked.sigma_m[-1])
     return FilterFix(time=tracked.time[-1], arc_m=arc if decided else np.nan, sigma_m=sigma, speed_mps=speed)
@@ -345,19 +339,13 @@ def gnss_epochs(
         np.where(np.isnan(air), 0.0, air),
     )
     epochs = GnssEpochs(
-        time=obs.time,
-        satellite=ranges.satellite,
-        clock=ranges.channels.clock,
-        sat_ecef_m=ranges.satellites.position_ecef_m,
-        sat_velocity_mps=ranges.satellites.velocity_ecef_mps,
-        code_m=np.where(healthy, ranges.corrected_code_m, np.nan),
-        code_sigma_m=ranges.sigma_m * noise_scale[:, None],
-        phase_m=np.where(healthy & phases, phase, np.nan),
-        phase_joined=~slips.slip[:, columns],
+        time=obs.time, satellite=ranges.satellite, clock=ranges.channels.clock,
+        sat_ecef_m=ranges.satellites.position_ecef_m, sat_velocity_mps=ranges.satellites.velocity_ecef_mps,
+        code_m=np.where(healthy, ranges.corrected_code_m, np.nan), code_sigma_m=ranges.sigma_m * noise_scale[:, None],
+        phase_m=np.where(healthy & phases, phase, np.nan), phase_joined=~slips.slip[:, columns],
         rate_mps=np.where(healthy & dopplers, -SPEED_OF_LIGHT / ranges.frequency_hz * ranges.doppler_hz, np.nan),
-        cn0_dbhz=ranges.cn0_dbhz,
-        off_map=np.zeros(len(obs.time), dtype=np.bool_),
-    )
+        cn0_dbhz=ranges.cn0_dbhz, off_map=np.zeros(len(obs.time), dtype=np.bool_),
+    )  # fmt: skip
     return epochs, after
 
 

@@ -138,14 +138,9 @@ def correct_ranges(
     observed = (reason & int(Reason.NOT_OBSERVED)) == 0
     fixes = None if sbas is None else sbas.satellites(obs.time, satellite, received.navigation)
     states = satellite_states(
-        obs.time,
-        satellite,
-        signal,
-        code,
-        received.navigation,
-        max_age_s=config.max_ephemeris_age_s,
+        obs.time, satellite, signal, code, received.navigation, max_age_s=config.max_ephemeris_age_s,
         record=None if fixes is None else fixes.record,
-    )
+    )  # fmt: skip
     lacking = np.zeros(code.shape, dtype=np.int64)
     if isinstance(fixes, DfmcCorrections):
         states, lacking = apply_dfmc(states, fixes, satellite, signal)
@@ -205,31 +200,13 @@ def correct_ranges(
         bound = np.hypot(bound, nominal) if error_model.covers == "local" or sbas is not None else bound
     uncorrected = (reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma) & np.isfinite(bound))
     return CorrectedRanges(
-        observations=obs,
-        channels=channels,
-        time=obs.time,
-        break_before=obs.break_before,
-        satellite=satellite,
-        signal=signal,
-        frequency_hz=frequency,
-        code_m=code,
-        doppler_hz=obs.doppler_hz[:, columns],
-        cn0_dbhz=cn0,
-        satellites=states,
-        anchor_ecef_m=anchor,
-        elevation_deg=seen.elevation_deg,
-        azimuth_deg=seen.azimuth_deg,
-        ionosphere_m=delays.ionosphere_m,
-        troposphere_m=delays.troposphere_m,
-        corrected_code_m=clean,
-        sigma_m=sigma,
-        nominal_m=nominal,
-        bound_sigma_m=bound,
-        bias_m=bias,
-        reason=np.where(uncorrected, int(Reason.NO_CORRECTION), reason),
-        second=second,
-        base=base,
-    )
+        observations=obs, channels=channels, time=obs.time, break_before=obs.break_before, satellite=satellite,
+        signal=signal, frequency_hz=frequency, code_m=code, doppler_hz=obs.doppler_hz[:, columns], cn0_dbhz=cn0,
+        satellites=states, anchor_ecef_m=anchor, elevation_deg=seen.elevation_deg, azimuth_deg=seen.azimuth_deg,
+        ionosphere_m=delays.ionosphere_m, troposphere_m=delays.troposphere_m, corrected_code_m=clean, sigma_m=sigma,
+        nominal_m=nominal, bound_sigma_m=bound, bias_m=bias,
+        reason=np.where(uncorrected, int(Reason.NO_CORRECTION), reason), second=second, base=base,
+    )  # fmt: skip
 
 
 def _by_error_model(model: ErrorModel, seen: SeenFrom, cn0: Floats, antennas: AntennaRows) -> tuple[Floats, Floats]:
@@ -304,11 +281,9 @@ def without(ranges: Ranges, dropped: Masks) -> Ranges:
 def conditions_of(config: Config) -> Conditions:
     """Settings that the errors of the ranges depend on: the conditions of an error model made from such a run."""
     return Conditions(
-        systems=config.systems,
-        signals={letter: config.signals.get(letter, ()) for letter in config.systems},
-        screens=config.screens,
-        elevation_mask_deg=config.elevation.mask_deg,
+        systems=config.systems, signals={letter: config.signals.get(letter, ()) for letter in config.systems},
+        screens=config.screens, elevation_mask_deg=config.elevation.mask_deg,
         codes="smoothed" if config.carrier == "smoothed" else "raw",
         ionosphere="sbas" if config.sbas else config.ionosphere,
         troposphere="sbas" if config.sbas else config.troposphere,
-    )
+    )  # fmt: skip

@@ -9,18 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import (
-    Bits,
-    Bytes,
-    Codes,
-    Datetimes,
-    Floats,
-    Indices,
-    Integers,
-    Masks,
-    changed,
-    read_only,
-)
+from railfix.core.arrays import Bits, Bytes, Codes, Floats, Indices, Masks, changed, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
 from railfix.core.timescale import GPS_EPOCH
@@ -100,23 +89,16 @@ def _motion_inputs(
         arc, offset = index.trajectory.nearest(near[part])
         off_line[part] = np.where((arc > 0.0) & (arc < index.trajectory.arc_m[-1]), offset, np.nan)
     return MotionInputs(
-        time=corrected.time[rows],
-        break_before=broken,
-        channel=corrected.channels.names,
+        time=corrected.time[rows], break_before=broken, channel=corrected.channels.names,
         group=np.array([clocks.index(letter) for letter in corrected.channels.clock.tolist()], dtype=np.intp),
-        near_ecef_m=near,
-        sat_ecef_m=corrected.satellites.position_ecef_m[rows],
+        near_ecef_m=near, sat_ecef_m=corrected.satellites.position_ecef_m[rows],
         sat_velocity_mps=corrected.satellites.velocity_ecef_mps[rows],
         code_m=np.where((reason & _NOT_ITS_SIGNAL) == 0, code, np.nan),
         rate_mps=-SPEED_OF_LIGHT / corrected.frequency_hz * corrected.doppler_hz[rows],
-        corrected_code_m=corrected.corrected_code_m[rows],
-        sigma_m=corrected.sigma_m[rows],
-        used=(reason & ~_CONTRADICTED) == 0,
-        noise_scale=solution.noise_scale[rows],
-        clock_offset_m=solution.ties.offset_m[rows],
-        clock_sigma_m=solution.ties.sigma_m[rows],
-        off_line_m=off_line,
-    )
+        corrected_code_m=corrected.corrected_code_m[rows], sigma_m=corrected.sigma_m[rows],
+        used=(reason & ~_CONTRADICTED) == 0, noise_scale=solution.noise_scale[rows],
+        clock_offset_m=solution.ties.offset_m[rows], clock_sigma_m=solution.ties.sigma_m[rows], off_line_m=off_line,
+    )  # fmt: skip
 
 
 def _find_interference(
@@ -192,11 +174,12 @@ class _Due(NamedTuple):
     #: Alarms of the receiver and breaks up to each of them, and those that count at the next one; shape (n + 1,).
     alarm: Bytes
     broken: Masks
+    last: int  #: GPS second of the last epoch.
 
 
 def _due(corrected: CorrectedRanges, rows: slice, state: InterferenceState) -> _Due:
     """Return the epochs of one antenna at which interference is looked for."""
-    second = _seconds(corrected.time[rows])
+    second = (corrected.time[rows] - GPS_EPOCH + _TAG) // _SECOND
     due = second != np.concatenate([[state.second], second[:-1]])[: len(second)]
     group = due.cumsum()
     count = int(group[-1]) + 1 if len(group) else 1
@@ -205,21 +188,14 @@ def _due(corrected: CorrectedRanges, rows: slice, state: InterferenceState) -> _
     # what came after a due epoch belongs to the next one
     np.bitwise_or.at(alarm, group - due, corrected.observations.receiver_alarm[rows])
     np.logical_or.at(broken, group - due, corrected.break_before[rows])
-    return _Due(due.nonzero()[0] + (rows.start or 0), group, alarm, broken)
-
-
-def _seconds(time: Datetimes) -> Integers:
-    """Return the GPS second of each epoch, shape (T,)."""
-    return np.asarray((time - GPS_EPOCH + _TAG) // _SECOND)
+    last = int(second[-1]) if len(second) else state.second
+    return _Due(due.nonzero()[0] + (rows.start or 0), group, alarm, broken, last)
 
 
 def _on_all_epochs(
-    due: _Due, last: int, found: Interference | None, state: InterferenceState
+    due: _Due, found: Interference | None, state: InterferenceState
 ) -> tuple[Interference, InterferenceState]:
-    """Return the interference of all epochs of one antenna, which have what was found at the first of the second.
-
-    `last`: GPS second of the last epoch.
-    """
+    """Return the interference of all epochs of one antenna, which have what was found at the first of the second."""
     known = [each for each in (state.latest, found) if each is not None]
     if len(due.group) == 1:
         every = latest = known[-1]
@@ -228,7 +204,7 @@ def _on_all_epochs(
         every = joined(known)
         every, latest = rows_of(every, row), rows_of(every, row[-1:])
     count = len(due.rows)
-    after = changed(state, second=last, alarm=int(due.alarm[count]), broken=bool(due.broken[count]), latest=latest)
+    after = changed(state, second=due.last, alarm=int(due.alarm[count]), broken=bool(due.broken[count]), latest=latest)
     return every, after
 
 
@@ -277,14 +253,14 @@ def judge_interference(
     found: list[Interference] = []
     after: list[InterferenceState] = []
     first = 0
-    for own, part, state in zip(due, antennas.parts, states, strict=True):
+    for own, state in zip(due, states, strict=True):
         new, at = None, slice(first, first := first + len(own.rows))
         if len(own.rows) or not len(own.group):
             new, state = _find_interference(
                 corrected, own.rows, own.alarm[:-1], inputs.take(at), fitted.take(at), state, limits
             )
         if len(own.group):
-            new, state = _on_all_epochs(own, int(_seconds(corrected.time[part][-1:])[0]), new, state)
+            new, state = _on_all_epochs(own, new, state)
         assert new is not None, "an epoch without one before it is due"
         found.append(new)
         after.append(state)

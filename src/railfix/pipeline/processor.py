@@ -387,12 +387,9 @@ class EpochProcessor:
             return along_track(
                 rows_of(solved.ranges, rows),
                 single_epochs(solved.results[name], solved.off_map[rows], self.config.map_offset),
-                self.trajectories[name],
-                self.config,
-                state.fusion.get(name) or self._before_filter,
-                samples=solved.sensors,
-                surroundings=self._line_references(name, solved.sensors),
-            )
+                self.trajectories[name], self.config, state.fusion.get(name) or self._before_filter,
+                samples=solved.sensors, surroundings=self._line_references(name, solved.sensors),
+            )  # fmt: skip
 
         over_antennas = map if self._threads is None else self._threads.map
         return dict(zip(solved.results, over_antennas(one_antenna, solved.results), strict=True))
@@ -417,13 +414,9 @@ class EpochProcessor:
             return None
         front, rear = ranges["front"], ranges["rear"]
         return pair_antennas(
-            front,
-            rear,
-            front.anchor_ecef_m,
-            self.trajectories["front"],
-            self.trajectories["rear"],
+            front, rear, front.anchor_ecef_m, self.trajectories["front"], self.trajectories["rear"],
             tolerance_s=self.config.antenna_pair.tag_tolerance_s,
-        )
+        )  # fmt: skip
 
 
 def _threads(antennas: int) -> ThreadPoolExecutor | None:

@@ -405,15 +405,9 @@ def sensed_motion(
     sensed = replace(sensed, under_m=along(sensed.under_m))
     step = 1e-9 * _TICK_NS
     series = RateSeries(
-        time=middle,
-        known=when,
-        way_m=facing * (passed[1:] - passed[0]),
-        arc_m=passed_m,
-        turned_rad=step * turned,
-        climbed_rad=step * (turning - found.gyro_bias_radps),
-        speed_mps=facing * speed.speed_mps,
-        rolls=rolls,
-    )
+        time=middle, known=when, way_m=facing * (passed[1:] - passed[0]), arc_m=passed_m, turned_rad=step * turned,
+        climbed_rad=step * (turning - found.gyro_bias_radps), speed_mps=facing * speed.speed_mps, rolls=rolls,
+    )  # fmt: skip
     return sensed, series, replace(state, tick=int(ticks[-1]), arc_m=float(arc[-1]), slip=slip)
 
 

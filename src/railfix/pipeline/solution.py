@@ -206,21 +206,10 @@ def solve(
     if phase is not None:
         off_map = _off_map(ranges, antennas, place, arc, config)
     solution = Solution(
-        point=point,
-        point_status=validate_point(point, untied, scale, limits=config.single_point),
-        place=place,
-        ties=ties,
-        raim=raim,
-        status=np.zeros(len(ranges), dtype=np.int8),
-        noise_scale=scale,
-        own_sigma_m=own_sigma,
-        arc_m=arc,
-        along_sigma_m=along_sigma,
-        phase=phase,
-        protection=level,
-        map_offset=offset,
-        off_map=away,
-    )
+        point=point, point_status=validate_point(point, untied, scale, limits=config.single_point), place=place,
+        ties=ties, raim=raim, status=np.zeros(len(ranges), dtype=np.int8), noise_scale=scale, own_sigma_m=own_sigma,
+        arc_m=arc, along_sigma_m=along_sigma, phase=phase, protection=level, map_offset=offset, off_map=away,
+    )  # fmt: skip
     solution = changed(solution, status=_status(corrected, ranges, solution, judged, off_map, open_elsewhere, config))
     after = []
     for k, (state, rows) in enumerate(zip(states, antennas.parts, strict=True)):

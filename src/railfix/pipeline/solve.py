@@ -150,12 +150,9 @@ def fault_free(
     on = "raim" in config.screens
     raim = RaimResult(
         outcome=np.where(test.testable & on, int(Outcome.PASSED), int(Outcome.UNTESTABLE)).astype(np.int8),
-        statistic=test.statistic,
-        threshold=test.threshold,
-        excluded=np.zeros(ranges.code_m.shape, dtype=bool),
-        own_error_m=np.full(ranges.code_m.shape, np.nan),
-        protection_level_m=np.full(len(ranges), np.nan),
-    )
+        statistic=test.statistic, threshold=test.threshold, excluded=np.zeros(ranges.code_m.shape, dtype=bool),
+        own_error_m=np.full(ranges.code_m.shape, np.nan), protection_level_m=np.full(len(ranges), np.nan),
+    )  # fmt: skip
     for index, failing in antennas.split((test.detected & on).nonzero()[0]):
         ranges, place, raim = _faults_excluded(ranges, index, place, raim, failing, scale, agreeing, config)
     return ranges, place, raim

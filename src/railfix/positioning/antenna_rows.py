@@ -37,10 +37,11 @@ class OnDemand:
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            if name not in _members(type(self)) or "_later" not in vars(self):
+            own = self.__dict__
+            if "_later" not in own or name not in _members(self.__class__):
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-            vars(self).update(vars(self)["_later"](name))
-            return vars(self)[name]
+            own.update(own["_later"](name))
+            return own[name]
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all fields, for another process."""
@@ -142,7 +143,7 @@ class _Lines(NamedTuple):
     axes: Floats
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=4)
 def _lines(indices: tuple[SearchIndex, ...]) -> _Lines:
     lines = [index.trajectory for index in indices]
     points = np.cumsum([0, *map(len, lines)])

@@ -173,14 +173,11 @@ def robust_fit(
         return RobustFit(kept=used, variance=np.full(len(ranges), np.nan), freedom=nothing)
     freedom = ranges.n_used - ranges.n_clocks - (3 if information is None else 1)
     kept, wsse, solved = kernels.robust.reweighted(
-        ranges.arrays,
-        kernel_array(place_ecef_m),
+        ranges.arrays, kernel_array(place_ecef_m),
         kernel_array(np.empty((0, 3, 3)) if information is None else information),
-        np.sqrt(ranges.n_used / np.maximum(freedom, 1)) / _NORMAL_MEDIAN,
-        limits.keep,
-        limits.reject,
+        np.sqrt(ranges.n_used / np.maximum(freedom, 1)) / _NORMAL_MEDIAN, limits.keep, limits.reject,
         limits.iterations,
-    )
+    )  # fmt: skip
     left = np.asarray(kept.sum(axis=1) - (ranges.n_used - freedom), dtype=np.int64)
     some = (left > 0) & solved
     return RobustFit(

@@ -147,14 +147,10 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     """Return the normal equations of `ranges` linearised at one place an epoch, shape (T, 3) [m]."""
     system, means, rows, seen = kernels.ranges.reduced_equations(ranges.arrays, kernel_array(place_ecef_m))
     return NormalEquations(
-        matrix=system[:, :3, :3],
-        vector=system[:, :3, 3],
-        wsse=system[:, 3, 3],
-        clock_m=np.where(seen, means[:, 3], np.nan),
-        residual_m=rows[:, 3],
-        clock_slope=means[:, :3],
+        matrix=system[:, :3, :3], vector=system[:, :3, 3], wsse=system[:, 3, 3],
+        clock_m=np.where(seen, means[:, 3], np.nan), residual_m=rows[:, 3], clock_slope=means[:, :3],
         design=rows[:, :3],
-    )
+    )  # fmt: skip
 
 
 def fit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> Floats:
@@ -239,17 +235,9 @@ def constrained_on_lines(
     arc, section, solved, clock, residual, iterations = first
     _, sigma, exact, wsse, overshoot, dilution = solved
     return Constrained(
-        arc_m=arc,
-        section=section,
-        sigma_m=sigma,
-        exact_map_sigma_m=exact,
-        dilution=dilution,
-        overshoot_m=overshoot,
-        clock_m=clock.T,
-        wsse=wsse,
-        residual_m=residual.T,
-        iterations=iterations,
-    )
+        arc_m=arc, section=section, sigma_m=sigma, exact_map_sigma_m=exact, dilution=dilution, overshoot_m=overshoot,
+        clock_m=clock.T, wsse=wsse, residual_m=residual.T, iterations=iterations,
+    )  # fmt: skip
 
 
 def _on_line(

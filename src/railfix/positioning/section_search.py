@@ -207,14 +207,9 @@ def _in_ball(
 ) -> SectionCandidates:
     """Points in the ball of each epoch with q from the quadratic form; exact where that leaves a choice."""
     count, vertex, q, half_gradient, unsure = kernels.search.points_in_balls(
-        index.trajectory.ecef_m,
-        index.stretches,
-        point.ecef_m[epochs],
-        radius,
-        point.matrix[epochs],
-        point.wsse[epochs],
-        weight_norm[epochs],
-    )
+        index.trajectory.ecef_m, index.stretches, point.ecef_m[epochs], radius, point.matrix[epochs],
+        point.wsse[epochs], weight_norm[epochs],
+    )  # fmt: skip
     if not np.all(count):
         raise AssertionError(f"an empty ball at epochs {epochs[count == 0]}: the radius is below the nearest point")
     if unsure.any():

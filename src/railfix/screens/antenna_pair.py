@@ -239,13 +239,9 @@ def antenna_pair_screen(
         azimuth_error_deg=limits.azimuth_error_deg,
     )
     return AntennaPairScreened(
-        metric=metric,
-        reject=np.abs(metric) > np.maximum(limits.limit_m, zone),
-        expected_m=expected,
-        ambiguity_m=zone,
-        clock_m=clock,
-        clocks=CLOCKS[limits.clocks],
-    )
+        metric=metric, reject=np.abs(metric) > np.maximum(limits.limit_m, zone), expected_m=expected,
+        ambiguity_m=zone, clock_m=clock, clocks=CLOCKS[limits.clocks],
+    )  # fmt: skip
 
 
 class AntennaPairScreen(PairScreen[AntennaPairLimits]):

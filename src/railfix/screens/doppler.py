@@ -325,15 +325,10 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
     ) -> tuple[tuple[Verdict, ...], Any]:
         """Return the verdict on a chunk, and the last epoch with the satellites under suspicion."""
         screened, after = doppler_screen(
-            antenna.time,
-            np.where((antenna.reason & Reason.IMPLAUSIBLE_CODE) == 0, antenna.code_m, np.nan),
-            antenna.doppler_hz,
-            channels=DopplerChannels(antenna.satellite, antenna.signal, antenna.frequency_hz),
-            break_before=antenna.break_before,
-            code_sigma_m=antenna.sigma_m,
-            limits=limits,
-            state=state,
-        )
+            antenna.time, np.where((antenna.reason & int(Reason.IMPLAUSIBLE_CODE)) == 0, antenna.code_m, np.nan),
+            antenna.doppler_hz, channels=DopplerChannels(antenna.satellite, antenna.signal, antenna.frequency_hz),
+            break_before=antenna.break_before, code_sigma_m=antenna.sigma_m, limits=limits, state=state,
+        )  # fmt: skip
         error = np.fmax(np.abs(screened.level_m), screened.limit_m) if limits.verdict == "weigh" else None
         return (Verdict(name="doppler", reason=Reason.DOPPLER, screened=screened, error_m=error),), after
 

@@ -175,16 +175,10 @@ class Trajectory(FrozenArrays, NotebookTable):
     def from_track(cls, track: Track) -> Trajectory:
         """Create a trajectory that uses the track as the antenna's path; `notes` records it."""
         return cls(
-            name=track.name,
-            ecef_m=track.ecef_m,
-            chainage_m=track.chainage_m,
-            kilometrage_m=track.kilometrage_m,
-            cant_m=track.cant_m,
-            roll_deg=read_only(np.zeros(len(track))),
-            sigma_plan_m=track.sigma_plan_m,
-            sigma_height_m=track.sigma_height_m,
-            notes=(TRACK_AS_PATH, *track.provenance.notes),
-        )
+            name=track.name, ecef_m=track.ecef_m, chainage_m=track.chainage_m, kilometrage_m=track.kilometrage_m,
+            cant_m=track.cant_m, roll_deg=read_only(np.zeros(len(track))), sigma_plan_m=track.sigma_plan_m,
+            sigma_height_m=track.sigma_height_m, notes=(TRACK_AS_PATH, *track.provenance.notes),
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.ecef_m)

@@ -135,27 +135,14 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
         near, epochs.sat_ecef_m, epochs.sat_velocity_mps, before, measured, has, variance, interval
     )
     return Chunk(
-        time=epochs.time,
-        interval_s=interval,
-        apart=apart,
-        satellite=epochs.satellite,
-        slot=slot,
+        time=epochs.time, interval_s=interval, apart=apart, satellite=epochs.satellite, slot=slot,
         offset=np.array([_OFFSETS[letter] for letter in epochs.clock.tolist()], dtype=np.intp),
-        sat_ecef_m=epochs.sat_ecef_m,
-        sat_velocity_mps=epochs.sat_velocity_mps,
-        before_ecef_m=before,
-        measured=measured,
-        has=has,
-        variance=variance,
-        motion_measured=np.asarray(has[1:].sum(axis=2).max(axis=0) >= _MOTION),
-        code_sigma_m=epochs.code_sigma_m,
-        fresh=fresh & ~kept,
-        off_map=epochs.off_map,
-        remembered=kept,
-        velocity_mps=velocity.velocity_mps,
-        velocity_covariance=velocity.covariance,
-        velocity_age_s=velocity.age_s,
-    )
+        sat_ecef_m=epochs.sat_ecef_m, sat_velocity_mps=epochs.sat_velocity_mps, before_ecef_m=before,
+        measured=measured, has=has, variance=variance,
+        motion_measured=np.asarray(has[1:].sum(axis=2).max(axis=0) >= _MOTION), code_sigma_m=epochs.code_sigma_m,
+        fresh=fresh & ~kept, off_map=epochs.off_map, remembered=kept, velocity_mps=velocity.velocity_mps,
+        velocity_covariance=velocity.covariance, velocity_age_s=velocity.age_s,
+    )  # fmt: skip
 
 
 def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> None:

@@ -139,13 +139,9 @@ class Recursion:
         cut[:, SATELLITES + self.chunk.fresh[epoch].nonzero()[0]] = True
         handed.take_back(state, epoch, epoch + 1)
         step = Step(
-            dt=float(self.chunk.interval_s[epoch]),
-            cut=cut,
-            satellite=state.satellite,
-            parent=found.parent,
-            splits=found.splits,
-            updated=updated,
-        )
+            dt=float(self.chunk.interval_s[epoch]), cut=cut, satellite=state.satellite, parent=found.parent,
+            splits=found.splits, updated=updated,
+        )  # fmt: skip
         if hypotheses > 1:
             step.choose(handed.work.kept[: state.hypotheses])
         step.mean, step.covariance = state.mean, state.covariance

@@ -78,13 +78,10 @@ class Handover:
         full, place = self.full, np.full(state.mean.shape[1], -1, dtype=np.intp)
         place[full] = np.arange(len(full))
         self.active = layout.Active(
-            full=full,
-            wheel=int(place[StateIndex.WHEEL]),
-            force=int(place[StateIndex.FORCE_OFFSET]),
-            radar=int(place[StateIndex.RADAR]),
-            offset=place[OFFSETS:SATELLITES].copy(),
+            full=full, wheel=int(place[StateIndex.WHEEL]), force=int(place[StateIndex.FORCE_OFFSET]),
+            radar=int(place[StateIndex.RADAR]), offset=place[OFFSETS:SATELLITES].copy(),
             satellite=place[SATELLITES:].copy(),
-        )
+        )  # fmt: skip
         origin = chunk.time[0]
         scalars = np.array([
             state.hypotheses, state.weak_motion_s, state.weak_code_s, *state.log_scale, state.distance_since_code_m,
@@ -255,14 +252,9 @@ def _subfilters(
         covariance[at] = state.bank.covariance[kept][:, full[:, None], full]
     clock = [CLOCKS.index(bank.clock_of(name)) for name in state.satellite.tolist()] if names else []
     return layout.Subfilters(
-        running=running,
-        mean=mean,
-        covariance=covariance,
-        weak_s=weak,
-        **parameters,
-        begun=begun,
+        running=running, mean=mean, covariance=covariance, weak_s=weak, **parameters, begun=begun,
         clock=np.array(clock, dtype=np.intp),
-    )
+    )  # fmt: skip
 
 
 @lru_cache(maxsize=64)
@@ -299,14 +291,11 @@ def _work_space(
         "bend": (2,), "point": (2, 3), "axes": (2, 3, 3), "places": (room, 3), "place_axes": (room, 3, 3),
     }  # fmt: skip
     work = layout.Work(
-        **{name: np.zeros(shape) for name, shape in shapes.items()},
-        anew=np.zeros((room, 3), dtype=np.bool_),
-        source=np.zeros(sources, dtype=np.bool_),
-        met=np.zeros(sources, dtype=np.bool_),
-        ranked=np.empty(room, dtype=np.intp),
-        kept=np.empty(room, dtype=np.intp),
+        **{name: np.zeros(shape) for name, shape in shapes.items()}, anew=np.zeros((room, 3), dtype=np.bool_),
+        source=np.zeros(sources, dtype=np.bool_), met=np.zeros(sources, dtype=np.bool_),
+        ranked=np.empty(room, dtype=np.intp), kept=np.empty(room, dtype=np.intp),
         unknown=np.zeros((room, size, 6), dtype=np.intp),
-    )
+    )  # fmt: skip
     listed = (np.empty(length, dtype=np.intp) for length in (channels, channels, channels, sensors, 4))
     return layout.Rows(*listed), work
 

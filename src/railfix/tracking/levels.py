@@ -96,15 +96,11 @@ def thinned(
     size[:1] += since.epochs - 1
     rest = slice(int(edges[-1]), None)
     left = changed(
-        since,
-        start=start,
-        number=int(before[-1]),
+        since, start=start, number=int(before[-1]),
         epochs=len(total[rest]) if len(taken) else since.epochs + len(epochs),
         unbroken=_names(epochs, np.asarray(goes_on[rest].all(axis=0)), anew=len(taken) > 0 and not len(total[rest])),
-        total=total[rest].sum(axis=0),
-        variance=square[rest].sum(axis=0),
-        balises=left_balises,
-    )
+        total=total[rest].sum(axis=0), variance=square[rest].sum(axis=0), balises=left_balises,
+    )  # fmt: skip
     if not len(taken):
         return taken, None, SensorEpochs(), left
     end, first = int(edges[-1]), edges[:-1]
@@ -283,16 +279,11 @@ def carried_levels(
     apart = np.where(np.isnan(separation), 0.0, separation)
     spread = np.where(doubt, apart, np.sqrt(np.maximum(apart**2 - explained**2, 0.0)))
     tracked = changed(
-        tracked,
-        status=told,
-        sigma_m=np.hypot(tracked.sigma_m, spread),
-        level_m=level,
-        ground_level_m=widened(ground, straight),
-        level_noise_m=np.where(known, noise, np.nan),
-        level_speed_mps=np.where(known, of_speed, np.nan),
-        separation_m=np.where(known, separation, np.nan),
+        tracked, status=told, sigma_m=np.hypot(tracked.sigma_m, spread), level_m=level,
+        ground_level_m=widened(ground, straight), level_noise_m=np.where(known, noise, np.nan),
+        level_speed_mps=np.where(known, of_speed, np.nan), separation_m=np.where(known, separation, np.nan),
         amount_m=np.where(known, amount, np.nan),
-    )
+    )  # fmt: skip
     return tracked, changed(state, time=times[-1], values=values[-1])
 
 

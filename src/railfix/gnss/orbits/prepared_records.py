@@ -110,16 +110,10 @@ def make_lookup(label: Strings, toe: Datetimes, transmitted: Datetimes, validity
     by_row = np.argsort(order)
     middle[first] = origin
     return Lookup(
-        number={str(name): i for i, name in enumerate(names)},
-        first=first,
-        sent_key=sent[resort],
-        sent_record=order[resort].astype(np.int64),
-        toe_key=number * _SPAN + (middle - origin) // _MILLISECOND,
-        toe_record=order.astype(np.int64),
-        origin=origin,
-        toe=toe[by_row],
-        available=available[by_row],
-    )
+        number={str(name): i for i, name in enumerate(names)}, first=first, sent_key=sent[resort],
+        sent_record=order[resort].astype(np.int64), toe_key=number * _SPAN + (middle - origin) // _MILLISECOND,
+        toe_record=order.astype(np.int64), origin=origin, toe=toe[by_row], available=available[by_row],
+    )  # fmt: skip
 
 
 def validity_s(records: KeplerRecords) -> Floats:

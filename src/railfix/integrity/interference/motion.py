@@ -142,27 +142,15 @@ def motion_signs(
     been = np.logical_or.accumulate(np.concatenate([[state.on_map], on_line]))
     off = np.where(been[1:], inputs.off_line_m, np.nan)
     signs = MotionSigns(
-        clock_jump_m=clock,
-        drift_jump_mps=drift,
-        drift_jump_sigmas=drift_sigmas,
-        speed_jump_mps=speed,
-        speed_jump_sigmas=speed_sigmas,
-        position_jump_m=jump,
-        position_jump_sigmas=jump_sigmas,
-        part_sigmas=part_sigmas,
-        off_line_m=off,
+        clock_jump_m=clock, drift_jump_mps=drift, drift_jump_sigmas=drift_sigmas, speed_jump_mps=speed,
+        speed_jump_sigmas=speed_sigmas, position_jump_m=jump, position_jump_sigmas=jump_sigmas,
+        part_sigmas=part_sigmas, off_line_m=off,
         off_line_sigmas=np.maximum(off - limits.position_jump_m, 0.0) / fixes.sigma_m,
-    )
+    )  # fmt: skip
     after = MotionSignState(
-        time=inputs.time[-1],
-        channel=inputs.channel,
-        code_m=last_codes[0],
-        rate_mps=last_codes[1],
-        since=last_codes[2],
-        position=last_position,
-        velocity=last_velocity,
-        on_map=bool(been[-1]),
-    )
+        time=inputs.time[-1], channel=inputs.channel, code_m=last_codes[0], rate_mps=last_codes[1],
+        since=last_codes[2], position=last_position, velocity=last_velocity, on_map=bool(been[-1]),
+    )  # fmt: skip
     return signs, after
 
 

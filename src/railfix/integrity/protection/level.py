@@ -182,13 +182,10 @@ def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
     floats = "level_m fault_free_m one_fault_m two_fault_m sigma_m k_fault_free k_one_fault k_two_faults k_false_alarm"
     return ProtectionLevel(
         **{name: np.full(epochs, np.nan) for name in (*floats.split(), "separation")},
-        consistent=np.zeros(epochs, dtype=bool),
-        worst_one=np.full(epochs, -1, dtype=np.intp),
-        worst_two=np.full((epochs, 2), -1, dtype=np.intp),
-        worst_constellation=np.full(epochs, "", dtype="<U1"),
-        unchecked_risk=plan.beyond.copy(),
-        cause=np.full(epochs, Cause.NO_POSITION, dtype=np.int8),
-    )
+        consistent=np.zeros(epochs, dtype=bool), worst_one=np.full(epochs, -1, dtype=np.intp),
+        worst_two=np.full((epochs, 2), -1, dtype=np.intp), worst_constellation=np.full(epochs, "", dtype="<U1"),
+        unchecked_risk=plan.beyond.copy(), cause=np.full(epochs, Cause.NO_POSITION, dtype=np.int8),
+    )  # fmt: skip
 
 
 def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Indices]:
@@ -305,15 +302,10 @@ def _list_hypotheses(plan: Allocation, rows: Indices, n: int) -> Asked:
     kinds = tuple(shared.kind for shared in plan.shared)
     first, bounds = _places(kinds, tuple(order.max(axis=0).tolist()), n)
     return Asked(
-        prior=plan.prior[rows],
-        members=plan.members[rows],
-        wrong_map=np.array([shared.wrong_map for shared in plan.shared]),
-        shared_prior=plan.shared_prior[rows],
-        order=order,
-        k_false_alarm=plan.k_false_alarm[rows],
-        first=first,
-        bounds=bounds,
-    )
+        prior=plan.prior[rows], members=plan.members[rows],
+        wrong_map=np.array([shared.wrong_map for shared in plan.shared]), shared_prior=plan.shared_prior[rows],
+        order=order, k_false_alarm=plan.k_false_alarm[rows], first=first, bounds=bounds,
+    )  # fmt: skip
 
 
 def _channels(channel: Indices, place: Indices) -> Indices:

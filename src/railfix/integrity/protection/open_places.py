@@ -161,15 +161,9 @@ def places_beyond_the_level(
         block = rows[first : first + size]
         part, noise = model.take(block), np.maximum(scale[block], 1.0)
         bound = kernels.off_tangent.risk_off_tangent(
-            part.arrays,
-            noise,
-            likely,
-            np.ascontiguousarray(sides[block]),
-            risk.side_prior,
-            clear[block],
-            sigmas,
+            part.arrays, noise, likely, np.ascontiguousarray(sides[block]), risk.side_prior, clear[block], sigmas,
             risk.risk_per_sample,
-        )
+        )  # fmt: skip
         near = block[bound > risk.risk_per_sample]
         for index, own in antennas.split(near):
             for some in np.array_split(own, 1 + 9 * len(own) // size):

@@ -252,13 +252,9 @@ def _of_few_epochs(
     """Allocation of few epochs, kept: nobody writes into it."""
     channels, excluded = len(systems), np.frombuffer(out, dtype=np.int64).copy()
     return _allocate(
-        np.frombuffer(used, dtype=bool).reshape(len(excluded), channels).copy(),
-        systems,
-        risk.risk,
-        excluded,
-        np.frombuffer(sides, dtype=bool).reshape(len(excluded), count, channels).copy(),
-        wrong_map=wrong_map,
-    )
+        np.frombuffer(used, dtype=bool).reshape(len(excluded), channels).copy(), systems, risk.risk, excluded,
+        np.frombuffer(sides, dtype=bool).reshape(len(excluded), count, channels).copy(), wrong_map=wrong_map,
+    )  # fmt: skip
 
 
 def _allocate(
@@ -305,20 +301,12 @@ def _allocate(
     tests = np.where(mapped, 0.0, np.take_along_axis(sizes, order, axis=1)).sum(axis=1) - 1.0
     asked = [0, *(b for b in range(1, len(shared)) if (order[:, b] >= 0).any())]
     return Allocation(
-        prior=prior,
-        groups=tuple(letters),
-        shared=tuple(shared[b] for b in asked),
+        prior=prior, groups=tuple(letters), shared=tuple(shared[b] for b in asked),
         members=np.stack([members[:, shared[b].events].any(axis=1) for b in asked], axis=1),
-        shared_prior=each[:, asked],
-        order=order[:, asked],
-        beyond=beyond,
-        fault_free=parts[0],
-        one=parts[1],
-        two=parts[2],
-        more=np.where(more, sum(parts) / 3.0, 0.0),
-        reserved=np.where(pairs, 0.0, of_pairs),
+        shared_prior=each[:, asked], order=order[:, asked], beyond=beyond, fault_free=parts[0], one=parts[1],
+        two=parts[2], more=np.where(more, sum(parts) / 3.0, 0.0), reserved=np.where(pairs, 0.0, of_pairs),
         k_false_alarm=one_sided_k(risk.false_alarm / (2.0 * np.maximum(tests, 1.0))),
-    )
+    )  # fmt: skip
 
 
 @lru_cache(maxsize=64)

@@ -59,16 +59,11 @@ class LinearModel:
     def take(self, epochs: Masks | Indices) -> LinearModel:
         """The model of some epochs, by mask or index."""
         return LinearModel(
-            root_weight=self.root_weight[epochs],
-            clock=self.clock,
-            clock_covariance_m2=self.clock_covariance_m2[epochs],
-            design=self.design[epochs],
-            covariance_m2=self.covariance_m2[epochs],
-            prior=self.prior,
-            misfit=self.misfit[epochs],
-            freedom=self.freedom[epochs],
-            interest=self.interest,
-        )
+            root_weight=self.root_weight[epochs], clock=self.clock,
+            clock_covariance_m2=self.clock_covariance_m2[epochs], design=self.design[epochs],
+            covariance_m2=self.covariance_m2[epochs], prior=self.prior, misfit=self.misfit[epochs],
+            freedom=self.freedom[epochs], interest=self.interest,
+        )  # fmt: skip
 
     @property
     def arrays(self) -> ModelArrays:
