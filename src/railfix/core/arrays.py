@@ -76,4 +76,4 @@ def medians(values: Floats) -> Floats:
     rows.sort()  # NaN last
     count, row = (rows == rows).sum(axis=1), np.arange(len(rows))
     low, high = rows[row, np.maximum(count - 1, 0) // 2], rows[row, np.minimum(count // 2, width - 1)]
-    return ((low + high) / 2.0).reshape(shape)  # type: ignore[no-any-return]
+    return np.asarray((low + high) / 2.0).reshape(shape)

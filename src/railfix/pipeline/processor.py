@@ -154,9 +154,8 @@ class EpochProcessor:
         chosen = (*(s for s in SCREENS if s.name in config.screens), *screens)
         self.screens = tuple((s, getattr(config, s.name, s.limits)) for s in in_order(chosen))
         kinds = ObservationScreen, PairScreen, PositionScreen
-        self._of_observations, self._of_pairs, self._of_positions = (
-            [(s, limits) for s, limits in self.screens if isinstance(s, kind)] for kind in kinds
-        )
+        by_kind: list[list[Any]] = [[each for each in self.screens if isinstance(each[0], kind)] for kind in kinds]
+        self._of_observations, self._of_pairs, self._of_positions = by_kind
         self.setup = ScreenSetup(
             antennas=len(self.trajectories),
             spacing_known=all(t.body_chainage_m is not None for t in self.trajectories.values()),

@@ -122,7 +122,7 @@ class AntennaRows:
 
     def axes_of(self, section: Indices) -> Floats:
         """Unit vectors along, across and up at sections of the lines, shape (T, 3, 3)."""
-        return _lines(self.indices).axes[section + self._first]
+        return np.asarray(_lines(self.indices).axes[section + self._first])
 
     def _interpolated(self, arc_m: Floats, values: Floats) -> Floats:
         """Interpolate values of the points of all lines at arc lengths."""

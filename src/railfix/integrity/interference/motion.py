@@ -46,8 +46,8 @@ class MotionInputs(NamedTuple):
 
     def take(self, rows: slice) -> MotionInputs:
         """Return those of some epochs."""
-        of_channels = {"channel": self.channel, "group": self.group}
-        return MotionInputs(*(own[rows] for own in self))._replace(**of_channels)
+        own = {name: values[rows] for name, values in self._asdict().items()}
+        return MotionInputs(**{**own, "channel": self.channel, "group": self.group})
 
 
 class Fix(NamedTuple):
