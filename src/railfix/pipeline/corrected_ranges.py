@@ -165,13 +165,9 @@ def correct_ranges(
         reason = np.where(observed, reason | delays.reason, reason)
     else:
         delays = model_delays(
-            obs.time,
-            seen,
-            frequency,
-            klobuchar=received.klobuchar,
-            ionosphere_sigma_m=received.ionosphere_sigma_m,
+            obs.time, seen, frequency, klobuchar=received.klobuchar, ionosphere_sigma_m=received.ionosphere_sigma_m,
             troposphere=config.troposphere,
-        )
+        )  # fmt: skip
         beyond = np.hypot(delays.sigma_m, config.nominal.unusual_sigma_m(states.accuracy_m))
         nominal = np.hypot(config.nominal.sigma_m(seen.elevation_deg), beyond)
         if isinstance(fixes, DfmcCorrections):

@@ -64,12 +64,9 @@ class LineFeatures:
         body = trajectory.chainage_m if trajectory.body_chainage_m is None else trajectory.body_chainage_m
         inside = np.clip(body, line.chainage_m[0], line.chainage_m[-1])
         return cls(
-            series=series,
-            features=tuple(map_features(series)),
-            antenna_m=np.asarray(trajectory.arc_m),
-            body_m=line.arc_at_chainage(inside) + body - inside,
-            line=Line.of(line),
-        )
+            series=series, features=tuple(map_features(series)), antenna_m=np.asarray(trajectory.arc_m),
+            body_m=line.arc_at_chainage(inside) + body - inside, line=Line.of(line),
+        )  # fmt: skip
 
     def body_at(self, antenna_m: Floats) -> Floats:
         """Place of the body's middle where an antenna is at an arc length of its trajectory [m]."""

@@ -112,12 +112,9 @@ def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, l
     `noise_scale`: standard deviation of this receiver's ranges over the sigmas of the weights, shape (T,).
     """
     test = detect(
-        point.wsse,
-        point.residual_m,
-        ranges.n_used - ranges.n_clocks - 3,
-        scale=noise_scale,
+        point.wsse, point.residual_m, ranges.n_used - ranges.n_clocks - 3, scale=noise_scale,
         limits=RaimLimits(false_alarm=limits.false_alarm),
-    )
+    )  # fmt: skip
     located = np.asarray(np.isfinite(point.ecef_m).all(axis=1))
     over = ~(position_dilution(ranges, point.ecef_m) <= limits.dilution_limit)
     status = np.where(over, int(PointStatus.DILUTION), int(PointStatus.VALID))
@@ -188,12 +185,9 @@ def _faults_excluded(
     place = solved_again(ranges, index, place, changed, config)
     # Without the fault another section can fit best: the remaining ranges must be consistent there, too.
     recheck = detect(
-        place.constrained.wsse[changed],
-        place.constrained.residual_m[changed],
-        redundancy_of(ranges)[changed],
-        limits=limits,
-        scale=scale[changed],
-    )
+        place.constrained.wsse[changed], place.constrained.residual_m[changed], redundancy_of(ranges)[changed],
+        limits=limits, scale=scale[changed],
+    )  # fmt: skip
     outcome = np.where(recheck.detected, Outcome.UNRESOLVED, raim.outcome[changed])
     return ranges, place, replace(raim, outcome=_put(raim.outcome, changed, outcome))
 

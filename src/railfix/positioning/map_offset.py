@@ -159,12 +159,10 @@ def map_offset(
         sums, antennas.sigma_plan_m, antennas.sigma_height_m, limits.detectable_sigmas
     )
     result = MapOffset(
-        across_m=np.where(enough, mean[:, 0], np.nan),
-        up_m=np.where(enough, mean[:, 1], np.nan),
-        covariance_m2=np.where(enough[:, None, None], known, np.nan),
-        statistic=np.where(enough, statistic, np.nan),
+        across_m=np.where(enough, mean[:, 0], np.nan), up_m=np.where(enough, mean[:, 1], np.nan),
+        covariance_m2=np.where(enough[:, None, None], known, np.nan), statistic=np.where(enough, statistic, np.nan),
         detectable_m=np.where(enough[:, None], detectable, np.nan),
-    )
+    )  # fmt: skip
     return result, after
 
 

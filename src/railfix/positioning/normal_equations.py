@@ -86,12 +86,9 @@ class Ranges:
     def take(self, epochs: Masks | Indices) -> Ranges:
         """The ranges of some epochs, by mask or index."""
         return Ranges(
-            sat_ecef_m=self.sat_ecef_m[epochs],
-            code_m=self.code_m[epochs],
-            weight=self.weight[epochs],
-            groups=self.groups,
-            ties=None if self.ties is None else self.ties.take(epochs),
-        )
+            sat_ecef_m=self.sat_ecef_m[epochs], code_m=self.code_m[epochs], weight=self.weight[epochs],
+            groups=self.groups, ties=None if self.ties is None else self.ties.take(epochs),
+        )  # fmt: skip
 
     @cached_property
     def arrays(self) -> RangeArrays:
@@ -324,12 +321,9 @@ def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLim
     """Compute single-point positions of all epochs at once, from starts (T, 3) [m] within a few thousand kilometres."""
     limits = limits or SinglePointLimits()
     place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterated_points(
-        ranges.arrays,
-        kernel_array(start_ecef_m),
-        np.asarray(ranges.n_used - ranges.n_clocks >= 3),
-        limits.tolerance_m,
-        limits.max_iterations,
-    )
+        ranges.arrays, kernel_array(start_ecef_m), np.asarray(ranges.n_used - ranges.n_clocks >= 3),
+        limits.tolerance_m, limits.max_iterations,
+    )  # fmt: skip
     return SinglePoint(
         ecef_m=place, clock_m=clock, matrix=matrix, covariance_m2=covariance, wsse=wsse, residual_m=residual
     )

@@ -190,15 +190,9 @@ def _ball(
     place = point.ecef_m[at]
     nearest_m, vertex = index.tree.query(place)
     radius[known] = kernels.search.radii_of_balls(
-        np.asarray(nearest_m, dtype=np.float64),
-        index.trajectory.ecef_m[vertex] - place,
-        point.matrix[at],
-        point.covariance_m2[at],
-        point.wsse[at],
-        weight_norm[at],
-        freedom[at],
-        limits.reach,
-    )
+        np.asarray(nearest_m, dtype=np.float64), index.trajectory.ecef_m[vertex] - place, point.matrix[at],
+        point.covariance_m2[at], point.wsse[at], weight_norm[at], freedom[at], limits.reach,
+    )  # fmt: skip
     return radius
 
 

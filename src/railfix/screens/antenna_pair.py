@@ -232,12 +232,9 @@ def antenna_pair_screen(
     metric = raw - clock
     relative = np.asarray(azimuth_deg) - np.asarray(spacing.heading_deg, dtype=np.float64)[..., None]
     zone = ambiguity_m(
-        elevation_deg,
-        relative,
-        np.asarray(spacing.spacing_m, dtype=np.float64)[..., None],
-        elevation_error_deg=limits.elevation_error_deg,
-        azimuth_error_deg=limits.azimuth_error_deg,
-    )
+        elevation_deg, relative, np.asarray(spacing.spacing_m, dtype=np.float64)[..., None],
+        elevation_error_deg=limits.elevation_error_deg, azimuth_error_deg=limits.azimuth_error_deg,
+    )  # fmt: skip
     return AntennaPairScreened(
         metric=metric, reject=np.abs(metric) > np.maximum(limits.limit_m, zone), expected_m=expected,
         ambiguity_m=zone, clock_m=clock, clocks=CLOCKS[limits.clocks],

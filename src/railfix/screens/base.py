@@ -300,12 +300,10 @@ def pair_antennas(
     front_arc, _ = front_path.nearest(front_anchor_ecef_m[at_front])
     rear_arc = rear_path.arc_of_body(front_path.body_at(front_arc))
     return PairedEpochs(
-        front_epoch=at_front,
-        rear_epoch=at_rear,
-        front_ecef_m=front_path.at_arc(front_arc),
+        front_epoch=at_front, rear_epoch=at_rear, front_ecef_m=front_path.at_arc(front_arc),
         rear_ecef_m=rear_path.at_arc(rear_arc),
         along_m=front_path.chainage_at(front_arc) - rear_path.chainage_at(rear_arc),
-    )
+    )  # fmt: skip
 
 
 def clock_medians(values: Floats, satellite: Strings, *, least: int = 0) -> Floats:

@@ -385,16 +385,12 @@ class PreparedRecords:
         clock: ClockReference = "broadcast" if self.navigation.precise is None else "ionosphere_free"
         records = self.navigation.kepler
         return ChannelRecords(
-            kepler=kepler,
-            glonass=glonass,
-            preferred=preferred,
-            other=other,
-            any_other=bool((other >= 0).any()),
+            kepler=kepler, glonass=glonass, preferred=preferred, other=other, any_other=bool((other >= 0).any()),
             signal=np.array([codes.index(code) for _, code in names], dtype=np.int64),
             group_delay_s=_rows(lambda code: group_delay_s(records, code, clock=clock), codes, len(records)),
             unhealthy=_rows(lambda code: unhealthy(records, code), codes, len(records)).astype(bool),
             glonass_number=np.array([glonass_number.get(satellite[i], -1) for i in glonass], dtype=np.int64),
-        )
+        )  # fmt: skip
 
 
 def _rows(of_signal: Callable[[str], NDArray[np.generic]], codes: list[str], records: int) -> Floats:

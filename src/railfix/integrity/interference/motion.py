@@ -171,12 +171,9 @@ def fixes_of(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats]) -> Fix
         np.concatenate([-sight, ones], axis=2), rate, known.astype(np.float64), least=_LEAST_FREEDOM
     )
     return Fix(
-        inputs.time,
-        near + step[:, :3],
-        scale * _length(covariance),
-        velocity,
+        inputs.time, near + step[:, :3], scale * _length(covariance), velocity,
         np.maximum(noise, _LEAST_MPS) * _length(of_velocity),
-    )
+    )  # fmt: skip
 
 
 def _misfit(inputs: MotionInputs) -> tuple[Floats, Floats, Floats]:

@@ -150,12 +150,10 @@ def along_track_level(
     groups = np.zeros((epochs, 0, channels), dtype=bool) if sides is None else sides
     plan = allocate(model, systems, risk, out, groups, wrong_map=map_error.seen is not None)
     given = Errors(
-        scale,
-        _by_epoch(overbound.sigma_m, epochs, channels),
-        _by_epoch(overbound.bias_m, epochs, channels),
+        scale, _by_epoch(overbound.sigma_m, epochs, channels), _by_epoch(overbound.bias_m, epochs, channels),
         _by_epoch(map_error.bias_m, epochs, 2),
         *((np.zeros((epochs, 2)), np.zeros((epochs, 2, 2))) if map_error.seen is None else map_error.seen),
-    )
+    )  # fmt: skip
     located = np.isfinite(model.covariance_m2).all(axis=(1, 2)) & np.isfinite(scale)
     if 0 < epochs <= FEW and located.all():
         return ProtectionLevel(**_level_of_block(np.arange(epochs), model, plan, given))

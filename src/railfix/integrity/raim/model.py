@@ -159,13 +159,10 @@ def compact(model: LinearModel) -> Compact:
     projector = -spread @ unknowns.swapaxes(1, 2)
     projector[:, np.arange(n), np.arange(n)] += used
     return Compact(
-        channel=channel,
-        used=used,
-        projector=projector,
-        residual=np.take_along_axis(model.residual, channel, axis=1),
+        channel=channel, used=used, projector=projector, residual=np.take_along_axis(model.residual, channel, axis=1),
         sigma_m=np.where(used, 1.0 / np.where(used, root, 1.0), 0.0),
         gain_m=np.take_along_axis(model.gain_m, channel[..., None], axis=1),
-    )
+    )  # fmt: skip
 
 
 def constrained_model(
@@ -211,16 +208,10 @@ def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *,
     design = rows - root[..., None] * _clocks(root, clock, covariance, rows)
     normal = rows.swapaxes(1, 2) @ design
     return LinearModel(
-        root_weight=root,
-        clock=clock,
-        clock_covariance_m2=covariance,
-        design=design,
-        covariance_m2=regular_inverse((normal + normal.swapaxes(1, 2)) / 2.0 + prior),
-        prior=prior,
-        misfit=root * misfit,
-        freedom=ranges.n_used - ranges.n_clocks - unknowns,
-        interest=1 if unknowns == 1 else 2,
-    )
+        root_weight=root, clock=clock, clock_covariance_m2=covariance, design=design,
+        covariance_m2=regular_inverse((normal + normal.swapaxes(1, 2)) / 2.0 + prior), prior=prior,
+        misfit=root * misfit, freedom=ranges.n_used - ranges.n_clocks - unknowns, interest=1 if unknowns == 1 else 2,
+    )  # fmt: skip
 
 
 def _clock_covariance(totals: Floats, tie_sigma_m: Floats | None) -> Floats:

@@ -339,8 +339,7 @@ def smooth_codes(
     after = SmoothingState(
         time=time[-1], channels=channels, base_m=read_only(np.where(runs[-1], base[-1], np.nan)),
         offset_m=read_only(np.where(runs[-1], offset[-1], 0.0)),
-        count=read_only(np.where(runs[-1], count[-1], 0.0).astype(np.int64)),
-        last_m=read_only(last),
+        count=read_only(np.where(runs[-1], count[-1], 0.0).astype(np.int64)), last_m=read_only(last),
         clock_m=float(apart[-1]),
-    )
+    )  # fmt: skip
     return smoothed, after
