@@ -40,7 +40,7 @@ def epochs(case: Ride, trajectory: Trajectory) -> GnssEpochs:
     processor = processor_of(config, case.simulation.navigation, {"front": trajectory})
     solved, _ = processor.single_epochs({"front": case.observations})
     result = solved.results["front"]
-    found, _ = gnss_epochs(solved.ranges["front"], result.noise_scale, config, None)
+    found, _ = gnss_epochs(solved.ranges, result.noise_scale, config, None)
     return replace(found, near_ecef_m=result.conventional_ecef_m)
 
 

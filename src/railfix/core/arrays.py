@@ -33,6 +33,9 @@ def read_only(array: NDArray[Any]) -> NDArray[Any]:
 
 def kernel_array(array: NDArray[Any]) -> Floats:
     """A read-only view of numbers in C order: kernels are compiled once for all callers."""
+    flags = array.flags
+    if flags.c_contiguous and not flags.writeable and array.dtype == np.float64:
+        return array
     return read_only(np.ascontiguousarray(array, dtype=np.float64))
 
 
@@ -60,7 +63,7 @@ class FrozenArrays:
 def changed(instance: Instance, **values: Any) -> Instance:
     """Copy a frozen dataclass with changes, without ``__init__``, ``__post_init__`` and cached properties."""
     copy = object.__new__(type(instance))
-    vars(copy).update(vars(instance), **values)
+    copy.__dict__.update(instance.__dict__, **values)
     return copy
 
 
@@ -69,7 +72,8 @@ def medians(values: Floats) -> Floats:
     *shape, width = values.shape
     if not width:
         return np.full(shape, np.nan)
-    rows = np.sort(values, axis=-1).reshape(-1, width)  # NaN last
-    count, row = (~np.isnan(rows)).sum(axis=1), np.arange(len(rows))
+    rows = values.reshape(-1, width).copy()
+    rows.sort()  # NaN last
+    count, row = (rows == rows).sum(axis=1), np.arange(len(rows))
     low, high = rows[row, np.maximum(count - 1, 0) // 2], rows[row, np.minimum(count // 2, width - 1)]
     return np.asarray((low + high) / 2.0).reshape(shape)

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, freeze_arrays
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, changed, freeze_arrays
 from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP
 from railfix.core.tables import NotebookTable, plural, time_span_text
 from railfix.core.timescale import gps_time
@@ -166,16 +166,15 @@ class Observations(NotebookTable):
         epochs = slice(start, stop, rows.step)
         channels = slice(None) if names is None else self._channels_of([names] if isinstance(names, str) else names)
         arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
-        return Observations(
-            time=self.time[epochs],
-            satellite=self.satellite[channels],
-            signal=self.signal[channels],
+        part = changed(
+            self, time=self.time[epochs], satellite=self.satellite[channels], signal=self.signal[channels],
             **{name: getattr(self, name)[epochs][:, channels] for name in arrays},
-            break_before=self.break_before[epochs],
-            receiver_alarm=self.receiver_alarm[epochs],
-            front_end_gain=self.front_end_gain[epochs],
-            header=self.header,
-        )
+            break_before=self.break_before[epochs], receiver_alarm=self.receiver_alarm[epochs],
+            front_end_gain=self.front_end_gain[epochs], problems=(), problem_count=0, skipped={},
+        )  # fmt: skip
+        if names is not None:
+            freeze_arrays(part)
+        return part
 
     def _epoch_at(self, bound: str | datetime | np.datetime64) -> int:
         """Return the number of the first epoch at or after a time."""
@@ -273,19 +272,14 @@ def stack_parts(parts: Sequence[Observations]) -> Observations:
     for part in parts:
         skipped.update(part.skipped)
     return Observations(
-        time=np.concatenate([p.time for p in parts]),
-        satellite=np.array([k[0] for k in keys], dtype="<U3"),
-        signal=np.array([k[1] for k in keys], dtype="<U2"),
-        loss_of_lock=lock,
+        time=np.concatenate([p.time for p in parts]), satellite=np.array([k[0] for k in keys], dtype="<U3"),
+        signal=np.array([k[1] for k in keys], dtype="<U2"), loss_of_lock=lock,
         break_before=np.concatenate([p.break_before for p in parts]),
         receiver_alarm=np.concatenate([p.receiver_alarm for p in parts]),
-        front_end_gain=np.concatenate([p.front_end_gain for p in parts]),
-        header=_join_header(parts),
+        front_end_gain=np.concatenate([p.front_end_gain for p in parts]), header=_join_header(parts),
         problems=capped_problems(chain.from_iterable(p.problems[:MAX_PROBLEMS] for p in parts), count=count),
-        problem_count=count,
-        skipped=dict(skipped),
-        **floats,
-    )
+        problem_count=count, skipped=dict(skipped), **floats,
+    )  # fmt: skip
 
 
 def _join_header(parts: Sequence[Observations]) -> ObservationHeader:

@@ -166,7 +166,8 @@ class SensorSamples:
         return SensorSamples(**parts, silent=later.silent)
 
     def __bool__(self) -> bool:
-        return any(len(rows) > 0 for rows in self.tables.values())
+        tables = self.tachometer, self.inertial, self.radar, self.ranging, self.balises
+        return sum(map(len, tables)) > 0
 
 
 @dataclass(frozen=True, kw_only=True)

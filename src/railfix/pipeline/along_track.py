@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from itertools import pairwise
 from typing import Final
@@ -20,6 +20,7 @@ from railfix.pipeline.balises import BaliseLimits, find_passings
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.filter_result import (
+    COORDINATES,
     AlongTrack,
     FilterFix,
     FilterState,
@@ -98,25 +99,22 @@ def along_track(
             after, tracked = replace(after, pulled=filtered), _bounded_by_wheel(tracked, pulled.bound_m)
         tracked = doubted(tracked, wheel.parted & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
     inside = on_line_m(tracked, trajectory)
-    ecef, chainage = trajectory.at_arc(inside), trajectory.chainage_at(inside)
-    latitude, longitude, height = geodetic_from_ecef(ecef)
+    chainage = trajectory.chainage_at(inside)
+
+    def later(name: str) -> Mapping[str, Floats]:
+        if name == "ecef_m":
+            return {name: trajectory.at_arc(inside)}
+        if name == "kilometrage_m":
+            return {name: interpolate_kilometrage(chainage, trajectory.chainage_m, trajectory.kilometrage_m)}
+        return dict(zip(COORDINATES, geodetic_from_ecef(result.ecef_m), strict=True))
+
     speed, sigma = tracked.speed_mps, tracked.speed_sigma_mps
     direction = np.where(np.abs(speed) > _DIRECTION_SIGMAS * sigma, np.sign(speed), 0.0)
-    result = AlongTrack(
-        tracked=tracked,
-        chainage_m=chainage,
-        kilometrage_m=interpolate_kilometrage(chainage, trajectory.chainage_m, trajectory.kilometrage_m),
-        ecef_m=ecef,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        height_m=height,
-        direction=direction.astype(np.int8),
-        standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS,
-        sensed=sensed,
-        spacing_error_m=np.full(len(tracked), np.nan),
-        wheel=wheel,
-        replay=replays,
-    )
+    result = AlongTrack.made(
+        later, tracked=tracked, chainage_m=chainage, direction=direction.astype(np.int8),
+        standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS, sensed=sensed,
+        spacing_error_m=np.full(len(tracked), np.nan), wheel=wheel, replay=replays,
+    )  # fmt: skip
     return result, changed(after, line=line)
 
 
@@ -206,7 +204,7 @@ def _tracked(
 
     sensing = bool(samples) or bool(state.sensors.samples)
     number = epochs.time.astype(np.int64) // _STRETCH_NS
-    edges = np.flatnonzero(np.diff(number, prepend=number[:1], append=number[-1:])) if sensing else np.empty(0, np.intp)
+    edges = np.diff(number, prepend=number[:1], append=number[-1:]).nonzero()[0] if sensing else np.empty(0, np.intp)
     parts: list[Tracked] = []
     motions: list[SensedMotion] = []
     replays: list[Replay] = []
@@ -295,7 +293,7 @@ def _begun_anew(state: FilterState, fixed: FilterFix) -> FilterState:
 
 
 def _fixed(tracked: Tracked) -> FilterFix:
-    decided = tracked.status[-1] in (TrackStatus.TRACKING, TrackStatus.COASTING)
+    decided = int(tracked.status[-1]) in (TrackStatus.TRACKING, TrackStatus.COASTING)
     arc, speed = float(tracked.arc_m[-1]), float(tracked.speed_mps[-1])
     sigma = float(tracked.sigma_m[-1])
     return FilterFix(time=tracked.time[-1], arc_m=arc if decided else np.nan, sigma_m=sigma, speed_mps=speed)
@@ -341,19 +339,13 @@ def gnss_epochs(
         np.where(np.isnan(air), 0.0, air),
     )
     epochs = GnssEpochs(
-        time=obs.time,
-        satellite=ranges.satellite,
-        clock=ranges.channels.clock,
-        sat_ecef_m=ranges.satellites.position_ecef_m,
-        sat_velocity_mps=ranges.satellites.velocity_ecef_mps,
-        code_m=np.where(healthy, ranges.corrected_code_m, np.nan),
-        code_sigma_m=ranges.sigma_m * noise_scale[:, None],
-        phase_m=np.where(healthy & phases, phase, np.nan),
-        phase_joined=~slips.slip[:, columns],
+        time=obs.time, satellite=ranges.satellite, clock=ranges.channels.clock,
+        sat_ecef_m=ranges.satellites.position_ecef_m, sat_velocity_mps=ranges.satellites.velocity_ecef_mps,
+        code_m=np.where(healthy, ranges.corrected_code_m, np.nan), code_sigma_m=ranges.sigma_m * noise_scale[:, None],
+        phase_m=np.where(healthy & phases, phase, np.nan), phase_joined=~slips.slip[:, columns],
         rate_mps=np.where(healthy & dopplers, -SPEED_OF_LIGHT / ranges.frequency_hz * ranges.doppler_hz, np.nan),
-        cn0_dbhz=ranges.cn0_dbhz,
-        off_map=np.zeros(len(obs.time), dtype=np.bool_),
-    )
+        cn0_dbhz=ranges.cn0_dbhz, off_map=np.zeros(len(obs.time), dtype=np.bool_),
+    )  # fmt: skip
     return epochs, after
 
 

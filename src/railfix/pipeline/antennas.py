@@ -7,7 +7,7 @@ it should be ahead.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
@@ -19,11 +19,12 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Status
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
+from railfix.pipeline.filter_result import COORDINATES
 from railfix.pipeline.level_stage import judged
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.solution import Solution, reason_of_all_channels, satellites_rejected
 from railfix.positioning.antenna_rows import AntennaRows, joined
-from railfix.screens import FilteredMotion, PairedEpochs, PairScreen, PositionScreen, Screened
+from railfix.screens import FilteredMotion, PairedEpochs, Screened
 from railfix.screens.base import on_pairs, pair_epochs
 from railfix.track.track import interpolate_kilometrage
 from railfix.track.trajectory import Trajectory
@@ -36,6 +37,10 @@ def with_coordinates(failed_checks: str) -> Masks:
     return read_only(np.array([status in POSITIONED and status not in dropped for status in sorted(Status)]))
 
 
+#: Fields of `AntennaResult` that are computed together.
+_NEAREST: Final = ("conventional_arc_m", "conventional_offset_m", "conventional_chainage_m")
+
+
 def antenna_results(
     corrected: CorrectedRanges, antennas: AntennaRows, solution: Solution, chainage_m: Floats, config: Config
 ) -> AntennaResult:
@@ -43,10 +48,6 @@ def antenna_results(
     obs, point, constrained = corrected.observations, solution.point, solution.place.constrained
     has = with_coordinates(config.failed_checks)[solution.status]
     arc, chainage = np.where(has, solution.arc_m, np.nan), np.where(has, chainage_m, np.nan)
-    ecef, kilometrage = antennas.each(lambda index, rows: _places(index.trajectory, arc[rows], chainage[rows]))
-    latitude, longitude, height = geodetic_from_ecef(ecef)
-    nearest, offset, beside = antennas.each(lambda index, rows: _nearest(index.trajectory, point.ecef_m[rows]))
-    reason = reason_of_all_channels(corrected)
     protection = solution.protection
 
     def on_all_channels(values: Floats) -> Floats:
@@ -54,36 +55,41 @@ def antenna_results(
         full[:, corrected.columns] = values
         return full
 
-    return AntennaResult(
+    def later(name: str) -> Mapping[str, Any]:
+        if name in COORDINATES:
+            return dict(zip(COORDINATES, geodetic_from_ecef(result.ecef_m), strict=True))
+        if name in _NEAREST:
+            found = antennas.each(lambda index, rows: _nearest(index.trajectory, point.ecef_m[rows]))
+            return dict(zip(_NEAREST, found, strict=True))
+        return {name: alone[name]()}
+
+    alone: dict[str, Callable[[], Any]] = {
+        "ecef_m": lambda: antennas.at_arc(arc),
+        "kilometrage_m": lambda: antennas.each(lambda index, rows: _kilometrage(index.trajectory, chainage[rows])),
+        "reason": lambda: reason_of_all_channels(corrected),
+        "n_rejected": lambda: satellites_rejected(corrected.channels.member, result.reason),
+        "n_used": lambda: (corrected.reason == 0).sum(axis=1),
+        "elevation_deg": lambda: on_all_channels(corrected.elevation_deg),
+        "azimuth_deg": lambda: on_all_channels(corrected.azimuth_deg),
+        "sigma_m": lambda: on_all_channels(corrected.sigma_m),
+        "bound_sigma_m": lambda: on_all_channels(corrected.bound_sigma_m),
+        "corrected_code_m": lambda: on_all_channels(corrected.corrected_code_m),
+        "residual_m": lambda: on_all_channels(np.where(corrected.reason == 0, constrained.residual_m, np.nan)),
+    }
+    result = AntennaResult.made(
+        later,
         time=obs.time,
         satellite=obs.satellite,
         signal=obs.signal,
         status=solution.status,
         chainage_m=chainage,
-        kilometrage_m=kilometrage,
         arc_m=arc,
         along_sigma_m=np.where(has, solution.along_sigma_m, np.nan),
         own_sigma_m=solution.own_sigma_m,
         noise_scale=solution.noise_scale,
-        ecef_m=ecef,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        height_m=height,
-        n_used=np.count_nonzero(corrected.reason == 0, axis=1),
-        n_rejected=satellites_rejected(corrected.channels.member, reason),
         conventional_status=solution.point_status,
         conventional_ecef_m=point.ecef_m,
-        conventional_arc_m=nearest,
-        conventional_chainage_m=beside,
-        conventional_offset_m=offset,
-        reason=reason,
-        elevation_deg=on_all_channels(corrected.elevation_deg),
-        azimuth_deg=on_all_channels(corrected.azimuth_deg),
         cn0_dbhz=obs.cn0_dbhz,
-        sigma_m=on_all_channels(corrected.sigma_m),
-        bound_sigma_m=on_all_channels(corrected.bound_sigma_m),
-        corrected_code_m=on_all_channels(corrected.corrected_code_m),
-        residual_m=on_all_channels(np.where(corrected.reason == 0, constrained.residual_m, np.nan)),
         satellites=corrected.satellites,
         columns=corrected.columns,
         second=corrected.second,
@@ -96,17 +102,18 @@ def antenna_results(
         raim=changed(solution.raim, protection_level_m=np.where(has, solution.raim.protection_level_m, np.nan)),
         protection=None if protection is None else judged(protection, solution.status, has, chainage, config),
         map_offset=solution.map_offset,
-        interference=solution.interference,
+        interference=None,  # of each antenna
         araim=solution.araim,
         clocks=corrected.clocks,
         clock_offset_m=solution.ties.offset_m,
         clock_offset_sigma_m=solution.ties.sigma_m,
     )
+    return result
 
 
-def _places(line: Trajectory, arc_m: Floats, chainage_m: Floats) -> tuple[Floats, Floats]:
-    """Return points (T, 3) and kilometrage (T,) of a line at arc lengths and their chainages [m]."""
-    return line.at_arc(arc_m), interpolate_kilometrage(chainage_m, line.chainage_m, line.kilometrage_m)
+def _kilometrage(line: Trajectory, chainage_m: Floats) -> Floats:
+    """Return the kilometrage of a line at chainages, shape (T,) [m]."""
+    return interpolate_kilometrage(chainage_m, line.chainage_m, line.kilometrage_m)
 
 
 def _nearest(line: Trajectory, ecef_m: Floats) -> tuple[Floats, Floats, Floats]:
@@ -128,10 +135,9 @@ def judge_pairs(
 ) -> dict[str, CorrectedRanges]:
     """Return the ranges after the screens of common observations, by antenna; `screens` are with their limits."""
     judged = dict(ranges)
-    for screen, limits in screens:
-        if pair is not None and isinstance(screen, PairScreen):
-            for name, verdicts in screen.judge(ranges["front"], ranges["rear"], pair, limits).items():
-                judged[name] = judged[name].judged(verdicts)
+    for screen, limits in screens if pair is not None else ():
+        for name, verdicts in screen.judge(ranges["front"], ranges["rear"], pair, limits).items():
+            judged[name] = judged[name].judged(verdicts)
     return judged
 
 
@@ -147,7 +153,7 @@ def position_verdicts(
     """Return the verdicts of the screens of the published positions, by antenna; both antennas get the status."""
     checks: dict[str, tuple[PositionVerdict, ...]] = {}
     for screen, limits in screens:
-        if pair is None or not isinstance(screen, PositionScreen):
+        if pair is None:
             continue
         front, rear = chainage_m["front"][pair.front_epoch], chainage_m["rear"][pair.rear_epoch]
         verdict = screen.judge(front, rear, pair, limits)
@@ -163,7 +169,7 @@ def filter_verdicts(
     """Return the verdicts of the screens of positions on the places by the filter, by antenna."""
     checks: dict[str, Screened] = {}
     for screen, limits in screens:
-        if pair is None or not isinstance(screen, PositionScreen):
+        if pair is None:
             continue
         epochs = {"front": pair.front_epoch, "rear": pair.rear_epoch}
         front, rear = (filtered[name].take(rows) for name, rows in epochs.items())

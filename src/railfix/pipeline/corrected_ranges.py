@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, changed
+from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, changed, kernel_array
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states
@@ -17,7 +17,7 @@ from railfix.integrity.protection.araim import IntegritySupport
 from railfix.pipeline.channels import Channels, second_codes
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received
-from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.antenna_rows import AntennaRows, OnDemand
 from railfix.positioning.carrier import Slips
 from railfix.positioning.normal_equations import Ranges, SinglePointLimits, single_point
 from railfix.positioning.section_search import SearchIndex, search
@@ -59,7 +59,7 @@ class Models(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrectedRanges(AntennaRanges):
+class CorrectedRanges(AntennaRanges, OnDemand):
     """Corrected pseudoranges before positioning: T epochs by the K channels that the settings allow."""
 
     observations: Observations
@@ -138,14 +138,9 @@ def correct_ranges(
     observed = (reason & int(Reason.NOT_OBSERVED)) == 0
     fixes = None if sbas is None else sbas.satellites(obs.time, satellite, received.navigation)
     states = satellite_states(
-        obs.time,
-        satellite,
-        signal,
-        code,
-        received.navigation,
-        max_age_s=config.max_ephemeris_age_s,
+        obs.time, satellite, signal, code, received.navigation, max_age_s=config.max_ephemeris_age_s,
         record=None if fixes is None else fixes.record,
-    )
+    )  # fmt: skip
     lacking = np.zeros(code.shape, dtype=np.int64)
     if isinstance(fixes, DfmcCorrections):
         states, lacking = apply_dfmc(states, fixes, satellite, signal)
@@ -170,13 +165,9 @@ def correct_ranges(
         reason = np.where(observed, reason | delays.reason, reason)
     else:
         delays = model_delays(
-            obs.time,
-            seen,
-            frequency,
-            klobuchar=received.klobuchar,
-            ionosphere_sigma_m=received.ionosphere_sigma_m,
+            obs.time, seen, frequency, klobuchar=received.klobuchar, ionosphere_sigma_m=received.ionosphere_sigma_m,
             troposphere=config.troposphere,
-        )
+        )  # fmt: skip
         beyond = np.hypot(delays.sigma_m, config.nominal.unusual_sigma_m(states.accuracy_m))
         nominal = np.hypot(config.nominal.sigma_m(seen.elevation_deg), beyond)
         if isinstance(fixes, DfmcCorrections):
@@ -205,31 +196,13 @@ def correct_ranges(
         bound = np.hypot(bound, nominal) if error_model.covers == "local" or sbas is not None else bound
     uncorrected = (reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma) & np.isfinite(bound))
     return CorrectedRanges(
-        observations=obs,
-        channels=channels,
-        time=obs.time,
-        break_before=obs.break_before,
-        satellite=satellite,
-        signal=signal,
-        frequency_hz=frequency,
-        code_m=code,
-        doppler_hz=obs.doppler_hz[:, columns],
-        cn0_dbhz=cn0,
-        satellites=states,
-        anchor_ecef_m=anchor,
-        elevation_deg=seen.elevation_deg,
-        azimuth_deg=seen.azimuth_deg,
-        ionosphere_m=delays.ionosphere_m,
-        troposphere_m=delays.troposphere_m,
-        corrected_code_m=clean,
-        sigma_m=sigma,
-        nominal_m=nominal,
-        bound_sigma_m=bound,
-        bias_m=bias,
-        reason=np.where(uncorrected, int(Reason.NO_CORRECTION), reason),
-        second=second,
-        base=base,
-    )
+        observations=obs, channels=channels, time=obs.time, break_before=obs.break_before, satellite=satellite,
+        signal=signal, frequency_hz=frequency, code_m=code, doppler_hz=obs.doppler_hz[:, columns], cn0_dbhz=cn0,
+        satellites=states, anchor_ecef_m=anchor, elevation_deg=seen.elevation_deg, azimuth_deg=seen.azimuth_deg,
+        ionosphere_m=delays.ionosphere_m, troposphere_m=delays.troposphere_m, corrected_code_m=clean, sigma_m=sigma,
+        nominal_m=nominal, bound_sigma_m=bound, bias_m=bias,
+        reason=np.where(uncorrected, int(Reason.NO_CORRECTION), reason), second=second, base=base,
+    )  # fmt: skip
 
 
 def _by_error_model(model: ErrorModel, seen: SeenFrom, cn0: Floats, antennas: AntennaRows) -> tuple[Floats, Floats]:
@@ -258,11 +231,11 @@ def _anchor(antennas: AntennaRows, config: Config, ranges: Ranges) -> Floats:
     point = single_point(ranges, middle, limits=_rough(config.single_point))
     anchor = point.ecef_m.copy()
     solved = np.isfinite(anchor[:, 0])
-    for index, found in antennas.split(np.flatnonzero(solved)):
+    for index, found in antennas.split(solved.nonzero()[0]):
         distance, vertex = index.tree.query(anchor[found])
         beside = np.asarray(distance) < BESIDE_THE_LINE_M
         anchor[found[beside]] = index.trajectory.ecef_m[np.asarray(vertex)[beside]]
-    for index, rest in antennas.split(np.flatnonzero(~solved)):
+    for index, rest in antennas.split((~solved).nonzero()[0]):
         best = search(ranges.take(rest), index, point.take(rest), limits=config.section).vertex
         anchor[rest] = np.where((best >= 0)[:, None], index.trajectory.ecef_m[best], middle[rest])
     return anchor
@@ -289,9 +262,9 @@ def usable_ranges(
     """Return ranges to be fitted: those with a reason, or without a number, have weight 0 and finite values."""
     used = (reason == 0) & np.isfinite(code) & np.isfinite(weight)
     return Ranges(
-        sat_ecef_m=np.where(used[..., None], states.position_ecef_m, SOMEWHERE_ABOVE_M),
-        code_m=np.where(used, code, 0.0),
-        weight=np.where(used, weight, 0.0),
+        sat_ecef_m=kernel_array(np.where(used[..., None], states.position_ecef_m, SOMEWHERE_ABOVE_M)),
+        code_m=kernel_array(np.where(used, code, 0.0)),
+        weight=kernel_array(np.where(used, weight, 0.0)),
         groups=groups,
     )
 
@@ -304,11 +277,9 @@ def without(ranges: Ranges, dropped: Masks) -> Ranges:
 def conditions_of(config: Config) -> Conditions:
     """Settings that the errors of the ranges depend on: the conditions of an error model made from such a run."""
     return Conditions(
-        systems=config.systems,
-        signals={letter: config.signals.get(letter, ()) for letter in config.systems},
-        screens=config.screens,
-        elevation_mask_deg=config.elevation.mask_deg,
+        systems=config.systems, signals={letter: config.signals.get(letter, ()) for letter in config.systems},
+        screens=config.screens, elevation_mask_deg=config.elevation.mask_deg,
         codes="smoothed" if config.carrier == "smoothed" else "raw",
         ionosphere="sbas" if config.sbas else config.ionosphere,
         troposphere="sbas" if config.sbas else config.troposphere,
-    )
+    )  # fmt: skip

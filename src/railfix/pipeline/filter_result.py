@@ -16,6 +16,7 @@ from railfix.integrity.interference import Suspicion, WheelSigns, WheelState
 from railfix.pipeline.balises import Passing, PassingState
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import SensorLimits, SensorState
+from railfix.positioning.antenna_rows import OnDemand
 from railfix.positioning.carrier import CycleSlipState
 from railfix.positioning.map_offset import MapOffsetLimits, beyond_threshold
 from railfix.screens import FilteredMotion
@@ -91,7 +92,7 @@ def gated_codes(
     steps = seconds(np.diff(time, prepend=last if not np.isnat(last) else time[:1]))
     if np.isnat(returned) and observed.all() and steps.max(initial=0.0) < _OUTAGE_S:
         last, observed = time[-1] if len(time) else last, observed[:0]
-    for k in np.flatnonzero(observed).tolist():
+    for k in observed.nonzero()[0].tolist():
         out = not np.isnat(last) and (not np.isnat(returned) or float(seconds(time[k] - last)) >= _OUTAGE_S)
         if out and np.isfinite(coasted[k]):
             returned = time[k] if np.isnat(returned) else returned
@@ -284,8 +285,12 @@ class FilterState(NotebookTable):
         return f"{place:,.1f} ± {np.sqrt(variance):.1f}"
 
 
+#: Fields of results that are computed together.
+COORDINATES: Final = ("latitude_deg", "longitude_deg", "height_m")
+
+
 @dataclass(frozen=True, kw_only=True)
-class AlongTrack(NotebookTable):
+class AlongTrack(NotebookTable, OnDemand):
     """Positions of one antenna by the filter along the track, T epochs."""
 
     #: Places along the antenna's trajectory, and what measured them; channels as `AntennaResult.columns`.

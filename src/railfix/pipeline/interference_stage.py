@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from railfix.integrity.interference import (
     power_signs,
     suspicion,
 )
-from railfix.integrity.interference.motion import MotionInputs
+from railfix.integrity.interference.motion import MotionFit, MotionInputs, fit_motion
 from railfix.positioning.antenna_rows import AntennaRows, joined, rows_of
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from railfix.pipeline.filter_result import AlongTrack
     from railfix.pipeline.results import AntennaResult
     from railfix.pipeline.solution import Solution
-    from railfix.positioning.section_search import SearchIndex
 
 #: Reasons given because ranges contradict others: those of a spoofer do.
 _CONTRADICTED: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.ALONE_ON_ITS_CLOCK)
@@ -78,55 +77,51 @@ class Interference:
         return suspicion(self.causes)
 
 
-def find_interference(
+def _motion_inputs(
+    corrected: CorrectedRanges, solution: Solution, antennas: AntennaRows, rows: Indices, broken: Masks
+) -> MotionInputs:
+    """Return the ranges of some epochs, which have all reasons; `broken`: breaks since the epoch before."""
+    code, reason, clocks = corrected.code_m[rows], corrected.reason[rows], list(corrected.clocks)
+    near, off_line = solution.point.ecef_m[rows], np.empty(len(rows))
+    first = 0
+    for index, own in antennas.split(rows):
+        part = slice(first, first := first + len(own))
+        arc, offset = index.trajectory.nearest(near[part])
+        off_line[part] = np.where((arc > 0.0) & (arc < index.trajectory.arc_m[-1]), offset, np.nan)
+    return MotionInputs(
+        time=corrected.time[rows], break_before=broken, channel=corrected.channels.names,
+        group=np.array([clocks.index(letter) for letter in corrected.channels.clock.tolist()], dtype=np.intp),
+        near_ecef_m=near, sat_ecef_m=corrected.satellites.position_ecef_m[rows],
+        sat_velocity_mps=corrected.satellites.velocity_ecef_mps[rows],
+        code_m=np.where((reason & _NOT_ITS_SIGNAL) == 0, code, np.nan),
+        rate_mps=-SPEED_OF_LIGHT / corrected.frequency_hz * corrected.doppler_hz[rows],
+        corrected_code_m=corrected.corrected_code_m[rows], sigma_m=corrected.sigma_m[rows],
+        used=(reason & ~_CONTRADICTED) == 0, noise_scale=solution.noise_scale[rows],
+        clock_offset_m=solution.ties.offset_m[rows], clock_sigma_m=solution.ties.sigma_m[rows], off_line_m=off_line,
+    )  # fmt: skip
+
+
+def _find_interference(
     corrected: CorrectedRanges,
-    solution: Solution,
     rows: Indices,
-    heard: tuple[Bytes, Masks],
-    index: SearchIndex,
+    alarm: Bytes,
+    inputs: MotionInputs,
+    fitted: MotionFit,
     state: InterferenceState,
     limits: InterferenceLimits,
 ) -> tuple[Interference, InterferenceState]:
-    """Return the interference of some epochs of one antenna, whose ranges have all reasons, and the state to pass on.
+    """Return the interference of some epochs of one antenna, and the state to pass on.
 
-    `heard`: alarms of the receiver and breaks since the epoch before, of each.
+    `alarm`: alarms of the receiver since the epoch before, of each.
     """
-    (alarm, broken), time, reason = heard, corrected.time[rows], corrected.reason[rows]
-    channel, code = corrected.channels.names, corrected.code_m[rows]
-    taken = (reason & _NOT_ITS_SIGNAL) == 0
-    cn0 = np.where(taken & np.isfinite(code), corrected.cn0_dbhz[rows], np.nan)
+    cn0 = np.where(np.isfinite(inputs.code_m), corrected.cn0_dbhz[rows], np.nan)
     power, power_state = power_signs(
-        time, channel, cn0, corrected.observations.front_end_gain[rows], state.power, limits
+        inputs.time, inputs.channel, cn0, corrected.observations.front_end_gain[rows], state.power, limits
     )
-    clocks = list(corrected.clocks)
-    near = solution.point.ecef_m[rows]
-    arc, offset = index.trajectory.nearest(near)
-    inside = (arc > 0.0) & (arc < index.trajectory.arc_m[-1])
-    motion, motion_state = motion_signs(
-        MotionInputs(
-            time=time,
-            break_before=broken,
-            channel=channel,
-            group=np.array([clocks.index(letter) for letter in corrected.channels.clock.tolist()], dtype=np.intp),
-            near_ecef_m=near,
-            sat_ecef_m=corrected.satellites.position_ecef_m[rows],
-            sat_velocity_mps=corrected.satellites.velocity_ecef_mps[rows],
-            code_m=np.where(taken, code, np.nan),
-            rate_mps=-SPEED_OF_LIGHT / corrected.frequency_hz * corrected.doppler_hz[rows],
-            corrected_code_m=corrected.corrected_code_m[rows],
-            sigma_m=corrected.sigma_m[rows],
-            used=(reason & ~_CONTRADICTED) == 0,
-            noise_scale=solution.noise_scale[rows],
-            clock_offset_m=solution.ties.offset_m[rows],
-            clock_sigma_m=solution.ties.sigma_m[rows],
-            off_line_m=np.where(inside, offset, np.nan),
-        ),
-        state.motion,
-        limits,
-    )
+    motion, motion_state = motion_signs(inputs, state.motion, limits, fitted)
     signs = _signs(alarm, power, motion, limits)
     hold, release = _times(limits)
-    _, stays, held_state = held(time, signs, state.held, hold_s=hold, release_s=release)
+    _, stays, held_state = held(inputs.time, signs, state.held, hold_s=hold, release_s=release)
     causes = (stays * np.array([int(cause) for cause in CAUSES])).sum(axis=1, dtype=np.int64)
     after = replace(state, power=power_state, motion=motion_state, held=held_state)
     return Interference(causes=causes, power=power, motion=motion), after
@@ -150,7 +145,7 @@ def _signs(alarm: Bytes, power: PowerSigns, motion: MotionSigns, limits: Interfe
         Sign.WHEEL_PARTS: np.zeros(len(alarm), dtype=np.bool_),  # `with_wheel`, after the filter
         Sign.LEFT_MAP: (motion.off_line_m >= limits.off_map_m) & (motion.off_line_sigmas >= sigmas),
     }
-    return np.stack([by_cause[cause] for cause in CAUSES], axis=1)
+    return np.array([by_cause[cause] for cause in CAUSES]).T
 
 
 @lru_cache
@@ -171,50 +166,52 @@ def _times(limits: InterferenceLimits) -> tuple[Floats, Floats]:
     )
 
 
-def _once_a_second(
-    corrected: CorrectedRanges,
-    solution: Solution,
-    index: SearchIndex,
-    rows: slice,
-    state: InterferenceState,
-    limits: InterferenceLimits,
-) -> tuple[Interference, InterferenceState]:
-    """Return the interference of the epochs of one antenna, `rows`: looked for at the first epoch of each second.
+class _Due(NamedTuple):
+    """Epochs of one antenna at which interference is looked for: the first of each second."""
 
-    The others have what was found there; a break or an alarm between counts at the next one.
-    """
-    time = corrected.time[rows]
-    if not len(time):
-        nothing = np.empty(0, np.uint8), np.empty(0, np.bool_)
-        return find_interference(corrected, solution, np.empty(0, np.intp), nothing, index, state, limits)
-    second = (time - GPS_EPOCH + _TAG) // _SECOND
-    due = second != np.concatenate([[state.second], second[:-1]])
-    group = np.cumsum(due)
-    alarm, broken = np.zeros(group[-1] + 2, dtype=np.uint8), np.zeros(group[-1] + 2, dtype=np.bool_)
+    rows: Indices  #: Among those of all antennas, shape (n,).
+    group: Indices  #: How many there have been up to each epoch of the antenna, shape (T,).
+    #: Alarms of the receiver and breaks up to each of them, and those that count at the next one; shape (n + 1,).
+    alarm: Bytes
+    broken: Masks
+    last: int  #: GPS second of the last epoch.
+
+
+def _due(corrected: CorrectedRanges, rows: slice, state: InterferenceState) -> _Due:
+    """Return the epochs of one antenna at which interference is looked for."""
+    second = (corrected.time[rows] - GPS_EPOCH + _TAG) // _SECOND
+    due = second != np.concatenate([[state.second], second[:-1]])[: len(second)]
+    group = due.cumsum()
+    count = int(group[-1]) + 1 if len(group) else 1
+    alarm, broken = np.zeros(count, dtype=np.uint8), np.zeros(count, dtype=np.bool_)
     alarm[0], broken[0] = state.alarm, state.broken
     # what came after a due epoch belongs to the next one
     np.bitwise_or.at(alarm, group - due, corrected.observations.receiver_alarm[rows])
     np.logical_or.at(broken, group - due, corrected.break_before[rows])
-    at = np.flatnonzero(due)
-    found, after = [], state
-    if len(at):
-        heard, at = (alarm[:-2], broken[:-2]), at + (rows.start or 0)
-        own, after = find_interference(corrected, solution, at, heard, index, state, limits)
-        found = [own]
-    known = found if state.latest is None else [state.latest, *found]
-    every = joined(known)
-    row = group - (state.latest is None)
-    after = changed(
-        after, second=int(second[-1]), alarm=int(alarm[group[-1]]), broken=bool(broken[group[-1]]),
-        latest=rows_of(every, row[-1:]),
-    )  # fmt: skip
-    return rows_of(every, row), after
+    last = int(second[-1]) if len(second) else state.second
+    return _Due(due.nonzero()[0] + (rows.start or 0), group, alarm, broken, last)
+
+
+def _on_all_epochs(
+    due: _Due, found: Interference | None, state: InterferenceState
+) -> tuple[Interference, InterferenceState]:
+    """Return the interference of all epochs of one antenna, which have what was found at the first of the second."""
+    known = [each for each in (state.latest, found) if each is not None]
+    if len(due.group) == 1:
+        every = latest = known[-1]
+    else:
+        row = due.group - (state.latest is None)
+        every = joined(known)
+        every, latest = rows_of(every, row), rows_of(every, row[-1:])
+    count = len(due.rows)
+    after = changed(state, second=due.last, alarm=int(due.alarm[count]), broken=bool(due.broken[count]), latest=latest)
+    return every, after
 
 
 def with_statuses(status: Codes, kind: Codes) -> Codes:
     """Return the statuses of positions with those of interference where they outrank, shape (T,)."""
-    jammed = (kind == Suspicion.JAMMING_SUSPECTED) & (status == Status.OK)
-    spoofed = (kind == Suspicion.SPOOFING_SUSPECTED) & _UNDER_SPOOFING[status]
+    jammed = (kind == int(Suspicion.JAMMING_SUSPECTED)) & (status == int(Status.OK))
+    spoofed = (kind == int(Suspicion.SPOOFING_SUSPECTED)) & _UNDER_SPOOFING[status]
     status = np.where(jammed, np.int8(Status.JAMMING_SUSPECTED), status)
     return np.where(spoofed, np.int8(Status.SPOOFING_SUSPECTED), status)
 
@@ -239,14 +236,33 @@ def judge_interference(
     antennas: AntennaRows,
     states: list[InterferenceState],
     limits: InterferenceLimits,
-) -> tuple[Solution, list[InterferenceState]]:
-    """Return positions with interference and its statuses, and the new state of each antenna."""
+) -> tuple[Solution, Sequence[Interference | None], list[InterferenceState]]:
+    """Return positions with the statuses of interference, and interference and new state of each antenna.
+
+    It is looked for at the first epoch of each second; the others have what was found there. A break or an alarm
+    between counts at the next one.
+    """
     if limits.use == "off":
-        return solution, states
-
-    def of_antenna(index: SearchIndex, rows: slice, state: InterferenceState) -> tuple[Interference, InterferenceState]:
-        return _once_a_second(corrected, solution, index, rows, state, limits)
-
-    found, after = antennas.each_with_state(of_antenna, states)
-    status = with_statuses(solution.status, found.suspicion)
-    return changed(solution, status=status, interference=found), after
+        return solution, [None] * len(states), states
+    due = antennas.apart(lambda _, rows, state: _due(corrected, rows, state), states)
+    rows = np.concatenate([own.rows for own in due])
+    broken = np.concatenate([own.broken[:-1] for own in due])
+    if len(rows) or not len(corrected.time):
+        inputs = _motion_inputs(corrected, solution, antennas, rows, broken)
+        fitted = fit_motion(inputs, limits)
+    found: list[Interference] = []
+    after: list[InterferenceState] = []
+    first = 0
+    for own, state in zip(due, states, strict=True):
+        new, at = None, slice(first, first := first + len(own.rows))
+        if len(own.rows) or not len(own.group):
+            new, state = _find_interference(
+                corrected, own.rows, own.alarm[:-1], inputs.take(at), fitted.take(at), state, limits
+            )
+        if len(own.group):
+            new, state = _on_all_epochs(own, new, state)
+        assert new is not None, "an epoch without one before it is due"
+        found.append(new)
+        after.append(state)
+    kind = suspicion(np.concatenate([own.causes for own in found]))
+    return changed(solution, status=with_statuses(solution.status, kind)), found, after

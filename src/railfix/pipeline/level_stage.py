@@ -130,15 +130,12 @@ def protection_levels(
     """
     covariance = np.where(raim.faulty[:, None, None], np.nan, model.covariance_m2)
     level = along_track_level(
-        replace(model, covariance_m2=covariance),
-        [name[0] for name in corrected.satellite.tolist()],
-        risk=risk_of(config),
-        scale=level_scale(scale, config),
+        replace(model, covariance_m2=covariance), [name[0] for name in corrected.satellite.tolist()],
+        risk=risk_of(config), scale=level_scale(scale, config),
         overbound=None if config.error_model is None else RangeBounds(corrected.bound_sigma_m, corrected.bias_m),
-        map_error=MapDeviation(np.stack(offset.beyond_m, axis=1), offset.seen),
-        sides=sides,
+        map_error=MapDeviation(np.array(offset.beyond_m).T, offset.seen), sides=sides,
         n_excluded=raim.excluded.sum(axis=1),
-    )
+    )  # fmt: skip
     status = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
     return ProtectionResult(level=level, status=status, kind=kind_of(config), basis=basis_of(config))
 
@@ -167,22 +164,17 @@ def unresolved_alternatives(
     `bounding_model` where there is an error model.
     """
     return places_beyond_the_level(
-        antennas,
-        place.constrained.arc_m,
-        bounding[0],
-        np.where(place.section.excess > config.section.threshold, protection.level.level_m, np.nan),
-        bounding[1],
-        [name[0] for name in corrected.satellite.tolist()],
-        risk_of(config),
-        sides,
-    )
+        antennas, place.constrained.arc_m, bounding[0],
+        np.where(place.section.excess > config.section.threshold, protection.level.level_m, np.nan), bounding[1],
+        [name[0] for name in corrected.satellite.tolist()], risk_of(config), sides,
+    )  # fmt: skip
 
 
 def low_sides(corrected: CorrectedRanges, heading_deg: Floats, elevation_deg: float) -> Masks:
     """Return the low satellites left and right of the track, shape (T, 2, K); `heading_deg` is its azimuth (T,)."""
     right = np.sin(np.radians(corrected.azimuth_deg - heading_deg[:, None])) > 0
     low = corrected.elevation_deg < elevation_deg
-    return np.stack([low & ~right, low & right], axis=1)
+    return np.concatenate([(low & ~right)[:, None], (low & right)[:, None]], axis=1)
 
 
 def judged(
@@ -204,9 +196,9 @@ def judged(
         values["cause"] = np.where(near, int(Cause.UNBOUNDED), values["cause"]).astype(np.int8)
     level = ProtectionLevel(**values)
     verdict = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
-    verdict = np.where(_ALARMING[status], LevelStatus.ALARM, verdict)
-    doubtful = status == Status.AMBIGUOUS
-    verdict = np.where(doubtful & (verdict == LevelStatus.AVAILABLE), LevelStatus.UNAVAILABLE, verdict)
+    verdict = np.where(_ALARMING[status], int(LevelStatus.ALARM), verdict)
+    doubtful = status == int(Status.AMBIGUOUS)
+    verdict = np.where(doubtful & (verdict == int(LevelStatus.AVAILABLE)), int(LevelStatus.UNAVAILABLE), verdict)
     return ProtectionResult(level=level, status=verdict.astype(np.int8), kind=protection.kind, basis=protection.basis)
 
 
@@ -244,18 +236,14 @@ def with_araim(
     named = [letter for letter in stated.constellation_prior if (letters == letter).any()]
     ranges = AraimGeometry(
         design=np.concatenate([-sight, np.broadcast_to(clocks, (len(place), *clocks.shape))], axis=2),
-        sigma_int_m=integrity,
-        sigma_acc_m=accuracy,
-        bias_m=np.broadcast_to(np.nan_to_num(stated.bias_m), integrity.shape),
-        prior=np.nan_to_num(stated.prior),
+        sigma_int_m=integrity, sigma_acc_m=accuracy,
+        bias_m=np.broadcast_to(np.nan_to_num(stated.bias_m), integrity.shape), prior=np.nan_to_num(stated.prior),
         together=np.array([letters == letter for letter in named], dtype=bool).reshape(len(named), len(letters)),
         together_prior=np.array([stated.constellation_prior[letter] for letter in named]),
-    )
+    )  # fmt: skip
     budget = config.araim
     near = np.nan_to_num(place, nan=1e6)
-    axes = antennas.each(
-        lambda index, rows: index.trajectory.axes_of(np.maximum(solution.place.constrained.section[rows], 0))
-    )
+    axes = antennas.axes_of(np.maximum(solution.place.constrained.section, 0))
     on_line = with_map(_turned(ranges, axes), antennas.sigma_plan_m, antennas.sigma_height_m, budget.map_prior)
     horizontal = budget.phmi_horizontal / 2.0, budget.false_alarm_horizontal / 2.0
     return changed(
@@ -305,7 +293,6 @@ def with_map(geometry: AraimGeometry, plan_m: float, height_m: float, prior: flo
         sigma_int_m=np.concatenate([geometry.sigma_int_m, sigma], axis=1),
         sigma_acc_m=np.concatenate([geometry.sigma_acc_m, sigma], axis=1),
         bias_m=np.concatenate([geometry.bias_m, nothing], axis=1),
-        prior=np.concatenate([geometry.prior, np.zeros(2)]),
-        together=together,
+        prior=np.concatenate([geometry.prior, np.zeros(2)]), together=together,
         together_prior=np.append(geometry.together_prior, prior),
-    )
+    )  # fmt: skip

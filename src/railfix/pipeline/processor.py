@@ -35,7 +35,7 @@ from railfix.pipeline.channels import ChannelBook, combined
 from railfix.pipeline.config import SCREEN_NAMES, Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, Models, conditions_of, correct_ranges
 from railfix.pipeline.filter_result import AlongTrack, FilterState, single_epochs
-from railfix.pipeline.interference_stage import judge_interference, with_wheel
+from railfix.pipeline.interference_stage import Interference, judge_interference, with_wheel
 from railfix.pipeline.level_stage import with_araim
 from railfix.pipeline.received import Received, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
@@ -46,7 +46,17 @@ from railfix.positioning.antenna_rows import AntennaRows, rows_of, stack_observa
 from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.error_model import condition_differences
 from railfix.ranges.sbas import SbasMessages
-from railfix.screens import SCREENS, AntennaRanges, ObservationScreen, PairedEpochs, Screen, ScreenSetup, in_order
+from railfix.screens import (
+    SCREENS,
+    AntennaRanges,
+    ObservationScreen,
+    PairedEpochs,
+    PairScreen,
+    PositionScreen,
+    Screen,
+    ScreenSetup,
+    in_order,
+)
 from railfix.screens.base import pair_antennas
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
@@ -59,8 +69,9 @@ class SolvedChunk:
     """Single epochs of a chunk, and what the filter along the track takes from them."""
 
     results: Mapping[str, AntennaResult]
-    ranges: Mapping[str, CorrectedRanges]  #: After all screens and exclusions, by antenna.
-    off_map: Mapping[str, Masks]  #: The train is away from the line, shape (T,).
+    ranges: CorrectedRanges  #: After all screens and exclusions, epochs of all antennas.
+    off_map: Masks  #: The train is away from the line, shape (T,).
+    rows: Mapping[str, slice]  #: Epochs of each antenna among these.
     pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.
     sensors: SensorSamples | None  #: Of the sensors on board since the chunk before.
     notes: tuple[str, ...]
@@ -142,6 +153,9 @@ class EpochProcessor:
             raise ValueError(f"there is a screen {taken[0]} already; give it another name")
         chosen = (*(s for s in SCREENS if s.name in config.screens), *screens)
         self.screens = tuple((s, getattr(config, s.name, s.limits)) for s in in_order(chosen))
+        kinds = ObservationScreen, PairScreen, PositionScreen
+        by_kind: list[list[Any]] = [[each for each in self.screens if isinstance(each[0], kind)] for kind in kinds]
+        self._of_observations, self._of_pairs, self._of_positions = by_kind
         self.setup = ScreenSetup(
             antennas=len(self.trajectories),
             spacing_known=all(t.body_chainage_m is not None for t in self.trajectories.values()),
@@ -263,17 +277,18 @@ class EpochProcessor:
         corrected = correct_ranges(obs, channels, self.config, received, antennas, error_model=self._error_model)
         ranges, own_states = self._screened(names, antennas, corrected, received, state)
         pair = self._pair(ranges)
-        ranges = judge_pairs(self.screens, pair, ranges)
+        ranges = judge_pairs(self._of_pairs, pair, ranges)
         corrected, solution, own_states = solve(with_screens(corrected, ranges), antennas, self.config, own_states)
-        solution, signs = judge_interference(
+        solution, interference, signs = judge_interference(
             corrected, solution, antennas, [own.interference for own in own_states], self.config.interference
         )
         own_states = [changed(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
         solution = with_araim(corrected, solution, antennas, self._support, self.config)
         solved = SolvedChunk(
-            results=self._results(antennas, corrected, solution, pair, ranges),
-            ranges={name: rows_of(corrected, rows) for name, rows in zip(names, parts, strict=True)},
-            off_map={name: solution.off_map[rows] for name, rows in zip(names, parts, strict=True)},
+            results=self._results(antennas, corrected, solution, interference, pair, ranges),
+            ranges=corrected,
+            off_map=solution.off_map,
+            rows=dict(zip(names, parts, strict=True)),
             pair=pair,
             sensors=sensors,
             notes=(
@@ -305,7 +320,7 @@ class EpochProcessor:
         if self.config.filter == "track":
             found = self._filtered(solved, state)
             motions = {name: tracked.motion for name, (tracked, _) in found.items()}
-            spacing = filter_verdicts(self.screens, solved.pair, motions)
+            spacing = filter_verdicts(self._of_positions, solved.pair, motions)
             held_s, limits = self.config.antenna_spacing.filter_held_s, self.config.sensors.balise
             for name, (tracked, own) in found.items():
                 tracked, own = checked(tracked, spacing.get(name), own, held_s)
@@ -322,12 +337,11 @@ class EpochProcessor:
         for name, rows in zip(names, antennas.parts, strict=True):
             before = state.antennas.get(name) or AntennaState()
             own, states = rows_of(corrected, rows), dict(before.screens)
-            for screen, limits in self.screens:
-                if isinstance(screen, ObservationScreen):
-                    verdicts, screen_state = screen.judge(own, limits, self.setup, states.get(screen.name))
-                    own = own.judged(verdicts)
-                    if screen_state is not None:
-                        states[screen.name] = screen_state
+            for screen, limits in self._of_observations:
+                verdicts, screen_state = screen.judge(own, limits, self.setup, states.get(screen.name))
+                own = own.judged(verdicts)
+                if screen_state is not None:
+                    states[screen.name] = screen_state
             own, two = combined(own, self.config, received.ionosphere_sigma_m, before.two_frequencies)
             carrier = before.carrier
             if self.config.carrier != "off":
@@ -343,36 +357,38 @@ class EpochProcessor:
         antennas: AntennaRows,
         corrected: CorrectedRanges,
         solution: Solution,
+        interference: Sequence[Interference | None],
         pair: PairedEpochs | None,
         ranges: Mapping[str, CorrectedRanges],
     ) -> dict[str, AntennaResult]:
         """Return the results of single epochs by antenna, after the screens of the published positions."""
-        chainage = antennas.each(lambda index, rows: index.trajectory.chainage_at(solution.arc_m[rows]))
+        chainage = antennas.chainage_at(solution.arc_m)
         published = {name: chainage[rows] for name, rows in zip(ranges, antennas.parts, strict=True)}
         screens = {name: dict(own.screens) for name, own in ranges.items()}
         rows_by_name, status = dict(zip(ranges, antennas.parts, strict=True)), solution.status.copy()
-        for name, verdicts in position_verdicts(self.screens, pair, published).items():
+        for name, verdicts in position_verdicts(self._of_positions, pair, published).items():
             rows = rows_by_name[name]
             for verdict in verdicts:
                 doubtful = verdict.screened.reject & with_coordinates(self.config.failed_checks)[status[rows]]
                 status[rows] = np.where(doubtful, verdict.status, status[rows])
                 screens[name][verdict.name] = verdict.screened
         results = antenna_results(corrected, antennas, changed(solution, status=status), chainage, self.config)
-        return {name: changed(rows_of(results, rows), screens=screens[name]) for name, rows in rows_by_name.items()}
+        return {
+            name: changed(rows_of(results, rows), screens=screens[name], interference=own)
+            for (name, rows), own in zip(rows_by_name.items(), interference, strict=True)
+        }
 
     def _filtered(self, solved: SolvedChunk, state: State) -> dict[str, tuple[AlongTrack, FilterState]]:
         """Return the places of the filter along the track by antenna, and its states; two antennas in two threads."""
 
         def one_antenna(name: str) -> tuple[AlongTrack, FilterState]:
+            rows = solved.rows[name]
             return along_track(
-                solved.ranges[name],
-                single_epochs(solved.results[name], solved.off_map[name], self.config.map_offset),
-                self.trajectories[name],
-                self.config,
-                state.fusion.get(name) or self._before_filter,
-                samples=solved.sensors,
-                surroundings=self._line_references(name, solved.sensors),
-            )
+                rows_of(solved.ranges, rows),
+                single_epochs(solved.results[name], solved.off_map[rows], self.config.map_offset),
+                self.trajectories[name], self.config, state.fusion.get(name) or self._before_filter,
+                samples=solved.sensors, surroundings=self._line_references(name, solved.sensors),
+            )  # fmt: skip
 
         over_antennas = map if self._threads is None else self._threads.map
         return dict(zip(solved.results, over_antennas(one_antenna, solved.results), strict=True))
@@ -397,13 +413,9 @@ class EpochProcessor:
             return None
         front, rear = ranges["front"], ranges["rear"]
         return pair_antennas(
-            front,
-            rear,
-            front.anchor_ecef_m,
-            self.trajectories["front"],
-            self.trajectories["rear"],
+            front, rear, front.anchor_ecef_m, self.trajectories["front"], self.trajectories["rear"],
             tolerance_s=self.config.antenna_pair.tag_tolerance_s,
-        )
+        )  # fmt: skip
 
 
 def _threads(antennas: int) -> ThreadPoolExecutor | None:
@@ -421,7 +433,7 @@ def _missing_notes(received: Received) -> tuple[str, ...]:
 def _check_rising(name: str, observations: Observations, before: AntennaState | None) -> None:
     """Raise ValueError where an epoch is not after the one before it, of the chunk `before` or its own."""
     time = observations.time
-    if (back := np.flatnonzero(time[1:] <= time[:-1])).size:
+    if (back := (time[1:] <= time[:-1]).nonzero()[0]).size:
         earlier, later = time[back[0] : back[0] + 2]
         raise ValueError(f"{name}: epoch {back[0] + 1} ({later}) is not after {earlier}; give epochs in order of time")
     if before is not None and len(time) and time[0] <= before.ended:

@@ -20,6 +20,7 @@ from railfix.pipeline.carrier_stage import CarrierState
 from railfix.pipeline.filter_result import AlongTrack, FilterState, OffMapState
 from railfix.pipeline.interference_stage import Interference, InterferenceState
 from railfix.pipeline.received import Received
+from railfix.positioning.antenna_rows import OnDemand
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.map_offset import MapOffset, MapOffsetState
 from railfix.positioning.noise_scale import LastingErrorState, NoiseState, OffsetState
@@ -114,7 +115,7 @@ class State(NotebookTable):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AntennaResult(NotebookTable):
+class AntennaResult(NotebookTable, OnDemand):
     """Results of one antenna, T epochs by M channels.
 
     The channels are those of the observations given, of all antennas where few epochs of several are given together.

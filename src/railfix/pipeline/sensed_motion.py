@@ -64,12 +64,9 @@ class LineFeatures:
         body = trajectory.chainage_m if trajectory.body_chainage_m is None else trajectory.body_chainage_m
         inside = np.clip(body, line.chainage_m[0], line.chainage_m[-1])
         return cls(
-            series=series,
-            features=tuple(map_features(series)),
-            antenna_m=np.asarray(trajectory.arc_m),
-            body_m=line.arc_at_chainage(inside) + body - inside,
-            line=Line.of(line),
-        )
+            series=series, features=tuple(map_features(series)), antenna_m=np.asarray(trajectory.arc_m),
+            body_m=line.arc_at_chainage(inside) + body - inside, line=Line.of(line),
+        )  # fmt: skip
 
     def body_at(self, antenna_m: Floats) -> Floats:
         """Place of the body's middle where an antenna is at an arc length of its trajectory [m]."""
@@ -297,6 +294,8 @@ class SensedMotion:
     @classmethod
     def joined(cls, parts: Sequence[SensedMotion]) -> SensedMotion:
         """Return parts one after the other."""
+        if len(parts) == 1:
+            return parts[0]
         return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
 
 
@@ -318,9 +317,11 @@ class SensedState:
 
 def nothing_sensed(intervals: int) -> SensedMotion:
     """Motion without a sensor."""
-    absent = {field.name: np.full(intervals, np.nan) for field in fields(SensedMotion)}
-    still = {"doubt_mps": np.zeros(intervals), "swing_mps2": np.zeros(intervals)}
-    return SensedMotion(**{**absent, **still, "state": np.zeros(intervals, dtype=np.int8)})
+    absent, still = np.full(intervals, np.nan), np.zeros(intervals)
+    return SensedMotion(
+        state=still.astype(np.int8), way_m=absent, doubt_mps=still, swing_mps2=still, gradient=absent,
+        curvature_1pm=absent, cant_m=absent, under_m=absent,
+    )  # fmt: skip
 
 
 def sensed_motion(
@@ -401,15 +402,9 @@ def sensed_motion(
     sensed = replace(sensed, under_m=along(sensed.under_m))
     step = 1e-9 * _TICK_NS
     series = RateSeries(
-        time=middle,
-        known=when,
-        way_m=facing * (passed[1:] - passed[0]),
-        arc_m=passed_m,
-        turned_rad=step * turned,
-        climbed_rad=step * (turning - found.gyro_bias_radps),
-        speed_mps=facing * speed.speed_mps,
-        rolls=rolls,
-    )
+        time=middle, known=when, way_m=facing * (passed[1:] - passed[0]), arc_m=passed_m, turned_rad=step * turned,
+        climbed_rad=step * (turning - found.gyro_bias_radps), speed_mps=facing * speed.speed_mps, rolls=rolls,
+    )  # fmt: skip
     return sensed, series, replace(state, tick=int(ticks[-1]), arc_m=float(arc[-1]), slip=slip)
 
 

@@ -18,7 +18,6 @@ from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import OFF_MAP_S, Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.filter_result import OffMapState, off_map_epochs
-from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.level_stage import bounding_model, low_sides, protection_levels, unresolved_alternatives
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
 from railfix.pipeline.solve import (
@@ -26,7 +25,7 @@ from railfix.pipeline.solve import (
     fault_free,
     lasting_errors,
     line_model,
-    place_on_line,
+    place_on_lines,
     redundancy_of,
     validate_point,
     with_p4_level,
@@ -38,7 +37,7 @@ from railfix.positioning.noise_scale import (
     NoiseState,
     RobustFit,
     epoch_variance,
-    map_information,
+    information_of,
     noise_age,
     own_sigma_m,
     robust_fit,
@@ -75,7 +74,7 @@ def alone_on_their_clocks(corrected: CorrectedRanges, ties: ClockTies) -> Masks:
     alone = np.zeros(corrected.reason.shape, dtype=bool)
     for g, group in enumerate(corrected.groups):
         used = corrected.reason[:, group] == 0
-        lone = (np.count_nonzero(used, axis=1) == 1) & (ties.sigma_m[:, g] >= UNTIED_M)
+        lone = (used.sum(axis=1) == 1) & (ties.sigma_m[:, g] >= UNTIED_M)
         alone[:, group] = used & lone[:, None]
     return alone
 
@@ -85,7 +84,7 @@ def satellites_rejected(member: Integers, reason: Bits) -> Integers:
     of_satellite = member.astype(np.float32)  # small counts are exact, and floats are multiplied in blocks
     seen = ((reason & Reason.NOT_OBSERVED) == 0).astype(np.float32) @ of_satellite > 0
     used = (reason == 0).astype(np.float32) @ of_satellite > 0
-    return np.asarray(np.count_nonzero(seen & ~used, axis=1), dtype=np.int64)
+    return np.asarray((seen & ~used).sum(axis=1), dtype=np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,8 +108,6 @@ class Solution:
     protection: ProtectionResult | None
     map_offset: MapOffset
     off_map: Masks  #: The train is away from the line: `railfix.pipeline.filter_result`; shape (T,).
-    #: Of `railfix.pipeline.interference_stage`, which comes after; None where it is off.
-    interference: Interference | None = None
     #: Of `railfix.pipeline.level_stage`, which comes after; None without an integrity support message.
     araim: AraimResult | None = None
 
@@ -135,7 +132,7 @@ def solve(
     if len(corrected.groups) > 1:
         ranges = replace(ranges, ties=ties)
         tied = _tie(ranges, ties, point, corrected.anchor_ecef_m, config)
-    place = antennas.each(lambda index, rows: place_on_line(rows_of(ranges, rows), index, rows_of(tied, rows), config))
+    place = place_on_lines(ranges, antennas, tied, config)
     corrected = corrected.rejected(alone_on_their_clocks(corrected, ties), Reason.ALONE_ON_ITS_CLOCK)
     ages = antennas.apart(lambda _, rows, state: noise_age(time[rows], state.noise, limits=config.noise_scale), states)
     on_line, teaching = _fit_on_line(corrected, ranges, antennas, place, config)
@@ -209,21 +206,10 @@ def solve(
     if phase is not None:
         off_map = _off_map(ranges, antennas, place, arc, config)
     solution = Solution(
-        point=point,
-        point_status=validate_point(point, untied, scale, limits=config.single_point),
-        place=place,
-        ties=ties,
-        raim=raim,
-        status=np.zeros(len(ranges), dtype=np.int8),
-        noise_scale=scale,
-        own_sigma_m=own_sigma,
-        arc_m=arc,
-        along_sigma_m=along_sigma,
-        phase=phase,
-        protection=level,
-        map_offset=offset,
-        off_map=away,
-    )
+        point=point, point_status=validate_point(point, untied, scale, limits=config.single_point), place=place,
+        ties=ties, raim=raim, status=np.zeros(len(ranges), dtype=np.int8), noise_scale=scale, own_sigma_m=own_sigma,
+        arc_m=arc, along_sigma_m=along_sigma, phase=phase, protection=level, map_offset=offset, off_map=away,
+    )  # fmt: skip
     solution = changed(solution, status=_status(corrected, ranges, solution, judged, off_map, open_elsewhere, config))
     after = []
     for k, (state, rows) in enumerate(zip(states, antennas.parts, strict=True)):
@@ -242,7 +228,7 @@ def solve(
 
 def _tie(ranges: Ranges, ties: ClockTies, point: SinglePoint, anchor_ecef_m: Floats, config: Config) -> SinglePoint:
     """Return the 3-D positions with the clocks tied; those with free clocks where no bias is known yet."""
-    rows = np.flatnonzero(np.count_nonzero(ties.sigma_m < UNTIED_M, axis=1) > 1)
+    rows = ((ties.sigma_m < UNTIED_M).sum(axis=1) > 1).nonzero()[0]
     if not len(rows):
         return point
     start = np.where(np.isnan(point.ecef_m), anchor_ecef_m, point.ecef_m)
@@ -256,7 +242,7 @@ def _agreeing(ranges: Ranges, point: SinglePoint, anchor_ecef_m: Floats, config:
     place = np.where(np.isnan(point.ecef_m), anchor_ecef_m, point.ecef_m)
     fit = robust_fit(ranges, place, limits=config.robust_fit)
     dropped = (ranges.weight > 0) & ~fit.kept
-    changed = np.flatnonzero(dropped.any(axis=1))
+    changed = dropped.any(axis=1).nonzero()[0]
     if not len(changed):
         return ranges, point
     agreeing = without(ranges, dropped)
@@ -271,7 +257,7 @@ def _fit_on_line(
     arc, section = place.constrained.arc_m, np.maximum(place.constrained.section, 0)
     known = np.isfinite(arc)
     at = np.where(known[:, None], antennas.at_arc(arc), corrected.anchor_ecef_m)
-    information = antennas.each(lambda index, rows: map_information(index.trajectory, section[rows]))
+    information = information_of(antennas.axes_of(section), antennas.sigma_plan_m, antennas.sigma_height_m)
     fit = robust_fit(ranges, at, information=information, limits=config.robust_fit)
     return fit, known & ~_off_map(ranges, antennas, place, arc, config)
 
@@ -315,7 +301,7 @@ def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, place: Place, 
     """
     section, square = place.section, np.zeros(len(ranges))
     open_ones = (section.other_vertex >= 0) & (section.excess <= config.section.threshold) & np.isfinite(arc)
-    for index, rows in antennas.split(np.flatnonzero(open_ones)):
+    for index, rows in antennas.split(open_ones.nonzero()[0]):
         line, vertex = index.trajectory, section.other_vertex[rows]
         other = constrained_position(ranges.take(rows), line, vertex, limits=config.constrained)
         apart = line.at_arc(other.arc_m) - line.at_arc(arc[rows])

@@ -38,12 +38,12 @@ from railfix.positioning.normal_equations import (
     Ranges,
     SinglePoint,
     SinglePointLimits,
-    constrained_position,
+    constrained_on_lines,
     inverse_3x3,
     normal_equations,
     single_point,
 )
-from railfix.positioning.section_search import SearchIndex, Section, search
+from railfix.positioning.section_search import SearchIndex, Section, search_lines
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,9 +57,15 @@ class Place:
 
 def place_on_line(ranges: Ranges, index: SearchIndex, point: SinglePoint, config: Config) -> Place:
     """Return section and position on the line of the epochs that have `Config.min_satellites`."""
-    section = search(ranges, index, point, limits=config.section)
+    return place_on_lines(ranges, AntennaRows.of(index), point, config)
+
+
+def place_on_lines(ranges: Ranges, antennas: AntennaRows, point: SinglePoint, config: Config) -> Place:
+    """Return the same of the epochs of several antennas."""
+    lines = [(index.trajectory, rows) for index, rows in zip(antennas.indices, antennas.parts, strict=True)]
+    section = search_lines(ranges, zip(antennas.indices, antennas.parts, strict=True), point, limits=config.section)
     vertex = np.where(ranges.n_used >= config.min_satellites, section.vertex, -1)
-    constrained = constrained_position(ranges, index.trajectory, vertex, limits=config.constrained)
+    constrained = constrained_on_lines(ranges, lines, vertex, limits=config.constrained)
     return Place(point=point, section=section, constrained=constrained)
 
 
@@ -78,9 +84,8 @@ def solved_again(ranges: Ranges, index: SearchIndex, place: Place, epochs: Indic
 def line_model(ranges: Ranges, antennas: AntennaRows, constrained: Constrained) -> LinearModel:
     """Return the model of positions on the line (`constrained_model`); NaN in the epochs without one."""
     section = np.maximum(constrained.section, 0)
-    axes = antennas.each(lambda index, rows: index.trajectory.axes_of(section[rows]))
     place = antennas.at_arc(constrained.arc_m)
-    return model_on_line(ranges, place, axes, antennas.sigma_plan_m, antennas.sigma_height_m)
+    return model_on_line(ranges, place, antennas.axes_of(section), antennas.sigma_plan_m, antennas.sigma_height_m)
 
 
 def redundancy_of(ranges: Ranges) -> Integers:
@@ -107,12 +112,9 @@ def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, l
     `noise_scale`: standard deviation of this receiver's ranges over the sigmas of the weights, shape (T,).
     """
     test = detect(
-        point.wsse,
-        point.residual_m,
-        ranges.n_used - ranges.n_clocks - 3,
-        scale=noise_scale,
+        point.wsse, point.residual_m, ranges.n_used - ranges.n_clocks - 3, scale=noise_scale,
         limits=RaimLimits(false_alarm=limits.false_alarm),
-    )
+    )  # fmt: skip
     located = np.asarray(np.isfinite(point.ecef_m).all(axis=1))
     over = ~(position_dilution(ranges, point.ecef_m) <= limits.dilution_limit)
     status = np.where(over, int(PointStatus.DILUTION), int(PointStatus.VALID))
@@ -144,14 +146,11 @@ def fault_free(
     test = detect(constrained.wsse, constrained.residual_m, redundancy_of(ranges), limits=limits, scale=scale)
     on = "raim" in config.screens
     raim = RaimResult(
-        outcome=np.where(test.testable & on, Outcome.PASSED, Outcome.UNTESTABLE).astype(np.int8),
-        statistic=test.statistic,
-        threshold=test.threshold,
-        excluded=np.zeros(ranges.code_m.shape, dtype=bool),
-        own_error_m=np.full(ranges.code_m.shape, np.nan),
-        protection_level_m=np.full(len(ranges), np.nan),
-    )
-    for index, failing in antennas.split(np.flatnonzero(test.detected & on)):
+        outcome=np.where(test.testable & on, int(Outcome.PASSED), int(Outcome.UNTESTABLE)).astype(np.int8),
+        statistic=test.statistic, threshold=test.threshold, excluded=np.zeros(ranges.code_m.shape, dtype=bool),
+        own_error_m=np.full(ranges.code_m.shape, np.nan), protection_level_m=np.full(len(ranges), np.nan),
+    )  # fmt: skip
+    for index, failing in antennas.split((test.detected & on).nonzero()[0]):
         ranges, place, raim = _faults_excluded(ranges, index, place, raim, failing, scale, agreeing, config)
     return ranges, place, raim
 
@@ -172,11 +171,11 @@ def _faults_excluded(
     model = constrained_model(ranges.take(failing), index.trajectory, arc, section=section)
     exclusion = exclude(model, limits=limits, scale=scale[failing])
     raim = _with_exclusion(raim, failing, exclusion, np.arange(len(failing)))
-    unresolved = np.flatnonzero(exclusion.outcome == Outcome.UNRESOLVED)
+    unresolved = (exclusion.outcome == Outcome.UNRESOLVED).nonzero()[0]
     if len(unresolved):
         epochs = failing[unresolved]
         second = _second_attempt(ranges, index, place, epochs, model.take(unresolved), scale, config)
-        raim = _with_exclusion(raim, epochs, second, np.flatnonzero(second.excluded.any(axis=1)))
+        raim = _with_exclusion(raim, epochs, second, second.excluded.any(axis=1).nonzero()[0])
     if limits.mode == "chi_square":
         raim = _by_robust_fit(raim, ranges, agreeing, failing, limits.min_redundancy)
     changed = failing[raim.excluded[failing].any(axis=1)]
@@ -186,12 +185,9 @@ def _faults_excluded(
     place = solved_again(ranges, index, place, changed, config)
     # Without the fault another section can fit best: the remaining ranges must be consistent there, too.
     recheck = detect(
-        place.constrained.wsse[changed],
-        place.constrained.residual_m[changed],
-        redundancy_of(ranges)[changed],
-        limits=limits,
-        scale=scale[changed],
-    )
+        place.constrained.wsse[changed], place.constrained.residual_m[changed], redundancy_of(ranges)[changed],
+        limits=limits, scale=scale[changed],
+    )  # fmt: skip
     outcome = np.where(recheck.detected, Outcome.UNRESOLVED, raim.outcome[changed])
     return ranges, place, replace(raim, outcome=_put(raim.outcome, changed, outcome))
 
@@ -314,12 +310,12 @@ def lasting_errors(
         left_out |= found
         if found.any():
             ranges = without(ranges, found)
-            for index, epochs in antennas.split(np.flatnonzero(found.any(axis=1))):
+            for index, epochs in antennas.split(found.any(axis=1).nonzero()[0]):
                 place = solved_again(ranges, index, place, epochs, config)
             model = line_model(ranges, antennas, place.constrained)
             error = _own_errors(model, noise, limits.clipped)
     after_states = [
-        changed(state, time=time[rows][-1], age=float(own[-1]), channel=channel, sums=np.stack(new, axis=1))
+        changed(state, time=time[rows][-1], age=float(own[-1]), channel=channel, sums=np.array(new).T)
         if len(time[rows])
         else state
         for rows, own, new, state in zip(antennas.parts, age, sums, states, strict=True)

@@ -6,23 +6,46 @@ each antenna, and what they return is joined.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cache
+from functools import cache, cached_property, lru_cache
 from itertools import accumulate, pairwise
-from typing import Any, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices
 from railfix.gnss.observations import Observations, stack_parts
 from railfix.positioning.section_search import SearchIndex
+from railfix.track.trajectory import between_points
 
 Value = TypeVar("Value")
 State = TypeVar("State")
 #: Members that are the same for all rows: of the channels alone.
 _OF_CHANNELS: Final = frozenset({"satellite", "signal", "frequency_hz", "channels", "columns", "header"})
 EVERY: Final = slice(None)  #: All rows.
+
+
+class OnDemand:
+    """Base of dataclasses with fields that are computed when they are first asked for: most are not, epoch by epoch."""
+
+    @classmethod
+    def made(cls: type[Value], later: Callable[[str], Mapping[str, Any]], **members: Any) -> Value:
+        """Return an instance with some fields; `later` returns another by its name, and those made with it."""
+        return cast(Value, _make(cls, {**members, "_later": later}))
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            own = self.__dict__
+            if "_later" not in own or name not in _members(self.__class__):
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            own.update(own["_later"](name))
+            return own[name]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all fields, for another process."""
+        return {name: getattr(self, name) for name in _members(type(self))}
 
 
 @dataclass(frozen=True)
@@ -73,9 +96,65 @@ class AntennaRows:
             if len(own):
                 yield index, own
 
+    @cached_property
+    def _first(self) -> Indices | int:
+        """Place of the first point of each epoch's line among those of all lines."""
+        if len(self.parts) == 1:
+            return 0
+        return np.repeat(_lines(self.indices).first, [part.stop - part.start for part in self.parts])
+
     def at_arc(self, arc_m: Floats) -> Floats:
         """Points of the lines at arc lengths, shape (T, 3) [m]; NaN for NaN."""
-        return self.each(lambda index, rows: index.trajectory.at_arc(arc_m[rows]))
+        return self._interpolated(arc_m, _lines(self.indices).ecef_m)
+
+    def chainage_at(self, arc_m: Floats) -> Floats:
+        """Chainages at arc lengths, shape (T,) [m]; NaN for NaN."""
+        return self._interpolated(arc_m, _lines(self.indices).chainage_m)
+
+    def segment_at(self, arc_m: Floats) -> Indices:
+        """Section of each arc length on its line, shape (T,), as `Trajectory.segment_at`."""
+        section = np.empty(len(arc_m), dtype=np.intp)
+        for index, rows in zip(self.indices, self.parts, strict=True):
+            of_line = index.trajectory.arc_m
+            found = of_line.searchsorted(arc_m[rows], side="right") - 1
+            section[rows] = np.minimum(np.maximum(found, 0), len(of_line) - 2)
+        return section
+
+    def axes_of(self, section: Indices) -> Floats:
+        """Unit vectors along, across and up at sections of the lines, shape (T, 3, 3)."""
+        return np.asarray(_lines(self.indices).axes[section + self._first])
+
+    def _interpolated(self, arc_m: Floats, values: Floats) -> Floats:
+        """Interpolate values of the points of all lines at arc lengths."""
+        lines = _lines(self.indices)
+        return between_points(arc_m, lines.arc_m, lines.length_m, values, self.segment_at(arc_m) + self._first)
+
+
+class _Lines(NamedTuple):
+    """Points of several lines, one line after the other, and the sections that begin there; none does at a last one."""
+
+    first: Indices  #: First point of each line.
+    #: Of V points.
+    arc_m: Floats
+    ecef_m: Floats
+    chainage_m: Floats
+    #: Of the sections, shapes (V,), (V, 3, 3): along, across, up.
+    length_m: Floats
+    axes: Floats
+
+
+@lru_cache(maxsize=4)
+def _lines(indices: tuple[SearchIndex, ...]) -> _Lines:
+    lines = [index.trajectory for index in indices]
+    points = np.cumsum([0, *map(len, lines)])
+    length, axes = np.full(points[-1], np.nan), np.full((points[-1], 3, 3), np.nan)
+    for line, first in zip(lines, points[:-1].tolist(), strict=True):
+        own = slice(first, first + len(line) - 1)
+        length[own], axes[own] = line.length_m, line.axes_of(np.arange(len(line) - 1))
+    arc, ecef, chainage = (
+        np.concatenate([getattr(line, n) for line in lines]) for n in ("arc_m", "ecef_m", "chainage_m")
+    )
+    return _Lines(points[:-1].astype(np.intp), arc, ecef, chainage, length, axes)
 
 
 def stack_observations(observations: Sequence[Observations]) -> tuple[Observations, tuple[slice, ...]]:
@@ -104,6 +183,12 @@ def _members(kind: Any) -> dict[str, bool]:
     return {f.name: f.name not in _OF_CHANNELS for f in fields(kind)} if is_dataclass(kind) else {}
 
 
+@cache
+def _defaults(kind: Any) -> tuple[str, ...]:
+    """Return the members of a dataclass that have a default."""
+    return tuple(name for name in _members(kind) if hasattr(kind, name))
+
+
 def joined(values: Sequence[Value]) -> Value:
     """Join arrays row after row, or those of dataclasses or of tuples; what is neither is that of the first."""
     first: Any = values[0]
@@ -116,12 +201,14 @@ def joined(values: Sequence[Value]) -> Value:
 
 def _join(values: Sequence[Any]) -> Any:
     first = values[0]
-    if isinstance(first, np.ndarray):
+    if first.__class__ is np.ndarray:
         return np.concatenate(values)
     if not (has_rows := _members(first.__class__)):
         return first
-    own = [vars(value) for value in values]
-    return _make(type(first), {n: _join([o[n] for o in own]) if rows else own[0][n] for n, rows in has_rows.items()})
+    return _make(
+        type(first),
+        {n: _join([getattr(v, n) for v in values]) if rows else getattr(first, n) for n, rows in has_rows.items()},
+    )
 
 
 def rows_of(value: Value, rows: slice | Indices) -> Value:
@@ -130,15 +217,24 @@ def rows_of(value: Value, rows: slice | Indices) -> Value:
 
 
 def _rows_of(value: Any, rows: slice | Indices) -> Any:
-    if isinstance(value, np.ndarray):
+    if value.__class__ is np.ndarray:
         return value[rows]
     if not (has_rows := _members(value.__class__)):
         return value
-    own, members = vars(value), {}
+    own, members = value.__dict__, {}
+    if isinstance(value, OnDemand):
+        for name, item in own.items():
+            if item.__class__ is np.ndarray and has_rows[name]:
+                members[name] = item[rows]
+        for name in _defaults(value.__class__):  # they would hide that a field is to be taken
+            members[name] = _rows_of(own[name], rows)
+        return value.made(
+            lambda n: {n: _rows_of(getattr(value, n), rows) if has_rows[n] else getattr(value, n)}, **members
+        )
     for name, of_rows in has_rows.items():
         item = own[name]
         if of_rows and item is not None:
-            item = item[rows] if type(item) is np.ndarray else _rows_of(item, rows)
+            item = item[rows] if item.__class__ is np.ndarray else _rows_of(item, rows)
         members[name] = item
     return _make(type(value), members)
 
@@ -146,5 +242,5 @@ def _rows_of(value: Any, rows: slice | Indices) -> Any:
 def _make(kind: Any, members: dict[str, Any]) -> Any:
     """Return a dataclass with given members, which have been checked before."""
     instance = object.__new__(kind)
-    vars(instance).update(members)
+    instance.__dict__.update(members)
     return instance

@@ -21,7 +21,6 @@ from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.noise_scale import correlated_sums
 from railfix.positioning.normal_equations import RangeArrays, Ranges, SinglePoint
-from railfix.track.trajectory import Trajectory
 
 _SUMS: Final = 9  #: Sums of a window.
 
@@ -96,7 +95,7 @@ class MapOffset:
     def seen(self) -> tuple[Floats, Floats]:
         """Offset (T, 2) [m] and its inverse covariance (T, 2, 2) [1/m^2]; 0 without a window."""
         known = np.isfinite(self.across_m)[:, None]
-        offset = np.where(known, np.stack([self.across_m, self.up_m], axis=1), 0.0)
+        offset = np.where(known, np.array([self.across_m, self.up_m]).T, 0.0)
         return offset, np.where(known[..., None], _inverse_2x2(self.covariance_m2), 0.0)
 
     @property
@@ -141,14 +140,14 @@ def map_offset(
     limits, (arc_m, off_map) = limits or MapOffsetLimits(), positions
     usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.n_used - ranges.n_clocks > 3)
     arc = np.where(usable, arc_m, 0.0)
-    axes, place = antennas.each(lambda index, rows: _across_and_up(index.trajectory, arc[rows]))
+    axes, place = antennas.axes_of(antennas.segment_at(arc))[:, 1:], antennas.at_arc(arc)
     at = np.where(usable[:, None], point.ecef_m, place)
     covariance = np.where(usable[:, None, None], point.covariance_m2, np.eye(3))
     terms = terms_of_epochs(
         ranges.arrays, at, covariance, place, axes, np.ascontiguousarray(errors.nominal_m), errors.variance
     )
     sample = np.zeros((len(time), 2, _SUMS))
-    rows = np.flatnonzero(usable)
+    rows = usable.nonzero()[0]
     sample[rows, off_map[rows].astype(np.intp)] = terms[rows]
     both, after = antennas.each_with_state(
         lambda _, rows, state: _window(time[rows], sample[rows].reshape(-1, 2 * _SUMS), state, limits), states
@@ -160,18 +159,11 @@ def map_offset(
         sums, antennas.sigma_plan_m, antennas.sigma_height_m, limits.detectable_sigmas
     )
     result = MapOffset(
-        across_m=np.where(enough, mean[:, 0], np.nan),
-        up_m=np.where(enough, mean[:, 1], np.nan),
-        covariance_m2=np.where(enough[:, None, None], known, np.nan),
-        statistic=np.where(enough, statistic, np.nan),
+        across_m=np.where(enough, mean[:, 0], np.nan), up_m=np.where(enough, mean[:, 1], np.nan),
+        covariance_m2=np.where(enough[:, None, None], known, np.nan), statistic=np.where(enough, statistic, np.nan),
         detectable_m=np.where(enough[:, None], detectable, np.nan),
-    )
+    )  # fmt: skip
     return result, after
-
-
-def _across_and_up(line: Trajectory, arc_m: Floats) -> tuple[Floats, Floats]:
-    """Return unit vectors across and up (T, 2, 3), and the points (T, 3) [m], of a line at arc lengths."""
-    return line.axes_of(line.segment_at(arc_m)[0])[:, 1:], line.at_arc(arc_m)
 
 
 def _window(
@@ -236,7 +228,7 @@ def _inverse_2x2(matrix: Floats) -> Floats:
     """Inverse of symmetric 2 x 2 matrices, shape (T, 2, 2)."""
     a, b, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]
     determinant = np.maximum(a * d - b * b, 1e-300)
-    return np.stack([d, -b, -b, a], axis=1).reshape(-1, 2, 2) / determinant[:, None, None]
+    return np.array([d, -b, -b, a]).T.reshape(-1, 2, 2) / determinant[:, None, None]
 
 
 def beyond_threshold(offset: MapOffset, limits: MapOffsetLimits) -> Masks:

@@ -61,8 +61,9 @@ def decayed_sums(age: Floats, values: Floats, start: Floats, last_age: float) ->
     """
     span, current, of_current = np.floor(age / _SPAN), start, np.floor(last_age / _SPAN)
     before = np.empty(values.shape)
-    edges = (np.flatnonzero(span[1:] != span[:-1]) + 1).tolist() if len(span) > 1 else []
-    for first, end in pairwise([0, *edges, len(span)] if len(span) else []):
+    epochs = len(span)
+    edges = ((span[1:] != span[:-1]).nonzero()[0] + 1).tolist() if epochs > 1 else []
+    for first, end in pairwise([0, *edges, epochs] if epochs else ()):
         if span[first] != of_current:
             current = current * np.exp(-_SPAN * (span[first] - of_current))
             of_current = span[first]
@@ -147,10 +148,14 @@ class RobustFit:
 
 def map_information(trajectory: Trajectory, section: Indices) -> Floats:
     """Inverse covariance of the place across and above sections of the line, shape (T, 3, 3) [1/m^2] in ECEF."""
-    across, up = trajectory.across[section], trajectory.up[section]
+    return information_of(trajectory.axes_of(section), trajectory.sigma_plan_m, trajectory.sigma_height_m)
+
+
+def information_of(axes: Floats, sigma_plan_m: float, sigma_height_m: float) -> Floats:
+    """Return the same by the axes of the line there, shape (T, 3, 3), and the sigmas of its map."""
+    across, up = axes[:, 1], axes[:, 2]
     return np.asarray(
-        across[:, :, None] * across[:, None, :] / trajectory.sigma_plan_m**2
-        + up[:, :, None] * up[:, None, :] / trajectory.sigma_height_m**2
+        across[:, :, None] * across[:, None, :] / sigma_plan_m**2 + up[:, :, None] * up[:, None, :] / sigma_height_m**2
     )
 
 
@@ -168,15 +173,12 @@ def robust_fit(
         return RobustFit(kept=used, variance=np.full(len(ranges), np.nan), freedom=nothing)
     freedom = ranges.n_used - ranges.n_clocks - (3 if information is None else 1)
     kept, wsse, solved = kernels.robust.reweighted(
-        ranges.arrays,
-        kernel_array(place_ecef_m),
+        ranges.arrays, kernel_array(place_ecef_m),
         kernel_array(np.empty((0, 3, 3)) if information is None else information),
-        np.sqrt(ranges.n_used / np.maximum(freedom, 1)) / _NORMAL_MEDIAN,
-        limits.keep,
-        limits.reject,
+        np.sqrt(ranges.n_used / np.maximum(freedom, 1)) / _NORMAL_MEDIAN, limits.keep, limits.reject,
         limits.iterations,
-    )
-    left = np.asarray(np.count_nonzero(kept, axis=1) - (ranges.n_used - freedom), dtype=np.int64)
+    )  # fmt: skip
+    left = np.asarray(kept.sum(axis=1) - (ranges.n_used - freedom), dtype=np.int64)
     some = (left > 0) & solved
     return RobustFit(
         kept=kept, variance=np.where(some, wsse / np.maximum(left, 1), np.nan), freedom=np.where(some, left, 0)
@@ -311,7 +313,7 @@ def robust_clock(
     for g, group in enumerate(groups):
         part, sigma = residual_m[:, group], sigma_m[:, group]
         valid = np.isfinite(part) & np.isfinite(sigma)
-        rows = np.flatnonzero(valid.sum(axis=1) >= least_ranges)
+        rows = (valid.sum(axis=1) >= least_ranges).nonzero()[0]
         if not len(rows):
             continue
         part, valid = np.where(valid, part, np.nan)[rows], valid[rows]
@@ -359,10 +361,10 @@ class OffsetState:
 
     def later(self, letters: Sequence[str], sums: Floats, last: np.datetime64, age: float) -> OffsetState:
         """Return the state with new sums of some clocks (`sums`), those of the others as they are."""
-        information, moment = (zip(letters, half, strict=True) for half in np.split(sums, 2))
+        count = len(letters)
         return OffsetState(
-            information={**self.information, **dict(information)},
-            moment={**self.moment, **dict(moment)},
+            information={**self.information, **dict(zip(letters, sums[:count], strict=True))},
+            moment={**self.moment, **dict(zip(letters, sums[count:], strict=True))},
             last=last,
             age=age,
         )

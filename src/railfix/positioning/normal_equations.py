@@ -86,12 +86,9 @@ class Ranges:
     def take(self, epochs: Masks | Indices) -> Ranges:
         """The ranges of some epochs, by mask or index."""
         return Ranges(
-            sat_ecef_m=self.sat_ecef_m[epochs],
-            code_m=self.code_m[epochs],
-            weight=self.weight[epochs],
-            groups=self.groups,
-            ties=None if self.ties is None else self.ties.take(epochs),
-        )
+            sat_ecef_m=self.sat_ecef_m[epochs], code_m=self.code_m[epochs], weight=self.weight[epochs],
+            groups=self.groups, ties=None if self.ties is None else self.ties.take(epochs),
+        )  # fmt: skip
 
     @cached_property
     def arrays(self) -> RangeArrays:
@@ -147,14 +144,10 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     """Return the normal equations of `ranges` linearised at one place an epoch, shape (T, 3) [m]."""
     system, means, rows, seen = kernels.ranges.reduced_equations(ranges.arrays, kernel_array(place_ecef_m))
     return NormalEquations(
-        matrix=system[:, :3, :3],
-        vector=system[:, :3, 3],
-        wsse=system[:, 3, 3],
-        clock_m=np.where(seen, means[:, 3], np.nan),
-        residual_m=rows[:, 3],
-        clock_slope=means[:, :3],
+        matrix=system[:, :3, :3], vector=system[:, :3, 3], wsse=system[:, 3, 3],
+        clock_m=np.where(seen, means[:, 3], np.nan), residual_m=rows[:, 3], clock_slope=means[:, :3],
         design=rows[:, :3],
-    )
+    )  # fmt: skip
 
 
 def fit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> Floats:
@@ -219,11 +212,38 @@ def constrained_position(
     one. Where both neighbours of a point send the step back, the point is the answer. At an open end the position is
     clamped and `overshoot_m` is how far beyond it the ranges pull.
     """
-    limits = limits or ConstrainedLimits()
-    start = np.where(ranges.n_used - ranges.n_clocks >= 1, vertex, -1)
+    return constrained_on_lines(ranges, ((trajectory, slice(None)),), vertex, limits=limits or ConstrainedLimits())
+
+
+def constrained_on_lines(
+    ranges: Ranges, lines: Sequence[tuple[Trajectory, slice]], vertex: Indices, *, limits: ConstrainedLimits
+) -> Constrained:
+    """Compute the same of epochs on several lines; each comes with its epochs, one line's after the other's."""
+    enough = ranges.n_used - ranges.n_clocks >= 1
+    parts = []
+    for trajectory, rows in lines:
+        start = np.full(len(vertex), -1, dtype=np.intp)
+        start[rows] = np.where(enough[rows], vertex[rows], -1)
+        parts.append(_on_line(ranges, trajectory, start, limits))
+    first = parts[0]
+    for part, (_, rows) in zip(parts[1:], lines[1:], strict=True):
+        for whole, own in zip(first, part, strict=True):
+            whole[..., rows] = own[..., rows]
+    arc, section, solved, clock, residual, iterations = first
+    _, sigma, exact, wsse, overshoot, dilution = solved
+    return Constrained(
+        arc_m=arc, section=section, sigma_m=sigma, exact_map_sigma_m=exact, dilution=dilution, overshoot_m=overshoot,
+        clock_m=clock.T, wsse=wsse, residual_m=residual.T, iterations=iterations,
+    )  # fmt: skip
+
+
+def _on_line(
+    ranges: Ranges, trajectory: Trajectory, start: Indices, limits: ConstrainedLimits
+) -> tuple[Floats, Indices, Floats, Floats, Floats, Integers]:
+    """Return arc lengths (T,), and what `_from` returns with the epochs on the last axis."""
     section, solved, clock, residual, iterations = _from(start, ranges, trajectory, limits)
     for end, join in zip((0, len(trajectory) - 2), trajectory.joins_m, strict=True):
-        pulled = np.flatnonzero((solved[4] > 0.0) & (section == end))
+        pulled = ((solved[4] > 0.0) & (section == end)).nonzero()[0]
         if not np.isnan(join) and len(pulled):
             there = np.full(len(pulled), np.argmin(np.abs(trajectory.arc_m - join)))
             other = _from(there, ranges.take(pulled), trajectory, limits)
@@ -233,19 +253,8 @@ def constrained_position(
             for array, new in zip((section, clock, residual), (other[0], *other[2:4]), strict=True):
                 array[rows] = new[better]
             iterations[pulled] += other[4]
-    along, sigma, exact, wsse, overshoot, dilution = solved
-    return Constrained(
-        arc_m=trajectory.arc_m[np.maximum(section, 0)] + along,
-        section=section,
-        sigma_m=sigma,
-        exact_map_sigma_m=exact,
-        dilution=dilution,
-        overshoot_m=overshoot,
-        clock_m=clock,
-        wsse=wsse,
-        residual_m=residual,
-        iterations=iterations,
-    )
+    arc = trajectory.arc_m[np.maximum(section, 0)] + solved[0]
+    return arc, section, solved, clock.T, residual.T, iterations
 
 
 def _from(
@@ -312,12 +321,9 @@ def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLim
     """Compute single-point positions of all epochs at once, from starts (T, 3) [m] within a few thousand kilometres."""
     limits = limits or SinglePointLimits()
     place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterated_points(
-        ranges.arrays,
-        kernel_array(start_ecef_m),
-        np.asarray(ranges.n_used - ranges.n_clocks >= 3),
-        limits.tolerance_m,
-        limits.max_iterations,
-    )
+        ranges.arrays, kernel_array(start_ecef_m), np.asarray(ranges.n_used - ranges.n_clocks >= 3),
+        limits.tolerance_m, limits.max_iterations,
+    )  # fmt: skip
     return SinglePoint(
         ecef_m=place, clock_m=clock, matrix=matrix, covariance_m2=covariance, wsse=wsse, residual_m=residual
     )

@@ -9,6 +9,7 @@ of the summed weights times the distance moved. Both are exact.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -102,8 +103,9 @@ class SearchIndex:
         """
         line = self.trajectory
         section = line.segment_at(arc_m)[0]
-        new = np.unique(section[np.isnan(self._clear_m[section])])
-        if len(new):
+        unknown = np.isnan(self._clear_m[section])
+        if unknown.any():
+            new = np.unique(section[unknown])
             middle = line.ecef_m[new] + 0.5 * line.length_m[new, None] * line.tangent[new]
             reach = CLEAR_M + 0.5 * line.length_m[new] + line.length_m.max()
             lists = self.tree.query_ball_point(middle, reach)
@@ -134,47 +136,63 @@ def search(ranges: Ranges, index: SearchIndex, point: SinglePoint, *, limits: Se
 
     `point`: 3-D position from the same ranges and weights; NaN where there is none.
     """
-    limits = limits or SectionLimits()
+    return search_lines(ranges, ((index, slice(None)),), point, limits=limits or SectionLimits())
+
+
+def search_lines(
+    ranges: Ranges, lines: Iterable[tuple[SearchIndex, slice]], point: SinglePoint, *, limits: SectionLimits
+) -> Section:
+    """Return the same of epochs on several lines; each comes with its epochs."""
     epochs = len(ranges)
     weight_norm = np.sqrt(ranges.weight.sum(axis=1))
     freedom = np.maximum(ranges.n_used - ranges.n_clocks - 1, 1)
-    candidates: list[SectionCandidates] = []
+    vertex, other = np.full((2, epochs), -1, dtype=np.intp)
+    q, excess = np.full(epochs, np.nan), np.full(epochs, np.inf)
     evaluations = np.zeros(epochs, dtype=np.int64)
-
-    radius = _ball(index, point, weight_norm, freedom, limits)
-    in_ball = np.flatnonzero(np.isfinite(radius))
-    if len(in_ball):
-        part = _in_ball(ranges, index, point, weight_norm, in_ball, radius[in_ball])
-        candidates.append(part)
-    coarse = np.flatnonzero(~np.isfinite(radius) & (ranges.n_used > ranges.n_clocks))
-    if len(coarse):
-        part, tried = _coarse_to_fine(ranges, index, weight_norm, freedom, limits, coarse)
-        evaluations[coarse] += tried
-        candidates.append(part)
-    for part in candidates:
-        evaluations[part.at] += part.points
-    return _decide(epochs, candidates, index.trajectory, freedom, limits, evaluations)
+    every = np.arange(epochs)
+    for index, rows in lines:
+        own, trajectory = every[rows], index.trajectory
+        candidates: list[SectionCandidates] = []
+        radius = _ball(index, point, weight_norm, freedom, own, limits)
+        known = np.isfinite(radius)
+        if known.any():
+            in_ball = own[known]
+            candidates.append(_in_ball(ranges, index, point, weight_norm, in_ball, radius[known]))
+        coarse = own[~known & (ranges.n_used > ranges.n_clocks)[own]]
+        if len(coarse):
+            part, tried = _coarse_to_fine(ranges, index, weight_norm, freedom, limits, coarse)
+            evaluations[coarse] += tried
+            candidates.append(part)
+        line = (trajectory.arc_m, trajectory.tangent, trajectory.length_m)
+        for part in candidates:
+            at = part.at
+            evaluations[at] += part.points
+            vertex[at], q[at], excess[at], other[at] = kernels.search.best_points(
+                part, freedom[at], line, limits.separation_m, trajectory.turn_m
+            )
+    return Section(vertex=vertex, q=q, excess=excess, other_vertex=other, evaluations=evaluations)
 
 
 def _ball(
-    index: SearchIndex, point: SinglePoint, weight_norm: Floats, freedom: Integers, limits: SectionLimits
+    index: SearchIndex,
+    point: SinglePoint,
+    weight_norm: Floats,
+    freedom: Integers,
+    epochs: Indices,
+    limits: SectionLimits,
 ) -> Floats:
-    """Radius around the 3-D position that holds every point worth looking at; NaN where unknown."""
-    radius = np.full(len(point.ecef_m), np.nan)
-    at = np.flatnonzero(np.isfinite(point.ecef_m[:, 0]))
+    """Radius around the 3-D position of some epochs that holds every point worth looking at; NaN where unknown."""
+    radius = np.full(len(epochs), np.nan)
+    known = np.isfinite(point.ecef_m[epochs, 0])
+    at = epochs[known]
     if not len(at):
         return radius
-    nearest_m, vertex = index.tree.query(point.ecef_m[at])
-    radius[at] = kernels.search.radii_of_balls(
-        np.asarray(nearest_m, dtype=np.float64),
-        index.trajectory.ecef_m[vertex] - point.ecef_m[at],
-        point.matrix[at],
-        point.covariance_m2[at],
-        point.wsse[at],
-        weight_norm[at],
-        freedom[at],
-        limits.reach,
-    )
+    place = point.ecef_m[at]
+    nearest_m, vertex = index.tree.query(place)
+    radius[known] = kernels.search.radii_of_balls(
+        np.asarray(nearest_m, dtype=np.float64), index.trajectory.ecef_m[vertex] - place, point.matrix[at],
+        point.covariance_m2[at], point.wsse[at], weight_norm[at], freedom[at], limits.reach,
+    )  # fmt: skip
     return radius
 
 
@@ -183,20 +201,15 @@ def _in_ball(
 ) -> SectionCandidates:
     """Points in the ball of each epoch with q from the quadratic form; exact where that leaves a choice."""
     count, vertex, q, half_gradient, unsure = kernels.search.points_in_balls(
-        index.trajectory.ecef_m,
-        index.stretches,
-        point.ecef_m[epochs],
-        radius,
-        point.matrix[epochs],
-        point.wsse[epochs],
-        weight_norm[epochs],
-    )
+        index.trajectory.ecef_m, index.stretches, point.ecef_m[epochs], radius, point.matrix[epochs],
+        point.wsse[epochs], weight_norm[epochs],
+    )  # fmt: skip
     if not np.all(count):
         raise AssertionError(f"an empty ball at epochs {epochs[count == 0]}: the radius is below the nearest point")
     if unsure.any():
         q[unsure] = fit(ranges, index.trajectory.ecef_m[vertex[unsure]], np.repeat(epochs, count)[unsure])
     matrix = np.ascontiguousarray(point.matrix)
-    return SectionCandidates(epochs, count, vertex, q, half_gradient, matrix, np.repeat(epochs, count))
+    return SectionCandidates(epochs, count, vertex, q, half_gradient, matrix, epochs.repeat(count))
 
 
 def _coarse_to_fine(
@@ -229,24 +242,3 @@ def _coarse_to_fine(
     found, every = count > 0, np.arange(len(epoch))
     slope, matrix = np.ascontiguousarray(-equations.vector), np.ascontiguousarray(equations.matrix)
     return SectionCandidates(epochs[found], count[found], node, q, slope, matrix, every), tried[epochs]
-
-
-def _decide(
-    epochs: int,
-    parts: list[SectionCandidates],
-    trajectory: Trajectory,
-    freedom: Integers,
-    limits: SectionLimits,
-    evaluations: Integers,
-) -> Section:
-    """The best point of each epoch, and the best of the other places."""
-    vertex = np.full(epochs, -1, dtype=np.intp)
-    other = np.full(epochs, -1, dtype=np.intp)
-    q, excess = np.full(epochs, np.nan), np.full(epochs, np.inf)
-    line = (trajectory.arc_m, trajectory.tangent, trajectory.length_m)
-    for part in parts:
-        at = part.at
-        vertex[at], q[at], excess[at], other[at] = kernels.search.best_points(
-            part, freedom[at], line, limits.separation_m, trajectory.turn_m
-        )
-    return Section(vertex=vertex, q=q, excess=excess, other_vertex=other, evaluations=evaluations)

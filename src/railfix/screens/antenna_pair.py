@@ -232,20 +232,13 @@ def antenna_pair_screen(
     metric = raw - clock
     relative = np.asarray(azimuth_deg) - np.asarray(spacing.heading_deg, dtype=np.float64)[..., None]
     zone = ambiguity_m(
-        elevation_deg,
-        relative,
-        np.asarray(spacing.spacing_m, dtype=np.float64)[..., None],
-        elevation_error_deg=limits.elevation_error_deg,
-        azimuth_error_deg=limits.azimuth_error_deg,
-    )
+        elevation_deg, relative, np.asarray(spacing.spacing_m, dtype=np.float64)[..., None],
+        elevation_error_deg=limits.elevation_error_deg, azimuth_error_deg=limits.azimuth_error_deg,
+    )  # fmt: skip
     return AntennaPairScreened(
-        metric=metric,
-        reject=np.abs(metric) > np.maximum(limits.limit_m, zone),
-        expected_m=expected,
-        ambiguity_m=zone,
-        clock_m=clock,
-        clocks=CLOCKS[limits.clocks],
-    )
+        metric=metric, reject=np.abs(metric) > np.maximum(limits.limit_m, zone), expected_m=expected,
+        ambiguity_m=zone, clock_m=clock, clocks=CLOCKS[limits.clocks],
+    )  # fmt: skip
 
 
 class AntennaPairScreen(PairScreen[AntennaPairLimits]):
@@ -277,10 +270,10 @@ class AntennaPairScreen(PairScreen[AntennaPairLimits]):
         """Return the verdict on a chunk, the same for both antennas."""
         at_front, at_rear = pair.front_epoch, pair.rear_epoch
         ours, theirs = pair_channels(front.satellite, front.signal, rear.satellite, rear.signal)
-        here = np.ix_(at_front, ours)
+        here = at_front[:, None], ours
         screened = antenna_pair_screen(
             front.corrected_code_m[here],
-            rear.corrected_code_m[np.ix_(at_rear, theirs)],
+            rear.corrected_code_m[at_rear[:, None], theirs],
             front.elevation_deg[here],
             front.azimuth_deg[here],
             satellite=front.satellite[ours],

@@ -259,7 +259,7 @@ def pair_epochs(time_front: ArrayLike, time_rear: ArrayLike, *, tolerance_s: flo
     within_ns = round(tolerance_s * 1e9)
     to_rear = nearest_rows(time_rear, time_front, within_ns=within_ns)
     to_front = nearest_rows(time_front, time_rear, within_ns=within_ns)
-    index = np.flatnonzero(to_rear >= 0)
+    index = (to_rear >= 0).nonzero()[0]
     index = index[to_front[to_rear[index]] == index]
     return index, to_rear[index]
 
@@ -281,7 +281,7 @@ def pair_channels(
 def on_pairs(screened: Screened, shape: tuple[int, ...], epochs: Indices, channels: Indices) -> Screened:
     """Return a verdict on pairs of epochs and channels laid on one antenna's own, of shape `shape`."""
     metric, reject = np.full(shape, np.nan), np.zeros(shape, dtype=bool)
-    where = np.ix_(epochs, channels) if len(shape) > 1 else epochs
+    where = (epochs[:, None], channels) if len(shape) > 1 else epochs
     metric[where], reject[where] = screened.metric, screened.reject
     return Screened(metric=metric, reject=reject)
 
@@ -300,12 +300,10 @@ def pair_antennas(
     front_arc, _ = front_path.nearest(front_anchor_ecef_m[at_front])
     rear_arc = rear_path.arc_of_body(front_path.body_at(front_arc))
     return PairedEpochs(
-        front_epoch=at_front,
-        rear_epoch=at_rear,
-        front_ecef_m=front_path.at_arc(front_arc),
+        front_epoch=at_front, rear_epoch=at_rear, front_ecef_m=front_path.at_arc(front_arc),
         rear_ecef_m=rear_path.at_arc(rear_arc),
         along_m=front_path.chainage_at(front_arc) - rear_path.chainage_at(rear_arc),
-    )
+    )  # fmt: skip
 
 
 def clock_medians(values: Floats, satellite: Strings, *, least: int = 0) -> Floats:
@@ -327,7 +325,7 @@ def _clocks(kind: str, satellites: bytes) -> tuple[Indices, Indices, Floats, Flo
     names = np.frombuffer(satellites, dtype=kind).tolist()
     clock = np.unique([CLOCK_GROUP[name[0]] for name in names], return_inverse=True)[1].astype(np.intp)
     number = np.unique(names, return_inverse=True)[1]
-    rows = [np.flatnonzero(clock == one).tolist() for one in range(int(clock.max(initial=-1)) + 1)]
+    rows = [(clock == one).nonzero()[0].tolist() for one in range(int(clock.max(initial=-1)) + 1)]
     widest = max(map(len, rows), default=0)
     columns = np.array([row + [len(names)] * (widest - len(row)) for row in rows], dtype=np.intp)
     member = (number[:, None] == np.arange(int(number.max(initial=-1)) + 1)).astype(np.float32)

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Strings, freeze_arrays, medians
+from railfix.core.arrays import Datetimes, Floats, Strings, changed, freeze_arrays, medians, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
@@ -114,7 +114,7 @@ def receiver_limit_m(
     """
     growth = _growth(interval_s, limits)
     shown = medians(np.abs(metric_m)) / _MEDIAN_NORMAL / growth
-    counts = (np.count_nonzero(np.isfinite(metric_m), axis=1) >= _LEAST_CHANGES) & np.isfinite(shown)
+    counts = (np.isfinite(metric_m).sum(axis=1) >= _LEAST_CHANGES) & np.isfinite(shown)
     logs = np.where(counts, np.log(np.maximum(np.where(counts, shown, 1.0), _FINEST_M)), 0.0)
     # running sums, one after the other from the carried ones: a cut does not show
     sums = np.concatenate([[sum_log], logs]).cumsum()[1:]
@@ -240,9 +240,10 @@ def doppler_screen(
     reject, level, since = kernels.screens.suspicions(
         when.astype(np.int64), metric, limit, before.level_m, before.since.astype(np.int64), int(limits.hold_s * _NS)
     )
-    after = DopplerState(
-        time=when[-1], satellite=satellite, signal=signal, code_m=code[-1].copy(), doppler_hz=doppler[-1].copy(),
-        code_sigma_m=sigma[-1].copy(), level_m=level[-1].copy(), since=since.astype("datetime64[ns]"),
+    after = changed(
+        before, time=when[-1], satellite=satellite, signal=signal, code_m=read_only(code[-1].copy()),
+        doppler_hz=read_only(doppler[-1].copy()), code_sigma_m=read_only(sigma[-1].copy()),
+        level_m=read_only(level[-1].copy()), since=read_only(since.astype("datetime64[ns]")),
         scale_sum=sum_log, scale_epochs=weight,
     )  # fmt: skip
     return DopplerScreened(metric=metric, reject=reject, limit_m=limit, level_m=level), after
@@ -324,15 +325,10 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
     ) -> tuple[tuple[Verdict, ...], Any]:
         """Return the verdict on a chunk, and the last epoch with the satellites under suspicion."""
         screened, after = doppler_screen(
-            antenna.time,
-            np.where((antenna.reason & Reason.IMPLAUSIBLE_CODE) == 0, antenna.code_m, np.nan),
-            antenna.doppler_hz,
-            channels=DopplerChannels(antenna.satellite, antenna.signal, antenna.frequency_hz),
-            break_before=antenna.break_before,
-            code_sigma_m=antenna.sigma_m,
-            limits=limits,
-            state=state,
-        )
+            antenna.time, np.where((antenna.reason & int(Reason.IMPLAUSIBLE_CODE)) == 0, antenna.code_m, np.nan),
+            antenna.doppler_hz, channels=DopplerChannels(antenna.satellite, antenna.signal, antenna.frequency_hz),
+            break_before=antenna.break_before, code_sigma_m=antenna.sigma_m, limits=limits, state=state,
+        )  # fmt: skip
         error = np.fmax(np.abs(screened.level_m), screened.limit_m) if limits.verdict == "weigh" else None
         return (Verdict(name="doppler", reason=Reason.DOPPLER, screened=screened, error_m=error),), after
 

@@ -61,7 +61,7 @@ class NearestOnPolyline:
         index = np.full(len(points), -1, dtype=np.intp)
         along = np.full(len(points), np.nan)
         offset = np.full(len(points), np.nan)
-        pending = np.flatnonzero(np.isfinite(points).all(axis=1))
+        pending = np.isfinite(points).all(axis=1).nonzero()[0]
         candidates = min(_FIRST_CANDIDATES, len(self._segment))
         while pending.size:
             unproven = []
@@ -175,16 +175,10 @@ class Trajectory(FrozenArrays, NotebookTable):
     def from_track(cls, track: Track) -> Trajectory:
         """Create a trajectory that uses the track as the antenna's path; `notes` records it."""
         return cls(
-            name=track.name,
-            ecef_m=track.ecef_m,
-            chainage_m=track.chainage_m,
-            kilometrage_m=track.kilometrage_m,
-            cant_m=track.cant_m,
-            roll_deg=read_only(np.zeros(len(track))),
-            sigma_plan_m=track.sigma_plan_m,
-            sigma_height_m=track.sigma_height_m,
-            notes=(TRACK_AS_PATH, *track.provenance.notes),
-        )
+            name=track.name, ecef_m=track.ecef_m, chainage_m=track.chainage_m, kilometrage_m=track.kilometrage_m,
+            cant_m=track.cant_m, roll_deg=read_only(np.zeros(len(track))), sigma_plan_m=track.sigma_plan_m,
+            sigma_height_m=track.sigma_height_m, notes=(TRACK_AS_PATH, *track.provenance.notes),
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.ecef_m)
@@ -279,14 +273,8 @@ class Trajectory(FrozenArrays, NotebookTable):
 
     def _interpolate(self, arc_m: ArrayLike, values: Floats) -> Floats:
         """Values (V, ...) at arc lengths of any shape; NaN beyond the ends by more than the tolerance."""
-        given = np.array(arc_m, dtype=np.float64)
-        index, along = self.segment_at(given.reshape(-1))
-        length, rows = self.length_m[index], values.reshape(len(values), -1)
-        share, beyond = along / length, _END_TOLERANCE_M / length
-        share = np.where((share < -beyond) | (share > 1.0 + beyond), np.nan, share)[:, None]
-        # exact at both ends of a segment
-        result = (1.0 - share) * rows[index] + share * rows[index + 1]
-        return np.asarray(result).reshape(given.shape + values.shape[1:])
+        arc = np.asarray(arc_m, dtype=np.float64)
+        return between_points(arc, self.arc_m, self.length_m, values, self.segment_at(arc)[0])
 
     def at_arc(self, arc_m: ArrayLike) -> Floats:
         """Interpolate the point at an arc length, shape (..., 3) [m]; NaN beyond the ends and for NaN."""
@@ -330,3 +318,14 @@ class Trajectory(FrozenArrays, NotebookTable):
         """
         index, along, offset = self._nearest(ecef_m)
         return self.arc_m[np.maximum(index, 0)] + along, offset  # `along` is NaN where there is no segment
+
+
+def between_points(arc: Floats, arc_m: Floats, length_m: Floats, values: Floats, section: Indices) -> Floats:
+    """Interpolate values (V, ...) of a line at arc lengths on its sections (n, ...); NaN beyond its ends."""
+    length = length_m[section]
+    share, beyond = (arc - arc_m[section]) / length, _END_TOLERANCE_M / length
+    share = np.where((share < -beyond) | (share > 1.0 + beyond), np.nan, share)
+    if values.ndim > 1:
+        share = share[..., None]
+    # exact at both ends of a section
+    return np.asarray((1.0 - share) * values[section] + share * values[section + 1])

@@ -20,6 +20,8 @@ _SHORTEST_S: Final = 1e-3
 _APART_S: Final = 3600.0
 #: Phases or Dopplers of an epoch that give speed and clock drift with redundancy.
 _MOTION: Final = 4
+#: Place of each clock in `CLOCKS`.
+_OFFSETS: Final = {letter: k for k, letter in enumerate(CLOCKS)}
 #: Satellites unseen for this many correlation times of codes are dropped from the state.
 FORGOTTEN: Final = 3.0
 
@@ -90,14 +92,16 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     phase = np.concatenate([phase[None], epochs.phase_m])
     placed = np.isfinite(epochs.sat_ecef_m).all(axis=2)
     before = np.concatenate([before[None], epochs.sat_ecef_m])[:-1]
-    measured = np.stack([epochs.code_m, phase[1:] - phase[:-1], epochs.rate_mps])
+    measured = np.array([epochs.code_m, phase[1:] - phase[:-1], epochs.rate_mps])
     has = np.isfinite(measured) & placed
     has[0] &= np.isfinite(epochs.code_sigma_m)
     has[1] &= epochs.phase_joined & np.isfinite(before).all(axis=2)
     has[2] &= np.isfinite(epochs.sat_velocity_mps).all(axis=2)
 
-    since = np.diff(epochs.time, prepend=epochs.time[:1] if np.isnat(state.time) else state.time)
-    gap = seconds(since)
+    earlier = np.concatenate([np.array([state.time]), epochs.time[:-1]])
+    gap = seconds(epochs.time - earlier)
+    if np.isnat(state.time):
+        gap[:1] = 0.0
     apart = gap > _APART_S
     # Two epochs at one instant are a millisecond apart: Dopplers and forces count by the interval.
     interval = np.maximum(gap, _SHORTEST_S)
@@ -109,10 +113,9 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     slot = _with_satellites(state, epochs, np.asarray(any_kind.any(axis=0)))
     seen = np.full((len(epochs) + 1, len(state.satellite)), np.datetime64("NaT", "ns"), dtype="datetime64[ns]")
     seen[0] = state.seen
-    used = np.flatnonzero(slot >= 0)
+    used = (slot >= 0).nonzero()[0]
     seen[1:, slot[used]] = np.where(any_kind[:, used], epochs.time[:, None], np.datetime64("NaT", "ns"))
     seen = np.fmax.accumulate(seen, axis=0)
-    earlier = np.concatenate([np.array([state.time]), epochs.time[:-1]])
     kept = seconds(earlier[:, None] - seen[:-1]) <= FORGOTTEN * limits.code_correlation_s
     fresh = np.zeros(kept.shape, dtype=np.bool_)
     fresh[:, slot[used]] = any_kind[:, used]
@@ -120,7 +123,7 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
 
     cn0 = np.where(np.isnan(epochs.cn0_dbhz), 45.0, np.minimum(epochs.cn0_dbhz, 50.0))
     weak = 10.0 ** ((45.0 - cn0) / 10.0)
-    variance = np.stack(
+    variance = np.array(
         [
             (limits.code_white_share * epochs.code_sigma_m) ** 2,
             limits.phase_floor_m**2 + limits.phase_zenith_m**2 * weak,
@@ -132,27 +135,14 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
         near, epochs.sat_ecef_m, epochs.sat_velocity_mps, before, measured, has, variance, interval
     )
     return Chunk(
-        time=epochs.time,
-        interval_s=interval,
-        apart=apart,
-        satellite=epochs.satellite,
-        slot=slot,
-        offset=np.array([CLOCKS.index(letter) for letter in epochs.clock.tolist()], dtype=np.intp),
-        sat_ecef_m=epochs.sat_ecef_m,
-        sat_velocity_mps=epochs.sat_velocity_mps,
-        before_ecef_m=before,
-        measured=measured,
-        has=has,
-        variance=variance,
-        motion_measured=np.asarray(np.count_nonzero(has[1:], axis=2).max(axis=0) >= _MOTION),
-        code_sigma_m=epochs.code_sigma_m,
-        fresh=fresh & ~kept,
-        off_map=epochs.off_map,
-        remembered=kept,
-        velocity_mps=velocity.velocity_mps,
-        velocity_covariance=velocity.covariance,
-        velocity_age_s=velocity.age_s,
-    )
+        time=epochs.time, interval_s=interval, apart=apart, satellite=epochs.satellite, slot=slot,
+        offset=np.array([_OFFSETS[letter] for letter in epochs.clock.tolist()], dtype=np.intp),
+        sat_ecef_m=epochs.sat_ecef_m, sat_velocity_mps=epochs.sat_velocity_mps, before_ecef_m=before,
+        measured=measured, has=has, variance=variance,
+        motion_measured=np.asarray(has[1:].sum(axis=2).max(axis=0) >= _MOTION), code_sigma_m=epochs.code_sigma_m,
+        fresh=fresh & ~kept, off_map=epochs.off_map, remembered=kept, velocity_mps=velocity.velocity_mps,
+        velocity_covariance=velocity.covariance, velocity_age_s=velocity.age_s,
+    )  # fmt: skip
 
 
 def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> None:
@@ -161,15 +151,15 @@ def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState, limits: Tr
     state.previous = Previous(satellite=epochs.satellite, sat_ecef_m=epochs.sat_ecef_m[-1], phase_m=phase)
     kept = seconds(chunk.time[-1] - state.seen) <= FORGOTTEN * limits.code_correlation_s
     if not kept.all():
-        state.rearrange(np.flatnonzero(kept), ())
+        state.rearrange(kept.nonzero()[0], ())
 
 
 def _previous(epochs: GnssEpochs, previous: Previous | None) -> tuple[Floats, Floats]:
     """Phase and satellites of the epoch before the first, in the order of the channels."""
+    if previous is not None and epochs.satellite.tolist() == previous.satellite.tolist():
+        return previous.phase_m, previous.sat_ecef_m
     size = len(epochs.satellite)
     phase, sat = np.full(size, np.nan), np.full((size, 3), np.nan)
-    if previous is not None and np.array_equal(epochs.satellite, previous.satellite):
-        return previous.phase_m, previous.sat_ecef_m
     if previous is not None:
         _, here, there = np.intersect1d(epochs.satellite, previous.satellite, return_indices=True)
         phase[here], sat[here] = previous.phase_m[there], previous.sat_ecef_m[there]

@@ -6,19 +6,19 @@ on the unknowns that are in use; the state has all of them.
 
 from __future__ import annotations
 
-from copy import copy
 from functools import lru_cache
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats
+from railfix.core.arrays import Datetimes, Floats, changed
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking import layout
 from railfix.tracking import bank
 from railfix.tracking.chunk import Chunk, finish_chunk, prepare_chunk
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
-from railfix.tracking.handover import Handover, row_major
+from railfix.tracking.handover import Handover
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.result import Tracked, TrackStatus
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 #: Satellites come and go: the unknowns in use are chosen again after so many epochs.
 _EPOCHS: Final = 512
+_ANSWERS: Final = itemgetter(*layout.Outputs._fields)
 #: Least `map_branch_m` in standard deviations of the map across.
 _BRANCH_SIGMAS: Final = 3.0
 
@@ -68,22 +69,20 @@ class Recursion:
         matrices = [singer(float(dt), limits.acceleration_mps2, limits.acceleration_s) for dt in interval]
         values: dict[str, Any] = _columns(sensors, chunk.time)
         self.sensed = np.isfinite(values["sensor"]).any(axis=0)
-        values |= {
+        values |= vars(chunk) | {
             "time_s": seconds(chunk.time - chunk.time[0]),
             "begins": chunk.apart | chunk.off_map,
             "singer": singers.reshape(-1).astype(np.intp),
-            "step": np.stack([step for step, _ in matrices]),
-            "noise": np.stack([noise for _, noise in matrices]),
+            "step": [step for step, _ in matrices],
+            "noise": [noise for _, noise in matrices],
         }
-        for name in layout.Epochs._fields:
-            if name not in values and name != "unsigned":
-                values[name] = getattr(chunk, name)
-        arrays = {name: row_major(array) for name, array in values.items()}
+        # writable copies, row by row: one type of arrays for the compiler
+        arrays = {name: np.array(values[name], order="C") for name in layout.Epochs._fields if name != "unsigned"}
         self.epochs = layout.Epochs(**arrays, unsigned=sensors.wheel_sign == "unknown")
         self.course = layout.LineArrays(**line.written)
         branch_m = max(limits.map_branch_m, _BRANCH_SIGMAS * line.sigma_plan_m)
         self.parameters = _parameters(limits, branch_m)
-        self.answers = layout.Outputs(*(vars(result)[name] for name in layout.Outputs._fields))
+        self.answers = layout.Outputs(*_ANSWERS(vars(result)))
 
     def advance(self, state: TrackState, first: int, trace: list[Step] | None) -> tuple[int, bool]:
         """Do epochs from `first` on and change the state; return the next, and whether places have to be sought there.
@@ -137,16 +136,12 @@ class Recursion:
         """Take an epoch back, and add what the smoother needs of it."""
         hypotheses = state.hypotheses
         updated, cut = handed.updated(state, epoch)
-        cut[:, SATELLITES + np.flatnonzero(self.chunk.fresh[epoch])] = True
+        cut[:, SATELLITES + self.chunk.fresh[epoch].nonzero()[0]] = True
         handed.take_back(state, epoch, epoch + 1)
         step = Step(
-            dt=float(self.chunk.interval_s[epoch]),
-            cut=cut,
-            satellite=state.satellite,
-            parent=found.parent,
-            splits=found.splits,
-            updated=updated,
-        )
+            dt=float(self.chunk.interval_s[epoch]), cut=cut, satellite=state.satellite, parent=found.parent,
+            splits=found.splits, updated=updated,
+        )  # fmt: skip
         if hypotheses > 1:
             step.choose(handed.work.kept[: state.hypotheses])
         step.mean, step.covariance = state.mean, state.covariance
@@ -239,7 +234,7 @@ def track(
         Epochs one by one with the state handed on give the same numbers as all at once.
     """
     limits, sensors = limits or TrackingLimits(), sensors or SensorEpochs()
-    state = TrackState.empty() if state is None else copy(state)
+    state = TrackState.empty() if state is None else changed(state)
     result = Tracked.empty(epochs.time, len(epochs.satellite))
     if len(epochs):
         chunk = prepare_chunk(epochs, state, limits)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -29,9 +29,9 @@ _ALWAYS: Final = np.array([
 ])  # fmt: skip
 #: Unknowns of sensors, as the kernel names them, the columns of measurements that need them, and their random walks.
 _SENSORS: Final = (
-    (StateIndex.WHEEL, layout.WHEEL_ROW, WHEEL_WALK),
-    (StateIndex.FORCE_OFFSET, layout.FORCE_ROW, FORCE_WALK_MPS2),
-    (StateIndex.RADAR, layout.RADAR_ROW, RADAR_WALK),
+    (int(StateIndex.WHEEL), layout.WHEEL_ROW, WHEEL_WALK),
+    (int(StateIndex.FORCE_OFFSET), layout.FORCE_ROW, FORCE_WALK_MPS2),
+    (int(StateIndex.RADAR), layout.RADAR_ROW, RADAR_WALK),
 )
 #: Fields of the result that these unknowns are.
 _RESULTS: Final = ("wheel_scale", "force_offset_mps2", "radar_scale")
@@ -73,18 +73,15 @@ class Handover:
         in_use = _in_use(state, chunk, recursion.sensed, first, last)
         in_use[:] |= every
         in_use[:OFFSETS] &= _OF_SENSORS
-        self.full = np.concatenate([_ALWAYS, np.flatnonzero(in_use)]).astype(np.intp)
+        self.full = np.concatenate([_ALWAYS, in_use.nonzero()[0]]).astype(np.intp)
         self.both = np.concatenate([self.full, _OF_EPOCH])
         full, place = self.full, np.full(state.mean.shape[1], -1, dtype=np.intp)
         place[full] = np.arange(len(full))
         self.active = layout.Active(
-            full=full,
-            wheel=int(place[StateIndex.WHEEL]),
-            force=int(place[StateIndex.FORCE_OFFSET]),
-            radar=int(place[StateIndex.RADAR]),
-            offset=place[OFFSETS:SATELLITES].copy(),
+            full=full, wheel=int(place[StateIndex.WHEEL]), force=int(place[StateIndex.FORCE_OFFSET]),
+            radar=int(place[StateIndex.RADAR]), offset=place[OFFSETS:SATELLITES].copy(),
             satellite=place[SATELLITES:].copy(),
-        )
+        )  # fmt: skip
         origin = chunk.time[0]
         scalars = np.array([
             state.hypotheses, state.weak_motion_s, state.weak_code_s, *state.log_scale, state.distance_since_code_m,
@@ -93,15 +90,16 @@ class Handover:
             state.branch_m, state.across, state.step_s, state.withheld_s, state.open_s, state.motion_misfit,
         ])  # fmt: skip
         self.memory = layout.KernelState(
-            mean=row_major(state.mean[:, full]),
-            covariance=row_major(state.covariance[:, full[:, None], full]),
-            log_probability=row_major(state.log_probability),
-            log_code=row_major(state.log_code),
-            log_least=row_major(state.log_least),
-            log_recent=row_major(state.log_recent),
-            code_bias=row_major(state.code_bias),
-            origin_m=row_major(state.origin_m),
-            offset_known=row_major(state.offset_known),
+            # writable copies, row by row: one type of arrays for the compiler
+            mean=np.array(state.mean[:, full], order="C"),
+            covariance=np.array(state.covariance[:, full[:, None], full], order="C"),
+            log_probability=np.array(state.log_probability),
+            log_code=np.array(state.log_code),
+            log_least=np.array(state.log_least),
+            log_recent=np.array(state.log_recent),
+            code_bias=np.array(state.code_bias),
+            origin_m=np.array(state.origin_m),
+            offset_known=np.array(state.offset_known),
             scalars=scalars,
         )
         self.names = _sources(state) if recursion.levels else []
@@ -166,7 +164,7 @@ class Handover:
         """Put the sub-filters that there are into the state."""
         if not self.names:
             return
-        running = np.flatnonzero(self.subfilters.running)
+        running = self.subfilters.running.nonzero()[0]
         means, covariances = _scatter(
             self.full, self.subfilters.mean[running], self.subfilters.covariance[running], mean, variance
         )
@@ -179,7 +177,7 @@ class Handover:
 
     def _idle(self, state: TrackState, elapsed_s: float) -> tuple[Floats, Floats]:
         """Mean and variance of unknowns that are not in use, after so many seconds of random walks."""
-        mean, variance = state.mean[0].copy(), np.diagonal(state.covariance[0]).copy()
+        mean, variance = state.mean[0].copy(), state.covariance[0].diagonal().copy()
         for unknown, _, walk in _SENSORS:
             variance[unknown] += walk**2 * elapsed_s
         variance[OFFSETS:SATELLITES] += self.recursion.limits.offset_walk_m**2 * elapsed_s
@@ -210,12 +208,12 @@ class Handover:
 
 def _in_use(state: TrackState, chunk: Chunk, sensed: Masks, first: int, last: int) -> Masks:
     """Unknowns that are measured in some epochs, or correlated with others, shape (N,)."""
-    used = np.count_nonzero(state.covariance, axis=1).max(axis=0) > 1
+    used = (state.covariance != 0.0).sum(axis=1).max(axis=0) > 1
     if state.bank is not None and len(state.bank.without):
-        used |= np.count_nonzero(state.bank.covariance, axis=1).max(axis=0) > 1
+        used |= (state.bank.covariance != 0.0).sum(axis=1).max(axis=0) > 1
     for unknown, column, _ in _SENSORS:
         used[unknown] |= sensed[column]
-    channels = np.flatnonzero(chunk.has[:, first:last].any(axis=(0, 1)))
+    channels = chunk.has[:, first:last].any(axis=(0, 1)).nonzero()[0]
     used[OFFSETS + chunk.offset[channels]] = True
     used[SATELLITES + chunk.slot[channels]] = True
     return np.asarray(used)
@@ -225,9 +223,10 @@ def _scatter(
     at: Indices, means: Floats, covariances: Floats, idle_mean: Floats, idle_variance: Floats
 ) -> tuple[Floats, Floats]:
     """Gaussians of all unknowns from those `at` some of them; the others are independent."""
-    mean = np.repeat(idle_mean[None], len(means), axis=0)
-    covariance = np.zeros((len(means), len(idle_mean), len(idle_mean)))
-    covariance[:, np.arange(len(idle_mean)), np.arange(len(idle_mean))] = idle_variance
+    every = np.arange(len(idle_mean))
+    mean = idle_mean[None].repeat(len(means), axis=0)
+    covariance = np.zeros((len(means), len(every), len(every)))
+    covariance[:, every, every] = idle_variance
     mean[:, at] = means
     covariance[:, at[:, None], at] = covariances
     return mean, covariance
@@ -253,14 +252,9 @@ def _subfilters(
         covariance[at] = state.bank.covariance[kept][:, full[:, None], full]
     clock = [CLOCKS.index(bank.clock_of(name)) for name in state.satellite.tolist()] if names else []
     return layout.Subfilters(
-        running=running,
-        mean=mean,
-        covariance=covariance,
-        weak_s=weak,
-        **parameters,
-        begun=begun,
+        running=running, mean=mean, covariance=covariance, weak_s=weak, **parameters, begun=begun,
         clock=np.array(clock, dtype=np.intp),
-    )
+    )  # fmt: skip
 
 
 @lru_cache(maxsize=64)
@@ -297,14 +291,11 @@ def _work_space(
         "bend": (2,), "point": (2, 3), "axes": (2, 3, 3), "places": (room, 3), "place_axes": (room, 3, 3),
     }  # fmt: skip
     work = layout.Work(
-        **{name: np.zeros(shape) for name, shape in shapes.items()},
-        anew=np.zeros((room, 3), dtype=np.bool_),
-        source=np.zeros(sources, dtype=np.bool_),
-        met=np.zeros(sources, dtype=np.bool_),
-        ranked=np.empty(room, dtype=np.intp),
-        kept=np.empty(room, dtype=np.intp),
+        **{name: np.zeros(shape) for name, shape in shapes.items()}, anew=np.zeros((room, 3), dtype=np.bool_),
+        source=np.zeros(sources, dtype=np.bool_), met=np.zeros(sources, dtype=np.bool_),
+        ranked=np.empty(room, dtype=np.intp), kept=np.empty(room, dtype=np.intp),
         unknown=np.zeros((room, size, 6), dtype=np.intp),
-    )
+    )  # fmt: skip
     listed = (np.empty(length, dtype=np.intp) for length in (channels, channels, channels, sensors, 4))
     return layout.Rows(*listed), work
 
@@ -312,8 +303,3 @@ def _work_space(
 def _sources(state: TrackState) -> list[str]:
     """Sources of sub-filters in the order of the kernel."""
     return [*state.satellite.tolist(), *CLOCKS, *bank.SENSORS.values(), *bank.OTHERS]
-
-
-def row_major(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """A writable copy, row by row: one type of arrays for the compiler."""
-    return np.array(array, order="C")

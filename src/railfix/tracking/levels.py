@@ -62,11 +62,12 @@ class AccumulatedIncrement:
 
 def thinned(
     epochs: GnssEpochs, sensors: SensorEpochs, since: AccumulatedIncrement, period_s: float
-) -> tuple[Indices, GnssEpochs, SensorEpochs, AccumulatedIncrement]:
+) -> tuple[Indices, GnssEpochs | None, SensorEpochs, AccumulatedIncrement]:
     """Return which epochs are taken, these with what was measured since the one before, and what to go on with.
 
-    A carrier phase goes on where it did so at all epochs between. Ways between epochs are added, the force is their
-    mean; balises at the next epoch taken; places by features and ranges to ground units at the epochs that are taken.
+    None for these where none is. A carrier phase goes on where it did so at all epochs between. Ways between epochs are
+    added, the force is their mean; balises at the next epoch taken; places by features and ranges to ground units at
+    the epochs that are taken.
 
     Parameters
     ----------
@@ -78,11 +79,11 @@ def thinned(
     period_s : float [s]
     """
     if not len(epochs):
-        return np.empty(0, dtype=np.intp), epochs, SensorEpochs(), since
+        return np.empty(0, dtype=np.intp), None, SensorEpochs(), since
     start = epochs.time[0] if np.isnat(since.start) else since.start
     number = np.floor(seconds(epochs.time - start) / period_s + 0.5).astype(np.int64)
     before = np.maximum.accumulate(np.concatenate([[since.number], number]))
-    taken = np.flatnonzero(before[1:] > before[:-1])
+    taken = (before[1:] > before[:-1]).nonzero()[0]
     joined = epochs.phase_joined & np.isfinite(epochs.phase_m)
     value, variance = _columns(sensors, len(epochs))
     goes_on = np.concatenate([_unbroken(epochs, since)[None], joined])
@@ -91,24 +92,21 @@ def thinned(
     balises, left_balises = _balises(sensors, since, np.searchsorted(taken, np.arange(len(epochs))), len(taken))
     # Rows of the intervals: that left by the epochs before is the first; those after the last epoch taken are left.
     edges = np.concatenate([[0], taken + 2])
-    size = np.diff(edges)
+    size = edges[1:] - edges[:-1]
     size[:1] += since.epochs - 1
     rest = slice(int(edges[-1]), None)
     left = changed(
-        since,
-        start=start,
-        number=int(before[-1]),
+        since, start=start, number=int(before[-1]),
         epochs=len(total[rest]) if len(taken) else since.epochs + len(epochs),
         unbroken=_names(epochs, np.asarray(goes_on[rest].all(axis=0)), anew=len(taken) > 0 and not len(total[rest])),
-        total=total[rest].sum(axis=0),
-        variance=square[rest].sum(axis=0),
-        balises=left_balises,
-    )
+        total=total[rest].sum(axis=0), variance=square[rest].sum(axis=0), balises=left_balises,
+    )  # fmt: skip
     if not len(taken):
-        return taken, epochs.take(taken), SensorEpochs(), left
+        return taken, None, SensorEpochs(), left
     end, first = int(edges[-1]), edges[:-1]
-    some = replace(
-        epochs.take(taken), phase_joined=np.logical_and.reduceat(goes_on[:end], first, axis=0) & joined[taken]
+    some = changed(
+        epochs if len(taken) == len(epochs) else epochs.take(taken),
+        phase_joined=np.logical_and.reduceat(goes_on[:end], first, axis=0) & joined[taken],
     )
     share = np.where(_MEAN, 1.0 / np.maximum(size, 1)[:, None], 1.0)
     total, square = (np.add.reduceat(values[:end], first, axis=0) * share for values in (total, square))
@@ -213,9 +211,11 @@ def track_with_levels(
     Where the filter with sub-filters takes every epoch its places are those of the filter, which then does not run.
     """
     taken, some, sensed, since = thinned(epochs, sensors, state.since, limits.level_period_s)
-    place, after = track(some, line, state.track, limits=limits, sensors=sensed, levels=True)
+    place, after = None, state.track
+    if some is not None:
+        place, after = track(some, line, state.track, limits=limits, sensors=sensed, levels=True)
     every = state.every and len(taken) == len(epochs)
-    if every:
+    if every and place is not None and after is not None:
         tracked, track_state = place, changed(after, bank=None)
     else:
         tracked, track_state = track(epochs, line, track_state, limits=limits, sensors=sensors)
@@ -228,7 +228,7 @@ def carried_levels(
     tracked: Tracked,
     epochs: GnssEpochs,
     taken: Indices,
-    place: Tracked,
+    place: Tracked | None,
     line: Line,
     state: LevelState,
     limits: TrackingLimits,
@@ -242,18 +242,19 @@ def carried_levels(
     epochs : GnssEpochs
     taken : ndarray of int
         Epochs that the filter with sub-filters took.
-    place : Tracked
-        Its places there.
+    place : Tracked or None
+        Its places there; None without any.
     line : Line
     state : LevelState
         Its last epoch before these.
     limits : TrackingLimits
     """
-    columns = np.stack([getattr(place, name) for name in _KEPT], axis=1).astype(np.float64)
-    columns[:, _KEPT.index("level_m")] = np.where(is_bounded(place.status), place.level_m, np.inf)
-    number = np.searchsorted(taken, np.arange(len(epochs)), side="right")
-    times = np.concatenate([[state.time], place.time])
-    values = np.concatenate([state.values[None], columns])
+    number = taken.searchsorted(np.arange(len(epochs)), side="right")
+    times, values = np.array([state.time]), state.values[None]
+    if place is not None:
+        columns = np.array([getattr(place, name) for name in _KEPT], dtype=np.float64).T
+        columns[:, _KEPT.index("level_m")] = np.where(is_bounded(place.status), place.level_m, np.inf)
+        times, values = np.concatenate([times, place.time]), np.concatenate([values, columns])
     arc, speed, level, ground, noise, of_speed, separation, amount, status = values[number].T
     tau = _since(times[number], tracked.time)
     carried = line.nearest_m(arc, tracked.arc_m) + speed * tau
@@ -275,19 +276,14 @@ def carried_levels(
     # explain.
     doubt = (told == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
     explained = np.where(is_bounded(told), _EXPLAINED[1], _EXPLAINED[0]) * tracked.sigma_m
-    apart = np.nan_to_num(separation)
+    apart = np.where(np.isnan(separation), 0.0, separation)
     spread = np.where(doubt, apart, np.sqrt(np.maximum(apart**2 - explained**2, 0.0)))
     tracked = changed(
-        tracked,
-        status=told,
-        sigma_m=np.hypot(tracked.sigma_m, spread),
-        level_m=level,
-        ground_level_m=widened(ground, straight),
-        level_noise_m=np.where(known, noise, np.nan),
-        level_speed_mps=np.where(known, of_speed, np.nan),
-        separation_m=np.where(known, separation, np.nan),
+        tracked, status=told, sigma_m=np.hypot(tracked.sigma_m, spread), level_m=level,
+        ground_level_m=widened(ground, straight), level_noise_m=np.where(known, noise, np.nan),
+        level_speed_mps=np.where(known, of_speed, np.nan), separation_m=np.where(known, separation, np.nan),
         amount_m=np.where(known, amount, np.nan),
-    )
+    )  # fmt: skip
     return tracked, changed(state, time=times[-1], values=values[-1])
 
 

@@ -41,7 +41,7 @@ ROTATION: Final[Mapping[str, float]] = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Orbits:
     """Orbit elements and time-independent quantities, shape (n,); others as in `KeplerRecords`."""
 

@@ -110,16 +110,10 @@ def make_lookup(label: Strings, toe: Datetimes, transmitted: Datetimes, validity
     by_row = np.argsort(order)
     middle[first] = origin
     return Lookup(
-        number={str(name): i for i, name in enumerate(names)},
-        first=first,
-        sent_key=sent[resort],
-        sent_record=order[resort].astype(np.int64),
-        toe_key=number * _SPAN + (middle - origin) // _MILLISECOND,
-        toe_record=order.astype(np.int64),
-        origin=origin,
-        toe=toe[by_row],
-        available=available[by_row],
-    )
+        number={str(name): i for i, name in enumerate(names)}, first=first, sent_key=sent[resort],
+        sent_record=order[resort].astype(np.int64), toe_key=number * _SPAN + (middle - origin) // _MILLISECOND,
+        toe_record=order.astype(np.int64), origin=origin, toe=toe[by_row], available=available[by_row],
+    )  # fmt: skip
 
 
 def validity_s(records: KeplerRecords) -> Floats:
@@ -138,7 +132,7 @@ class _Issues:
     """Records by satellite and issue, each from half-way between the toe before and its own; F/NAV before I/NAV."""
 
     def __init__(self, kepler: KeplerRecords) -> None:
-        row = np.flatnonzero(np.isin(kepler.message, ("LNAV", "INAV", "FNAV", "CNV1")))
+        row = np.isin(kepler.message, ("LNAV", "INAV", "FNAV", "CNV1")).nonzero()[0]
         issue = kepler.iode[row] % np.where(kepler.message[row] == "LNAV", 256, _ISSUES)
         names, number = np.unique(kepler.satellite[row], return_inverse=True)
         self.number = {str(name): i for i, name in enumerate(names)}
@@ -391,16 +385,12 @@ class PreparedRecords:
         clock: ClockReference = "broadcast" if self.navigation.precise is None else "ionosphere_free"
         records = self.navigation.kepler
         return ChannelRecords(
-            kepler=kepler,
-            glonass=glonass,
-            preferred=preferred,
-            other=other,
-            any_other=bool((other >= 0).any()),
+            kepler=kepler, glonass=glonass, preferred=preferred, other=other, any_other=bool((other >= 0).any()),
             signal=np.array([codes.index(code) for _, code in names], dtype=np.int64),
             group_delay_s=_rows(lambda code: group_delay_s(records, code, clock=clock), codes, len(records)),
             unhealthy=_rows(lambda code: unhealthy(records, code), codes, len(records)).astype(bool),
             glonass_number=np.array([glonass_number.get(satellite[i], -1) for i in glonass], dtype=np.int64),
-        )
+        )  # fmt: skip
 
 
 def _rows(of_signal: Callable[[str], NDArray[np.generic]], codes: list[str], records: int) -> Floats:

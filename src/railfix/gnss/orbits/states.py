@@ -184,11 +184,11 @@ def _groups(rows: Integers, usable: Masks) -> Iterator[tuple[Any, Any, Integers]
             yield k, t, rows[k, t]
         return
     for channel, (row, used) in enumerate(zip(rows, usable, strict=True)):
-        at = np.flatnonzero(used)
+        at = used.nonzero()[0]
         if not len(at):
             continue
         of_at = row[at]
-        edges = (np.flatnonzero(of_at[1:] != of_at[:-1]) + 1).tolist()
+        edges = ((of_at[1:] != of_at[:-1]).nonzero()[0] + 1).tolist()
         for begin, end in zip([0, *edges], [*edges, len(at)], strict=True):
             for first in range(begin, end, _BLOCK):
                 yield channel, at[first : min(first + _BLOCK, end)], of_at[begin : begin + 1]

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Integers, Masks, Strings, medians
@@ -159,11 +160,10 @@ def held(
     step = np.diff(np.concatenate([[before], time])).astype(np.int64)[:, None]
     total = np.cumsum(np.minimum(step, np.maximum(hold // 2, 0)), axis=0)
     # lengths of runs: total so far less the total at the last epoch at which the condition did not hold
-    start = np.maximum.accumulate(np.vstack([-run, np.where(signs, np.iinfo(np.int64).min, total)]), axis=0)[1:]
+    start = _running(np.maximum, -run, np.where(signs, np.iinfo(np.int64).min, total))[1:]
     length = total - start
     counts = signs & (length >= hold)
-    when = np.vstack([last, np.where(counts, time[:, None], _NEVER)])
-    latest = np.fmax.accumulate(when, axis=0)[1:]
+    latest = _running(np.fmax, last, np.where(counts, time[:, None], _NEVER))[1:]
     stays = seconds(time[:, None] - latest) <= release_s
     return counts, stays, HeldState(time=time[-1], run_ns=np.where(signs[-1], length[-1], 0), last=latest[-1])
 
@@ -210,20 +210,20 @@ def power_signs(
     seen, now = np.isfinite(cn0_dbhz), seconds(time - GPS_EPOCH)[:, None]
     peak, first, last = _rearrange(state, channel)
     decay = limits.peak_decay_db_per_min / _MINUTE_S
-    peaks = np.maximum.accumulate(np.vstack([peak, np.where(seen, cn0_dbhz + decay * now, -np.inf)]), axis=0)[1:]
-    lasts = np.fmax.accumulate(np.vstack([last, np.where(seen, now, np.nan)]), axis=0)
+    peaks = _running(np.maximum, peak, np.where(seen, cn0_dbhz + decay * now, -np.inf))[1:]
+    lasts = _running(np.fmax, last, np.where(seen, now, np.nan))
     begun = seen & ~(now - lasts[:-1] <= _LONGEST_SILENCE_S)
-    firsts = np.fmax.accumulate(np.vstack([first, np.where(begun, now, np.nan)]), axis=0)[1:]
+    firsts = _running(np.fmax, first, np.where(begun, now, np.nan))[1:]
     compared = seen & (now - firsts >= limits.known_after_s)
     fall = np.where(compared, peaks - decay * now - cn0_dbhz, np.nan)
-    enough = np.count_nonzero(compared, axis=1) >= limits.least_satellites
+    enough = compared.sum(axis=1) >= limits.least_satellites
     forgotten = _GAIN_DECAY_PER_MIN / _MINUTE_S * now[:, 0]
     logarithm = np.log(np.where(gain > 0, gain, np.nan))
     gains = np.fmax.accumulate(np.concatenate([[state.gain], logarithm + forgotten]))[1:]
     signs = PowerSigns(
         fall_db=np.where(enough, medians(fall), np.nan),
         spread_db=np.where(enough, _deviation(fall), np.nan),
-        difference_db=np.where(np.count_nonzero(seen, axis=1) >= limits.least_satellites, _deviation(cn0_dbhz), np.nan),
+        difference_db=np.where(seen.sum(axis=1) >= limits.least_satellites, _deviation(cn0_dbhz), np.nan),
         gain_fall=1.0 - np.exp(logarithm + forgotten - gains),
     )
     if not len(time):
@@ -232,16 +232,23 @@ def power_signs(
     return signs, after
 
 
+def _running(larger: np.ufunc, before: NDArray[Any], values: NDArray[Any]) -> NDArray[Any]:
+    """Return the largest values so far (T + 1, K) of those before, (K,), and of T epochs, (T, K)."""
+    return np.asarray(larger.accumulate(np.concatenate([before[None], values]), axis=0))
+
+
 def _deviation(values: Floats) -> Floats:
     """Return the standard deviation of each row over what is not NaN, shape (T,)."""
     has = np.isfinite(values)
-    count = np.maximum(np.count_nonzero(has, axis=1), 1)
+    count = np.maximum(has.sum(axis=1), 1)
     mean = np.where(has, values, 0.0).sum(axis=1) / count
     return np.asarray(np.sqrt(np.where(has, (values - mean[:, None]) ** 2, 0.0).sum(axis=1) / count))
 
 
 def _rearrange(state: PowerState, channel: Strings) -> tuple[Floats, Floats, Floats]:
     """Return peaks, beginnings and last observations on other channels."""
+    if state.channel is channel:
+        return state.peak_db, state.first_s, state.last_s
     peak, first, last = np.full(len(channel), -np.inf), np.full(len(channel), np.nan), np.full(len(channel), np.nan)
     _, here, there = np.intersect1d(channel, state.channel, return_indices=True)
     peak[here], first[here], last[here] = state.peak_db[there], state.first_s[there], state.last_s[there]

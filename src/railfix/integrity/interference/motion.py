@@ -44,6 +44,11 @@ class MotionInputs(NamedTuple):
     clock_sigma_m: Floats
     off_line_m: Floats  #: Distance of the 3-D position from the line across it; NaN beyond an end; shape (T,).
 
+    def take(self, rows: slice) -> MotionInputs:
+        """Return those of some epochs."""
+        own = {name: values[rows] for name, values in self._asdict().items()}
+        return MotionInputs(**{**own, "channel": self.channel, "group": self.group})
+
 
 class Fix(NamedTuple):
     """Positions and velocities of T epochs, each with its standard deviation; NaN where there is none."""
@@ -104,14 +109,30 @@ class MotionSigns:
     off_line_sigmas: Floats
 
 
+class MotionFit(NamedTuple):
+    """What the ranges of T epochs give by themselves, of whatever antenna."""
+
+    fixes: Fix
+    part_sigmas: Floats  #: Of `MotionSigns`.
+
+    def take(self, rows: slice) -> MotionFit:
+        """Return those of some epochs."""
+        return MotionFit(self.fixes.take(rows), self.part_sigmas[rows])
+
+
+def fit_motion(inputs: MotionInputs, limits: InterferenceLimits) -> MotionFit:
+    """Return positions and velocities, and how far constellations are apart."""
+    linear = _misfit(inputs)
+    return MotionFit(fixes_of(inputs, linear), _parts(inputs, linear, limits.least_satellites - 1))
+
+
 def motion_signs(
-    inputs: MotionInputs, state: MotionSignState, limits: InterferenceLimits
+    inputs: MotionInputs, state: MotionSignState, limits: InterferenceLimits, fitted: MotionFit | None = None
 ) -> tuple[MotionSigns, MotionSignState]:
     """Return the statistics of clock, velocity and position of T epochs, and the state to pass on."""
     if not len(inputs.time):
         return MotionSigns(**{item.name: np.zeros(0) for item in fields(MotionSigns)}), state
-    linear = _misfit(inputs)
-    fixes = fixes_of(inputs, linear)
+    fixes, part_sigmas = fitted or fit_motion(inputs, limits)
     position, last_position = _before(fixes, state.position, fixes.sigma_m <= limits.largest_sigma_m)
     velocity, last_velocity = _before(fixes, state.velocity, fixes.velocity_sigma_mps <= limits.largest_speed_sigma_mps)
     speed, speed_sigmas, drift, drift_sigmas = _speed_jump(fixes, velocity, limits)
@@ -121,27 +142,15 @@ def motion_signs(
     been = np.logical_or.accumulate(np.concatenate([[state.on_map], on_line]))
     off = np.where(been[1:], inputs.off_line_m, np.nan)
     signs = MotionSigns(
-        clock_jump_m=clock,
-        drift_jump_mps=drift,
-        drift_jump_sigmas=drift_sigmas,
-        speed_jump_mps=speed,
-        speed_jump_sigmas=speed_sigmas,
-        position_jump_m=jump,
-        position_jump_sigmas=jump_sigmas,
-        part_sigmas=_parts(inputs, linear, limits.least_satellites - 1),
-        off_line_m=off,
+        clock_jump_m=clock, drift_jump_mps=drift, drift_jump_sigmas=drift_sigmas, speed_jump_mps=speed,
+        speed_jump_sigmas=speed_sigmas, position_jump_m=jump, position_jump_sigmas=jump_sigmas,
+        part_sigmas=part_sigmas, off_line_m=off,
         off_line_sigmas=np.maximum(off - limits.position_jump_m, 0.0) / fixes.sigma_m,
-    )
+    )  # fmt: skip
     after = MotionSignState(
-        time=inputs.time[-1],
-        channel=inputs.channel,
-        code_m=last_codes[0],
-        rate_mps=last_codes[1],
-        since=last_codes[2],
-        position=last_position,
-        velocity=last_velocity,
-        on_map=bool(been[-1]),
-    )
+        time=inputs.time[-1], channel=inputs.channel, code_m=last_codes[0], rate_mps=last_codes[1],
+        since=last_codes[2], position=last_position, velocity=last_velocity, on_map=bool(been[-1]),
+    )  # fmt: skip
     return signs, after
 
 
@@ -162,12 +171,9 @@ def fixes_of(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats]) -> Fix
         np.concatenate([-sight, ones], axis=2), rate, known.astype(np.float64), least=_LEAST_FREEDOM
     )
     return Fix(
-        inputs.time,
-        near + step[:, :3],
-        scale * _length(covariance),
-        velocity,
+        inputs.time, near + step[:, :3], scale * _length(covariance), velocity,
         np.maximum(noise, _LEAST_MPS) * _length(of_velocity),
-    )
+    )  # fmt: skip
 
 
 def _misfit(inputs: MotionInputs) -> tuple[Floats, Floats, Floats]:
@@ -192,7 +198,7 @@ def _fit(design: Floats, value: Floats, weight: Floats, *, least: int) -> tuple[
     covariance = np.linalg.inv(normal + ridge[:, :, None] * np.eye(size))
     solution = (covariance @ (weighted * y[..., None]).sum(axis=1)[..., None])[..., 0]
     left = y - (rows @ solution[..., None])[..., 0]
-    freedom = np.count_nonzero(has, axis=1) - np.count_nonzero(unknown, axis=1)
+    freedom = has.sum(axis=1) - unknown.sum(axis=1)
     redundant = (freedom >= least) & unknown[:, :3].all(axis=1)
     scale = np.sqrt((w * left**2).sum(axis=1) / np.maximum(freedom, 1))
     return np.where(redundant[:, None], solution, np.nan), covariance, np.where(redundant, scale, np.nan)
@@ -243,13 +249,15 @@ def _clock_jump(
 ) -> tuple[Floats, tuple[Floats, Floats, Datetimes]]:
     """Return the median change of codes against Dopplers, less whole milliseconds (T,) [m], and the new state."""
     channels = len(inputs.channel)
-    code, rate = np.full(channels, np.nan), np.full(channels, np.nan)
-    since = np.full(channels, np.datetime64("NaT", "ns"))
-    _, here, there = np.intersect1d(inputs.channel, state.channel, return_indices=True)
-    code[here], rate[here], since[here] = state.code_m[there], state.rate_mps[there], state.since[there]
-    codes, rates = np.vstack([code, inputs.code_m]), np.vstack([rate, inputs.rate_mps])
+    code, rate, since = state.code_m, state.rate_mps, state.since
+    if state.channel is not inputs.channel:
+        code, rate = np.full((2, channels), np.nan)
+        since = np.full(channels, np.datetime64("NaT", "ns"))
+        _, here, there = np.intersect1d(inputs.channel, state.channel, return_indices=True)
+        code[here], rate[here], since[here] = state.code_m[there], state.rate_mps[there], state.since[there]
+    codes, rates = np.concatenate([code[None], inputs.code_m]), np.concatenate([rate[None], inputs.rate_mps])
     has = np.isfinite(codes) & np.isfinite(rates)
-    when = np.vstack([since, np.where(has[1:], inputs.time[:, None], np.datetime64("NaT", "ns"))])
+    when = np.concatenate([since[None], np.where(has[1:], inputs.time[:, None], np.datetime64("NaT", "ns"))])
     row = np.maximum.accumulate(np.where(has, np.arange(len(codes))[:, None], 0), axis=0)
     before, column = row[:-1], np.arange(channels)
     dt = seconds(inputs.time[:, None] - when[before, column])
@@ -257,7 +265,7 @@ def _clock_jump(
     near = (dt <= limits.longest_gap_s) & (broken[1:, None] == broken[before])
     change = codes[1:] - codes[before, column] - (rates[1:] + rates[before, column]) / 2.0 * dt
     change = np.where(near, change, np.nan)
-    enough = np.count_nonzero(np.isfinite(change), axis=1) >= limits.least_satellites
+    enough = np.isfinite(change).sum(axis=1) >= limits.least_satellites
     step = np.where(enough, medians(change), np.nan)
     last = row[-1]
     kept = np.where(broken[-1] == broken[last], 0.0, np.nan)  # nothing is compared across a break
@@ -269,15 +277,16 @@ def _parts(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats], least: i
     """Return the largest difference of two constellations' positions and clocks, in standard deviations, shape (T,)."""
     near, sight, misfit = linear
     design = np.concatenate([-sight, np.ones((*sight.shape[:2], 1))], axis=2)
-    found = []
-    for clock in range(int(inputs.group.max(initial=-1)) + 1):
-        used = inputs.used & (inputs.group == clock)
-        weight = np.where(used & (np.count_nonzero(used, axis=1) >= least)[:, None], 1.0 / inputs.sigma_m**2, 0.0)
-        step, covariance, scale = _fit(design, misfit, weight, least=1)
-        covariance = covariance * (np.maximum(scale, inputs.noise_scale) ** 2)[:, None, None]
-        step[:, 3] -= inputs.clock_offset_m[:, clock]
-        covariance[:, 3, 3] += inputs.clock_sigma_m[:, clock] ** 2
-        found.append((step, covariance))
+    epochs, clocks = len(near), int(inputs.group.max(initial=-1)) + 1
+    used = inputs.used & (inputs.group == np.arange(clocks)[:, None, None])
+    enough = used.sum(axis=2) >= least
+    weight = np.where(used & enough[..., None], 1.0 / inputs.sigma_m**2, 0.0)
+    rows = np.tile(np.arange(epochs), clocks)
+    step, covariance, scale = _fit(design[rows], misfit[rows], weight.reshape(clocks * epochs, -1), least=1)
+    covariance = covariance * (np.maximum(scale, inputs.noise_scale[rows]) ** 2)[:, None, None]
+    step[:, 3] -= inputs.clock_offset_m.T.ravel()
+    covariance[:, 3, 3] += inputs.clock_sigma_m.T.ravel() ** 2
+    found = list(zip(step.reshape(clocks, epochs, -1), covariance.reshape(clocks, epochs, _SIZE, _SIZE), strict=True))
     largest = np.full(len(near), np.nan)
     for k, (one, of_one) in enumerate(found):
         for other, of_other in found[:k]:

@@ -150,17 +150,15 @@ def along_track_level(
     groups = np.zeros((epochs, 0, channels), dtype=bool) if sides is None else sides
     plan = allocate(model, systems, risk, out, groups, wrong_map=map_error.seen is not None)
     given = Errors(
-        scale,
-        _by_epoch(overbound.sigma_m, epochs, channels),
-        _by_epoch(overbound.bias_m, epochs, channels),
+        scale, _by_epoch(overbound.sigma_m, epochs, channels), _by_epoch(overbound.bias_m, epochs, channels),
         _by_epoch(map_error.bias_m, epochs, 2),
         *((np.zeros((epochs, 2)), np.zeros((epochs, 2, 2))) if map_error.seen is None else map_error.seen),
-    )
+    )  # fmt: skip
     located = np.isfinite(model.covariance_m2).all(axis=(1, 2)) & np.isfinite(scale)
     if 0 < epochs <= FEW and located.all():
         return ProtectionLevel(**_level_of_block(np.arange(epochs), model, plan, given))
     result = _empty(epochs, plan)
-    for block in _blocks(model, plan, np.flatnonzero(located)):
+    for block in _blocks(model, plan, located.nonzero()[0]):
         for name, values in _level_of_block(block, model.take(block), plan, given).items():
             getattr(result, name)[block] = values
     return result
@@ -182,20 +180,17 @@ def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
     floats = "level_m fault_free_m one_fault_m two_fault_m sigma_m k_fault_free k_one_fault k_two_faults k_false_alarm"
     return ProtectionLevel(
         **{name: np.full(epochs, np.nan) for name in (*floats.split(), "separation")},
-        consistent=np.zeros(epochs, dtype=bool),
-        worst_one=np.full(epochs, -1, dtype=np.intp),
-        worst_two=np.full((epochs, 2), -1, dtype=np.intp),
-        worst_constellation=np.full(epochs, "", dtype="<U1"),
-        unchecked_risk=plan.beyond.copy(),
-        cause=np.full(epochs, Cause.NO_POSITION, dtype=np.int8),
-    )
+        consistent=np.zeros(epochs, dtype=bool), worst_one=np.full(epochs, -1, dtype=np.intp),
+        worst_two=np.full((epochs, 2), -1, dtype=np.intp), worst_constellation=np.full(epochs, "", dtype="<U1"),
+        unchecked_risk=plan.beyond.copy(), cause=np.full(epochs, Cause.NO_POSITION, dtype=np.int8),
+    )  # fmt: skip
 
 
 def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Indices]:
     """Epochs of like numbers of hypotheses together: no block is wider than it must be."""
     if len(rows) <= FEW:
         return iter([rows] if len(rows) else [])
-    used = np.count_nonzero(model.used[rows], axis=1)
+    used = model.used[rows].sum(axis=1)
     sizes = np.cumsum(comb(used[:, None], np.arange(MOST_TOGETHER + 1)), axis=1)
     sizes = np.concatenate([sizes, np.zeros((len(rows), 1))], axis=1)
     count = np.take_along_axis(sizes, plan.order[rows], axis=1).sum(axis=1)
@@ -232,11 +227,11 @@ class Asked(NamedTuple):
 def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: Errors) -> dict[str, NDArray[Any]]:
     """Return the fields of `ProtectionLevel` of a block of epochs with positions."""
     of_block = Errors(*(np.ascontiguousarray(each[rows]) for each in given))
-    n = int(np.count_nonzero(model.used, axis=1).max())
+    n = int(model.used.sum(axis=1).max())
     channel, offset, sigma, weight, separation = kernels.hypotheses.tails_of_hypotheses(
         model.arrays, of_block, asked := _list_hypotheses(plan, rows, n)
     )
-    share = np.stack([each[rows] for each in (plan.fault_free, plan.one, plan.two, plan.more)], axis=1)
+    share = np.array([plan.fault_free, plan.one, plan.two, plan.more])[:, rows].T.copy()
     level, spender, part, k, worst = kernels.level.solve_level(
         offset, sigma, weight, asked.bounds, share, plan.reserved[rows]
     )
@@ -305,15 +300,10 @@ def _list_hypotheses(plan: Allocation, rows: Indices, n: int) -> Asked:
     kinds = tuple(shared.kind for shared in plan.shared)
     first, bounds = _places(kinds, tuple(order.max(axis=0).tolist()), n)
     return Asked(
-        prior=plan.prior[rows],
-        members=plan.members[rows],
-        wrong_map=np.array([shared.wrong_map for shared in plan.shared]),
-        shared_prior=plan.shared_prior[rows],
-        order=order,
-        k_false_alarm=plan.k_false_alarm[rows],
-        first=first,
-        bounds=bounds,
-    )
+        prior=plan.prior[rows], members=plan.members[rows],
+        wrong_map=np.array([shared.wrong_map for shared in plan.shared]), shared_prior=plan.shared_prior[rows],
+        order=order, k_false_alarm=plan.k_false_alarm[rows], first=first, bounds=bounds,
+    )  # fmt: skip
 
 
 def _channels(channel: Indices, place: Indices) -> Indices:

@@ -97,7 +97,7 @@ def without_sides(parts: Compact, design: Floats, none: Forms, sides: Masks, pri
         residual, own = rows[..., n], rows[..., n + 1 :]
         forms.append(
             Forms(
-                prior=np.where(np.count_nonzero(members, axis=1) > 1, prior, 0.0)[:, None],
+                prior=np.where(members.sum(axis=1) > 1, prior, 0.0)[:, None],
                 constant=none.constant - np.einsum("tm,tm->t", residual, scaled[..., n])[:, None],
                 slope=none.slope - np.einsum("tm,tmi->ti", residual, scaled[..., n + 1 :])[:, None],
                 matrix=none.matrix - np.einsum("tmi,tmj->tij", own, scaled[..., n + 1 :])[:, None],
@@ -115,7 +115,7 @@ def one_after_the_other(columns: Floats, members: Masks) -> tuple[Floats, Floats
     Without the group the columns are less by ``rows[..., :n]^T scaled``.
     """
     at = np.arange(len(columns))
-    place = np.argsort(~members, axis=1, kind="stable")[:, : int(np.count_nonzero(members, axis=1).max(initial=0))]
+    place = np.argsort(~members, axis=1, kind="stable")[:, : int(members.sum(axis=1).max(initial=0))]
     rows = columns[at[:, None], place] * members[at[:, None], place][..., None]
     scaled, checked = np.empty_like(rows), np.empty(place.shape, dtype=bool)
     for k in range(place.shape[1]):
@@ -148,10 +148,10 @@ def places_beyond_the_level(
     are the low satellites of each side.
     """
     result = np.zeros(len(arc_m), dtype=bool)
-    rows = np.flatnonzero(np.isfinite(level_m) & np.isfinite(arc_m) & np.isfinite(model.wsse))
+    rows = (np.isfinite(level_m) & np.isfinite(arc_m) & np.isfinite(model.wsse)).nonzero()[0]
     if not len(rows):
         return result
-    channels = int(np.count_nonzero(model.used[rows], axis=1).max())
+    channels = int(model.used[rows].sum(axis=1).max())
     size = max(1, _BOUND_SIZE // channels**2)
     likely, sigmas = risk.prior(systems), (antennas.sigma_plan_m, antennas.sigma_height_m)
     clear = np.full(len(arc_m), np.nan)
@@ -161,15 +161,9 @@ def places_beyond_the_level(
         block = rows[first : first + size]
         part, noise = model.take(block), np.maximum(scale[block], 1.0)
         bound = kernels.off_tangent.risk_off_tangent(
-            part.arrays,
-            noise,
-            likely,
-            np.ascontiguousarray(sides[block]),
-            risk.side_prior,
-            clear[block],
-            sigmas,
+            part.arrays, noise, likely, np.ascontiguousarray(sides[block]), risk.side_prior, clear[block], sigmas,
             risk.risk_per_sample,
-        )
+        )  # fmt: skip
         near = block[bound > risk.risk_per_sample]
         for index, own in antennas.split(near):
             for some in np.array_split(own, 1 + 9 * len(own) // size):

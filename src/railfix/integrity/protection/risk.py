@@ -252,13 +252,9 @@ def _of_few_epochs(
     """Allocation of few epochs, kept: nobody writes into it."""
     channels, excluded = len(systems), np.frombuffer(out, dtype=np.int64).copy()
     return _allocate(
-        np.frombuffer(used, dtype=bool).reshape(len(excluded), channels).copy(),
-        systems,
-        risk.risk,
-        excluded,
-        np.frombuffer(sides, dtype=bool).reshape(len(excluded), count, channels).copy(),
-        wrong_map=wrong_map,
-    )
+        np.frombuffer(used, dtype=bool).reshape(len(excluded), channels).copy(), systems, risk.risk, excluded,
+        np.frombuffer(sides, dtype=bool).reshape(len(excluded), count, channels).copy(), wrong_map=wrong_map,
+    )  # fmt: skip
 
 
 def _allocate(
@@ -274,8 +270,8 @@ def _allocate(
     # A constellation has a satellite at least, a side two.
     nominal = np.array([risk.constellation_prior[s] for s in letters] + [risk.side_prior] * sides.shape[1])
     least = np.array([1] * len(letters) + [2] * sides.shape[1])
-    event_prior = nominal * (np.count_nonzero(members & used[:, None], axis=2) >= least)
-    events = np.flatnonzero(event_prior.any(axis=0)).tolist()
+    event_prior = nominal * ((members & used[:, None]).sum(axis=2) >= least)
+    events = event_prior.any(axis=0).nonzero()[0].tolist()
     of_map = risk.map_prior if wrong_map else 0.0
     shared, within = _sets_of(tuple(events), len(letters), wrong_map=of_map > 0.0)
     each = np.stack([event_prior[:, s.events].prod(axis=1) * (of_map if s.wrong_map else 1.0) for s in shared], axis=1)
@@ -284,7 +280,7 @@ def _allocate(
     if len(events) + wrong_map > _MOST_SHARED:
         of_each = np.concatenate([event_prior, np.full((len(used), 1), of_map)], axis=1)
         further = set_sums(of_each, _MOST_SHARED + 1)[:, -1]
-    n = np.count_nonzero(used, axis=1)
+    n = used.sum(axis=1)
     always = [2] + [-1 if s.size > 1 else int(s.wrong_map or s.events[0] < len(letters)) for s in shared[1:]]
     classes = _Classes(each, within, set_sums(everyone, MOST_TOGETHER + 1), further, always)
     order = classes.choose(
@@ -305,20 +301,12 @@ def _allocate(
     tests = np.where(mapped, 0.0, np.take_along_axis(sizes, order, axis=1)).sum(axis=1) - 1.0
     asked = [0, *(b for b in range(1, len(shared)) if (order[:, b] >= 0).any())]
     return Allocation(
-        prior=prior,
-        groups=tuple(letters),
-        shared=tuple(shared[b] for b in asked),
+        prior=prior, groups=tuple(letters), shared=tuple(shared[b] for b in asked),
         members=np.stack([members[:, shared[b].events].any(axis=1) for b in asked], axis=1),
-        shared_prior=each[:, asked],
-        order=order[:, asked],
-        beyond=beyond,
-        fault_free=parts[0],
-        one=parts[1],
-        two=parts[2],
-        more=np.where(more, sum(parts) / 3.0, 0.0),
-        reserved=np.where(pairs, 0.0, of_pairs),
+        shared_prior=each[:, asked], order=order[:, asked], beyond=beyond, fault_free=parts[0], one=parts[1],
+        two=parts[2], more=np.where(more, sum(parts) / 3.0, 0.0), reserved=np.where(pairs, 0.0, of_pairs),
         k_false_alarm=one_sided_k(risk.false_alarm / (2.0 * np.maximum(tests, 1.0))),
-    )
+    )  # fmt: skip
 
 
 @lru_cache(maxsize=64)
@@ -367,7 +355,7 @@ class _Classes:
         alone = (self.each[..., None] * self.sums[:, None, :-1] > share) & feasible[:, None]
         order = np.maximum(np.max(np.where(alone, sizes, -1), axis=2), self.least)
         order = np.where(self.each > 0.0, order, -1)
-        rows = np.flatnonzero(self.rest(order) > share)
+        rows = (self.rest(order) > share).nonzero()[0]
         if not len(rows):
             return np.asarray(order, dtype=np.intp)
         classes = [(-likely[b] * satellite**k, k, b) for b in range(len(likely)) for k in sizes.tolist()]

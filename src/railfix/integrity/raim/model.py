@@ -58,9 +58,12 @@ class LinearModel:
 
     def take(self, epochs: Masks | Indices) -> LinearModel:
         """The model of some epochs, by mask or index."""
-        common = ("clock", "prior", "interest")
-        values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return LinearModel(**{name: v if name in common else v[epochs] for name, v in values.items()})
+        return LinearModel(
+            root_weight=self.root_weight[epochs], clock=self.clock,
+            clock_covariance_m2=self.clock_covariance_m2[epochs], design=self.design[epochs],
+            covariance_m2=self.covariance_m2[epochs], prior=self.prior, misfit=self.misfit[epochs],
+            freedom=self.freedom[epochs], interest=self.interest,
+        )  # fmt: skip
 
     @property
     def arrays(self) -> ModelArrays:
@@ -144,7 +147,7 @@ class Compact:
 
 def compact(model: LinearModel) -> Compact:
     """The residual projector over the channels in use, in their order; (T, n, n) of memory."""
-    n = int(np.count_nonzero(model.used, axis=1).max(initial=0))
+    n = int(model.used.sum(axis=1).max(initial=0))
     channel = np.argsort(~model.used, axis=1, kind="stable")[:, :n]
     used = np.take_along_axis(model.used, channel, axis=1)
     root = np.take_along_axis(model.root_weight, channel, axis=1)
@@ -156,13 +159,10 @@ def compact(model: LinearModel) -> Compact:
     projector = -spread @ unknowns.swapaxes(1, 2)
     projector[:, np.arange(n), np.arange(n)] += used
     return Compact(
-        channel=channel,
-        used=used,
-        projector=projector,
-        residual=np.take_along_axis(model.residual, channel, axis=1),
+        channel=channel, used=used, projector=projector, residual=np.take_along_axis(model.residual, channel, axis=1),
         sigma_m=np.where(used, 1.0 / np.where(used, root, 1.0), 0.0),
         gain_m=np.take_along_axis(model.gain_m, channel[..., None], axis=1),
-    )
+    )  # fmt: skip
 
 
 def constrained_model(
@@ -208,16 +208,10 @@ def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *,
     design = rows - root[..., None] * _clocks(root, clock, covariance, rows)
     normal = rows.swapaxes(1, 2) @ design
     return LinearModel(
-        root_weight=root,
-        clock=clock,
-        clock_covariance_m2=covariance,
-        design=design,
-        covariance_m2=regular_inverse((normal + normal.swapaxes(1, 2)) / 2.0 + prior),
-        prior=prior,
-        misfit=root * misfit,
-        freedom=ranges.n_used - ranges.n_clocks - unknowns,
-        interest=1 if unknowns == 1 else 2,
-    )
+        root_weight=root, clock=clock, clock_covariance_m2=covariance, design=design,
+        covariance_m2=regular_inverse((normal + normal.swapaxes(1, 2)) / 2.0 + prior), prior=prior,
+        misfit=root * misfit, freedom=ranges.n_used - ranges.n_clocks - unknowns, interest=1 if unknowns == 1 else 2,
+    )  # fmt: skip
 
 
 def _clock_covariance(totals: Floats, tie_sigma_m: Floats | None) -> Floats:

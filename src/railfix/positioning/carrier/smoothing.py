@@ -178,24 +178,15 @@ def find_slips(
     after = state
     if len(observations):
         after = CycleSlipState(
-            time=observations.time[-1],
-            channels=channels,
-            code_m=read_only(observations.code_m[-1].copy()),
-            phase_m=read_only(phase[-1].copy()),
-            doppler_mps=read_only(doppler[-1].copy()),
-            half_cycle=read_only(half[-1].copy()),
-            step_ms=int(total_ms[-1]),
-        )
+            time=observations.time[-1], channels=channels, code_m=read_only(observations.code_m[-1].copy()),
+            phase_m=read_only(phase[-1].copy()), doppler_mps=read_only(doppler[-1].copy()),
+            half_cycle=read_only(half[-1].copy()), step_ms=int(total_ms[-1]),
+        )  # fmt: skip
     slips = Slips(
-        slip=has & (reason != 0),
-        reason=reason,
-        phase_m=phase + (total_ms[1:] * MILLISECOND_M)[:, None],
-        doppler_metric_m=doppler_metric,
-        code_metric_m=code_metric,
-        doppler_limit_m=doppler_limit,
-        clock_step_m=step,
+        slip=has & (reason != 0), reason=reason, phase_m=phase + (total_ms[1:] * MILLISECOND_M)[:, None],
+        doppler_metric_m=doppler_metric, code_metric_m=code_metric, doppler_limit_m=doppler_limit, clock_step_m=step,
         half_cycle=half,
-    )
+    )  # fmt: skip
     return slips, after
 
 
@@ -270,7 +261,7 @@ def _hold(values: Floats, at: Masks, first: Floats) -> Floats:
 def _common_change(difference: Floats, begins: Masks, last: Floats) -> Floats:
     """Mean change of code less phase over the channels that run on, 0 where there is none; shape (T,)."""
     change = np.where(begins, np.nan, difference - np.concatenate([last[None], difference[:-1]]))
-    number = np.count_nonzero(np.isfinite(change), axis=1)
+    number = np.isfinite(change).sum(axis=1)
     return np.asarray(np.nansum(change, axis=1) / np.maximum(number, 1))
 
 
@@ -346,12 +337,9 @@ def smooth_codes(
     smoothed = np.where(runs, phase_m + (base + offset + apart[1:, None]), code_m)
     smoothed = np.where(has & (gain == 1.0), code_m, smoothed)
     after = SmoothingState(
-        time=time[-1],
-        channels=channels,
-        base_m=read_only(np.where(runs[-1], base[-1], np.nan)),
+        time=time[-1], channels=channels, base_m=read_only(np.where(runs[-1], base[-1], np.nan)),
         offset_m=read_only(np.where(runs[-1], offset[-1], 0.0)),
-        count=read_only(np.where(runs[-1], count[-1], 0.0).astype(np.int64)),
-        last_m=read_only(last),
+        count=read_only(np.where(runs[-1], count[-1], 0.0).astype(np.int64)), last_m=read_only(last),
         clock_m=float(apart[-1]),
-    )
+    )  # fmt: skip
     return smoothed, after
