@@ -27,8 +27,8 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits.prepared_records import issue_records
-from railfix.ranges.sbas.decode import BitField, Layout, read_fields, time_near
-from railfix.ranges.sbas.dfmc_orbits import COVARIANCE, almanacs, covariance_factor, ephemerides
+from railfix.ranges.sbas.decode import BitField, Layout, covariance_factor, read_fields, time_near
+from railfix.ranges.sbas.dfmc_orbits import COVARIANCE, almanacs, ephemerides
 from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import system_name
 

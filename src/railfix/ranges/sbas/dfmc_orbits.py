@@ -20,7 +20,7 @@ from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import seconds
 from railfix.gnss.orbits.ephemerides import GM, Orbits, kepler_state
-from railfix.ranges.sbas.decode import UPPER, BitField, Decoded, Layout, read_fields, time_near
+from railfix.ranges.sbas.decode import BitField, Decoded, Layout, covariance_factor, read_fields, time_near
 from railfix.ranges.sbas.messages import SbasMessages
 
 _BDSBAS: Final = 5  #: Number of the service.
@@ -72,13 +72,6 @@ _LAYOUTS: Final[Mapping[int, Layout]] = {
     },
 }
 _ALMANACS_AT: Final = (10, 116)  #: First bits of the two satellites of type 47.
-
-
-def covariance_factor(sent: Decoded) -> Floats:
-    """Return the upper triangular factors of covariances, shape (n, 4, 4)."""
-    factor = np.zeros((len(sent["exponent"]), 4, 4))
-    factor[:, range(4), range(4)], factor[:, UPPER[0], UPPER[1]] = sent["diagonal"], sent["upper"]
-    return np.asarray(factor * np.exp2(sent["exponent"] - 5.0)[:, None, None])
 
 
 @dataclass(frozen=True, kw_only=True)
