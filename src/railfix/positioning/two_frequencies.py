@@ -80,9 +80,7 @@ class TwoFrequencyState:
         information, moment = np.split(self.sums, 2)
         none = np.zeros(len(fresh))
         sums = np.concatenate([information, none, moment, none])
-        own = TwoFrequencyState(
-            names=self.names + fresh, sums=sums, scale=self.scale, last=self.last, age=self.age
-        )  # fmt: skip
+        own = replace(self, names=self.names + fresh, sums=sums)
         return own, np.array([known[name] for name in names], dtype=np.intp)
 
 
@@ -178,14 +176,8 @@ def ionosphere_free(
 ) -> Combined:
     """Return the ionosphere-free combination of two codes, with the test of their difference by `combine_codes`.
 
-    ``P = (ratio P1 - P2) / (ratio - 1)``, whose noise no epoch before makes less.
-
-    Parameters
-    ----------
-    code_m, noise_m : ndarray, shape (T, K) [m]
-        As in `combine_codes`.
-    delays_m : tuple of ndarray, shapes (T, K) [m]
-        Group delays that the corrections contain already, of the first and the second code.
+    ``P = (ratio P1 - P2) / (ratio - 1)``, whose noise no epoch before makes less. `delays_m` are the group delays that
+    the corrections contain already, of the first and the second code, shapes (T, K).
     """
     share = np.where(np.isfinite(code_m + second.code_m), -1.0 / (second.ratio - 1.0), np.nan)
     first, other = code_m + delays_m[0], second.code_m + delays_m[1]

@@ -120,7 +120,8 @@ def slot_satellite(slot: int) -> str:
     return f"C{slot - 158:02d}" if 159 <= slot <= 195 else ""
 
 
-_SLOT_OF: Final = {slot_satellite(slot): slot for slot in range(1, 215) if slot_satellite(slot)}
+#: Slots of satellites.
+SLOT_OF: Final = {slot_satellite(slot): slot for slot in range(1, 215) if slot_satellite(slot)}
 
 
 def residual_ionosphere_m(elevation_deg: Floats) -> Floats:
@@ -261,7 +262,7 @@ class DfmcService:
 
     def _slots(self, name: str, mask: Integers) -> tuple[Masks, Integers]:
         """Whether a satellite is in the mask in force, and its rank among those that are."""
-        slot = _SLOT_OF.get(name, 0)
+        slot = SLOT_OF.get(name, 0)
         if not slot or not len(self._time[31]):
             return np.zeros(len(mask), dtype=np.bool_), np.zeros(len(mask), dtype=np.int64)
         member = self._read[31]["member"][mask]
