@@ -116,10 +116,10 @@ def ephemerides(messages: SbasMessages, valid_s: float) -> SbasOrbits:
         other = newest.get((79 - kind, issue))
         if other is not None and seconds(messages.time[row] - messages.time[rows[79 - kind][other]]) <= valid_s:
             pairs.append((row, *((k, other) if kind == 39 else (other, k))))
-    row, first, second = np.array(pairs, dtype=np.int64).reshape(-1, 3).T
+    last, first, second = np.array(pairs, dtype=np.int64).reshape(-1, 3).T
     part = {name: values[first] for name, values in sent[39].items()}
     part |= {name: values[second] for name, values in sent[40].items()}
-    return _orbits(messages, row, part)
+    return _orbits(messages, last, part)
 
 
 def almanacs(messages: SbasMessages) -> SbasOrbits:
