@@ -9,7 +9,10 @@ from railfix.ranges.sbas import SbasMessages
 from railfix.ranges.sbas.standard import system_name
 
 #: Types decoded into corrections or into records.
-DECODED: Final = {"L1": (0, 1, 2, 3, 4, 5, 6, 7, 10, 12, 18, 24, 25, 26, 27, 28), "L5": (0, 31, 32, 34, 35, 36, 37)}
+DECODED: Final = {
+    "L1": (0, 1, 2, 3, 4, 5, 6, 7, 10, 12, 18, 24, 25, 26, 27, 28),
+    "L5": (0, 31, 32, 34, 35, 36, 37, 39, 40, 47),
+}
 
 #: Message types of L1 (DO-229D, table A-3).
 TYPE_NAMES: Final = {
@@ -43,10 +46,10 @@ L5_TYPE_NAMES: Final = {
     35: "integrity, first 53 satellites",
     36: "integrity, the others",
     37: "degradation and scale",
-    39: "orbit of the SBAS satellite, whose scales differ between public sources",
+    39: "orbit of the SBAS satellite",
     40: "orbit of the SBAS satellite, second part",
     42: "network time, whose layout is not public",
-    47: "almanac, which no range needs",
+    47: "SBAS almanacs",
     62: "internal test",
     63: "null",
 }

@@ -55,13 +55,18 @@ def made(
 
 
 def combine(
-    time: np.ndarray, code: Floats, second: SecondCodes, state: TwoFrequencyState | None = None, prior_m: float = 1.5
+    time: np.ndarray,
+    code: Floats,
+    second: SecondCodes,
+    state: TwoFrequencyState | None = None,
+    prior_m: float = 1.5,
+    sky: Floats | None = None,
 ) -> tuple[Combined, TwoFrequencyState]:
     ones = np.ones(code.shape)
     pairs = (NAMES, np.zeros(len(NAMES), dtype=np.intp))
-    return combine_codes(
-        time, code, ones, second, prior_m * ones, pairs, state or TwoFrequencyState(), TwoFrequencyLimits()
-    )
+    field = np.zeros((*code.shape, 4)) if sky is None else np.broadcast_to(sky, (*code.shape, 4)).copy()
+    field[..., 3] = prior_m
+    return combine_codes(time, code, ones, second, field, pairs, state or TwoFrequencyState(), TwoFrequencyLimits())
 
 
 def spread(values: Floats) -> float:
@@ -135,6 +140,29 @@ def test_noisy_codes_leave_the_ionosphere_to_the_model() -> None:
     found, _ = combine(time, code, second)
     assert np.abs(found.ionosphere_m[60:] - error[60:]).max() < 1.5
     assert (found.share[60:] > 0.2).all(), "weighted mean of two codes"
+
+
+def test_the_ionosphere_of_a_noisy_satellite_is_that_of_its_neighbours() -> None:
+    """A field of two gradients: one satellite's codes differ by 4 m more for as long as it stands (multipath)."""
+    east = np.linspace(-1.0, 1.0, len(NAMES))
+    sky = np.stack([np.full(8, 1.5), 1.5 * east, 1.5 * np.cos(3.0 * east), np.zeros(8)], axis=-1)
+    error = sky[:, :3] @ np.array([1.0, -0.8, 0.5])
+    time, code, second, _ = made(600, ionosphere_m=error)
+    second.code_m[:, 3] += 4.0
+    found, _ = combine(time, code, second, prior_m=0.35, sky=sky)
+    alone, _ = combine(time, code, second, prior_m=1.5)
+    apart = [each.ionosphere_m[-1] - error for each in (found, alone)]
+    with_field, without = (float(values[3] - np.median(values)) for values in apart)
+    assert with_field < 1.2
+    assert without > 2.5
+
+
+def test_what_the_means_have_told_is_not_told_again() -> None:
+    """Codes of equal noise are averaged once the ionosphere is known; before, nearly ionosphere-free."""
+    time, code, second, _ = made(1800, noise_m=0.05)
+    share = combine(time, code, second)[0].share
+    assert (share[60] < -0.3).all()
+    assert (share[-1] > 0.3).all()
 
 
 @pytest.fixture(scope="module")

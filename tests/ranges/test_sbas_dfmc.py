@@ -206,7 +206,7 @@ def test_broken_and_foreign_messages_are_counted_and_left_out(tmp_path: Path) ->
     write_sbas(written, tmp_path / "l5.sbs")
     read = read_sbas(tmp_path / "l5.sbs", band="L5")
     assert account(read) == {
-        "MSAS 137 type 47 almanac, which no range needs, not decoded": 1, "MSAS 137 type 61 reserved, not decoded": 1,
+        "MSAS 137 type 47 SBAS almanacs": 1, "MSAS 137 type 61 reserved, not decoded": 1,
         "rejected: duplicate": 0, "rejected: line": 0, "rejected: parity": 1, "rejected: preamble": 1,
     }  # fmt: skip
     assert at(DfmcService(read, prn=137), 4.0).state[0, 0] == DfmcState.NO_MASK

@@ -1,7 +1,7 @@
 """One against two frequencies on the recordings that have two, printed as a table.
 
-Run ``python tests/studies/frequencies_score.py`` with the recordings beside the checkout. Constants were chosen with
-the town, the phone and the Japanese log in view; the static station shaped the prior; the roof was kept out.
+Run ``python tests/studies/frequencies_score.py`` with the recordings beside the checkout. The field of the ionosphere
+was shaped with all of them in view but the phone.
 """
 
 from __future__ import annotations

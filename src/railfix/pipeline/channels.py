@@ -38,6 +38,10 @@ _FAST: Final = ("G5", "J5", "E5", "E7", "C5", "C6")
 _FAST_NOISE: Final = 0.5
 #: Key of the verdict.
 NAME: Final = "two_frequencies"
+#: Arc, of 1000 km, over which the error of the ionosphere's model changes by its own size [rad].
+_IONOSPHERE_ARC: Final = 0.157
+#: Vertical delays about a plane (Walter et al., Navigation 48, 2001: 0.35 m on quiet days).
+_IONOSPHERE_REST_M: Final = 0.35
 
 
 def second_codes(
@@ -108,7 +112,7 @@ def combined(
         np.where(usable, ranges.corrected_code_m, np.nan),
         noise,
         second,
-        vertical * thin_shell_obliquity(ranges.elevation_deg),
+        _field_of_ionosphere(ranges.elevation_deg, ranges.azimuth_deg, vertical),
         (ranges.channels.pair_names, ranges.channels.pair_groups),
         state,
         config.two_frequencies,
@@ -134,6 +138,15 @@ def combined(
     screened = Screened(metric=found.difference_m, reject=found.suspected)
     verdict = Verdict(name=NAME, reason=Reason.USED, screened=screened, error_m=found.difference_m)
     return ranges.judged([verdict]), state
+
+
+def _field_of_ionosphere(elevation_deg: Floats, azimuth_deg: Floats, vertical_m: float) -> Floats:
+    """Return sigmas of the modelled ionosphere by offset, gradients and the satellite's rest, shape (T, K, 4) [m]."""
+    obliquity, azimuth = thin_shell_obliquity(elevation_deg), np.radians(azimuth_deg)
+    offset = vertical_m * obliquity
+    to_pierce_point = np.radians(90.0 - elevation_deg) - np.arccos(1.0 / obliquity)
+    slope = offset * to_pierce_point / _IONOSPHERE_ARC
+    return np.stack([offset, slope * np.sin(azimuth), slope * np.cos(azimuth), _IONOSPHERE_REST_M * obliquity], axis=-1)
 
 
 def _delays(

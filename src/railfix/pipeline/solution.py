@@ -242,7 +242,7 @@ def _agreeing(ranges: Ranges, point: SinglePoint, anchor_ecef_m: Floats, config:
     place = np.where(np.isnan(point.ecef_m), anchor_ecef_m, point.ecef_m)
     fit = robust_fit(ranges, place, limits=config.robust_fit)
     dropped = (ranges.weight > 0) & ~fit.kept
-    changed = dropped.any(axis=1).nonzero()[0]
+    changed = np.flatnonzero(dropped.any(axis=1))
     if not len(changed):
         return ranges, point
     agreeing = without(ranges, dropped)

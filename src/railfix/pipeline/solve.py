@@ -175,7 +175,7 @@ def _faults_excluded(
     if len(unresolved):
         epochs = failing[unresolved]
         second = _second_attempt(ranges, index, place, epochs, model.take(unresolved), scale, config)
-        raim = _with_exclusion(raim, epochs, second, second.excluded.any(axis=1).nonzero()[0])
+        raim = _with_exclusion(raim, epochs, second, np.flatnonzero(second.excluded.any(axis=1)))
     if limits.mode == "chi_square":
         raim = _by_robust_fit(raim, ranges, agreeing, failing, limits.min_redundancy)
     changed = failing[raim.excluded[failing].any(axis=1)]
@@ -310,7 +310,7 @@ def lasting_errors(
         left_out |= found
         if found.any():
             ranges = without(ranges, found)
-            for index, epochs in antennas.split(found.any(axis=1).nonzero()[0]):
+            for index, epochs in antennas.split(np.flatnonzero(found.any(axis=1))):
                 place = solved_again(ranges, index, place, epochs, config)
             model = line_model(ranges, antennas, place.constrained)
             error = _own_errors(model, noise, limits.clipped)

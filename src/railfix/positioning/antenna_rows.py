@@ -45,7 +45,7 @@ class OnDemand:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all fields, for another process."""
-        return {name: getattr(self, name) for name in _members(type(self))}
+        return {name: getattr(self, name) for name in _members(cast(Any, type(self)))}
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,7 @@ def _rows_of(value: Any, rows: slice | Indices) -> Any:
         for name, item in own.items():
             if item.__class__ is np.ndarray and has_rows[name]:
                 members[name] = item[rows]
-        for name in _defaults(value.__class__):  # they would hide that a field is to be taken
+        for name in _defaults(cast(Any, value.__class__)):  # they would hide that a field is to be taken
             members[name] = _rows_of(own[name], rows)
         return value.made(
             lambda n: {n: _rows_of(getattr(value, n), rows) if has_rows[n] else getattr(value, n)}, **members

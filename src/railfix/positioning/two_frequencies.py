@@ -5,9 +5,10 @@ The difference of the two corrected codes of a satellite has no geometry. With `
     ``P2 - P1 = B + (ratio - 1) I + e2 - e1``
 
 where I is the error of the modelled ionosphere on the first frequency, and B the delay between the frequencies in the
-receiver. B and I follow from the means of all satellites by best linear prediction, with the sigma of the model as the
-prior. The two codes, less the ionosphere predicted so far, then measure one range with a common error of known sigma:
-least squares in closed form.
+receiver. The error is a field, alike for neighbouring satellites: an offset and two gradients with the sigma of the
+model as the prior, and a rest of each satellite's own. They and B follow from the means of all satellites by best
+linear prediction. The two codes, less the ionosphere predicted so far, then measure one range: least squares in closed
+form, in which only what the means have not told yet sets the codes apart.
 """
 
 from __future__ import annotations
@@ -25,9 +26,6 @@ from railfix.positioning.noise_scale import correlated_sums
 _FROM_MEAN_SIZE: Final = 1.2533  #: Mean size of a normal deviate, inverted.
 _FIRST_SAMPLES: Final = 2.0  #: Samples with the noise that the weights assume, which the noise scale begins with.
 _CLIP: Final = 2.5  #: Sigmas beyond which the mean difference of a satellite counts as so far off and no further.
-#: Satellites that the error of the model is judged by at least, and the least share of its prior variance then.
-_FEWEST: Final = 5
-_LEAST_PRIOR: Final = 0.04
 _LEAST_SUSPICION_M: Final = 3.0  #: Smallest such difference.
 
 
@@ -82,8 +80,8 @@ class TwoFrequencyState:
         information, moment = np.split(self.sums, 2)
         none = np.zeros(len(fresh))
         sums = np.concatenate([information, none, moment, none])
-        numbers = np.array([known[name] for name in names], dtype=np.intp)
-        return replace(self, names=self.names + fresh, sums=sums), numbers
+        own = replace(self, names=self.names + fresh, sums=sums)
+        return own, np.array([known[name] for name in names], dtype=np.intp)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,16 +103,17 @@ def combine_codes(
     code_m: Floats,
     noise_m: Floats,
     second: SecondCodes,
-    prior_sigma_m: Floats,
+    field_m: Floats,
     pairs: tuple[tuple[str, ...], Integers],
     state: TwoFrequencyState,
     limits: TwoFrequencyLimits,
 ) -> tuple[Combined, TwoFrequencyState]:
     """Combine the two codes of each satellite, with the ionosphere from the epochs before, however a log is cut.
 
-    `code_m`, shape (T, K), are corrected first codes, NaN where unusable; `noise_m` is what the weights assume,
-    `prior_sigma_m` that of the modelled ionosphere on the first frequency; `pairs` are the names of the pairs, length
-    Q, and the group of each whose receiver delay is common.
+    `code_m`, shape (T, K), are corrected first codes, NaN where unusable; `noise_m` is what the weights assume;
+    `field_m`, shape (T, K, 4), are the standard deviations with sign of the modelled ionosphere on the first frequency
+    by its offset, two gradients and the satellite's own rest; `pairs` are the names of the pairs, length Q, and the
+    group of each whose receiver delay is common.
     """
     names, groups = pairs
     own, number = state.with_pairs(names)
@@ -138,21 +137,25 @@ def combine_codes(
     of_mean = scale[:, None] / np.where(known, information, 1.0)
     lever = second.ratio - 1.0
     delay = second.delay_sigma_m**2 + limits.delay_sigma_m**2
-    prior = np.where(known, prior_sigma_m**2, 1.0)
+    basis = np.where(known[..., None], field_m, 0.0)
+    own_m2 = basis[..., 3] ** 2
+    error = of_mean + delay + lever**2 * own_m2
     group = np.where(known, groups[second.pair], -1) if size else second.pair
-    bias, _ = _receiver_delays(mean, np.where(known, 1.0 / (of_mean + delay + lever**2 * prior), 0.0), group)
-    prior = prior * _prior_scale((mean - bias) ** 2 - delay, lever**2 * prior, known)[:, None]
-    weight = np.where(known, 1.0 / (of_mean + delay + lever**2 * prior), 0.0)
-    bias, of_bias = _receiver_delays(mean, weight, group)
-    gain = lever * prior * weight
-    reach = _CLIP / np.sqrt(np.where(known, weight, 1.0))
-    ionosphere = gain * np.clip(mean - bias, -reach, reach)
-    left = np.maximum(prior - lever * prior * gain + gain**2 * of_bias, 0.0)
-    p1, p2 = code_m - ionosphere, second.code_m - bias - second.ratio * ionosphere
+    weight = np.where(known, 1.0 / error, 0.0)
+    for _ in range(2):  # the second time, a satellite that is far off counts little
+        field, of_field, bias, of_bias = _fit_field(mean, basis[..., :3], lever, weight, group)
+        rest = mean - bias - lever * field
+        weight = np.where(known, 1.0 / (error + (rest / _CLIP) ** 2), 0.0)
+    rest = np.clip(rest / error, -_CLIP / np.sqrt(error), _CLIP / np.sqrt(error))
+    ionosphere = field + lever * own_m2 * rest
+    prior = of_field + own_m2
+    p1, p2 = code_m - ionosphere, second.code_m - bias - second.ratio * ionosphere - delay * rest
     noise = np.minimum(scale, 1.0)[:, None]
+    # what the means have told is in both codes alike
+    untold = of_mean / (error + of_bias + lever**2 * of_field)
     share, total = share_of_second(
-        scale[:, None] * first, scale[:, None] * other + delay + of_bias, second.ratio, left
-    )  # fmt: skip
+        scale[:, None] * first, scale[:, None] * other + untold * (delay + of_bias), second.ratio, untold * prior
+    )
     share = np.where(known, share, np.nan)
     apart = np.where(known, p2 - p1, np.nan)
     found = Combined(
@@ -160,7 +163,7 @@ def combine_codes(
         variance_m2=noise * ((1.0 - share) ** 2 * first + share**2 * other - first),
         share=share,
         ionosphere_m=np.where(known, ionosphere, np.nan),
-        ionosphere_sigma_m=np.where(known, np.sqrt(left), np.nan),
+        ionosphere_sigma_m=np.where(known, np.sqrt(prior - (lever * own_m2) ** 2 / error), np.nan),
         difference_m=apart,
         suspected=np.abs(apart) > np.maximum(limits.suspicion * np.sqrt(total), _LEAST_SUSPICION_M),
     )
@@ -173,8 +176,8 @@ def ionosphere_free(
 ) -> Combined:
     """Return the ionosphere-free combination of two codes, with the test of their difference by `combine_codes`.
 
-    ``P = (ratio P1 - P2) / (ratio - 1)``, whose noise no epoch before makes less. `delays_m`: group delays that the
-    corrections contain already, of the first and the second code, shapes (T, K).
+    ``P = (ratio P1 - P2) / (ratio - 1)``, whose noise no epoch before makes less. `delays_m` are the group delays that
+    the corrections contain already, of the first and the second code, shapes (T, K).
     """
     share = np.where(np.isfinite(code_m + second.code_m), -1.0 / (second.ratio - 1.0), np.nan)
     first, other = code_m + delays_m[0], second.code_m + delays_m[1]
@@ -208,28 +211,30 @@ def _noise_scale(
     return mean**2, after
 
 
-def _prior_scale(excess: Floats, expected: Floats, known: Masks) -> Floats:
-    """Return the variance of the model's error that the satellites show over the prior one, at most 1, shape (T,)."""
-    shown = _sum(np.where(known, np.minimum(excess, 4.0 * expected), 0.0))
-    scale = np.clip(shown / np.maximum(_sum(np.where(known, expected, 0.0)), 1e-9), _LEAST_PRIOR, 1.0)
-    return np.where(np.count_nonzero(known, axis=1) >= _FEWEST, scale, 1.0)
+def _fit_field(
+    mean: Floats, basis: Floats, lever: Floats, weight: Floats, group: Integers
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Fit the field of the ionosphere and the delay of each group to mean differences.
 
-
-def _receiver_delays(mean: Floats, weight: Floats, group: Integers) -> tuple[Floats, Floats]:
-    """Return the delay common to the satellites of each group, and its variance, of each channel, shapes (T, K)."""
-    bias, variance = np.zeros(mean.shape), np.zeros(mean.shape)
+    Returns the field and its variance, the delay and its variance, of each channel, shapes (T, K).
+    """
+    values = np.concatenate([lever[..., None] * basis, mean[..., None]], axis=-1)
+    centre, of_centre = np.zeros(values.shape), np.zeros(mean.shape)
     for number in np.unique(group[group >= 0]).tolist():
         here = group == number
-        has = here.any(axis=1)
         own = np.where(here, weight, 0.0)
-        centre = _sum(own * mean) / np.where(has, _sum(own), 1.0)
-        own = own / (1.0 + own * (mean - centre[:, None]) ** 2 / _CLIP**2)  # a satellite that is far off counts little
-        total = np.where(has, _sum(own), 1.0)
-        bias = np.where(here, (_sum(own * mean) / total)[:, None], bias)
-        variance = np.where(here, 1.0 / total[:, None], variance)
-    return bias, variance
+        total = np.where(here.any(axis=1), _sum(own), 1.0)
+        centre = np.where(here[..., None], (_sum(own[..., None] * values) / total[:, None])[:, None], centre)
+        of_centre = np.where(here, 1.0 / total[:, None], of_centre)
+    apart = values - centre
+    normal = _sum((weight[..., None] * apart)[..., None] * apart[..., None, :])
+    covariance = np.linalg.inv(normal[:, :3, :3] + np.eye(3))
+    factors = np.einsum("tij,tj->ti", covariance, normal[:, :3, 3])
+    variance = [np.einsum("tki,tij,tkj->tk", at, covariance, at) for at in (basis, centre[..., :3])]
+    field, of_centre_m = (np.einsum("tki,ti->tk", at, factors) for at in (basis, centre[..., :3]))
+    return field, variance[0], centre[..., 3] - of_centre_m, of_centre + variance[1]
 
 
 def _sum(values: Floats) -> Floats:
     """Sum over the channels one after the other: channels without a value between them change no bit."""
-    return np.asarray(np.cumsum(values, axis=1)[:, -1]) if values.shape[1] else np.zeros(len(values))
+    return np.asarray(np.cumsum(values, axis=1)[:, -1]) if values.shape[1] else values.sum(axis=1)

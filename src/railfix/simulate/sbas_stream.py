@@ -14,7 +14,7 @@ from railfix.core.constants import CARRIER_FREQUENCY, SPEED_OF_LIGHT
 from railfix.core.files import write_whole
 from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta, to_week
 from railfix.ranges.sbas import SbasMessages
-from railfix.ranges.sbas.dfmc import AUGMENTED, FIRST, slot_satellite
+from railfix.ranges.sbas.dfmc import AUGMENTED, FIRST, SLOT_OF
 from railfix.ranges.sbas.messages import PREAMBLES, message_type
 from railfix.simulate.receiver import group_delay_s, signals_of
 from railfix.simulate.sbas_service import CLOCK, FAST_PERIOD_S, Field, Service, pack_message
@@ -94,7 +94,6 @@ def parameters(
     )
 
 
-_SLOT_OF: Final = {slot_satellite(slot): slot for slot in range(1, 215)}
 #: Factor of the covariance that is sent: 1.03 to 1.06 times the indicator's sigma along a line of sight.
 _COVARIANCE: Final = (3, np.diag([1.0, 1.0, 1.0, 4.0]))
 _LARGEST_M: Final = 63.9  #: Largest correction of a clock that the field holds [m].
@@ -107,7 +106,7 @@ class SimulatedDfmc(Service):
     @staticmethod
     def slot(name: str) -> int:
         """Slot of a satellite, 0 without one."""
-        return _SLOT_OF.get(name, 0)
+        return SLOT_OF.get(name, 0)
 
     def clocks_m(self, second: float) -> Floats:
         """Corrections of the clocks of `satellites` [m] for ionosphere-free codes, group delays included.

@@ -61,7 +61,7 @@ class NearestOnPolyline:
         index = np.full(len(points), -1, dtype=np.intp)
         along = np.full(len(points), np.nan)
         offset = np.full(len(points), np.nan)
-        pending = np.isfinite(points).all(axis=1).nonzero()[0]
+        pending = np.flatnonzero(np.isfinite(points).all(axis=1))
         candidates = min(_FIRST_CANDIDATES, len(self._segment))
         while pending.size:
             unproven = []

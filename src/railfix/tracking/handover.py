@@ -213,7 +213,7 @@ def _in_use(state: TrackState, chunk: Chunk, sensed: Masks, first: int, last: in
         used |= (state.bank.covariance != 0.0).sum(axis=1).max(axis=0) > 1
     for unknown, column, _ in _SENSORS:
         used[unknown] |= sensed[column]
-    channels = chunk.has[:, first:last].any(axis=(0, 1)).nonzero()[0]
+    channels = np.flatnonzero(chunk.has[:, first:last].any(axis=(0, 1)))
     used[OFFSETS + chunk.offset[channels]] = True
     used[SATELLITES + chunk.slot[channels]] = True
     return np.asarray(used)

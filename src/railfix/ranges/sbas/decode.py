@@ -22,7 +22,7 @@ BLOCK: Final = 13  #: Slots of one message of type 2 to 5.
 _REGIONS: Final = 5
 _DO_NOT_USE_DELAY_M: Final = 0x1FF * 0.125
 #: Rows and columns of the elements above the diagonal of a covariance factor, in the order of the message.
-UPPER: Final = ([0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3])
+_UPPER: Final = ([0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3])
 
 
 class BitField(NamedTuple):
@@ -277,18 +277,21 @@ def grid_delays(messages: SbasMessages) -> Decoded:
     return {**decoded, "delay_m": np.where(delay == _DO_NOT_USE_DELAY_M, np.nan, delay)}
 
 
+def covariance_factor(sent: Decoded) -> Floats:
+    """Return the upper triangular factors of covariances, shape (n, 4, 4)."""
+    factor = np.zeros((len(sent["exponent"]), 4, 4))
+    factor[:, range(4), range(4)], factor[:, _UPPER[0], _UPPER[1]] = sent["diagonal"], sent["upper"]
+    return np.asarray(factor * np.exp2(sent["exponent"] - 5.0)[:, None, None])
+
+
 def covariance(messages: SbasMessages) -> Decoded:
     """Both halves of type 28: `slot`, `iodp`, `scale` (n,), `factor` (n, 4, 4), upper triangular, scaled."""
     decoded = decode(messages, 28)
     row, parts = decoded["row"], []
     for start in (16, 121):
         part = read_fields(messages.bits[row], LAYOUTS["satellite of type 28"], start)
-        scale = np.exp2(part["exponent"] - 5.0)
-        factor = np.zeros((len(row), 4, 4))
-        factor[:, range(4), range(4)] = part["diagonal"]
-        factor[:, UPPER[0], UPPER[1]] = part["upper"]
-        slot = part["slot"] - 1
-        parts.append({**decoded, "slot": slot, "scale": scale, "factor": factor * scale[:, None, None]})
+        slot, scale = part["slot"] - 1, np.exp2(part["exponent"] - 5.0)
+        parts.append({**decoded, "slot": slot, "scale": scale, "factor": covariance_factor(part)})
     return _join(parts)
 
 

@@ -12,10 +12,7 @@ hour of SouthPAN and BDSBAS (`test_sbas_dfmc.py`) slot and share of the rate hav
 issue of BeiDou is the IODE of B-CNAV1. BDSBAS corrects clocks of BeiDou-3 by decimetres, where group delays differ by
 metres: they are not in its corrections.
 
-Types 39 and 40, the orbit of the SBAS satellite, are counted: cssrlib and MAAST differ in the inclination rate (7/6 and
-7 pi 2^-21 1e-6 rad/s a step) and by 6370 km in the semi-major axis. The hour settles the axis alone, after MAAST:
-SouthPAN sends zeros with indicator 15, BDSBAS another layout (the axis in type 39, from bit 89 on). Neither program
-decodes type 42; no range needs the almanac, type 47.
+Orbits of the SBAS satellites themselves (types 39, 40 and 47) are in `dfmc_orbits`; nothing here needs them.
 """
 
 from __future__ import annotations
@@ -30,7 +27,8 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits.prepared_records import issue_records
-from railfix.ranges.sbas.decode import UPPER, BitField, Layout, read_fields, time_near
+from railfix.ranges.sbas.decode import BitField, Layout, covariance_factor, read_fields, time_near
+from railfix.ranges.sbas.dfmc_orbits import COVARIANCE, almanacs, ephemerides
 from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import first_that_holds, system_name
 
@@ -54,12 +52,7 @@ LAYOUTS: Final[dict[int, Layout]] = {
         "clock_m": BitField(61, 12, 0.03125, True),
         "velocity_mps": BitField(73, 8, 2.0**-11, True, 3),
         "drift_mps": BitField(97, 9, 2.0**-12, True),
-        "time_of_day_s": BitField(106, 13, 16.0),
-        "exponent": BitField(119, 3, 1.0),
-        "diagonal": BitField(122, 9, 1.0, False, 4),
-        "upper": BitField(158, 10, 1.0, True, 6),
-        "dfrei": BitField(218, 4),
-        "rate_share": BitField(222, 4),
+        **COVARIANCE,
     },
     34: {"change": BitField(10, 2, number=AUGMENTED), "dfrei": BitField(194, 4, number=7), "iodm": BitField(224, 2)},
     35: {"dfrei": BitField(10, 4, number=FIRST), "iodm": BitField(224, 2)},
@@ -123,7 +116,8 @@ def slot_satellite(slot: int) -> str:
     return f"C{slot - 158:02d}" if 159 <= slot <= 195 else ""
 
 
-_SLOT_OF: Final = {slot_satellite(slot): slot for slot in range(1, 215) if slot_satellite(slot)}
+#: Slots of satellites.
+SLOT_OF: Final = {slot_satellite(slot): slot for slot in range(1, 215) if slot_satellite(slot)}
 
 
 def residual_ionosphere_m(elevation_deg: Floats) -> Floats:
@@ -157,6 +151,8 @@ class DfmcService:
         self._time = {kind: own.time[own.type == kind] for kind in (0, *LAYOUTS)}
         self._read = {kind: read_fields(own.bits[own.type == kind], layout) for kind, layout in LAYOUTS.items()}
         self._indicators = self._all_indicators()
+        valid_s = self._read[37]["valid_40_s"][-1:]
+        self.notes += ephemerides(own, float(valid_s.sum())).notes() or almanacs(own).notes()
 
     @classmethod
     def from_log(cls, messages: SbasMessages, *, prn: int | Literal["best"] = "best") -> DfmcService:
@@ -233,11 +229,8 @@ class DfmcService:
         own["clock_m"][good] = sent["clock_m"] + sent["drift_mps"] * moved_s
         code = scale["scale"][ten, dfrei]
         own["sigma_m"][good] = np.array(SIGMA_LEAST_M)[dfrei] + code * np.array(SIGMA_STEP_M)[dfrei]
-        unit = np.exp2(sent["exponent"] - 5.0)
-        factor = np.zeros((len(good), 4, 4))
-        factor[:, range(4), range(4)], factor[:, UPPER[0], UPPER[1]] = sent["diagonal"], sent["upper"]
-        own["factor"][good] = factor * unit[:, None, None]
-        own["constant"][good] = scale["covariance"][ten] * unit
+        own["factor"][good] = covariance_factor(sent)
+        own["constant"][good] = scale["covariance"][ten] * np.exp2(sent["exponent"] - 5.0)
         kind = _DEGRADED.index(name[0])
         age = seconds(time - self._time[32][row])
         interval = scale["interval_s"][ten, kind]
@@ -251,7 +244,7 @@ class DfmcService:
 
     def _slots(self, name: str, mask: Integers) -> tuple[Masks, Integers]:
         """Whether a satellite is in the mask in force, and its rank among those that are."""
-        slot = _SLOT_OF.get(name, 0)
+        slot = SLOT_OF.get(name, 0)
         if not slot or not len(self._time[31]):
             return np.zeros(len(mask), dtype=np.bool_), np.zeros(len(mask), dtype=np.int64)
         member = self._read[31]["member"][mask]
