@@ -96,7 +96,7 @@ def test_faults_together_stay_within_the_level(kind: str, monkeypatch: pytest.Mo
     def least(classes: risk._Classes, *_: object) -> np.ndarray:
         return np.where(classes.each > 0.0, classes.least, -1)
 
-    monkeypatch.setattr(risk._Classes, "chosen", least)
+    monkeypatch.setattr(risk._Classes, "choose", least)
     monkeypatch.setattr(risk._Classes, "rest", lambda classes, _: np.zeros(len(classes.each)))
     careless = exceeded(systems, members, wrong_map=wrong_map)
     assert careless > found

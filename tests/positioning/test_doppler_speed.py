@@ -52,7 +52,7 @@ class Simulated:
             np.sign(train_mps)[:, None] * step / np.maximum(length, 1e-3)[:, None],
             place.forward,
         )
-        self.drift_mps = 299792458.0 * simulation.clocks.drift("front")
+        self.drift_mps = 299792458.0 * simulation.scenario.receiver.clock_drift
         self.dopplers = dopplers_of_log(obs, simulation.navigation, systems=SYSTEMS, signals=DEFAULT_SIGNALS)
 
     def solve(self, dopplers: Dopplers | None = None, limits: DopplerSpeedLimits | None = None) -> DopplerSpeed:
