@@ -317,10 +317,11 @@ class SensedState:
 
 def nothing_sensed(intervals: int) -> SensedMotion:
     """Motion without a sensor."""
-    absent, still = np.full(intervals, np.nan), np.zeros(intervals)
+    way, gradient, curvature, cant, under = np.full((5, intervals), np.nan)
+    doubt, swing = np.zeros((2, intervals))
     return SensedMotion(
-        state=still.astype(np.int8), way_m=absent, doubt_mps=still, swing_mps2=still, gradient=absent,
-        curvature_1pm=absent, cant_m=absent, under_m=absent,
+        state=np.zeros(intervals, dtype=np.int8), way_m=way, doubt_mps=doubt, swing_mps2=swing, gradient=gradient,
+        curvature_1pm=curvature, cant_m=cant, under_m=under,
     )  # fmt: skip
 
 
