@@ -6,7 +6,7 @@ epochs in the usual run; all with ``-m slow`` (``-s`` prints the counts).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -20,8 +20,9 @@ from exhaustive_search import exhaustive_search
 from pipeline_cases import demo_observations, processor
 from railfix.pipeline import corrected_ranges, solve
 from railfix.positioning import normal_equations, section_search
-from railfix.positioning.normal_equations import UNTIED_M, Constrained, Ranges
-from railfix.positioning.section_search import SearchIndex, Section
+from railfix.positioning.antenna_rows import rows_of
+from railfix.positioning.normal_equations import UNTIED_M, Constrained, ConstrainedLimits, Ranges, SinglePoint
+from railfix.positioning.section_search import SearchIndex, Section, SectionLimits
 from railfix.track.trajectory import Trajectory
 
 #: Points times channels looked at together, to keep the exhaustive search in memory.
@@ -50,10 +51,29 @@ def calls(monkeypatch) -> Calls:
         found.positions.append((ranges, trajectory, result))
         return result
 
-    for module in (solve, corrected_ranges, recordings_score):
+    def search_lines(
+        ranges: Ranges, lines: Iterable[tuple[SearchIndex, slice]], point: SinglePoint, *, limits: SectionLimits
+    ) -> Section:
+        each = list(lines)
+        result = section_search.search_lines(ranges, each, point, limits=limits)
+        for index, rows in each:
+            found.searches.append((rows_of(ranges, rows), index.trajectory, rows_of(result, rows)))
+        return result
+
+    monkeypatch.setattr(solve, "search_lines", search_lines)
+    for module in (corrected_ranges, recordings_score):
         monkeypatch.setattr(module, "search", search)
-    for module in (solve, recordings_score):
-        monkeypatch.setattr(module, "constrained_position", position)
+
+    def positions(
+        ranges: Ranges, lines: Sequence[tuple[Trajectory, slice]], vertex: np.ndarray, *, limits: ConstrainedLimits
+    ) -> Constrained:
+        result = normal_equations.constrained_on_lines(ranges, lines, vertex, limits=limits)
+        for line, rows in lines:
+            found.positions.append((rows_of(ranges, rows), line, rows_of(result, rows)))
+        return result
+
+    monkeypatch.setattr(solve, "constrained_on_lines", positions)
+    monkeypatch.setattr(recordings_score, "constrained_position", position)
     return found
 
 

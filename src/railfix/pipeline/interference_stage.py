@@ -247,7 +247,7 @@ def judge_interference(
     due = antennas.apart(lambda _, rows, state: _due(corrected, rows, state), states)
     rows = np.concatenate([own.rows for own in due])
     broken = np.concatenate([own.broken[:-1] for own in due])
-    if len(rows) or not len(corrected.time):
+    if any(len(own.rows) or not len(own.group) for own in due):
         inputs = _motion_inputs(corrected, solution, antennas, rows, broken)
         fitted = fit_motion(inputs, limits)
     found: list[Interference] = []

@@ -281,12 +281,14 @@ def _parts(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats], least: i
     used = inputs.used & (inputs.group == np.arange(clocks)[:, None, None])
     enough = used.sum(axis=2) >= least
     weight = np.where(used & enough[..., None], 1.0 / inputs.sigma_m**2, 0.0)
+    weight = weight.reshape(clocks * epochs, used.shape[2])
     rows = np.tile(np.arange(epochs), clocks)
-    step, covariance, scale = _fit(design[rows], misfit[rows], weight.reshape(clocks * epochs, -1), least=1)
+    step, covariance, scale = _fit(design[rows], misfit[rows], weight, least=1)
     covariance = covariance * (np.maximum(scale, inputs.noise_scale[rows]) ** 2)[:, None, None]
     step[:, 3] -= inputs.clock_offset_m.T.ravel()
     covariance[:, 3, 3] += inputs.clock_sigma_m.T.ravel() ** 2
-    found = list(zip(step.reshape(clocks, epochs, -1), covariance.reshape(clocks, epochs, _SIZE, _SIZE), strict=True))
+    shape = clocks, epochs, _SIZE
+    found = list(zip(step.reshape(shape), covariance.reshape(*shape, _SIZE), strict=True))
     largest = np.full(len(near), np.nan)
     for k, (one, of_one) in enumerate(found):
         for other, of_other in found[:k]:
