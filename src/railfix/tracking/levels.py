@@ -166,8 +166,8 @@ def _sensors(sensors: SensorEpochs, taken: Indices, total: Floats, sigma: Floats
     return SensorEpochs(**values, wheel_sign=sensors.wheel_sign, ranges=ranges)
 
 
-#: A sub-filter this many standard deviations off is explained by them, where a place has no level and where it has one:
-#: without the satellite that is faulty it lies further away, at any level.
+#: The standard deviation explains a sub-filter up to so many of it away: where a place has no level, where it has one.
+#: One without the faulty satellite lies further away.
 _EXPLAINED: Final = (3.0, 4.0)
 _KEPT: Final = (
     "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m", "amount_m",
