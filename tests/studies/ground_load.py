@@ -1,7 +1,7 @@
 """Load of a centre by its trains: ``python tests/studies/ground_load.py [TRAINS ...] [--seconds 20]``.
 
 Two trains a station, each of which asks for a route whenever it reports. ``logic``: the centre alone takes a second's
-reports in five steps: supervision, commit to SQLite, authorities. ``links``: ``railfix ground centre`` as a process on
+reports in its steps: supervision, commit to SQLite, authorities. ``links``: ``railfix ground centre`` as a process on
 one core, each train with its two QUIC links and a report a second, at instants spread over the second; all trains
 share a process on the other core. Printed: processor time of the centre a second, time from a report to the authority
 that answers it, and the reports that none answered.
@@ -56,7 +56,7 @@ def line(trains: int) -> tuple[Layout, dict[int, SimulatedTrain]]:
 def logic(number: int, seconds: int) -> None:
     """Print the times of the centre without links."""
     layout, trains = line(number)
-    now, sent, steps = [0.0], [0], []
+    now, sent, steps, steps_a_second = [0.0], [0], [], round(1.0 / STEP_S)
     supervision = Supervision(layout=layout, state=at_start(layout, [train.at_rest() for train in trains.values()]))
 
     def send(train: int, payload: bytes) -> None:
@@ -69,7 +69,7 @@ def logic(number: int, seconds: int) -> None:
         spent = 0.0
         for step in range(round(seconds / STEP_S)):
             now[0] = step * STEP_S
-            due = [train for k, train in enumerate(trains.values()) if k % 5 == step % 5]
+            due = [train for k, train in enumerate(trains.values()) if k % steps_a_second == step % steps_a_second]
             for train in due:
                 train.step(now[0])
             reports = [(train.number, encode(train.message(now[0]))) for train in due]

@@ -37,7 +37,7 @@ from railfix.io import read_navigation
 from railfix.track.network_read import read_network
 
 #: Period of the centre's work [s].
-STEP_S = 0.2
+STEP_S = 0.1
 #: Thresholds of the garbage collection: with a thousand connections a whole one takes 0.3 s, and is made rarely.
 COLLECTION = 10_000, 20, 50
 #: Document with the stations and trains that the database is of.
