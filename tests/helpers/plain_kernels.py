@@ -16,7 +16,7 @@ from railfix import kernels
 from railfix.kernels import compiling
 from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits
-from railfix.tracking.bank import SENSORS, budget, kind_of
+from railfix.tracking.bank import OTHERS, SENSORS, budget, kind_of
 from railfix.tracking.filter import _parameters
 from railfix.tracking.handover import _work_space
 
@@ -82,17 +82,17 @@ def memory(
 
 
 def subfilters(names: list[str], place_m: Any, sigma_m: Any, limits: TrackingLimits, weak_s: Any = 0.0) -> Any:
-    """Running sub-filters at places, the last one, of the map, not running."""
-    given, kinds = budget(limits), [kind_of(name) for name in names]
-    size = len(names) + 1
+    """Running sub-filters at places; the last ones, of satellites ahead and behind and of the map, not running."""
+    given, kinds = budget(limits), [kind_of(name) for name in (*names, *OTHERS[2:])]
+    size = len(kinds)
     mean, covariance = np.zeros((size, 12)), np.zeros((size, 12, 12))
-    mean[:-1, layout.ARC], covariance[:-1, layout.ARC, layout.ARC] = place_m, np.square(sigma_m)
+    mean[: len(names), layout.ARC], covariance[: len(names), layout.ARC, layout.ARC] = place_m, np.square(sigma_m)
     return named_tuple(
         layout.Subfilters,
         running=np.arange(size) < len(names),
         mean=mean,
         covariance=covariance,
-        weak_s=np.append(np.broadcast_to(weak_s, len(names)), 0.0),
-        prior=np.append(np.array(given.prior)[kinds], given.prior[4]),
-        k=np.append(np.array(given.k_fault)[kinds], given.k_fault[4]),
+        weak_s=np.where(np.arange(size) < len(names), np.resize(weak_s, size), 0.0),
+        prior=np.array(given.prior)[kinds],
+        k=np.array(given.k_fault)[kinds],
     )

@@ -116,7 +116,7 @@ def test_the_receivers_own_alarm_counts_and_all_can_be_turned_off() -> None:
 @pytest.mark.requirement("B8")
 def test_the_filter_gives_no_bound_and_the_message_says_why() -> None:
     log = signal_attacks.repeated(scene(), AT, (120.0, -90.0), 200.0)[: AT + 20]
-    whole, _ = pipeline_cases.processor().process({"front": log})
+    whole, _ = pipeline_cases.processor({"filter": "track"}).process({"front": log})
     tracked = whole.fusion["front"].tracked
     spoofed = whole["front"].interference.suspicion == Suspicion.SPOOFING_SUSPECTED
     assert spoofed.sum() > 15

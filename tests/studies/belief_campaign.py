@@ -60,6 +60,8 @@ from railfix.tracking import Line, Tracked, TrackStatus
 
 #: Faults that no measurement of this receiver contradicts: codes, phases and Dopplers agree on another motion.
 UNDETECTED: Final = ("pull 0.5 m/s, all", "pull 0.5 m/s, all, from the start")
+#: Beginnings of the names of faults that never begin with the first epoch.
+LATE_FAULTS: Final = ("Dopp", "phases", "step", "codes ", "late", "clock of", "clock +1")
 
 
 @dataclass(frozen=True)
@@ -416,11 +418,12 @@ def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterat
     listed.append(("phases +2 m/s", nothing, 2.0 * along * slide, nothing))
     listed.append(("step of all codes 30 m", 30.0 * along * (t >= 45.0)[:, None], nothing, nothing))
     listed.append(("pull 0.5 m/s, all", *(x * along for x in (0.5 * after, 0.5 * after, 0.5 * on))))
+    listed.extend(shared_faults(along, t, seed=len(t) + int(start)))
     pair = of(one, other)
     listed.append(("pair +30 m", 30.0 * (pair & on), nothing, nothing))
     listed.append(("pair +20, -20 m", 20.0 * ((of(one) & on).astype(float) - (of(other) & on)), nothing, nothing))
     for name, code, phase, rate in listed:
-        label = name if start or name.startswith(("Dopp", "phases", "step")) else f"{name}, from the start"
+        label = name if start or name.startswith(LATE_FAULTS) else f"{name}, from the start"
         yield label, with_fault(case, Fault(name, code, phase, rate))
     few = [str(x) for x in random.choice(names, min(3, len(names)), replace=False)]
     for count in (3, 2):
@@ -433,6 +436,9 @@ def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterat
         yield f"{count} satellites after 45 s", replace(case, observations=replace(obs, **some))
     if case.sensors is not None:
         yield from sensor_faults(case, case.sensors)
+    up = np.asarray(case.trajectory.ecef_m) / np.linalg.norm(case.trajectory.ecef_m, axis=1, keepdims=True)
+    for metres in (40.0, -40.0):
+        yield f"map {metres:+g} m in height", on_line(case, np.asarray(case.trajectory.ecef_m) + metres * up)
     yield "map 20 m to the right", moved(case, 20.0)
     yield "map 20 m to the left", moved(case, -20.0)
     yield "map 5 m to the right", moved(case, 5.0)
@@ -441,6 +447,22 @@ def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterat
     yield "line that ends under way", ended(case)
     yield "map 2 % long", stretched(case, 0.02)
     yield "map wandering by 2 m, stated", roughened(case, 2.0)
+
+
+def shared_faults(along: np.ndarray, t: np.ndarray, *, seed: int) -> Iterator[tuple[str, *tuple[np.ndarray, ...]]]:
+    """Faults that several satellites share, from 45 s on or for the minute after: name, code, phase, range rate."""
+    random, nothing = np.random.default_rng(seed), np.zeros(along.shape)
+    minute = ((t >= 45.0) & (t < 105.0))[:, None]
+    for side, there in (("ahead", along < -0.2), ("behind", along > 0.2)):
+        for size in (15.0, 25.0):
+            yield f"codes {side} {size:+.0f} m", size * (there & minute), nothing, nothing
+    late = np.where(random.random(along.shape[1]) < 0.4, random.exponential(15.0, along.shape[1]), 0.0)
+    yield "late codes of 40 %", late * minute, nothing, nothing
+    slips = np.cumsum(random.choice([-1.0, 0.0, 0.0, 0.0, 1.0], along.shape), axis=0)
+    yield "slips unflagged on a third", nothing, slips * (random.random(along.shape[1]) < 0.33), nothing
+    step = 1e-3 * SPEED_OF_LIGHT * (t >= 45.0)[:, None] * np.ones(along.shape)
+    yield "clock of the codes +1 ms", step, nothing, nothing
+    yield "clock +1 ms", step, step, nothing
 
 
 def sensor_faults(case: Case, sensors: SensorSamples) -> Iterator[tuple[str, Case]]:

@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 import belief_campaign
 from plain_kernels import memory, named_tuple, parameters, plain, subfilters, work_space
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
 from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits, TrackStatus, track
 from railfix.tracking.bank import OTHERS, budget
@@ -210,6 +210,41 @@ def test_the_sub_filter_without_the_faulty_satellite_keeps_the_place() -> None:
     k = state.bank.without.index(str(case.epochs.satellite[3]))
     sigma = np.sqrt(state.bank.covariance[k, 0, 0])
     assert abs(state.bank.mean[k, 0] - case.arc_m[-1]) < 3.0 * sigma
+
+
+@pytest.mark.requirement("C2")
+@pytest.mark.parametrize("side", ["ahead", "behind"])
+def test_the_sub_filter_without_the_satellites_of_a_side_keeps_the_place(side: str) -> None:
+    case = ride(100, noise=1.0, seed=2)
+    point, axes = case.line.at(case.arc_m)[:2]
+    _, sight = range_with_rotation(case.epochs.sat_ecef_m, point[:, None])
+    along = (sight * axes[:, :1]).sum(axis=-1) * (1.0 if side == "ahead" else -1.0)
+    code = case.epochs.code_m + np.where(along > 0.2, np.clip(0.2 * (np.arange(100.0) - 20.0), 0.0, 14.0)[:, None], 0.0)
+    found, state = track(replace(case.epochs, code_m=code), case.line, limits=LIMITS, levels=True)
+    assert state.bank is not None
+    k = state.bank.without.index(side)
+    sigma = np.sqrt(state.bank.covariance[k, 0, 0])
+    assert abs(found.arc_m[-1] - case.arc_m[-1]) > 3.0
+    assert abs(state.bank.mean[k, 0] - case.arc_m[-1]) < min(2.0 * sigma, 2.0)
+
+
+@pytest.mark.requirement("C2")
+@pytest.mark.parametrize(
+    ("name", "start", "side"), [("pixel", 800, "ahead"), ("f9p", 200, "ahead"), ("f9p", 200, "behind")]
+)
+def test_late_codes_of_all_satellites_of_a_side_are_in_the_level(
+    recordings: Path, name: str, start: int, side: str
+) -> None:
+    case = belief_campaign.cases(recordings)[name]().part(start, start + 150)
+    along, _ = belief_campaign.sights(case)
+    late = 25.0 * (along < -0.2 if side == "ahead" else along > 0.2)
+    nothing = np.zeros(late.shape)
+    found = belief_campaign.run(
+        belief_campaign.with_fault(case, belief_campaign.Fault(side, late, nothing, nothing)), {}
+    )
+    assert np.nanmax(found.straight_m) > 15.0
+    assert np.isfinite(found.ground_level_m).sum() > 15
+    assert not found.over_ground.any()
 
 
 @pytest.mark.requirement("C2")

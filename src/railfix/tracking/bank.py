@@ -37,10 +37,12 @@ class SourceKind(IntEnum):
     MOTION = 3
     MAP = 4
     BALISE = 5
+    SIDE = 6
 
 
-#: Sources beside satellites, constellations and sensors: all Dopplers, all phases, the map.
-OTHERS: Final = ("doppler", "phase", "map")
+#: Sources beside satellites, constellations and sensors: all Dopplers, phases, codes of satellites ahead or behind,
+#: the map.
+OTHERS: Final = ("doppler", "phase", "ahead", "behind", "map")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +88,7 @@ def budget(limits: TrackingLimits) -> Budget:
         min(local * limits.level_motion_prior, 1.0),
         min(local * limits.level_map_prior, 1.0),
         min(local * limits.level_balise_prior, 1.0),
+        min(local * limits.level_side_prior, 1.0),
     ]
     kept = [prior if MOST_SOURCES * prior > SPARED * risk else 0.0 for prior in exposed]
     risk -= MOST_SOURCES * sum(prior for prior, monitored in zip(exposed, kept, strict=True) if not monitored)
@@ -109,7 +112,8 @@ def kind_of(name: str) -> SourceKind:
     if name in CLOCKS:
         return SourceKind.CONSTELLATION
     if name in OTHERS:
-        return SourceKind.MAP if name == "map" else SourceKind.MOTION
+        kinds = {"map": SourceKind.MAP, "ahead": SourceKind.SIDE, "behind": SourceKind.SIDE}
+        return kinds.get(name, SourceKind.MOTION)
     if name in (SENSORS[Kind.BALISE], SENSORS[Kind.NEXT_BALISE]):
         return SourceKind.BALISE
     return SourceKind.SENSOR if name in SENSORS.values() else SourceKind.SATELLITE

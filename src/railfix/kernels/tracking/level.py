@@ -20,6 +20,7 @@ import math
 from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.algebra import invert, restart
 from railfix.kernels.tracking.constants import (
+    AHEAD,
     JOINED,
     PRECISION_M,
     ROUNDS,
@@ -78,7 +79,9 @@ def _sources(epochs: Epochs, t: int, rows: Rows, bank: Subfilters, slots: int, b
     for j in range(rows.counts[3]):
         source[slots + clocks + min(rows.sensors[j], RANGE_ROW)] = True
     first = slots + clocks + SENSORS
-    source[first], source[first + 1], source[first + 2] = rows.counts[2] > 0, rows.counts[1] > 0, rows.counts[0] > 0
+    source[first], source[first + 1] = rows.counts[2] > 0, rows.counts[1] > 0
+    for b in range(first + 2, first + OTHERS):
+        source[b] = rows.counts[0] > 0
     for k in range(slots):
         if epochs.remembered[t, k]:
             met[slots + bank.clock[k]] = True
@@ -215,12 +218,13 @@ def advance_subfilters(
             _begin(bank, b, before and not met[b], best, parameters, work, h)
         else:
             continue
+        side = 1.0 if b == others + 2 else (-1.0 if b == others + 3 else 0.0)
         for i in range(gnss):
             k = rows.codes[i] if i < nc else (rows.phases[i - nc] if i < nc + nph else rows.dopplers[i - nc - nph])
             own = epochs.slot[k] if satellite else slots + epochs.offset[k]
-            work.masked[i] = math.inf if own == b else work.variance[i]
-            if (b == others and i >= nc + nph) or (b == others + 1 and nc <= i < nc + nph):
-                work.masked[i] = math.inf
+            out = own == b or (b == others and i >= nc + nph) or (b == others + 1 and nc <= i < nc + nph)
+            out = out or (i < nc and side * work.design[best, i, 0] < -AHEAD)
+            work.masked[i] = math.inf if out else work.variance[i]
         for j in range(rows.counts[3]):
             own = slots + clocks + min(rows.sensors[j], RANGE_ROW)
             work.masked[gnss + j] = math.inf if own == b else work.variance[gnss + j]
@@ -280,12 +284,13 @@ def write_level(
     """
     place, sigma = state.mean[0, ARC], math.sqrt(state.covariance[0, ARC, ARC])
     noise, apart = parameters.level_k * sigma, math.nan
-    start, contradicted = noise, False
+    start, contradicted, sides = noise, False, len(bank.running) - 3
     for b in range(len(bank.running)):
         if bank.running[b]:
             contradicted = contradicted or bank.weak_s[b] > parameters.level_doubt_s
             away = abs(bank.mean[b, ARC] - place)
-            apart = away if math.isnan(apart) else max(apart, away)
+            if not sides <= b < sides + 2:  # without half of the codes one is apart by noise
+                apart = away if math.isnan(apart) else max(apart, away)
             start = max(start, away + bank.k[b] * math.sqrt(bank.covariance[b, ARC, ARC]))
     outputs.level_noise_m[t], outputs.separation_m[t] = noise, apart
     outputs.level_m[t] = outputs.ground_level_m[t] = math.inf
