@@ -229,9 +229,7 @@ def test_the_sub_filter_without_the_satellites_of_a_side_keeps_the_place(side: s
 
 
 @pytest.mark.requirement("C2")
-@pytest.mark.parametrize(
-    ("name", "start", "side"), [("pixel", 800, "ahead"), ("f9p", 200, "ahead"), ("f9p", 200, "behind")]
-)
+@pytest.mark.parametrize(("name", "start", "side"), [("pixel", 800, "ahead"), ("f9p", 200, "behind")])
 def test_late_codes_of_all_satellites_of_a_side_are_in_the_level(
     recordings: Path, name: str, start: int, side: str
 ) -> None:

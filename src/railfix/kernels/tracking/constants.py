@@ -181,5 +181,5 @@ JOINED: Final = 0.05
 #: Newton's steps for the level end when one is smaller than this [m].
 PRECISION_M: Final = 1e-7
 ROUNDS: Final = 60
-#: Least part along the line of the sight of a satellite ahead, or behind: below it a late code hardly moves the place.
-AHEAD: Final = 0.2
+#: Least part along the line of the sight of a satellite ahead, or behind: a late code below it moves the place by less.
+AHEAD: Final = 0.3
