@@ -259,6 +259,24 @@ def test_a_train_that_runs_back_over_another_track_has_a_route_and_says_so() -> 
     assert left_out[0] in (1, 2)
 
 
+def test_there_and_back_over_the_same_tracks_chainage_rises_on_the_way_there() -> None:
+    net = made_network(10.0)
+    log, _ = made_run(net, [0, 1, 3], rng=np.random.default_rng(5), sigma_m=0.05)
+    matched = match(net, log, sigma_m=0.3)
+    for seed in range(20):
+        share = np.random.default_rng(seed).uniform(0.5, 1.0, len(log.time))[:, None] * matched.probabilities
+        found = replace(
+            matched,
+            track=np.concatenate([matched.track, matched.track[::-1]]),
+            probabilities=np.concatenate([share, share[::-1]]),
+            candidates=replace(
+                matched.candidates,
+                track=np.concatenate([matched.candidates.track, matched.candidates.track[::-1]]),
+            ),
+        )
+        assert route_of(net, found) == ([0, 1, 3], [])
+
+
 @pytest.mark.parametrize("jump", [(30, 10, 5), (2, 3, 3), (60, 4, 0)])
 def test_a_jump_to_a_track_beside_cuts_no_connected_route(jump: tuple[int, int, int]) -> None:
     """The loop, nothing and the main track again: no way leads from the loop back, but one over all main tracks."""

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from math import fsum
 from typing import Literal
 
 import numpy as np
@@ -162,7 +163,8 @@ def route_of(network: Network, matched: Matched) -> tuple[list[int], list[int]]:
         # the train turned back, the map has a gap, or positions lay on a track that was not passed
         routes = [*_legs(network, passed), *(_most_of(network, order, share) for order in (passed, passed[::-1]))]
     once = [part for route in routes if route is not None for part in _once(network, route)]
-    route = max(once, key=lambda leg: sum(share.get(t, 0.0) for t in leg))
+    # `fsum` rounds the same in any order: there and back over the same tracks, the way there is the route
+    route = max(once, key=lambda leg: fsum(share.get(t, 0.0) for t in leg))
     return route, [t for t in dict.fromkeys(passed) if t not in route]
 
 
