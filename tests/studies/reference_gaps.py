@@ -21,8 +21,8 @@ import recordings_truth
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.timescale import seconds, timedelta
 from railfix.evaluate import along_track_error, interpolate_reference
+from railfix.io import read_navigation, read_observations
 from railfix.io.position_log import PositionLog
-from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import DEFAULT_SIGNALS
 from railfix.positioning.doppler_speed import Dopplers, doppler_speed, dopplers_of_log
 from railfix.reference import Pulses, ReferenceData, ReferenceSettings, build_references

@@ -10,7 +10,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from itertools import chain, islice, pairwise
+from itertools import chain, groupby, islice, pairwise
+from operator import itemgetter
 from typing import Any, Final
 
 import numpy as np
@@ -292,6 +293,12 @@ def _join_header(parts: Sequence[Observations]) -> ObservationHeader:
         channels = {**header.glonass_channel, **channels}
     joined = {system: tuple(sorted(names)) for system, names in signals.items()}
     return replace(first, signals=joined, glonass_channel=channels)
+
+
+def signals_by_system(satellite: Strings, signal: Strings) -> dict[str, tuple[str, ...]]:
+    """Return the signals of the channels by constellation letter, sorted (`ObservationHeader.signals`)."""
+    pairs = sorted(set(zip(satellite.astype("<U1").tolist(), signal.tolist(), strict=True)))
+    return {system: tuple(name for _, name in group) for system, group in groupby(pairs, key=itemgetter(0))}
 
 
 def capped_problems(messages: Iterable[str], *, count: int) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -190,15 +190,8 @@ def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None
             else "holds no position of the receiver (UBX NAV-PVT or NAV-HPPOSLLH, SBF PVTGeodetic or PVTCartesian)"
         )
         raise InputFileError(path, why)
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return PositionLog(
-        path=str(path),
-        time=columns["time"],
-        ecef_m=columns["ecef_m"],
-        quality=columns["quality"],
-        sigma_m=columns["sigma_m"],
-        line=np.arange(1, len(columns["time"]) + 1),
-    )
+    columns: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return PositionLog(path=str(path), line=np.arange(1, len(columns["time"]) + 1), **columns)
 
 
 #: Kinds of messages with observations.

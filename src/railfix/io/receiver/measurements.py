@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings
 from railfix.core.timescale import from_week, gpst_minus_utc, nearest_week, seconds, timedelta, to_week
-from railfix.gnss.observations import ObservationHeader, Observations
+from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.nav_messages import Values
 from railfix.io.rinex.navigation_records import RawRecord, fields_of
@@ -145,9 +145,6 @@ def slips(lock_s: Floats, polarity: Floats) -> Masks:
 
 
 def _header(measurements: Measurements, satellite: Strings, signal: Strings) -> ObservationHeader:
-    signals: dict[str, set[str]] = {}
-    for name, code in zip(satellite.tolist(), signal.tolist(), strict=True):
-        signals.setdefault(name[0], set()).add(code)
     glonass = np.char.startswith(measurements.satellite, "R")
     channel = dict(
         zip(measurements.satellite[glonass].tolist(), measurements.glonass_channel[glonass].tolist(), strict=True)
@@ -156,7 +153,7 @@ def _header(measurements: Measurements, satellite: Strings, signal: Strings) -> 
         receiver=measurements.receiver,
         glonass_channel={name: number for name, number in sorted(channel.items()) if -7 <= number <= 6},
         leap_seconds=measurements.leap_seconds,
-        signals={system: tuple(sorted(codes)) for system, codes in sorted(signals.items())},
+        signals=signals_by_system(satellite, signal),
     )
 
 
@@ -168,22 +165,10 @@ ROW_ARRAYS: Final = (
 
 def no_measurements(receiver: str) -> Measurements:
     """Create measurements without a row."""
-    numbers, names = np.zeros(0), np.zeros(0, dtype="<U3")
-    return Measurements(
-        time=np.zeros(0, dtype="datetime64[ns]"),
-        epoch=np.zeros(0, dtype=np.intp),
-        satellite=names,
-        signal=names,
-        code_m=numbers,
-        phase_cycles=numbers,
-        doppler_hz=numbers,
-        cn0_dbhz=numbers,
-        lock_s=numbers,
-        half_cycle=np.zeros(0, dtype=bool),
-        polarity=np.zeros(0, dtype=np.int64),
-        glonass_channel=np.zeros(0, dtype=np.int64),
-        receiver=receiver,
-    )
+    kinds = {"satellite": "<U3", "signal": "<U3", "half_cycle": "?", "polarity": "<i8", "glonass_channel": "<i8"}
+    rows: dict[str, Any] = {name: np.zeros(0, dtype=kinds.get(name, "<f8")) for name in ROW_ARRAYS}
+    nothing = np.zeros(0, dtype=np.intp)
+    return Measurements(time=nothing.astype("datetime64[ns]"), epoch=nothing, receiver=receiver, **rows)
 
 
 def join_measurements(parts: Sequence[Measurements]) -> Measurements:

@@ -20,8 +20,8 @@ from railfix import kernels
 from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks, Strings
 from railfix.gnss.observations import channels_with_data
 from railfix.io.rinex.header import RinexHeader
-from railfix.io.rinex.observations_epochs import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, EpochHeads, FaultLog
-from railfix.io.rinex.observations_lines import KINDS, SYSTEMS, Lines, SignalColumn
+from railfix.io.rinex.observations_epochs import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, FaultLog
+from railfix.io.rinex.observations_lines import KINDS, SYSTEMS, EpochHeads, Lines, SignalColumn
 
 Words = NDArray[np.uint64]
 
@@ -138,7 +138,7 @@ class Dense:
 
     satellite: Strings
     signal: Strings
-    kinds: tuple[Floats, Floats, Floats, Floats]
+    values: dict[str, Any]  #: Arrays by their names in `Observations`.
     lock: Bytes
 
 
@@ -323,10 +323,9 @@ def _scatter(parts: list[tuple[str, DecodedRows, Fields, tuple[SignalColumn, ...
         kernels.reading.placed_fields(kinds, lock, cell, kind, signal, fields.value, fields.lock)
     used = channels_with_data(kinds, lock)
     keep = np.flatnonzero(used) if not used.all() else slice(None)
-    code, phase, doppler, cn0 = kinds[:, :, keep]
     return Dense(
         satellite=np.array(satellites, dtype="<U3")[keep],
         signal=np.array(signals, dtype="<U2")[keep],
-        kinds=(code, phase, doppler, cn0),
+        values=dict(zip(KINDS.values(), kinds[:, :, keep], strict=True)),
         lock=lock[:, keep],
     )
