@@ -79,9 +79,7 @@ class Case:
     truth: Path
 
     def check_hashes(self) -> None:
-        """Raise InputFileError where a file is missing or not the one that the case was made of, SettingsError without
-        a hash.
-        """
+        """Raise InputFileError where a file is not the one of the case, SettingsError without a hash."""
         for name in self.content.every_file():
             path, stated = self.folder / name, self.content.sha256.get(str(name))
             if stated is None:
@@ -133,10 +131,7 @@ def write_case(folder: Path, content: Mapping[str, Any]) -> None:
 
 
 def check_not_fitted(config: Config, cases: Sequence[Case]) -> None:
-    """Raise MismatchError where a file of the settings was fitted on a file of a held-out case.
-
-    C/N0 curves and error models record the SHA-256 of the files that they were made from.
-    """
+    """Raise MismatchError where a file of the settings was fitted (by the SHA-256 it records) on a held-out case."""
     files = [path for path in (config.cn0_curve, config.error_model) if path is not None]
     for path in files:
         text = read_text(path)

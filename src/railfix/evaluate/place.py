@@ -75,10 +75,7 @@ def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float 
 def interpolate_reference(
     time: Datetimes, reference_time: Datetimes, reference_ecef_m: Floats, *, largest_gap_s: float = LARGEST_GAP_S
 ) -> Floats:
-    """Reference positions, shape (R, 3), linearly at other times, shape (T, 3) [m]; NaN outside and in gaps.
-
-    Times of the reference rise; steps longer than `largest_gap_s` are not bridged.
-    """
+    """Interpolate positions (R, 3) linearly at times (T,) [m]; NaN outside and in steps longer than `largest_gap_s`."""
     return bracket(time, reference_time, largest_gap_s=largest_gap_s).of(reference_ecef_m)
 
 
@@ -131,11 +128,7 @@ def along_track_error(
 
 
 def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory) -> Floats:
-    """Straight distance between positions on the map and the reference's nearest point on the map, shape (T,) [m].
-
-    It needs no choice between several passes of the line at one place, and never exceeds the distance along the line.
-    NaN where the position or the reference, shape (T, 3), is missing.
-    """
+    """Straight distance between positions (T, 3) on the map and its point nearest to the reference, shape (T,) [m]."""
     distance = np.full(len(arc_m), np.nan)
     rows = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
     if len(rows):
@@ -204,11 +197,8 @@ def errors_of(
     method: Literal["auto", "chainage", "trajectory"],
     files: TrackFiles,
 ) -> PlaceErrors:
-    """Return the errors of one antenna of a run.
-
-    By chainage if the reference has one at every epoch, the run's chainage is that of the antenna, and both agree with
-    the coordinates to `SAME_MAP_M` at the median; otherwise along the trajectory. MismatchError: `method` is "chainage"
-    and not applicable, or the track is not that of the run.
+    """Return the errors of one antenna of a run, by chainage where the reference has it, on the same map to
+    `SAME_MAP_M`, else along the trajectory. MismatchError: the method asked for or the track does not fit.
     """
     _check_same_place(run, antenna, answers)
     against, trusted = _against_chainage(run, antenna, answers)
@@ -306,10 +296,7 @@ def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
 def find_trajectory(
     run: RunFolder, antenna: str, chainage_m: Floats, ecef_m: Floats, files: TrackFiles
 ) -> tuple[Trajectory, tuple[tuple[str, Path], ...], tuple[str, ...]]:
-    """Return the trajectory of a run's positions, shape (T,), (T, 3), from its track and vehicle; files and notes.
-
-    MismatchError: the positions do not lie on it: another track or vehicle, or other reading options.
-    """
+    """Return the trajectory of a run's positions, its files and notes; MismatchError: they do not lie on it."""
     tracks = list(files.track) or run.tracks
     vehicles = [files.vehicle] if files.vehicle is not None else run.input_paths("vehicle")
     if not tracks:

@@ -136,10 +136,7 @@ def base_station(
 def base_station_from_files(
     paths: Sequence[Path], processor: EpochProcessor, *, position_ecef_m: Floats | None = None
 ) -> StationErrors:
-    """Common range errors from RINEX files; the position is that of the header where none is given.
-
-    InputFileError: no position is known, or no error could be computed.
-    """
+    """Compute common range errors from RINEX files, by default at the header's position; InputFileError without one."""
     parts = list(scan_observations(paths, epochs=20_000))
     place = position_ecef_m if position_ecef_m is not None else parts[0].header.approximate_ecef_m
     if place is None or not np.isfinite(place).all() or np.linalg.norm(place) < 1e6:

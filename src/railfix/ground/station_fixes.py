@@ -114,10 +114,7 @@ def station_fixes(
 
 
 def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats, *, cn0_fallen: Masks) -> StationFixes:
-    """Compute fixes from corrected ranges of the same satellites, by the single-point solution of a run.
-
-    At T times, from N ranges at N known points, shape (N, 3); `cn0_fallen` has the shape (T, N).
-    """
+    """Compute single-point fixes at T times from corrected ranges at known points (N, 3); `cn0_fallen` (T, N)."""
     plane = _plane(points_ecef_m)
     fixes = [
         single_point(item, np.broadcast_to(point, (len(time), 3))).ecef_m

@@ -215,10 +215,7 @@ def _times(texts: list[str]) -> Datetimes:
 
 
 def read_rtklib_positions(path: str | PathLike[str]) -> PositionLog:
-    """Read RTKLIB's solution format in any of its time and coordinate forms (manual 2.4.2, appendix B.1).
-
-    Baselines (e/n/u) and heights above the geoid are rejected: they give no ellipsoidal position.
-    """
+    """Read RTKLIB's solution format (manual 2.4.2, B.1); baselines and heights above the geoid are rejected."""
     lines = read_text(path).splitlines()
     header = [line for line in lines if line.startswith("%")]
     rows = [(i, line) for i, line in enumerate(lines, start=1) if line.strip() and not line.startswith("%")]

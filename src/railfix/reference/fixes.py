@@ -239,11 +239,8 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
 def judge_travel(
     fixes: Fixes, travelled: Callable[[Datetimes], tuple[Floats, Floats]], settings: ReferenceSettings
 ) -> Fixes:
-    """Reject rows by the way between them against the way travelled (P2 3.3).
-
-    Neighbours that agree make a run; kept is the chain of runs that holds most fixes, where each joint that does not
-    agree counts against it. So a short wrong stretch goes, and where long stretches on both sides stay apart, the
-    sensor is held wrong and both stay. `travelled` gives the way up to instants and its variance; NaN where unknown.
+    """Reject rows by the way between them against the way travelled and its variance (P2 3.3): kept is the chain of
+    agreeing runs with most fixes, less joints that disagree.
     """
     rows = fixes.good
     if len(rows) < 2:

@@ -43,11 +43,8 @@ class _Passes:
 def match(
     time: Datetimes, ecef_m: Floats, trajectory: Trajectory, *, lateral_m: float, height_m: float, max_speed_mps: float
 ) -> MatchedReference:
-    """Put F positions on a trajectory, in order of rising time.
-
-    Where the line passes a place more than once (a loop, laps), the chain of passes is taken that a train
-    no faster than `max_speed_mps` can run, and of several such the one with the shortest way. Passes further off than
-    `lateral_m` and `height_m` are none.
+    """Put F positions on a trajectory, in order of time: of several passes of a place the shortest chain within
+    `max_speed_mps`, none further off than `lateral_m` and `height_m`.
     """
     count = len(ecef_m)
     nearest, _ = trajectory.nearest(ecef_m)

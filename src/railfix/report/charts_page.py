@@ -150,10 +150,7 @@ _IGNORED: Final = ("Point", "MultiPoint")
 
 
 def read_background(path: Path) -> tuple[Floats, ...]:
-    """Read lines and outlines of a GeoJSON file, each of shape (P, 2): longitude and latitude [deg].
-
-    Points are left out; InputFileError where it is not GeoJSON, or has no lines.
-    """
+    """Read lines and outlines of a GeoJSON file, each (P, 2) [deg]; InputFileError where it has none."""
     node = read_json_object(path, what="GeoJSON")
     lines = tuple(_lines(path, node))
     if not lines:

@@ -156,10 +156,7 @@ class Group:
 
 
 def overview(run: ReportedRun, antenna: str, background: Sequence[Floats] = ()) -> Group:
-    """Plan of the line and errors over chainage of one antenna: the picture at the top of the page.
-
-    Without a reference, protection levels or intervals stand beside the plan.
-    """
+    """Plan of the line and errors over chainage of one antenna, or protection levels without a reference."""
     positions, errors = run.positions_of(antenna), run.errors_of(antenna)
     if errors is not None:
         beside = error_over_chainage(errors, filtered=run.filtered_of(antenna))
@@ -189,11 +186,7 @@ def _plan(run: ReportedRun, antenna: str, background: Sequence[Floats]) -> Chart
 def antenna_groups(
     run: ReportedRun, antenna: str, *, sky: int = SKY_EPOCHS, background: Sequence[Floats] = ()
 ) -> Iterator[Group]:
-    """Charts of one antenna of a run.
-
-    `sky` is the largest number of epochs of the sky plot; `background` has longitude and latitude of lines to draw
-    below the plan, each of shape (P, 2) [deg].
-    """
+    """Charts of one antenna of a run; `sky`: most epochs of the sky plot, `background`: lines below the plan [deg]."""
     positions, errors = run.positions_of(antenna), run.errors_of(antenna)
     start = start_of(positions)
     yield Group(title="The line", charts=_keep(_plan(run, antenna, background)), start=start)

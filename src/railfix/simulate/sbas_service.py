@@ -37,11 +37,7 @@ DEGRADATION: Final = {
 
 
 def message(kind: int, second: int, *fields: Field) -> Bytes:
-    """Message of a type, with one of the three preambles by its second, and its parity, shape (32,).
-
-    The fields (value, length) lie from bit 14 on, negative values in two's complement. ValueError: when a value does
-    not fit its field, or the fields are longer than a message.
-    """
+    """Message of a type and its parity (32,); fields (value, length) from bit 14 on. ValueError: one does not fit."""
     return pack_message(f"{PREAMBLES['L1'][second % 3]:08b}{kind:06b}", kind, fields)
 
 

@@ -161,11 +161,7 @@ class AlignmentPoints:
 def alignment_at(
     place_m: Floats, plan: Sequence[PlanElement], profile: Sequence[ProfileElement], cant: Sequence[CantElement]
 ) -> AlignmentPoints:
-    """Points of an alignment at lengths in plan, shape (n,), within the plan's length.
-
-    Each element is evaluated from its own first point as the file has it, so an error of one is not carried on. At
-    a joint the later element holds. Beyond the profile its last gradient goes on; beyond the cant there is none.
-    """
+    """Return points of an alignment at lengths in plan (n,), each by the first point of its own element."""
     starts = np.concatenate([[0.0], np.cumsum([element.length_m for element in plan])])
     xy, curvature = np.zeros((len(place_m), 2)), np.zeros(len(place_m))
     index = np.clip(np.searchsorted(starts, place_m, side="right") - 1, 0, len(plan) - 1)
@@ -233,11 +229,7 @@ def segment_of_design(
     grid: tuple[float, float, float, float, float, float] | None = None,
     notes: tuple[str, ...] = (),
 ) -> Segment:
-    """Return the points of one alignment as a segment, without heights where the profile is empty.
-
-    `grid`: easting, northing, height, cosine and sine of the rotation, and scale that turn the file's coordinates into
-    those of the grid. InputFileError: no element, or no grid. SettingsError: no height datum.
-    """
+    """Return the points of one alignment; `grid`: easting, northing, height, cosine, sine, scale of the file."""
     if not plan:
         raise InputFileError(path, f"alignment {name!r} has no element in plan")
     crs = reading.crs

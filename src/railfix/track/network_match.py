@@ -159,12 +159,8 @@ def match(
     within_m: float | None = None,
     correlation_s: float = 20.0,
 ) -> Matched:
-    """Match positions of a run, in the order of travel and in the frame of the network, to its tracks.
-
-    `sigma_m` is the standard deviation of the distance from the track, map included (by default of the log and the
-    map); `within_m` the farthest track considered (30 m, or five standard deviations up to 100 m); `correlation_s` the
-    time over which errors persist that are not common to minutes. Heights count where both sides have them and tracks
-    lie above each other. MismatchError: there is no position.
+    """Match positions of a run, in the order of travel and in the frame of the network, to its tracks no farther than
+    `within_m`; `sigma_m` is of the distance from the track, `correlation_s` the time over which errors persist.
     """
     given = np.flatnonzero(np.isfinite(log.latitude_deg))
     if not len(given):

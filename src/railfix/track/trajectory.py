@@ -85,11 +85,7 @@ class NearestOnPolyline:
 def nearest_segments(
     points_m: Floats, segment: Indices, start_m: Floats, step_m: Floats
 ) -> tuple[Indices, Floats, Floats]:
-    """Find the nearest of some segments (n, C) to each point (n, 3); of equally near ones the one earlier on the line.
-
-    `start_m` and `step_m`, shape (V - 1, 3), are the segments' first points and steps. Returns the segment, the place
-    on it, 0 to 1, and the distance, shapes (n,).
-    """
+    """Return the nearest of some segments (n, C) to each point (n, 3), the place on it and the distance."""
     share, offset = project_on_segments(points_m[:, None], start_m[segment], step_m[segment])
     best = offset.min(axis=1)
     # independent of the order of the tree that has named the segments

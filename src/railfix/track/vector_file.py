@@ -193,11 +193,7 @@ _NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")  #: C
 
 
 def read_layers(path: str | PathLike[str], *, geometry: str) -> list[tuple[str | None, list[dict[str, Any]], Any]]:
-    """Read all features of a kind of geometry ("LineString"), or whatever their geometry ("none").
-
-    One entry a layer: CRS or None, properties of each feature, shapely geometries. InputFileError: when pyogrio is
-    missing, or GDAL cannot read the file.
-    """
+    """Read CRS, properties and geometries of all features of a kind ("LineString", "none": any), an entry a layer."""
     try:
         import pyogrio
         import shapely
@@ -244,11 +240,7 @@ def _check_text(path: str | PathLike[str]) -> None:
 
 
 def read_vector_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
-    """Read the lines of a map file as segments, in the order of the file.
-
-    The CRS is that of a file without one (an error where the file names another one); height datum and geoid are those
-    of coordinates with heights: a segment whose heights are all 0 counts as one without. InputFileError, SettingsError.
-    """
+    """Read the lines of a map file as segments; CRS, height datum and geoid are for files that name none."""
     check_height_datum(reading.height_datum)
     segments: list[Segment] = []
     left_out: Counter[str] = Counter()

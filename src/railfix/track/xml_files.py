@@ -246,10 +246,8 @@ def _landxml_profile(path: str, profile: Any, scale: float, start: float) -> lis
 
 
 def _landxml_cant(cant: Any, scale: float, start: float) -> tuple[list[CantElement], tuple[str, ...]]:
-    """Elements between cant stations, about the rail or the middle that the file names; and notes.
-
-    Without a name the outer rail is raised. A ramp runs by the transition type of the station that it begins at. The
-    applied cant is in millimetres, in inches where lengths are imperial (LandXML 1.2), in metres in InfraModel.
+    """Return elements between cant stations and notes; the outer rail is raised unless named; units are mm, inches
+    where lengths are imperial (LandXML 1.2), metres in InfraModel.
     """
     if cant is None:
         return [], ()

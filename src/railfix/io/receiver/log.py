@@ -162,11 +162,8 @@ _BLOCK_BYTES = 1 << 22
 
 
 def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None) -> PositionLog:
-    """Read the positions that a receiver computed from its log, plain or packed; `line` counts the positions.
-
-    SBF PVTGeodetic, or PVTCartesian without it; UBX NAV-HPPOSLLH, or NAV-PVT without it. `date` is some time within
-    half a week, for UBX logs without a dated NAV-PVT. InputFileError: the log has no position, or none that can be
-    dated.
+    """Read the positions that a receiver computed (SBF PVT, UBX NAV-HPPOSLLH or NAV-PVT); `date`, within half a week,
+    is for UBX logs without a dated NAV-PVT.
     """
     parts = []
     near = np.datetime64("NaT", "ns") if date is None else date.astype("datetime64[ns]")
@@ -215,11 +212,8 @@ class LogPiece:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamState:
-    """What the bytes so far left: the start of a frame, unfinished ephemerides, the last known time.
-
-    `kind`: the messages that the observations are taken from; `observed`: whether there was an epoch of the receiver's
-    own format; `clock`: the last time of an epoch or another message; `station`: position of a base station (RTCM 1005,
-    1006).
+    """What the bytes so far left; `kind` are the messages that observations are taken from, `observed` whether one
+    came, `clock` the last time of any message, `station` that of RTCM 1005 and 1006.
     """
 
     rest: bytes = b""

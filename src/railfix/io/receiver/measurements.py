@@ -130,11 +130,7 @@ def rising_epochs(time: Datetimes, after: np.datetime64 | None = None) -> Masks:
 
 
 def slips(lock_s: Floats, polarity: Floats) -> Masks:
-    """Epochs whose phase is not continuous with the channel's last one, shape (T, M).
-
-    Lock time zero or less than before, or a change of polarity; both are NaN where there is no phase. The first phase
-    of a channel counts as continuous unless its lock time is zero.
-    """
+    """Flag phases not continuous (T, M): lock time 0 or less than before, or changed polarity; NaN without phase."""
     present = ~np.isnan(lock_s)
     epochs = np.where(present, np.arange(len(lock_s))[:, None], -1)
     last = np.concatenate([np.full((1, lock_s.shape[1]), -1), np.maximum.accumulate(epochs, axis=0)[:-1]])
@@ -228,9 +224,7 @@ def cnav_record(satellite: str, values: Values) -> Record:
 
 
 def bcnav_record(satellite: str, message: str, values: Values) -> Record | None:
-    """Record of BeiDou from the fields of B-CNAV1 or 2 (the whole week: no date is needed); None of another
-    satellite.
-    """
+    """Record of BeiDou from the fields of B-CNAV1 or 2, with the whole week; None of another satellite."""
     if int(values["kind"]) not in nav_messages.BCNAV_AXIS_M or f"C{int(values['number']):02d}" != satellite:
         return None
     sent = from_week(int(values["week"]) + _BDS_WEEK_MINUS_GPS, values["tow_s"])

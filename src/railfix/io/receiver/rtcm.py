@@ -95,11 +95,8 @@ def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
 
 
 def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews) -> tuple[Measurements, Integers]:
-    """Decode all MSM4 to MSM7 messages, and find where in the stream each epoch begins.
-
-    Messages of one instant make one epoch. `near` is a time within half a week of the first message, GPS time (NaT:
-    none); every other message is within half a week of the one before it. Phases of GLONASS have no cycles where no
-    channel is known.
+    """Decode all MSM4 to MSM7 messages, those of one instant as one epoch, and find where each begins; `near` is within
+    half a week of the first (NaT: none), each other within half a week of the one before.
     """
     messages = frames.of("rtcm3", *MSM_NUMBERS)
     parts = [

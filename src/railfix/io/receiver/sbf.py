@@ -251,10 +251,7 @@ def _read_signed(value: Integers, bits: int) -> Integers:
 
 
 def navigation_subframes(frames: Frames) -> Subframes:
-    """Navigation pages, their words laid out as in UBX RXM-SFRBX.
-
-    Pages whose parity or CRC the receiver found wrong are left out and counted.
-    """
+    """Return navigation pages that passed the receiver's check, their words laid out as in UBX RXM-SFRBX."""
     chosen = frames.of("sbf", *_PAGES)
     # The shortest block (GLONASS, three words) has 24 bytes; words that a block lacks are zero.
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= 24]
@@ -346,10 +343,7 @@ def _words_of_30(words: Words) -> Words:
 
 
 def positions(frames: Frames) -> dict[str, np.ndarray]:
-    """The receiver's own positions: of PVTGeodetic blocks where it sends them, else of PVTCartesian.
-
-    ``time``, ``ecef_m`` (shape (N, 3)), ``quality`` (as RTKLIB counts), ``sigma_m`` (shape (N, 3), NaN).
-    """
+    """Return the receiver's own positions, of PVTGeodetic, else PVTCartesian blocks: columns of `PositionLog`."""
     geodetic = len(frames.of("sbf", PVT_GEODETIC)) > 0
     chosen = frames.of("sbf", PVT_GEODETIC if geodetic else PVT_CARTESIAN)
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _PVT.itemsize]

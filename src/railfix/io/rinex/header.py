@@ -95,11 +95,7 @@ def _check_kind(path: str, line: str) -> None:
 
 
 def parse_header(path: str, lines: Sequence[str], *, notes: list[str] | None = None) -> RinexHeader:
-    """Parse the header of an observation file, its lines up to END OF HEADER.
-
-    Unreadable records that do not affect how the file is read are put into `notes` where that is given, else raised.
-    InputFileError: version not supported, types missing or miscounted, or an invalid number.
-    """
+    """Parse the header of an observation file; unreadable records that do not matter go into `notes` if given."""
     version = read_version(path, lines[0])
     system = lines[0][40:41].strip().upper() or ("G" if version < 3.0 else "M")
     if system not in SYSTEMS + "M":

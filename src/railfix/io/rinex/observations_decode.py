@@ -58,11 +58,7 @@ def joined(parts: Sequence[Fields]) -> Fields:
 
 
 def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
-    """Gather `count` fields of lines as pairs of little-endian 64-bit words, shape (n, count, 2).
-
-    `start` and `length`, shape (n,), are of the first field and of the rest of the line; beyond its end is blank.
-    `data` ends with `PADDING` bytes.
-    """
+    """Gather `count` fields of lines as pairs of little-endian 64-bit words (n, count, 2), blank beyond `length`."""
     width = FIELD_WIDTH * count
     if width > PADDING:
         raise ValueError(f"a line of {count} fields is longer than the padding of {PADDING} bytes")

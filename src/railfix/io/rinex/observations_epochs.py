@@ -105,11 +105,7 @@ _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 def find_epochs(
     lines: Lines, *, version: float, lines_per_satellite: int, at_end: bool, log: FaultLog
 ) -> tuple[EpochHeads, int]:
-    """Find the complete epochs and events of a block, and the number of lines they and broken lines take.
-
-    `lines` are complete ones from the first of a record; where the file does not end with them (`at_end`) the last
-    epoch waits for the next block. `lines_per_satellite` is for RINEX 2, with lines of five observations.
-    """
+    """Find the complete epochs and events of a block, and the lines they take; not `at_end`, the last one waits."""
     if version >= 3.0:
         return _find_marked(lines, version=version, at_end=at_end, log=log)
     return _find_unmarked(lines, lines_per_satellite=lines_per_satellite, at_end=at_end, log=log)
