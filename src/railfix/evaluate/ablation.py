@@ -142,9 +142,7 @@ def ablate_files(
     names: Mapping[str, str] | None = None,
     progress: Progress | None = None,
 ) -> Ablation:
-    """Process the logs, read once, with every choice of screens and of the filter's sources, and write rates and errors
-    of each to ``ablation.csv`` and ``ablation.json``.
-    """
+    """Process the logs with every choice of screens and sources, and write ``ablation.csv`` and ``ablation.json``."""
     began = clock.perf_counter()
     options = options or RunOptions()
     inputs, config = inputs.prepare(config or Config())

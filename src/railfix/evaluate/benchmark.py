@@ -62,9 +62,7 @@ def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
 
 
 def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Trajectory) -> pl.DataFrame:
-    """Return positions of another program as a table of a run (`inputs.NEEDED`), moved to the nearest point of the
-    line; `epochs` are railfix's of the same log.
-    """
+    """Return positions of another program as a table of a run, moved to the nearest point of the line."""
     time = epochs["time_gpst"].to_numpy()
     row = rows_at_epochs(time, log.time)
     has = row >= 0
@@ -206,9 +204,8 @@ def run_benchmark(
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """Run the cases of a folder with one configuration, and judge them and other programs; what is there is not
-    repeated. Returns `BENCHMARK_COLUMNS` and notes. InputFileError: a wrong hash. MismatchError: settings made from
-    held-out cases.
+    """Run the cases of a folder with one configuration, and judge them and other programs; return `BENCHMARK_COLUMNS`
+    and notes. InputFileError: a wrong hash. MismatchError: settings made from held-out cases.
     """
     cases = read_cases(folder)
     check_not_fitted(config, cases)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -11,14 +11,13 @@ from pydantic import Field
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import file_sha256, read_text
-from railfix.core.settings import Settings, load_settings, validated, write_toml
+from railfix.core.settings import Settings, load_settings
 from railfix.evaluate.inputs import EvaluationOptions
 from railfix.pipeline.config import Config
 from railfix.run.inputs import Antenna, ColumnNames, RunInputs, RunOptions
 
 #: File that makes a folder a case.
 CASE_FILE: Final = "case.toml"
-_KIND: Final = "a case of a benchmark"
 #: Files of a run that are settings: one configuration is that of all cases.
 _SETTINGS: Final = ("config", "cn0_curve", "error_model", "sbas")
 
@@ -96,7 +95,7 @@ class Case:
 def read_case(folder: Path) -> Case:
     """Read the case in a folder; InputFileError, SettingsError where ``case.toml`` is not that of a case."""
     path = folder / CASE_FILE
-    content = load_settings(CaseFile, path, what=_KIND)
+    content = load_settings(CaseFile, path, what="a case of a benchmark")
     if content.files.truth is None:
         raise SettingsError(f"{path}: setting files.truth is missing; name the ground truth")
     if given := [name for name in _SETTINGS if getattr(content.files, name)]:
@@ -121,13 +120,6 @@ def read_cases(folder: Path) -> list[Case]:
     if not folders:
         raise InputFileError(folder, f"no folder in it has a {CASE_FILE}; railfix benchmark --help shows one")
     return [read_case(path) for path in folders]
-
-
-def write_case(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write the ``case.toml`` of a folder from its content without hashes; errors as `read_case`."""
-    case = validated(CaseFile, {**content, "sha256": {}}, source=str(folder / CASE_FILE))
-    hashes = {str(name): file_sha256(folder / name) for name in case.every_file()}
-    write_toml(folder / CASE_FILE, {**content, "sha256": hashes}, what=_KIND)
 
 
 def check_not_fitted(config: Config, cases: Sequence[Case]) -> None:

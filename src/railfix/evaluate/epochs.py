@@ -124,9 +124,7 @@ def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
 def distance_travelled(
     time: Datetimes, step_m: Floats, known: Masks, speed_mps: Floats, *, options: EvaluationOptions
 ) -> Floats:
-    """Return the distance travelled since the first epoch with a known reference position, shape (T,) [m], by steps in
-    which the train moved; NaN before the first and after the last.
-    """
+    """Return the distance travelled since the first known reference position (T,) [m]; NaN before and after."""
     at = np.flatnonzero(known)
     moved = np.full(len(time), np.nan)
     if not len(at):

@@ -85,9 +85,7 @@ def block_limits(
     seed: int,
     confidence: float,
 ) -> dict[str, float]:
-    """Return limits of mean, rate and percentiles (`LIMIT_COLUMNS`), and the number of blocks, by drawing blocks with
-    replacement; NaN with fewer than `FEWEST_BLOCKS`. Arrays are of shape (T,).
-    """
+    """Return `LIMIT_COLUMNS` and the number of blocks, drawn with replacement; NaN below `FEWEST_BLOCKS`."""
     names, member = np.unique(block, return_inverse=True)
     blocks = len(names)
     if blocks < FEWEST_BLOCKS:

@@ -157,9 +157,7 @@ def tables_of(path: Path) -> list[str]:
 def read_run(
     path: Path, *, table: str = POSITIONS_TABLE, conventional: Path | None = None, columns: cs.Selector | None = None
 ) -> RunFolder:
-    """Read a folder that `railfix run` wrote; a filter's `table` takes satellites used and conventional position from
-    the single epochs. InputFileError, MismatchError: not what it should be.
-    """
+    """Read a folder that `railfix run` wrote; InputFileError, MismatchError: it is not what it should be."""
     record = read_record(path).record
     needed = (*NEEDED, *SINGLE_EPOCH) if table == POSITIONS_TABLE else NEEDED
     file, rows = read_table(path, table, needed, columns)

@@ -269,13 +269,8 @@ COLUMNS: Final = (
 
 
 def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_m: float = 20.0) -> pl.DataFrame:
-    """Compute what satellites gave by stretches of the line, over all antennas of several runs on one map.
-
-    Epochs without a position of their own stand where the filter has the train, else where the epochs about them lie.
-    Returns `COLUMNS`, in order of the chainage, without stretches that no run has passed. `rejected_share`: of the
-    satellites; `reflection_p95_m`: distance of the 3-D position from the line; `ok_share`: single epochs with the
-    status ok; `tracking_share` and levels: of the filter, infinite where it has none; null without a filter.
-    MismatchError: the runs are on different maps.
+    """Compute `COLUMNS`, what satellites gave by stretches of the line, over all antennas of runs on one map (else
+    MismatchError); epochs without position stand where the filter has the train.
     """
     runs = [read_run(folder) for folder in folders]
     first = runs[0].track_facts

@@ -9,13 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
 from pydantic import Field
-from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError, MismatchError, RailfixError
@@ -25,7 +23,7 @@ from railfix.evaluate.inputs import LARGEST_GAP_S, Method, RunFolder
 from railfix.run.inputs import TrackReading
 from railfix.track import Track, read_track
 from railfix.track.track import ANOTHER_PLACE_M
-from railfix.track.trajectory import Trajectory, short_way_m
+from railfix.track.trajectory import Trajectory, passes_of, short_way_m
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 
@@ -98,26 +96,14 @@ def along_track_error(
         return error
     reference, length = reference_ecef_m[at], trajectory.length_m
     nearest_arc, offset = trajectory.nearest(reference)
-    middle = 0.5 * (trajectory.ecef_m[1:] + trajectory.ecef_m[:-1])
-    lists = cKDTree(middle).query_ball_point(
-        reference, np.maximum(same_place_m, offset) + 0.5 * length.max(), return_sorted=True
-    )
-    which = np.repeat(np.arange(len(at)), [len(x) for x in lists])
-    section = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=len(which))
-    delta = reference[which] - trajectory.ecef_m[section]
-    along = np.einsum("pi,pi->p", delta, trajectory.tangent[section])
-    foot = np.clip(along, 0.0, length[section])
-    away = np.linalg.norm(delta - foot[:, None] * trajectory.tangent[section], axis=1)
-    # A pass is a local minimum of the distance along the line: no neighbouring section comes nearer.
-    joined = (which[1:] == which[:-1]) & (section[1:] == section[:-1] + 1)
-    passing = away <= same_place_m
+    passes = passes_of(reference, trajectory, np.maximum(same_place_m, offset))
+    passing = passes.lowest & (np.linalg.norm(passes.offset_m, axis=1) <= same_place_m)
     if np.isfinite(trajectory.turn_m):  # the ends of a closed line are no passes: it goes on there
-        passing &= ~((section == 0) & (along <= 0.0))
-        passing &= ~((section == len(length) - 1) & (along >= length[-1]))
-    passing[1:] &= ~joined | (away[1:] <= away[:-1])
-    passing[:-1] &= ~joined | (away[:-1] <= away[1:])
-    signed = np.concatenate([arc_m[at] - nearest_arc, (arc_m[at][which] - trajectory.arc_m[section] - foot)[passing]])
-    owner = np.concatenate([np.arange(len(at)), which[passing]])
+        passing &= ~((passes.segment == 0) & (passes.along_m <= 0.0))
+        passing &= ~((passes.segment == len(length) - 1) & (passes.along_m >= length[-1]))
+    ways = arc_m[at][passes.position] - trajectory.arc_m[passes.segment] - passes.foot_m
+    signed = np.concatenate([arc_m[at] - nearest_arc, ways[passing]])
+    owner = np.concatenate([np.arange(len(at)), passes.position[passing]])
     signed = short_way_m(signed, trajectory.turn_m)
     order = np.lexsort((np.abs(signed), owner))
     first = order[np.flatnonzero(np.r_[True, owner[order][1:] != owner[order][:-1]])]
@@ -197,9 +183,7 @@ def errors_of(
     method: Literal["auto", "chainage", "trajectory"],
     files: TrackFiles,
 ) -> PlaceErrors:
-    """Return the errors of one antenna of a run, by chainage where the reference has it, on the same map to
-    `SAME_MAP_M`, else along the trajectory. MismatchError: the method asked for or the track does not fit.
-    """
+    """Return the errors of one antenna, by chainage on the same map to `SAME_MAP_M`, else along the trajectory."""
     _check_same_place(run, antenna, answers)
     against, trusted = _against_chainage(run, antenna, answers)
     turn = run.turn_m(antenna)

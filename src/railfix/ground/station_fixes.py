@@ -177,12 +177,8 @@ _USUAL_EPOCHS: Final = 600
 
 
 class StationStreams:
-    """Fixes of receivers at known points from their epochs as they arrive.
-
-    An epoch counts when every receiver has it; older ones that wait are then dropped. A receiver that sends nothing
-    therefore gives no fixes at all, which the monitor finds by their lateness. Records from the streams are added to
-    the navigation known from the start; epochs at whole seconds are used. `counts`: epochs "used",
-    "incomplete", and "without common satellites".
+    """Fixes of receivers at known points as epochs arrive: one counts at a whole second when every receiver has it, and
+    drops older ones; `counts` are "used", "incomplete", "without common satellites".
     """
 
     def __init__(self, points_ecef_m: Floats, *, navigation: Navigation | None = None) -> None:

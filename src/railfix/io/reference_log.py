@@ -239,9 +239,7 @@ class Acceleration:
 
 
 def read_pulses(path: str | PathLike[str]) -> Pulses:
-    """Read a tachometer table (CSV, .parquet) with ``time_gpst`` and ``count``, ``distance_m`` or a pulse a row, and
-    maybe ``direction`` (1, -1). InputFileError: none such.
-    """
+    """Read a tachometer table with ``time_gpst`` and ``count`` or ``distance_m``, and maybe ``direction`` (1, -1)."""
     table = _sensor_table(path)
     time = _rising_times(table)
     kind = "count" if "count" in table else "distance" if "distance_m" in table else "pulse"
@@ -261,9 +259,7 @@ def read_pulses(path: str | PathLike[str]) -> Pulses:
 
 
 def read_acceleration(path: str | PathLike[str]) -> Acceleration:
-    """Read a table of accelerations toward the front (CSV, .parquet): ``specific_force_mps2`` or ``force_forward_mps2``
-    with gravity, or ``acceleration_mps2`` of the motion.
-    """
+    """Read a table of ``specific_force_mps2``, ``force_forward_mps2`` or ``acceleration_mps2``, to the front."""
     table = _sensor_table(path)
     kinds = {
         "specific_force_mps2": "specific_force",

@@ -60,9 +60,7 @@ class ReferenceData:
 
 
 def build_references(data: ReferenceData, settings: ReferenceSettings | None = None) -> dict[str, Built]:
-    """Build the reference of every antenna with a log of positions. NoPositionError: fewer than two good fixes.
-    MismatchError: two logs without the distance between the antennas, or sensors of another time.
-    """
+    """Build the reference of every antenna with a log of positions; NoPositionError, MismatchError."""
     settings = settings or ReferenceSettings()
     judged = {name: judge_alone(log, settings) for name, log in data.logs.items()}
     if len(judged) == 2:

@@ -302,9 +302,7 @@ def assemble_reference(
     settings: ReferenceSettings,
     facts: dict[str, Any],
 ) -> Built:
-    """Return the reference of one antenna: places of fixes, smoothed between them, with the errors that fixes have in
-    common; `excess` (G - 1,) is closing error over its sigma.
-    """
+    """Return the reference of one antenna: places of fixes, smoothed between; `excess` (G - 1,) in sigmas."""
     time, good = evidence.time, fixes.good
     at = np.flatnonzero(np.isfinite(evidence.fix_m))
     is_fix = np.zeros(len(time), dtype=np.bool_)

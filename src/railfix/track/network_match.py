@@ -99,11 +99,9 @@ def _check_region(network: Network, log: PlanLog) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Matched:
-    """Positions on a network, n rows; `track` is the most probable sequence, -1 where none fits.
-
-    `offset_m` is in plan, positive to the right of the track. `probability` is that of the track given the whole log;
-    NaN where there is no position, or a wrong one: for less than a minute farther from all tracks than six times
-    `within_m`. `probabilities`, shape (n, m), are those of each candidate; the rest to 1 is that of no mapped track.
+    """Positions on a network, n rows; `track` is the most probable sequence (-1: none), `offset_m` in plan, positive to
+    the right; `probability` is given the whole log, NaN without or with a wrong position; `probabilities`, shape (n,
+    m), of each candidate, the rest to 1 of no mapped track.
     """
 
     track: Indices

@@ -29,10 +29,8 @@ _STEPS = 15
 
 @dataclass(frozen=True, kw_only=True)
 class Filled:
-    """Places of all positions, shapes (n,); `track` is -1 where no place is known and no route was found.
-
-    `bound_m` is the farthest that a train on this route, which does not turn back, can be from the filled place [m];
-    infinite before the first known place and after the last, NaN where the place was known.
+    """Places of all positions, shapes (n,); `track` is -1 without a place or route; `bound_m` is the farthest that a
+    train on this route can be from a filled place [m], infinite before and after known ones.
     """
 
     track: Indices
@@ -41,9 +39,7 @@ class Filled:
 
 
 def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill: Rows = "gaps") -> Filled:
-    """Fill rows without usable position along the shortest route between known places, at even speed; "off-map" also
-    fills rows of positions off the map, by routes as long as their steps to `_DRIFT_M`.
-    """
+    """Fill rows without usable position along the shortest route at even speed; "off-map" also those off the map."""
     filled = Filled(
         track=matched.track.copy(), chainage_m=matched.chainage_m.copy(), bound_m=np.full(len(matched.track), np.nan)
     )

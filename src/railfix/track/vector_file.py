@@ -23,10 +23,9 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import ending, open_stream
-from railfix.track.crs import choose_crs, frame_degrees, older_datum_note, unit_of_heights
+from railfix.track.crs import choose_crs, frame_degrees, unit_of_heights
 from railfix.track.frames import check_height_datum, heights_of_file
-from railfix.track.route import ATTRIBUTES, NO_HEIGHTS, MapReading, Segment
-from railfix.track.track import UNNAMED
+from railfix.track.route import MapReading, Segment, make_segment
 
 #: Standard deviation in plan of a track of OpenStreetMap, drawn from aerial pictures, if its file has none [m].
 SIGMA_M: Final = 2.0
@@ -291,7 +290,7 @@ def plan_segment(
         raise InputFileError(source, "names no CRS, and its coordinates are no degrees; give --crs")
     used = crs or "EPSG:4326"
     latitude, longitude, frame = frame_degrees(used, values[:, 0], values[:, 1], path=source)
-    height, model, datum = np.full(len(values), np.nan), "", NO_HEIGHTS
+    heights = None
     known = np.isfinite(values[:, 2]) if values.shape[1] == 3 else np.zeros(len(values), dtype=np.bool_)
     if known.any() and not known.all():
         raise InputFileError(
@@ -300,23 +299,10 @@ def plan_segment(
             "mend them, or write the line without heights",
         )
     if known.any() and values[:, 2].any():
-        height, model, datum = heights_of_file(
-            values[:, 2] * unit_of_heights(crs), latitude, longitude, reading, path=source
-        )
-    return Segment(
-        source=source,
-        file=path,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        height_m=height,
-        crs=crs or UNNAMED,
-        frame=frame if crs else "EPSG:4979",
-        height_datum=datum,
-        geoid=model,
-        metadata={**(stated or {}), "name": name},
-        notes=older_datum_note(crs),
-        **dict.fromkeys(ATTRIBUTES, np.full(len(values), np.nan)),
-    )
+        heights = heights_of_file(values[:, 2] * unit_of_heights(crs), latitude, longitude, reading, path=source)
+    degrees = latitude, longitude, frame if crs else "EPSG:4979"
+    metadata = {**(stated or {}), "name": name}
+    return make_segment(degrees, heights, source=source, file=path, crs=crs, metadata=metadata)
 
 
 def name_of(row: Mapping[str, Any], *, fallback: str) -> str:

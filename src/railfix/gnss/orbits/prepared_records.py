@@ -153,9 +153,7 @@ def _issues_of(navigation: Navigation) -> _Issues:
 
 
 def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, issue: Integers) -> Integers:
-    """Find the rows of `navigation.kepler` of an `issue` (T, M) (IODC, its lower 8 bits; IODnav), the nearest that is
-    valid, sent or not; -1 without one, and for GLONASS.
-    """
+    """Find the nearest valid row of `navigation.kepler` of an `issue` (T, M), sent or not; -1 without one."""
     table = _issues_of(navigation)
     number = np.array([table.number.get(str(name), -1) for name in satellite], dtype=np.int64)
     issue = np.where(np.char.startswith(satellite, "E") | (issue < 0), issue, issue % 256)

@@ -55,9 +55,7 @@ class Forms(NamedTuple):
 
 
 def whiten_residuals(model: LinearModel, plan: float, height: float, scale: Floats) -> tuple[Compact, Floats, Forms]:
-    """Return the residuals of n channels with the map error, alike in all horizontal directions, in the noise; their
-    design (T, n, 3) [1/m] along, across and up; and the form without fault.
-    """
+    """Return whitened residuals, their design (T, n, 3) [1/m] along, across, up, and the form without fault."""
     normal = np.linalg.inv(model.covariance_m2) - model.prior
     prior = scale[:, None, None] ** 2 * np.diag([plan**-2.0, plan**-2.0, height**-2.0])
     covariance = np.asarray(np.linalg.inv(normal + prior), dtype=np.float64)

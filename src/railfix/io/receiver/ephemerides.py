@@ -51,9 +51,7 @@ _FRAME_S: Final = 30.0
 
 @dataclass(frozen=True, kw_only=True)
 class Unfinished:
-    """What the subframes left: `latest` by satellite and number; `issued`, which tells the last record from the next;
-    `waiting`, GLONASS satellites with all strings, and the first epoch after these.
-    """
+    """What the subframes left: `latest`, what tells the last record (`issued`), GLONASS satellites `waiting`."""
 
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -80,9 +78,7 @@ def assemble_records(
     after: Datetimes,
     first: np.datetime64,
 ) -> tuple[Assembled, Unfinished]:
-    """Return the ephemerides that a piece of a stream completes, and what it leaves; `time` (N,) is of the last epoch
-    before each subframe, `after` of the first after it, `first` of the piece.
-    """
+    """Return the ephemerides that a piece completes, and what it leaves; `time` is before, `after` after each."""
     builder = _EphemerisBuilder(state)
     builder.waiting = {name: first if np.isnat(at) else at for name, at in builder.waiting.items()}
     pages, counts = decode_pages(subframes)

@@ -162,9 +162,7 @@ _BLOCK_BYTES = 1 << 22
 
 
 def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None) -> PositionLog:
-    """Read the positions that a receiver computed (SBF PVT, UBX NAV-HPPOSLLH or NAV-PVT); `date`, within half a week,
-    is for UBX logs without a dated NAV-PVT.
-    """
+    """Read the positions that a receiver computed; `date` is for UBX logs without a dated NAV-PVT."""
     parts = []
     near = np.datetime64("NaT", "ns") if date is None else date.astype("datetime64[ns]")
     undated, rest = 0, b""

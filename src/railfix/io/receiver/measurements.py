@@ -48,9 +48,7 @@ class Measurements:
 
 @dataclass(frozen=True, kw_only=True)
 class Tracking:
-    """What the epochs so far left: the last one, NaT before the first, and lock time [s] and polarity of the last phase
-    of each channel (satellite and signal joined).
-    """
+    """What the epochs left: the last one, and lock time [s] and polarity of the last phase of each channel."""
 
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     lock: Mapping[str, tuple[float, float]] = field(default_factory=dict)

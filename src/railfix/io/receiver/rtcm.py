@@ -95,9 +95,7 @@ def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
 
 
 def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews) -> tuple[Measurements, Integers]:
-    """Decode all MSM4 to MSM7 messages, those of one instant as one epoch, and find where each begins; `near` is within
-    half a week of the first (NaT: none), each other within half a week of the one before.
-    """
+    """Decode all MSM4 to MSM7 messages, and where each epoch begins; `near` is within half a week of the first."""
     messages = frames.of("rtcm3", *MSM_NUMBERS)
     parts = [
         (order, rows, np.full(len(order), SYSTEMS[number // 10] == "R"))

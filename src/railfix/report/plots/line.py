@@ -234,9 +234,7 @@ def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:
 
 
 def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
-    """Return the chainage of each position but the first, and its distance [m] from the one before while the train
-    moved, by the reference or by themselves; `prefix` begins the columns.
-    """
+    """Return chainage and distance [m] from the position before, while the train moved; `prefix` begins the columns."""
     if f"{prefix}interval_m" in table.columns:
         chainage, distance = floats(table, "chainage_m"), floats(table, f"{prefix}interval_m")
         moved = distance > 0.0

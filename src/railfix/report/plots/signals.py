@@ -49,9 +49,7 @@ def cn0_over_elevation(
     curve: Cn0Curve | None = None,
     mask_deg: float | None = None,
 ) -> list[Chart]:
-    """C/N0 over elevation with mean (of the open-sky `curve`, else their own) and thresholds, a chart for each
-    constellation and signal (P1 figure 3).
-    """
+    """C/N0 over elevation with mean and thresholds, a chart for each constellation and signal (P1 figure 3)."""
     taken = observations.lazy().filter(
         pl.col("reason") & int(Reason.OTHER_SIGNAL_TAKEN) == 0,
         pl.col("cn0_dbhz").is_finite(),

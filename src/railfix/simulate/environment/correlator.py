@@ -45,11 +45,8 @@ def track_paths(
     chip_m: Floats,
     receiver: CorrelatorSettings,
 ) -> TrackedCode:
-    """Track the sum of P paths, for N signals; `field`, shape (P, N), is relative to the unobstructed direct signal.
-
-    The loops lock to the strongest path; the code error about it stays within half the spacing (early to late). Fading
-    faster than a loop's bandwidth is attenuated by ``1 / sqrt(1 + (f / loop_hz)^2)``; its power is kept. C/N0 is
-    averaged as the code is. `extra_m` and `rate_mps`, shape (P, N), are the excess path and its rate.
+    """Track the sum of P paths for N signals, `field` (P, N) relative to the direct one: loops lock to the strongest,
+    the code error stays within half the spacing, fading is attenuated by ``1 / sqrt(1 + (f / loop_hz)^2)``.
     """
     column = np.arange(field.shape[1])
     strength = np.sqrt(field.real**2 + field.imag**2)

@@ -264,9 +264,7 @@ class Environment:
         return Disturbance(code_m=code, phase_m=phase, doppler_hz=doppler, cn0_db=cn0)
 
     def _paths(self, rays: Rays, platform: Masks, clock_s: Floats) -> tuple[Complexes, Floats, Floats]:
-        """Return fields relative to the direct signal (without the phase of the extra path), extra paths [m] and their
-        growth with the chainage [m/m] of all paths of N signals, shapes (P, N).
-        """
+        """Return fields relative to the direct signal, extra paths [m] and their growth [m/m], shapes (P, N)."""
         field, delay = self._direct(rays, clock_s)
         nothing = np.zeros(len(rays.x))
         rows: list[tuple[Floats | Complexes, Floats, Floats]] = [(field, delay, nothing)]
@@ -326,10 +324,8 @@ class Environment:
         return np.asarray(strength * roughness_loss(rough, rays.z, rays.wavelength_m))
 
     def _reflection(self, r: int, rays: Rays) -> tuple[Floats, Floats, Floats]:
-        """Amplitude (with a phase shift of half a cycle), extra path and growth of the reflection in row r.
-
-        The incident ray passes the rows of the satellite's side, seen from the antenna's mirror image; the reflected
-        ray passes the nearer rows of the reflecting side.
+        """Amplitude, extra path and growth of the reflection in row r; the incident ray passes the rows of the
+        satellite's side, the reflected one the nearer rows of the reflecting side.
         """
         image = reflections(self.structures.walls[r], rays)
         amplitude = image.amplitude.copy()

@@ -155,9 +155,7 @@ _LEAST_TWICE: Final = 0.05  #: The same for rays that are reflected twice.
 def second_reflection(
     rows: tuple[Strips, ...], rays: Rays, antenna: AntennaSettings | None
 ) -> tuple[Floats, Floats, Floats]:
-    """Amplitude, extra path ``2 (d_A + d_B) |u_y|`` [m] and growth [m/m] of signals reflected by the nearest rows of
-    both sides, taken as parallel to the line, shapes (N,).
-    """
+    """Reflect by both sides: amplitude, extra path ``2 (d_A + d_B) |u_y|`` [m] and growth [m/m], shapes (N,)."""
     row = rows[0]
     side = (rays.y > 0.0).astype(np.intp)
     lateral = np.maximum(np.abs(rays.y), _LEAST_TWICE)
@@ -220,12 +218,8 @@ def side_streets(settings: SideStreetSettings, *, first_m: float, last_m: float,
 def street_reflections(
     streets: tuple[SideStreets, ...], rays: Rays, *, candidates: int, roughness_m: float
 ) -> list[tuple[Floats, Floats, Floats, Floats]]:
-    """Amplitude, extra path [m], growth [m/m] and cosine of incidence of each candidate street, shapes (N,).
-
-    A satellite behind the train is reflected by a wall ahead that faces it, and the other way round: with the wall's
-    plane at a distance D along the line the extra path is ``2 D |u_x|``; the ray meets the wall ``D |u_y| / |u_x|`` to
-    the side, within the street, and comes in over the walls across it. `candidates` streets of each side are tried for
-    each ray.
+    """Amplitude, extra path ``2 D |u_x|`` [m], growth [m/m] and cosine of incidence of the reflection of each candidate
+    street, by a wall across at a distance D along the line, shapes (N,).
     """
     along, lateral = np.maximum(np.abs(rays.x), _LEAST_SIDE), np.maximum(np.abs(rays.y), _LEAST_SIDE)
     ahead = np.where(rays.x < 0.0, 1.0, -1.0)

@@ -165,9 +165,7 @@ def _line_sigmas(
     unknowns: int,
     limits: SurveyLimits,
 ) -> Floats:
-    """Compute standard deviations of the points of the line (J, 2) [m]; with Student's t errors an observation informs
-    by (freedom + size) / (freedom + size + 2).
-    """
+    """Compute sigmas of the line (J, 2) [m]; Student's t informs by (freedom + size) / (freedom + size + 2)."""
     expected = [
         np.full(len(weight), (limits.freedom + system.size) / (limits.freedom + system.size + 2.0))
         if system.robust

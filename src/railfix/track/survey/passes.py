@@ -226,9 +226,7 @@ def _extend(course: Course, points: Floats, spacing_m: float, width_m: float) ->
 
 
 def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats, Integers, Floats]:
-    """Return the fractional point of the course for each point of a leg, NaN beyond the width; the direction along it
-    (1, -1, 0 beside it); and the distance to its right [m]; shapes (q,).
-    """
+    """Return the fractional point of the course, direction (0: beside) and distance to its right [m], shapes (q,)."""
     way, line_way = directions(points), course.direction
     vertices = course.point_m[:, :2]
     count = min(_NEIGHBOURS, len(course))
