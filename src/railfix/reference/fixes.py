@@ -217,7 +217,7 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
     rejection = fixes.rejection.copy()
     arc, lateral, height, sigma = (np.full(len(fixes), np.nan) for _ in range(4))
     if len(rows):
-        matched = match(
+        arc[rows], lateral[rows], height[rows], section = match(
             fixes.time[rows],
             fixes.ecef_m[rows],
             trajectory,
@@ -225,8 +225,7 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
             height_m=settings.height_m,
             max_speed_mps=settings.max_speed_mps,
         )
-        arc[rows], lateral[rows], height[rows] = matched.arc_m, matched.lateral_m, matched.height_m
-        along = sigma_along(fixes.sigma_enu_m[rows], fixes.ecef_m[rows], trajectory.tangent[matched.section])
+        along = sigma_along(fixes.sigma_enu_m[rows], fixes.ecef_m[rows], trajectory.tangent[section])
         sigma[rows] = np.where(np.isnan(along), settings.fix_sigma_m, np.maximum(along, _FIX_FLOOR_M))
         missed = np.isnan(arc) & (rejection == 0)
         _reject(rejection, missed & ~(np.abs(lateral) <= settings.lateral_m), FixRejection.OFF_TRACK)

@@ -17,21 +17,14 @@ _OUT_OF_REACH_M = 1e6  #: A pass out of reach costs this much more than any othe
 _JITTER_M = 2.0  #: Positions may jitter by this much more than the train can run [m].
 
 
-@dataclass(frozen=True, kw_only=True)
-class MatchedReference:
-    """Positions on a trajectory, F of them."""
-
-    arc_m: Floats  #: Of the pass chosen; NaN where no pass is near enough; shape (F,).
-    #: To the right of and above the trajectory there, else at the nearest point; shape (F,).
-    lateral_m: Floats
-    height_m: Floats
-    section: Indices  #: Segment of the trajectory, shape (F,).
-
-
 def match(
     time: Datetimes, ecef_m: Floats, trajectory: Trajectory, *, lateral_m: float, height_m: float, max_speed_mps: float
-) -> MatchedReference:
-    """Put F positions in order of time on a trajectory: the shortest chain of passes within `max_speed_mps`."""
+) -> tuple[Floats, Floats, Floats, Indices]:
+    """Put F positions in order of time on a trajectory: the shortest chain of passes within `max_speed_mps`.
+
+    Returns arc length, NaN where no pass is near enough; distance to the right and above, there or at the nearest
+    point; and segment, shapes (F,).
+    """
     count = len(ecef_m)
     nearest, _ = trajectory.nearest(ecef_m)
     section, _ = trajectory.segment_at(nearest)
@@ -50,7 +43,7 @@ def match(
     at = passes.position[chosen]
     arc[at], section[at] = along[chosen], passes.segment[chosen]
     lateral[at], height[at] = beside[chosen], above[chosen]
-    return MatchedReference(arc_m=arc, lateral_m=lateral, height_m=height, section=section)
+    return arc, lateral, height, section
 
 
 def _beside(offset: Floats, trajectory: Trajectory, section: Indices) -> tuple[Floats, Floats]:

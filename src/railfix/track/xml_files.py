@@ -49,7 +49,6 @@ _SPIRALS: Final = {
 class Relation:
     """Connection of two net elements as railML 3 and RailTopoModel have it."""
 
-    name: str
     #: Names of the elements.
     first: str
     second: str
@@ -321,7 +320,6 @@ def read_railml_relations(path: str | PathLike[str]) -> list[Relation]:
             raise InputFileError(path, f"netRelation {item.get('id')} names no two elements", line=item.sourceline)
         relations.append(
             Relation(
-                name=str(item.get("id")),
                 first=str(first.get("ref")),
                 second=str(second.get("ref")),
                 first_end=int(float(item.get("positionOnA"))),
@@ -380,7 +378,6 @@ def read_rinf_relations(path: str | PathLike[str]) -> list[Relation]:
         way = [str(value).rsplit("/", 1)[-1].lower() for value in _values(graph, item, f"{_ERA}navigability")]
         relations.append(
             Relation(
-                name=_name(graph, item),
                 first=_name(graph, first),
                 second=_name(graph, second),
                 first_end=0 if at_first.toPython() else 1,

@@ -158,10 +158,7 @@ class BlockReader:
         problems, problem_count, skipped = self._log.take()
         return Observations(
             time=time_ns.astype("datetime64[ns]"),
-            satellite=dense.satellite,
-            signal=dense.signal,
-            **dense.values,
-            loss_of_lock=dense.lock,
+            **dense,
             break_before=before,
             header=header.public,
             problems=problems,
