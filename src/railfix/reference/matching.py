@@ -36,7 +36,8 @@ def match(
     # beyond the ends of the line there is nothing to be on
     beyond = np.abs(passes.along_m - passes.foot_m) > 0.5
     beyond &= (passes.segment == 0) | (passes.segment == len(trajectory.length_m) - 1)
-    near = np.flatnonzero(passes.lowest & (np.abs(beside) <= lateral_m) & (np.abs(above) <= height_m) & ~beyond)
+    within = (np.abs(beside) <= lateral_m) & (np.abs(above) <= height_m) & ~beyond
+    near = np.flatnonzero(passes.lowest & ~passes.again & within)
     since = seconds(time - time[0]) if count else np.empty(0)
     along = trajectory.arc_m[passes.segment] + passes.foot_m
     chosen = near[_chain(passes.position[near], along[near], beside[near], since, max_speed_mps)]

@@ -323,6 +323,7 @@ class Passes(NamedTuple):
     foot_m: Floats
     offset_m: Floats  #: From that point to the position, shape (P, 3).
     lowest: Masks  #: No neighbouring segment comes nearer: the line passes the position here.
+    again: Masks  #: As near as the segment before: at the point between the two.
 
 
 def passes_of(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats | float) -> Passes:
@@ -338,11 +339,12 @@ def passes_of(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats | float) -
     foot = np.clip(along, 0.0, length[segment])
     offset = delta - foot[:, None] * tangent[segment]
     away = np.linalg.norm(offset, axis=1)
-    apart = (position[1:] != position[:-1]) | (segment[1:] != segment[:-1] + 1)
-    lowest = np.ones(len(position), dtype=np.bool_)
-    lowest[1:] &= apart | (away[1:] < away[:-1])
-    lowest[:-1] &= apart | (away[:-1] <= away[1:])
-    return Passes(position, segment, along, foot, offset, lowest)
+    joined = (position[1:] == position[:-1]) & (segment[1:] == segment[:-1] + 1)
+    lowest, again = np.ones(len(position), dtype=np.bool_), np.zeros(len(position), dtype=np.bool_)
+    lowest[1:] &= ~joined | (away[1:] <= away[:-1])
+    lowest[:-1] &= ~joined | (away[:-1] <= away[1:])
+    again[1:] = joined & (away[1:] == away[:-1])
+    return Passes(position, segment, along, foot, offset, lowest, again)
 
 
 def between_points(arc: Floats, arc_m: Floats, length_m: Floats, values: Floats, section: Indices) -> Floats:
