@@ -63,7 +63,7 @@ class ReferenceCurve:
             direction=direction, running_s=np.concatenate(time), chainage_m=np.concatenate(place), stations_m=stations_m
         )
 
-    def simulated_m(self, from_m: float, elapsed_s: float) -> float:
+    def running_m(self, from_m: float, elapsed_s: float) -> float:
         """Return the place a running time after a place, at most the next station: by place, not by timetable."""
         at = np.interp(self.direction * from_m, self.direction * self.chainage_m, self.running_s)
         place = float(np.interp(at + max(elapsed_s, 0.0), self.running_s, self.chainage_m))
@@ -208,7 +208,7 @@ def time_passed(
         start = record.measured_s
         if record.departure_s is not None and curve.station_at(last) is not None:
             start = max(start, record.departure_s)
-        place = curve.simulated_m(last, now_s - start)
+        place = curve.running_m(last, now_s - start)
     at_end = authority_m is not None and facing * (authority_m - place) <= 0.0
     if at_end and authority_m is not None:
         place = authority_m if facing * (authority_m - last) > 0.0 else last

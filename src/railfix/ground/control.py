@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from railfix.ground.centre import ReferenceCurve, TrainRecord, TrainState, time_passed
-from railfix.ground.interlocking import HEAD, Interlocking, from_documents, stopped_trains, to_documents
+from railfix.ground.interlocking import HEAD, Interlocking, from_documents, stop_orders, to_documents
 from railfix.ground.layout import PointName
 from railfix.ground.stops import close_section, open_section, release_train, stop_trains
 from railfix.ground.store import DatabaseError, Store
@@ -97,7 +97,7 @@ class ControlCentre:
         self._routes = {n: train.station for n, train in self.supervision.state.trains.items()}
 
     @classmethod
-    def restored(cls, supervision: Supervision, store: Store, *, judged: bool, **rest: Any) -> ControlCentre:
+    def restore(cls, supervision: Supervision, store: Store, *, judged: bool, **rest: Any) -> ControlCentre:
         """Return the centre as stored, trains unknown; with a triangle the first start is a stop."""
         texts, monitor = store.documents(HEAD), MonitorState() if judged else None
         if texts:
@@ -309,7 +309,7 @@ class ControlCentre:
     def snapshot(self) -> dict[str, Any]:
         """Return plain values of trains, points, monitor and log for the page."""
         layout, state = self.supervision.layout, self.supervision.state
-        trains, stopped = [], stopped_trains(state)
+        trains, stopped = [], stop_orders(state)
         for number, train in state.trains.items():
             record = self.supervision.records.get(number, TrainRecord(train=number))
             rear, front = train.interval_m

@@ -153,7 +153,7 @@ def points_ecef_m() -> Floats:
     return ecef_from_geodetic(35.7, 139.7, 100.0) + PLAN_M @ enu_axes(35.7, 139.7)[:2]
 
 
-def simulated_fixes(
+def draw_fixes(
     rng: np.random.Generator, *, epochs: int = 60, common_m: Floats | None = None, moved_m: Floats | None = None
 ) -> StationFixes:
     """Return fixes, one a second, with errors `common_m` (T, 9), moved by `moved_m` (T, 3, 2), NaN without fix."""
@@ -226,7 +226,7 @@ def _verdicts(seed: int) -> list[tuple[TriangleVerdict, int]]:
     epochs = int(END_S) + 1
     common = np.zeros((epochs, 9))
     common[:, 3] = 8.0 * np.clip(np.arange(epochs) - FAULT_S, 0.0, None)
-    fixes = simulated_fixes(np.random.default_rng(seed), epochs=epochs, common_m=common)
+    fixes = draw_fixes(np.random.default_rng(seed), epochs=epochs, common_m=common)
     result = compare_triangle(PLAN_M, fixes.fixes_m, limits=TriangleLimits())
     return [(TriangleVerdict(int(v)), int(r)) for v, r in zip(result.verdict, result.receiver, strict=True)]
 

@@ -20,7 +20,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.settings import Settings
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
-from railfix.ground.quic import WAIT_S, LinkProtocol, configuration, connected, listen, read_revoked
+from railfix.ground.quic import WAIT_S, LinkProtocol, configuration, connection, listen, read_revoked
 
 #: Results that are kept: an hour of ten frames a second.
 KEPT: Final = 36_000
@@ -253,7 +253,7 @@ class TrainLinks:
         settings = configuration(self._keys, f"train-{self.train}", is_client=True, idle_s=idle_s)
         while True:
             try:
-                async with connected(
+                async with connection(
                     self._bearers[name].centre,
                     settings,
                     local=self._bearers[name].local,

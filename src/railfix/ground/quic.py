@@ -155,7 +155,7 @@ class LinkProtocol(QuicConnectionProtocol):
 
 
 @contextmanager
-def named_address(host: str, port: int) -> Iterator[None]:
+def address_errors(host: str, port: int) -> Iterator[None]:
     """Name the address in an OSError of listening there, and what to do."""
     try:
         yield
@@ -179,7 +179,7 @@ async def listen(
 
     What is owed to a verified peer, answers and acknowledgements, waits up to `wait_s` to go with what is sent.
     """
-    with named_address(*address):
+    with address_errors(*address):
         server = await serve(
             *address,
             configuration=settings,
@@ -192,7 +192,7 @@ async def listen(
 
 
 @asynccontextmanager
-async def connected(
+async def connection(
     address: tuple[str, int],
     settings: QuicConfiguration,
     *,

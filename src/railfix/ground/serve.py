@@ -280,7 +280,7 @@ def _centre(
         ports={name: settings.listen[name][1] for name in BEARERS},
         received=lambda number, payload: control.report(number, payload),
     )
-    control = ControlCentre.restored(
+    control = ControlCentre.restore(
         supervision,
         store,
         judged=settings.triangle is not None,

@@ -75,7 +75,7 @@ def station_fixes(
     common = list({satellite: (satellite, signal) for satellite, signal in reversed(common)}.values())[::-1]
     if not common:
         raise MismatchError("the logs have no satellite on the same signal in common; the same signals are needed")
-    epochs = [rounded(log.time) for log in logs]
+    epochs = [round_tags(log.time) for log in logs]
     if not len(reduce(np.intersect1d, epochs)):
         raise MismatchError("the logs have no epoch in common; logs of the same time are needed")
     time = reduce(np.union1d, epochs)
@@ -147,7 +147,7 @@ def _plane(points_ecef_m: Floats) -> Floats:
     return enu_axes(latitude, longitude)[:2]
 
 
-def rounded(time: Datetimes) -> Datetimes:
+def round_tags(time: Datetimes) -> Datetimes:
     """Return tags rounded to `SAME_EPOCH`, shape (T,)."""
     step = SAME_EPOCH.astype("timedelta64[ns]").astype(np.int64)
     rounded = (time.astype("datetime64[ns]").astype(np.int64) + step // 2) // step * step
@@ -195,7 +195,7 @@ class StationStreams:
 
     def push(self, receiver: int, epoch: Observations) -> StationFixes | None:
         """Take one epoch of a receiver; return the fixes where all receivers have sent theirs."""
-        tag = rounded(epoch.time)[0]
+        tag = round_tags(epoch.time)[0]
         tag_ns = int(tag.astype(np.int64))
         if tag_ns % 1_000_000_000 or tag <= self._done:
             return None

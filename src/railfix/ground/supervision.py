@@ -29,7 +29,7 @@ from railfix.ground.interlocking import (
     points_reported,
     released,
     route_requested,
-    stopped_trains,
+    stop_orders,
     with_train,
 )
 from railfix.ground.layout import Layout, PointName
@@ -181,7 +181,7 @@ def report_received(
         claimed_m=rear if confirmed else None,
     )
     if turns:
-        return with_train(state, _turned(known, facing, rear, ahead, layout))
+        return with_train(state, _turn(known, facing, rear, ahead, layout))
     if confirmed and before.claimed_m is not None and before.stop is None:
         # one wrong report alone moves no rear end, and a wider bound moves none back
         both = min(facing * rear, facing * before.claimed_m)
@@ -191,7 +191,7 @@ def report_received(
     return with_train(state, replace(known, front_m=front))
 
 
-def _turned(known: TrainInterval, facing: int, rear: float, ahead: float, layout: Layout) -> TrainInterval:
+def _turn(known: TrainInterval, facing: int, rear: float, ahead: float, layout: Layout) -> TrainInterval:
     """Return a train that has changed ends: no authority beyond its front, and where it stood is still occupied."""
     covered = facing * max(facing * ahead, facing * known.rear_m)
     back = facing * min(facing * rear, facing * known.front_m)
@@ -288,14 +288,14 @@ class Supervision:
         """
         self.state = overlaps_stopped(self.state, self.layout)
         self.state = released(self.state, now_s, self.layout, limits=self.limits)
-        nearby, stopped = NearbyTrains(self.state, self.layout), stopped_trains(self.state)
+        nearby, stopped = NearbyTrains(self.state, self.layout), stop_orders(self.state)
         due = [number for number in self.state.trains if self._is_due(number, now_s, stopped)]
         if self.routes == "automatic":
             for number in due:
                 if self._wants_route(self.state.trains[number]):
                     self.set_route(number, nearby=nearby, stopped=stopped)
         self.state = extended(self.state, self.layout, limits=self.limits, trains=due, nearby=nearby, stopped=stopped)
-        stopped = stopped_trains(self.state)
+        stopped = stop_orders(self.state)
         due = [number for number in self.state.trains if self._is_due(number, now_s, stopped)]
         if not due:
             return []

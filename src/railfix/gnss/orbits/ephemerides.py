@@ -184,11 +184,11 @@ def _out_of_tilted_frame(
     angle = rate * since_toe_s
     cos_z, sin_z = np.cos(angle), np.sin(angle)
 
-    def rotated(v: Components) -> Components:
+    def rotate(v: Components) -> Components:
         y, z = cos_x * v[1] + sin_x * v[2], cos_x * v[2] - sin_x * v[1]
         return cos_z * v[0] + sin_z * y, cos_z * y - sin_z * v[0], z
 
-    place, speed = rotated(position), rotated(velocity)
+    place, speed = rotate(position), rotate(velocity)
     speed = (speed[0] + rate * place[1], speed[1] - rate * place[0], speed[2])
     tilted = rate != 0.0
     x, y, z = (np.where(tilted, new, old) for new, old in zip(place, position, strict=True))

@@ -347,7 +347,7 @@ class PreparedRecords:
         self._cache: dict[tuple[bytes, ...], ChannelRecords] = {}
 
     @cached_property
-    def integrated(self) -> GlonassStates:
+    def step_states(self) -> GlonassStates:
         """GLONASS states at multiples of the integration step."""
         return GlonassStates.from_records(self.navigation.glonass, VALIDITY_S["R"])
 

@@ -221,7 +221,7 @@ def _fill_glonass(
     since = age - code_m[t, m] / SPEED_OF_LIGHT
     bias, rate = records.clock_bias_s[row], records.relative_frequency[row]
     since = since - (bias + rate * since)
-    position, velocity = table.integrated.state(row, since)
+    position, velocity = table.step_states.state(row, since)
     for i in range(3):
         states.position_ecef_m[t, m, i], states.velocity_ecef_mps[t, m, i] = position[i], velocity[i]
     states.clock_m[t, m] = SPEED_OF_LIGHT * (bias + rate * since)

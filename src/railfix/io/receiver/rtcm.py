@@ -14,7 +14,7 @@ import numpy as np
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import bdt_to_gpst, gpst_minus_utc, nearest_week
-from railfix.gnss.observations import named_frequency_hz
+from railfix.gnss.observations import frequency_by_name_hz
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.framing import Field, Frames, fields, signed, unsigned
 from railfix.io.receiver.measurements import ROW_ARRAYS, Measurements, join_measurements, no_measurements
@@ -270,7 +270,7 @@ def _decode(
     codes = np.array([SIGNALS[system].get(k, "") for k in signals.tolist()])[of_signal]
     channel = channel[:, of_satellite]
     known_channel = np.isin(channel, list(_GLONASS_RANGE))
-    frequency = named_frequency_hz(np.char.add(system, codes), np.where(known_channel, channel, np.nan))
+    frequency = frequency_by_name_hz(np.char.add(system, codes), np.where(known_channel, channel, np.nan))
     shape = (len(bits), n_cells)
     return Measurements(
         time=_times(system, bits, near),

@@ -64,7 +64,7 @@ class NavigationContent:
         if not any(stored[part]):
             stored[part] = [0.0 if np.isnan(v) else v for v in values]
 
-    def received_klobuchar(self) -> dict[str, Floats]:
+    def klobuchar_sets(self) -> dict[str, Floats]:
         """Return the coefficients by constellation; all-zero sets, which were not received, are noted."""
         received = {}
         for letter, values in self.klobuchar.items():
@@ -147,7 +147,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navi
     return Navigation(
         kepler=kepler_records([r for r in content.records if r.system != "R"]),
         glonass=glonass_records([r for r in content.records if r.system == "R"]),
-        klobuchar=content.received_klobuchar(),
+        klobuchar=content.klobuchar_sets(),
         leap_seconds=content.leap_seconds,
         skipped=dict(content.skipped),
         notes=tuple(dict.fromkeys(content.notes)),

@@ -9,7 +9,7 @@ import numpy as np
 from railfix.core.arrays import Integers, Masks
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines
-from railfix.gnss.observations import MAX_PROBLEMS, capped_problems
+from railfix.gnss.observations import MAX_PROBLEMS, first_problems
 from railfix.io.rinex.observations_lines import EpochHeads, Lines, epoch_width, event_line, flaw_text, read_epoch_lines
 
 EPOCHS = "broken epochs"
@@ -92,7 +92,7 @@ class FaultLog:
 
     def take(self) -> tuple[tuple[str, ...], int, dict[str, int]]:
         """Return messages, number of faults and counts since the last call, and reset them."""
-        taken = (capped_problems(self._messages, count=self._problems), self._problems, self.counts)
+        taken = (first_problems(self._messages, count=self._problems), self._problems, self.counts)
         self._messages, self._problems, self.counts = [], 0, {}
         return taken
 

@@ -154,7 +154,7 @@ class Chart:
     width: Literal["wide", "half"] = "wide"
 
     @property
-    def shared_axis(self) -> Literal["time", "chainage", ""]:
+    def common_axis(self) -> Literal["time", "chainage", ""]:
         """Quantity on the x axis that other charts share: they are zoomed together."""
         if self.start is not None:
             return "time"
