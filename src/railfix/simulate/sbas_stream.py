@@ -72,13 +72,20 @@ def integrity(second: int, dfrei: Sequence[int], *, kind: int = 35, iodm: int = 
 
 
 def parameters(
-    second: int, *, valid_s: float = 120.0, degradation: tuple[float, float, float] = (30.0, 0.0, 0.0)
+    second: int,
+    *,
+    valid_s: float = 120.0,
+    covariance: float = 0.0,
+    degradation: tuple[float, float, float] = (30.0, 0.0, 0.0),
+    scale: int = 0,
 ) -> Bytes:
-    """Type 37: one degradation (interval [s], step [m], rate [m/s]) of all constellations, no term of covariance."""
+    """Type 37: one degradation (interval [s], step [m], rate [m/s]) of all constellations, one code of the scale."""
     interval, step, rate = degradation
     each = [(round(interval / 6.0) - 5, 5), (round(step / 0.01), 8), (round(rate / 0.0002), 8)]
     valid = (round(valid_s / 6.0) - 5, 6)
-    return message(37, second, valid, valid, (0, 13), *(each * 6), *([(0, 4)] * 15), (0, 3))
+    return message(
+        37, second, valid, valid, (0, 6), (round(covariance / 0.1), 7), *(each * 6), *([(scale, 4)] * 15), (0, 3)
+    )
 
 
 #: Factor of the covariance that is sent: 1.03 to 1.06 times the indicator's sigma along a line of sight.
