@@ -17,7 +17,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
 import tracking_cases
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.run.processor import processor_of
 from railfix.simulate.demonstration import demo_inputs

@@ -32,7 +32,7 @@ import numpy as np
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.ranges.atmosphere import rtca_troposphere_m, rtca_troposphere_sigma_m

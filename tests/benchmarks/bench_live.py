@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from railfix import kernels
 from railfix.gnss.observations import Observations
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.run.processor import processor_of

@@ -101,7 +101,7 @@ def seconds(action: Callable[[], object], rounds: int) -> float:
 
 def read_with_railfix(path: Path) -> int:
     """Epochs read."""
-    from railfix.io.rinex import read_observations
+    from railfix.io import read_observations
 
     return len(read_observations(path))
 

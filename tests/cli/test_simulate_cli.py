@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from railfix.cli import app
-from railfix.io.rinex import read_observations
+from railfix.io import read_observations
 from railfix.simulate import demo_files, load_scenario, shipped_scenarios
 from railfix.track import read_track
 

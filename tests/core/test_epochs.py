@@ -14,8 +14,8 @@ from railfix.gnss.observations import (
     MAX_PROBLEMS,
     ObservationHeader,
     Observations,
-    capped_problems,
     concatenate,
+    first_problems,
 )
 
 START = np.datetime64("2024-03-13T08:00:00", "ns")
@@ -130,10 +130,10 @@ def test_parts_in_the_wrong_order_are_named_with_their_times() -> None:
 
 def test_problems_are_kept_up_to_a_number_and_all_counted() -> None:
     sentences = [str(k) for k in range(MAX_PROBLEMS + 7)]
-    kept = capped_problems(sentences, count=len(sentences))
+    kept = first_problems(sentences, count=len(sentences))
     assert kept[:MAX_PROBLEMS] == tuple(sentences[:MAX_PROBLEMS])
     assert kept[MAX_PROBLEMS:] == ("and 7 more problems",)
-    assert capped_problems(["a"], count=1) == ("a",)
+    assert first_problems(["a"], count=1) == ("a",)
 
 
 # ---------------------------------------------------------------- reasons

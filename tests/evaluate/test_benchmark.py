@@ -15,13 +15,14 @@ import pytest
 from typer.testing import CliRunner
 
 import public_recording
+from case_files import write_case
 from conftest import ROOT
 from railfix.cli import app
 from railfix.core.errors import InputFileError, MismatchError, RailfixError, SettingsError
 from railfix.core.files import file_sha256, read_bytes
 from railfix.evaluate import EvaluationOptions, evaluate_run
 from railfix.evaluate.benchmark import RTKLIB_SINGLE, rows_at_epochs, run_benchmark
-from railfix.evaluate.cases import read_case, read_cases, write_case
+from railfix.evaluate.cases import read_case, read_cases
 from railfix.pipeline.config import Config
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 

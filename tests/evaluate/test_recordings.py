@@ -16,8 +16,8 @@ import pytest
 import integrity_tables
 import recordings_score
 from railfix.evaluate import Score, along_track_error, interpolate_reference
+from railfix.io import read_observations
 from railfix.io.position_log import read_positions
-from railfix.io.rinex import read_observations
 from railfix.run.processor import processor_of
 
 

@@ -17,7 +17,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.settings import load_settings
 from railfix.ground import stops, supervision
 from railfix.ground.control import ControlCentre, orders_of
-from railfix.ground.interlocking import Interlocking, InterlockingLimits, extended, from_documents, stopped_trains
+from railfix.ground.interlocking import Interlocking, InterlockingLimits, extended, from_documents, stop_orders
 from railfix.ground.layout import Layout, LoopStation
 from railfix.ground.serve import CentreFile, _check_line
 from railfix.ground.stops import overlaps_stopped, release_train
@@ -101,7 +101,7 @@ def test_reports_that_agree_move_the_rear_end(state: Interlocking) -> None:
     """Front 3010 m, 5 m of over-reading, 200 m: 2805 m of the two in a row, less the margin of 20 m."""
     moved = after(state, report(1, 3010.0), report(2, 3050.0), report(3, 3090.0))
     assert moved.trains[1].rear_m == pytest.approx(3050.0 - 205.0)
-    assert stopped_trains(moved) == {}
+    assert stop_orders(moved) == {}
     assert follower_end_m(moved) == pytest.approx(3050.0 - 205.0 - 20.0)
 
 
@@ -150,7 +150,7 @@ def test_a_contradiction_stops_the_train_and_its_neighbours(
     found = after(begun, report(2, **wrong))
     assert reason in (found.trains[1].stop or "")
     assert found.trains[1].rear_m <= begun.trains[1].rear_m
-    assert set(stopped_trains(found)) == {1, 2, 3}
+    assert set(stop_orders(found)) == {1, 2, 3}
     later = after(found, *(report(k, 3000.0 + 40.0 * k) for k in range(3, 9)))
     assert later.trains[1].stop == found.trains[1].stop
     assert later.trains[1].rear_m == found.trains[1].rear_m
@@ -224,7 +224,7 @@ def test_intervals_that_grow_into_each_other_stop_both(state: Interlocking) -> N
 def centre(store: Store, **values: Any) -> ControlCentre:
     trains = [standing_train(1, direction=1, front_m=300.0, length_m=80.0, bound_m=5.0, station=0, track=1)]
     supervision = Supervision(layout=LINE, state=at_start(LINE, trains))
-    return ControlCentre.restored(
+    return ControlCentre.restore(
         supervision, store, curves={}, send=lambda *_: None, wall_ns=lambda: 0, **{"clock": lambda: 10.0, **values}
     )
 
@@ -246,7 +246,7 @@ def test_a_train_is_stopped_and_released_from_the_page(tmp_path: Path) -> None:
             assert (reason == "train 1 is silent: order it again in 3 to 60 s if it stands, whole") == refused
         assert orders["release-train"]({"train": 1}) == "train 1 is not stopped"
         assert orders["stop-all"]({}) is None
-        assert stopped_trains(control.supervision.state) == {1: "stopped by hand"}
+        assert stop_orders(control.supervision.state) == {1: "stopped by hand"}
 
 
 def test_the_worst_verdict_between_two_steps_counts_and_old_ones_do_not(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from railfix.ground.interlocking import (
     points_reported,
     released,
     route_requested,
-    stopped_trains,
+    stop_orders,
     to_documents,
 )
 from railfix.ground.layout import Layout, LoopStation, layout_of, overlap
@@ -408,8 +408,8 @@ def test_neighbours_of_stopped_trains() -> None:
     for _ in range(300):
         run.step()
         stopped = stop_trains(run.centre.state, rng.sample(sorted(run.trains), rng.randint(0, 4)), "by hand")
-        assert set(stopped_trains(stopped)) == neighbours_of_stopped(stopped)
-        kinds.add(len(stopped_trains(stopped)))
+        assert set(stop_orders(stopped)) == neighbours_of_stopped(stopped)
+        kinds.add(len(stop_orders(stopped)))
     assert len(kinds) > 4
 
 

@@ -29,7 +29,7 @@ from railfix.ground.links import (
     coverage,
     round_trips,
 )
-from railfix.ground.quic import LinkProtocol, configuration, connected, write_keys
+from railfix.ground.quic import LinkProtocol, configuration, connection, write_keys
 
 pytestmark = pytest.mark.requirement("F3")
 
@@ -378,7 +378,7 @@ def test_a_centre_that_does_not_answer_is_one_time_out(keys: Path) -> None:
         settings = configuration(keys, "train-7", is_client=True)
         settings.initial_rtt = 0.01  # closing takes some of them
         with pytest.raises(TimeoutError):
-            async with connected(
+            async with connection(
                 ("127.0.0.1", 9), settings, local="127.0.0.1", received=lambda *_: None, timeout_s=0.1
             ):
                 pass

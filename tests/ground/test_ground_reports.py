@@ -31,7 +31,7 @@ RULES["creep"] = {
         )
     }
 }
-RULES["tracks kept"] = {supervision._turned: {"if station in under": "if station == known.station"}}
+RULES["tracks kept"] = {supervision._turn: {"if station in under": "if station == known.station"}}
 RULES["end of the place"] = {OnBoard.receive: {"if not self._granted:": "if False:"}}
 RULES["two places"] = {OnBoard.moved: {"self.direction * before)": "-1e9)"}}
 RULES["unknown before"] = {OnBoard.receive: {"authority.shortens and not (agrees or self._granted)": "False"}}

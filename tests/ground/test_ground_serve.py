@@ -338,7 +338,7 @@ def restored(store: Store, state: Interlocking, sent: list[Authority], now: list
     supervision = Supervision(
         layout=line_with_loops(3), state=state, command=lambda point, _: moved.append(point), routes="by hand"
     )
-    control = ControlCentre.restored(
+    control = ControlCentre.restore(
         supervision, store, judged=True, curves={}, send=lambda _, data: sent.append(Authority.decode(data)),
         clock=lambda: now[0], wall_ns=lambda: 0, times=MonitorLimits(healthy_s=5.0),
     )  # fmt: skip

@@ -18,7 +18,7 @@ import static_monitors
 from railfix.cli.ground import app
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.observations import Observations
-from railfix.ground.demo import PLAN_M, TIME, points_ecef_m, simulated_fixes
+from railfix.ground.demo import PLAN_M, TIME, draw_fixes, points_ecef_m
 from railfix.ground.station_fixes import StationStreams, station_fixes
 from railfix.ground.triangle import (
     SIDES,
@@ -175,7 +175,7 @@ def test_cause_and_time_to_alert_of_faults(fault: str) -> None:
             moved[since > 0] = np.nan
         else:
             moved[since > 0] = FAR - PLAN_M
-        fixes = simulated_fixes(rng, common_m=common, moved_m=moved)
+        fixes = draw_fixes(rng, common_m=common, moved_m=moved)
         log = monitor_log(fixes, limits=LIMITS)
         verdicts = log.triangle.verdict
         assert (verdicts[:20] == TriangleVerdict.HEALTHY).all()

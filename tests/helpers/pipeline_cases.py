@@ -16,7 +16,7 @@ import polars as pl
 
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
 from railfix.simulate import Scenario, write_run

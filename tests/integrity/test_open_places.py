@@ -19,7 +19,7 @@ from railfix.core.reasons import Status
 from railfix.integrity.protection import SATELLITE_PRIOR, RiskBudget, open_places
 from railfix.integrity.protection.open_places import places_beyond_the_level
 from railfix.integrity.raim import constrained_model
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.section_search import SearchIndex

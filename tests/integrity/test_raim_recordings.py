@@ -22,7 +22,7 @@ from railfix.integrity.raim import (
     reliability,
 )
 from railfix.integrity.raim.model import compact
-from railfix.io.rinex import read_observations
+from railfix.io import read_observations
 from railfix.positioning.normal_equations import Constrained, Ranges, clock_groups, constrained_position
 from railfix.track.trajectory import Trajectory
 from raim_oracle import point_model

@@ -16,7 +16,7 @@ import railfix
 from railfix.core.timescale import to_week
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.io import read_any_positions, rinex
+from railfix.io import read_any_positions
 from railfix.io.receiver import sbf, ubx
 from railfix.io.receiver.framing import Subframes, find_frames, sbas_frames
 from railfix.io.receiver.log import StreamState, decode
@@ -116,7 +116,7 @@ def test_rtklib_reads_the_same(logged: Observations, tmp_path: Path) -> None:
     log, target = written(logged, tmp_path), tmp_path / "log.obs"
     words = [program, "-r", "sbf", "-od", "-os", "-f", "5", "-v", "3.04", "-o", str(target), str(log)]
     subprocess.run(words, capture_output=True, check=True, timeout=60)
-    ours, theirs = railfix.read_observations(log), rinex.read_observations(target)
+    ours, theirs = railfix.read_observations(log), railfix.read_observations(target)
     assert len(ours) == len(theirs) == EPOCHS
     for name, tolerance in (("code_m", 0.00051), ("phase_cycles", 0.00051), ("doppler_hz", 0.00062)):
         a, b = in_common(ours, theirs, name)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from railfix.gnss.observations import Observations
-from railfix.io.rinex import read_observations
+from railfix.io import read_observations
 from rinex_observations_text import epoch_2, epoch_3, event_2, field, header_2, header_3, record, write
 
 pytestmark = pytest.mark.requirement("A7")

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from railfix.core.errors import InputFileError, MismatchError
-from railfix.io.rinex import read_observations, scan_observations
+from railfix.io import read_observations, scan_observations
 from rinex_observations_text import epoch_2, epoch_3, event_2, field, header_2, header_3, record, text_of, write
 
 pytestmark = pytest.mark.requirement("A7")

@@ -9,7 +9,7 @@ import pytest
 
 from railfix.core.files import read_bytes
 from railfix.gnss.observations import Observations, concatenate
-from railfix.io.rinex import read_observations, scan_observations
+from railfix.io import read_observations, scan_observations
 from railfix.io.rinex.observations_lines import KINDS, signal_of
 
 pytestmark = [pytest.mark.requirement("A7"), pytest.mark.filterwarnings("ignore")]
@@ -89,7 +89,7 @@ def compare_with_georinex(path: Path) -> int:
             values = theirs[name].values[:, j]
             signal = signal_of(name, system=system, version=version, declared=names)
             at = column.get((f"{system}{int(satellite[1:]):02d}", str(signal)))
-            kind = KINDS.index("C" if name[0] == "P" else name[0])
+            kind = list(KINDS).index("C" if name[0] == "P" else name[0])
             if at is None:
                 assert not np.nan_to_num(values).any()
                 continue

@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from railfix.core import files
 from railfix.core.errors import InputFileError
 from railfix.gnss.observations import Observations, concatenate
-from railfix.io.rinex import observations_decode, read_observations, scan_observations
+from railfix.io import read_observations
+from railfix.io.rinex import observations_decode, scan_observations
 from railfix.io.rinex.observations import BlockReader, Selection
 from rinex_observations_text import epoch_2, epoch_3, event_2, field, header_2, header_3, record, text_of, write
 

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from railfix.core.errors import OutputError
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import ObservationHeader, Observations, concatenate
-from railfix.io.rinex import read_navigation, read_observations, write_navigation, write_observations
+from railfix.io import read_navigation, read_observations, write_navigation, write_observations
 from railfix.io.rinex.write import RinexVersion, _format_f14_3, packing_of
 from railfix.simulate import Scenario, SkySettings, simulated_navigation
 from railfix.simulate.scenario import ReceiverSettings

@@ -28,7 +28,7 @@ from railfix.core.arrays import read_only
 from railfix.integrity.protection import RiskBudget, along_track_level
 from railfix.integrity.protection.level import MapDeviation, RangeBounds
 from railfix.integrity.raim import constrained_model
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.kernels import compiling
 from railfix.kernels.compiling import by_reference
 from railfix.kernels.tracking.recursion import advance

@@ -14,7 +14,7 @@ import pytest
 import integrity_tables
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline import processor as processing
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import correct_ranges

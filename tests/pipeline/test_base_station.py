@@ -14,7 +14,7 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import GPS_EPOCH
 from railfix.evaluate import along_track_error, interpolate_reference
 from railfix.gnss.observations import Observations
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.live.engine import LiveEngine
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import single_epochs

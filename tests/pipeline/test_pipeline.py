@@ -32,7 +32,7 @@ from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.reasons import POSITIONED, Reason, Status
 from railfix.core.timescale import timedelta
 from railfix.gnss.observations import Observations
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.processor import EpochProcessor
 from railfix.run.processor import processor_of
 

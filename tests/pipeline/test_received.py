@@ -26,7 +26,7 @@ from railfix.core.reasons import Reason
 from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import GlonassRecords, Navigation
 from railfix.gnss.orbits.prepared_records import validity_s
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import known_from_start, receive

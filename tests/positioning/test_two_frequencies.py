@@ -14,7 +14,7 @@ from railfix.core.reasons import Reason
 from railfix.core.timescale import timedelta
 from railfix.evaluate import interpolate_reference
 from railfix.gnss.orbits.prepared_records import group_delay_s
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.channels import NAME, signal_delays
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import AntennaResult

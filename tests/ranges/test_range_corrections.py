@@ -16,7 +16,7 @@ from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotation
 from railfix.core.reasons import Reason
 from railfix.gnss.orbits import SatelliteStates
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline import carrier_stage
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor, Models

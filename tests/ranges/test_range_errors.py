@@ -24,8 +24,8 @@ from railfix.evaluate.range_errors import (
 )
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
+from railfix.io import read_navigation, read_observations
 from railfix.io.reference_log import AntennaReference, read_reference
-from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import conditions_of
 from railfix.pipeline.processor import EpochProcessor

@@ -15,8 +15,8 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.core.timescale import from_week
 from railfix.gnss.orbits.states import satellite_states
+from railfix.io import read_observations
 from railfix.io.rinex.navigation import read_navigation
-from railfix.io.rinex.observations import read_observations
 from railfix.ranges.atmosphere import rtca_troposphere_m
 from railfix.ranges.sbas import IonosphereState, SatelliteState, SbasCorrections, SbasLimits, SbasMessages, read_sbas
 

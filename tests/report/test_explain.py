@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from railfix.cli import app
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.reasons import Status
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.report.explain import FILTER_STATUS, SINGLE_STATUS, explain_epoch
 from railfix.run import RunOptions, run_files

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from railfix.evaluate import along_track_error
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.run.processor import processor_of
 from railfix.simulate import demo_files

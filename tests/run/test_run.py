@@ -18,7 +18,7 @@ from railfix.core.commit import source_commit
 from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status, reason_text
 from railfix.evaluate import evaluate_run
-from railfix.io.rinex import read_navigation, read_observations, scan_observations
+from railfix.io import read_navigation, read_observations, scan_observations
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import Result
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS

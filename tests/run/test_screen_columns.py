@@ -10,7 +10,7 @@ import pytest
 
 from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.integrity.raim import Outcome, threshold
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import Result
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS

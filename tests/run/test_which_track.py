@@ -14,7 +14,7 @@ from network_made import made_network
 from railfix.cli import app
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.positioning.which_track import StandstillErrors, StandstillFix, TrackPosterior, track_posterior
 from railfix.run.standstill import StandstillCodes, standstill_codes

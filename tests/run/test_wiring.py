@@ -17,7 +17,7 @@ import pytest
 from railfix.core.reasons import Reason, Status
 from railfix.core.tables import Table, listing
 from railfix.evaluate.tables import _ERRORS
-from railfix.io.rinex import read_observations, write_observations
+from railfix.io import read_observations, write_observations
 from railfix.pipeline.config import Config
 from railfix.pipeline.results import Result
 from railfix.pipeline.tables import observations_table, positions_table, train_table

@@ -16,7 +16,7 @@ from conftest import ROOT
 from railfix.cli import app
 from railfix.core.errors import InputFileError, MismatchError, OutputError, SettingsError
 from railfix.gnss.observations import ObservationHeader
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.ranges.cn0_curve import (
     KINDS,
     Cn0Curve,

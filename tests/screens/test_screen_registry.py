@@ -21,7 +21,7 @@ from pipeline_cases import clean_navigation, clean_observations, clean_trajector
 from railfix.core.errors import NoPositionError
 from railfix.core.reasons import Reason, Status, reason_names, reason_text, screen_reason
 from railfix.core.settings import Settings
-from railfix.io.rinex import read_observations, write_observations
+from railfix.io import read_observations, write_observations
 from railfix.pipeline.config import SCREEN_NAMES, Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.run import RunInputs, run_files

@@ -18,7 +18,7 @@ from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, enu_axes
 from railfix.core.timescale import timedelta
 from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.gnss.orbits import satellite_states
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.screens import (
     AntennaPairLimits,
     AntennaPairScreened,

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from railfix.core.errors import SettingsError
-from railfix.io.rinex import read_observations
+from railfix.io import read_observations
 from railfix.ranges.cn0_curve import Cn0Curve, Cn0Mean
 from railfix.screens import Cn0Limits, cn0_screen
 

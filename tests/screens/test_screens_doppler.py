@@ -14,7 +14,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.errors import SettingsError
 from railfix.core.timescale import timedelta
 from railfix.gnss.observations import Observations, carrier_frequency_hz
-from railfix.io.rinex import read_observations
+from railfix.io import read_observations
 from railfix.screens import DopplerLimits, DopplerScreened, DopplerState, doppler_limit_m, doppler_screen
 from railfix.screens.doppler import DopplerChannels
 

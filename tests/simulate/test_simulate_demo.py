@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from conftest import ROOT
 from railfix.cli import app
 from railfix.core.errors import InputFileError
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.simulate import DEMO_FILES, Scenario, demo_files, demo_folder, demonstration, write_run
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle

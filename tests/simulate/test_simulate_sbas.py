@@ -9,7 +9,7 @@ import pytest
 
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
-from railfix.io.rinex import read_observations
+from railfix.io import read_observations
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, SbasLimits, SbasMessages, read_sbas
 from railfix.simulate import Scenario, Simulation, write_run
 from railfix.simulate import sbas_service as service

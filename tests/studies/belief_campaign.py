@@ -46,8 +46,8 @@ from railfix.evaluate import interpolate_reference, straight_distance
 from railfix.evaluate.cases import read_case
 from railfix.gnss.navigation import Navigation, glonass_channels
 from railfix.gnss.observations import Observations, carrier_frequency_hz
+from railfix.io import read_navigation, read_observations
 from railfix.io.reference_log import read_reference
-from railfix.io.rinex import read_navigation, read_observations
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import parse_config

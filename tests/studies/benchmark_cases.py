@@ -19,7 +19,7 @@ from typing import Any, Final
 import paths
 import belief_campaign
 import recordings_truth
-from railfix.evaluate.cases import write_case
+from case_files import write_case
 from railfix.track import from_positions
 from railfix.track.point_files import write_track_csv
 

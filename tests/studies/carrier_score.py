@@ -24,7 +24,7 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.evaluate import along_track_error, interpolate_reference, score
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import AntennaResult
 from railfix.positioning.carrier import (

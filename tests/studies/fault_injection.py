@@ -33,7 +33,7 @@ from railfix.integrity.raim import (
     threshold,
 )
 from railfix.integrity.raim.model import compact
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import AntennaResult
 from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, constrained_position

@@ -19,7 +19,7 @@ from railfix.core.arrays import Floats
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.evaluate import interpolate_reference, straight_distance
 from railfix.gnss.observations import Observations
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import parse_config
 from railfix.run.processor import processor_of

@@ -28,8 +28,8 @@ from railfix.gnss.observations import Observations
 from railfix.integrity.protection import ProtectionLevel, along_track_level
 from railfix.integrity.raim import constrained_model
 from railfix.integrity.stanford import Region, Stanford, stanford
+from railfix.io import read_navigation, read_observations
 from railfix.io.reference_log import AntennaReference, read_reference
-from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
 from railfix.pipeline.level_stage import risk_of

@@ -32,7 +32,7 @@ from railfix.gnss.observations import Observations
 from railfix.integrity.protection import LevelStatus, RiskBudget
 from railfix.integrity.protection.risk import set_sums
 from railfix.integrity.raim import constrained_model
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult

@@ -30,7 +30,7 @@ from network_around import SHAPES, Shape, made, network_around, write_network
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import timedelta
 from railfix.evaluate import interpolate_reference
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.locate import locate

@@ -21,7 +21,7 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ece
 from railfix.evaluate import along_track_error
 from railfix.gnss.observations import Observations
 from railfix.integrity.raim import Outcome, RaimLimits
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import AntennaResult
 from railfix.run.processor import processor_of

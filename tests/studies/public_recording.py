@@ -18,7 +18,7 @@ from pathlib import Path
 
 import polars as pl
 
-from railfix.evaluate.cases import write_case
+from case_files import write_case
 
 WHEEL = "gnss-benchmark==2.3.0"
 INSIDE = "gnss_benchmark/datasets/mosaicx5_multi_dynamic"

@@ -20,7 +20,7 @@ from railfix.core.timescale import timedelta
 from railfix.evaluate import Score, along_track_error, interpolate_reference, score, straight_distance
 from railfix.integrity.raim import Outcome as RaimOutcome
 from railfix.integrity.raim import constrained_model, exclude
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import without

@@ -21,8 +21,8 @@ import recordings_truth
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.timescale import seconds, timedelta
 from railfix.evaluate import along_track_error, interpolate_reference
+from railfix.io import read_navigation, read_observations
 from railfix.io.position_log import PositionLog
-from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import DEFAULT_SIGNALS
 from railfix.positioning.doppler_speed import Dopplers, doppler_speed, dopplers_of_log
 from railfix.reference import Pulses, ReferenceData, ReferenceSettings, build_references
@@ -212,7 +212,7 @@ def truth_steps(recording: Recording, *, over_m: float = 0.2) -> tuple[int, int,
     """Epochs at which the inertial reference steps against the odometer, of how many, and the largest step [m]."""
     time, ecef = recording.truth
     limits = {"lateral_m": 1.0, "height_m": 2.0, "max_speed_mps": 50.0}
-    arc = match(time, ecef, recording.trajectory, **limits).arc_m
+    arc, *_ = match(time, ecef, recording.trajectory, **limits)
     if recording.pulses is None:
         raise ValueError(f"{recording.name} has no odometer")
     step = np.abs(np.diff(arc - recording.pulses.at(time)))

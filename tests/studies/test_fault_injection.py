@@ -32,7 +32,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.integrity.raim import detect
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.run.processor import processor_of
 from railfix.screens import DopplerLimits

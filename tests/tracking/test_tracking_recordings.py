@@ -9,7 +9,7 @@ import pytest
 
 import filter_score
 import recordings_score
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.run.processor import processor_of
 

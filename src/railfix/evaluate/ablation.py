@@ -142,13 +142,7 @@ def ablate_files(
     names: Mapping[str, str] | None = None,
     progress: Progress | None = None,
 ) -> Ablation:
-    """Process the logs with every choice of screens, and write the rates and errors of each.
-
-    With ``config.filter = "track"`` the filter along the track has rows too: with everything that is there, and without
-    each of its sources, all screens on. The logs are read once. ``ablation.csv`` has a row per choice and antenna,
-    ``ablation.json`` also the content of ``run.json``. With a `truth`, errors along the line are added; `names` are
-    those of its columns (`railfix.io.read_reference`).
-    """
+    """Process the logs with every choice of screens and sources, and write ``ablation.csv`` and ``ablation.json``."""
     began = clock.perf_counter()
     options = options or RunOptions()
     inputs, config = inputs.prepare(config or Config())

@@ -49,11 +49,7 @@ _SYSTEMS: Final = {"G": 1, "R": 4, "E": 8, "J": 16, "C": 32}
 
 
 def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
-    """Find the row of a log of positions that is nearest to each epoch, shape (T,); -1 without one near it.
-
-    A position belongs to an epoch within 0.4 of the median interval: programs take the receiver's clock out of their
-    time tags. Epochs rise, and are at least two.
-    """
+    """Find the row of a log nearest to each epoch, within 0.4 of the median interval; -1 without one, shape (T,)."""
     rows = np.full(len(time), -1, dtype=np.intp)
     known = np.flatnonzero(~np.isnat(found))
     index = np.clip(np.searchsorted(time, found[known]), 1, len(time) - 1)
@@ -66,12 +62,7 @@ def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
 
 
 def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Trajectory) -> pl.DataFrame:
-    """Return positions of another program as a table of a run, moved to the nearest point of the line.
-
-    `epochs` are railfix's positions of the same antenna and log, of which a rate is counted. Columns are
-    `railfix.evaluate.inputs.NEEDED`, satellites and conventional position null; times are those of the positions,
-    where there is one.
-    """
+    """Return positions of another program as a table of a run, moved to the nearest point of the line."""
     time = epochs["time_gpst"].to_numpy()
     row = rows_at_epochs(time, log.time)
     has = row >= 0
@@ -98,11 +89,7 @@ def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Traje
 
 
 def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) -> None:
-    """Write positions of another program as the folder of a run, which `railfix evaluate` reads as well.
-
-    `run` is the folder of railfix's run on the same receiver log; what is in `out` is replaced. MismatchError: the run
-    has no such antenna, or no position of the log lies near one of its epochs.
-    """
+    """Write positions of another program as the folder of a run; `run` is railfix's on the same log."""
     own = read_run(run)
     epochs = own.positions.filter(pl.col("antenna") == antenna)
     if len(epochs) < 2:
@@ -128,11 +115,7 @@ def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) 
 
 
 def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> str | None:
-    """Compute RTKLIB's single point of the front antenna's log into a ``.pos`` file; return why there is none, or None.
-
-    With the elevation mask and the constellations of the settings and the broadcast models; its own checks (chi-square
-    test of the residuals, dilution of precision) are its defaults.
-    """
+    """Compute RTKLIB's single point of the front antenna with the settings' mask; return why there is none."""
     program = shutil.which(RTKLIB_PROGRAM)
     if program is None:
         return f"no row of RTKLIB: {RTKLIB_PROGRAM} (Debian package rtklib) is not installed"
@@ -221,16 +204,8 @@ def run_benchmark(
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """Run the cases of a folder with one configuration, and judge them and the positions of other programs.
-
-    Into `out` come ``benchmark.csv``, ``benchmark.json`` (with the settings, and hashes, licences and scenarios of the
-    cases), ``benchmark.md``, and the folders of the runs: those of railfix in ``runs``, those of others in
-    ``programs``. Runs whose results are there, of the same inputs and settings, are not repeated. Other parameters and
-    errors are those of `railfix.run.campaign.run_campaign` and `read_cases`. Returns `BENCHMARK_COLUMNS`, by case, then
-    by position, and notes.
-
-    InputFileError: a file is not the one that its hash states; nothing is run then. MismatchError: the settings were
-    made from files of a held-out case.
+    """Run the cases of a folder with one configuration, and judge them and other programs; return `BENCHMARK_COLUMNS`
+    and notes. InputFileError: a wrong hash. MismatchError: settings made from held-out cases.
     """
     cases = read_cases(folder)
     check_not_fitted(config, cases)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -11,14 +11,13 @@ from pydantic import Field
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import file_sha256, read_text
-from railfix.core.settings import Settings, load_settings, validated, write_toml
+from railfix.core.settings import Settings, load_settings
 from railfix.evaluate.inputs import EvaluationOptions
 from railfix.pipeline.config import Config
 from railfix.run.inputs import Antenna, ColumnNames, RunInputs, RunOptions
 
 #: File that makes a folder a case.
 CASE_FILE: Final = "case.toml"
-_KIND: Final = "a case of a benchmark"
 #: Files of a run that are settings: one configuration is that of all cases.
 _SETTINGS: Final = ("config", "cn0_curve", "error_model", "sbas")
 
@@ -79,9 +78,7 @@ class Case:
     truth: Path
 
     def check_hashes(self) -> None:
-        """Raise InputFileError where a file is missing or not the one that the case was made of, SettingsError without
-        a hash.
-        """
+        """Raise InputFileError where a file is not the one of the case, SettingsError without a hash."""
         for name in self.content.every_file():
             path, stated = self.folder / name, self.content.sha256.get(str(name))
             if stated is None:
@@ -98,7 +95,7 @@ class Case:
 def read_case(folder: Path) -> Case:
     """Read the case in a folder; InputFileError, SettingsError where ``case.toml`` is not that of a case."""
     path = folder / CASE_FILE
-    content = load_settings(CaseFile, path, what=_KIND)
+    content = load_settings(CaseFile, path, what="a case of a benchmark")
     if content.files.truth is None:
         raise SettingsError(f"{path}: setting files.truth is missing; name the ground truth")
     if given := [name for name in _SETTINGS if getattr(content.files, name)]:
@@ -125,18 +122,8 @@ def read_cases(folder: Path) -> list[Case]:
     return [read_case(path) for path in folders]
 
 
-def write_case(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write the ``case.toml`` of a folder from its content without hashes; errors as `read_case`."""
-    case = validated(CaseFile, {**content, "sha256": {}}, source=str(folder / CASE_FILE))
-    hashes = {str(name): file_sha256(folder / name) for name in case.every_file()}
-    write_toml(folder / CASE_FILE, {**content, "sha256": hashes}, what=_KIND)
-
-
 def check_not_fitted(config: Config, cases: Sequence[Case]) -> None:
-    """Raise MismatchError where a file of the settings was fitted on a file of a held-out case.
-
-    C/N0 curves and error models record the SHA-256 of the files that they were made from.
-    """
+    """Raise MismatchError where a file of the settings was fitted (by the SHA-256 it records) on a held-out case."""
     files = [path for path in (config.cn0_curve, config.error_model) if path is not None]
     for path in files:
         text = read_text(path)

@@ -105,10 +105,7 @@ def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 
 def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
-    """Return the epochs of a log and those missing in its gaps, rising; which are of the log; and its step [s].
-
-    Gaps of more than 1.5 steps have instants at the median step of the log, which is NaN with fewer than two epochs.
-    """
+    """Return the epochs of a log with those missing in gaps over 1.5 steps, which are of it, and its step [s]."""
     if len(time) < 2:
         return time, np.ones(len(time), dtype=np.bool_), float("nan")
     gap = seconds(np.diff(time))
@@ -127,12 +124,7 @@ def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
 def distance_travelled(
     time: Datetimes, step_m: Floats, known: Masks, speed_mps: Floats, *, options: EvaluationOptions
 ) -> Floats:
-    """Return the distance travelled since the first epoch with a known reference position, shape (T,) [m].
-
-    A step counts if the train moved: by the mean of the reference speeds at its ends, or by the mean speed of the step
-    where these are unknown or the step is longer than `reference_gap_s`. Interpolated by time between known positions;
-    NaN before the first and after the last. `step_m`: lengths of the steps between the K known epochs, shape (K - 1,).
-    """
+    """Return the distance travelled since the first known reference position (T,) [m]; NaN before and after."""
     at = np.flatnonzero(known)
     moved = np.full(len(time), np.nan)
     if not len(at):
@@ -163,10 +155,7 @@ def antenna_epochs(
     files: TrackFiles,
     options: EvaluationOptions,
 ) -> AntennaEpochs:
-    """Return the epochs of one antenna of a run with their errors.
-
-    MismatchError: reference and run have no time in common, or the errors cannot be worked out as asked.
-    """
+    """Return the epochs of one antenna of a run with their errors; MismatchError: no time in common, no errors."""
     mine = run.positions.filter(pl.col("antenna") == antenna)
     time, logged, step_s = with_missing(mine["time_gpst"].to_numpy())
     rows = np.where(logged, np.cumsum(logged) - 1, len(mine))

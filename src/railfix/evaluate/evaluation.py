@@ -92,11 +92,7 @@ class Evaluation:
     inputs: tuple[Mapping[str, Any], ...] = ()  #: Files of all runs, with size and hash.
 
     def figure(self, name: str, **where: str) -> Any:
-        """One figure of the table of figures, of the row whose other columns have these values.
-
-        Without values it is that of the grouping "all", own epochs, constrained. LookupError: not exactly one row is
-        meant.
-        """
+        """Return one figure of the row with these values, by default of "all", own, constrained; else LookupError."""
         chosen = {"grouping": ALL, "epochs_of": "own", "position": "constrained"} | where
         rows = self.figures.filter(*(pl.col(key) == value for key, value in chosen.items()))
         if len(rows) != 1:
@@ -308,10 +304,7 @@ def short_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
-    """Every grouping of every run; of several also the runs of each configuration together.
-
-    Runs of different configurations are never put together: they may be of the same log.
-    """
+    """Return every grouping of every run; of several also the runs of each configuration together."""
     epochs = epochs.select(*KEYS, *USED)
     groupings = ("all", "section", "environment", "speed", "satellites", "signals", "status")
     tables = [figures_by(_parts(epochs, "run", ()), groupings, options)]

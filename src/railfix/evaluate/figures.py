@@ -85,12 +85,7 @@ def block_limits(
     seed: int,
     confidence: float,
 ) -> dict[str, float]:
-    """Return limits of mean, rate and percentiles (`LIMIT_COLUMNS`) and number of blocks, by resampling blocks.
-
-    Blocks are drawn with replacement, as many as the data has. A percentile of a resample is the smallest value that
-    the given share of its values do not exceed. The limits are NaN with fewer than `FEWEST_BLOCKS` blocks. Arrays are
-    of shape (T,), NaN where there is no error, or no standard deviation.
-    """
+    """Return `LIMIT_COLUMNS` and the number of blocks, drawn with replacement; NaN below `FEWEST_BLOCKS`."""
     names, member = np.unique(block, return_inverse=True)
     blocks = len(names)
     if blocks < FEWEST_BLOCKS:
@@ -133,11 +128,7 @@ def block_limits(
 
 
 def _percentiles(size: Floats, member: Integers, times: Floats, errors: Floats, *, share: float) -> Floats:
-    """Percentile of each resample, shape (replicates,); NaN where a resample has no value.
-
-    Values are counted at nodes, then at finer nodes in the range of the percentiles of all resamples, until every
-    value of that range is a node.
-    """
+    """Compute the percentile of each resample (replicates,), counted at ever finer nodes; NaN where it has no value."""
     found = np.full(len(times), np.nan)
     drawn = errors > 0
     if not drawn.any():
@@ -317,10 +308,7 @@ def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
 
 
 def figures_by(parts: Iterable[pl.DataFrame], groupings: Sequence[str], options: EvaluationOptions) -> pl.DataFrame:
-    """Return `FIGURE_COLUMNS`, a row for every grouping, group, antenna, kind of position and choice of epochs.
-
-    Parts of the epochs and values of `KEYS` are kept apart: memory is that of the largest part.
-    """
+    """Return `FIGURE_COLUMNS` for every grouping, group, antenna, kind of position and choice of epochs."""
     kinds = [(position, "own") for position in POSITIONS] + [("constrained", "common"), ("conventional", "common")]
     tables: dict[str, list[list[pl.DataFrame]]] = {grouping: [[] for _ in kinds] for grouping in groupings}
     for epochs in parts:

@@ -157,13 +157,7 @@ def tables_of(path: Path) -> list[str]:
 def read_run(
     path: Path, *, table: str = POSITIONS_TABLE, conventional: Path | None = None, columns: cs.Selector | None = None
 ) -> RunFolder:
-    """Read the folder that `railfix run` wrote.
-
-    A `table` other than "positions" takes the satellites used and the conventional position from the single-epoch
-    positions of the same time and antenna. `conventional`: see `railfix.evaluate.RunAndReference`; `columns`: those to
-    read beside those that every table of positions has, all without. InputFileError: no such folder, or its files are
-    not what they should be. MismatchError: `conventional` is a run on another log.
-    """
+    """Read a folder that `railfix run` wrote; InputFileError, MismatchError: it is not what it should be."""
     record = read_record(path).record
     needed = (*NEEDED, *SINGLE_EPOCH) if table == POSITIONS_TABLE else NEEDED
     file, rows = read_table(path, table, needed, columns)
@@ -194,11 +188,7 @@ def _log_hashes(record: Mapping[str, Any]) -> list[str]:
 def read_table(
     path: Path, name: str, needed: Sequence[str] = NEEDED, columns: cs.Selector | None = None
 ) -> tuple[Path, pl.DataFrame]:
-    """Return the file and the rows of one table of a run, in order of time.
-
-    `needed` are the columns that it must have, `columns` those to read beside them, all without. InputFileError: the
-    table is absent, lacks a column, has no rows, or an antenna twice at one time.
-    """
+    """Return the file and the rows of one table of a run, in order of time; InputFileError without `needed` columns."""
     file = next((path / f"{name}{end}" for end in _ENDINGS if (path / f"{name}{end}").is_file()), None)
     if file is None:
         raise InputFileError(path, f"holds neither {name}.parquet nor {name}.csv; name a folder of railfix run")

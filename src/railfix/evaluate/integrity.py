@@ -106,10 +106,7 @@ def level_name(kind: str) -> str:
 
 
 def effective_levels(level_m: Floats, has: Masks, status: Strings, verdict: Strings, *, levels_of: LevelsOf) -> Floats:
-    """Return levels as counted, shape (T,) [m]: infinite without a usable level, NaN without a position.
-
-    `status` of the position and `verdict` of the level are blank where there is none, `level_m` is NaN.
-    """
+    """Return levels as counted, shape (T,) [m]: infinite without a usable level, NaN without a position."""
     bound = np.where(np.isnan(level_m), np.inf, level_m)
     if levels_of == "usable":
         bound = np.where(_usable(status, verdict), bound, np.inf)
@@ -129,10 +126,7 @@ def _words(table: pl.DataFrame, name: str) -> Strings:
 def epochs_diagram(
     epochs: pl.DataFrame, kind: str, *, alarm_limit_m: float, levels_of: LevelsOf, options: EvaluationOptions
 ) -> Stanford:
-    """Stanford diagram of the epochs of one antenna of one run that lie inside the reference.
-
-    Of `railfix.evaluate.EPOCH_COLUMNS` and the levels of a kind, in order of time.
-    """
+    """Sort the epochs of one antenna (`EPOCH_COLUMNS`) inside the reference, and their levels, into a diagram."""
     columns = (level_name(kind), f"{kind}_protection_status")
     spanned = epochs.select(*_JUDGED, *(name for name in columns if name in epochs.columns)).filter("in_reference")
     return _sort(spanned, *_judge(spanned, kind, levels_of), alarm_limit_m, options)
@@ -155,10 +149,7 @@ def _judge(spanned: pl.DataFrame, kind: str, levels_of: LevelsOf) -> tuple[Float
 def positions_diagram(
     positions: pl.DataFrame, *, alarm_limit_m: float, levels_of: LevelsOf, options: EvaluationOptions
 ) -> Stanford:
-    """Stanford diagram of a run without a reference: availability and continuity only.
-
-    Of one antenna, columns of `railfix.pipeline.result_columns.POSITION_COLUMNS`, in order of time.
-    """
+    """Sort the epochs of one antenna (`POSITION_COLUMNS`) without reference by availability and continuity."""
     level = effective_levels(
         floats(positions, "protection_level_m"),
         np.isfinite(floats(positions, "chainage_m")),
@@ -183,11 +174,7 @@ def _sort(
 
 
 def integrity_of(epochs: pl.DataFrame, runs: Mapping[str, Level], options: EvaluationOptions) -> dict[str, Integrity]:
-    """Levels against errors by kind, of all runs; empty where no run has levels.
-
-    Every run is counted at the alarm limits of the options and at those of all runs, so that rows of several runs
-    together include each of them.
-    """
+    """Judge levels against errors by kind, of all runs at all alarm limits; empty where no run has levels."""
     own = {limit for _, limit in runs.values() if limit is not None}
     limits = sorted({*options.alarm_limits_m, *own})
     by_kind = {}

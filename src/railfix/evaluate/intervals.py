@@ -35,11 +35,7 @@ _OF: Final = ("run", "antenna")
 
 
 def interval_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame:
-    """Distribution of the intervals of each kind of position: columns `by` and `INTERVAL_COLUMNS`.
-
-    An interval lies within one run and antenna. The values of the columns `by`, ``configuration`` among them, are kept
-    apart; before_first_s and after_last_s are the largest of the runs.
-    """
+    """Distribution of the intervals of each kind of position, within one run and antenna (`INTERVAL_COLUMNS`)."""
     return pl.concat(
         _of_position(epochs.lazy().filter(configuration=name), position, by)
         for position in POSITIONS
@@ -118,10 +114,7 @@ _OUTAGE_COLUMNS: Final = (
 
 
 def outage_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
-    """Stretches without satellites with the filter's errors, in order of time; None without a table of the filter.
-
-    Single epochs have no position in these stretches and are left out.
-    """
+    """Stretches without satellites with the filter's errors, in order of time; None without a table of the filter."""
     filtered = epochs.select(*KEYS, *_OUTAGE_COLUMNS).filter(OF_FILTER)
     if not len(filtered):
         return None
@@ -174,11 +167,7 @@ BRANCH_COLUMNS: Final[dict[str, str]] = {
 
 
 def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
-    """Stated probability against the share of right places, by class; None without a table of the filter.
-
-    Of `railfix.evaluate.epochs.EPOCH_COLUMNS` of all runs. Calibrated probabilities have a `right_share` of at least
-    `probability_mean`: a hypothesis rejected can be near.
-    """
+    """Stated probability against the share of right places, by class; None without a table of the filter."""
     filtered = epochs.select(*KEYS, *_BRANCH_COLUMNS).filter(OF_FILTER)
     if not len(filtered):
         return None
@@ -280,13 +269,8 @@ COLUMNS: Final = (
 
 
 def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_m: float = 20.0) -> pl.DataFrame:
-    """Compute what satellites gave by stretches of the line, over all antennas of several runs on one map.
-
-    Epochs without a position of their own stand where the filter has the train, else where the epochs about them lie.
-    Returns `COLUMNS`, in order of the chainage, without stretches that no run has passed. `rejected_share`: of the
-    satellites; `reflection_p95_m`: distance of the 3-D position from the line; `ok_share`: single epochs with the
-    status ok; `tracking_share` and levels: of the filter, infinite where it has none; null without a filter.
-    MismatchError: the runs are on different maps.
+    """Compute `COLUMNS`, what satellites gave by stretches of the line, over all antennas of runs on one map (else
+    MismatchError); epochs without position stand where the filter has the train.
     """
     runs = [read_run(folder) for folder in folders]
     first = runs[0].track_facts

@@ -9,13 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
 from pydantic import Field
-from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError, MismatchError, RailfixError
@@ -25,7 +23,7 @@ from railfix.evaluate.inputs import LARGEST_GAP_S, Method, RunFolder
 from railfix.run.inputs import TrackReading
 from railfix.track import Track, read_track
 from railfix.track.track import ANOTHER_PLACE_M
-from railfix.track.trajectory import Trajectory, short_way_m
+from railfix.track.trajectory import Trajectory, passes_of, short_way_m
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 
@@ -75,10 +73,7 @@ def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float 
 def interpolate_reference(
     time: Datetimes, reference_time: Datetimes, reference_ecef_m: Floats, *, largest_gap_s: float = LARGEST_GAP_S
 ) -> Floats:
-    """Reference positions, shape (R, 3), linearly at other times, shape (T, 3) [m]; NaN outside and in gaps.
-
-    Times of the reference rise; steps longer than `largest_gap_s` are not bridged.
-    """
+    """Interpolate positions (R, 3) linearly at times (T,) [m]; NaN outside and in steps longer than `largest_gap_s`."""
     return bracket(time, reference_time, largest_gap_s=largest_gap_s).of(reference_ecef_m)
 
 
@@ -101,26 +96,14 @@ def along_track_error(
         return error
     reference, length = reference_ecef_m[at], trajectory.length_m
     nearest_arc, offset = trajectory.nearest(reference)
-    middle = 0.5 * (trajectory.ecef_m[1:] + trajectory.ecef_m[:-1])
-    lists = cKDTree(middle).query_ball_point(
-        reference, np.maximum(same_place_m, offset) + 0.5 * length.max(), return_sorted=True
-    )
-    which = np.repeat(np.arange(len(at)), [len(x) for x in lists])
-    section = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=len(which))
-    delta = reference[which] - trajectory.ecef_m[section]
-    along = np.einsum("pi,pi->p", delta, trajectory.tangent[section])
-    foot = np.clip(along, 0.0, length[section])
-    away = np.linalg.norm(delta - foot[:, None] * trajectory.tangent[section], axis=1)
-    # A pass is a local minimum of the distance along the line: no neighbouring section comes nearer.
-    joined = (which[1:] == which[:-1]) & (section[1:] == section[:-1] + 1)
-    passing = away <= same_place_m
+    passes = passes_of(reference, trajectory, np.maximum(same_place_m, offset))
+    passing = passes.lowest & (np.linalg.norm(passes.offset_m, axis=1) <= same_place_m)
     if np.isfinite(trajectory.turn_m):  # the ends of a closed line are no passes: it goes on there
-        passing &= ~((section == 0) & (along <= 0.0))
-        passing &= ~((section == len(length) - 1) & (along >= length[-1]))
-    passing[1:] &= ~joined | (away[1:] <= away[:-1])
-    passing[:-1] &= ~joined | (away[:-1] <= away[1:])
-    signed = np.concatenate([arc_m[at] - nearest_arc, (arc_m[at][which] - trajectory.arc_m[section] - foot)[passing]])
-    owner = np.concatenate([np.arange(len(at)), which[passing]])
+        passing &= ~((passes.segment == 0) & (passes.along_m <= 0.0))
+        passing &= ~((passes.segment == len(length) - 1) & (passes.along_m >= length[-1]))
+    ways = arc_m[at][passes.position] - trajectory.arc_m[passes.segment] - passes.foot_m
+    signed = np.concatenate([arc_m[at] - nearest_arc, ways[passing]])
+    owner = np.concatenate([np.arange(len(at)), passes.position[passing]])
     signed = short_way_m(signed, trajectory.turn_m)
     order = np.lexsort((np.abs(signed), owner))
     first = order[np.flatnonzero(np.r_[True, owner[order][1:] != owner[order][:-1]])]
@@ -131,11 +114,7 @@ def along_track_error(
 
 
 def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory) -> Floats:
-    """Straight distance between positions on the map and the reference's nearest point on the map, shape (T,) [m].
-
-    It needs no choice between several passes of the line at one place, and never exceeds the distance along the line.
-    NaN where the position or the reference, shape (T, 3), is missing.
-    """
+    """Straight distance between positions (T, 3) on the map and its point nearest to the reference, shape (T,) [m]."""
     distance = np.full(len(arc_m), np.nan)
     rows = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
     if len(rows):
@@ -204,12 +183,7 @@ def errors_of(
     method: Literal["auto", "chainage", "trajectory"],
     files: TrackFiles,
 ) -> PlaceErrors:
-    """Return the errors of one antenna of a run.
-
-    By chainage if the reference has one at every epoch, the run's chainage is that of the antenna, and both agree with
-    the coordinates to `SAME_MAP_M` at the median; otherwise along the trajectory. MismatchError: `method` is "chainage"
-    and not applicable, or the track is not that of the run.
-    """
+    """Return the errors of one antenna, by chainage on the same map to `SAME_MAP_M`, else along the trajectory."""
     _check_same_place(run, antenna, answers)
     against, trusted = _against_chainage(run, antenna, answers)
     turn = run.turn_m(antenna)
@@ -306,10 +280,7 @@ def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
 def find_trajectory(
     run: RunFolder, antenna: str, chainage_m: Floats, ecef_m: Floats, files: TrackFiles
 ) -> tuple[Trajectory, tuple[tuple[str, Path], ...], tuple[str, ...]]:
-    """Return the trajectory of a run's positions, shape (T,), (T, 3), from its track and vehicle; files and notes.
-
-    MismatchError: the positions do not lie on it: another track or vehicle, or other reading options.
-    """
+    """Return the trajectory of a run's positions, its files and notes; MismatchError: they do not lie on it."""
     tracks = list(files.track) or run.tracks
     vehicles = [files.vehicle] if files.vehicle is not None else run.input_paths("vehicle")
     if not tracks:

@@ -84,10 +84,7 @@ class StationErrors:
     smoothed: bool  #: Whether the pseudoranges were smoothed by carrier phase.
 
     def at(self, time: Datetimes, satellite: Strings, *, largest_gap_s: float) -> Floats:
-        """Errors at other times, interpolated linearly between the station's epochs, shape (T, K) [m].
-
-        NaN for satellites that the station does not see, outside its log and in gaps.
-        """
+        """Errors at other times, interpolated linearly, shape (T, K) [m]; NaN where the station sees nothing."""
         column = {name: i for i, name in enumerate(self.satellite.tolist())}
         known = [k for k, name in enumerate(satellite.tolist()) if name in column]
         result = np.full((len(time), len(satellite)), np.nan)
@@ -100,10 +97,8 @@ class StationErrors:
 def base_station(
     parts: Iterable[Observations], processor: EpochProcessor, position_ecef_m: Floats, *, name: str
 ) -> StationErrors:
-    """Common range errors from the parts of the log of a station at a known position, in order of time.
-
-    Its pseudoranges are corrected like those of the train, by the `processor` of the train, and smoothed by carrier
-    phase where available, which reduces the station's own noise. The station's own multipath remains.
+    """Common range errors from the log of a station at a known position, corrected by the train's `processor` and
+    smoothed by carrier phase; the station's own multipath remains.
     """
     station, carrier, phases = BaseStation(processor.config, position_ecef_m), CarrierState(), False
     times: list[Datetimes] = []
@@ -136,10 +131,7 @@ def base_station(
 def base_station_from_files(
     paths: Sequence[Path], processor: EpochProcessor, *, position_ecef_m: Floats | None = None
 ) -> StationErrors:
-    """Common range errors from RINEX files; the position is that of the header where none is given.
-
-    InputFileError: no position is known, or no error could be computed.
-    """
+    """Compute common range errors from RINEX files, by default at the header's position; InputFileError without one."""
     parts = list(scan_observations(paths, epochs=20_000))
     place = position_ecef_m if position_ecef_m is not None else parts[0].header.approximate_ecef_m
     if place is None or not np.isfinite(place).all() or np.linalg.norm(place) < 1e6:

@@ -10,7 +10,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from itertools import chain, islice, pairwise
+from itertools import chain, groupby, islice, pairwise
+from operator import itemgetter
 from typing import Any, Final
 
 import numpy as np
@@ -24,25 +25,12 @@ from railfix.core.timescale import gps_time
 def carrier_frequency_hz(
     satellite: Strings, signal: Strings, glonass_channel: Mapping[str, int] | None = None
 ) -> Floats:
-    """Carrier frequency of each channel, shape (M,) [Hz].
-
-    Parameters
-    ----------
-    satellite, signal : ndarray of str, shape (M,)
-        "R05" on "1C".
-    glonass_channel : mapping of str to int, optional
-        Frequency channel of GLONASS satellites.
-
-    Returns
-    -------
-    ndarray, shape (M,) [Hz]
-        NaN where the band is not one of the constellation's, or a GLONASS channel is unknown.
-    """
+    """Return the carrier frequency of each channel, shape (M,) [Hz]; NaN for an unknown band or GLONASS channel."""
     channels = np.array([(glonass_channel or {}).get(name, np.nan) for name in satellite.tolist()], dtype=np.float64)
-    return named_frequency_hz(np.char.add(satellite.astype("<U1"), signal), channels)
+    return frequency_by_name_hz(np.char.add(satellite.astype("<U1"), signal), channels)
 
 
-def named_frequency_hz(name: Strings, glonass_channel: Floats) -> Floats:
+def frequency_by_name_hz(name: Strings, glonass_channel: Floats) -> Floats:
     """Carrier frequency [Hz] of signals ("G1C") and GLONASS channels, shape (..., M); NaN where unknown."""
     frequency = np.full(glonass_channel.shape, np.nan)
     for text in np.unique(name).tolist():
@@ -277,7 +265,7 @@ def stack_parts(parts: Sequence[Observations]) -> Observations:
         break_before=np.concatenate([p.break_before for p in parts]),
         receiver_alarm=np.concatenate([p.receiver_alarm for p in parts]),
         front_end_gain=np.concatenate([p.front_end_gain for p in parts]), header=_join_header(parts),
-        problems=capped_problems(chain.from_iterable(p.problems[:MAX_PROBLEMS] for p in parts), count=count),
+        problems=first_problems(chain.from_iterable(p.problems[:MAX_PROBLEMS] for p in parts), count=count),
         problem_count=count, skipped=dict(skipped), **floats,
     )  # fmt: skip
 
@@ -294,7 +282,13 @@ def _join_header(parts: Sequence[Observations]) -> ObservationHeader:
     return replace(first, signals=joined, glonass_channel=channels)
 
 
-def capped_problems(messages: Iterable[str], *, count: int) -> tuple[str, ...]:
+def signals_by_system(satellite: Strings, signal: Strings) -> dict[str, tuple[str, ...]]:
+    """Return the signals of the channels by constellation letter, sorted (`ObservationHeader.signals`)."""
+    pairs = sorted(set(zip(satellite.astype("<U1").tolist(), signal.tolist(), strict=True)))
+    return {system: tuple(name for _, name in group) for system, group in groupby(pairs, key=itemgetter(0))}
+
+
+def first_problems(messages: Iterable[str], *, count: int) -> tuple[str, ...]:
     """Return the first `MAX_PROBLEMS` messages, and one with the number of the others of `count`."""
     kept = tuple(islice(messages, MAX_PROBLEMS))
     return (*kept, f"and {count - len(kept)} more problems") if count > len(kept) else kept

@@ -43,11 +43,7 @@ class ReferenceCurve:
 
     @classmethod
     def between_stations(cls, stations_m: Floats, *, speed_mps: float) -> Self:
-        """Return the curve of a run that starts and stops at each station with an even acceleration.
-
-        Stations, shape (K,) [m], are in the order of the run; where they are near each other the train does not reach
-        its highest speed [m/s].
-        """
+        """Return the curve of a run that stops at each station (K,) [m], up to a highest speed [m/s]."""
         direction = 1 if stations_m[-1] > stations_m[0] else -1
         time, place, start = [np.zeros(1)], [stations_m[:1]], 0.0
         for origin, way in zip(stations_m[:-1], np.abs(np.diff(stations_m)), strict=True):
@@ -67,7 +63,7 @@ class ReferenceCurve:
             direction=direction, running_s=np.concatenate(time), chainage_m=np.concatenate(place), stations_m=stations_m
         )
 
-    def simulated_m(self, from_m: float, elapsed_s: float) -> float:
+    def running_m(self, from_m: float, elapsed_s: float) -> float:
         """Return the place a running time after a place, at most the next station: by place, not by timetable."""
         at = np.interp(self.direction * from_m, self.direction * self.chainage_m, self.running_s)
         place = float(np.interp(at + max(elapsed_s, 0.0), self.running_s, self.chainage_m))
@@ -83,10 +79,7 @@ class ReferenceCurve:
         return nearest if distance[nearest] <= _AT_STATION_M else None
 
     def progress(self, chainage_m: float) -> tuple[int, float]:
-        """Return the section, by its first station, and the progress in it in running direction [%].
-
-        P5 3.1: a train reports the station at a station, else the section and the progress, its length being 100 %.
-        """
+        """Return the section, by its first station, and the progress in it in running direction [%] (P5 3.1)."""
         along = self.direction * self.stations_m
         section = int(np.clip(np.searchsorted(along, self.direction * chainage_m, side="right") - 1, 0, len(along) - 2))
         share = (self.direction * chainage_m - along[section]) / (along[section + 1] - along[section])
@@ -215,7 +208,7 @@ def time_passed(
         start = record.measured_s
         if record.departure_s is not None and curve.station_at(last) is not None:
             start = max(start, record.departure_s)
-        place = curve.simulated_m(last, now_s - start)
+        place = curve.running_m(last, now_s - start)
     at_end = authority_m is not None and facing * (authority_m - place) <= 0.0
     if at_end and authority_m is not None:
         place = authority_m if facing * (authority_m - last) > 0.0 else last

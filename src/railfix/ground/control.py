@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from railfix.ground.centre import ReferenceCurve, TrainRecord, TrainState, time_passed
-from railfix.ground.interlocking import HEAD, Interlocking, from_documents, stopped_trains, to_documents
+from railfix.ground.interlocking import HEAD, Interlocking, from_documents, stop_orders, to_documents
 from railfix.ground.layout import PointName
 from railfix.ground.stops import close_section, open_section, release_train, stop_trains
 from railfix.ground.store import DatabaseError, Store
@@ -97,12 +97,8 @@ class ControlCentre:
         self._routes = {n: train.station for n, train in self.supervision.state.trains.items()}
 
     @classmethod
-    def restored(cls, supervision: Supervision, store: Store, *, judged: bool, **rest: Any) -> ControlCentre:
-        """Return the centre with what a process before has stored; at the first start as `supervision` has it.
-
-        Trains are unknown until they are heard, and points that were moving are moved again. Where a triangle judges
-        satellite positioning, the first start is a stop, to be released by hand.
-        """
+    def restore(cls, supervision: Supervision, store: Store, *, judged: bool, **rest: Any) -> ControlCentre:
+        """Return the centre as stored, trains unknown; with a triangle the first start is a stop."""
         texts, monitor = store.documents(HEAD), MonitorState() if judged else None
         if texts:
             supervision.state = state = from_documents(texts)
@@ -179,10 +175,7 @@ class ControlCentre:
         return [f"train {n} suspects {kind.name.lower()}" for n, kind in sorted(self.interference.items()) if kind]
 
     def judge(self, verdict: TriangleVerdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
-        """Take a verdict on satellite positioning, of fixes of an age; of those between two steps the worst counts.
-
-        Fixes older than `MonitorLimits.late_s`, or from the future by as much, are no verdict.
-        """
+        """Take a verdict of fixes no older than `MonitorLimits.late_s`; the worst between two steps counts."""
         if abs(age_s) > self.times.late_s:
             self.rejected["fixes of the triangle with a wrong age"] += 1
             return
@@ -275,10 +268,7 @@ class ControlCentre:
         return None
 
     def release_train(self, train: int) -> str | None:
-        """Release the stop of a train by hand; return the reason of a refusal.
-
-        Nothing says of a silent train that it still is where it was: its release is ordered twice (`AGAIN_S`).
-        """
+        """Release a train's stop by hand, a silent one's twice (`AGAIN_S`); return the reason of a refusal."""
         now, (least_s, most_s), asked_s = self.clock(), AGAIN_S, self._asked_s.pop(train, -math.inf)
         silent = self.supervision.records.get(train, TrainRecord(train=train)).state is not TrainState.TRACKED
         state, reason = release_train(self.supervision.state, train, self.supervision.layout)
@@ -319,7 +309,7 @@ class ControlCentre:
     def snapshot(self) -> dict[str, Any]:
         """Return plain values of trains, points, monitor and log for the page."""
         layout, state = self.supervision.layout, self.supervision.state
-        trains, stopped = [], stopped_trains(state)
+        trains, stopped = [], stop_orders(state)
         for number, train in state.trains.items():
             record = self.supervision.records.get(number, TrainRecord(train=number))
             rear, front = train.interval_m

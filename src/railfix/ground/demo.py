@@ -55,10 +55,7 @@ class RelaySettings(Settings):
 
 
 class LinkDisturbance:
-    """Seeded disturbance of packets of any kind, counted by what happened to them.
-
-    `settings` may be replaced while packets pass; while `up` is False, an outage, every packet is lost.
-    """
+    """Seeded disturbance of packets, counted by what happened to them; every packet is lost unless `up`."""
 
     def __init__(self, settings: RelaySettings) -> None:
         self.settings, self.up = settings, True
@@ -156,14 +153,10 @@ def points_ecef_m() -> Floats:
     return ecef_from_geodetic(35.7, 139.7, 100.0) + PLAN_M @ enu_axes(35.7, 139.7)[:2]
 
 
-def simulated_fixes(
+def draw_fixes(
     rng: np.random.Generator, *, epochs: int = 60, common_m: Floats | None = None, moved_m: Floats | None = None
 ) -> StationFixes:
-    """Return fixes, one a second, from simulated ranges of satellites that stand still.
-
-    `common_m`, shape (T, 9): errors of the satellites, common to the receivers. `moved_m`, shape (T, 3, 2): east and
-    north by which the fix of a receiver moves; NaN: it has none, and its C/N0 has fallen.
-    """
+    """Return fixes, one a second, with errors `common_m` (T, 9), moved by `moved_m` (T, 3, 2), NaN without fix."""
     points, axes = points_ecef_m(), enu_axes(35.7, 139.7)
     el, az = np.radians(ELEVATION_DEG), np.radians(AZIMUTH_DEG)
     enu = np.stack([np.cos(el) * np.sin(az), np.cos(el) * np.cos(az), np.sin(el)], axis=1)
@@ -233,7 +226,7 @@ def _verdicts(seed: int) -> list[tuple[TriangleVerdict, int]]:
     epochs = int(END_S) + 1
     common = np.zeros((epochs, 9))
     common[:, 3] = 8.0 * np.clip(np.arange(epochs) - FAULT_S, 0.0, None)
-    fixes = simulated_fixes(np.random.default_rng(seed), epochs=epochs, common_m=common)
+    fixes = draw_fixes(np.random.default_rng(seed), epochs=epochs, common_m=common)
     result = compare_triangle(PLAN_M, fixes.fixes_m, limits=TriangleLimits())
     return [(TriangleVerdict(int(v)), int(r)) for v, r in zip(result.verdict, result.receiver, strict=True)]
 

@@ -102,10 +102,7 @@ class Interlocking:
 
 
 class NearbyTrains:
-    """Trains by where their intervals and routes are, or come to be by one more route.
-
-    Made once for a step, so that the cost of a step is that of its trains and not of their pairs.
-    """
+    """Trains by where their intervals and routes are, or come to be by one more route; made once for a step."""
 
     def __init__(self, state: Interlocking, layout: Layout) -> None:
         self._layout = layout
@@ -129,7 +126,7 @@ def with_train(state: Interlocking, train: TrainInterval) -> Interlocking:
     return replace(state, trains={**state.trains, train.train: train})
 
 
-def stopped_trains(state: Interlocking) -> dict[int, str]:
+def stop_orders(state: Interlocking) -> dict[int, str]:
     """Return the trains that are ordered to stop, and why: those stopped themselves, and the nearest on either side."""
     found = {number: train.stop for number, train in state.trains.items() if train.stop is not None}
     if not found:
@@ -173,7 +170,7 @@ def route_requested(
 ) -> tuple[Interlocking, tuple[PointName, ...], str | None]:
     """Return the state with a route to the next station, the points to be moved, and the reason of a refusal.
 
-    With `NearbyTrains` and `stopped_trains` of the step where they are at hand.
+    With `NearbyTrains` and `stop_orders` of the step where they are at hand.
     """
     here = state.trains[train]
     begin, direction = here.station, here.direction
@@ -182,7 +179,7 @@ def route_requested(
         return state, (), "a shorter authority is being agreed with the train"
     if state.stopped:
         return state, (), "satellite positioning is suspended"
-    if train in (stops := stopped_trains(state) if stopped is None else stopped):
+    if train in (stops := stop_orders(state) if stopped is None else stopped):
         return state, (), f"the train is stopped: {stops[train]}"
     if not 0 <= target < len(layout.stations):
         return state, (), "there is no station ahead"
@@ -272,11 +269,11 @@ def extended(
 ) -> Interlocking:
     """Return the state with the authorities of trains, of all without `trains`, extended as far as they may be.
 
-    With `NearbyTrains` and `stopped_trains` of the step where they are at hand.
+    With `NearbyTrains` and `stop_orders` of the step where they are at hand.
     """
     if state.stopped:
         return state
-    stopped = stopped_trains(state) if stopped is None else stopped
+    stopped = stop_orders(state) if stopped is None else stopped
     nearby = nearby or NearbyTrains(state, layout)
     after = dict(state.trains)
     state = replace(state, trains=after)
@@ -343,10 +340,7 @@ def to_documents(state: Interlocking, before: Interlocking | None = None) -> dic
 
 
 def from_documents(texts: Mapping[str, str]) -> Interlocking:
-    """Return the state from its texts. Times of release begin again: the clock of the process before is not known.
-
-    InputFileError: when an older version wrote them.
-    """
+    """Return the state from its texts, with times of release begun again; InputFileError: of an older version."""
     head = json.loads(texts[HEAD])
     if "closed" not in head:
         raise InputFileError("the centre's database", "is of an older version of railfix; name another database")

@@ -56,11 +56,7 @@ def configuration(folder: Path, name: str, *, is_client: bool, idle_s: float = I
 
 
 class LinkProtocol(QuicConnectionProtocol):
-    """One end of a connection that carries datagrams.
-
-    `peer` is the common name of the other end's certificate, None before it was verified; `ends`, when that ends to be
-    valid.
-    """
+    """One end of a connection that carries datagrams; `peer`: common name of the verified certificate, till `ends`."""
 
     def __init__(
         self,
@@ -159,7 +155,7 @@ class LinkProtocol(QuicConnectionProtocol):
 
 
 @contextmanager
-def named_address(host: str, port: int) -> Iterator[None]:
+def address_errors(host: str, port: int) -> Iterator[None]:
     """Name the address in an OSError of listening there, and what to do."""
     try:
         yield
@@ -183,7 +179,7 @@ async def listen(
 
     What is owed to a verified peer, answers and acknowledgements, waits up to `wait_s` to go with what is sent.
     """
-    with named_address(*address):
+    with address_errors(*address):
         server = await serve(
             *address,
             configuration=settings,
@@ -196,7 +192,7 @@ async def listen(
 
 
 @asynccontextmanager
-async def connected(
+async def connection(
     address: tuple[str, int],
     settings: QuicConfiguration,
     *,
@@ -237,10 +233,7 @@ def check_keys(folder: Path, name: str) -> None:
 
 
 def read_revoked(folder: Path) -> frozenset[str]:
-    """Return the names whose certificates do not count any more: the lines of ``revoked.txt``, such as ``train-7``.
-
-    InputFileError: when the file is there and cannot be read.
-    """
+    """Return the names whose certificates do not count (``revoked.txt``); InputFileError: it cannot be read."""
     path = folder / "revoked.txt"
     try:
         return frozenset(path.read_text(encoding="utf-8").split())
@@ -251,10 +244,8 @@ def read_revoked(folder: Path) -> frozenset[str]:
 
 
 def write_keys(folder: Path, trains: list[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
-    """Write ``authority.pem``, and certificate and key of ``centre`` and of each ``train-N``; return the files.
-
-    The key of the authority is not kept: for another train write a new set. Keys can be read by their owner alone.
-    OutputError: when a file is there already, or cannot be written.
+    """Write ``authority.pem``, and certificate and key of ``centre`` and each ``train-N``, for their owner; the
+    authority's key is not kept. OutputError: a file is there already, or cannot be written.
     """
     now = datetime.now(UTC)
 

@@ -75,7 +75,7 @@ def station_fixes(
     common = list({satellite: (satellite, signal) for satellite, signal in reversed(common)}.values())[::-1]
     if not common:
         raise MismatchError("the logs have no satellite on the same signal in common; the same signals are needed")
-    epochs = [rounded(log.time) for log in logs]
+    epochs = [round_tags(log.time) for log in logs]
     if not len(reduce(np.intersect1d, epochs)):
         raise MismatchError("the logs have no epoch in common; logs of the same time are needed")
     time = reduce(np.union1d, epochs)
@@ -114,10 +114,7 @@ def station_fixes(
 
 
 def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats, *, cn0_fallen: Masks) -> StationFixes:
-    """Compute fixes from corrected ranges of the same satellites, by the single-point solution of a run.
-
-    At T times, from N ranges at N known points, shape (N, 3); `cn0_fallen` has the shape (T, N).
-    """
+    """Compute single-point fixes at T times from corrected ranges at known points (N, 3); `cn0_fallen` (T, N)."""
     plane = _plane(points_ecef_m)
     fixes = [
         single_point(item, np.broadcast_to(point, (len(time), 3))).ecef_m
@@ -150,7 +147,7 @@ def _plane(points_ecef_m: Floats) -> Floats:
     return enu_axes(latitude, longitude)[:2]
 
 
-def rounded(time: Datetimes) -> Datetimes:
+def round_tags(time: Datetimes) -> Datetimes:
     """Return tags rounded to `SAME_EPOCH`, shape (T,)."""
     step = SAME_EPOCH.astype("timedelta64[ns]").astype(np.int64)
     rounded = (time.astype("datetime64[ns]").astype(np.int64) + step // 2) // step * step
@@ -180,12 +177,8 @@ _USUAL_EPOCHS: Final = 600
 
 
 class StationStreams:
-    """Fixes of receivers at known points from their epochs as they arrive.
-
-    An epoch counts when every receiver has it; older ones that wait are then dropped. A receiver that sends nothing
-    therefore gives no fixes at all, which the monitor finds by their lateness. Records from the streams are added to
-    the navigation known from the start; epochs at whole seconds are used. `counts`: epochs "used",
-    "incomplete", and "without common satellites".
+    """Fixes of receivers at known points as epochs arrive: one counts at a whole second when every receiver has it, and
+    drops older ones; `counts` are "used", "incomplete", "without common satellites".
     """
 
     def __init__(self, points_ecef_m: Floats, *, navigation: Navigation | None = None) -> None:
@@ -202,7 +195,7 @@ class StationStreams:
 
     def push(self, receiver: int, epoch: Observations) -> StationFixes | None:
         """Take one epoch of a receiver; return the fixes where all receivers have sent theirs."""
-        tag = rounded(epoch.time)[0]
+        tag = round_tags(epoch.time)[0]
         tag_ns = int(tag.astype(np.int64))
         if tag_ns % 1_000_000_000 or tag <= self._done:
             return None

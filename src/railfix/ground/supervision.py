@@ -29,7 +29,7 @@ from railfix.ground.interlocking import (
     points_reported,
     released,
     route_requested,
-    stopped_trains,
+    stop_orders,
     with_train,
 )
 from railfix.ground.layout import Layout, PointName
@@ -61,10 +61,7 @@ def compute_contradiction(
     granted: int,
     latest_ns: int | None = None,
 ) -> str | None:
-    """Return what a placed report contradicts, None where it may be right.
-
-    `granted` is the number of the last authorities, `latest_ns` the train's clock at most, by the centre's own clock.
-    """
+    """Return what a placed report contradicts, None where it may be right; `latest_ns` is the train's clock at most."""
     assert message.chainage_cm is not None
     assert message.over_cm is not None
     assert message.under_cm is not None
@@ -109,10 +106,7 @@ def compute_contradiction(
 def stop_contradicted(
     known: TrainInterval, message: TrainMessage, reason: str, rear: float, ahead: float
 ) -> TrainInterval:
-    """Return a train that is stopped, its interval extended to the reported place unless that cannot be right.
-
-    Whatever else is wrong with a report, as its clock, the train may be there.
-    """
+    """Return a train that is stopped, its interval extended to the reported place unless that cannot be right."""
     stopped = replace(
         known, stop=known.stop or reason, sequence=message.sequence, standstill=message.standstill, claimed_m=None
     )
@@ -187,7 +181,7 @@ def report_received(
         claimed_m=rear if confirmed else None,
     )
     if turns:
-        return with_train(state, _turned(known, facing, rear, ahead, layout))
+        return with_train(state, _turn(known, facing, rear, ahead, layout))
     if confirmed and before.claimed_m is not None and before.stop is None:
         # one wrong report alone moves no rear end, and a wider bound moves none back
         both = min(facing * rear, facing * before.claimed_m)
@@ -197,7 +191,7 @@ def report_received(
     return with_train(state, replace(known, front_m=front))
 
 
-def _turned(known: TrainInterval, facing: int, rear: float, ahead: float, layout: Layout) -> TrainInterval:
+def _turn(known: TrainInterval, facing: int, rear: float, ahead: float, layout: Layout) -> TrainInterval:
     """Return a train that has changed ends: no authority beyond its front, and where it stood is still occupied."""
     covered = facing * max(facing * ahead, facing * known.rear_m)
     back = facing * min(facing * rear, facing * known.front_m)
@@ -270,10 +264,7 @@ class Supervision:
         self.state = points_reported(self.state, point, track)
 
     def set_route(self, train: int, **step: Any) -> str | None:
-        """Set a route to the next station; return the reason of a refusal.
-
-        `step` is what `route_requested` takes of the step at hand.
-        """
+        """Set a route to the next station in `step` (of `route_requested`); return the reason of a refusal."""
         if train not in self.state.trains:
             return f"there is no train {train}"
         self.state, moved, reason = route_requested(self.state, train, self.layout, **step)
@@ -297,14 +288,14 @@ class Supervision:
         """
         self.state = overlaps_stopped(self.state, self.layout)
         self.state = released(self.state, now_s, self.layout, limits=self.limits)
-        nearby, stopped = NearbyTrains(self.state, self.layout), stopped_trains(self.state)
+        nearby, stopped = NearbyTrains(self.state, self.layout), stop_orders(self.state)
         due = [number for number in self.state.trains if self._is_due(number, now_s, stopped)]
         if self.routes == "automatic":
             for number in due:
                 if self._wants_route(self.state.trains[number]):
                     self.set_route(number, nearby=nearby, stopped=stopped)
         self.state = extended(self.state, self.layout, limits=self.limits, trains=due, nearby=nearby, stopped=stopped)
-        stopped = stopped_trains(self.state)
+        stopped = stop_orders(self.state)
         due = [number for number in self.state.trains if self._is_due(number, now_s, stopped)]
         if not due:
             return []

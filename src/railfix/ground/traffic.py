@@ -115,10 +115,7 @@ class SimulatedTrain:
 
 @dataclass(kw_only=True)
 class Traffic:
-    """Traffic on a line: the trains and points, and the centre that supervises them.
-
-    Its messages are those of a subclass: `send_report` and `exchange`.
-    """
+    """Trains and points on a line and the centre that supervises them; messages are those of a subclass."""
 
     trains: dict[int, SimulatedTrain]
     centre: Supervision

@@ -32,7 +32,7 @@ YEAR_S: Final = 31_557_600.0
 
 
 class TriangleVerdict(IntEnum):
-    """TriangleVerdict on one set of three fixes; every one from `ONE_RECEIVER` on stops the trains."""
+    """Verdict on one set of three fixes; every one from `ONE_RECEIVER` on stops the trains."""
 
     #: Every fix inside its circle, every side as it should be.
     HEALTHY = 0
@@ -235,7 +235,7 @@ class MonitorState:
     """State of the monitor."""
 
     stopped: bool = True  #: True before the first healthy period was released, and from a stop to its release.
-    cause: TriangleVerdict | None = None  #: TriangleVerdict that stopped the trains; None at the start.
+    cause: TriangleVerdict | None = None  #: Verdict that stopped the trains; None at the start.
     receiver: int = -1  #: Receiver that the cause names, -1 where it names none.
     since_s: float = 0.0  #: When the stop was given.
     complete_s: float = 0.0  #: Time of the last set of three fixes.
@@ -336,10 +336,7 @@ class MonitoredLog:
 def monitor_log(
     fixes: StationFixes, *, limits: TriangleLimits | None = None, times: MonitorLimits | None = None
 ) -> MonitoredLog:
-    """Run the monitor over fixes in order of time, released at the start.
-
-    SettingsError: when the sides of the triangle are too short for the limits.
-    """
+    """Run the monitor, released at the start, over fixes in order of time; SettingsError: sides too short."""
     limits, times = limits or TriangleLimits(), times or MonitorLimits()
     triangle = _compare(fixes, limits)
     seconds = (fixes.time - fixes.time[0]) / np.timedelta64(1, "s")

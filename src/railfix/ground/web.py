@@ -24,7 +24,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingR
 from starlette.routing import Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from railfix.ground.quic import named_address
+from railfix.ground.quic import address_errors
 
 #: Time between two events of the page [s].
 EVENT_S: Final = 0.5
@@ -88,14 +88,11 @@ class Sessions:
 
 
 def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *, sessions: Sessions) -> Starlette:
-    """Return the web application: the snapshot's plain values, and orders by the last part of their address.
-
-    ``done`` in the snapshot ends its events.
-    """
+    """Return the web application: the snapshot's plain values as events until ``done``, and orders by their address."""
     template = (files("railfix.ground") / "page.html").read_text(encoding="utf-8")
     newest: tuple[float, str, bool] | None = None
 
-    def shared() -> tuple[str, bool]:
+    def snapshot_text() -> tuple[str, bool]:
         """The snapshot as JSON, and whether it is the last: made once for all who read within `EVENT_S`."""
         nonlocal newest
         now = time.monotonic()
@@ -106,7 +103,7 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
 
     async def page(_: Request) -> Response:
         # "<" in a string would end the script
-        state = shared()[0].replace("<", "\\u003c")
+        state = snapshot_text()[0].replace("<", "\\u003c")
         return HTMLResponse(template.replace("/*STATE*/null", state), headers=_HEADERS)
 
     async def state(_: Request) -> Response:
@@ -114,7 +111,7 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
 
     async def stream() -> AsyncIterator[str]:
         while True:
-            text, done = shared()
+            text, done = snapshot_text()
             yield f"data: {text}\n\n"
             if done:
                 return
@@ -221,7 +218,7 @@ class PageServer:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            with named_address(host, port):
+            with address_errors(host, port):
                 self._socket.bind((host, port))
         except OSError:
             self._socket.close()

@@ -14,7 +14,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Strings
 from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.observations import ObservationHeader, Observations
+from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_records, kepler_records
 from railfix.io.rinex.observations_lines import KINDS, signal_of
 from railfix.io.rinex.write_navigation import glonass_numbers, kepler_numbers
@@ -22,7 +22,6 @@ from railfix.io.rinex.write_navigation import glonass_numbers, kepler_numbers
 if TYPE_CHECKING:
     import xarray as xr
 
-_ARRAYS: Final = dict(zip(KINDS, ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz"), strict=True))
 _DIMENSIONS: Final = ("time", "sv")
 _TYPE: Final = re.compile(r"[CPLDS][1-9ABCD][A-Z]?")
 #: Names that georinex gives the numbers of a record, in the order of the file (RINEX 3.04, tables A6 to A14).
@@ -73,7 +72,7 @@ def observations_to_xarray(observations: Observations) -> xr.Dataset:
     satellites, row = np.unique(observations.satellite, return_inverse=True)
     shape = (len(observations), len(satellites))
     variables: dict[str, Any] = {}
-    for kind, name in _ARRAYS.items():
+    for kind, name in KINDS.items():
         values = getattr(observations, name)
         for column in np.flatnonzero(np.isfinite(values).any(axis=0)):
             variable = kind + str(observations.signal[column])
@@ -137,11 +136,11 @@ def observations_from_xarray(data: xr.Dataset) -> Observations:
         flags = data.get(f"{name}lli")
         lock = None if flags is None else np.asarray(flags.transpose(*_DIMENSIONS).values, dtype=np.float64)
         for k in np.flatnonzero(np.isfinite(values).any(axis=0)):
-            satellite = str(satellites[k])
-            signal = signal_of(name, system=satellite[0], version=version, declared=types)
-            if signal is None:
+            own = str(satellites[k])
+            code = signal_of(name, system=own[0], version=version, declared=types)
+            if code is None:
                 continue
-            channel = columns.setdefault((satellite, signal), {})
+            channel = columns.setdefault((own, code), {})
             channel.setdefault("C" if name[0] == "P" else name[0], values[:, k])
             if lock is not None:
                 channel.setdefault("lock", lock[:, k])
@@ -153,17 +152,18 @@ def observations_from_xarray(data: xr.Dataset) -> Observations:
         return np.where(values == 0.0, np.nan, values)
 
     breaks = data.get("break_before")
+    satellite, signal = (np.array([key[i] for key in keys], dtype=kind) for i, kind in enumerate(("<U3", "<U2")))
     return Observations(
         time=time,
-        satellite=np.array([key[0] for key in keys], dtype="<U3"),
-        signal=np.array([key[1] for key in keys], dtype="<U2"),
+        satellite=satellite,
+        signal=signal,
         code_m=grid("C"),
         phase_cycles=grid("L"),
         doppler_hz=grid("D"),
         cn0_dbhz=grid("S"),
         loss_of_lock=np.nan_to_num(grid("lock")).astype(np.uint8),
         break_before=np.zeros(len(time), dtype=np.bool_) if breaks is None else np.array(breaks.values, dtype=np.bool_),
-        header=_observation_header(data, keys, version),
+        header=_observation_header(data, satellite, signal, version),
     )
 
 
@@ -182,11 +182,8 @@ def _gps_time(data: xr.Dataset) -> Datetimes:
     return time
 
 
-def _observation_header(data: xr.Dataset, keys: list[tuple[str, str]], version: float) -> ObservationHeader:
+def _observation_header(data: xr.Dataset, satellite: Strings, signal: Strings, version: float) -> ObservationHeader:
     attributes = data.attrs
-    signals: dict[str, set[str]] = {}
-    for satellite, signal in keys:
-        signals.setdefault(satellite[0], set()).add(signal)
     channels = data.get("glonass_channel")
     position = np.array(attributes.get("position", np.full(3, np.nan)), dtype=np.float64)
     return ObservationHeader(
@@ -200,7 +197,7 @@ def _observation_header(data: xr.Dataset, keys: list[tuple[str, str]], version: 
         glonass_channel={}
         if channels is None
         else {str(sv): int(k) for sv, k in zip(data["sv"].values, channels.values, strict=True) if np.isfinite(k)},
-        signals={system: tuple(sorted(names)) for system, names in signals.items()},
+        signals=signals_by_system(satellite, signal),
         receiver_clock_applied=bool(attributes.get("receiver_clock_offset_applied", 0)),
     )
 

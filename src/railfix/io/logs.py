@@ -47,8 +47,12 @@ def read_observations(
     path : path or sequence of path
         RINEX observation files, or logs in UBX, SBF or RTCM 3 (other protocols between them are passed over),
         plain or packed. Several files are put in order of time; they are all of one of these two kinds.
-    broken_lines, systems, start, end
-        As `railfix.io.rinex.read_observations`. What is broken in a receiver log is always counted.
+    broken_lines : {"stop", "count"}
+        A broken line of RINEX is an error, or what it breaks is skipped and counted; in a receiver log it is always so.
+    systems : iterable of str, optional
+        Letters of constellations, all by default.
+    start, end : datetime64 or str, optional
+        GPS time; the end is no part of the span.
     date : datetime64 or str, optional
         Some time within half a week of the log: needed for RTCM 3, whose observations carry no week.
     reader : {"railfix", "georinex"}
@@ -208,7 +212,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
     ----------
     paths : path or sequence of path
     broken_lines : {"stop", "count"}
-        As `railfix.io.rinex.read_navigation`.
+        A broken record is an error, or is counted in `Navigation.skipped` and described in its notes.
     date : datetime64 or str, optional
         Some time within half a week of RTCM 3 logs.
 

@@ -15,7 +15,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, ending, read_text, read_text_lines
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week, utc_to_gpst
-from railfix.gnss.observations import capped_problems
+from railfix.gnss.observations import first_problems
 from railfix.io.position_log import PositionLog, read_positions
 from railfix.io.receiver.framing import head_of, is_receiver_log
 from railfix.io.receiver.log import read_receiver_positions
@@ -175,7 +175,7 @@ def read_nmea(
         raise InputFileError(
             path, "there is no RMC or ZDA sentence, the date is unknown; log one of them, or give the date"
         )
-    notes = capped_problems((str(problem) for problem in problems), count=len(problems))
+    notes = first_problems((str(problem) for problem in problems), count=len(problems))
     return PositionLog(
         path=str(path),
         time=_times(fixes, dates, chained=date is not None),

@@ -150,9 +150,11 @@ def rename_columns(table: NamedColumns, columns: Mapping[str, str], *, known: Co
 
 def positions_times(table: NamedColumns) -> Datetimes:
     """Parse times as GPS time, NaT if blank: ``time_gpst``, ``time_utc``, ``unix_s``, or ``week`` and ``tow_s``."""
-    if "time_gpst" not in table and "time_utc" in table:
+    if "time_gpst" in table:
+        return _column_of_times(table, "time_gpst")
+    if "time_utc" in table:
         return _from_utc(_column_of_times(table, "time_utc"))
-    if "time_gpst" not in table and "unix_s" in table:
+    if "unix_s" in table:
         unix = table.numbers("unix_s", blank=np.nan)
         wrong = np.isfinite(unix) & ((unix < 0.0) | (unix > _LAST_UNIX_S))
         if wrong.any():
@@ -161,7 +163,8 @@ def positions_times(table: NamedColumns) -> Datetimes:
         whole = np.floor(np.nan_to_num(unix))
         since = whole.astype("timedelta64[s]") + timedelta(np.nan_to_num(unix) - whole)
         return _from_utc(np.where(np.isnan(unix), np.datetime64("NaT"), np.datetime64("1970-01-01", "ns") + since))
-    if "time_gpst" not in table and "week" in table and "tow_s" in table:
+    time = np.full(len(table), np.datetime64("NaT", "ns"))
+    if "week" in table and "tow_s" in table:
         week, seconds = table.numbers("week", blank=np.nan), table.numbers("tow_s", blank=np.nan)
         known = np.isfinite(week) & np.isfinite(seconds)
         wrong = known & ((week != np.floor(week)) | (week < 0) | (seconds < 0) | (seconds > _WEEK_S))
@@ -169,12 +172,8 @@ def positions_times(table: NamedColumns) -> Datetimes:
             row = int(np.argmax(wrong))
             what = f"week {week[row]:g} and tow_s {seconds[row]:g}"
             raise table.error(row, f"{what} are no GPS week and seconds of it (0 to {_WEEK_S})")
-        time = np.full(len(table), np.datetime64("NaT", "ns"))
         time[known] = from_week(week[known].astype(np.int64), seconds[known])
-        return time
-    if "time_gpst" not in table:
-        return np.full(len(table), np.datetime64("NaT", "ns"))
-    return _column_of_times(table, "time_gpst")
+    return time
 
 
 def _column_of_times(table: NamedColumns, name: str) -> Datetimes:
@@ -216,10 +215,7 @@ def _times(texts: list[str]) -> Datetimes:
 
 
 def read_rtklib_positions(path: str | PathLike[str]) -> PositionLog:
-    """Read RTKLIB's solution format in any of its time and coordinate forms (manual 2.4.2, appendix B.1).
-
-    Baselines (e/n/u) and heights above the geoid are rejected: they give no ellipsoidal position.
-    """
+    """Read RTKLIB's solution format (manual 2.4.2, B.1); baselines and heights above the geoid are rejected."""
     lines = read_text(path).splitlines()
     header = [line for line in lines if line.startswith("%")]
     rows = [(i, line) for i, line in enumerate(lines, start=1) if line.strip() and not line.startswith("%")]

@@ -62,11 +62,7 @@ def style_file(path: Path) -> Path | None:
 
 
 def write_positions(rows: pl.DataFrame, path: Path, *, description: str) -> int:
-    """Write the rows that have coordinates in the format of the file's ending, with its style; return their number.
-
-    `rows` has `COORDINATES`, ``time_gpst``, ``antenna``, ``status`` and any of `ATTRIBUTES`; `description` is written
-    into the file. NoPositionError: no row has coordinates. OutputError: a file cannot be written.
-    """
+    """Write the rows with coordinates in the format of the ending, with style; NoPositionError: there is none."""
     points = _points(rows)
     if points.is_empty():
         raise NoPositionError(f"{path}: no epoch has a position; nothing was written")

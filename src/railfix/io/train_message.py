@@ -204,11 +204,8 @@ _LARGEST_LENGTH: Final = 32_766  #: Largest value of a length of packet 0; one m
 
 
 def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> dict[str, int]:
-    """Return the fields of a position report, packet 0 (SUBSET-026 v4, 7.4.2.1), against a reference location of the
-    line.
-
-    `reference_cm` is its chainage, `reference` its identity: up to 16383 (NID_BG), or with the country (NID_LRBG) up to
-    2^24 - 1. ValueError: no position, or a distance outside the packet's range.
+    """Return the fields of packet 0 (SUBSET-026 v4, 7.4.2.1) against a reference at `reference_cm` of identity
+    `reference` (NID_BG or NID_LRBG). ValueError: no position, or too far.
     """
     if message.chainage_cm is None or message.over_cm is None or message.under_cm is None:
         raise ValueError("a message without a position has no packet 0")

@@ -22,7 +22,7 @@ import numpy as np
 from railfix import kernels
 from railfix.gnss.observations import Observations
 from railfix.integrity.protection.open_places import Forms
-from railfix.io.rinex import read_navigation, read_observations
+from railfix.io import read_navigation, read_observations
 from railfix.kernels.compiling import resolved_once
 from railfix.pipeline.config import parse_config
 from railfix.run.processor import processor_of

@@ -85,11 +85,7 @@ class ReferenceInputs(InputFiles):
         return logs_by_antenna(self.front, self.rear)
 
     def check(self) -> None:
-        """Check the input files before anything is read.
-
-        SettingsError: no positions, observations without navigation or the other way round, two antennas without a
-        vehicle. InputFileError: a file is missing, or given as both antennas'.
-        """
+        """Check the input files before anything is read; SettingsError, InputFileError."""
         if not self.positions:
             raise SettingsError("no positions are given; name a log of them with --rtk or --rtk-rear")
         if bool(self.logs) != bool(self.nav):

@@ -217,7 +217,7 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
     rejection = fixes.rejection.copy()
     arc, lateral, height, sigma = (np.full(len(fixes), np.nan) for _ in range(4))
     if len(rows):
-        matched = match(
+        arc[rows], lateral[rows], height[rows], section = match(
             fixes.time[rows],
             fixes.ecef_m[rows],
             trajectory,
@@ -225,8 +225,7 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
             height_m=settings.height_m,
             max_speed_mps=settings.max_speed_mps,
         )
-        arc[rows], lateral[rows], height[rows] = matched.arc_m, matched.lateral_m, matched.height_m
-        along = sigma_along(fixes.sigma_enu_m[rows], fixes.ecef_m[rows], trajectory.tangent[matched.section])
+        along = sigma_along(fixes.sigma_enu_m[rows], fixes.ecef_m[rows], trajectory.tangent[section])
         sigma[rows] = np.where(np.isnan(along), settings.fix_sigma_m, np.maximum(along, _FIX_FLOOR_M))
         missed = np.isnan(arc) & (rejection == 0)
         _reject(rejection, missed & ~(np.abs(lateral) <= settings.lateral_m), FixRejection.OFF_TRACK)
@@ -239,11 +238,8 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
 def judge_travel(
     fixes: Fixes, travelled: Callable[[Datetimes], tuple[Floats, Floats]], settings: ReferenceSettings
 ) -> Fixes:
-    """Reject rows by the way between them against the way travelled (P2 3.3).
-
-    Neighbours that agree make a run; kept is the chain of runs that holds most fixes, where each joint that does not
-    agree counts against it. So a short wrong stretch goes, and where long stretches on both sides stay apart, the
-    sensor is held wrong and both stay. `travelled` gives the way up to instants and its variance; NaN where unknown.
+    """Reject rows by the way between them against the way travelled and its variance (P2 3.3): kept is the chain of
+    agreeing runs with most fixes, less joints that disagree.
     """
     rows = fixes.good
     if len(rows) < 2:

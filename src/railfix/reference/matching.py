@@ -4,50 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Datetimes, Floats, Indices
 from railfix.core.timescale import nearest_rows, seconds, timedelta
-from railfix.track.trajectory import Trajectory
+from railfix.track.trajectory import Trajectory, passes_of
 
 _OUT_OF_REACH_M = 1e6  #: A pass out of reach costs this much more than any other choice [m].
 _JITTER_M = 2.0  #: Positions may jitter by this much more than the train can run [m].
 
 
-@dataclass(frozen=True, kw_only=True)
-class MatchedReference:
-    """Positions on a trajectory, F of them."""
-
-    arc_m: Floats  #: Of the pass chosen; NaN where no pass is near enough; shape (F,).
-    #: To the right of and above the trajectory there, else at the nearest point; shape (F,).
-    lateral_m: Floats
-    height_m: Floats
-    section: Indices  #: Segment of the trajectory, shape (F,).
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Passes:
-    """Where the line passes near positions, P of them, by position."""
-
-    position: Indices
-    section: Indices
-    arc_m: Floats
-    lateral_m: Floats
-    height_m: Floats
-
-
 def match(
     time: Datetimes, ecef_m: Floats, trajectory: Trajectory, *, lateral_m: float, height_m: float, max_speed_mps: float
-) -> MatchedReference:
-    """Put F positions on a trajectory, in order of rising time.
+) -> tuple[Floats, Floats, Floats, Indices]:
+    """Put F positions in order of time on a trajectory: the shortest chain of passes within `max_speed_mps`.
 
-    Where the line passes a place more than once (a loop, laps), the chain of passes is taken that a train
-    no faster than `max_speed_mps` can run, and of several such the one with the shortest way. Passes further off than
-    `lateral_m` and `height_m` are none.
+    Returns arc length, NaN where no pass is near enough; distance to the right and above, there or at the nearest
+    point; and segment, shapes (F,).
     """
     count = len(ecef_m)
     nearest, _ = trajectory.nearest(ecef_m)
@@ -55,12 +31,20 @@ def match(
     offset = ecef_m - trajectory.at_arc(nearest)
     arc = np.full(count, np.nan)
     lateral, height = _beside(offset, trajectory, section)
-    passes = _passes(ecef_m, trajectory, lateral_m, height_m)
-    chosen = _chain(passes, seconds(time - time[0]) if count else np.empty(0), max_speed_mps)
+    passes = passes_of(ecef_m, trajectory, float(np.hypot(lateral_m, height_m)))
+    beside, above = _beside(passes.offset_m, trajectory, passes.segment)
+    # beyond the ends of the line there is nothing to be on
+    beyond = np.abs(passes.along_m - passes.foot_m) > 0.5
+    beyond &= (passes.segment == 0) | (passes.segment == len(trajectory.length_m) - 1)
+    within = (np.abs(beside) <= lateral_m) & (np.abs(above) <= height_m) & ~beyond
+    near = np.flatnonzero(passes.lowest & ~passes.again & within)
+    since = seconds(time - time[0]) if count else np.empty(0)
+    along = trajectory.arc_m[passes.segment] + passes.foot_m
+    chosen = near[_chain(passes.position[near], along[near], beside[near], since, max_speed_mps)]
     at = passes.position[chosen]
-    arc[at], section[at] = passes.arc_m[chosen], passes.section[chosen]
-    lateral[at], height[at] = passes.lateral_m[chosen], passes.height_m[chosen]
-    return MatchedReference(arc_m=arc, lateral_m=lateral, height_m=height, section=section)
+    arc[at], section[at] = along[chosen], passes.segment[chosen]
+    lateral[at], height[at] = beside[chosen], above[chosen]
+    return arc, lateral, height, section
 
 
 def _beside(offset: Floats, trajectory: Trajectory, section: Indices) -> tuple[Floats, Floats]:
@@ -69,53 +53,22 @@ def _beside(offset: Floats, trajectory: Trajectory, section: Indices) -> tuple[F
     return np.einsum("fi,fi->f", offset, right), np.einsum("fi,fi->f", offset, np.cross(right, along))
 
 
-def _passes(ecef_m: Floats, trajectory: Trajectory, lateral_m: float, height_m: float) -> _Passes:
-    """Local minima of the distance along the line that are within the limits."""
-    length = trajectory.length_m
-    middle = 0.5 * (trajectory.ecef_m[1:] + trajectory.ecef_m[:-1])
-    reach = float(np.hypot(lateral_m, height_m)) + 0.5 * float(length.max())
-    lists = cKDTree(middle).query_ball_point(ecef_m, np.full(len(ecef_m), reach), return_sorted=True)
-    position = np.repeat(np.arange(len(ecef_m)), [len(x) for x in lists])
-    section = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=len(position))
-    delta = ecef_m[position] - trajectory.ecef_m[section]
-    along = np.einsum("pi,pi->p", delta, trajectory.tangent[section])
-    foot = np.clip(along, 0.0, length[section])
-    offset = delta - foot[:, None] * trajectory.tangent[section]
-    away = np.linalg.norm(offset, axis=1)
-    joined = (position[1:] == position[:-1]) & (section[1:] == section[:-1] + 1)
-    best = np.ones(len(position), dtype=np.bool_)
-    best[1:] &= ~joined | (away[1:] < away[:-1])
-    best[:-1] &= ~joined | (away[:-1] <= away[1:])
-    lateral, height = _beside(offset, trajectory, section)
-    # beyond the ends of the line there is nothing to be on
-    beyond = np.abs(along - foot) > 0.5
-    beyond &= (section == 0) | (section == len(length) - 1)
-    near = best & (np.abs(lateral) <= lateral_m) & (np.abs(height) <= height_m) & ~beyond
-    return _Passes(
-        position=position[near],
-        section=section[near],
-        arc_m=(trajectory.arc_m[section] + foot)[near],
-        lateral_m=lateral[near],
-        height_m=height[near],
-    )
-
-
-def _chain(passes: _Passes, time_s: Floats, max_speed_mps: float) -> Indices:
+def _chain(position: Indices, arc_m: Floats, lateral_m: Floats, time_s: Floats, max_speed_mps: float) -> Indices:
     """One pass a position: the cheapest chain from the first to the last (dynamic programming)."""
-    found, first = np.unique(passes.position, return_index=True)
-    if len(found) == len(passes.position):
+    found, first = np.unique(position, return_index=True)
+    if len(found) == len(position):
         return np.arange(len(found))
-    edges = np.append(first, len(passes.position)).tolist()
-    cost = np.abs(passes.lateral_m[edges[0] : edges[1]])
+    edges = np.append(first, len(position)).tolist()
+    cost = np.abs(lateral_m[edges[0] : edges[1]])
     came: list[Indices] = []
     for k, (begin, end) in enumerate(pairwise(edges[1:])):
         start = edges[k]
-        way = np.abs(passes.arc_m[begin:end, None] - passes.arc_m[None, start:begin])
+        way = np.abs(arc_m[begin:end, None] - arc_m[None, start:begin])
         reach = max_speed_mps * (time_s[found[k + 1]] - time_s[found[k]]) + _JITTER_M
         # The shortest way counts; a second pass of a crossing costs what it is longer by.
         total = cost + way + np.where(way > reach, _OUT_OF_REACH_M, 0.0)
         came.append(total.argmin(axis=1))
-        cost = total.min(axis=1) + np.abs(passes.lateral_m[begin:end])
+        cost = total.min(axis=1) + np.abs(lateral_m[begin:end])
     best = int(np.argmin(cost))
     chosen = [edges[-2] + best]
     for k in range(len(came) - 1, -1, -1):

@@ -302,12 +302,7 @@ def assemble_reference(
     settings: ReferenceSettings,
     facts: dict[str, Any],
 ) -> Built:
-    """Return the reference of one antenna from everything known of it.
-
-    At a fix it is the fix's place on the track, between fixes the smoothed one with the errors that fixes have in
-    common on top. `excess`, shape (G - 1,): from each good fix to the next, closing error over its standard deviation,
-    which counts where it is larger.
-    """
+    """Return the reference of one antenna: places of fixes, smoothed between; `excess` (G - 1,) in sigmas."""
     time, good = evidence.time, fixes.good
     at = np.flatnonzero(np.isfinite(evidence.fix_m))
     is_fix = np.zeros(len(time), dtype=np.bool_)

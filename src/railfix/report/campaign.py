@@ -55,11 +55,7 @@ class CampaignReport:
 
 
 def report_campaign(runs: pl.DataFrame, out: Path) -> CampaignReport:
-    """Sum up the runs of a campaign, and explain their worst epochs where the observations were written.
-
-    `runs` is the table of `railfix.run.campaign.run_campaign`, `out` its folder; explanations go into ``explain`` in
-    it.
-    """
+    """Sum up the runs of a campaign (`run_campaign`), and explain their worst epochs."""
     fields = runs.columns[: runs.columns.index("status")]
     rows, epochs, notes = [], [], []
     for row in runs.iter_rows(named=True):

@@ -59,7 +59,7 @@ def pack_array(values: NDArray[Any], kind: str = "f") -> str:
 def chart_values(chart: Chart, epochs_from: np.datetime64 | None = None) -> dict[str, Any]:
     """A chart as plain values; `epochs_from`: origin of ``epoch_s`` of its points, if not `Chart.start`."""
     values: dict[str, Any] = {name: getattr(chart, name) for name in _OF_CHART}
-    values |= {"axis": chart.shared_axis, "layers": [_layer(layer) for layer in chart.layers]}
+    values |= {"axis": chart.common_axis, "layers": [_layer(layer) for layer in chart.layers]}
     if chart.start is not None:
         values["start"] = since_1970(chart.start)
     if epochs_from is not None:
@@ -150,10 +150,7 @@ _IGNORED: Final = ("Point", "MultiPoint")
 
 
 def read_background(path: Path) -> tuple[Floats, ...]:
-    """Read lines and outlines of a GeoJSON file, each of shape (P, 2): longitude and latitude [deg].
-
-    Points are left out; InputFileError where it is not GeoJSON, or has no lines.
-    """
+    """Read lines and outlines of a GeoJSON file, each (P, 2) [deg]; InputFileError where it has none."""
     node = read_json_object(path, what="GeoJSON")
     lines = tuple(_lines(path, node))
     if not lines:
@@ -307,7 +304,7 @@ def figure(
         clickable = any(isinstance(layer, Points) and layer.epoch_s is not None for layer in chart.layers)
         values = chart_values(chart, group.start if group is not None and clickable else None)
         linked = sky if clickable else ""
-        axis = f"{anchor}-{chart.shared_axis}" if chart.shared_axis else ""
+        axis = f"{anchor}-{chart.common_axis}" if chart.common_axis else ""
         width = width or chart.width
     return Figure(
         number=next(numbers), chart=chart, json=Markup(script_json(values)), width=width, sky=linked, zoomed_with=axis

@@ -83,12 +83,7 @@ class Explanation:
 
 
 def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanation:
-    """Explain the epoch of a run nearest to a time.
-
-    `at` is GPS time as ``hh:mm:ss``, of the first day of the run on which it has epochs, or ``yyyy-mm-dd hh:mm:ss``;
-    the antenna is the first of the run unless given. InputFileError: the folder lacks a table. SettingsError: `at` is
-    no time, or `antenna` none of the run's. MismatchError: the run has no epoch within a minute of the time.
-    """
+    """Explain the epoch of one antenna nearest to a GPS time, ``hh:mm:ss`` of the first day or with the date."""
     folder = read_run(run)
     if not (run / "observations.parquet").is_file():
         raise InputFileError(run / "observations.parquet", "there is no such file; repeat the run with --observations")

@@ -156,13 +156,10 @@ class Group:
 
 
 def overview(run: ReportedRun, antenna: str, background: Sequence[Floats] = ()) -> Group:
-    """Plan of the line and errors over chainage of one antenna: the picture at the top of the page.
-
-    Without a reference, protection levels or intervals stand beside the plan.
-    """
+    """Plan of the line and errors over chainage of one antenna, or protection levels without a reference."""
     positions, errors = run.positions_of(antenna), run.errors_of(antenna)
     if errors is not None:
-        beside = error_over_chainage(errors, filtered=run.filtered_of(antenna))
+        beside = error_over_chainage(errors, filtered=run.filter_rows(antenna))
     else:
         beside = levels_over_chainage(positions, _alarm_limit(run))
         beside = interval_over_chainage(positions) if beside.empty else beside
@@ -189,16 +186,12 @@ def _plan(run: ReportedRun, antenna: str, background: Sequence[Floats]) -> Chart
 def antenna_groups(
     run: ReportedRun, antenna: str, *, sky: int = SKY_EPOCHS, background: Sequence[Floats] = ()
 ) -> Iterator[Group]:
-    """Charts of one antenna of a run.
-
-    `sky` is the largest number of epochs of the sky plot; `background` has longitude and latitude of lines to draw
-    below the plan, each of shape (P, 2) [deg].
-    """
+    """Charts of one antenna of a run; `sky`: most epochs of the sky plot, `background`: lines below the plan [deg]."""
     positions, errors = run.positions_of(antenna), run.errors_of(antenna)
     start = start_of(positions)
     yield Group(title="The line", charts=_keep(_plan(run, antenna, background)), start=start)
     if errors is not None:
-        filtered = run.filtered_of(antenna)
+        filtered = run.filter_rows(antenna)
         over = _keep(error_over_time(errors, filtered=filtered), error_over_chainage(errors, filtered=filtered))
         yield Group(title="Errors", charts=over, start=start_of(errors))
     else:
@@ -269,7 +262,7 @@ def _keep(*charts: Chart) -> tuple[Chart, ...]:
 
 def _stanford(run: ReportedRun, antenna: str, errors: pl.DataFrame, limit_m: float) -> Iterator[Chart]:
     """Stanford diagrams of the usable levels, of all levels, and of the filter's usable levels."""
-    kind, filtered, options = run.folder.level_kind, run.filtered_of(antenna), EvaluationOptions()
+    kind, filtered, options = run.folder.level_kind, run.filter_rows(antenna), EvaluationOptions()
     if kind is None:
         return
     for levels_of, words in zip(LEVELS_OF, ("usable levels", "all levels"), strict=True):

@@ -162,7 +162,7 @@ def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, ow
 
 def _filter(run: ReportedRun, antenna: str) -> dict[str, float]:
     """Error sizes and rate of the filter along the track over all its epochs; empty without it."""
-    table = run.filtered_of(antenna)
+    table = run.filter_rows(antenna)
     known = pl.DataFrame() if table is None else table.filter("positioned", "reference_good")
     if table is None or not len(known):
         return {}

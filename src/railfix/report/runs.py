@@ -74,7 +74,7 @@ class ReportedRun:
         """Rows of one antenna, None without a reference."""
         return None if self.errors is None else self.errors.filter(antenna=antenna)
 
-    def filtered_of(self, antenna: str) -> pl.DataFrame | None:
+    def filter_rows(self, antenna: str) -> pl.DataFrame | None:
         """Rows of the filter along the track, None without."""
         return None if self.filtered is None else self.filtered.filter(antenna=antenna)
 

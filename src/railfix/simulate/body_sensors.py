@@ -84,11 +84,7 @@ def pulse_times_s(
     *,
     tooth_errors: Floats | None = None,
 ) -> Floats:
-    """Exact times of the pulses [s after the start], shape (P,).
-
-    `phase`, in [0, 1): part of a pulse's distance that the wheel turns before the first one. `tooth_errors`, shape
-    (pulses_per_turn,): displacement of each tooth as a share of their spacing.
-    """
+    """Compute pulse times [s after the start]; `phase` in [0, 1), `tooth_errors` are shares of the spacing."""
     # The motion's own corners are nodes too, so that without slips nothing is approximate.
     corner = motion.time_s[(motion.time_s > 0.0) & (motion.time_s < duration_s)]
     node = np.unique(np.concatenate([np.arange(0.0, duration_s, _STEP_S), corner, [duration_s]]))
@@ -200,11 +196,7 @@ def _pose(simulation: Simulation, offset_m: tuple[float, float, float], time_s: 
 
 
 def true_motion(simulation: Simulation, offset_m: tuple[float, float, float], time_s: Floats, half_s: float) -> Floats:
-    """Specific force [m/s^2] and angular rate against inertial space [rad/s] in the axes of the body, shape (n, 6).
-
-    Differences over `half_s` before and after: an acceleration is weighted by a triangle of that half
-    width, so that sums over samples `half_s` apart give the motion back exactly.
-    """
+    """Compute force [m/s^2] and inertial rate [rad/s] in the body's axes (n, 6) by differences over `half_s`."""
     before, now, after = (_pose(simulation, offset_m, time_s + d) for d in (-half_s, 0.0, half_s))
     place, axes = now
     # Differences of positions first, which keeps the digits.

@@ -34,12 +34,7 @@ _SIGNALS_MESSAGE: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV",), "C": 
 
 
 def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
-    """Read the records of the scenario's constellations that serve its time.
-
-    A satellite takes part when at every moment of the run the newest record transmitted is within its validity.
-    Galileo's are the I/NAV ones, Klobuchar's coefficients GPS' for all. InputFileError: no navigation file.
-    MismatchError: the scenario's time is not within its records, or it lacks the coefficients.
-    """
+    """Read the records of satellites with a valid one at every moment of the scenario."""
     navigation = read_navigation(path)
     if "G" not in navigation.klobuchar and scenario.sky.ionosphere_scale > 0.0:
         raise MismatchError(

@@ -35,10 +35,7 @@ def satellite_key(satellite: str) -> tuple[int, int]:
 
 
 class Interpolated:
-    """Columns given at even nodes, as functions of time with a continuous rate.
-
-    `nodes`, shape (K, C), are the values at ``(k - nodes_before(spacing_s)) * spacing_s``.
-    """
+    """Columns at even nodes, shape (K, C), the first `nodes_before` the start, with a continuous rate."""
 
     def __init__(self, nodes: Floats, spacing_s: float) -> None:
         self._nodes = nodes
@@ -100,10 +97,7 @@ def _interpolate_sigma(rho: float) -> float:
 
 
 class ClockWalk(Interpolated):
-    """Variation of a receiver's clock [m]: random walks of bias and drift with nodes at the epochs, 0 at the start.
-
-    `walk` in m / sqrt(s), `frequency_walk` in m/s / sqrt(s).
-    """
+    """Variation of a receiver's clock [m]: random walks of bias [m / sqrt(s)] and drift [m/s / sqrt(s)]."""
 
     def __init__(
         self, key: Sequence[int], *, walk: float, frequency_walk: float, interval_s: float, duration_s: float
@@ -192,11 +186,7 @@ def pierce_point_km(
 
 
 class CommonErrors:
-    """Errors of satellites and atmosphere as functions of time and place.
-
-    Second 0 is `start`, GPS time; the vertical ionosphere is given at `origin_deg`, latitude and longitude; the
-    broadcast orbits of the `records` give the directions radial, along and cross; S satellites.
-    """
+    """Errors of satellites and the atmosphere as functions of time since `start` and place."""
 
     def __init__(
         self,
@@ -294,10 +284,7 @@ class CommonErrors:
         return error
 
     def path_m(self, time_s: Floats, sight: Floats, elevation_deg: Floats) -> Floats:
-        """Orbit, clock and troposphere together, what they add to the ranges, shape (T, S) [m].
-
-        At T times after the start; `sight`, shape (T, S, 3): unit vectors from the receiver to the satellites.
-        """
+        """Sum orbit, clock and troposphere for T times and `sight`, shape (T, S, 3), shape (T, S) [m]."""
         added = -self.clock_error_m(time_s)
         if self._orbits:
             added += np.einsum("tsi,tsi->ts", self.orbit_error_m(time_s), sight)

@@ -66,11 +66,8 @@ class Motion:
 
 
 def limit_jerk(motion: Motion, jerk_mps3: float) -> Motion:
-    """Average a motion of constant accelerations over the time T that keeps its jerk within a limit.
-
-    The average over [t - T, t] has the speed ``(s(t) - s(t - T)) / T`` and so on: it never exceeds the motion's own
-    largest speed and acceleration, stops at the same chainages, and is late by T / 2. A stop shorter than T is not
-    reached.
+    """Average a motion over the time T that keeps its jerk within a limit: the speed becomes ``(s(t) - s(t - T)) / T``,
+    stops stay, all is late by T / 2.
     """
     start = motion.time_s
     duration = float(np.abs(np.diff(motion.acceleration_mps2, prepend=0.0)).max()) / jerk_mps3

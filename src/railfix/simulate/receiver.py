@@ -26,10 +26,7 @@ from railfix.simulate.settings import InterSystemSettings, NoiseSettings, Tracki
 
 
 class CarriedNoise:
-    """Correlated noise of a receiver's channels, chunk by chunk; results do not depend on the chunks.
-
-    The key is the seed, another one for each receiver.
-    """
+    """Correlated noise of a receiver's channels, the same whatever the chunks; `key` is the seed of the receiver."""
 
     def __init__(self, settings: NoiseSettings, *, key: Sequence[int], channels: int, interval_s: float) -> None:
         self._settings = settings
@@ -64,10 +61,8 @@ class _FirstOrder:
 
 
 class CodeSmoothing:
-    """Filter of first order on the code errors of a receiver's channels, restarted after each loss of lock.
-
-    ``y[k] = y[k-1] + (1 - exp(-interval / time)) (x[k] - y[k-1])``, y = x at the first epoch of a lock; a time constant
-    of 0 is no filter. The state is carried from chunk to chunk.
+    """Filter of first order on code errors, restarted after loss of lock: ``y[k] = y[k-1] + (1 - exp(-interval / time))
+    (x[k] - y[k-1])``; a time of 0 is no filter.
     """
 
     def __init__(self, time_s: float, *, channels: int, interval_s: float) -> None:
@@ -102,10 +97,7 @@ class LockState:
 
 
 class TrackingNoise:
-    """Loss of lock and re-acquisition of a receiver's channels; the state is carried from chunk to chunk.
-
-    The key is the seed of the slips, another one for each receiver.
-    """
+    """Loss of lock and re-acquisition of a receiver's channels, carried from chunk to chunk."""
 
     def __init__(self, settings: TrackingSettings, *, key: Sequence[int], channels: int, interval_s: float) -> None:
         self._settings = settings
@@ -218,10 +210,7 @@ def signals_of(letter: str, settings: ReceiverSettings) -> tuple[str, ...]:
 
 
 class Receiver:
-    """One receiver's channels (satellite and signal of each), and its state that is carried between chunks.
-
-    The satellites are the columns of the sky, in alphabetical order.
-    """
+    """One receiver's channels (satellite, in alphabetical order, and signal), and its state between chunks."""
 
     def __init__(
         self,

@@ -249,13 +249,13 @@ def _write_files(
     files = {key: out.staged(name) for key, name in names.items()}
     for antenna in scenario.receivers:
 
-        def watched(antenna: str = antenna) -> Iterator[Observations]:
+        def chunks(antenna: str = antenna) -> Iterator[Observations]:
             for part in simulation.observations(antenna):
                 yield part
                 if progress is not None:
                     progress(antenna, len(part))
 
-        write_observations(watched(), files[antenna], comments=_COMMENTS)
+        write_observations(chunks(), files[antenna], comments=_COMMENTS)
     write_navigation(
         simulation.navigation,
         files["nav"],

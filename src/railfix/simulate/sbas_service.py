@@ -37,11 +37,7 @@ DEGRADATION: Final = {
 
 
 def message(kind: int, second: int, *fields: Field) -> Bytes:
-    """Message of a type, with one of the three preambles by its second, and its parity, shape (32,).
-
-    The fields (value, length) lie from bit 14 on, negative values in two's complement. ValueError: when a value does
-    not fit its field, or the fields are longer than a message.
-    """
+    """Message of a type and its parity (32,); fields (value, length) from bit 14 on. ValueError: one does not fit."""
     return pack_message(f"{PREAMBLES['L1'][second % 3]:08b}{kind:06b}", kind, fields)
 
 
@@ -77,10 +73,10 @@ def integrity(second: int, udrei: Sequence[int], iodf: Sequence[int] = (0, 0, 0,
     return message(6, second, *((i, 2) for i in iodf), *((g, 4) for g in grades))
 
 
-def factors(second: int, indicator: Sequence[int], *, latency: int = 0, iodp: int = 0) -> Bytes:
+def factors(second: int, indicator: Sequence[int], *, latency: int = 0) -> Bytes:
     """Type 7: degradation indicator of all slots."""
     values = list(indicator) + [0] * (51 - len(indicator))
-    return message(7, second, (latency, 4), (iodp, 2), (0, 2), *((v, 4) for v in values))
+    return message(7, second, (latency, 4), (0, 4), *((v, 4) for v in values))
 
 
 def parameters(second: int, **values: int) -> Bytes:
@@ -112,13 +108,12 @@ def mixed(
     *,
     block: int = 0,
     iodf: int = 0,
-    iodp: int = 0,
 ) -> Bytes:
     """Type 24: six fast corrections and half a type 25."""
     values = [round(v / STEP_M) for v in prc] + [0] * (6 - len(prc))
     grades = list(udrei) + [NOT_MONITORED] * (6 - len(udrei))
-    head = [*((v, 12) for v in values), *((g, 4) for g in grades), (iodp, 2), (block, 2), (iodf, 2), (0, 4)]
-    return message(24, second, *head, *half(satellites, iodp))
+    head = [*((v, 12) for v in values), *((g, 4) for g in grades), (0, 2), (block, 2), (iodf, 2), (0, 4)]
+    return message(24, second, *head, *half(satellites, 0))
 
 
 def grid_mask(second: int, band: int, bits: Collection[int], iodi: int = 0, bands: int = 1) -> Bytes:

@@ -25,10 +25,7 @@ if TYPE_CHECKING:
 
 
 def message(kind: int, second: int, *fields: Field) -> Bytes:
-    """Message of a type, its preamble by its second, with parity, shape (32,).
-
-    The fields (value, length) lie from bit 10 on, negative values in two's complement. ValueError: one does not fit.
-    """
+    """Message of a type and its parity (32,); fields (value, length) from bit 10 on. ValueError: one does not fit."""
     return pack_message(f"{PREAMBLES['L5'][second % 6]:04b}{kind:06b}", kind, fields)
 
 
@@ -48,10 +45,7 @@ def correction(
     covariance: tuple[int, Floats] = (5, np.eye(4)),
     dfrei: int = 3,
 ) -> Bytes:
-    """Type 32: position and clock [m], their rates [m/s], and the upper triangular factor of the covariance.
-
-    `covariance`: exponent, and the factor in units of 2^(exponent - 5).
-    """
+    """Type 32: position and clock [m], rates [m/s], covariance: exponent, and factor in units of 2^(exponent - 5)."""
     exponent, factor = covariance
     values = [(round(v / 0.0625), 11) for v in moved[:3]] + [(round(moved[3] / 0.03125), 12)]
     values += [(round(v * 2**11), 8) for v in rates[:3]] + [(round(rates[3] * 2**12), 9)]
@@ -109,11 +103,7 @@ class SimulatedDfmc(Service):
         return SLOT_OF.get(name, 0)
 
     def clocks_m(self, second: float) -> Floats:
-        """Corrections of the clocks of `satellites` [m] for ionosphere-free codes, group delays included.
-
-        Those of GPS refer to the clock without its group delays, those of Galileo to that of F/NAV, those of BeiDou to
-        that of B-CNAV1 with its group delays.
-        """
+        """Corrections of clocks [m] for ionosphere-free codes: GPS without delays, Galileo F/NAV, BeiDou B-CNAV1."""
         names, at = self.satellites, self._instant(second)
         first, other = ([signals_of(name[0], self._simulation.scenario.receiver)[k] for name in names] for k in (0, 1))
         ratio = np.array([(CARRIER_FREQUENCY[name[0]]["1"] / CARRIER_FREQUENCY[name[0]]["5"]) ** 2 for name in names])

@@ -158,11 +158,7 @@ def ranging_table(simulation: Simulation, settings: RangingSettings) -> pl.DataF
 
 
 def _range_errors_m(settings: RangingSettings, seed: int, number: int, ahead_m: Floats) -> Floats:
-    """Noise, and multipath that depends on the position alone: it stays while the train stands.
-
-    Positions are cells of `multipath_cell_m` along the line; each has its own error and, with the probability
-    `echo_chance`, a stronger echo that hides the direct path and is later by an exponential excess.
-    """
+    """Add noise, and multipath by cells of `multipath_cell_m`, some (`echo_chance`) with an echo alone."""
     reach = int(np.ceil(settings.reach_m / settings.multipath_cell_m)) + 1
     cell = np.clip(np.floor(ahead_m / settings.multipath_cell_m).astype(np.intp), -reach, reach) + reach
     position = np.random.default_rng([seed, _POSITION, number]).standard_normal(2 * reach + 1)

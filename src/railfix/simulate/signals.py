@@ -174,11 +174,7 @@ class Simulation:
 
 @dataclass(frozen=True, kw_only=True)
 class _Instant:
-    """Clean quantities of S satellites at T instants: shapes (T, S).
-
-    `path_m` is the distance with the troposphere, less the satellite clock; `ionosphere_m` is on L1.
-    The errors are parts of them.
-    """
+    """Clean quantities (T, S): `path_m` is distance with troposphere less satellite clock, `ionosphere_m` on L1."""
 
     elevation_deg: Floats
     azimuth_deg: Floats

@@ -273,11 +273,7 @@ def _operations(source: CRS, target: CRS, *, over: CRS | None = None) -> list[Tr
 
 
 def frame_degrees(crs: str, x: Floats, y: Floats, *, path: str) -> tuple[Floats, Floats, str]:
-    """Latitude and longitude of map coordinates (longitude and latitude, or easting and northing), and the frame.
-
-    Coordinates of an older datum (Tokyo, Belgian Datum 72) are transformed by PROJ to the modern frame of their region;
-    nothing is shifted between modern frames. InputFileError: when the CRS does not reach there.
-    """
+    """Return latitude and longitude of map coordinates, and the frame; of an older datum its modern one."""
     kind = kind_of_frame(crs)
     frame = _modern_frame(crs)[0] if kind == "older datum" else _frame_of(crs)
     longitude, latitude = (np.asarray(v, np.float64) for v in _in_plan(crs, frame).transform(x, y))

@@ -17,9 +17,9 @@ from pyproj import CRS, Transformer
 
 from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import InputFileError
-from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, frame_degrees, is_in_area, older_datum_note, unit_of_grid
+from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, frame_degrees, is_in_area, unit_of_grid
 from railfix.track.frames import heights_of_file
-from railfix.track.route import NO_HEIGHTS, MapReading, Segment
+from railfix.track.route import MapReading, Segment, make_segment
 
 #: Share of the change of curvature or cant at a share t of the element, and its integral from 0 (IFC 4.3.2).
 LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]]] = {
@@ -161,11 +161,7 @@ class AlignmentPoints:
 def alignment_at(
     place_m: Floats, plan: Sequence[PlanElement], profile: Sequence[ProfileElement], cant: Sequence[CantElement]
 ) -> AlignmentPoints:
-    """Points of an alignment at lengths in plan, shape (n,), within the plan's length.
-
-    Each element is evaluated from its own first point as the file has it, so an error of one is not carried on. At
-    a joint the later element holds. Beyond the profile its last gradient goes on; beyond the cant there is none.
-    """
+    """Return points of an alignment at lengths in plan (n,), each by the first point of its own element."""
     starts = np.concatenate([[0.0], np.cumsum([element.length_m for element in plan])])
     xy, curvature = np.zeros((len(place_m), 2)), np.zeros(len(place_m))
     index = np.clip(np.searchsorted(starts, place_m, side="right") - 1, 0, len(plan) - 1)
@@ -233,11 +229,7 @@ def segment_of_design(
     grid: tuple[float, float, float, float, float, float] | None = None,
     notes: tuple[str, ...] = (),
 ) -> Segment:
-    """Return the points of one alignment as a segment, without heights where the profile is empty.
-
-    `grid`: easting, northing, height, cosine and sine of the rotation, and scale that turn the file's coordinates into
-    those of the grid. InputFileError: no element, or no grid. SettingsError: no height datum.
-    """
+    """Return the points of one alignment; `grid`: easting, northing, height, cosine, sine, scale of the file."""
     if not plan:
         raise InputFileError(path, f"alignment {name!r} has no element in plan")
     crs = reading.crs
@@ -257,31 +249,28 @@ def segment_of_design(
         # northing before easting turns the plane over, so a curve to the left in the file is one to the right
         xy, curvature = xy[:, ::-1], -curvature
         joints = (*joints, f"{name}: the file has northing before easting")
-    latitude, longitude, frame = frame_degrees(crs, xy[:, 0], xy[:, 1], path=f"{path} ({name})")
-    _check_length(plan, frame, latitude, longitude, path=f"{path} ({name})")
-    height, model, datum = np.full(len(latitude), np.nan), "", NO_HEIGHTS
+    source, heights = f"{path} ({name})", None
+    latitude, longitude, frame = frame_degrees(crs, xy[:, 0], xy[:, 1], path=source)
+    _check_length(plan, frame, latitude, longitude, path=source)
     if profile:
-        joints += _check_profile(plan, profile, path=f"{path} ({name})")
-        height, model, datum = heights_of_file(points.height_m + up, latitude, longitude, reading, path=path)
+        joints += _check_profile(plan, profile, path=source)
+        heights = heights_of_file(points.height_m + up, latitude, longitude, reading, path=path)
     radius = np.full(len(latitude), np.inf)
     bent = np.abs(curvature) > 1e-9
     radius[bent] = -1.0 / curvature[bent] * scale
-    return Segment(
-        source=f"{path} ({name})",
+    return make_segment(
+        (latitude, longitude, frame),
+        heights,
+        source=source,
         file=path,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        height_m=height,
-        kilometrage_m=np.full(len(latitude), np.nan),
-        cant_m=points.cant_m * _side_of_curve(curvature, bent),
-        radius_m=radius,
-        gradient_permille=points.gradient * 1e3,
         crs=crs,
-        frame=frame,
-        height_datum=datum,
-        geoid=model,
         metadata={"name": name},
-        notes=(*notes, *joints, *older_datum_note(crs)),
+        notes=(*notes, *joints),
+        attributes={
+            "cant_m": points.cant_m * _side_of_curve(curvature, bent),
+            "radius_m": radius,
+            "gradient_permille": points.gradient * 1e3,
+        },
     )
 
 

@@ -104,11 +104,7 @@ def track_at(track: Track, time: np.datetime64, **motion: Unpack[MapMotion]) -> 
 def points_at(
     ecef_m: Floats, crs: str, time: np.datetime64, *, named: bool = True, **motion: Unpack[MapMotion]
 ) -> tuple[Floats, FrameShift]:
-    """Move points of a map (n, 3) to the frame of the satellites at a time; return also the shift at the middle one.
-
-    Where the map does not name its frame `crs` itself, the size of the doubt is noted. SettingsError: when the plate is
-    unknown, or an epoch or plate is given for a frame that does not need it.
-    """
+    """Move points of a map (n, 3) to the frame of the satellites at a time; return also the shift at the middle one."""
     epoch, plate, parameters = motion.get("epoch"), motion.get("plate"), motion.get("parameters")
     kind, frame, year = kind_of_frame(crs), geodetic_of(crs), decimal_year(time)
     used = f"ITRF2020 at {year:.2f}"
@@ -289,11 +285,8 @@ def check_height_datum(height_datum: str | None) -> None:
 
 
 def geoid_heights(geoid: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> tuple[Floats, str]:
-    """Height of a geoid above the WGS 84 ellipsoid, shape (n,) [m], and the model used.
-
-    The geoid is a key of `JAPAN_MODELS`; ``egm96``, by PROJ's grid, else by `sidereon` (0.4 m RMS from it); a pyproj
-    grid (``.tif``, ``.gtx``); or a vertical or compound CRS (``EPSG:5773``). SettingsError: unknown or not installed.
-    InputFileError: points outside the area of the model.
+    """Return heights of a geoid (`JAPAN_MODELS`, ``egm96``, a pyproj grid, a vertical or compound CRS) above the WGS 84
+    ellipsoid, shape (n,) [m], and the model used. SettingsError: not known or not installed.
     """
     key = geoid.strip().lower()
     if key in JAPAN_MODELS:

@@ -260,11 +260,7 @@ def track_of(
 
 
 def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_sigma_m: float | None = None) -> Masks:
-    """Flag the rows of a log that meet the quality limits; by default fixes (1) where the log has a quality, else all.
-
-    With a largest standard deviation [m] rows without one are rejected. InputFileError: the log lacks a column for a
-    filter that is given, or has no row of an accepted quality.
-    """
+    """Flag the rows of a log within the quality limits: by default fixes (1) where it has a quality, else all."""
     usable = np.ones(len(log), dtype=np.bool_)
     if quality is not None and not log.has_quality:
         raise InputFileError(log.path, "a quality was given, but the log has no column 'quality'")

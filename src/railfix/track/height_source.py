@@ -66,12 +66,8 @@ def with_heights(
     height_datum: str | None = None,
     sigma_m: float | None = None,
 ) -> Track:
-    """Return the track with the heights of a second source in place of its own, and their standard deviation.
-
-    `source` is a raster (`RASTERS`), which needs `height_datum` and `sigma_m`; a CSV with ``chainage_m`` or
-    ``kilometrage_m``, ``height_m`` (ellipsoidal) or ``elevation_m`` (orthometric), and ``sigma_m`` as a column or
-    comment; or a log of positions. InputFileError: it has no heights for a part of the line. SettingsError: a raster
-    without what it needs.
+    """Return the track with heights and sigmas of a raster (`RASTERS`; needs `height_datum`, `sigma_m`), of a CSV by
+    chainage or kilometrage, or of a log of positions. InputFileError: no heights for a part of the line.
     """
     track = _dense(track)
     if isinstance(source, PositionLog):

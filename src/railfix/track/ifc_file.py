@@ -99,11 +99,7 @@ def _values(text: str) -> list[Any]:
 
 
 def read_ifc_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
-    """Read the alignments of an IFC file, one segment each; the CRS is that of the grid without an IfcProjectedCRS.
-
-    The height is that of the middle between the rail tops: the profile and half the sum of both rails' cant (IFC 4.3.2,
-    IfcSegmentedReferenceCurve). InputFileError: no alignment, or one with elements that are not read.
-    """
+    """Read alignments of an IFC file; heights are of the middle between the rail tops (IfcSegmentedReferenceCurve)."""
     step = _Step(path)
     nested = {entity.values[4]: entity.values[5] for _, entity in step.of_kind("IFCRELNESTS")}
     scale, angle = _units(step)

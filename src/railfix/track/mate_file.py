@@ -25,7 +25,7 @@ from railfix.io.mate import mate_table, read_mate
 from railfix.io.named_columns import read_named_columns
 from railfix.track.crs import choose_crs, frame_degrees
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
-from railfix.track.route import MapReading, Segment
+from railfix.track.route import MapReading, Segment, make_segment
 
 #: CRS of coordinates in degrees with their ellipsoidal height (ETRS89).
 _ETRS89: Final = "EPSG:4937"
@@ -49,24 +49,19 @@ def _segment_of_points(path: Path, edge: str, rows: pl.DataFrame, reading: MapRe
         if not np.isfinite(values[name]).all():
             raise InputFileError(path, f"track edge {edge}: a point has no {name}; complete it")
     crs = reading.crs or _ETRS89
-    latitude, longitude, frame = frame_degrees(
-        crs, values["LONGITUDE_ETRS89"], values["LATITUDE_ETRS89"], path=f"{path} ({edge})"
-    )
-    return Segment(
-        source=f"{path} ({edge})",
+    source, radius = f"{path} ({edge})", values["RADIUS"]
+    return make_segment(
+        frame_degrees(crs, values["LONGITUDE_ETRS89"], values["LATITUDE_ETRS89"], path=source),
+        (values["ALTITUDE_ETRS89"], "", "ellipsoidal"),
+        source=source,
         file=str(path),
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        height_m=values["ALTITUDE_ETRS89"],
-        kilometrage_m=np.full(len(rows), np.nan),
-        cant_m=values["CANT"] * 1e-3,
-        radius_m=np.where(np.nan_to_num(values["RADIUS"]) == 0.0, np.inf, values["RADIUS"]),
-        gradient_permille=values["GRADIENT"],
         crs=crs,
-        frame=frame,
-        height_datum="ellipsoidal",
-        geoid="",
         metadata={"name": edge},
+        attributes={
+            "cant_m": values["CANT"] * 1e-3,
+            "radius_m": np.where(np.nan_to_num(radius) == 0.0, np.inf, radius),
+            "gradient_permille": values["GRADIENT"],
+        },
     )
 
 

@@ -199,11 +199,7 @@ def _likelihood(residuals: Residuals, lattice: _CommonError, k: int) -> Floats:
 
 
 def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
-    """Return the track of each position, and the probability of each track given the whole log, shape (n, m + 1).
-
-    The tracks, shape (n,), are columns of the candidates, m for none: the sequence of which the most pairs of
-    neighbours are expected to be right.
-    """
+    """Return the most probable track of each position (n,), m for none, and the probability of each (n, m + 1)."""
     n, m = residuals.offset_m.shape
     lattice = _CommonError(residuals)
     length = _BLOCK // len(lattice.up_m)

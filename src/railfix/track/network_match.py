@@ -99,11 +99,9 @@ def _check_region(network: Network, log: PlanLog) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Matched:
-    """Positions on a network, n rows; `track` is the most probable sequence, -1 where none fits.
-
-    `offset_m` is in plan, positive to the right of the track. `probability` is that of the track given the whole log;
-    NaN where there is no position, or a wrong one: for less than a minute farther from all tracks than six times
-    `within_m`. `probabilities`, shape (n, m), are those of each candidate; the rest to 1 is that of no mapped track.
+    """Positions on a network, n rows; `track` is the most probable sequence (-1: none), `offset_m` in plan, positive to
+    the right; `probability` is given the whole log, NaN without or with a wrong position; `probabilities`, shape (n,
+    m), of each candidate, the rest to 1 of no mapped track.
     """
 
     track: Indices
@@ -159,12 +157,8 @@ def match(
     within_m: float | None = None,
     correlation_s: float = 20.0,
 ) -> Matched:
-    """Match positions of a run, in the order of travel and in the frame of the network, to its tracks.
-
-    `sigma_m` is the standard deviation of the distance from the track, map included (by default of the log and the
-    map); `within_m` the farthest track considered (30 m, or five standard deviations up to 100 m); `correlation_s` the
-    time over which errors persist that are not common to minutes. Heights count where both sides have them and tracks
-    lie above each other. MismatchError: there is no position.
+    """Match positions of a run, in the order of travel and in the frame of the network, to its tracks no farther than
+    `within_m`; `sigma_m` is of the distance from the track, `correlation_s` the time over which errors persist.
     """
     given = np.flatnonzero(np.isfinite(log.latitude_deg))
     if not len(given):

@@ -69,7 +69,6 @@ def _relations(path: str | PathLike[str]) -> list[Relation]:
                 raise InputFileError(path, f"net relation {stated.get('id', '')!r} has no {', '.join(missing)}")
             relations.append(
                 Relation(
-                    name=str(stated.get("id", "")),
                     first=str(stated[RELATION]),
                     second=str(stated["netelementB"]),
                     first_end=int(stated["positionOnA"]),

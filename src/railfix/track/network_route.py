@@ -30,10 +30,8 @@ _STEPS = 15
 
 @dataclass(frozen=True, kw_only=True)
 class Filled:
-    """Places of all positions, shapes (n,); `track` is -1 where no place is known and no route was found.
-
-    `bound_m` is the farthest that a train on this route, which does not turn back, can be from the filled place [m];
-    infinite before the first known place and after the last, NaN where the place was known.
+    """Places of all positions, shapes (n,); `track` is -1 without a place or route; `bound_m` is the farthest that a
+    train on this route can be from a filled place [m], infinite before and after known ones.
     """
 
     track: Indices
@@ -42,12 +40,7 @@ class Filled:
 
 
 def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill: Rows = "gaps") -> Filled:
-    """Fill rows without usable position along the shortest route between known places, at even speed.
-
-    A gap with positions off the map is left, unless `rows_to_fill` is "off-map", as in a tunnel, where positions drift
-    but their steps still tell the speed. Then a route counts whose length differs from the distance travelled by at
-    most `_DRIFT_M`, and rows before the first known place and after the last are filled, too.
-    """
+    """Fill rows without usable position along the shortest route at even speed; "off-map" also those off the map."""
     filled = Filled(
         track=matched.track.copy(), chainage_m=matched.chainage_m.copy(), bound_m=np.full(len(matched.track), np.nan)
     )
@@ -148,11 +141,7 @@ def _fill_legs(
 
 
 def route_of(network: Network, matched: Matched) -> tuple[list[int], list[int]]:
-    """Tracks that a run passed, in the order of travel, and those that no route can join to them.
-
-    Each track is passed once: a train that runs back, or round several times, stays on the same route, and a closed
-    route ends where it began. Where it runs back over other tracks, the less probable ones are left out.
-    """
+    """Return the tracks that a run passed in order of travel, each once, and those that no route joins to them."""
     seen = matched.track[matched.track >= 0]
     if not len(seen):
         return [], []

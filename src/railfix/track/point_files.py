@@ -17,10 +17,10 @@ from railfix.core.files import read_text, write_whole
 from railfix.core.settings import misspelt
 from railfix.core.tables import plural
 from railfix.io.named_columns import NamedColumns, read_named_columns
-from railfix.track.crs import choose_crs, find_crs, frame_degrees, older_datum_note, unit_of_heights
+from railfix.track.crs import choose_crs, find_crs, frame_degrees, unit_of_heights
 from railfix.track.frames import HEIGHT_DATUMS, check_height_datum, ellipsoidal_heights, own_height_datum
-from railfix.track.route import NO_HEIGHTS, RINF_NAMES, RINF_SECTIONS, MapReading, Segment
-from railfix.track.track import UNNAMED, Track
+from railfix.track.route import RINF_NAMES, RINF_SECTIONS, MapReading, Segment, make_segment
+from railfix.track.track import Track
 from railfix.track.vector_file import (
     is_of_openstreetmap,
     metadata_of,
@@ -218,24 +218,16 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
             f"point {int(np.argmax(same)) + 2} repeats the one before ({int(same.sum())} such); remove it, "
             "'railfix map check' lists them all"
         )
-    latitude, longitude, frame = _in_frame(line.source, crs, line.coordinates)
-    height, model, datum = np.full(len(latitude), np.nan), "", NO_HEIGHTS
-    if line.coordinates.shape[1] > 2:
-        height, model, datum = _heights(line, crs, latitude, longitude, reading)
+    degrees = _in_frame(line.source, crs, line.coordinates)
     of_way = metadata_of(line.feature)
-    return Segment(
+    return make_segment(
+        degrees,
+        _heights(line, crs, *degrees[:2], reading) if line.coordinates.shape[1] > 2 else None,
         source=f"{line.path} ({of_way['name']})" if "name" in of_way else line.source,
         file=line.path,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        height_m=height,
         crs=crs,
-        frame=frame,
-        height_datum=datum,
-        geoid=model,
-        notes=older_datum_note(crs),
         metadata={key: str(line.properties[key]) for key in _MEMBERS if key in line.properties} | of_way,
-        **attributes(len(latitude), line.array),
+        attributes=attributes(line.array),
     )
 
 
@@ -281,13 +273,13 @@ KNOWN_COLUMNS: Final = (
 KNOWN_METADATA: Final = ("name", "crs", "height_datum", "geoid", "sigma_plan_m", "sigma_height_m", "note")
 
 
-def attributes(count: int, read: Callable[[str, float], Floats | None]) -> dict[str, Floats]:
+def attributes(read: Callable[[str, float], Floats | None]) -> dict[str, Floats]:
     """Read optional attributes of points by `read(name, blank)`; radii of 0, straight track, become infinite."""
     found: dict[str, Floats] = {}
     for column, (name, factor, blank) in OPTIONAL_COLUMNS.items():
-        values = read(column, blank)
-        found[name] = np.full(count, np.nan) if values is None else values * factor
-    return found | {"radius_m": np.where(found["radius_m"] == 0.0, np.inf, found["radius_m"])}
+        if (values := read(column, blank)) is not None:
+            found[name] = np.where(values == 0.0, np.inf, values) if name == "radius_m" else values * factor
+    return found
 
 
 def read_csv_segment(path: str | PathLike[str], reading: MapReading) -> Segment:
@@ -312,28 +304,24 @@ def read_csv_segment(path: str | PathLike[str], reading: MapReading) -> Segment:
             "'railfix map check' lists them all",
         )
     crs = choose_crs(path, reading.crs, table.metadata.get("crs"))
-    latitude, longitude, frame = _check_degrees(crs, latitude, longitude, path=table.path)
+    degrees = _check_degrees(crs, latitude, longitude, path=table.path)
     geoid, geoid_m = reading.geoid, None
     if datum == "orthometric" and "geoid_m" in table:
         geoid_m = table.numbers("geoid_m")
     elif datum == "orthometric" and geoid is None:
         geoid = table.metadata.get("geoid")
     height, model = ellipsoidal_heights(
-        heights, latitude, longitude, datum=datum, geoid=geoid, geoid_m=geoid_m, path=table.path
+        heights, *degrees[:2], datum=datum, geoid=geoid, geoid_m=geoid_m, path=table.path
     )
-    return Segment(
+    return make_segment(
+        degrees,
+        (height, model, datum),
         source=table.path,
         file=table.path,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        height_m=height,
-        crs=crs or UNNAMED,
-        frame=frame,
-        height_datum=datum,
-        geoid=model,
+        crs=crs,
         metadata={key: value for key, value in table.metadata.items() if key in KNOWN_METADATA},
-        notes=(*notes, *older_datum_note(crs)),
-        **attributes(len(table), lambda column, blank: table.numbers(column, blank=blank) if column in table else None),
+        notes=notes,
+        attributes=attributes(lambda column, blank: table.numbers(column, blank=blank) if column in table else None),
     )
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TypedDict
 
 import numpy as np
@@ -12,7 +13,8 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.track.track import BACKWARDS, SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
+from railfix.track.crs import older_datum_note
+from railfix.track.track import BACKWARDS, SIGMA_HEIGHT_M, SIGMA_PLAN_M, UNNAMED, Provenance, Track
 
 NO_HEIGHTS = "none"  #: `Segment.height_datum` of a segment without heights; they are NaN, or come from a second source.
 #: Optional attributes of each point of a map.
@@ -76,6 +78,28 @@ class Segment:
         turned = {name: getattr(self, name)[::-1] for name in names}
         turned |= {name: -turned[name] for name in ("radius_m", "gradient_permille")}
         return replace(self, **turned, notes=(*self.notes, f"{self.source} {BACKWARDS}"))
+
+
+def make_segment(
+    degrees: tuple[Floats, Floats, str],
+    heights: tuple[Floats, str, str] | None,
+    *,
+    source: str,
+    file: str,
+    crs: str | None,
+    metadata: dict[str, str],
+    notes: tuple[str, ...] = (),
+    attributes: Mapping[str, Floats] = MappingProxyType({}),
+) -> Segment:
+    """Return a segment of latitude, longitude and their frame; of heights, geoid and datum, where it has any."""
+    latitude, longitude, frame = degrees
+    absent = np.full(len(latitude), np.nan)
+    height, geoid, datum = heights or (absent, "", NO_HEIGHTS)
+    return Segment(
+        source=source, file=file, latitude_deg=latitude, longitude_deg=longitude, height_m=height, crs=crs or UNNAMED,
+        frame=frame, height_datum=datum, geoid=geoid, metadata=metadata, notes=(*notes, *older_datum_note(crs)),
+        **{**dict.fromkeys(ATTRIBUTES, absent), **attributes},
+    )  # fmt: skip
 
 
 SAME_POINT_M = 0.05  #: Ends of two segments nearer than this are the same point [m].

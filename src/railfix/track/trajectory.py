@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, Literal
+from itertools import chain
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,11 +35,7 @@ def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tu
 
 
 class NearestOnPolyline:
-    """Search structure for nearest points of a polyline of V points, shape (V, 3).
-
-    Each point of the polyline is within `reach_m` of a sample of its segment, so the segment sought has a sample within
-    the best distance found plus `reach_m`.
-    """
+    """Search structure for nearest points of a polyline (V, 3), each within `reach_m` of a sample of its segment."""
 
     def __init__(self, points_m: Floats) -> None:
         self._start = points_m[:-1]
@@ -85,11 +82,7 @@ class NearestOnPolyline:
 def nearest_segments(
     points_m: Floats, segment: Indices, start_m: Floats, step_m: Floats
 ) -> tuple[Indices, Floats, Floats]:
-    """Find the nearest of some segments (n, C) to each point (n, 3); of equally near ones the one earlier on the line.
-
-    `start_m` and `step_m`, shape (V - 1, 3), are the segments' first points and steps. Returns the segment, the place
-    on it, 0 to 1, and the distance, shapes (n,).
-    """
+    """Return the nearest of some segments (n, C) to each point (n, 3), the place on it and the distance."""
     share, offset = project_on_segments(points_m[:, None], start_m[segment], step_m[segment])
     best = offset.min(axis=1)
     # independent of the order of the tree that has named the segments
@@ -318,6 +311,40 @@ class Trajectory(FrozenArrays, NotebookTable):
         """
         index, along, offset = self._nearest(ecef_m)
         return self.arc_m[np.maximum(index, 0)] + along, offset  # `along` is NaN where there is no segment
+
+
+class Passes(NamedTuple):
+    """Segments near positions, P of them, sorted by position and segment."""
+
+    position: Indices
+    segment: Indices
+    #: Distance of the position along the segment's straight line from its start, and of the segment's nearest point.
+    along_m: Floats
+    foot_m: Floats
+    offset_m: Floats  #: From that point to the position, shape (P, 3).
+    lowest: Masks  #: No neighbouring segment comes nearer: the line passes the position here.
+    again: Masks  #: As near as the segment before: at the point between the two.
+
+
+def passes_of(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats | float) -> Passes:
+    """Return the segments whose middle is within a reach and half the longest segment of each position (n, 3)."""
+    length, tangent = trajectory.length_m, trajectory.tangent
+    middle = 0.5 * (trajectory.ecef_m[1:] + trajectory.ecef_m[:-1])
+    reach = np.broadcast_to(reach_m + 0.5 * length.max(), len(ecef_m))
+    lists = cKDTree(middle).query_ball_point(ecef_m, reach, return_sorted=True)
+    position = np.repeat(np.arange(len(ecef_m)), [len(x) for x in lists])
+    segment = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=len(position))
+    delta = ecef_m[position] - trajectory.ecef_m[segment]
+    along = np.einsum("pi,pi->p", delta, tangent[segment])
+    foot = np.clip(along, 0.0, length[segment])
+    offset = delta - foot[:, None] * tangent[segment]
+    away = np.linalg.norm(offset, axis=1)
+    joined = (position[1:] == position[:-1]) & (segment[1:] == segment[:-1] + 1)
+    lowest, again = np.ones(len(position), dtype=np.bool_), np.zeros(len(position), dtype=np.bool_)
+    lowest[1:] &= ~joined | (away[1:] <= away[:-1])
+    lowest[:-1] &= ~joined | (away[:-1] <= away[1:])
+    again[1:] = joined & (away[1:] == away[:-1])
+    return Passes(position, segment, along, foot, offset, lowest, again)
 
 
 def between_points(arc: Floats, arc_m: Floats, length_m: Floats, values: Floats, section: Indices) -> Floats:

@@ -23,10 +23,9 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import ending, open_stream
-from railfix.track.crs import choose_crs, frame_degrees, older_datum_note, unit_of_heights
+from railfix.track.crs import choose_crs, frame_degrees, unit_of_heights
 from railfix.track.frames import check_height_datum, heights_of_file
-from railfix.track.route import ATTRIBUTES, NO_HEIGHTS, MapReading, Segment
-from railfix.track.track import UNNAMED
+from railfix.track.route import MapReading, Segment, make_segment
 
 #: Standard deviation in plan of a track of OpenStreetMap, drawn from aerial pictures, if its file has none [m].
 SIGMA_M: Final = 2.0
@@ -193,11 +192,7 @@ _NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")  #: C
 
 
 def read_layers(path: str | PathLike[str], *, geometry: str) -> list[tuple[str | None, list[dict[str, Any]], Any]]:
-    """Read all features of a kind of geometry ("LineString"), or whatever their geometry ("none").
-
-    One entry a layer: CRS or None, properties of each feature, shapely geometries. InputFileError: when pyogrio is
-    missing, or GDAL cannot read the file.
-    """
+    """Read CRS, properties and geometries of all features of a kind ("LineString", "none": any), an entry a layer."""
     try:
         import pyogrio
         import shapely
@@ -244,11 +239,7 @@ def _check_text(path: str | PathLike[str]) -> None:
 
 
 def read_vector_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
-    """Read the lines of a map file as segments, in the order of the file.
-
-    The CRS is that of a file without one (an error where the file names another one); height datum and geoid are those
-    of coordinates with heights: a segment whose heights are all 0 counts as one without. InputFileError, SettingsError.
-    """
+    """Read the lines of a map file as segments; CRS, height datum and geoid are for files that name none."""
     check_height_datum(reading.height_datum)
     segments: list[Segment] = []
     left_out: Counter[str] = Counter()
@@ -299,7 +290,7 @@ def plan_segment(
         raise InputFileError(source, "names no CRS, and its coordinates are no degrees; give --crs")
     used = crs or "EPSG:4326"
     latitude, longitude, frame = frame_degrees(used, values[:, 0], values[:, 1], path=source)
-    height, model, datum = np.full(len(values), np.nan), "", NO_HEIGHTS
+    heights = None
     known = np.isfinite(values[:, 2]) if values.shape[1] == 3 else np.zeros(len(values), dtype=np.bool_)
     if known.any() and not known.all():
         raise InputFileError(
@@ -308,23 +299,10 @@ def plan_segment(
             "mend them, or write the line without heights",
         )
     if known.any() and values[:, 2].any():
-        height, model, datum = heights_of_file(
-            values[:, 2] * unit_of_heights(crs), latitude, longitude, reading, path=source
-        )
-    return Segment(
-        source=source,
-        file=path,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        height_m=height,
-        crs=crs or UNNAMED,
-        frame=frame if crs else "EPSG:4979",
-        height_datum=datum,
-        geoid=model,
-        metadata={**(stated or {}), "name": name},
-        notes=older_datum_note(crs),
-        **dict.fromkeys(ATTRIBUTES, np.full(len(values), np.nan)),
-    )
+        heights = heights_of_file(values[:, 2] * unit_of_heights(crs), latitude, longitude, reading, path=source)
+    degrees = latitude, longitude, frame if crs else "EPSG:4979"
+    metadata = {**(stated or {}), "name": name}
+    return make_segment(degrees, heights, source=source, file=path, crs=crs, metadata=metadata)
 
 
 def name_of(row: Mapping[str, Any], *, fallback: str) -> str:

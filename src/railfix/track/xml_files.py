@@ -49,7 +49,6 @@ _SPIRALS: Final = {
 class Relation:
     """Connection of two net elements as railML 3 and RailTopoModel have it."""
 
-    name: str
     #: Names of the elements.
     first: str
     second: str
@@ -246,10 +245,8 @@ def _landxml_profile(path: str, profile: Any, scale: float, start: float) -> lis
 
 
 def _landxml_cant(cant: Any, scale: float, start: float) -> tuple[list[CantElement], tuple[str, ...]]:
-    """Elements between cant stations, about the rail or the middle that the file names; and notes.
-
-    Without a name the outer rail is raised. A ramp runs by the transition type of the station that it begins at. The
-    applied cant is in millimetres, in inches where lengths are imperial (LandXML 1.2), in metres in InfraModel.
+    """Return elements between cant stations and notes; the outer rail is raised unless named; units are mm, inches
+    where lengths are imperial (LandXML 1.2), metres in InfraModel.
     """
     if cant is None:
         return [], ()
@@ -323,7 +320,6 @@ def read_railml_relations(path: str | PathLike[str]) -> list[Relation]:
             raise InputFileError(path, f"netRelation {item.get('id')} names no two elements", line=item.sourceline)
         relations.append(
             Relation(
-                name=str(item.get("id")),
                 first=str(first.get("ref")),
                 second=str(second.get("ref")),
                 first_end=int(float(item.get("positionOnA"))),
@@ -382,7 +378,6 @@ def read_rinf_relations(path: str | PathLike[str]) -> list[Relation]:
         way = [str(value).rsplit("/", 1)[-1].lower() for value in _values(graph, item, f"{_ERA}navigability")]
         relations.append(
             Relation(
-                name=_name(graph, item),
                 first=_name(graph, first),
                 second=_name(graph, second),
                 first_end=0 if at_first.toPython() else 1,

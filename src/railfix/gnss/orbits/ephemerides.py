@@ -110,10 +110,7 @@ def is_beidou_geo(satellite: str) -> bool:
 
 
 def eccentric_anomaly(mean_anomaly: Floats, eccentricity: Floats) -> tuple[Floats, Floats, Floats]:
-    """Solve Kepler's equation M = E - e sin E; return E, sin E and cos E.
-
-    Three Newton steps, converged to the last digit for e < 0.2 (the largest of these satellites is 0.17).
-    """
+    """Solve M = E - e sin E in three Newton steps (to the last digit for e < 0.2); return E, sin E and cos E."""
     anomaly = mean_anomaly
     sine, cosine = np.sin(anomaly), np.cos(anomaly)
     for _ in range(2):
@@ -187,11 +184,11 @@ def _out_of_tilted_frame(
     angle = rate * since_toe_s
     cos_z, sin_z = np.cos(angle), np.sin(angle)
 
-    def rotated(v: Components) -> Components:
+    def rotate(v: Components) -> Components:
         y, z = cos_x * v[1] + sin_x * v[2], cos_x * v[2] - sin_x * v[1]
         return cos_z * v[0] + sin_z * y, cos_z * y - sin_z * v[0], z
 
-    place, speed = rotated(position), rotated(velocity)
+    place, speed = rotate(position), rotate(velocity)
     speed = (speed[0] + rate * place[1], speed[1] - rate * place[0], speed[2])
     tilted = rate != 0.0
     x, y, z = (np.where(tilted, new, old) for new, old in zip(place, position, strict=True))
@@ -204,9 +201,7 @@ _BLOCK: Final = 8192  #: Rows integrated at once, so that the arrays stay in the
 
 
 def acceleration(position: Floats, velocity: Floats, luni_solar: Floats) -> Floats:
-    """Compute the acceleration in the Earth-fixed frame, shape (3, n) [m/s^2]: central force, J2, rotation, Moon and
-    Sun.
-    """
+    """Compute the acceleration in the Earth-fixed frame (3, n) [m/s^2]: central, J2, rotation, Moon and Sun."""
     omega = EARTH_ROTATION_RATE_GLONASS
     x, y, z = position
     r2 = x * x + y * y + z * z
@@ -361,11 +356,7 @@ def _rotate_axes(angle: Floats, vector: Floats) -> tuple[Floats, Floats, Floats]
 
 
 def _lagrange_at_zero(nodes: Floats, node_products: Floats) -> tuple[Floats, Floats]:
-    """Compute the Lagrange weights of value and slope at 0 of the polynomial through nodes, shape (P, n).
-
-    Products of ``-node`` over all nodes but one, and their derivatives, from the products before
-    and after that one, over the products of the differences.
-    """
+    """Compute the Lagrange weights of value and slope at 0 of the polynomial through nodes, shape (P, n)."""
     points = len(nodes)
     start = (np.ones(nodes.shape[1]), np.zeros(nodes.shape[1]))
     before, after = [start], [start]

@@ -59,12 +59,7 @@ class Lookup:
     available: Datetimes
 
     def find(self, number: Integers, time: Datetimes, limit: NDArray[np.timedelta64]) -> tuple[Integers, Masks, Masks]:
-        """Select the record of each satellite at each epoch, shapes (M, T): row of the table, in its validity, not yet
-        sent.
-
-        `number`, shape (M,), are values of the lookup's; -1 for a satellite without records. `limit` is the longest
-        distance of an epoch from toe, by row of the record table.
-        """
+        """Return row, validity (`limit` by row) and "not yet sent" of the record of each satellite, shapes (M, T)."""
         shape = (len(number), len(time))
         if not len(self.sent_key):
             return np.full(shape, -1, dtype=np.int64), np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
@@ -158,12 +153,7 @@ def _issues_of(navigation: Navigation) -> _Issues:
 
 
 def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, issue: Integers) -> Integers:
-    """Find the rows of `navigation.kepler` with given issues of data, shape (T, M); -1 without one, and for GLONASS.
-
-    `issue`, shape (T, M), is IODE (BeiDou: of B-CNAV1), of Galileo IODnav; -1 for none; of IODC, 10 bits, the lower 8
-    count. The record is the one of that issue whose reference time is nearest, if the epoch lies in its validity; it
-    may have been transmitted after the epoch (`SatelliteStates.future_record`).
-    """
+    """Find the nearest valid row of `navigation.kepler` of an `issue` (T, M), sent or not; -1 without one."""
     table = _issues_of(navigation)
     number = np.array([table.number.get(str(name), -1) for name in satellite], dtype=np.int64)
     issue = np.where(np.char.startswith(satellite, "E") | (issue < 0), issue, issue % 256)
@@ -357,7 +347,7 @@ class PreparedRecords:
         self._cache: dict[tuple[bytes, ...], ChannelRecords] = {}
 
     @cached_property
-    def integrated(self) -> GlonassStates:
+    def step_states(self) -> GlonassStates:
         """GLONASS states at multiples of the integration step."""
         return GlonassStates.from_records(self.navigation.glonass, VALIDITY_S["R"])
 

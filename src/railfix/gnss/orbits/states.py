@@ -24,10 +24,7 @@ _BLOCK: Final = 4096  #: Epochs of a channel computed at once, so that the array
 
 @dataclass(frozen=True, kw_only=True)
 class SatelliteStates:
-    """Satellite states at the times of transmission, T epochs by M channels.
-
-    NaN where a channel has no code, no record, or only records out of their validity.
-    """
+    """Satellite states at the times of transmission, T by M; NaN without a code or a valid record."""
 
     #: In the Earth-fixed frame of the time of transmission, not rotated to that of reception
     #: (`railfix.core.geodesy.range_with_rotation` does that); shape (T, M, 3).
@@ -224,7 +221,7 @@ def _fill_glonass(
     since = age - code_m[t, m] / SPEED_OF_LIGHT
     bias, rate = records.clock_bias_s[row], records.relative_frequency[row]
     since = since - (bias + rate * since)
-    position, velocity = table.integrated.state(row, since)
+    position, velocity = table.step_states.state(row, since)
     for i in range(3):
         states.position_ecef_m[t, m, i], states.velocity_ecef_mps[t, m, i] = position[i], velocity[i]
     states.clock_m[t, m] = SPEED_OF_LIGHT * (bias + rate * since)

@@ -29,10 +29,7 @@ _NEGLIGIBLE: Final = 0.01  #: Share of the risk of a sample below which places a
 
 
 class Forms(NamedTuple):
-    """Sum of squared residuals in variances, over the place d from the position, under K hypotheses, T epochs.
-
-    ``q(d) = constant - 2 d . slope + d^T matrix d``, d along, across and up at the position.
-    """
+    """Squared residuals over the place d under K hypotheses: ``q(d) = constant - 2 d . slope + d^T matrix d``."""
 
     prior: Floats  # (T, K)
     constant: Floats  # (T, K)
@@ -44,10 +41,7 @@ class Forms(NamedTuple):
         return Forms(*(np.concatenate(arrays, axis=1) for arrays in zip(self, *others, strict=True)))
 
     def radius_m(self, risk: float) -> Floats:
-        """Return the distance within which the open places of each hypothesis lie, shape (T, K); 0 without a prior.
-
-        Beyond them all have 1 % of the risk, the same for each.
-        """
+        """Return the radius of the open places of each hypothesis (T, K), beyond which all have 1 % of the risk."""
         covariance = inverse_3x3(self.matrix)
         centre = np.einsum("tkij,tkj->tki", covariance, self.slope)
         form = np.maximum(np.einsum("tki,tki->tk", centre, self.slope), 0.0)
@@ -61,12 +55,7 @@ class Forms(NamedTuple):
 
 
 def whiten_residuals(model: LinearModel, plan: float, height: float, scale: Floats) -> tuple[Compact, Floats, Forms]:
-    """Return the residuals of n channels with the map error in the noise, their design, and the form without fault (K =
-    1).
-
-    The map error is taken alike in all horizontal directions: another place has another tangent. The design, shape (T,
-    n, 3) [1/m], is the decrease of the residuals by a step along, across and up.
-    """
+    """Return whitened residuals, their design (T, n, 3) [1/m] along, across, up, and the form without fault."""
     normal = np.linalg.inv(model.covariance_m2) - model.prior
     prior = scale[:, None, None] ** 2 * np.diag([plan**-2.0, plan**-2.0, height**-2.0])
     covariance = np.asarray(np.linalg.inv(normal + prior), dtype=np.float64)
@@ -86,9 +75,7 @@ def whiten_residuals(model: LinearModel, plan: float, height: float, scale: Floa
 
 
 def without_sides(parts: Compact, design: Floats, none: Forms, sides: Masks, prior: float) -> Forms:
-    """Return the forms with the channels of each side (T, S, M) left out, K = S; prior 0 where fewer than two are in
-    use.
-    """
+    """Return the forms without the channels of each side (T, S, M), K = S; prior 0 with fewer than two in use."""
     n, forms = parts.channel.shape[1], []
     columns = np.concatenate([parts.projector, parts.residual[..., None], design], axis=2)
     for c in range(sides.shape[1]):

@@ -134,10 +134,7 @@ class RiskBudget(Settings):
         return k_factor(self.risk_per_sample)
 
     def prior(self, systems: Sequence[str]) -> Floats:
-        """Fault probability of each channel, shape (M,): of the satellite and of what is around the antenna.
-
-        ValueError: a constellation has no prior.
-        """
+        """Fault probability of each channel (M,); ValueError: a constellation has none."""
         unknown = sorted(set(systems) - set(self.satellite_prior))
         if unknown:
             raise ValueError(f"satellite_prior has no value for constellation {unknown[0]!r}: add one")
@@ -163,10 +160,7 @@ class RiskBudget(Settings):
 
 
 def set_sums(prior: Floats, most: int) -> Floats:
-    """Sums over sets of 0, 1, ..., `most` faults of the product of their priors, shape (T, M) to (T, most + 1).
-
-    Bounds of the probability of as many faults or more (Newton's identities).
-    """
+    """Bound the probability of 0 to `most` faults or more, (T, M) to (T, most + 1), by Newton's identities."""
     power, powers = prior, []
     for _ in range(most):
         powers.append(power.sum(axis=1))
@@ -219,12 +213,7 @@ class Allocation:
 def allocate(
     model: LinearModel, systems: Sequence[str], risk: RiskBudget, out: Integers, sides: Masks, *, wrong_map: bool
 ) -> Allocation:
-    """Divide the risk of each epoch.
-
-    Satellites alone, in pairs (where these are likelier than their share) and with a wrong map, constellations with one
-    satellite, and sides are hypotheses always; so are classes likelier than what may stay unchecked. `out`, shape (T,):
-    satellites excluded; `sides`, shape (T, S, M): sets of satellites that fail together.
-    """
+    """Divide the risk of each epoch; `out` (T,): satellites excluded; `sides` (T, S, M): sets that fail together."""
     used = model.used
     if len(used) <= FEW:  # live, where the same satellites are used epoch after epoch
         given = (used.tobytes(), out.tobytes(), (sides & used[:, None]).tobytes())
@@ -345,11 +334,7 @@ class _Classes:
         return np.asarray(each.sum(axis=1) + self.further)
 
     def choose(self, share: float, likely: Sequence[float], satellite: float, used: Integers) -> Indices:
-        """Return how many satellites at most are left out with each set of shared faults, shape (T, B).
-
-        `share` may stay unchecked; `likely` are the priors of the shared faults, length B, `satellite` that of a
-        satellite.
-        """
+        """Return how many satellites at most are left out with each set of shared faults, shape (T, B)."""
         sizes = np.arange(MOST_TOGETHER + 1)
         feasible = comb(used[:, None], sizes) <= _MOST_SETS
         alone = (self.each[..., None] * self.sums[:, None, :-1] > share) & feasible[:, None]

@@ -51,12 +51,7 @@ _FRAME_S: Final = 30.0
 
 @dataclass(frozen=True, kw_only=True)
 class Unfinished:
-    """What the subframes so far left.
-
-    `latest` has the fields of the latest subframe by satellite and number, with the time it was received; `issued`,
-    by satellite and message, what tells its last record from the next; `waiting`, GLONASS satellites with all strings,
-    and the first epoch after these, which tells whether they are of one frame (NaT until it comes).
-    """
+    """What the subframes left: `latest`, what tells the last record (`issued`), GLONASS satellites `waiting`."""
 
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -65,11 +60,7 @@ class Unfinished:
 
 @dataclass(frozen=True, kw_only=True)
 class Assembled:
-    """Records of a piece of a stream, in the order in which they became complete.
-
-    `complete_at` is the receiver's time of the subframe that completed each; NaT before the receiver knew the time.
-    `undated` are the satellites with an ephemeris whose date was not known.
-    """
+    """Records of a piece of a stream in order of completion, its time (NaT: unknown), and satellites `undated`."""
 
     records: tuple[RawRecord, ...]
     complete_at: Datetimes
@@ -87,11 +78,7 @@ def assemble_records(
     after: Datetimes,
     first: np.datetime64,
 ) -> tuple[Assembled, Unfinished]:
-    """Ephemerides that a piece of a stream completes, and what it leaves unfinished.
-
-    `time`, the last epoch before each subframe, shape (N,), resolves weeks and days; `after` is the first one after
-    each, NaT where the piece has none, `first` that of the piece.
-    """
+    """Return the ephemerides that a piece completes, and what it leaves; `time` is before, `after` after each."""
     builder = _EphemerisBuilder(state)
     builder.waiting = {name: first if np.isnat(at) else at for name, at in builder.waiting.items()}
     pages, counts = decode_pages(subframes)

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -162,12 +162,7 @@ _BLOCK_BYTES = 1 << 22
 
 
 def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None) -> PositionLog:
-    """Read the positions that a receiver computed from its log, plain or packed; `line` counts the positions.
-
-    SBF PVTGeodetic, or PVTCartesian without it; UBX NAV-HPPOSLLH, or NAV-PVT without it. `date` is some time within
-    half a week, for UBX logs without a dated NAV-PVT. InputFileError: the log has no position, or none that can be
-    dated.
-    """
+    """Read the positions that a receiver computed; `date` is for UBX logs without a dated NAV-PVT."""
     parts = []
     near = np.datetime64("NaT", "ns") if date is None else date.astype("datetime64[ns]")
     undated, rest = 0, b""
@@ -190,15 +185,8 @@ def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None
             else "holds no position of the receiver (UBX NAV-PVT or NAV-HPPOSLLH, SBF PVTGeodetic or PVTCartesian)"
         )
         raise InputFileError(path, why)
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return PositionLog(
-        path=str(path),
-        time=columns["time"],
-        ecef_m=columns["ecef_m"],
-        quality=columns["quality"],
-        sigma_m=columns["sigma_m"],
-        line=np.arange(1, len(columns["time"]) + 1),
-    )
+    columns: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return PositionLog(path=str(path), line=np.arange(1, len(columns["time"]) + 1), **columns)
 
 
 #: Kinds of messages with observations.
@@ -222,11 +210,8 @@ class LogPiece:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamState:
-    """What the bytes so far left: the start of a frame, unfinished ephemerides, the last known time.
-
-    `kind`: the messages that the observations are taken from; `observed`: whether there was an epoch of the receiver's
-    own format; `clock`: the last time of an epoch or another message; `station`: position of a base station (RTCM 1005,
-    1006).
+    """What the bytes so far left; `kind` are the messages that observations are taken from, `observed` whether one
+    came, `clock` the last time of any message, `station` that of RTCM 1005 and 1006.
     """
 
     rest: bytes = b""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings
 from railfix.core.timescale import from_week, gpst_minus_utc, nearest_week, seconds, timedelta, to_week
-from railfix.gnss.observations import ObservationHeader, Observations
+from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.nav_messages import Values
 from railfix.io.rinex.navigation_records import RawRecord, fields_of
@@ -48,9 +48,7 @@ class Measurements:
 
 @dataclass(frozen=True, kw_only=True)
 class Tracking:
-    """What the epochs so far left: the last one, NaT before the first, and lock time [s] and polarity of the last phase
-    of each channel (satellite and signal joined).
-    """
+    """What the epochs left: the last one, and lock time [s] and polarity of the last phase of each channel."""
 
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     lock: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -130,11 +128,7 @@ def rising_epochs(time: Datetimes, after: np.datetime64 | None = None) -> Masks:
 
 
 def slips(lock_s: Floats, polarity: Floats) -> Masks:
-    """Epochs whose phase is not continuous with the channel's last one, shape (T, M).
-
-    Lock time zero or less than before, or a change of polarity; both are NaN where there is no phase. The first phase
-    of a channel counts as continuous unless its lock time is zero.
-    """
+    """Flag phases not continuous (T, M): lock time 0 or less than before, or changed polarity; NaN without phase."""
     present = ~np.isnan(lock_s)
     epochs = np.where(present, np.arange(len(lock_s))[:, None], -1)
     last = np.concatenate([np.full((1, lock_s.shape[1]), -1), np.maximum.accumulate(epochs, axis=0)[:-1]])
@@ -145,9 +139,6 @@ def slips(lock_s: Floats, polarity: Floats) -> Masks:
 
 
 def _header(measurements: Measurements, satellite: Strings, signal: Strings) -> ObservationHeader:
-    signals: dict[str, set[str]] = {}
-    for name, code in zip(satellite.tolist(), signal.tolist(), strict=True):
-        signals.setdefault(name[0], set()).add(code)
     glonass = np.char.startswith(measurements.satellite, "R")
     channel = dict(
         zip(measurements.satellite[glonass].tolist(), measurements.glonass_channel[glonass].tolist(), strict=True)
@@ -156,7 +147,7 @@ def _header(measurements: Measurements, satellite: Strings, signal: Strings) -> 
         receiver=measurements.receiver,
         glonass_channel={name: number for name, number in sorted(channel.items()) if -7 <= number <= 6},
         leap_seconds=measurements.leap_seconds,
-        signals={system: tuple(sorted(codes)) for system, codes in sorted(signals.items())},
+        signals=signals_by_system(satellite, signal),
     )
 
 
@@ -168,22 +159,10 @@ ROW_ARRAYS: Final = (
 
 def no_measurements(receiver: str) -> Measurements:
     """Create measurements without a row."""
-    numbers, names = np.zeros(0), np.zeros(0, dtype="<U3")
-    return Measurements(
-        time=np.zeros(0, dtype="datetime64[ns]"),
-        epoch=np.zeros(0, dtype=np.intp),
-        satellite=names,
-        signal=names,
-        code_m=numbers,
-        phase_cycles=numbers,
-        doppler_hz=numbers,
-        cn0_dbhz=numbers,
-        lock_s=numbers,
-        half_cycle=np.zeros(0, dtype=bool),
-        polarity=np.zeros(0, dtype=np.int64),
-        glonass_channel=np.zeros(0, dtype=np.int64),
-        receiver=receiver,
-    )
+    kinds = {"satellite": "<U3", "signal": "<U3", "half_cycle": "?", "polarity": "<i8", "glonass_channel": "<i8"}
+    rows: dict[str, Any] = {name: np.zeros(0, dtype=kinds.get(name, "<f8")) for name in ROW_ARRAYS}
+    nothing = np.zeros(0, dtype=np.intp)
+    return Measurements(time=nothing.astype("datetime64[ns]"), epoch=nothing, receiver=receiver, **rows)
 
 
 def join_measurements(parts: Sequence[Measurements]) -> Measurements:
@@ -243,9 +222,7 @@ def cnav_record(satellite: str, values: Values) -> Record:
 
 
 def bcnav_record(satellite: str, message: str, values: Values) -> Record | None:
-    """Record of BeiDou from the fields of B-CNAV1 or 2 (the whole week: no date is needed); None of another
-    satellite.
-    """
+    """Record of BeiDou from the fields of B-CNAV1 or 2, with the whole week; None of another satellite."""
     if int(values["kind"]) not in nav_messages.BCNAV_AXIS_M or f"C{int(values['number']):02d}" != satellite:
         return None
     sent = from_week(int(values["week"]) + _BDS_WEEK_MINUS_GPS, values["tow_s"])

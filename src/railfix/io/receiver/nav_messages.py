@@ -275,11 +275,7 @@ URA_NOMINAL_M: Final = np.array([2, 2.8, 4, 5.7, 8, 11.3, 16, 32, 64, 128, 256, 
 
 
 def inav_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> tuple[Bytes, Masks]:
-    """Words of Galileo I/NAV page pairs as bits, shape (N, 128), and which have a valid CRC (even page first, no alert
-    page).
-
-    `words`, shape (N, 8): even page (four words of 32 bits, 120 bits used), then odd page.
-    """
+    """Return words of I/NAV page pairs (N, 8), even first, as bits (N, 128), and which have a valid CRC, no alert."""
     octets = words[:, :8].astype(">u4").view(np.uint8).reshape(len(words), 32)
     bits = np.unpackbits(octets, axis=1)
     even, odd = bits[:, :120], bits[:, 128:248]

@@ -14,7 +14,7 @@ import numpy as np
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import bdt_to_gpst, gpst_minus_utc, nearest_week
-from railfix.gnss.observations import named_frequency_hz
+from railfix.gnss.observations import frequency_by_name_hz
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.framing import Field, Frames, fields, signed, unsigned
 from railfix.io.receiver.measurements import ROW_ARRAYS, Measurements, join_measurements, no_measurements
@@ -95,12 +95,7 @@ def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
 
 
 def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews) -> tuple[Measurements, Integers]:
-    """Decode all MSM4 to MSM7 messages, and find where in the stream each epoch begins.
-
-    Messages of one instant make one epoch. `near` is a time within half a week of the first message, GPS time (NaT:
-    none); every other message is within half a week of the one before it. Phases of GLONASS have no cycles where no
-    channel is known.
-    """
+    """Decode all MSM4 to MSM7 messages, and where each epoch begins; `near` is within half a week of the first."""
     messages = frames.of("rtcm3", *MSM_NUMBERS)
     parts = [
         (order, rows, np.full(len(order), SYSTEMS[number // 10] == "R"))
@@ -275,7 +270,7 @@ def _decode(
     codes = np.array([SIGNALS[system].get(k, "") for k in signals.tolist()])[of_signal]
     channel = channel[:, of_satellite]
     known_channel = np.isin(channel, list(_GLONASS_RANGE))
-    frequency = named_frequency_hz(np.char.add(system, codes), np.where(known_channel, channel, np.nan))
+    frequency = frequency_by_name_hz(np.char.add(system, codes), np.where(known_channel, channel, np.nan))
     shape = (len(bits), n_cells)
     return Measurements(
         time=_times(system, bits, near),

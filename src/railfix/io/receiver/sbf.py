@@ -16,7 +16,7 @@ from railfix.core.arrays import Bytes, Datetimes, Indices, Integers, Strings
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week
-from railfix.gnss.observations import named_frequency_hz
+from railfix.gnss.observations import frequency_by_name_hz
 from railfix.io.receiver.framing import BCNAV1_PAGE, SBAS_L5, Frames, Subframes, join_subframes
 from railfix.io.receiver.measurements import Measurements
 from railfix.io.receiver.nav_messages import BCNAV1_PARTS, has_crc
@@ -204,7 +204,7 @@ def _decode(frames: Frames, place: Indices, kind: Indices, master: Indices) -> d
     known = (np.char.str_len(satellite) > 0) & (name.astype("<U1") == satellite.astype("<U1"))
     channel = (first["info"] >> 3).astype(np.int64) - 8  # bits 3 to 7 of ObsInfo
     main = _SIGNAL_NAMES[_signal_number(first["type"], first["info"])]
-    frequency, main_frequency = (named_frequency_hz(names, channel.astype(np.float64)) for names in (name, main))
+    frequency, main_frequency = (frequency_by_name_hz(names, channel.astype(np.float64)) for names in (name, main))
     code_main = ((first["misc"] & 15).astype(np.int64) << 32 | first["code"].astype(np.int64)) * 1e-3
     code_main = np.where(code_main == 0, np.nan, code_main)
     doppler_main = np.where(first["doppler"] == -(1 << 31), np.nan, first["doppler"] * 1e-4)
@@ -251,10 +251,7 @@ def _read_signed(value: Integers, bits: int) -> Integers:
 
 
 def navigation_subframes(frames: Frames) -> Subframes:
-    """Navigation pages, their words laid out as in UBX RXM-SFRBX.
-
-    Pages whose parity or CRC the receiver found wrong are left out and counted.
-    """
+    """Return navigation pages that passed the receiver's check, their words laid out as in UBX RXM-SFRBX."""
     chosen = frames.of("sbf", *_PAGES)
     # The shortest block (GLONASS, three words) has 24 bytes; words that a block lacks are zero.
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= 24]
@@ -346,10 +343,7 @@ def _words_of_30(words: Words) -> Words:
 
 
 def positions(frames: Frames) -> dict[str, np.ndarray]:
-    """The receiver's own positions: of PVTGeodetic blocks where it sends them, else of PVTCartesian.
-
-    ``time``, ``ecef_m`` (shape (N, 3)), ``quality`` (as RTKLIB counts), ``sigma_m`` (shape (N, 3), NaN).
-    """
+    """Return the receiver's own positions, of PVTGeodetic, else PVTCartesian blocks: columns of `PositionLog`."""
     geodetic = len(frames.of("sbf", PVT_GEODETIC)) > 0
     chosen = frames.of("sbf", PVT_GEODETIC if geodetic else PVT_CARTESIAN)
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _PVT.itemsize]

@@ -185,11 +185,7 @@ def has_lnav_parity(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> 
 
 
 def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
-    """Read the receiver's own positions: of NAV-HPPOSLLH where it is sent, else of NAV-PVT.
-
-    ``time``, ``ecef_m`` and ``sigma_m`` (east, north, up) of shape (N, 3), ``quality`` as RTKLIB counts, 5 without
-    NAV-PVT. `near` is a time within half a week where no dated NAV-PVT comes before; with NaT there is no position.
-    """
+    """Return the receiver's own positions, columns of `PositionLog`; `near` is within half a week."""
     coarse = frames.of("ubx", NAV_PVT)
     coarse = coarse[frames.end[coarse] - frames.start[coarse] >= _PVT.itemsize]
     pvt = gather_structures(frames.data, frames.start[coarse], _PVT)

@@ -12,7 +12,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import ByteStream
+from railfix.core.files import ByteStream, FilePath
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, columns_of
 
@@ -95,12 +95,8 @@ def _check_kind(path: str, line: str) -> None:
 
 
 def parse_header(path: str, lines: Sequence[str], *, notes: list[str] | None = None) -> RinexHeader:
-    """Parse the header of an observation file, its lines up to END OF HEADER.
-
-    Unreadable records that do not affect how the file is read are put into `notes` where that is given, else raised.
-    InputFileError: version not supported, types missing or miscounted, or an invalid number.
-    """
-    version = _version(path, lines[0])
+    """Parse the header of an observation file; unreadable records that do not matter go into `notes` if given."""
+    version = read_version(path, lines[0])
     system = lines[0][40:41].strip().upper() or ("G" if version < 3.0 else "M")
     if system not in SYSTEMS + "M":
         raise InputFileError(path, f"satellite system '{system}' is none of {', '.join(SYSTEMS)} or M", line=1)
@@ -114,7 +110,8 @@ def parse_header(path: str, lines: Sequence[str], *, notes: list[str] | None = N
     return header
 
 
-def _version(path: str, line: str) -> float:
+def read_version(path: FilePath, line: str) -> float:
+    """Read the version of a RINEX file from its first line."""
     try:
         version = float(line[:9])
     except ValueError as error:

@@ -15,6 +15,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath, Paths, listed, read_text_lines
 from railfix.gnss.navigation import Navigation
+from railfix.io.rinex.header import read_version
 from railfix.io.rinex.navigation_records import (
     RawRecord,
     fields_of,
@@ -63,7 +64,7 @@ class NavigationContent:
         if not any(stored[part]):
             stored[part] = [0.0 if np.isnan(v) else v for v in values]
 
-    def received_klobuchar(self) -> dict[str, Floats]:
+    def klobuchar_sets(self) -> dict[str, Floats]:
         """Return the coefficients by constellation; all-zero sets, which were not received, are noted."""
         received = {}
         for letter, values in self.klobuchar.items():
@@ -91,17 +92,11 @@ def read_header(path: FilePath, lines: list[str], content: NavigationContent) ->
 def _version(path: FilePath, first: str) -> tuple[float, str]:
     if first[60:80].strip() != "RINEX VERSION / TYPE":
         raise InputFileError(path, "is not a RINEX file: its first line lacks 'RINEX VERSION / TYPE'", line=1)
-    try:
-        version = float(first[:9])
-    except ValueError:
-        raise InputFileError(path, f"RINEX version {first[:9].strip()!r} is not a number", line=1) from None
-    kind = first[20:21].upper()
+    version, kind = read_version(path, first), first[20:21].upper()
     if kind == "O":
         raise InputFileError(
             path, "is a RINEX observation file; give it with --front or --rear (a navigation file was expected)", line=1
         )
-    if not 2.0 <= version < 5.0:
-        raise InputFileError(path, f"RINEX version {version:g} is not supported; 2, 3 and 4 are", line=1)
     if kind != "N" and not (kind in ("G", "H") and version < 3.0):
         raise InputFileError(path, f"is RINEX of type {kind!r}, a navigation file (N) was expected", line=1)
     return version, kind
@@ -152,7 +147,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navi
     return Navigation(
         kepler=kepler_records([r for r in content.records if r.system != "R"]),
         glonass=glonass_records([r for r in content.records if r.system == "R"]),
-        klobuchar=content.received_klobuchar(),
+        klobuchar=content.klobuchar_sets(),
         leap_seconds=content.leap_seconds,
         skipped=dict(content.skipped),
         notes=tuple(dict.fromkeys(content.notes)),

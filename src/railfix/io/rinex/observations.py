@@ -26,17 +26,17 @@ from railfix.io.rinex.observations_epochs import (
     CYCLE_SLIPS,
     DUPLICATES,
     EXTERNAL_EVENTS,
-    EpochHeads,
     FaultLog,
     find_epochs,
 )
-from railfix.io.rinex.observations_lines import SYSTEMS, Lines, split_lines
+from railfix.io.rinex.observations_lines import SYSTEMS, EpochHeads, Lines, split_lines
 
 #: Bytes of text read at a time: large enough for array operations, small enough for the processor's cache.
 BLOCK_BYTES: Final = 4 << 20
 #: A longer line is no RINEX, not even one that a failing recorder filled with zeros.
 _MAX_LINE_BYTES: Final = 8 << 20
 _BLANKS: Final = b" " * PADDING
+_TO_GPST: Final = {"GLO": utc_to_gpst, "UTC": utc_to_gpst, "BDT": bdt_to_gpst}  #: Other time systems are GPS time.
 _BEFORE_ALL: Final = np.iinfo(np.int64).min
 
 
@@ -86,8 +86,7 @@ class BlockReader:
                 lines = split_lines(text, first_number=number, keep_blank=header.version < 3.0)
                 used = 0
                 while used < len(lines):
-                    part = lines[used:]
-                    piece, header, taken = self._part(part, header, at_end=at_end)
+                    piece, header, taken = self._part(lines[used:], header, at_end=at_end)
                     yield piece
                     used += taken
                     if not taken:
@@ -125,8 +124,7 @@ class BlockReader:
                 table, _ = self._find(lines[:taken], header, at_end=True, log=trial)
                 break
         self._log.absorb(trial)
-        piece = self._observations(lines, table, header)
-        return piece, after, taken
+        return self._observations(lines, table, header), after, taken
 
     def _find(self, lines: Lines, header: RinexHeader, *, at_end: bool, log: FaultLog) -> tuple[EpochHeads, int]:
         each = lines_per_satellite(header)
@@ -146,10 +144,11 @@ class BlockReader:
         breaks = np.cumsum((table.flag >= 1) & (table.flag <= 3)) + int(self._break)
         seen = (table.flag == 0) | (table.flag == 1)
         epochs, breaks_at = table[seen], breaks[seen]
-        time_ns = _gps_time_ns(epochs.time_ns, header.time_system)
+        time_ns = epochs.time_ns
+        if header.time_system in _TO_GPST:
+            time_ns = _TO_GPST[header.time_system](time_ns.astype("datetime64[ns]")).astype(np.int64)
         kept = self._in_order(lines, epochs, time_ns)
-        inside = (time_ns >= self._selection.start_ns) & (time_ns < self._selection.end_ns)
-        kept &= inside
+        kept &= (time_ns >= self._selection.start_ns) & (time_ns < self._selection.end_ns)
         epochs, breaks_at, time_ns = epochs[kept], breaks_at[kept], time_ns[kept]
         before = np.diff(breaks_at, prepend=0) > 0
         total = int(breaks[-1]) if len(breaks) else int(self._break)
@@ -159,13 +158,7 @@ class BlockReader:
         problems, problem_count, skipped = self._log.take()
         return Observations(
             time=time_ns.astype("datetime64[ns]"),
-            satellite=dense.satellite,
-            signal=dense.signal,
-            code_m=dense.kinds[0],
-            phase_cycles=dense.kinds[1],
-            doppler_hz=dense.kinds[2],
-            cn0_dbhz=dense.kinds[3],
-            loss_of_lock=dense.lock,
+            **dense,
             break_before=before,
             header=header.public,
             problems=problems,
@@ -203,32 +196,10 @@ class BlockReader:
         return ~wrong
 
 
-def _gps_time_ns(time_ns: Integers, time_system: str) -> Integers:
-    time = time_ns.astype("datetime64[ns]")
-    if time_system in ("GLO", "UTC"):
-        return utc_to_gpst(time).astype(np.int64)
-    if time_system == "BDT":
-        return bdt_to_gpst(time).astype(np.int64)
-    return time_ns
-
-
 #: Default number of epochs of a piece.
 DEFAULT_EPOCHS: Final = 3600
 _PEEK_BYTES: Final = 1 << 16
 _GAP_INTERVALS: Final = 1.5  #: A step between files is a gap when it is longer than this many intervals.
-
-
-def read_observations(
-    path: Paths,
-    *,
-    broken_lines: BrokenLines = "stop",
-    systems: Iterable[str] | None = None,
-    start: np.datetime64 | str | None = None,
-    end: np.datetime64 | str | None = None,
-) -> Observations:
-    """Read the observation file or files of one receiver, RINEX alone; arguments as `railfix.read_observations`."""
-    selection = _selection(broken_lines=broken_lines, systems=systems, start=start, end=end)
-    return concatenate(list(_runs(listed(path), selection)))
 
 
 def scan_observations(
@@ -249,27 +220,15 @@ def scan_observations(
     """
     if epochs < 1:
         raise ValueError(f"a piece has at least one epoch, epochs={epochs} was asked for")
-    selection = _selection(broken_lines=broken_lines, systems=systems, start=start, end=end)
-    return in_pieces(_runs(listed(path), selection, progress), epochs)
-
-
-def _selection(
-    *,
-    broken_lines: BrokenLines,
-    systems: Iterable[str] | None,
-    start: np.datetime64 | str | None,
-    end: np.datetime64 | str | None,
-) -> Selection:
     if broken_lines not in get_args(BrokenLines):
         raise ValueError(f"broken_lines is '{broken_lines}', 'stop' or 'count' was expected")
     letters = None if systems is None else frozenset(systems)
     if letters is not None and (not letters or not letters <= set(SYSTEMS)):
         raise ValueError(f"systems is {sorted(letters)}, letters of {SYSTEMS} were expected")
-    limits = {}
-    for name, time in (("start_ns", start), ("end_ns", end)):
-        if time is not None:
-            limits[name] = int(gps_time(time).astype(np.int64))
-    return Selection(broken_lines=broken_lines, systems=letters, **limits)
+    limits = {"start_ns": start, "end_ns": end}
+    limits_ns = {name: int(gps_time(time).astype(np.int64)) for name, time in limits.items() if time is not None}
+    selection = Selection(broken_lines=broken_lines, systems=letters, **limits_ns)
+    return in_pieces(_runs(listed(path), selection, progress), epochs)
 
 
 def _runs(
@@ -282,11 +241,8 @@ def _runs(
     reader: BlockReader | None = None
     epochs = 0
     for k, path in enumerate(paths):
-        before, reader = (
-            reader,
-            BlockReader(path, selection, **({} if reader is None else {"after_ns": reader.last_ns})),
-        )
-        joint = before is not None and before.epochs > 0
+        joint = reader is not None and reader.epochs > 0
+        reader = BlockReader(path, selection, after_ns=_BEFORE_ALL if reader is None else reader.last_ns)
         for run in reader.blocks():
             if joint and len(run):
                 run = with_break_at_gap(last, run)

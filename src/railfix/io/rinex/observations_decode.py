@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railfix import kernels
-from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks, Strings
+from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks
 from railfix.gnss.observations import channels_with_data
 from railfix.io.rinex.header import RinexHeader
-from railfix.io.rinex.observations_epochs import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, EpochHeads, FaultLog
-from railfix.io.rinex.observations_lines import KINDS, SYSTEMS, Lines, SignalColumn
+from railfix.io.rinex.observations_epochs import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, FaultLog
+from railfix.io.rinex.observations_lines import KINDS, SYSTEMS, EpochHeads, Lines, SignalColumn
 
 Words = NDArray[np.uint64]
 
@@ -58,11 +58,7 @@ def joined(parts: Sequence[Fields]) -> Fields:
 
 
 def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
-    """Gather `count` fields of lines as pairs of little-endian 64-bit words, shape (n, count, 2).
-
-    `start` and `length`, shape (n,), are of the first field and of the rest of the line; beyond its end is blank.
-    `data` ends with `PADDING` bytes.
-    """
+    """Gather `count` fields of lines as pairs of little-endian 64-bit words (n, count, 2), blank beyond `length`."""
     width = FIELD_WIDTH * count
     if width > PADDING:
         raise ValueError(f"a line of {count} fields is longer than the padding of {PADDING} bytes")
@@ -132,16 +128,6 @@ class DecodedRows:
         return DecodedRows(self.epoch[which], self.letter[which], self.number[which], self.line[which])
 
 
-@dataclass(frozen=True)
-class Dense:
-    """Observations of a run of epochs, T by M channels, M sorted by satellite, then signal."""
-
-    satellite: Strings
-    signal: Strings
-    kinds: tuple[Floats, Floats, Floats, Floats]
-    lock: Bytes
-
-
 def lines_per_satellite(header: RinexHeader) -> int:
     """Return the number of observation lines of a satellite: several in RINEX 2, else one."""
     return max(-(-len(header.types_of("G") or ()) // FIELDS_PER_LINE), 1) if header.version < 3.0 else 1
@@ -149,8 +135,8 @@ def lines_per_satellite(header: RinexHeader) -> int:
 
 def decode(
     lines: Lines, epochs: EpochHeads, *, header: RinexHeader, systems: frozenset[str] | None, log: FaultLog
-) -> Dense:
-    """Decode the observations of epochs (flags 0 and 1) to dense arrays."""
+) -> dict[str, Any]:
+    """Decode the observations of epochs (flags 0 and 1) to dense arrays, by their names in `Observations`."""
     rows = _rows(lines, epochs, header)
     rows = _select(lines, rows, header=header, systems=systems, log=log)
     rows = _without_repeats(lines, rows, len(epochs), log)
@@ -304,7 +290,7 @@ def _continues(data: Bytes, start: Integers, length: Integers, width: int) -> Ma
     return result
 
 
-def _scatter(parts: list[tuple[str, DecodedRows, Fields, tuple[SignalColumn, ...]]], epochs: int) -> Dense:
+def _scatter(parts: list[tuple[str, DecodedRows, Fields, tuple[SignalColumn, ...]]], epochs: int) -> dict[str, Any]:
     """Fill arrays over epochs and channels; channels without any observation are dropped."""
     satellites: list[str] = []
     signals: list[str] = []
@@ -323,10 +309,5 @@ def _scatter(parts: list[tuple[str, DecodedRows, Fields, tuple[SignalColumn, ...
         kernels.reading.placed_fields(kinds, lock, cell, kind, signal, fields.value, fields.lock)
     used = channels_with_data(kinds, lock)
     keep = np.flatnonzero(used) if not used.all() else slice(None)
-    code, phase, doppler, cn0 = kinds[:, :, keep]
-    return Dense(
-        satellite=np.array(satellites, dtype="<U3")[keep],
-        signal=np.array(signals, dtype="<U2")[keep],
-        kinds=(code, phase, doppler, cn0),
-        lock=lock[:, keep],
-    )
+    names_of = {"satellite": np.array(satellites, dtype="<U3")[keep], "signal": np.array(signals, dtype="<U2")[keep]}
+    return {**names_of, **dict(zip(KINDS.values(), kinds[:, :, keep], strict=True)), "loss_of_lock": lock[:, keep]}

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from railfix.core.arrays import Integers, Masks
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines
-from railfix.gnss.observations import MAX_PROBLEMS, capped_problems
-from railfix.io.rinex.observations_lines import EpochLines, Lines, epoch_width, event_line, flaw_text, read_epoch_lines
+from railfix.gnss.observations import MAX_PROBLEMS, first_problems
+from railfix.io.rinex.observations_lines import EpochHeads, Lines, epoch_width, event_line, flaw_text, read_epoch_lines
 
 EPOCHS = "broken epochs"
 SATELLITES = "broken satellite lines"
@@ -93,7 +92,7 @@ class FaultLog:
 
     def take(self) -> tuple[tuple[str, ...], int, dict[str, int]]:
         """Return messages, number of faults and counts since the last call, and reset them."""
-        taken = (capped_problems(self._messages, count=self._problems), self._problems, self.counts)
+        taken = (first_problems(self._messages, count=self._problems), self._problems, self.counts)
         self._messages, self._problems, self.counts = [], 0, {}
         return taken
 
@@ -103,30 +102,10 @@ _MAX_LINES = 1100 * 6
 _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 
 
-@dataclass(frozen=True)
-class EpochHeads:
-    """Epochs and events of a block, shape (n,); `line` of each, `time_ns` in the file's time system (events: 0)."""
-
-    line: Integers
-    flag: Integers
-    count: Integers
-    time_ns: Integers
-
-    def __getitem__(self, which: slice | Masks | Integers) -> EpochHeads:
-        return EpochHeads(self.line[which], self.flag[which], self.count[which], self.time_ns[which])
-
-    def __len__(self) -> int:
-        return len(self.line)
-
-
 def find_epochs(
     lines: Lines, *, version: float, lines_per_satellite: int, at_end: bool, log: FaultLog
 ) -> tuple[EpochHeads, int]:
-    """Find the complete epochs and events of a block, and the number of lines they and broken lines take.
-
-    `lines` are complete ones from the first of a record; where the file does not end with them (`at_end`) the last
-    epoch waits for the next block. `lines_per_satellite` is for RINEX 2, with lines of five observations.
-    """
+    """Find the complete epochs and events of a block, and the lines they take; not `at_end`, the last one waits."""
     if version >= 3.0:
         return _find_marked(lines, version=version, at_end=at_end, log=log)
     return _find_unmarked(lines, lines_per_satellite=lines_per_satellite, at_end=at_end, log=log)
@@ -139,20 +118,19 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
     before = int(line[0]) if len(line) else n
     if before and (at_end or len(line) or n > _MAX_LINES):
         log.fault(EPOCHS, int(lines.number[0]), _no_epoch(lines, 0, version))
-    if not len(line):
-        return _none(), (n if at_end or n > _MAX_LINES else 0)
     head = read_epoch_lines(lines, line, version=version)
+    if not len(line):
+        return head, (n if at_end or n > _MAX_LINES else 0)
     room = np.diff(line, append=n) - 1
     done = n
     waits = not at_end and not (len(line) == 1 and n > _MAX_LINES)
     if waits:
         done = int(line[-1])
-        line, room = line[:-1], room[:-1]
-        head = head[: len(line)]
-    broken = head.flaw != 0
-    if at_end and len(line) and not room[-1] and lines.length[line[-1]] < epoch_width(version):
+        head, room = head[:-1], room[:-1]
+    if at_end and len(head) and not room[-1] and lines.length[line[-1]] < epoch_width(version):
         log.fault(EPOCHS, int(lines.number[-1]), _CUT_EPOCH_LINE)
-        line, room, broken, head = line[:-1], room[:-1], broken[:-1], head[: len(line) - 1]
+        head, room = head[:-1], room[:-1]
+    line, broken = head.line, head.flaw != 0
     log.faults(
         EPOCHS,
         lines.number[line[broken]],
@@ -168,7 +146,7 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
         lines.number[line[wrong]],
         lambda i: f"the epoch declares {head.count[wrong][i]} lines, {room[wrong][i]} follow before the next epoch",
     )
-    return EpochHeads(line, head.flag, head.count, head.time_ns)[~broken & ~wrong], done
+    return head[~broken & ~wrong], done
 
 
 def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log: FaultLog) -> tuple[EpochHeads, int]:
@@ -176,33 +154,29 @@ def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log:
     n = len(lines)
     long = np.flatnonzero(lines.length >= epoch_width(2.0))
     likely = long[lines.data[lines.start[long] + 18] == ord(".")]
-    read = read_epoch_lines(lines, likely, version=2.0)
-    fine = read.flaw == 0
-    line = likely[fine]
-    head = read[fine]
-    event = (head.flag >= 2) & (head.flag <= 5)
+    head = read_epoch_lines(lines, likely, version=2.0)
+    head = head[head.flaw == 0]
+    line, event = head.line, (head.flag >= 2) & (head.flag <= 5)
     satellite_lines = np.maximum(-(-head.count // 12), 1) - 1 + head.count * lines_per_satellite
     following = line + 1 + np.where(event, head.count, satellite_lines)
-    walk = _Walk(lines, line, following, event, head, log)
+    walk = _Walk(lines, following, event, head, log)
     stop = n
     if not at_end and len(line) and (line[-1] > 0 or n <= _MAX_LINES):
         stop = int(line[-1])
     elif not at_end and not len(line) and n <= _MAX_LINES:
-        return _none(), 0
+        return head, 0
     return walk.run(stop, at_end=at_end)
 
 
 class _Walk:
     """Walk from record to record; consecutive epochs without a gap are one step."""
 
-    def __init__(
-        self, lines: Lines, line: Integers, following: Integers, event: Masks, head: EpochLines, log: FaultLog
-    ) -> None:
-        self._lines, self._line, self._following, self._event = lines, line, following, event
+    def __init__(self, lines: Lines, following: Integers, event: Masks, head: EpochHeads, log: FaultLog) -> None:
+        self._lines, self._line, self._following, self._event = lines, head.line, following, event
         self._head, self._log = head, log
-        self._bound = np.append(line[1:], len(lines))[: len(line)]
+        self._bound = np.append(head.line[1:], len(lines))[: len(head)]
         self._breaks = np.flatnonzero(following != self._bound)
-        self._kept = np.zeros(len(line), dtype=np.bool_)
+        self._kept = np.zeros(len(head), dtype=np.bool_)
         self._events: list[tuple[int, int, int]] = []
 
     def run(self, stop: int, *, at_end: bool) -> tuple[EpochHeads, int]:
@@ -268,24 +242,13 @@ class _Walk:
         return int(self._line[k]) if k < len(self._line) else len(self._lines)
 
     def _table(self) -> EpochHeads:
-        kept = self._kept
-        epochs = EpochHeads(self._line[kept], self._head.flag[kept], self._head.count[kept], self._head.time_ns[kept])
+        epochs = self._head[self._kept]
         if not self._events:
             return epochs
-        extra = np.array(self._events, dtype=np.int64).reshape(-1, 3)
-        line = np.concatenate([epochs.line, extra[:, 0]])
-        order = np.argsort(line, kind="stable")
-        return EpochHeads(
-            line[order],
-            np.concatenate([epochs.flag, extra[:, 1]])[order],
-            np.concatenate([epochs.count, extra[:, 2]])[order],
-            np.concatenate([epochs.time_ns, np.zeros(len(extra), dtype=np.int64)])[order],
-        )
-
-
-def _none() -> EpochHeads:
-    nothing = np.zeros(0, dtype=np.int64)
-    return EpochHeads(nothing, nothing, nothing, nothing)
+        extra = np.array([(*event, 0, 0) for event in self._events], dtype=np.int64).T
+        columns = (epochs.line, epochs.flag, epochs.count, epochs.time_ns, epochs.flaw)
+        joined = EpochHeads(*(np.concatenate(pair) for pair in zip(columns, extra, strict=True)))
+        return joined[np.argsort(joined.line, kind="stable")]
 
 
 def _no_epoch(lines: Lines, line: int, version: float) -> str:

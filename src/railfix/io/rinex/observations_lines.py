@@ -71,16 +71,23 @@ def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
 
 
 @dataclass(frozen=True)
-class EpochLines:
-    """Numbers of epoch lines, shape (n,); -1 or time 0 where unreadable; index into `FLAWS`, 0 for a valid line."""
+class EpochHeads:
+    """Epochs and events of a block, shape (n,), `time_ns` in the file's time system (events: 0).
 
+    Of unreadable numbers flag and count are -1; `flaw` is an index into `FLAWS`, 0 for a valid line.
+    """
+
+    line: Integers
     flag: Integers
     count: Integers
     time_ns: Integers
     flaw: Integers
 
-    def __getitem__(self, which: slice | Masks) -> EpochLines:
-        return EpochLines(self.flag[which], self.count[which], self.time_ns[which], self.flaw[which])
+    def __len__(self) -> int:
+        return len(self.line)
+
+    def __getitem__(self, which: slice | Masks | Integers) -> EpochHeads:
+        return EpochHeads(self.line[which], self.flag[which], self.count[which], self.time_ns[which], self.flaw[which])
 
 
 FLAWS: Final = (
@@ -104,7 +111,7 @@ def epoch_width(version: float) -> int:
     return 35 if version >= 3.0 else 32
 
 
-def read_epoch_lines(lines: Lines, which: Integers, *, version: float) -> EpochLines:
+def read_epoch_lines(lines: Lines, which: Integers, *, version: float) -> EpochHeads:
     """Parse epoch lines of RINEX 2 (years of two digits), 3 and 4; events may lack the time."""
     width = epoch_width(version)
     text = np.ascontiguousarray(lines.columns(which, width).T)  # a row for each column of the file
@@ -145,7 +152,7 @@ def read_epoch_lines(lines: Lines, which: Integers, *, version: float) -> EpochL
     seconds = ((first_day + day - 1) * 24 + hour) * 3600 + minute * 60 + second
     time_ns = np.where((flaw == 0) & ~event, seconds * 1_000_000_000 + fraction * 100, 0)
     known = flaw != _SHORT
-    return EpochLines(np.where(flag_ok & known, flag, -1), np.where(count_ok & known, count, -1), time_ns, flaw)
+    return EpochHeads(which, np.where(flag_ok & known, flag, -1), np.where(count_ok & known, count, -1), time_ns, flaw)
 
 
 def flaw_text(lines: Lines, line: int, flaw: int, *, version: float) -> str:
@@ -195,8 +202,8 @@ def event_line(lines: Lines, line: int) -> tuple[int, int] | None:
 
 
 SYSTEMS: Final = "CEGIJRS"  #: Constellation letters of RINEX.
-#: Types of observable, in the order of the arrays: code, phase, Doppler, carrier-to-noise density.
-KINDS: Final = "CLDS"
+#: Array of each kind of observable, by the letter before the signal.
+KINDS: Final = {"C": "code_m", "L": "phase_cycles", "D": "doppler_hz", "S": "cn0_dbhz"}
 
 #: Signal of a RINEX 2 code by constellation.
 _CODES_2: Final[dict[str, dict[str, str]]] = {
@@ -253,7 +260,7 @@ def columns_of(
         signal = signal_of(name, system=system, version=version, declared=declared)
         if signal is None:
             continue
-        kind = KINDS.index("C" if version < 3.0 and name[0] == "P" else name[0])
+        kind = [*KINDS].index("C" if version < 3.0 and name[0] == "P" else name[0])
         divisor = scale.get((system, name), 1.0)
         columns.setdefault((kind, signal), SignalColumn(index, name, kind, signal, divisor))
     return tuple(columns.values())

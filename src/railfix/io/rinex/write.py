@@ -24,6 +24,7 @@ from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Mas
 from railfix.core.errors import OutputError
 from railfix.core.files import FilePath, staged_file
 from railfix.gnss.observations import ObservationHeader, Observations
+from railfix.io.rinex.observations_lines import KINDS
 
 RinexVersion = Literal["3.04", "4.02"]  #: Versions that can be written.
 
@@ -110,8 +111,6 @@ def program_line(created: np.datetime64 | None) -> str:
     return header_line(f"{PROGRAM:<20}{'':20}{date:<20}", "PGM / RUN BY / DATE")
 
 
-#: Array of each kind of observable, by the letter before the signal.
-KINDS: Final[dict[str, str]] = {"C": "code_m", "L": "phase_cycles", "D": "doppler_hz", "S": "cn0_dbhz"}
 _BLOCK_EPOCHS: Final = 1024  #: Epochs formatted at once.
 #: Bytes of an epoch line with its line end, and of one observation (F14.3, LLI, SSI).
 _EPOCH_WIDTH: Final = 36

@@ -40,11 +40,7 @@ _QUANTITIES = {
 
 
 def campaign_plan(places: pl.DataFrame, quantity: str) -> Chart:
-    """Plan of the places of all runs, coloured by the size of a quantity; the largest are drawn last.
-
-    `places` has ``x_m``, ``y_m``, ``z_m`` [ECEF] and `quantity`: ``error_m``, ``protection_level_m``,
-    ``along_sigma_m``.
-    """
+    """Plan of the places (``x_m``, ``y_m``, ``z_m``) of all runs, coloured by a quantity, the largest last."""
     named, edges, _ = _QUANTITIES[quantity]
     placed = points(places, *ECEF)
     rows = np.isfinite(placed[:, 0])

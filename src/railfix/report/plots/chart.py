@@ -154,7 +154,7 @@ class Chart:
     width: Literal["wide", "half"] = "wide"
 
     @property
-    def shared_axis(self) -> Literal["time", "chainage", ""]:
+    def common_axis(self) -> Literal["time", "chainage", ""]:
         """Quantity on the x axis that other charts share: they are zoomed together."""
         if self.start is not None:
             return "time"
@@ -243,10 +243,7 @@ _GOLDEN: Final = (5**0.5 - 1.0) / 2.0
 
 
 def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
-    """Rows of the smallest and the largest `y` in each piece of `x`, in rising order; rows with NaN are left out.
-
-    All rows where there are at most `points`, else two of each of `points` / 2 equal pieces of `x` at most.
-    """
+    """Rows of the smallest and largest `y` in each of at most `points` / 2 equal pieces of `x`, rising, not NaN."""
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(rows) <= points:
         return rows
@@ -265,10 +262,7 @@ def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
 
 
 def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> Indices:
-    """Rows in rising order of which no two lie in one square cell; rows with NaN are left out.
-
-    The cells, at first of width `cell`, grow until at most `points` rows are left.
-    """
+    """At most `points` rows, no two in one square cell, which grows from width `cell`; rows with NaN left out."""
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     left, low = (float(v[rows].min()) if len(rows) else 0.0 for v in (x, y))
     while len(rows) > points:
@@ -281,11 +275,7 @@ def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> 
 
 
 def spread(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
-    """At most `points` rows with the same density as all rows, and the extremes of each piece of `x`, in rising order.
-
-    Rows with NaN are left out, the others are sampled uniformly by the golden-ratio sequence, which has no period in
-    common with satellites or epochs; a fifth of the points are extremes, so that the outline and single outliers stay.
-    """
+    """At most `points` rows, not NaN: a fifth extremes, the others by the golden-ratio sequence, evenly dense."""
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(rows) <= points:
         return rows

@@ -85,10 +85,7 @@ def draw_chart(chart: Chart, axes: Axes) -> Axes:
 
 
 def draw_sky(sky: SkyEpochs, time: np.datetime64, axes: Axes | None = None) -> Axes:
-    """Draw the satellites over an antenna at the epoch nearest to a GPS time, into polar axes.
-
-    ValueError: there is no epoch.
-    """
+    """Draw the satellites at the epoch nearest to a GPS time into polar axes; ValueError: there is no epoch."""
     from matplotlib.figure import Figure
 
     if sky.empty:

@@ -59,13 +59,8 @@ def plan(
     background: Sequence[Floats] = (),
     title: str = "Plan of the line",
 ) -> Chart:
-    """Positions of one antenna and line in local metres, with marks of the kilometrage (P1 figure 6).
-
-    No layers without a position. The positions are coloured by `error_m` or `level_m`, shape (rows,), by the size of
-    the first that is given, and by their status without either. Of `filtered`, by the filter along the track, those of
-    epochs without a position of their own are drawn. Without `track` the line is drawn through the positions.
-    `tunnels_m` are chainages between which the line runs in a tunnel; `background` are longitudes and latitudes of
-    lines to draw below, each of shape (P, 2) [deg].
+    """Positions of one antenna and line in local metres, with marks of the kilometrage (P1 figure 6): coloured by
+    `error_m`, by `level_m` or by status; of `filtered`, where there is none; `tunnels_m` are chainages.
     """
     ecef, conventional = points(positions, *ECEF), points(positions, *(f"conventional_{name}" for name in ECEF))
     has = np.isfinite(ecef[:, 0])
@@ -239,12 +234,7 @@ def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:
 
 
 def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
-    """Return the chainage of each position but the first, and its distance from the one before while the train moved
-    [m].
-
-    From `railfix.evaluate.EPOCH_COLUMNS` of one antenna, with distances of the reference; or from positions alone, with
-    their own. `prefix`, "" or "conventional_", begins the names of the columns.
-    """
+    """Return chainage and distance [m] from the position before, while the train moved; `prefix` begins the columns."""
     if f"{prefix}interval_m" in table.columns:
         chainage, distance = floats(table, "chainage_m"), floats(table, f"{prefix}interval_m")
         moved = distance > 0.0

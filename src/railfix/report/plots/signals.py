@@ -49,12 +49,7 @@ def cn0_over_elevation(
     curve: Cn0Curve | None = None,
     mask_deg: float | None = None,
 ) -> list[Chart]:
-    """C/N0 over elevation with mean and thresholds, one chart per constellation and signal (P1 figure 3).
-
-    `observations` are of one antenna; the charts are of every signal that was taken, the most observed first. `limits`
-    are the thresholds that were in force; none are drawn without. Without the `curve` of the open sky, the mean of
-    these observations themselves is drawn.
-    """
+    """C/N0 over elevation with mean and thresholds, a chart for each constellation and signal (P1 figure 3)."""
     taken = observations.lazy().filter(
         pl.col("reason") & int(Reason.OTHER_SIGNAL_TAKEN) == 0,
         pl.col("cn0_dbhz").is_finite(),
@@ -159,11 +154,7 @@ def sky_epochs(
     start: np.datetime64 | None = None,
     title: str = "Sky",
 ) -> SkyEpochs:
-    """Satellites in view of one antenna, each once with the signal that was used, at some epochs, for sky plots.
-
-    At most `epochs` epochs, evenly spaced; of these up to half are the `wanted` ones. `start` is the origin of the
-    times, the first epoch if not given.
-    """
+    """Satellites in view of one antenna at at most `epochs` epochs, evenly spaced, up to half of them `wanted`."""
     rows = observations.lazy().filter(pl.col("elevation_deg") >= 0.0, pl.col("azimuth_deg").is_not_null())
     times = rows.select(pl.col("time_gpst").unique().sort()).collect()["time_gpst"]
     if len(times) > epochs:

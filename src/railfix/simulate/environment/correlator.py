@@ -45,11 +45,8 @@ def track_paths(
     chip_m: Floats,
     receiver: CorrelatorSettings,
 ) -> TrackedCode:
-    """Track the sum of P paths, for N signals; `field`, shape (P, N), is relative to the unobstructed direct signal.
-
-    The loops lock to the strongest path; the code error about it stays within half the spacing (early to late). Fading
-    faster than a loop's bandwidth is attenuated by ``1 / sqrt(1 + (f / loop_hz)^2)``; its power is kept. C/N0 is
-    averaged as the code is. `extra_m` and `rate_mps`, shape (P, N), are the excess path and its rate.
+    """Track the sum of P paths for N signals, `field` (P, N) relative to the direct one: loops lock to the strongest,
+    the code error stays within half the spacing, fading is attenuated by ``1 / sqrt(1 + (f / loop_hz)^2)``.
     """
     column = np.arange(field.shape[1])
     strength = np.sqrt(field.real**2 + field.imag**2)
@@ -140,11 +137,7 @@ def edge_amplitude(v: Floats) -> Floats:
 
 
 def strip_field(v: Floats, width_v: Floats) -> Complexes:
-    """Field that a strip removes from a wave of amplitude 1, by Kirchhoff and Babinet.
-
-    The field behind the strip is 1 minus this: ``(1 + j)/2 * integral of exp(-j pi t^2/2)`` over the strip, with its
-    middle and width as Fresnel parameters.
-    """
+    """Field that a strip removes (Kirchhoff, Babinet): ``(1 + j)/2 * integral of exp(-j pi t^2/2)`` over it."""
     sine_1, cosine_1 = fresnel(v - 0.5 * width_v)
     sine_2, cosine_2 = fresnel(v + 0.5 * width_v)
     return np.asarray(0.5 * (1.0 + 1.0j) * ((cosine_2 - cosine_1) - 1.0j * (sine_2 - sine_1)))
@@ -173,10 +166,8 @@ def circular_reflection(cosine: Floats, permittivity: float) -> tuple[Floats, Fl
 
 
 def reflection_amplitude(cosine: Floats, sine_elevation: Floats, antenna: AntennaSettings) -> Floats:
-    """Amplitude of a wall's reflection behind the antenna, over the direct signal from the same elevation.
-
-    Both polarisations add in power; the left-handed one is received with the antenna's cross-polar loss, linear in
-    the sine of the elevation from horizon to zenith [dB].
+    """Amplitude of a wall's reflection over the direct signal's; the left-handed part has the antenna's cross-polar
+    loss, linear in the sine of the elevation [dB].
     """
     right, left = circular_reflection(cosine, antenna.wall_permittivity)
     return np.sqrt(right**2 + (left * cross_polar_gain(sine_elevation, antenna)) ** 2)

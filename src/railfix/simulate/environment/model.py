@@ -200,11 +200,7 @@ _LEAST_ELEVATION_DEG: Final = 0.5  #: Lowest elevation that is computed [deg].
 
 
 class Environment:
-    """Multipath and blockage along a line.
-
-    `clear_cn0_dbhz` is the C/N0 of an unobstructed signal at the horizon, and its rise to the zenith. The same seed
-    gives the same structures and, where they are drawn, the same sections.
-    """
+    """Multipath and blockage along a line, the same for the same seed."""
 
     def __init__(
         self,
@@ -268,11 +264,7 @@ class Environment:
         return Disturbance(code_m=code, phase_m=phase, doppler_hz=doppler, cn0_db=cn0)
 
     def _paths(self, rays: Rays, platform: Masks, clock_s: Floats) -> tuple[Complexes, Floats, Floats]:
-        """Paths of N signals: the direct one, and those reflected and scattered by what is along the line.
-
-        Returns the fields relative to the unobstructed direct signal, without the phase of the extra path, the extra
-        paths [m], and their growth with the antenna's chainage [m/m], shapes (P, N).
-        """
+        """Return fields relative to the direct signal, extra paths [m] and their growth [m/m], shapes (P, N)."""
         field, delay = self._direct(rays, clock_s)
         nothing = np.zeros(len(rays.x))
         rows: list[tuple[Floats | Complexes, Floats, Floats]] = [(field, delay, nothing)]
@@ -332,10 +324,8 @@ class Environment:
         return np.asarray(strength * roughness_loss(rough, rays.z, rays.wavelength_m))
 
     def _reflection(self, r: int, rays: Rays) -> tuple[Floats, Floats, Floats]:
-        """Amplitude (with a phase shift of half a cycle), extra path and growth of the reflection in row r.
-
-        The incident ray passes the rows of the satellite's side, seen from the antenna's mirror image; the reflected
-        ray passes the nearer rows of the reflecting side.
+        """Amplitude, extra path and growth of the reflection in row r; the incident ray passes the rows of the
+        satellite's side, the reflected one the nearer rows of the reflecting side.
         """
         image = reflections(self.structures.walls[r], rays)
         amplitude = image.amplitude.copy()

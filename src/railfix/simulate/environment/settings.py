@@ -137,10 +137,7 @@ class CorrelatorSettings(ScenarioSettings):
 
 
 class AntennaSettings(ScenarioSettings):
-    """Polarisation of the antenna and material of the walls.
-
-    A wall's `reflection` then multiplies the reflection coefficient of its material.
-    """
+    """Polarisation of the antenna and material of the walls, which a wall's `reflection` then multiplies."""
 
     #: Gain for left-handed below that for right-handed signals, at the zenith and at the horizon.
     cross_polar_zenith_db: NotNegative = 15.0

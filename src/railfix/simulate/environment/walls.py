@@ -45,11 +45,7 @@ class Rays:
 
 
 def wall_met(row: Strips, side: Indices, x0: Floats, lateral0: Floats, along: Floats, lateral: Floats) -> Indices:
-    """Index of the wall that a horizontal ray meets, from (x0, lateral0) in direction (along, lateral).
-
-    Walls stand at various distances, so the search is repeated: with the distance of the wall
-    abeam, then with that of the wall found.
-    """
+    """Return the index of the wall that a horizontal ray meets, found first by the distance of the wall abeam."""
     distance = row.value["distance_m"]
     slant = along / lateral
     wall = row.nearest(side, x0)
@@ -101,11 +97,7 @@ class Reflections:
 
 
 def reflections(row: Strips, rays: Rays) -> Reflections:
-    """Reflection of each satellite in the row on the other side of the line.
-
-    Extra path 2 D (-n . u) with D the distance from the antenna to the wall's plane and n its normal
-    away from the antenna (image method).
-    """
+    """Reflect each satellite in the row on the other side: extra path 2 D (-n . u), n the normal of its plane."""
     sign = np.where(rays.y > 0.0, -1.0, 1.0)
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     wall = wall_met(row, (sign > 0.0).astype(np.intp), rays.chainage_m, np.zeros_like(lateral), rays.x, lateral)
@@ -163,12 +155,7 @@ _LEAST_TWICE: Final = 0.05  #: The same for rays that are reflected twice.
 def second_reflection(
     rows: tuple[Strips, ...], rays: Rays, antenna: AntennaSettings | None
 ) -> tuple[Floats, Floats, Floats]:
-    """Amplitude, extra path [m] and growth [m/m] of signals reflected by the nearest rows of both sides, shapes (N,).
-
-    The signal is reflected by the opposite row, then by the satellite's own side. Twice mirrored, the antenna's image
-    lies ``2 (d_A + d_B)`` away on the opposite side, so the extra path is ``2 (d_A + d_B) |u_y|`` with the distances of
-    both walls, which are taken as parallel to the line.
-    """
+    """Reflect by both sides: amplitude, extra path ``2 (d_A + d_B) |u_y|`` [m] and growth [m/m], shapes (N,)."""
     row = rows[0]
     side = (rays.y > 0.0).astype(np.intp)
     lateral = np.maximum(np.abs(rays.y), _LEAST_TWICE)
@@ -231,12 +218,8 @@ def side_streets(settings: SideStreetSettings, *, first_m: float, last_m: float,
 def street_reflections(
     streets: tuple[SideStreets, ...], rays: Rays, *, candidates: int, roughness_m: float
 ) -> list[tuple[Floats, Floats, Floats, Floats]]:
-    """Amplitude, extra path [m], growth [m/m] and cosine of incidence of each candidate street, shapes (N,).
-
-    A satellite behind the train is reflected by a wall ahead that faces it, and the other way round: with the wall's
-    plane at a distance D along the line the extra path is ``2 D |u_x|``; the ray meets the wall ``D |u_y| / |u_x|`` to
-    the side, within the street, and comes in over the walls across it. `candidates` streets of each side are tried for
-    each ray.
+    """Amplitude, extra path ``2 D |u_x|`` [m], growth [m/m] and cosine of incidence of the reflection of each candidate
+    street, by a wall across at a distance D along the line, shapes (N,).
     """
     along, lateral = np.maximum(np.abs(rays.x), _LEAST_SIDE), np.maximum(np.abs(rays.y), _LEAST_SIDE)
     ahead = np.where(rays.x < 0.0, 1.0, -1.0)
@@ -280,11 +263,7 @@ _EDGE_M: Final = 0.5  #: Width of the edge of a crown over which the loss rises 
 
 
 def foliage(row: Strips, rays: Rays) -> tuple[Floats, Floats, Floats]:
-    """Amplitude left by the crowns of a row of trees, and amplitude and extra path [m] of their scatter, shapes (N,).
-
-    The loss is the specific attenuation times the way through the crown, taken as long as the crown is wide, and at
-    most `most_db` (ITU-R P.833-9, 2.1: the loss saturates); what is lost is partly scattered forward.
-    """
+    """Amplitude left by trees, amplitude and extra path [m] of their scatter, shapes (N,) (ITU-R P.833-9, 2.1)."""
     side = (rays.y > 0.0).astype(np.intp)
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     tree = wall_met(row, side, rays.chainage_m, np.zeros_like(lateral), rays.x, lateral)

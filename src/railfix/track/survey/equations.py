@@ -128,10 +128,7 @@ def code_equations(
 def change_equations(
     signals: RunSignals, columns: RunColumns, near: Floats, origin: Floats, share: Floats, unknowns: int
 ) -> list[Equations]:  # fmt: skip
-    """Changes of ranges, phases and Dopplers: coordinates at both rows and a change of the clock a step.
-
-    Dopplers stand in for phases that are lost behind obstacles: reflections bias them for as long as the codes.
-    """
+    """Return changes of ranges, phases and Dopplers (for lost phases): both rows' coordinates, a clock a step."""
     step, sigma = signals.step, signals.change_sigma_m
     before, sight_before = range_with_rotation(signals.before_ecef_m, near[step] + origin)
     after, sight_after = range_with_rotation(signals.after_ecef_m, near[step + 1] + origin)

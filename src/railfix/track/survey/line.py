@@ -69,12 +69,7 @@ def adjust(
     limits: SurveyLimits | None = None,
     sigmas: Literal["none", "line"] = "none",
 ) -> Adjusted:
-    """Adjust the positions of all runs, with the line where its passes are known.
-
-    `near_ecef_m` are approximate positions of every row, right to a kilometre; `repeats` how often the run passes the
-    place of each row, where reflections are the same, so all passes count as one; `sigmas` "line" computes the standard
-    deviations of the line, which takes longer than the adjustment.
-    """
+    """Adjust the positions of all runs, with the line where passes are known; `repeats` of a row count as one."""
     limits = limits or SurveyLimits()
     origin = np.mean(near_ecef_m[0], axis=0)
     columns: list[RunColumns] = []
@@ -170,11 +165,7 @@ def _line_sigmas(
     unknowns: int,
     limits: SurveyLimits,
 ) -> Floats:
-    """Standard deviations of the points of the line, shape (J, 2) [m].
-
-    With Student's t errors an observation informs by (freedom + size) / (freedom + size + 2), not by its weight at the
-    end of the reweighting, which is largest where errors happen to be small.
-    """
+    """Compute sigmas of the line (J, 2) [m]; Student's t informs by (freedom + size) / (freedom + size + 2)."""
     expected = [
         np.full(len(weight), (limits.freedom + system.size) / (limits.freedom + system.size + 2.0))
         if system.robust
@@ -228,11 +219,7 @@ class Survey:
 
 
 def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None, name: str = "survey") -> Survey:
-    """Adjust runs over one line, each with three positions or more, to its map.
-
-    The runs are adjusted alone, then with each other as passes of one line. The course is that of the longest leg until
-    it repeats itself, extended by the others. ValueError: the runs never move, or lie apart.
-    """
+    """Adjust runs to the map of one line, alone, then as passes. ValueError: they never move, or lie apart."""
     limits = limits or SurveyLimits()
     origin = np.nanmean(np.concatenate([run.ecef_m for run in runs]), axis=0)
     latitude, longitude, _ = geodetic_from_ecef(origin)

@@ -226,11 +226,7 @@ def _extend(course: Course, points: Floats, spacing_m: float, width_m: float) ->
 
 
 def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats, Integers, Floats]:
-    """Match points of a leg, in its order, to the course.
-
-    Returns the number of the point of the course with its fraction, NaN further from it than the width; the sign, 1
-    along it, -1 against it, 0 beside it; and the distance to the right of it [m]; shapes (q,).
-    """
+    """Return the fractional point of the course, direction (0: beside) and distance to its right [m], shapes (q,)."""
     way, line_way = directions(points), course.direction
     vertices = course.point_m[:, :2]
     count = min(_NEIGHBOURS, len(course))

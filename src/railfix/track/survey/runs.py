@@ -114,11 +114,7 @@ class SurveyRun(FrozenArrays):
 
 
 def run_of_log(log: PositionLog, limits: SurveyLimits) -> SurveyRun:
-    """Return the positions of a log as a run, thinned to the interval, each with a standard deviation.
-
-    Those that the log states, at least a third of those of its quality (`SIGMA_OF_QUALITY`): a filter's own are often
-    the noise alone. ValueError: fewer than three positions with a time.
-    """
+    """Return the positions of a log as a run, thinned, with sigmas of at least a third of `SIGMA_OF_QUALITY`."""
     rows = np.flatnonzero(np.isfinite(log.ecef_m).all(axis=1) & ~np.isnat(log.time))
     rows = rows[np.argsort(log.time[rows], kind="stable")]
     rows = rows[rows_apart(log.time[rows], limits.interval_s)]
