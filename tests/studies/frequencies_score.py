@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from pyproj import Transformer
 
 import paths
 import recordings_truth
@@ -28,6 +29,8 @@ from recordings_score import straight_line, trajectory_of
 
 #: First epochs, processed one at a time, for the cost.
 _LIVE_EPOCHS = 120
+#: Date of the station's day [year].
+_STATION_YEAR = 2020.48
 
 
 def recordings(data: Path) -> Iterator[tuple[str, Observations, Path, Floats, Trajectory]]:
@@ -50,7 +53,9 @@ def recordings(data: Path) -> Iterator[tuple[str, Observations, Path, Floats, Tr
         yield f"roof, az {azimuth}", log, roof / "base.nav", reference, straight_line(place, azimuth)
     station = data / "static" / "ESBC_2020177"
     log = read_observations(station / "ESBC00DNK_R_20201770000_01D_30S_MO.crx.gz")
-    place = log.header.approximate_ecef_m
+    # the header is in ETRF2000, satellites are in the ITRF: 0.76 m apart
+    to_itrf = Transformer.from_crs("EPSG:7930", "EPSG:7789")
+    place = np.array(to_itrf.transform(*log.header.approximate_ecef_m, _STATION_YEAR)[:3])
     for azimuth in (0, 90):
         reference = np.broadcast_to(place, (len(log), 3))
         navigation = station / "ESBC00DNK_R_20201770000_01D_MN.rnx.gz"
