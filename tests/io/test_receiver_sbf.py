@@ -20,6 +20,7 @@ from railfix.io import read_any_positions
 from railfix.io.receiver import sbf, ubx
 from railfix.io.receiver.framing import Subframes, find_frames, sbas_frames
 from railfix.io.receiver.log import StreamState, decode
+from railfix.io.receiver.measurements import join_measurements
 from railfix.live.stream import ReceiverState, receive_bytes
 from railfix.ranges.sbas import from_receiver
 from railfix.ranges.sbas.messages import with_parity
@@ -376,3 +377,13 @@ def test_further_antennas_and_scrambled_blocks_are_left_out(logged: Observations
     assert len(read) == 2
     assert read.skipped["scrambled MeasEpoch"] == 1
     assert read.skipped["measurements of further antennas of a MeasEpoch"] == 1
+
+
+def test_blocks_without_measurements_name_no_receiver(logged: Observations) -> None:
+    """The first part of a log may hold no MeasEpoch: the receiver's name is that of the first part with one."""
+    first, state = decode(
+        block(4007, struct.pack("<IHBB3df", 1000, 2367, 4, 0, 0.9, -0.04, 100.0, 47.0) + bytes(40)), StreamState()
+    )
+    second, _ = decode(meas_epoch(logged, 0), state, at_end=True)
+    assert first.measurements.receiver == ""
+    assert join_measurements([first.measurements, second.measurements]).receiver == "Septentrio"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +11,10 @@ import pytest
 import recordings_truth
 from railfix.core.arrays import Floats
 from railfix.core.reasons import Reason
-from railfix.core.timescale import timedelta
-from railfix.evaluate import interpolate_reference
+from railfix.core.timescale import seconds, timedelta
+from railfix.evaluate import interpolate_reference, straight_distance
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
 from railfix.gnss.orbits.prepared_records import group_delay_s
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.channels import NAME, signal_delays
@@ -157,33 +159,58 @@ def test_the_ionosphere_of_a_noisy_satellite_is_that_of_its_neighbours() -> None
     assert without > 2.5
 
 
+@pytest.mark.parametrize(("epochs", "largest_m"), [(3, 1.25), (10, 1.15), (60, 1.15)])
+def test_an_error_that_lasts_a_minute_is_one_sample_from_the_start(epochs: int, largest_m: float) -> None:
+    """Half of the variance of a code is white, half stays alike for a minute: the error is as large as is stated.
+
+    Without a measurement it is that of the prior, 1.5 m less the mean of eight satellites: 1.40 m.
+    """
+    rng, errors, ratios = np.random.default_rng(3), [], []
+    for _ in range(100):
+        ionosphere = rng.normal(scale=1.5, size=len(NAMES))
+        time, code, second, _ = made(epochs, noise_m=0.0, ionosphere_m=ionosphere)
+        lasting, white = rng.normal(size=(2, 1, len(NAMES))), rng.normal(size=(2, *code.shape))
+        first, other = np.sqrt(0.5) * (lasting + white)
+        found, _ = combine(time, code + first, replace(second, code_m=second.code_m + other), prior_m=1.5)
+        away = found.ionosphere_m[-1] - ionosphere
+        errors.append(away - away.mean())
+        ratios.append(errors[-1] / found.ionosphere_sigma_m[-1])
+    assert np.sqrt(np.mean(np.square(errors))) < largest_m
+    assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.2
+
+
 def test_what_the_means_have_told_is_not_told_again() -> None:
-    """Codes of equal noise are averaged once the ionosphere is known; before, nearly ionosphere-free."""
+    """Codes of equal noise are averaged once the ionosphere is known; before, less of the second."""
     time, code, second, _ = made(1800, noise_m=0.05)
     share = combine(time, code, second)[0].share
-    assert (share[60] < -0.3).all()
+    assert (share[60] < 0.0).all()
     assert (share[-1] > 0.3).all()
 
 
-@pytest.fixture(scope="module")
-def open_sky(recordings: Path) -> dict[str, tuple[AntennaResult, Floats]]:
-    """Four minutes of open sky in Japan by one and two frequencies, with the reference positions."""
+def japan(recordings: Path) -> tuple[Observations, Navigation, Trajectory, Floats]:
+    """Four minutes of open sky in Japan: log, navigation, line, and the reference positions."""
     folder = recordings / "kinematic" / "japan_mosaic_2021265_with_GEONET3034"
     time, ecef = recordings_truth.japan_truth(folder)
     line = Trajectory.from_track(from_positions(time, ecef, spacing_m=5.0))
     log, navigation = read_observations(folder / "SEPT265G.21O")[:240], read_navigation(folder / "SEPT2650.21P")
-    reference = interpolate_reference(log.time, time, ecef)
-    found = {}
-    for frequencies in ("one", "two"):
-        config = parse_config({"frequencies": frequencies, "filter": "off", "protection": "off"})
-        processor = processor_of(config, navigation, {"front": line})
-        result, state = processor.process({"front": log})
-        found[frequencies] = result.antennas["front"], reference
-        if frequencies == "two":
-            state = None
-            for rows in (slice(0, 1), slice(1, 100), slice(100, 240)):
-                part, state = processor.process({"front": log[rows]}, state)
-            np.testing.assert_array_equal(part.antennas["front"].arc_m, result.antennas["front"].arc_m[100:])
+    return log, navigation, line, interpolate_reference(log.time, time, ecef)
+
+
+def solved(log: Observations, navigation: Navigation, line: Trajectory, frequencies: str) -> AntennaResult:
+    config = parse_config({"frequencies": frequencies, "filter": "off"})
+    return processor_of(config, navigation, {"front": line}).process({"front": log})[0].antennas["front"]
+
+
+@pytest.fixture(scope="module")
+def open_sky(recordings: Path) -> dict[str, tuple[AntennaResult, Floats]]:
+    """Open sky by one and two frequencies, with the reference positions."""
+    log, navigation, line, reference = japan(recordings)
+    found = {name: (solved(log, navigation, line, name), reference) for name in ("one", "two")}
+    processor = processor_of(parse_config({"frequencies": "two", "filter": "off"}), navigation, {"front": line})
+    state = None
+    for rows in (slice(0, 1), slice(1, 100), slice(100, 240)):
+        part, state = processor.process({"front": log[rows]}, state)
+    np.testing.assert_array_equal(part.antennas["front"].arc_m, found["two"][0].arc_m[100:])
     return found
 
 
@@ -196,6 +223,23 @@ def test_open_sky_is_better_by_half(open_sky: dict[str, tuple[AntennaResult, Flo
         across = apart - np.einsum("ti,ti->t", apart, up)[:, None] * up
         error[name] = np.nanmedian(np.linalg.norm(across, axis=1)[60:])
     assert error["two"] < 0.5 * error["one"]
+
+
+def test_fault_of_a_second_code_alone_is_weighed_down(recordings: Path) -> None:
+    """20 m on one satellite's second code for a minute: suspected at once, and the position hardly moves."""
+    log, navigation, line, reference = japan(recordings)
+    times = seconds(log.time - log.time[0])
+    wrong = (times >= 60.0) & (times < 120.0)
+    column = int(np.flatnonzero((log.satellite == "E26") & (log.signal == "5Q"))[0])
+    code = log.code_m.copy()
+    code[wrong, column] += 20.0
+    clean, faulty = (solved(each, navigation, line, "two") for each in (log, replace(log, code_m=code)))
+    at = faulty.satellite[faulty.columns].tolist().index("E26")
+    assert faulty.screens[NAME].reject[wrong, at].all()
+    error, before = (straight_distance(each.arc_m, reference, line) for each in (faulty, clean))
+    assert np.nanmax(np.abs(error - before)) < 1.0
+    assert faulty.protection is not None
+    assert not (error > faulty.protection.level.level_m).any()
 
 
 def test_second_signals_are_used_and_counted_so(open_sky: dict[str, tuple[AntennaResult, Floats]]) -> None:

@@ -8,7 +8,8 @@ pipeline with its defaults from a cold start; ``--mask`` changes the elevation m
 
 Whole recordings first (``--whole``), then a cold start every ``--every`` seconds, ``--length`` seconds each; with
 ``--faults`` instead faults of one satellite, one constellation, all Dopplers, all phases, a step of all codes, the map,
-pairs, few satellites, and sensors on board where there are any, in windows ``--fault-every`` seconds apart.
+pairs, few satellites, and sensors on board where there are any, in windows ``--fault-every`` seconds apart; with
+``--frequencies two`` of one satellite's second code too.
 ``--verbose`` lists the trials that fail.
 
 On a wrong map the straight distance counts, against the level on the ground alone. Otherwise an epoch is *exceeded*
@@ -26,6 +27,7 @@ import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -465,6 +467,25 @@ def shared_faults(along: np.ndarray, t: np.ndarray, *, seed: int) -> Iterator[tu
     yield "clock +1 ms", step, step, nothing
 
 
+def second_faults(case: Case, random: np.random.Generator) -> Iterator[tuple[str, Case]]:
+    """Faults of one satellite's codes below L1 alone: with one frequency nothing of them is used."""
+    obs = case.observations
+    t, nothing = seconds(obs.time - obs.time[0])[:, None], np.zeros(obs.code_m.shape)
+    below = ~np.char.startswith(obs.signal, "1") & ~np.isin(np.char.add(obs.system, obs.signal), ["C2I", "C2X"])
+    seen = below & (np.isfinite(obs.code_m).mean(axis=0) > 0.5)
+    if not seen.any():
+        return
+    mine = (below & (obs.satellite == random.choice(np.unique(obs.satellite[seen]))))[None, :]
+    minute = (t >= 45.0) & (t < 105.0)
+    for size in (20.0, -50.0, 100.0):
+        yield f"second code {size:+.0f} m, 60 s", with_fault(case, Fault("", size * (mine & minute), nothing, nothing))
+    for size in (6.0, 20.0, -20.0):
+        label = f"second code {size:+.0f} m, from the start"
+        yield label, with_fault(case, Fault(label, size * mine.repeat(len(t), 0), nothing, nothing))
+    drift = 0.1 * np.maximum(t - 30.0, 0.0) * mine
+    yield "second code 0.1 m/s", with_fault(case, Fault("", drift, nothing, nothing))
+
+
 def sensor_faults(case: Case, sensors: SensorSamples) -> Iterator[tuple[str, Case]]:
     """Every sensor that there is, wrong from 45 s on."""
     start = case.observations.time[0] + np.timedelta64(45, "s")
@@ -514,7 +535,11 @@ def show_faults(case: Case, args: argparse.Namespace) -> None:
     known = np.flatnonzero(np.isfinite(case.reference_ecef_m[:, 0]))
     for begin in np.arange(t[known[0]], t[known[-1]] - 90.0, args.fault_every):
         first, end = (int(k) for k in np.searchsorted(t, [begin, begin + args.length]))
-        for label, faulty in faults(case.part(first, end), along[first:end], random):
+        part = case.part(first, end)
+        listed = faults(part, along[first:end], random)
+        if args.settings.get("frequencies") == "two":
+            listed = chain(listed, second_faults(part, random))
+        for label, faulty in listed:
             trial = run(faulty, settings)
             bad = over(label, trial)
             if args.verbose and bad.any():
@@ -610,6 +635,7 @@ def main() -> int:
     parser.add_argument("--mask", type=float, nargs="*", default=[20.0])
     parser.add_argument("--thin", type=int, default=1)
     parser.add_argument("--set", dest="sets", nargs="*", default=[], help="settings of the filter, name=value")
+    parser.add_argument("--frequencies", choices=("one", "two"), default="one")
     parser.add_argument("--faults", action="store_true")
     parser.add_argument("--fault-every", type=float, default=90.0)
     parser.add_argument("--seed", type=int, default=0)
@@ -619,7 +645,7 @@ def main() -> int:
     parser.add_argument("--verbose", action="store_true")
     args = parser.parse_args()
     given = "\n".join(args.sets)
-    args.settings = {"tracking": tomllib.loads(given)} if given else {}
+    args.settings = {"frequencies": args.frequencies} | ({"tracking": tomllib.loads(given)} if given else {})
     known = cases(paths.DATA) if paths.DATA.is_dir() else {}
     if not args.faults:
         print(HEAD)

@@ -134,7 +134,8 @@ def combine_codes(
     known = both & (information > 0.0)
     mean[known] = before[np.nonzero(known)[0], size + at[known]] / information[known]
     scale, of_scale = _noise_scale(time, difference - mean, variance, known, own, ages)
-    of_mean = scale[:, None] / np.where(known, information, 1.0)
+    # errors alike for a time C: the mean over a time T is that of 1 + T / C samples
+    of_mean = scale[:, None] / (information + 1.0 / np.where(known, variance, 1.0))
     lever = second.ratio - 1.0
     delay = second.delay_sigma_m**2 + limits.delay_sigma_m**2
     basis = np.where(known[..., None], field_m, 0.0)

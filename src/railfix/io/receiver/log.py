@@ -242,8 +242,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Lo
     kind = state.kind or _first_kind(frames, own, msm_places)
     native = kind if kind in own else max(own, key=lambda name: len(own[name].time))
     raw = own[native]
-    taken = {**own, _MSM: msm, "": own[_RAWX]}
-    measurements = taken[kind] if kind in taken else no_measurements("u-blox")
+    measurements = {**own, _MSM: msm}.get(kind, no_measurements(""))
     unused = _of_other_kinds(frames, kind) if kind else {**raw.skipped, **msm.skipped}
     measurements = replace(measurements, skipped={**measurements.skipped, **unused, **_of_old_kinds(frames)})
     places = msm_places if kind == _MSM else _places(frames, native)
