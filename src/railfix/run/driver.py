@@ -21,7 +21,7 @@ from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import level_facts, prior_basis_text, risk_of
-from railfix.pipeline.processor import EpochProcessor, SolvedChunk, State
+from railfix.pipeline.processor import EpochProcessor, ScreenedChunk, SolvedChunk, State
 from railfix.run.batch_check import BatchCheck, add_batch
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.convert import add_mate_results
@@ -197,15 +197,16 @@ def _position(
 ) -> Tally:
     """Position chunk by chunk: counts and rows.
 
-    Four chunks are on their way at a time: one is read, one has its single epochs positioned, one is filtered, and the
-    rows of one are written by `beside`.
+    Five chunks are on their way at a time: one is read, one is screened, one has its single epochs positioned, one is
+    filtered, and the rows of one are written by `beside`.
     """
     tally = Tally(min_satellites=processor.config.min_satellites, order=processor.antenna_order())
     state = State()
     written: Future[None] | None = None
     chunks = read_ahead(align_logs({name: log.parts() for name, log in logs.items()}))
     began = clock.perf_counter()
-    for solved in read_ahead(_single_epochs(chunks, others, processor)):
+    screened = read_ahead(_screened(chunks, others, processor))
+    for solved in read_ahead(_single_epochs(screened, processor)):
         result, state = processor.along_track(solved, state)
         if rows.line.route is not None:
             result = without_beside(result, rows.line.route, processor.config)
@@ -224,19 +225,27 @@ def _position(
     return tally
 
 
-def _single_epochs(
+def _screened(
     chunks: Iterator[dict[str, Observations]],
     others: tuple[SensorSamples, BaseLog | None],
     processor: EpochProcessor,
-) -> Iterator[SolvedChunk]:
-    """Yield the single epochs of chunks, each with what sensors and base station measured up to its end."""
+) -> Iterator[ScreenedChunk]:
+    """Yield the screened ranges of chunks, each with what sensors and base station measured up to its end."""
     samples, station = others
     after, state = np.datetime64("NaT", "ns"), State()
     for chunk in chunks:
         end = max(own.time[-1] for own in chunk.values() if len(own))
         sensors, base = samples.between(after, end), None if station is None else station.until(end)
-        solved, state = processor.single_epochs(chunk, state, sensors=sensors, base=base)
+        screened, state = processor.screened(chunk, state, sensors=sensors, base=base)
         after = end
+        yield screened
+
+
+def _single_epochs(screened: Iterator[ScreenedChunk], processor: EpochProcessor) -> Iterator[SolvedChunk]:
+    """Yield the single epochs of chunks."""
+    state = State()
+    for chunk in screened:
+        solved, state = processor.single_epochs(chunk, state)
         yield solved
 
 
