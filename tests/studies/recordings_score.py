@@ -29,7 +29,7 @@ from railfix.positioning.noise_scale import (
     NoiseState,
     OffsetState,
     map_information,
-    noise_age,
+    noise_windows,
     own_sigma_m,
     robust_fit,
     robust_scale,
@@ -219,8 +219,8 @@ def smartloc_chain(
     known = np.isfinite(got.arc_m)
     at = np.where(known[:, None], trajectory.at_arc(np.where(known, got.arc_m, 0.0)), middle)
     agreeing = robust_fit(ranges, at, information=map_information(trajectory, np.maximum(got.section, 0)))
-    age = noise_age(time, NoiseState(), limits=config.noise_scale)
-    scale, _ = robust_scale(age, agreeing, known, NoiseState(), limits=config.noise_scale)
+    windows = noise_windows(time, (slice(None),), [NoiseState()], limits=config.noise_scale)
+    scale, _ = robust_scale(windows, agreeing, known, NoiseState().robust[None], limits=config.noise_scale)
     failed = np.zeros(len(ranges), dtype=bool)
     if "raim" in config.screens:
         model = constrained_model(ranges, trajectory, got.arc_m, section=got.section)

@@ -38,7 +38,7 @@ from railfix.positioning.noise_scale import (
     RobustFit,
     epoch_variance,
     information_of,
-    noise_age,
+    noise_windows,
     own_sigma_m,
     robust_fit,
     robust_scale,
@@ -134,17 +134,20 @@ def solve(
         tied = _tie(ranges, ties, point, corrected.anchor_ecef_m, config)
     place = place_on_lines(ranges, antennas, tied, config)
     corrected = corrected.rejected(alone_on_their_clocks(corrected, ties), Reason.ALONE_ON_ITS_CLOCK)
-    ages = antennas.apart(lambda _, rows, state: noise_age(time[rows], state.noise, limits=config.noise_scale), states)
+    windows = noise_windows(time, antennas.parts, [state.noise for state in states], limits=config.noise_scale)
     on_line, teaching = _fit_on_line(corrected, ranges, antennas, place, config)
-    lasting_noise = [changed(state.noise, robust=state.lasting.noise) for state in states]
-    raised, raised_sums = _robust_scale(on_line, teaching, antennas, ages, config, lasting_noise)
+    lasting_noise = np.array([state.lasting.noise for state in states])
+    raised, raised_sums = robust_scale(windows, on_line, teaching, lasting_noise, limits=config.noise_scale)
+    raised = np.maximum(raised, _least_scale(config))
     ranges, place, model, lasting, lasting_states = lasting_errors(
         corrected, ranges, antennas, place, raised, config, [state.lasting for state in states]
     )
     if lasting.any():
         corrected = corrected.rejected(lasting, Reason.LASTING_ERROR)
         on_line, teaching = _fit_on_line(corrected, ranges, antennas, place, config)
-    robust, robust_sums = _robust_scale(on_line, teaching, antennas, ages, config, [state.noise for state in states])
+    of_fits = np.array([state.noise.robust for state in states])
+    robust, robust_sums = robust_scale(windows, on_line, teaching, of_fits, limits=config.noise_scale)
+    robust = np.maximum(robust, _least_scale(config))
     tested, (ranges, place, raim) = ranges, fault_free(ranges, antennas, place, robust, on_line.kept, config)
     constrained, redundancy = place.constrained, redundancy_of(ranges)
     model = model if ranges is tested else line_model(ranges, antennas, constrained)
@@ -152,14 +155,10 @@ def solve(
     teaching = ~off_map & ~raim.faulty
     if "raim" not in config.screens:
         teaching[:] = False
-
-    def own_scale(_: SearchIndex, rows: slice, age: Floats, state: AntennaState) -> tuple[Floats, Floats]:
-        return stated_scale(
-            age, constrained.wsse[rows], redundancy[rows], teaching[rows], robust[rows], state.noise,
-            limits=config.noise_scale,
-        )  # fmt: skip
-
-    scale, stated_sums = antennas.each_with_state(own_scale, ages, states)
+    scale, stated_sums = stated_scale(
+        windows, constrained.wsse, redundancy, teaching, robust, np.array([state.noise.remaining for state in states]),
+        limits=config.noise_scale,
+    )  # fmt: skip
     scale = np.maximum(scale, _least_scale(config))
     on_map = np.isfinite(constrained.arc_m) & ~off_map
 
@@ -216,7 +215,7 @@ def solve(
         noise = state.noise
         if len(time[rows]):
             sums = {"robust": robust_sums[k], "remaining": stated_sums[k]}
-            noise = NoiseState(time=time[rows][-1], age=float(ages[k][-1]), **sums)
+            noise = NoiseState(time=time[rows][-1], age=float(windows.end_age[k]), **sums)
         after.append(
             changed(
                 state, offsets=offsets[k], noise=noise, map_offset=map_states[k], off_map=off_map_states[k],
@@ -260,23 +259,6 @@ def _fit_on_line(
     information = information_of(antennas.axes_of(section), antennas.sigma_plan_m, antennas.sigma_height_m)
     fit = robust_fit(ranges, at, information=information, limits=config.robust_fit)
     return fit, known & ~_off_map(ranges, antennas, place, arc, config)
-
-
-def _robust_scale(
-    fit: RobustFit,
-    teaching: Masks,
-    antennas: AntennaRows,
-    ages: Sequence[Floats],
-    config: Config,
-    states: Sequence[NoiseState],
-) -> tuple[Floats, list[Floats]]:
-    """Return the noise scale of the receiver by robust fits, and its new sums."""
-
-    def own_scale(_: SearchIndex, rows: slice, age: Floats, state: NoiseState) -> tuple[Floats, Floats]:
-        return robust_scale(age, rows_of(fit, rows), teaching[rows], state, limits=config.noise_scale)
-
-    scale, sums = antennas.each_with_state(own_scale, ages, states)
-    return np.maximum(scale, _least_scale(config)), sums
 
 
 def _least_scale(config: Config) -> float:

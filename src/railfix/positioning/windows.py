@@ -1,0 +1,77 @@
+"""Sums over earlier epochs with exponential forgetting: of noise, clocks, lasting errors, and the map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from railfix import kernels
+from railfix.core.arrays import Datetimes, Floats, Indices, kernel_array
+
+
+class Windows(NamedTuple):
+    """Ages of T epochs since the start of a log, those of A antennas one after the other."""
+
+    step_s: Floats  #: Time since the epoch before; 0 where there is none; shape (T,).
+    age: Floats  #: Shape (T,) [windows].
+    last_age: Floats  #: Of the epoch before the first of each antenna, shape (A,).
+    ends: Indices  #: Row after the last of each antenna, shape (A,).
+    end_age: Floats  #: Of its last epoch, shape (A,).
+
+    @classmethod
+    def of(
+        cls,
+        time: Datetimes,
+        parts: Sequence[slice],
+        last: Sequence[np.datetime64],
+        last_age: Sequence[float],
+        *,
+        window_s: float,
+        least_epochs: float,
+    ) -> Windows:
+        """Compute the ages by the rows of each antenna, and time and age of its epoch before (NaT: none).
+
+        A window is `window_s` or `least_epochs` epochs, whichever is longer, so that gaps forget no faster than epochs
+        come.
+        """
+        ends = np.array([len(time) if rows.stop is None else rows.stop for rows in parts], dtype=np.intp)
+        before, when = np.array(last_age, dtype=np.float64), np.array(last, dtype="datetime64[ns]").view(np.int64)
+        step, age, end_age = kernels.windows.window_ages(
+            time.astype(np.int64), when, before, ends, float(window_s), float(least_epochs)
+        )
+        return cls(step, age, before, ends, end_age)
+
+    def sums(self, values: Floats, start: Floats) -> tuple[Floats, Floats]:
+        """Sums of the values (T, K) of all earlier epochs, each times ``exp(-difference of the ages)``.
+
+        `start`, shape (A, K): running sums after the epochs before; those after the last ones are returned as well.
+        """
+        after = np.array(start, dtype=np.float64)
+        before = kernels.windows.decayed_sums(self.age, kernel_array(values), after, self.last_age, self.ends)
+        return before, after
+
+
+def correlated_sums(
+    time: Datetimes,
+    values: Floats,
+    start: Floats,
+    parts: Sequence[slice],
+    before: Sequence[tuple[np.datetime64, float]],
+    *,
+    window_s: float,
+    correlation_s: float,
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Sums over a window of epochs whose errors are alike for `correlation_s`: each counts by the time since the one
+    before.
+
+    Arguments as for `Windows`; `before` are time and age of the epoch before. Returns decayed sums at each epoch, its
+    own values not included (T, K), what each epoch adds (T, K), running sums after the last epochs (A, K), and their
+    ages (A,).
+    """
+    last, last_age = zip(*before, strict=True)
+    windows = Windows.of(time, parts, last, last_age, window_s=window_s, least_epochs=window_s / correlation_s)
+    own = np.minimum(windows.step_s / correlation_s, 1.0)[:, None] * values
+    sums, after = windows.sums(own, start)
+    return sums, own, after, windows.end_age
