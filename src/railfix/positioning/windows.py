@@ -8,17 +8,17 @@ from typing import NamedTuple
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Indices, kernel_array
+from railfix.core.arrays import Datetimes, Floats, Indices
 
 
 class Windows(NamedTuple):
     """Ages of T epochs since the start of a log, those of A antennas one after the other."""
 
     step_s: Floats  #: Time since the epoch before; 0 where there is none; shape (T,).
-    age: Floats  #: Shape (T,) [windows].
-    last_age: Floats  #: Of the epoch before the first of each antenna, shape (A,).
+    growth: Floats  #: Of a sum since the start of its span of windows, shape (T,).
+    decay: Floats  #: Of a sum into the span of an epoch, shape (T,).
     ends: Indices  #: Row after the last of each antenna, shape (A,).
-    end_age: Floats  #: Of its last epoch, shape (A,).
+    end_age: Floats  #: Of its last epoch, shape (A,) [windows].
 
     @classmethod
     def of(
@@ -38,10 +38,10 @@ class Windows(NamedTuple):
         """
         ends = np.array([len(time) if rows.stop is None else rows.stop for rows in parts], dtype=np.intp)
         before, when = np.array(last_age, dtype=np.float64), np.array(last, dtype="datetime64[ns]").view(np.int64)
-        step, age, end_age = kernels.windows.window_ages(
+        step, in_span, begun, end_age = kernels.windows.window_ages(
             time.astype(np.int64), when, before, ends, float(window_s), float(least_epochs)
         )
-        return cls(step, age, before, ends, end_age)
+        return cls(step, np.exp(in_span), np.exp(-kernels.windows.SPAN * begun), ends, end_age)
 
     def sums(self, values: Floats, start: Floats) -> tuple[Floats, Floats]:
         """Sums of the values (T, K) of all earlier epochs, each times ``exp(-difference of the ages)``.
@@ -49,7 +49,8 @@ class Windows(NamedTuple):
         `start`, shape (A, K): running sums after the epochs before; those after the last ones are returned as well.
         """
         after = np.array(start, dtype=np.float64)
-        before = kernels.windows.decayed_sums(self.age, kernel_array(values), after, self.last_age, self.ends)
+        grown = np.ascontiguousarray(self.growth[:, None] * values)
+        before = kernels.windows.decayed_sums(grown, self.growth, self.decay, after, self.ends)
         return before, after
 
 
