@@ -58,7 +58,7 @@ def test_sums_decay_as_one_by_one() -> None:
     values = generator.normal(size=(300, 2))
     limits = {"window_s": 100.0, "least_epochs": 4.0}
     nothing = np.datetime64("NaT", "ns")
-    whole = Windows.of(time, (slice(None),), [nothing], [0.0], **limits)
+    whole = Windows.of(time, (slice(None),), [(nothing, 0.0)], **limits)
     before, after = whole.sums(values, np.zeros((1, 2)))
     total = np.zeros(2)
     for t in range(300):
@@ -66,11 +66,11 @@ def test_sums_decay_as_one_by_one() -> None:
             total = total * np.exp(-min(step[t] / 100.0, 0.25))
         assert before[t] == pytest.approx(total, abs=1e-9)
         total = total + values[t]
-    begun = Windows.of(time[:150], (slice(None),), [nothing], [0.0], **limits)
+    begun = Windows.of(time[:150], (slice(None),), [(nothing, 0.0)], **limits)
     half = begun.sums(values[:150], np.zeros((1, 2)))
-    gone_on = Windows.of(time[150:], (slice(None),), [time[149]], begun.end_age.tolist(), **limits)
+    gone_on = Windows.of(time[150:], (slice(None),), begun.last, **limits)
     rest = gone_on.sums(values[150:], half[1])
-    assert np.array_equal(gone_on.end_age, whole.end_age)
+    assert gone_on.last == whole.last
     assert np.array_equal(np.concatenate([half[0], rest[0]]), before)
     assert np.array_equal(rest[1], after)
 

@@ -46,9 +46,8 @@ def window_ages(
 def decayed_sums(values: Floats, growth: Floats, decay: Floats, current: Floats, ends: Indices) -> Floats:
     """Return sums of the values (T, K) of all earlier epochs, each times ``exp(-difference of the ages)``.
 
-    `values` are times `growth`, the growth since the start of a span, and running sums `current`, shape (A, K), in
-    units of the decay since then, so that the same numbers are added in the same order wherever a chunk begins; those
-    after the last epochs replace them. `decay`: into the span of an epoch, from that of the epoch before, shape (T,).
+    `values` are times `growth`, and running sums `current`, shape (A, K), in units of the decay since the start of a
+    span, so that the same numbers are added in the same order wherever a chunk begins; the new sums replace them.
     """
     before, first = np.empty(values.shape), 0
     for a in range(len(ends)):

@@ -282,7 +282,7 @@ def lasting_errors(
     if "raim" not in config.screens or not limits.most_satellites:
         return ranges, place, model, left_out, list(states)
     windows = Windows.of(
-        time, antennas.parts, [state.time for state in states], [state.age for state in states],
+        time, antennas.parts, [(state.time, state.age) for state in states],
         window_s=limits.memory_s, least_epochs=limits.memory_s,
     )  # fmt: skip
     share = np.minimum(windows.step_s, 1.0)[:, None] / limits.memory_s
@@ -307,10 +307,8 @@ def lasting_errors(
             model = line_model(ranges, antennas, place.constrained)
             error = _own_errors(model, noise, limits.clipped)
     after_states = [
-        changed(state, time=time[rows][-1], age=float(windows.end_age[k]), channel=channel, sums=sums[:, k].T)
-        if len(time[rows])
-        else state
-        for k, (rows, state) in enumerate(zip(antennas.parts, states, strict=True))
+        changed(state, time=when, age=age, channel=channel, sums=sums[:, k].T) if len(time[rows]) else state
+        for k, (rows, state, (when, age)) in enumerate(zip(antennas.parts, states, windows.last, strict=True))
     ]
     return ranges, place, model, left_out, after_states
 

@@ -149,15 +149,12 @@ def map_offset(
     sample = np.zeros((len(time), 2, _SUMS))
     rows = usable.nonzero()[0]
     sample[rows, off_map[rows].astype(np.intp)] = terms[rows]
-    before, own, ended, age = correlated_sums(
+    before, own, ended, last = correlated_sums(
         time, sample.reshape(-1, 2 * _SUMS), np.array([state.sums for state in states]), antennas.parts,
         [(state.time, state.age) for state in states], window_s=limits.window_s, correlation_s=limits.correlation_s,
     )  # fmt: skip
     both = before + own
-    after = [
-        MapOffsetState(time=time[rows][-1], age=float(age[k]), sums=ended[k]) if len(time[rows]) else state
-        for k, (state, rows) in enumerate(zip(states, antennas.parts, strict=True))
-    ]
+    after = [MapOffsetState(time=when, age=age, sums=own) for (when, age), own in zip(last, ended, strict=True)]
     sums = np.where(off_map[:, None], both[:, _SUMS:], both[:, :_SUMS])
     enough = sums[:, 8] >= limits.least_samples
     sums = np.where(enough[:, None], sums, [1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])

@@ -28,7 +28,7 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Str
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import EVERY
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, SinglePoint
-from railfix.positioning.windows import Windows, correlated_sums
+from railfix.positioning.windows import Dated, Windows, correlated_sums
 from railfix.track.trajectory import Trajectory
 
 
@@ -153,48 +153,28 @@ class NoiseState:
     remaining: Floats = field(default_factory=lambda: np.zeros(2))
 
 
-def noise_windows(
-    time: Datetimes, parts: Sequence[slice], states: Sequence[NoiseState], *, limits: NoiseScaleLimits
-) -> Windows:
-    """Ages of the epochs of several antennas."""
-    last, last_age = [state.time for state in states], [state.age for state in states]
-    return Windows.of(time, parts, last, last_age, window_s=limits.window_s, least_epochs=limits.least_epochs)
-
-
-def robust_scale(
-    windows: Windows, fit: RobustFit, teaching: Masks, start: Floats, *, limits: NoiseScaleLimits
-) -> tuple[Floats, Floats]:
-    """Scale of the ranges against their weights (T,) by what agreed before each epoch; sums before and after (A, 2)."""
-    use = teaching & (fit.freedom > 0) & np.isfinite(fit.variance)
-    values = np.where(use, fit.variance * fit.freedom, 0.0), np.where(use, fit.freedom, 0)
-    return _learnt(windows, values, np.ones(len(use)), start, limits)
-
-
-def stated_scale(
+def noise_scale(
     windows: Windows,
     wsse: Floats,
-    redundancy: Integers,
+    freedom: Integers,
     teaching: Masks,
-    robust: Floats,
+    prior: Floats,
     start: Floats,
     *,
     limits: NoiseScaleLimits,
+    least: float = 0.0,
 ) -> tuple[Floats, Floats]:
-    """Scale of the ranges against their weights (T,) by what RAIM left before each epoch; sums before and after
-    (A, 2).
+    """Scale of the ranges against their weights (T,) by the epochs before, `least` at least; and new sums (A, 2).
+
+    Root mean square of the residuals with forgetting around a prior scale (T,); `start`: sums before (A, 2).
     """
-    use = teaching & (redundancy > 0) & np.isfinite(wsse)
-    return _learnt(windows, (np.where(use, wsse, 0.0), np.where(use, redundancy, 0)), robust, start, limits)
-
-
-def _learnt(
-    windows: Windows, values: tuple[Floats, Integers], prior: Floats, start: Floats, limits: NoiseScaleLimits
-) -> tuple[Floats, Floats]:
-    """Root mean square with forgetting around a prior scale, and the sums to go on with."""
-    before, after = windows.sums(np.array(values, dtype=np.float64).T, start)
+    use = teaching & (freedom > 0) & np.isfinite(wsse)
+    values = np.array([np.where(use, wsse, 0.0), np.where(use, freedom, 0)], dtype=np.float64).T
+    before, after = windows.sums(values, start)
     if np.isinf(limits.prior):
-        return prior, after
-    return np.sqrt((before[:, 0] + limits.prior * prior**2) / (before[:, 1] + limits.prior)), after
+        return np.maximum(prior, least), after
+    scale = np.sqrt((before[:, 0] + limits.prior * prior**2) / (before[:, 1] + limits.prior))
+    return np.maximum(scale, least), after
 
 
 def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits: NoiseScaleLimits) -> Floats:
@@ -291,14 +271,14 @@ class OffsetState:
         of_each = (self.information, self.moment)
         return np.array([values.get(letter, 0.0) for values in of_each for letter in letters], dtype=np.float64)
 
-    def later(self, letters: Sequence[str], sums: Floats, last: np.datetime64, age: float) -> OffsetState:
+    def later(self, letters: Sequence[str], sums: Floats, last: Dated) -> OffsetState:
         """Return the state with new sums of some clocks (`sums`), those of the others as they are."""
         count = len(letters)
         return OffsetState(
             information={**self.information, **dict(zip(letters, sums[:count], strict=True))},
             moment={**self.moment, **dict(zip(letters, sums[count:], strict=True))},
-            last=last,
-            age=age,
+            last=last[0],
+            age=last[1],
         )
 
 
@@ -338,14 +318,11 @@ def tie_clocks(
         weight = np.where(usable, 1.0 / variance, 0.0)
         difference = np.where(usable, free.clock_m[:, others] - free.clock_m[:, base], 0.0)
         sample = np.concatenate([weight, weight * difference], axis=1)
-    before, _, sums, age = correlated_sums(
+    before, _, sums, last = correlated_sums(
         time, sample, np.array([state.sums(letters) for state in states]), parts,
         [(state.last, state.age) for state in states], window_s=limits.window_s, correlation_s=limits.correlation_s,
     )  # fmt: skip
-    after = [
-        state.later(letters, sums[k], when[-1] if len(when := time[rows]) else state.last, float(age[k]))
-        for k, (state, rows) in enumerate(zip(states, parts, strict=True))
-    ]
+    after = [state.later(letters, *ended) for state, *ended in zip(states, sums, last, strict=True)]
     of_information, of_moment = before[:, : len(others)], before[:, len(others) :]
     has = of_information > 0.0
     safe = np.where(has, of_information, 1.0)

@@ -130,7 +130,7 @@ def combine_codes(
     sample[row, size + at[both]] = difference[both] / variance[both]
     ages = {"window_s": limits.window_s, "correlation_s": limits.correlation_s}
     last_epoch = [(own.last, own.age)]
-    before, _, (sums,), (age,) = correlated_sums(time, sample, own.sums[None], (EVERY,), last_epoch, **ages)
+    before, _, (sums,), ((last, age),) = correlated_sums(time, sample, own.sums[None], (EVERY,), last_epoch, **ages)
     information, mean = np.zeros(both.shape), np.zeros(both.shape)
     information[both] = before[row, at[both]]
     known = both & (information > 0.0)
@@ -169,8 +169,7 @@ def combine_codes(
         difference_m=apart,
         suspected=np.abs(apart) > np.maximum(limits.suspicion * np.sqrt(total), _LEAST_SUSPICION_M),
     )
-    last = time[-1] if len(time) else own.last
-    return found, TwoFrequencyState(names=own.names, sums=sums, scale=of_scale, last=last, age=float(age))
+    return found, TwoFrequencyState(names=own.names, sums=sums, scale=of_scale, last=last, age=age)
 
 
 def ionosphere_free(
@@ -184,13 +183,10 @@ def ionosphere_free(
     share = np.where(np.isfinite(code_m + second.code_m), -1.0 / (second.ratio - 1.0), np.nan)
     first, other = code_m + delays_m[0], second.code_m + delays_m[1]
     return replace(
-        found,
-        code_m=first + share * (other - first),
-        variance_m2=(1.0 - share) ** 2 * noise_m**2 + share**2 * second.noise_m**2 - noise_m**2,
-        share=share,
-        ionosphere_m=-share * (second.code_m - code_m),
-        ionosphere_sigma_m=-share * np.hypot(noise_m, second.noise_m),
-    )
+        found, code_m=first + share * (other - first),
+        variance_m2=(1.0 - share) ** 2 * noise_m**2 + share**2 * second.noise_m**2 - noise_m**2, share=share,
+        ionosphere_m=-share * (second.code_m - code_m), ionosphere_sigma_m=-share * np.hypot(noise_m, second.noise_m),
+    )  # fmt: skip
 
 
 def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphere_m2: Floats) -> tuple[Floats, Floats]:

@@ -10,6 +10,9 @@ import numpy as np
 from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Indices
 
+#: Time and age [windows] of an epoch; NaT for none.
+Dated = tuple[np.datetime64, float]
+
 
 class Windows(NamedTuple):
     """Ages of T epochs since the start of a log, those of A antennas one after the other."""
@@ -18,40 +21,33 @@ class Windows(NamedTuple):
     growth: Floats  #: Of a sum since the start of its span of windows, shape (T,).
     decay: Floats  #: Of a sum into the span of an epoch, shape (T,).
     ends: Indices  #: Row after the last of each antenna, shape (A,).
-    end_age: Floats  #: Of its last epoch, shape (A,) [windows].
+    last: list[Dated]  #: Last epoch of each antenna.
 
     @classmethod
     def of(
-        cls,
-        time: Datetimes,
-        parts: Sequence[slice],
-        last: Sequence[np.datetime64],
-        last_age: Sequence[float],
-        *,
-        window_s: float,
-        least_epochs: float,
+        cls, time: Datetimes, parts: Sequence[slice], before: Sequence[Dated], *, window_s: float, least_epochs: float
     ) -> Windows:
-        """Compute the ages by the rows of each antenna, and time and age of its epoch before (NaT: none).
+        """Compute the ages by the rows of each antenna and its last epoch before these.
 
-        A window is `window_s` or `least_epochs` epochs, whichever is longer, so that gaps forget no faster than epochs
-        come.
+        A window is `window_s` or `least_epochs` epochs, whichever is longer: gaps forget no faster than epochs come.
         """
+        times, ages = zip(*before, strict=True)
         ends = np.array([len(time) if rows.stop is None else rows.stop for rows in parts], dtype=np.intp)
-        before, when = np.array(last_age, dtype=np.float64), np.array(last, dtype="datetime64[ns]").view(np.int64)
-        step, in_span, begun, end_age = kernels.windows.window_ages(
-            time.astype(np.int64), when, before, ends, float(window_s), float(least_epochs)
-        )
-        return cls(step, np.exp(in_span), np.exp(-kernels.windows.SPAN * begun), ends, end_age)
+        step, in_span, begun, age = kernels.windows.window_ages(
+            time.astype(np.int64), np.array(times, dtype="datetime64[ns]").view(np.int64),
+            np.array(ages, dtype=np.float64), ends, float(window_s), float(least_epochs),
+        )  # fmt: skip
+        own = [time[rows] for rows in parts]
+        last = [(new[-1] if len(new) else old, now) for new, old, now in zip(own, times, age.tolist(), strict=True)]
+        return cls(step, np.exp(in_span), np.exp(-kernels.windows.SPAN * begun), ends, last)
 
     def sums(self, values: Floats, start: Floats) -> tuple[Floats, Floats]:
         """Sums of the values (T, K) of all earlier epochs, each times ``exp(-difference of the ages)``.
 
         `start`, shape (A, K): running sums after the epochs before; those after the last ones are returned as well.
         """
-        after = np.array(start, dtype=np.float64)
-        grown = np.ascontiguousarray(self.growth[:, None] * values)
-        before = kernels.windows.decayed_sums(grown, self.growth, self.decay, after, self.ends)
-        return before, after
+        after, grown = np.array(start, dtype=np.float64), np.ascontiguousarray(self.growth[:, None] * values)
+        return kernels.windows.decayed_sums(grown, self.growth, self.decay, after, self.ends), after
 
 
 def correlated_sums(
@@ -59,20 +55,18 @@ def correlated_sums(
     values: Floats,
     start: Floats,
     parts: Sequence[slice],
-    before: Sequence[tuple[np.datetime64, float]],
+    before: Sequence[Dated],
     *,
     window_s: float,
     correlation_s: float,
-) -> tuple[Floats, Floats, Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, list[Dated]]:
     """Sums over a window of epochs whose errors are alike for `correlation_s`: each counts by the time since the one
     before.
 
-    Arguments as for `Windows`; `before` are time and age of the epoch before. Returns decayed sums at each epoch, its
-    own values not included (T, K), what each epoch adds (T, K), running sums after the last epochs (A, K), and their
-    ages (A,).
+    Arguments as for `Windows`. Returns decayed sums at each epoch, its own values not included (T, K), what each epoch
+    adds (T, K), running sums after the last epochs (A, K), and these.
     """
-    last, last_age = zip(*before, strict=True)
-    windows = Windows.of(time, parts, last, last_age, window_s=window_s, least_epochs=window_s / correlation_s)
+    windows = Windows.of(time, parts, before, window_s=window_s, least_epochs=window_s / correlation_s)
     own = np.minimum(windows.step_s / correlation_s, 1.0)[:, None] * values
     sums, after = windows.sums(own, start)
-    return sums, own, after, windows.end_age
+    return sums, own, after, windows.last

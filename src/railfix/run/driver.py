@@ -92,14 +92,11 @@ def run_files(
             base_ecef_m=None if base is None else base.ecef_m,
         )  # fmt: skip
         rows = ResultRows(
-            folder=folder,
-            line=line,
-            observations=options.observations == "write",
+            folder=folder, line=line, observations=options.observations == "write",
             checks=SensorChecks() if sensors else None,
             batches={name: BatchCheck(trajectory=line.trajectories[name]) for name in logs if options.check == "batch"},
-            passings=balises is not None,
-            replays={name: Replays() for name in logs} if options.smooth == "on" else {},
-        )
+            passings=balises is not None, replays={name: Replays() for name in logs} if options.smooth == "on" else {},
+        )  # fmt: skip
         tally = _position(logs, (sensors, base), processor, rows, beside, progress)
         if rows.replays:
             add_smoothed(rows.replays, processor, folder)
@@ -142,13 +139,9 @@ def open_inputs(
 
     def log_of(paths: tuple[Path, ...]) -> Log:
         return Log(
-            paths=paths,
-            chunk_epochs=options.chunk_epochs,
-            broken_lines=options.broken_lines,
-            start=options.start,
-            end=options.end,
-            date=options.logs.instant,
-        )
+            paths=paths, chunk_epochs=options.chunk_epochs, broken_lines=options.broken_lines, start=options.start,
+            end=options.end, date=options.logs.instant,
+        )  # fmt: skip
 
     from railfix.run.route import LogPositions
 
@@ -158,14 +151,9 @@ def open_inputs(
         reading=options.track,
     )  # fmt: skip
     line = open_line(
-        inputs.track,
-        inputs.vehicle,
-        antennas=tuple(inputs.logs),
-        reading=options.track,
-        heights=inputs.heights,
-        at=at,
+        inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track, heights=inputs.heights, at=at,
         log=positions,
-    )
+    )  # fmt: skip
     logs = {name: log_of(paths) for name, paths in inputs.logs.items()}
     return navigation, line, logs
 

@@ -23,8 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import comb
 
 from railfix import kernels
-from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings
-from railfix.core.threads import in_threads
+from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings, over_blocks
 from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, Allocation, RiskBudget, allocate
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.model import constrained_model
@@ -164,7 +163,7 @@ def along_track_level(
         for name, values in _level_of_block(block, model.take(block), plan, given).items():
             getattr(result, name)[block] = values
 
-    in_threads(fill, _blocks(model, plan, located.nonzero()[0]))
+    over_blocks(fill, _blocks(model, plan, located.nonzero()[0]))
     return result
 
 

@@ -15,9 +15,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.arrays import Floats, Indices, Masks, over_blocks
 from railfix.core.constants import ALONG, LEAST_REDUNDANCY
-from railfix.core.threads import in_threads
 from railfix.integrity.protection.risk import RiskBudget, one_sided_k
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.model import Compact, compact
@@ -179,7 +178,7 @@ def places_beyond_the_level(
                 spent = _risk_of_block(index, arc_m[some], level_m[some], none.beside(*forms), risk)
                 result[some] = spent > risk.risk_per_sample
 
-    in_threads(fill, (rows[first : first + size] for first in range(0, len(rows), size)))
+    over_blocks(fill, (rows[first : first + size] for first in range(0, len(rows), size)))
     return result
 
 
