@@ -75,8 +75,9 @@ KERNELS = {
     "ranges": ("reduced_equations", "misfits", "iterated_points", "iterated_along"),
     "reading": ("decoded_fields", "placed_fields", "line_ends"),
     "robust": ("reweighted",),
-    "screens": ("suspicions",),
+    "screens": ("suspicions", "clock_medians"),
     "search": ("radii_of_balls", "points_in_balls", "best_points"),
+    "windows": ("window_ages", "decayed_sums"),
 }
 NAMES = [(module, name) for module, names in KERNELS.items() for name in names]
 

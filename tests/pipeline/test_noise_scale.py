@@ -15,8 +15,9 @@ from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
-from railfix.positioning.noise_scale import NoiseScaleLimits, ages, decayed_sums, epoch_variance, robust_fit, steps_s
+from railfix.positioning.noise_scale import NoiseScaleLimits, epoch_variance, robust_fit
 from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.windows import Windows
 from railfix.simulate.demonstration import demo_files
 
 
@@ -55,17 +56,21 @@ def test_sums_decay_as_one_by_one() -> None:
     step = generator.uniform(0.1, 400.0, 300)
     time = np.datetime64("2024-03-05T00:00:00", "ns") + timedelta(np.cumsum(step))
     values = generator.normal(size=(300, 2))
+    limits = {"window_s": 100.0, "least_epochs": 4.0}
     nothing = np.datetime64("NaT", "ns")
-    age = ages(steps_s(time, nothing), 0.0, window_s=100.0, least_epochs=4.0)
-    before, after = decayed_sums(age, values, np.zeros(2), 0.0)
+    whole = Windows.of(time, (slice(None),), [(nothing, 0.0)], **limits)
+    before, after = whole.sums(values, np.zeros((1, 2)))
     total = np.zeros(2)
     for t in range(300):
         if t:
             total = total * np.exp(-min(step[t] / 100.0, 0.25))
         assert before[t] == pytest.approx(total, abs=1e-9)
         total = total + values[t]
-    half = decayed_sums(age[:150], values[:150], np.zeros(2), 0.0)
-    rest = decayed_sums(age[150:], values[150:], half[1], float(age[149]))
+    begun = Windows.of(time[:150], (slice(None),), [(nothing, 0.0)], **limits)
+    half = begun.sums(values[:150], np.zeros((1, 2)))
+    gone_on = Windows.of(time[150:], (slice(None),), begun.last, **limits)
+    rest = gone_on.sums(values[150:], half[1])
+    assert gone_on.last == whole.last
     assert np.array_equal(np.concatenate([half[0], rest[0]]), before)
     assert np.array_equal(rest[1], after)
 

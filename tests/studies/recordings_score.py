@@ -29,14 +29,14 @@ from railfix.positioning.noise_scale import (
     NoiseState,
     OffsetState,
     map_information,
-    noise_age,
+    noise_scale,
     own_sigma_m,
     robust_fit,
-    robust_scale,
     tie_clocks,
 )
 from railfix.positioning.normal_equations import Constrained, Ranges, clock_groups, constrained_position, single_point
 from railfix.positioning.section_search import SearchIndex, search
+from railfix.positioning.windows import Windows
 from railfix.ranges.corrected import code_sigma_m
 from railfix.run.processor import processor_of
 from railfix.track import Track, from_positions
@@ -219,8 +219,12 @@ def smartloc_chain(
     known = np.isfinite(got.arc_m)
     at = np.where(known[:, None], trajectory.at_arc(np.where(known, got.arc_m, 0.0)), middle)
     agreeing = robust_fit(ranges, at, information=map_information(trajectory, np.maximum(got.section, 0)))
-    age = noise_age(time, NoiseState(), limits=config.noise_scale)
-    scale, _ = robust_scale(age, agreeing, known, NoiseState(), limits=config.noise_scale)
+    new, limits = NoiseState(), config.noise_scale
+    windows = Windows.of(
+        time, (slice(None),), [(new.time, new.age)], window_s=limits.window_s, least_epochs=limits.least_epochs
+    )
+    wsse, one = agreeing.variance * agreeing.freedom, np.ones(len(time))
+    scale, _ = noise_scale(windows, wsse, agreeing.freedom, known, one, new.robust[None], limits=limits)
     failed = np.zeros(len(ranges), dtype=bool)
     if "raim" in config.screens:
         model = constrained_model(ranges, trajectory, got.arc_m, section=got.section)

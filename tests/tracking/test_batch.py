@@ -38,7 +38,7 @@ def trajectory(case: Ride) -> Trajectory:
 def epochs(case: Ride, trajectory: Trajectory) -> GnssEpochs:
     config = parse_config({"filter": "off", "protection": "off"})
     processor = processor_of(config, case.simulation.navigation, {"front": trajectory})
-    solved, _ = processor.single_epochs({"front": case.observations})
+    solved, _ = processor.single_epochs(*processor.screened({"front": case.observations}))
     result = solved.results["front"]
     found, _ = gnss_epochs(solved.ranges, result.noise_scale, config, None)
     return replace(found, near_ecef_m=result.conventional_ecef_m)

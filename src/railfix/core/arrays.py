@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -77,3 +78,11 @@ def medians(values: Floats) -> Floats:
     count, row = (rows == rows).sum(axis=1), np.arange(len(rows))
     low, high = rows[row, np.maximum(count - 1, 0) // 2], rows[row, np.minimum(count // 2, width - 1)]
     return np.asarray((low + high) / 2.0).reshape(shape)
+
+
+def over_blocks(function: Callable[[Indices], None], blocks: Iterable[Indices]) -> None:
+    """Call a function for blocks of rows, several at a time: kernels and numpy release the interpreter lock."""
+    if len(every := list(blocks)) == 1:
+        return function(every[0])
+    with ThreadPoolExecutor() as threads:
+        any(threads.map(function, every))  # raises what the function raises

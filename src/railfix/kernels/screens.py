@@ -1,4 +1,4 @@
-"""Levels of satellites after jumps of their codes."""
+"""Levels of satellites after jumps of their codes; medians over the channels of a clock."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Integers, Masks
+from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import kernel
 
 #: A suspicion that there is none of: NaT as a number.
@@ -42,3 +42,34 @@ def suspicions(
         if suspected:
             since[m] = start
     return reject, level, since
+
+
+@kernel
+def clock_medians(values: Floats, clock: Indices, satellite: Indices, least: int) -> Floats:
+    """Return the median of the values (T, M) of each clock at its channels; NaN is left out.
+
+    NaN below `least` satellites with a finite value; clock and satellite of each channel are numbers, shape (M,).
+    """
+    epochs, channels = values.shape
+    result = np.full(values.shape, math.nan)
+    ordered, last_seen = np.empty(channels), np.full(channels, -1)
+    for t in range(epochs):
+        for c in range(clock.max() + 1 if channels else 0):
+            count = satellites = 0
+            for m in range(channels):
+                value = values[t, m]
+                if clock[m] != c or math.isnan(value):
+                    continue
+                at = count
+                while at > 0 and ordered[at - 1] > value:
+                    ordered[at] = ordered[at - 1]
+                    at -= 1
+                ordered[at], count = value, count + 1
+                if last_seen[satellite[m]] != t and not math.isinf(value):
+                    last_seen[satellite[m]], satellites = t, satellites + 1
+            if count > 0 and satellites >= least:
+                median = (ordered[(count - 1) // 2] + ordered[count // 2]) / 2.0
+                for m in range(channels):
+                    if clock[m] == c:
+                        result[t, m] = median
+    return result

@@ -76,38 +76,19 @@ def antenna_results(
         "corrected_code_m": lambda: on_all_channels(corrected.corrected_code_m),
         "residual_m": lambda: on_all_channels(np.where(corrected.reason == 0, constrained.residual_m, np.nan)),
     }
+    raim = changed(solution.raim, protection_level_m=np.where(has, solution.raim.protection_level_m, np.nan))
     result = AntennaResult.made(
-        later,
-        time=obs.time,
-        satellite=obs.satellite,
-        signal=obs.signal,
-        status=solution.status,
-        chainage_m=chainage,
-        arc_m=arc,
-        along_sigma_m=np.where(has, solution.along_sigma_m, np.nan),
-        own_sigma_m=solution.own_sigma_m,
-        noise_scale=solution.noise_scale,
-        conventional_status=solution.point_status,
-        conventional_ecef_m=point.ecef_m,
-        cn0_dbhz=obs.cn0_dbhz,
-        satellites=corrected.satellites,
-        columns=corrected.columns,
-        second=corrected.second,
-        combined=corrected.combined,
-        screens=corrected.screens,
-        single_point=point,
-        section=solution.place.section,
-        constrained=constrained,
-        phase=solution.phase,
-        raim=changed(solution.raim, protection_level_m=np.where(has, solution.raim.protection_level_m, np.nan)),
+        later, time=obs.time, satellite=obs.satellite, signal=obs.signal, status=solution.status, chainage_m=chainage,
+        arc_m=arc, along_sigma_m=np.where(has, solution.along_sigma_m, np.nan), own_sigma_m=solution.own_sigma_m,
+        noise_scale=solution.noise_scale, conventional_status=solution.point_status, conventional_ecef_m=point.ecef_m,
+        cn0_dbhz=obs.cn0_dbhz, satellites=corrected.satellites, columns=corrected.columns, second=corrected.second,
+        combined=corrected.combined, screens=corrected.screens, single_point=point, section=solution.place.section,
+        constrained=constrained, phase=solution.phase, raim=raim,
         protection=None if protection is None else judged(protection, solution.status, has, chainage, config),
-        map_offset=solution.map_offset,
+        map_offset=solution.map_offset, araim=solution.araim, clocks=corrected.clocks,
+        clock_offset_m=solution.ties.offset_m, clock_offset_sigma_m=solution.ties.sigma_m,
         interference=None,  # of each antenna
-        araim=solution.araim,
-        clocks=corrected.clocks,
-        clock_offset_m=solution.ties.offset_m,
-        clock_offset_sigma_m=solution.ties.sigma_m,
-    )
+    )  # fmt: skip
     return result
 
 

@@ -70,15 +70,9 @@ def smoothed(ranges: CorrectedRanges, config: Config, state: CarrierState) -> tu
     if slips is None:
         return ranges, state
     code_m, after = smooth_codes(
-        obs.time,
-        obs.satellite,
-        obs.signal,
-        obs.code_m,
-        slips.phase_m,
-        slips.slip,
-        state.smoothing,
+        obs.time, obs.satellite, obs.signal, obs.code_m, slips.phase_m, slips.slip, state.smoothing,
         limits=config.smoothing,
-    )
+    )  # fmt: skip
     change = code_m - obs.code_m
     corrected = change[:, ranges.columns]
     if ranges.second is not None and ranges.combined is not None:
@@ -129,11 +123,9 @@ def code_and_phase(
     sine = np.sin(np.radians(np.maximum(corrected.elevation_deg, LOWEST_WEIGHTED_DEG)))
     known = np.isfinite(phase)
     phases = Phases(
-        phase_m=np.where(known, phase, 0.0),
-        weight=np.where(known, (sine / config.phase_sigma_m) ** 2, 0.0),
-        arc_id=arcs,
-        integers=integers,
-    )
+        phase_m=np.where(known, phase, 0.0), weight=np.where(known, (sine / config.phase_sigma_m) ** 2, 0.0),
+        arc_id=arcs, integers=integers,
+    )  # fmt: skip
     if integers is not None:
         ranges, phases = _lasting(corrected, ranges, phases, config.phase, state)
     positions, after = phase_positions(time, ranges, phases, trajectory, arc_m, state.phase, limits=limits)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -61,20 +62,29 @@ from railfix.screens.base import pair_antennas
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
-__all__ = ["AntennaResult", "AntennaState", "EpochProcessor", "Result", "SolvedChunk", "State"]
+__all__ = ["AntennaResult", "AntennaState", "EpochProcessor", "Result", "ScreenedChunk", "SolvedChunk", "State"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScreenedChunk:
+    """Corrected ranges of a chunk after the screens, and what later stages take from them."""
+
+    corrected: CorrectedRanges  #: Epochs of all antennas.
+    ranges: Mapping[str, CorrectedRanges]  #: Of each antenna, with the verdicts of its screens.
+    rows: Mapping[str, slice]  #: Epochs of each antenna among those of all.
+    pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.
+    sensors: SensorSamples | None  #: Of the sensors on board since the chunk before.
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SolvedChunk:
     """Single epochs of a chunk, and what the filter along the track takes from them."""
 
+    screened: ScreenedChunk
     results: Mapping[str, AntennaResult]
     ranges: CorrectedRanges  #: After all screens and exclusions, epochs of all antennas.
     off_map: Masks  #: The train is away from the line, shape (T,).
-    rows: Mapping[str, slice]  #: Epochs of each antenna among these.
-    pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.
-    sensors: SensorSamples | None  #: Of the sensors on board since the chunk before.
-    notes: tuple[str, ...]
 
 
 class EpochProcessor:
@@ -164,15 +174,14 @@ class EpochProcessor:
         self._track, self.units, self.balises = track, stations.units, stations.balises
         self._features: dict[str, LineFeatures] = {}
         self._before_filter, self._lacking = FilterState(), self._inactive_notes()
-        self._threads = _threads(len(trajectories))
+
+    @cached_property
+    def _threads(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(len(self.trajectories))
 
     def __getstate__(self) -> dict[str, Any]:
         """Return everything but the threads, which another process has of its own."""
         return {name: value for name, value in self.__dict__.items() if name != "_threads"}
-
-    def __setstate__(self, state: Mapping[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._threads = _threads(len(self.trajectories))
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -239,12 +248,12 @@ class EpochProcessor:
         SettingsError
             As the class.
         """
-        solved, state = self.single_epochs(
+        screened, state = self.screened(
             observations, state, navigation=navigation, messages=messages, sensors=sensors, base=base
         )
-        return self.along_track(solved, state)
+        return self.along_track(*self.single_epochs(screened, state))
 
-    def single_epochs(
+    def screened(
         self,
         observations: Mapping[str, Observations],
         state: State | None = None,
@@ -253,12 +262,15 @@ class EpochProcessor:
         messages: SbasMessages | None = None,
         sensors: SensorSamples | None = None,
         base: Observations | None = None,
-    ) -> tuple[SolvedChunk, State]:
-        """Return the single epochs of one chunk: the part of `process` before the filter; parameters are the same."""
+    ) -> tuple[ScreenedChunk, State]:
+        """Return the ranges of one chunk after the screens: the first part of `process`; parameters are the same.
+
+        Each part uses and replaces its own members of the state, so that the parts of successive chunks can be computed
+        at the same time, each with the state that it left itself.
+        """
         if not (isinstance(observations, Mapping) and observations):
             raise ValueError("observations are one log for each antenna, at least one: {'front': log}")
-        unknown = sorted(set(observations) - set(self.trajectories))
-        if unknown:
+        if unknown := sorted(set(observations) - set(self.trajectories)):
             raise ValueError(f"no trajectory for antenna {', '.join(unknown)}")
         state = state or State()
         for name, part in observations.items():
@@ -278,41 +290,43 @@ class EpochProcessor:
         ranges, own_states = self._screened(names, antennas, corrected, received, state)
         pair = self._pair(ranges)
         ranges = judge_pairs(self._of_pairs, pair, ranges)
-        corrected, solution, own_states = solve(with_screens(corrected, ranges), antennas, self.config, own_states)
+        screened = ScreenedChunk(
+            corrected=with_screens(corrected, ranges), ranges=ranges, rows=dict(zip(names, parts, strict=True)),
+            pair=pair, sensors=sensors,
+            notes=(
+                *_missing_notes(received), *received.notes, *self._lacking, *self._curve_notes(observations),
+                *(self._support.notes(corrected.time) if self._support is not None else ()),
+            ),
+        )  # fmt: skip
+        after = dict(state.antennas)
+        for name, part, own in zip(names, observations.values(), own_states, strict=True):
+            after[name] = changed(own, ended=part.time[-1] if len(part) else own.ended)
+        return screened, changed(state, received=received, antennas=after, base=base_state)
+
+    def single_epochs(self, screened: ScreenedChunk, state: State) -> tuple[SolvedChunk, State]:
+        """Return the single epochs of one chunk: the second part of `process`, before the filter."""
+        names, parts = zip(*screened.rows.items(), strict=True)
+        antennas = AntennaRows(tuple(self.indices[name] for name in names), parts)
+        own_states = [state.antennas.get(name) or AntennaState() for name in names]
+        corrected, solution, own_states = solve(screened.corrected, antennas, self.config, own_states)
         solution, interference, signs = judge_interference(
             corrected, solution, antennas, [own.interference for own in own_states], self.config.interference
         )
         own_states = [changed(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
         solution = with_araim(corrected, solution, antennas, self._support, self.config)
-        solved = SolvedChunk(
-            results=self._results(antennas, corrected, solution, interference, pair, ranges),
-            ranges=corrected,
-            off_map=solution.off_map,
-            rows=dict(zip(names, parts, strict=True)),
-            pair=pair,
-            sensors=sensors,
-            notes=(
-                *_missing_notes(received),
-                *received.notes,
-                *self._lacking,
-                *self._curve_notes(observations),
-                *(self._support.notes(corrected.time) if self._support is not None else ()),
-            ),
-        )
-        after = dict(state.antennas)
-        for name, part, own in zip(names, observations.values(), own_states, strict=True):
-            after[name] = changed(own, ended=part.time[-1] if len(part) else own.ended)
-        return solved, changed(state, received=received, antennas=after, base=base_state)
+        results = self._results(antennas, corrected, solution, interference, screened)
+        solved = SolvedChunk(screened=screened, results=results, ranges=corrected, off_map=solution.off_map)
+        return solved, changed(state, antennas={**state.antennas, **dict(zip(names, own_states, strict=True))})
 
     def along_track(self, solved: SolvedChunk, state: State) -> tuple[Result, State]:
-        """Return the results of one chunk with those of the filter, where it is on: the second part of `process`.
+        """Return the results of one chunk with those of the filter, where it is on: the third part of `process`.
 
         Parameters
         ----------
         state : State
             Of it only what the filter left after the chunk before is used, and replaced.
         """
-        fusion, filter_states, sensors = {}, dict(state.fusion), solved.sensors
+        fusion, filter_states, sensors = {}, dict(state.fusion), solved.screened.sensors
         if sensors:
             for name, own in state.fusion.items():
                 if name not in solved.results:
@@ -320,13 +334,13 @@ class EpochProcessor:
         if self.config.filter == "track":
             found = self._filtered(solved, state)
             motions = {name: tracked.motion for name, (tracked, _) in found.items()}
-            spacing = filter_verdicts(self._of_positions, solved.pair, motions)
+            spacing = filter_verdicts(self._of_positions, solved.screened.pair, motions)
             held_s, limits = self.config.antenna_spacing.filter_held_s, self.config.sensors.balise
             for name, (tracked, own) in found.items():
                 tracked, own = checked(tracked, spacing.get(name), own, held_s)
                 path = self.trajectories[name]
                 fusion[name], filter_states[name] = with_passings(tracked, own, self.balises, path, sensors, limits)
-        result = Result(antennas=with_wheel(solved.results, fusion), notes=solved.notes, fusion=fusion)
+        result = Result(antennas=with_wheel(solved.results, fusion), notes=solved.screened.notes, fusion=fusion)
         return result, changed(state, fusion=filter_states)
 
     def _screened(
@@ -358,16 +372,15 @@ class EpochProcessor:
         corrected: CorrectedRanges,
         solution: Solution,
         interference: Sequence[Interference | None],
-        pair: PairedEpochs | None,
-        ranges: Mapping[str, CorrectedRanges],
+        screened: ScreenedChunk,
     ) -> dict[str, AntennaResult]:
         """Return the results of single epochs by antenna, after the screens of the published positions."""
         chainage = antennas.chainage_at(solution.arc_m)
-        published = {name: chainage[rows] for name, rows in zip(ranges, antennas.parts, strict=True)}
-        screens = {name: dict(own.screens) for name, own in ranges.items()}
-        rows_by_name, status = dict(zip(ranges, antennas.parts, strict=True)), solution.status.copy()
-        for name, verdicts in position_verdicts(self._of_positions, pair, published).items():
-            rows = rows_by_name[name]
+        published = {name: chainage[rows] for name, rows in screened.rows.items()}
+        screens = {name: dict(own.screens) for name, own in screened.ranges.items()}
+        status = solution.status.copy()
+        for name, verdicts in position_verdicts(self._of_positions, screened.pair, published).items():
+            rows = screened.rows[name]
             for verdict in verdicts:
                 doubtful = verdict.screened.reject & with_coordinates(self.config.failed_checks)[status[rows]]
                 status[rows] = np.where(doubtful, verdict.status, status[rows])
@@ -375,28 +388,27 @@ class EpochProcessor:
         results = antenna_results(corrected, antennas, changed(solution, status=status), chainage, self.config)
         return {
             name: changed(rows_of(results, rows), screens=screens[name], interference=own)
-            for (name, rows), own in zip(rows_by_name.items(), interference, strict=True)
+            for (name, rows), own in zip(screened.rows.items(), interference, strict=True)
         }
 
     def _filtered(self, solved: SolvedChunk, state: State) -> dict[str, tuple[AlongTrack, FilterState]]:
         """Return the places of the filter along the track by antenna, and its states; two antennas in two threads."""
 
         def one_antenna(name: str) -> tuple[AlongTrack, FilterState]:
-            rows = solved.rows[name]
+            rows, sensors = solved.screened.rows[name], solved.screened.sensors
             return along_track(
                 rows_of(solved.ranges, rows),
                 single_epochs(solved.results[name], solved.off_map[rows], self.config.map_offset),
                 self.trajectories[name], self.config, state.fusion.get(name) or self._before_filter,
-                samples=solved.sensors, surroundings=self._line_references(name, solved.sensors),
+                samples=sensors, surroundings=self._line_references(name, sensors),
             )  # fmt: skip
 
-        over_antennas = map if self._threads is None else self._threads.map
+        over_antennas = self._threads.map if len(solved.results) > 1 else map
         return dict(zip(solved.results, over_antennas(one_antenna, solved.results), strict=True))
 
     def _curve_notes(self, observations: Mapping[str, Observations]) -> Iterator[str]:
         """Yield notes on a C/N0 curve of another antenna or receiver."""
-        curve = self.setup.cn0_curve
-        if curve is not None and "cn0" in self.config.screens:
+        if (curve := self.setup.cn0_curve) is not None and "cn0" in self.config.screens:
             for name, own in observations.items():
                 yield from (f"{name}: {note}" for note in curve.notes_for(own.header))
 
@@ -416,10 +428,6 @@ class EpochProcessor:
             front, rear, front.anchor_ecef_m, self.trajectories["front"], self.trajectories["rear"],
             tolerance_s=self.config.antenna_pair.tag_tolerance_s,
         )  # fmt: skip
-
-
-def _threads(antennas: int) -> ThreadPoolExecutor | None:
-    return ThreadPoolExecutor(antennas) if antennas > 1 else None
 
 
 def _missing_notes(received: Received) -> tuple[str, ...]:

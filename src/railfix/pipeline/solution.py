@@ -38,11 +38,9 @@ from railfix.positioning.noise_scale import (
     RobustFit,
     epoch_variance,
     information_of,
-    noise_age,
+    noise_scale,
     own_sigma_m,
     robust_fit,
-    robust_scale,
-    stated_scale,
     tie_clocks,
 )
 from railfix.positioning.normal_equations import (
@@ -55,6 +53,7 @@ from railfix.positioning.normal_equations import (
     single_point,
 )
 from railfix.positioning.section_search import SearchIndex
+from railfix.positioning.windows import Windows
 
 
 def reason_of_all_channels(corrected: CorrectedRanges) -> Bits:
@@ -134,17 +133,28 @@ def solve(
         tied = _tie(ranges, ties, point, corrected.anchor_ecef_m, config)
     place = place_on_lines(ranges, antennas, tied, config)
     corrected = corrected.rejected(alone_on_their_clocks(corrected, ties), Reason.ALONE_ON_ITS_CLOCK)
-    ages = antennas.apart(lambda _, rows, state: noise_age(time[rows], state.noise, limits=config.noise_scale), states)
+    learning, noises = config.noise_scale, [state.noise for state in states]
+    windows = Windows.of(
+        time, antennas.parts, [(noise.time, noise.age) for noise in noises],
+        window_s=learning.window_s, least_epochs=learning.least_epochs,
+    )  # fmt: skip
+    least = 1.0 if config.sbas else 0.0  # SBAS states overbounds, which quiet residuals do not shrink
+
+    def robust_scale(sums: list[Floats]) -> tuple[Floats, Floats]:
+        wsse, one = on_line.variance * on_line.freedom, np.ones(len(time))
+        return noise_scale(
+            windows, wsse, on_line.freedom, teaching, one, np.array(sums), limits=learning, least=least
+        )  # fmt: skip
+
     on_line, teaching = _fit_on_line(corrected, ranges, antennas, place, config)
-    lasting_noise = [changed(state.noise, robust=state.lasting.noise) for state in states]
-    raised, raised_sums = _robust_scale(on_line, teaching, antennas, ages, config, lasting_noise)
+    raised, raised_sums = robust_scale([state.lasting.noise for state in states])
     ranges, place, model, lasting, lasting_states = lasting_errors(
         corrected, ranges, antennas, place, raised, config, [state.lasting for state in states]
     )
     if lasting.any():
         corrected = corrected.rejected(lasting, Reason.LASTING_ERROR)
         on_line, teaching = _fit_on_line(corrected, ranges, antennas, place, config)
-    robust, robust_sums = _robust_scale(on_line, teaching, antennas, ages, config, [state.noise for state in states])
+    robust, robust_sums = robust_scale([noise.robust for noise in noises])
     tested, (ranges, place, raim) = ranges, fault_free(ranges, antennas, place, robust, on_line.kept, config)
     constrained, redundancy = place.constrained, redundancy_of(ranges)
     model = model if ranges is tested else line_model(ranges, antennas, constrained)
@@ -152,15 +162,10 @@ def solve(
     teaching = ~off_map & ~raim.faulty
     if "raim" not in config.screens:
         teaching[:] = False
-
-    def own_scale(_: SearchIndex, rows: slice, age: Floats, state: AntennaState) -> tuple[Floats, Floats]:
-        return stated_scale(
-            age, constrained.wsse[rows], redundancy[rows], teaching[rows], robust[rows], state.noise,
-            limits=config.noise_scale,
-        )  # fmt: skip
-
-    scale, stated_sums = antennas.each_with_state(own_scale, ages, states)
-    scale = np.maximum(scale, _least_scale(config))
+    scale, stated_sums = noise_scale(
+        windows, constrained.wsse, redundancy, teaching, robust, np.array([noise.remaining for noise in noises]),
+        limits=learning, least=least,
+    )  # fmt: skip
     on_map = np.isfinite(constrained.arc_m) & ~off_map
 
     def own_absence(_: SearchIndex, rows: slice, state: AntennaState) -> tuple[Masks, OffMapState]:
@@ -212,11 +217,8 @@ def solve(
     )  # fmt: skip
     solution = changed(solution, status=_status(corrected, ranges, solution, judged, off_map, open_elsewhere, config))
     after = []
-    for k, (state, rows) in enumerate(zip(states, antennas.parts, strict=True)):
-        noise = state.noise
-        if len(time[rows]):
-            sums = {"robust": robust_sums[k], "remaining": stated_sums[k]}
-            noise = NoiseState(time=time[rows][-1], age=float(ages[k][-1]), **sums)
+    for k, (state, (when, age)) in enumerate(zip(states, windows.last, strict=True)):
+        noise = NoiseState(time=when, age=age, robust=robust_sums[k], remaining=stated_sums[k])
         after.append(
             changed(
                 state, offsets=offsets[k], noise=noise, map_offset=map_states[k], off_map=off_map_states[k],
@@ -260,28 +262,6 @@ def _fit_on_line(
     information = information_of(antennas.axes_of(section), antennas.sigma_plan_m, antennas.sigma_height_m)
     fit = robust_fit(ranges, at, information=information, limits=config.robust_fit)
     return fit, known & ~_off_map(ranges, antennas, place, arc, config)
-
-
-def _robust_scale(
-    fit: RobustFit,
-    teaching: Masks,
-    antennas: AntennaRows,
-    ages: Sequence[Floats],
-    config: Config,
-    states: Sequence[NoiseState],
-) -> tuple[Floats, list[Floats]]:
-    """Return the noise scale of the receiver by robust fits, and its new sums."""
-
-    def own_scale(_: SearchIndex, rows: slice, age: Floats, state: NoiseState) -> tuple[Floats, Floats]:
-        return robust_scale(age, rows_of(fit, rows), teaching[rows], state, limits=config.noise_scale)
-
-    scale, sums = antennas.each_with_state(own_scale, ages, states)
-    return np.maximum(scale, _least_scale(config)), sums
-
-
-def _least_scale(config: Config) -> float:
-    """Return the least noise scale: SBAS states overbounds, which quiet residuals do not shrink."""
-    return 1.0 if config.sbas else 0.0
 
 
 def _nominal_variance_m2(model: LinearModel, corrected: CorrectedRanges, config: Config) -> Floats:

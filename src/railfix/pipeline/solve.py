@@ -32,7 +32,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.results import RaimResult, patched
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.noise_scale import LastingErrorState, ages, decayed_sums, steps_s
+from railfix.positioning.noise_scale import LastingErrorState
 from railfix.positioning.normal_equations import (
     Constrained,
     Ranges,
@@ -44,6 +44,7 @@ from railfix.positioning.normal_equations import (
     single_point,
 )
 from railfix.positioning.section_search import SearchIndex, Section, search_lines
+from railfix.positioning.windows import Windows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -280,24 +281,15 @@ def lasting_errors(
     left_out = np.zeros(ranges.code_m.shape, dtype=np.bool_)
     if "raim" not in config.screens or not limits.most_satellites:
         return ranges, place, model, left_out, list(states)
-    least = {"window_s": limits.memory_s, "least_epochs": limits.memory_s}
-    step = antennas.apart(lambda _, rows, state: steps_s(time[rows], state.time), states)
-    age = [ages(own, state.age, **least) for own, state in zip(step, states, strict=True)]
+    windows = Windows.of(
+        time, antennas.parts, [(state.time, state.age) for state in states],
+        window_s=limits.memory_s, least_epochs=limits.memory_s,
+    )  # fmt: skip
+    share = np.minimum(windows.step_s, 1.0)[:, None] / limits.memory_s
+    sums = np.stack([_arrange(state, channel, limits.most_satellites) for state in states], axis=1)
     error = _own_errors(model, noise, limits.clipped)
-    sums: list[list[Floats]] = [[] for _ in states]
     for turn in range(limits.most_satellites):
-
-        def mean_error(
-            _: SearchIndex, rows: slice, of_antenna: Floats, since: Floats, state: LastingErrorState,
-            values: Floats = error, turn: int = turn,
-        ) -> tuple[Floats, Floats]:  # fmt: skip
-            start = _arrange(state.sums[:, turn : turn + 1], state.channel, channel).sum(axis=1)
-            share = np.minimum(since, 1.0) / limits.memory_s
-            return decayed_sums(of_antenna, share[:, None] * values[rows], start, state.age)
-
-        mean, after = antennas.each_with_state(mean_error, age, step, states)
-        for k, new in enumerate(after):
-            sums[k].append(new)
+        mean, sums[turn] = windows.sums(share * error, sums[turn])
         worst = np.abs(np.where(ranges.weight > 0, mean, 0.0)).argmax(axis=1) if len(channel) else np.zeros(0, int)
         found = np.zeros_like(left_out)
         if len(channel):
@@ -315,10 +307,8 @@ def lasting_errors(
             model = line_model(ranges, antennas, place.constrained)
             error = _own_errors(model, noise, limits.clipped)
     after_states = [
-        changed(state, time=time[rows][-1], age=float(own[-1]), channel=channel, sums=np.array(new).T)
-        if len(time[rows])
-        else state
-        for rows, own, new, state in zip(antennas.parts, age, sums, states, strict=True)
+        changed(state, time=when, age=age, channel=channel, sums=sums[:, k].T) if len(time[rows]) else state
+        for k, (rows, state, (when, age)) in enumerate(zip(antennas.parts, states, windows.last, strict=True))
     ]
     return ranges, place, model, left_out, after_states
 
@@ -331,11 +321,11 @@ def _own_errors(model: LinearModel, noise: Floats, clipped: float) -> Floats:
     return np.asarray(np.minimum(np.maximum(own, -clipped), clipped) / clipped)
 
 
-def _arrange(sums: Floats, of_channel: Strings, channel: Strings) -> Floats:
-    """Return sums by channel, in rows, for other channels: 0 for new ones; those that are gone are forgotten."""
-    if of_channel is channel:
-        return sums
-    start = np.zeros((len(channel), sums.shape[1]))
-    _, here, there = np.intersect1d(channel, of_channel, return_indices=True)
-    start[here] = sums[there]
+def _arrange(state: LastingErrorState, channel: Strings, turns: int) -> Floats:
+    """Return the sums by turn for some channels, shape (P, K): 0 for new ones; those that are gone are forgotten."""
+    if state.channel is channel:
+        return state.sums.T
+    start = np.zeros((turns, len(channel)))
+    _, here, there = np.intersect1d(channel, state.channel, return_indices=True)
+    start[: state.sums.shape[1], here] = state.sums[there].T
     return start

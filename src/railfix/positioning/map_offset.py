@@ -19,8 +19,8 @@ from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Masks, kernel_array
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.noise_scale import correlated_sums
 from railfix.positioning.normal_equations import RangeArrays, Ranges, SinglePoint
+from railfix.positioning.windows import correlated_sums
 
 _SUMS: Final = 9  #: Sums of a window.
 
@@ -149,9 +149,12 @@ def map_offset(
     sample = np.zeros((len(time), 2, _SUMS))
     rows = usable.nonzero()[0]
     sample[rows, off_map[rows].astype(np.intp)] = terms[rows]
-    both, after = antennas.each_with_state(
-        lambda _, rows, state: _window(time[rows], sample[rows].reshape(-1, 2 * _SUMS), state, limits), states
-    )
+    before, own, ended, last = correlated_sums(
+        time, sample.reshape(-1, 2 * _SUMS), np.array([state.sums for state in states]), antennas.parts,
+        [(state.time, state.age) for state in states], window_s=limits.window_s, correlation_s=limits.correlation_s,
+    )  # fmt: skip
+    both = before + own
+    after = [MapOffsetState(time=when, age=age, sums=own) for (when, age), own in zip(last, ended, strict=True)]
     sums = np.where(off_map[:, None], both[:, _SUMS:], both[:, :_SUMS])
     enough = sums[:, 8] >= limits.least_samples
     sums = np.where(enough[:, None], sums, [1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
@@ -164,16 +167,6 @@ def map_offset(
         detectable_m=np.where(enough[:, None], detectable, np.nan),
     )  # fmt: skip
     return result, after
-
-
-def _window(
-    time: Datetimes, sample: Floats, state: MapOffsetState, limits: MapOffsetLimits
-) -> tuple[Floats, MapOffsetState]:
-    """Return the sums of the window at each epoch, its own included, shape (T, 18), and the state after them."""
-    before, own, sums, age = correlated_sums(
-        time, sample, state.sums, state.time, state.age, window_s=limits.window_s, correlation_s=limits.correlation_s
-    )
-    return before + own, MapOffsetState(time=time[-1], age=age, sums=sums) if len(time) else state
 
 
 def terms_of_epochs(

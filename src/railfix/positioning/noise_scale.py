@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -27,74 +26,10 @@ from scipy.special import ndtri, stdtrit
 from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, kernel_array
 from railfix.core.settings import Settings
-from railfix.core.timescale import seconds
 from railfix.positioning.antenna_rows import EVERY
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, SinglePoint
+from railfix.positioning.windows import Dated, Windows, correlated_sums
 from railfix.track.trajectory import Trajectory
-
-#: Windows that one running sum spans; exp(50) = 5e21, so that it overflows nowhere and keeps all digits of its terms.
-_SPAN: Final = 50.0
-
-
-def steps_s(time: Datetimes, last: np.datetime64) -> Floats:
-    """Time since the epoch before, shape (T,) [s]; 0 where there is none (`last` NaT)."""
-    every = np.concatenate([np.array([last], dtype="datetime64[ns]"), time])
-    return np.fmax(seconds(every[1:] - every[:-1]), 0.0)
-
-
-def ages(step_s: Floats, last_age: float, *, window_s: float, least_epochs: float) -> Floats:
-    """Age of each epoch since the start of a log, shape (T,) [windows], by `steps_s` and the age of the epoch before.
-
-    A window is `window_s` or `least_epochs` epochs, whichever is longer, so that gaps forget no faster than epochs
-    come.
-    """
-    step = np.minimum(step_s / window_s, 1.0 / least_epochs)
-    return np.concatenate([[last_age], step]).cumsum()[1:]
-
-
-def decayed_sums(age: Floats, values: Floats, start: Floats, last_age: float) -> tuple[Floats, Floats]:
-    """Sums of the values (T, K) of all earlier epochs, each times ``exp(-difference of the ages)``, and those after the
-    last.
-
-    Running sums (K,) are kept in units of the decay since the start of a span of 50 windows, so that the same numbers
-    are added in the same order wherever a chunk begins.
-    """
-    span, current, of_current = np.floor(age / _SPAN), start, np.floor(last_age / _SPAN)
-    before = np.empty(values.shape)
-    epochs = len(span)
-    edges = ((span[1:] != span[:-1]).nonzero()[0] + 1).tolist() if epochs > 1 else []
-    for first, end in pairwise([0, *edges, epochs] if epochs else ()):
-        if span[first] != of_current:
-            current = current * np.exp(-_SPAN * (span[first] - of_current))
-            of_current = span[first]
-        growth = np.exp(age[first:end] - _SPAN * of_current)[:, None]
-        sums = np.concatenate([current[None], growth * values[first:end]]).cumsum(axis=0)
-        before[first:end] = sums[:-1] / growth
-        current = sums[-1]
-    return before, current
-
-
-def correlated_sums(
-    time: Datetimes,
-    values: Floats,
-    start: Floats,
-    last: np.datetime64,
-    last_age: float,
-    *,
-    window_s: float,
-    correlation_s: float,
-) -> tuple[Floats, Floats, Floats, float]:
-    """Sums over a window of epochs whose errors are alike for `correlation_s`: each counts by the time since the one
-    before.
-
-    Arguments as for `steps_s` and `decayed_sums`. Returns decayed sums at each epoch, its own values not included
-    (T, K), what each epoch adds (T, K), running sums after the last epoch (K,), and its age.
-    """
-    step = steps_s(time, last)
-    own = np.minimum(step / correlation_s, 1.0)[:, None] * values
-    age = ages(step, last_age, window_s=window_s, least_epochs=window_s / correlation_s)
-    before, after = decayed_sums(age, own, start, last_age)
-    return before, own, after, float(age[-1]) if len(time) else last_age
 
 
 class LastingErrorLimits(Settings):
@@ -218,51 +153,28 @@ class NoiseState:
     remaining: Floats = field(default_factory=lambda: np.zeros(2))
 
 
-def noise_age(time: Datetimes, state: NoiseState, *, limits: NoiseScaleLimits) -> Floats:
-    """Age of each epoch, shape (T,) [windows]."""
-    step = steps_s(time, state.time)
-    return ages(step, state.age, window_s=limits.window_s, least_epochs=limits.least_epochs)
-
-
-def robust_scale(
-    age: Floats, fit: RobustFit, teaching: Masks, state: NoiseState, *, limits: NoiseScaleLimits
-) -> tuple[Floats, Floats]:
-    """Scale of the ranges against their weights (T,) by what agreed before each epoch; and new sums (2,)."""
-    use = teaching & (fit.freedom > 0) & np.isfinite(fit.variance)
-    return _learnt(age, np.where(use, fit.variance * fit.freedom, 0.0), np.where(use, fit.freedom, 0), state.robust,
-                   np.ones(len(age)), state, limits)  # fmt: skip
-
-
-def stated_scale(
-    age: Floats,
-    wsse: Floats,
-    redundancy: Integers,
-    teaching: Masks,
-    robust: Floats,
-    state: NoiseState,
-    *,
-    limits: NoiseScaleLimits,
-) -> tuple[Floats, Floats]:
-    """Scale of the ranges against their weights (T,) by what RAIM left before each epoch; and new sums (2,)."""
-    use = teaching & (redundancy > 0) & np.isfinite(wsse)
-    return _learnt(age, np.where(use, wsse, 0.0), np.where(use, redundancy, 0), state.remaining, robust, state, limits)
-
-
-def _learnt(
-    age: Floats,
+def noise_scale(
+    windows: Windows,
     wsse: Floats,
     freedom: Integers,
-    start: Floats,
+    teaching: Masks,
     prior: Floats,
-    state: NoiseState,
+    start: Floats,
+    *,
     limits: NoiseScaleLimits,
+    least: float = 0.0,
 ) -> tuple[Floats, Floats]:
-    """Root mean square with forgetting around a prior scale, and the sums to go on with."""
-    values = np.array([wsse, freedom]).T
-    before, after = decayed_sums(age, values, start, state.age)
+    """Scale of the ranges against their weights (T,) by the epochs before, `least` at least; and new sums (A, 2).
+
+    Root mean square of the residuals with forgetting around a prior scale (T,); `start`: sums before (A, 2).
+    """
+    use = teaching & (freedom > 0) & np.isfinite(wsse)
+    values = np.array([np.where(use, wsse, 0.0), np.where(use, freedom, 0)], dtype=np.float64).T
+    before, after = windows.sums(values, start)
     if np.isinf(limits.prior):
-        return prior, after
-    return np.sqrt((before[:, 0] + limits.prior * prior**2) / (before[:, 1] + limits.prior)), after
+        return np.maximum(prior, least), after
+    scale = np.sqrt((before[:, 0] + limits.prior * prior**2) / (before[:, 1] + limits.prior))
+    return np.maximum(scale, least), after
 
 
 def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits: NoiseScaleLimits) -> Floats:
@@ -359,14 +271,14 @@ class OffsetState:
         of_each = (self.information, self.moment)
         return np.array([values.get(letter, 0.0) for values in of_each for letter in letters], dtype=np.float64)
 
-    def later(self, letters: Sequence[str], sums: Floats, last: np.datetime64, age: float) -> OffsetState:
+    def later(self, letters: Sequence[str], sums: Floats, last: Dated) -> OffsetState:
         """Return the state with new sums of some clocks (`sums`), those of the others as they are."""
         count = len(letters)
         return OffsetState(
             information={**self.information, **dict(zip(letters, sums[:count], strict=True))},
             moment={**self.moment, **dict(zip(letters, sums[count:], strict=True))},
-            last=last,
-            age=age,
+            last=last[0],
+            age=last[1],
         )
 
 
@@ -406,14 +318,11 @@ def tie_clocks(
         weight = np.where(usable, 1.0 / variance, 0.0)
         difference = np.where(usable, free.clock_m[:, others] - free.clock_m[:, base], 0.0)
         sample = np.concatenate([weight, weight * difference], axis=1)
-    before, after = np.empty(sample.shape), []
-    for state, rows in zip(states, parts, strict=True):
-        own, when = state.sums(letters), time[rows]
-        before[rows], _, sums, age = correlated_sums(
-            when, sample[rows], own, state.last, state.age,
-            window_s=limits.window_s, correlation_s=limits.correlation_s,
-        )  # fmt: skip
-        after.append(state.later(letters, sums, when[-1] if len(when) else state.last, age))
+    before, _, sums, last = correlated_sums(
+        time, sample, np.array([state.sums(letters) for state in states]), parts,
+        [(state.last, state.age) for state in states], window_s=limits.window_s, correlation_s=limits.correlation_s,
+    )  # fmt: skip
+    after = [state.later(letters, *ended) for state, *ended in zip(states, sums, last, strict=True)]
     of_information, of_moment = before[:, : len(others)], before[:, len(others) :]
     has = of_information > 0.0
     safe = np.where(has, of_information, 1.0)

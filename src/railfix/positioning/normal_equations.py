@@ -261,21 +261,11 @@ def _from(
     vertex: Indices, ranges: Ranges, trajectory: Trajectory, limits: ConstrainedLimits
 ) -> tuple[Indices, Floats, Floats, Floats, Integers]:
     """`iterated_along` of a trajectory, from points of it."""
-    return kernels.ranges.iterated_along(
-        ranges.arrays,
-        SectionArrays(
-            trajectory.ecef_m[:-1],
-            trajectory.tangent,
-            trajectory.across,
-            trajectory.up,
-            trajectory.length_m,
-            trajectory.sigma_plan_m,
-            trajectory.sigma_height_m,
-        ),
-        vertex,
-        limits.tolerance_m,
-        limits.max_iterations,
-    )
+    line = SectionArrays(
+        trajectory.ecef_m[:-1], trajectory.tangent, trajectory.across, trajectory.up, trajectory.length_m,
+        trajectory.sigma_plan_m, trajectory.sigma_height_m,
+    )  # fmt: skip
+    return kernels.ranges.iterated_along(ranges.arrays, line, vertex, limits.tolerance_m, limits.max_iterations)
 
 
 class SectionArrays(NamedTuple):

@@ -21,7 +21,8 @@ from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.settings import Settings
-from railfix.positioning.noise_scale import correlated_sums
+from railfix.positioning.antenna_rows import EVERY
+from railfix.positioning.windows import correlated_sums
 
 _FROM_MEAN_SIZE: Final = 1.2533  #: Mean size of a normal deviate, inverted.
 _FIRST_SAMPLES: Final = 2.0  #: Samples with the noise that the weights assume, which the noise scale begins with.
@@ -128,7 +129,8 @@ def combine_codes(
     sample[row, at[both]] = 1.0 / variance[both]
     sample[row, size + at[both]] = difference[both] / variance[both]
     ages = {"window_s": limits.window_s, "correlation_s": limits.correlation_s}
-    before, _, sums, age = correlated_sums(time, sample, own.sums, own.last, own.age, **ages)
+    last_epoch = [(own.last, own.age)]
+    before, _, (sums,), ((last, age),) = correlated_sums(time, sample, own.sums[None], (EVERY,), last_epoch, **ages)
     information, mean = np.zeros(both.shape), np.zeros(both.shape)
     information[both] = before[row, at[both]]
     known = both & (information > 0.0)
@@ -168,7 +170,6 @@ def combine_codes(
         difference_m=apart,
         suspected=np.abs(apart) > np.maximum(limits.suspicion * np.sqrt(total), _LEAST_SUSPICION_M),
     )
-    last = time[-1] if len(time) else own.last
     return found, TwoFrequencyState(names=own.names, sums=sums, scale=of_scale, last=last, age=age)
 
 
@@ -183,13 +184,10 @@ def ionosphere_free(
     share = np.where(np.isfinite(code_m + second.code_m), -1.0 / (second.ratio - 1.0), np.nan)
     first, other = code_m + delays_m[0], second.code_m + delays_m[1]
     return replace(
-        found,
-        code_m=first + share * (other - first),
-        variance_m2=(1.0 - share) ** 2 * noise_m**2 + share**2 * second.noise_m**2 - noise_m**2,
-        share=share,
-        ionosphere_m=-share * (second.code_m - code_m),
-        ionosphere_sigma_m=-share * np.hypot(noise_m, second.noise_m),
-    )
+        found, code_m=first + share * (other - first),
+        variance_m2=(1.0 - share) ** 2 * noise_m**2 + share**2 * second.noise_m**2 - noise_m**2, share=share,
+        ionosphere_m=-share * (second.code_m - code_m), ionosphere_sigma_m=-share * np.hypot(noise_m, second.noise_m),
+    )  # fmt: skip
 
 
 def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphere_m2: Floats) -> tuple[Floats, Floats]:
@@ -207,7 +205,8 @@ def _noise_scale(
     """Return the variance of the differences over the assumed one, by the epochs before, shape (T,), and the sums."""
     size = np.where(known, np.abs(deviation) / np.sqrt(np.where(known, variance, 1.0)), 0.0)
     sample = np.stack([_sum(size), _sum(known.astype(np.float64))], axis=1)
-    before, _, after, _ = correlated_sums(time, sample, own.scale, own.last, own.age, **ages)
+    last_epoch = [(own.last, own.age)]
+    before, _, (after,), _ = correlated_sums(time, sample, own.scale[None], (EVERY,), last_epoch, **ages)
     mean = (_FROM_MEAN_SIZE * before[:, 0] + _FIRST_SAMPLES) / (before[:, 1] + _FIRST_SAMPLES)
     return mean**2, after
 

@@ -21,7 +21,7 @@ from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import level_facts, prior_basis_text, risk_of
-from railfix.pipeline.processor import EpochProcessor, SolvedChunk, State
+from railfix.pipeline.processor import EpochProcessor, ScreenedChunk, SolvedChunk, State
 from railfix.run.batch_check import BatchCheck, add_batch
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.convert import add_mate_results
@@ -92,14 +92,11 @@ def run_files(
             base_ecef_m=None if base is None else base.ecef_m,
         )  # fmt: skip
         rows = ResultRows(
-            folder=folder,
-            line=line,
-            observations=options.observations == "write",
+            folder=folder, line=line, observations=options.observations == "write",
             checks=SensorChecks() if sensors else None,
             batches={name: BatchCheck(trajectory=line.trajectories[name]) for name in logs if options.check == "batch"},
-            passings=balises is not None,
-            replays={name: Replays() for name in logs} if options.smooth == "on" else {},
-        )
+            passings=balises is not None, replays={name: Replays() for name in logs} if options.smooth == "on" else {},
+        )  # fmt: skip
         tally = _position(logs, (sensors, base), processor, rows, beside, progress)
         if rows.replays:
             add_smoothed(rows.replays, processor, folder)
@@ -142,13 +139,9 @@ def open_inputs(
 
     def log_of(paths: tuple[Path, ...]) -> Log:
         return Log(
-            paths=paths,
-            chunk_epochs=options.chunk_epochs,
-            broken_lines=options.broken_lines,
-            start=options.start,
-            end=options.end,
-            date=options.logs.instant,
-        )
+            paths=paths, chunk_epochs=options.chunk_epochs, broken_lines=options.broken_lines, start=options.start,
+            end=options.end, date=options.logs.instant,
+        )  # fmt: skip
 
     from railfix.run.route import LogPositions
 
@@ -158,14 +151,9 @@ def open_inputs(
         reading=options.track,
     )  # fmt: skip
     line = open_line(
-        inputs.track,
-        inputs.vehicle,
-        antennas=tuple(inputs.logs),
-        reading=options.track,
-        heights=inputs.heights,
-        at=at,
+        inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track, heights=inputs.heights, at=at,
         log=positions,
-    )
+    )  # fmt: skip
     logs = {name: log_of(paths) for name, paths in inputs.logs.items()}
     return navigation, line, logs
 
@@ -197,15 +185,16 @@ def _position(
 ) -> Tally:
     """Position chunk by chunk: counts and rows.
 
-    Four chunks are on their way at a time: one is read, one has its single epochs positioned, one is filtered, and the
-    rows of one are written by `beside`.
+    Five chunks are on their way at a time: one is read, one is screened, one has its single epochs positioned, one is
+    filtered, and the rows of one are written by `beside`.
     """
     tally = Tally(min_satellites=processor.config.min_satellites, order=processor.antenna_order())
     state = State()
     written: Future[None] | None = None
     chunks = read_ahead(align_logs({name: log.parts() for name, log in logs.items()}))
     began = clock.perf_counter()
-    for solved in read_ahead(_single_epochs(chunks, others, processor)):
+    screened = read_ahead(_screened(chunks, others, processor))
+    for solved in read_ahead(_single_epochs(screened, processor)):
         result, state = processor.along_track(solved, state)
         if rows.line.route is not None:
             result = without_beside(result, rows.line.route, processor.config)
@@ -224,19 +213,27 @@ def _position(
     return tally
 
 
-def _single_epochs(
+def _screened(
     chunks: Iterator[dict[str, Observations]],
     others: tuple[SensorSamples, BaseLog | None],
     processor: EpochProcessor,
-) -> Iterator[SolvedChunk]:
-    """Yield the single epochs of chunks, each with what sensors and base station measured up to its end."""
+) -> Iterator[ScreenedChunk]:
+    """Yield the screened ranges of chunks, each with what sensors and base station measured up to its end."""
     samples, station = others
     after, state = np.datetime64("NaT", "ns"), State()
     for chunk in chunks:
         end = max(own.time[-1] for own in chunk.values() if len(own))
         sensors, base = samples.between(after, end), None if station is None else station.until(end)
-        solved, state = processor.single_epochs(chunk, state, sensors=sensors, base=base)
+        screened, state = processor.screened(chunk, state, sensors=sensors, base=base)
         after = end
+        yield screened
+
+
+def _single_epochs(screened: Iterator[ScreenedChunk], processor: EpochProcessor) -> Iterator[SolvedChunk]:
+    """Yield the single epochs of chunks."""
+    state = State()
+    for chunk in screened:
+        solved, state = processor.single_epochs(chunk, state)
         yield solved
 
 

@@ -271,19 +271,13 @@ class AntennaPairScreen(PairScreen[AntennaPairLimits]):
         at_front, at_rear = pair.front_epoch, pair.rear_epoch
         ours, theirs = pair_channels(front.satellite, front.signal, rear.satellite, rear.signal)
         here = at_front[:, None], ours
+        rate = -SPEED_OF_LIGHT / front.frequency_hz[ours] * front.doppler_hz[here]
         screened = antenna_pair_screen(
-            front.corrected_code_m[here],
-            rear.corrected_code_m[at_rear[:, None], theirs],
-            front.elevation_deg[here],
-            front.azimuth_deg[here],
-            satellite=front.satellite[ours],
+            front.corrected_code_m[here], rear.corrected_code_m[at_rear[:, None], theirs], front.elevation_deg[here],
+            front.azimuth_deg[here], satellite=front.satellite[ours],
             spacing=spacing_direction(pair.front_ecef_m, pair.rear_ecef_m),
-            tags=TagDifference(
-                rear.time[at_rear] - front.time[at_front],
-                -SPEED_OF_LIGHT / front.frequency_hz[ours] * front.doppler_hz[here],
-            ),
-            limits=limits,
-        )
+            tags=TagDifference(rear.time[at_rear] - front.time[at_front], rate), limits=limits,
+        )  # fmt: skip
         verdicts = {}
         for name, antenna, epochs, channels in (("front", front, at_front, ours), ("rear", rear, at_rear, theirs)):
             own = on_pairs(screened, antenna.reason.shape, epochs, channels)

@@ -17,7 +17,8 @@ from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, Protocol,
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings, medians, read_only
+from railfix import kernels
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings, kernel_array
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
 from railfix.core.settings import Settings
@@ -308,27 +309,14 @@ def pair_antennas(
 
 def clock_medians(values: Floats, satellite: Strings, *, least: int = 0) -> Floats:
     """Median over the channels of one clock, at each channel (T, M); NaN below `least` satellites."""
-    clock, columns, member, of_clock = _clocks(satellite.dtype.str, satellite.tobytes())
-    padded = np.concatenate([values, np.full((len(values), 1), np.nan)], axis=1)
-    median = medians(padded.take(columns, axis=1))
-    if least:
-        seen = (np.isfinite(values).astype(np.float32) @ member > 0).astype(np.float32)
-        median = np.where(seen @ of_clock >= least, median, np.nan)
-    return np.asarray(median[:, clock])
+    return kernels.screens.clock_medians(
+        kernel_array(values), *_clocks(satellite.dtype.str, satellite.tobytes()), least
+    )
 
 
 @lru_cache(maxsize=256)
-def _clocks(kind: str, satellites: bytes) -> tuple[Indices, Indices, Floats, Floats]:
-    """Return clocks of M channels; channels of G clocks, filled up with M, (G, W); which are of S satellites, (M, S);
-    and which of these of a clock, (S, G): small counts are exact as floats of 32 bits.
-    """
+def _clocks(kind: str, satellites: bytes) -> tuple[Indices, Indices]:
+    """Return numbers of clock and satellite of M channels."""
     names = np.frombuffer(satellites, dtype=kind).tolist()
-    clock = np.unique([CLOCK_GROUP[name[0]] for name in names], return_inverse=True)[1].astype(np.intp)
-    number = np.unique(names, return_inverse=True)[1]
-    rows = [(clock == one).nonzero()[0].tolist() for one in range(int(clock.max(initial=-1)) + 1)]
-    widest = max(map(len, rows), default=0)
-    columns = np.array([row + [len(names)] * (widest - len(row)) for row in rows], dtype=np.intp)
-    member = (number[:, None] == np.arange(int(number.max(initial=-1)) + 1)).astype(np.float32)
-    of_clock = (member.T @ (clock[:, None] == np.arange(len(rows))) > 0).astype(np.float32)
-    columns = columns.reshape(len(rows), widest)
-    return read_only(clock), read_only(columns), read_only(member), read_only(of_clock)
+    clock, number = (np.unique(of, return_inverse=True)[1] for of in ([CLOCK_GROUP[n[0]] for n in names], names))
+    return clock.astype(np.intp), number.astype(np.intp)

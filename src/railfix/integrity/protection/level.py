@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import comb
 
 from railfix import kernels
-from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings
+from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings, over_blocks
 from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, Allocation, RiskBudget, allocate
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.model import constrained_model
@@ -158,9 +158,12 @@ def along_track_level(
     if 0 < epochs <= FEW and located.all():
         return ProtectionLevel(**_level_of_block(np.arange(epochs), model, plan, given))
     result = _empty(epochs, plan)
-    for block in _blocks(model, plan, located.nonzero()[0]):
+
+    def fill(block: Indices) -> None:
         for name, values in _level_of_block(block, model.take(block), plan, given).items():
             getattr(result, name)[block] = values
+
+    over_blocks(fill, _blocks(model, plan, located.nonzero()[0]))
     return result
 
 

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.arrays import Floats, Indices, Masks, over_blocks
 from railfix.core.constants import ALONG, LEAST_REDUNDANCY
 from railfix.integrity.protection.risk import RiskBudget, one_sided_k
 from railfix.integrity.raim import LinearModel
@@ -144,8 +144,8 @@ def places_beyond_the_level(
     clear = np.full(len(arc_m), np.nan)
     for index, own in antennas.split(rows):
         clear[own] = index.clear_of_tangent_m(arc_m[own])
-    for first in range(0, len(rows), size):
-        block = rows[first : first + size]
+
+    def fill(block: Indices) -> None:
         part, noise = model.take(block), np.maximum(scale[block], 1.0)
         bound = kernels.off_tangent.risk_off_tangent(
             part.arrays, noise, likely, np.ascontiguousarray(sides[block]), risk.side_prior, clear[block], sigmas,
@@ -164,6 +164,8 @@ def places_beyond_the_level(
                     forms.append(_without_two(parts, design, none, prior))
                 spent = _risk_of_block(index, arc_m[some], level_m[some], none.beside(*forms), risk)
                 result[some] = spent > risk.risk_per_sample
+
+    over_blocks(fill, (rows[first : first + size] for first in range(0, len(rows), size)))
     return result
 
 

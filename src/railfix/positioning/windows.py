@@ -1,0 +1,72 @@
+"""Sums over earlier epochs with exponential forgetting: of noise, clocks, lasting errors, and the map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from railfix import kernels
+from railfix.core.arrays import Datetimes, Floats, Indices
+
+#: Time and age [windows] of an epoch; NaT for none.
+Dated = tuple[np.datetime64, float]
+
+
+class Windows(NamedTuple):
+    """Ages of T epochs since the start of a log, those of A antennas one after the other."""
+
+    step_s: Floats  #: Time since the epoch before; 0 where there is none; shape (T,).
+    growth: Floats  #: Of a sum since the start of its span of windows, shape (T,).
+    decay: Floats  #: Of a sum into the span of an epoch, shape (T,).
+    ends: Indices  #: Row after the last of each antenna, shape (A,).
+    last: list[Dated]  #: Last epoch of each antenna.
+
+    @classmethod
+    def of(
+        cls, time: Datetimes, parts: Sequence[slice], before: Sequence[Dated], *, window_s: float, least_epochs: float
+    ) -> Windows:
+        """Compute the ages by the rows of each antenna and its last epoch before these.
+
+        A window is `window_s` or `least_epochs` epochs, whichever is longer: gaps forget no faster than epochs come.
+        """
+        times, ages = zip(*before, strict=True)
+        ends = np.array([len(time) if rows.stop is None else rows.stop for rows in parts], dtype=np.intp)
+        step, in_span, begun, age = kernels.windows.window_ages(
+            time.astype(np.int64), np.array(times, dtype="datetime64[ns]").view(np.int64),
+            np.array(ages, dtype=np.float64), ends, float(window_s), float(least_epochs),
+        )  # fmt: skip
+        own = [time[rows] for rows in parts]
+        last = [(new[-1] if len(new) else old, now) for new, old, now in zip(own, times, age.tolist(), strict=True)]
+        return cls(step, np.exp(in_span), np.exp(-kernels.windows.SPAN * begun), ends, last)
+
+    def sums(self, values: Floats, start: Floats) -> tuple[Floats, Floats]:
+        """Sums of the values (T, K) of all earlier epochs, each times ``exp(-difference of the ages)``.
+
+        `start`, shape (A, K): running sums after the epochs before; those after the last ones are returned as well.
+        """
+        after, grown = np.array(start, dtype=np.float64), np.ascontiguousarray(self.growth[:, None] * values)
+        return kernels.windows.decayed_sums(grown, self.growth, self.decay, after, self.ends), after
+
+
+def correlated_sums(
+    time: Datetimes,
+    values: Floats,
+    start: Floats,
+    parts: Sequence[slice],
+    before: Sequence[Dated],
+    *,
+    window_s: float,
+    correlation_s: float,
+) -> tuple[Floats, Floats, Floats, list[Dated]]:
+    """Sums over a window of epochs whose errors are alike for `correlation_s`: each counts by the time since the one
+    before.
+
+    Arguments as for `Windows`. Returns decayed sums at each epoch, its own values not included (T, K), what each epoch
+    adds (T, K), running sums after the last epochs (A, K), and these.
+    """
+    windows = Windows.of(time, parts, before, window_s=window_s, least_epochs=window_s / correlation_s)
+    own = np.minimum(windows.step_s / correlation_s, 1.0)[:, None] * values
+    sums, after = windows.sums(own, start)
+    return sums, own, after, windows.last
