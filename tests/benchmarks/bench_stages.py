@@ -41,7 +41,7 @@ STAGES: Final = (
     ("rest of positioning", "railfix.pipeline.processor", "solve"),
     ("conventional position", "railfix.pipeline.solution", "single_point"),
     ("robust fits", "railfix.pipeline.solution", "_agreeing"),
-    ("robust fits", "railfix.pipeline.solution", "_robust_scale"),
+    ("noise scales", "railfix.pipeline.solution", "noise_scale"),
     ("section search", "railfix.pipeline.solve", "search_lines"),
     ("constrained position", "railfix.pipeline.solve", "constrained_on_lines"),
     ("lasting errors", "railfix.pipeline.solution", "lasting_errors"),

@@ -233,7 +233,7 @@ def test_a_session_that_is_behind_says_so_while_data_wait(
     asyncio.run(run_session(engine, {"front": "tcp://127.0.0.1:1"}, [], speed=None))
     (at,) = (count for text, count in said.items() if "behind the receivers: epochs are skipped" in text)
     assert at < skipped() == 60
-    assert len([count for count in polls if 0 < count < 60]) < 20
+    assert len([count for count in polls if 0 < count < 60]) < 50  # by time, not one an epoch
 
 
 def test_a_computer_too_busy_to_skip_is_no_step_of_the_tags() -> None:

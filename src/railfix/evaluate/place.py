@@ -73,7 +73,10 @@ def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float 
 def interpolate_reference(
     time: Datetimes, reference_time: Datetimes, reference_ecef_m: Floats, *, largest_gap_s: float = LARGEST_GAP_S
 ) -> Floats:
-    """Interpolate positions (R, 3) linearly at times (T,) [m]; NaN outside and in steps longer than `largest_gap_s`."""
+    """Reference positions, shape (R, 3), linearly at other times, shape (T, 3) [m]; NaN outside and in gaps.
+
+    Times of the reference rise; steps longer than `largest_gap_s` are not bridged.
+    """
     return bracket(time, reference_time, largest_gap_s=largest_gap_s).of(reference_ecef_m)
 
 
@@ -114,7 +117,11 @@ def along_track_error(
 
 
 def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory) -> Floats:
-    """Straight distance between positions (T, 3) on the map and its point nearest to the reference, shape (T,) [m]."""
+    """Straight distance between positions on the map and the reference's nearest point on the map, shape (T,) [m].
+
+    It needs no choice between several passes of the line at one place, and never exceeds the distance along the line.
+    NaN where the position or the reference, shape (T, 3), is missing.
+    """
     distance = np.full(len(arc_m), np.nan)
     rows = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
     if len(rows):

@@ -25,7 +25,20 @@ from railfix.core.timescale import gps_time
 def carrier_frequency_hz(
     satellite: Strings, signal: Strings, glonass_channel: Mapping[str, int] | None = None
 ) -> Floats:
-    """Return the carrier frequency of each channel, shape (M,) [Hz]; NaN for an unknown band or GLONASS channel."""
+    """Carrier frequency of each channel, shape (M,) [Hz].
+
+    Parameters
+    ----------
+    satellite, signal : ndarray of str, shape (M,)
+        "R05" on "1C".
+    glonass_channel : mapping of str to int, optional
+        Frequency channel of GLONASS satellites.
+
+    Returns
+    -------
+    ndarray, shape (M,) [Hz]
+        NaN where the band is not one of the constellation's, or a GLONASS channel is unknown.
+    """
     channels = np.array([(glonass_channel or {}).get(name, np.nan) for name in satellite.tolist()], dtype=np.float64)
     return frequency_by_name_hz(np.char.add(satellite.astype("<U1"), signal), channels)
 

@@ -217,7 +217,10 @@ class Pulses:
 
 @dataclass(frozen=True, kw_only=True)
 class Acceleration:
-    """Longitudinal acceleration toward the front, A rows [m/s2]; `kind` "motion", or "specific_force" with gravity."""
+    """Longitudinal acceleration toward the vehicle's front, A rows [m/s2].
+
+    `kind`: acceleration of the "motion", or "specific_force", which includes gravity on gradients.
+    """
 
     path: str
     time: Datetimes
@@ -239,7 +242,12 @@ class Acceleration:
 
 
 def read_pulses(path: str | PathLike[str]) -> Pulses:
-    """Read a tachometer table with ``time_gpst`` and ``count`` or ``distance_m``, and maybe ``direction`` (1, -1)."""
+    """Read a tachometer table: CSV (or the same as .parquet) with ``time_gpst`` and the count.
+
+    ``count`` is the reading of a counter (falling when running backward, never wrapping), ``distance_m`` the distance
+    run; with neither, each row is one pulse. A column ``direction`` of 1 and -1 gives the sign. InputFileError: no such
+    table, times that do not rise, a direction other than 1 and -1.
+    """
     table = _sensor_table(path)
     time = _rising_times(table)
     kind = "count" if "count" in table else "distance" if "distance_m" in table else "pulse"
@@ -259,7 +267,12 @@ def read_pulses(path: str | PathLike[str]) -> Pulses:
 
 
 def read_acceleration(path: str | PathLike[str]) -> Acceleration:
-    """Read a table of ``specific_force_mps2``, ``force_forward_mps2`` or ``acceleration_mps2``, to the front."""
+    """Read a table of accelerations toward the front: CSV, or .parquet, with ``time_gpst`` and one other column.
+
+    ``specific_force_mps2`` and ``force_forward_mps2`` (of the simulator) are measured by an accelerometer and
+    include gravity on gradients, which is removed with the map; ``acceleration_mps2`` is that of the motion.
+    InputFileError: none or several of the columns, or times that do not rise.
+    """
     table = _sensor_table(path)
     kinds = {
         "specific_force_mps2": "specific_force",

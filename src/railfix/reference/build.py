@@ -60,7 +60,11 @@ class ReferenceData:
 
 
 def build_references(data: ReferenceData, settings: ReferenceSettings | None = None) -> dict[str, Built]:
-    """Build the reference of every antenna with a log of positions; NoPositionError, MismatchError."""
+    """Reference positions of every antenna that has a log of positions.
+
+    NoPositionError: when there are fewer than two good fixes. MismatchError: when there are two logs of positions
+    without the distance between the antennas, or pulses or accelerations of another time.
+    """
     settings = settings or ReferenceSettings()
     judged = {name: judge_alone(log, settings) for name, log in data.logs.items()}
     if len(judged) == 2:

@@ -24,7 +24,10 @@ _BLOCK: Final = 4096  #: Epochs of a channel computed at once, so that the array
 
 @dataclass(frozen=True, kw_only=True)
 class SatelliteStates:
-    """Satellite states at the times of transmission, T by M; NaN without a code or a valid record."""
+    """Satellite states at the times of transmission, T epochs by M channels.
+
+    NaN where a channel has no code, no record, or only records out of their validity.
+    """
 
     #: In the Earth-fixed frame of the time of transmission, not rotated to that of reception
     #: (`railfix.core.geodesy.range_with_rotation` does that); shape (T, M, 3).

@@ -57,7 +57,10 @@ _SERIES: Final = (
 
 
 def error_over_time(errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None) -> Chart:
-    """Errors on the map and of the conventional position, with sigma and level (P1 figures 7, 10)."""
+    """Errors on the map and of the conventional position, with sigma and protection level (P1 figures 7, 10).
+
+    Both tables are of one antenna, in order of time; `filtered` is of the filter along the track.
+    """
     return _errors(errors, filtered, start_of(errors))
 
 
@@ -217,7 +220,10 @@ _REGIONS: Final = (
 
 
 def stanford(diagram: Stanford, *, title: str = "Stanford diagram") -> Chart:
-    """Protection level over the size of the error, counted in cells (the last ones without end), by region."""
+    """Protection level over the size of the error, counted in cells, with the epochs of each region written into it.
+
+    Values beyond the axes stand in their last cells. The darkness of a cell grows with the logarithm of its epochs.
+    """
     width = diagram.edges_m[1] - diagram.edges_m[0]
     edges = np.append(diagram.edges_m[:-1], diagram.edges_m[-2] + width)
     top, limit = float(edges[-1]), diagram.alarm_limit_m

@@ -59,8 +59,13 @@ def plan(
     background: Sequence[Floats] = (),
     title: str = "Plan of the line",
 ) -> Chart:
-    """Positions of one antenna and line in local metres, with marks of the kilometrage (P1 figure 6): coloured by
-    `error_m`, by `level_m` or by status; of `filtered`, where there is none; `tunnels_m` are chainages.
+    """Positions of one antenna and line in local metres, with marks of the kilometrage (P1 figure 6).
+
+    No layers without a position. The positions are coloured by `error_m` or `level_m`, shape (rows,), by the size of
+    the first that is given, and by their status without either. Of `filtered`, by the filter along the track, those of
+    epochs without a position of their own are drawn. Without `track` the line is drawn through the positions.
+    `tunnels_m` are chainages between which the line runs in a tunnel; `background` are longitudes and latitudes of
+    lines to draw below, each of shape (P, 2) [deg].
     """
     ecef, conventional = points(positions, *ECEF), points(positions, *(f"conventional_{name}" for name in ECEF))
     has = np.isfinite(ecef[:, 0])

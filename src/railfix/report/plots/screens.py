@@ -47,7 +47,10 @@ _LINE_POINTS: Final = 1500
 def draw_screen(
     path: str | PathLike[str], picture: ScreenPicture, time: Datetimes, chainage_m: Floats | None = None
 ) -> Path:
-    """Draw a metric against its limit over T times, and over chainage [m] where known; OutputError: not written."""
+    """Draw a metric against its limit over T times, and over chainage [m] where it is known, as a PNG file.
+
+    OutputError: the file cannot be written.
+    """
     from matplotlib.figure import Figure
 
     charts = [screen_over_time(picture, time)]
@@ -192,7 +195,10 @@ class _ScreenRows:
 
 
 def draw_run_screens(run: Path, out: Path) -> list[Path]:
-    """Draw every screen of a run with observations that tested anything: ``front_doppler.png`` and the like."""
+    """Draw every screen of a run that tested anything, one picture per antenna: ``front_doppler.png`` and the like.
+
+    InputFileError: the folder is not that of a run, or the run wrote no observations (``railfix run --observations``).
+    """
     (reported,), _ = read_runs([run])
     if reported.observations is None:
         raise InputFileError(

@@ -154,7 +154,11 @@ def sky_epochs(
     start: np.datetime64 | None = None,
     title: str = "Sky",
 ) -> SkyEpochs:
-    """Satellites in view of one antenna at at most `epochs` epochs, evenly spaced, up to half of them `wanted`."""
+    """Satellites in view of one antenna, each once with the signal that was used, at some epochs, for sky plots.
+
+    At most `epochs` epochs, evenly spaced; of these up to half are the `wanted` ones. `start` is the origin of the
+    times, the first epoch if not given.
+    """
     rows = observations.lazy().filter(pl.col("elevation_deg") >= 0.0, pl.col("azimuth_deg").is_not_null())
     times = rows.select(pl.col("time_gpst").unique().sort()).collect()["time_gpst"]
     if len(times) > epochs:

@@ -200,7 +200,11 @@ _LEAST_ELEVATION_DEG: Final = 0.5  #: Lowest elevation that is computed [deg].
 
 
 class Environment:
-    """Multipath and blockage along a line, the same for the same seed."""
+    """Multipath and blockage along a line.
+
+    `clear_cn0_dbhz` is the C/N0 of an unobstructed signal at the horizon, and its rise to the zenith. The same seed
+    gives the same structures and, where they are drawn, the same sections.
+    """
 
     def __init__(
         self,

@@ -72,7 +72,10 @@ TUNNEL_CROWN: Final = RoofSettings(inner_m=0.0, outer_m=200.0, height_m=6.5, los
 def draw_sections(
     shares: Mapping[Kind, float], length_m: float, *, section_length_m: Between, seed: int
 ) -> tuple[SectionSettings, ...]:
-    """Draw sections of about `section_length_m` with exactly the given shares of a line, in random order."""
+    """Sections with exactly the given shares of a line, which add up to 1, in random order from 0 to its end.
+
+    `section_length_m` is the approximate range of their lengths; a small share gives one shorter section.
+    """
     rng = np.random.default_rng([seed, 7101])
     low, high = section_length_m
     kinds: list[Kind] = []
