@@ -242,8 +242,8 @@ def test_tables_fit_a_window_of_1300_pixels(tmp_path: Path) -> None:
     with_limits = EvaluationOptions(block_s=20.0)
     evaluation = evaluate_runs([RunAndReference(run=out, reference=demo_truth())], options=with_limits)
     document = report_page(runs, evaluation)
-    assert "95 % limits" in document
-    assert "% to 100.0 %]" in document
+    assert "Limits of 95 % confidence, from blocks of 20 s" in document
+    assert "100.00 to 100.00" in document
     page = tmp_path / "wide.html"
     page.write_text(document.replace("</body>", WIDE), encoding="utf-8")
     read = Page(run_browser(page, "--window-size=1300,1000", "--dump-dom"))

@@ -117,14 +117,14 @@ _STANFORD: Final[Sequence[Column]] = (
     ("limit m", "limit", _text),
     ("epochs", "epochs", count),
     ("nominal", "nominal", count),
-    ("misleading", "misleading", count),
+    ("misl.", "misleading", count),
     ("hazard.\nmisl.", "hazardously_misleading", count),
     ("unavail.", "unavailable", count),
     ("unavail.\nmisl.", "unavailable_misleading", count),
-    ("unjudged", "unjudged", count),
+    ("not\njudged", "unjudged", count),
     ("no\nposition", "no_position", count),
-    ("available\n%", "availability", percent),
-    ("of\nobserved %", "availability_of_observed", percent),
+    ("avail.\n%", "availability", percent),
+    ("of\nobs. %", "availability_of_observed", percent),
     ("blocks\nbeyond", "beyond_blocks", count),
     ("15 s %", "continuity_15_s", percent),
     ("60 s %", "continuity_60_s", percent),
@@ -298,7 +298,9 @@ def _stanford(name: str, rows: pl.DataFrame, caption: str, *first: Column) -> Ta
     limits = [f"{limit:g}{' (own)' if its else ''}" for limit, its in zip(rows["alarm_limit_m"], own, strict=True)]
     shown = rows.with_columns(_OF, pl.Series("limit", limits, dtype=pl.String))
     marked = [] if first else [k for k, its in enumerate(own) if its]
-    return listing(name, shown, [*_where(rows), *first, *_STANFORD], caption, marked=marked)
+    # of one environment a row: usable levels at the alarm limit of the run, as the caption says
+    columns = _STANFORD[2:] if first else _STANFORD
+    return listing(name, shown, [*_where(rows), *first, *columns], caption, marked=marked)
 
 
 def _beyond(found: Integrity, kind: str, worst: int) -> Table:
