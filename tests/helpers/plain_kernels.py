@@ -82,8 +82,8 @@ def memory(
 
 
 def subfilters(names: list[str], place_m: Any, sigma_m: Any, limits: TrackingLimits, weak_s: Any = 0.0) -> Any:
-    """Running sub-filters at places; the last ones, of satellites ahead and behind and of the map, not running."""
-    given, kinds = budget(limits), [kind_of(name) for name in (*names, *OTHERS[2:])]
+    """Running sub-filters at places; the last ones, `OTHERS`, not running."""
+    given, kinds = budget(limits), [kind_of(name) for name in (*names, *OTHERS)]
     size = len(kinds)
     mean, covariance = np.zeros((size, 12)), np.zeros((size, 12, 12))
     mean[: len(names), layout.ARC], covariance[: len(names), layout.ARC, layout.ARC] = place_m, np.square(sigma_m)

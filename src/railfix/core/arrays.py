@@ -85,4 +85,4 @@ def over_blocks(function: Callable[[Indices], None], blocks: Iterable[Indices]) 
     if len(every := list(blocks)) == 1:
         return function(every[0])
     with ThreadPoolExecutor() as threads:
-        any(threads.map(function, every))  # raises what the function raises
+        list(threads.map(function, every))  # raises what the function raises

@@ -43,7 +43,11 @@ class ReferenceCurve:
 
     @classmethod
     def between_stations(cls, stations_m: Floats, *, speed_mps: float) -> Self:
-        """Return the curve of a run that stops at each station (K,) [m], up to a highest speed [m/s]."""
+        """Return the curve of a run that starts and stops at each station with an even acceleration.
+
+        Stations, shape (K,) [m], are in the order of the run; where they are near each other the train does not reach
+        its highest speed [m/s].
+        """
         direction = 1 if stations_m[-1] > stations_m[0] else -1
         time, place, start = [np.zeros(1)], [stations_m[:1]], 0.0
         for origin, way in zip(stations_m[:-1], np.abs(np.diff(stations_m)), strict=True):
@@ -79,7 +83,10 @@ class ReferenceCurve:
         return nearest if distance[nearest] <= _AT_STATION_M else None
 
     def progress(self, chainage_m: float) -> tuple[int, float]:
-        """Return the section, by its first station, and the progress in it in running direction [%] (P5 3.1)."""
+        """Return the section, by its first station, and the progress in it in running direction [%].
+
+        P5 3.1: a train reports the station at a station, else the section and the progress, its length being 100 %.
+        """
         along = self.direction * self.stations_m
         section = int(np.clip(np.searchsorted(along, self.direction * chainage_m, side="right") - 1, 0, len(along) - 2))
         share = (self.direction * chainage_m - along[section]) / (along[section + 1] - along[section])

@@ -98,7 +98,11 @@ class ControlCentre:
 
     @classmethod
     def restore(cls, supervision: Supervision, store: Store, *, judged: bool, **rest: Any) -> ControlCentre:
-        """Return the centre as stored, trains unknown; with a triangle the first start is a stop."""
+        """Return the centre with what a process before has stored; at the first start as `supervision` has it.
+
+        Trains are unknown until they are heard, and points that were moving are moved again. Where a triangle judges
+        satellite positioning, the first start is a stop, to be released by hand.
+        """
         texts, monitor = store.documents(HEAD), MonitorState() if judged else None
         if texts:
             supervision.state = state = from_documents(texts)
@@ -175,7 +179,10 @@ class ControlCentre:
         return [f"train {n} suspects {kind.name.lower()}" for n, kind in sorted(self.interference.items()) if kind]
 
     def judge(self, verdict: TriangleVerdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
-        """Take a verdict of fixes no older than `MonitorLimits.late_s`; the worst between two steps counts."""
+        """Take a verdict on satellite positioning, of fixes of an age; of those between two steps the worst counts.
+
+        Fixes older than `MonitorLimits.late_s`, or from the future by as much, are no verdict.
+        """
         if abs(age_s) > self.times.late_s:
             self.rejected["fixes of the triangle with a wrong age"] += 1
             return
@@ -268,7 +275,10 @@ class ControlCentre:
         return None
 
     def release_train(self, train: int) -> str | None:
-        """Release a train's stop by hand, a silent one's twice (`AGAIN_S`); return the reason of a refusal."""
+        """Release the stop of a train by hand; return the reason of a refusal.
+
+        Nothing says of a silent train that it still is where it was: its release is ordered twice (`AGAIN_S`).
+        """
         now, (least_s, most_s), asked_s = self.clock(), AGAIN_S, self._asked_s.pop(train, -math.inf)
         silent = self.supervision.records.get(train, TrainRecord(train=train)).state is not TrainState.TRACKED
         state, reason = release_train(self.supervision.state, train, self.supervision.layout)

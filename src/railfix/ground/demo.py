@@ -55,7 +55,10 @@ class RelaySettings(Settings):
 
 
 class LinkDisturbance:
-    """Seeded disturbance of packets, counted by what happened to them; every packet is lost unless `up`."""
+    """Seeded disturbance of packets of any kind, counted by what happened to them.
+
+    `settings` may be replaced while packets pass; while `up` is False, an outage, every packet is lost.
+    """
 
     def __init__(self, settings: RelaySettings) -> None:
         self.settings, self.up = settings, True
@@ -156,7 +159,11 @@ def points_ecef_m() -> Floats:
 def draw_fixes(
     rng: np.random.Generator, *, epochs: int = 60, common_m: Floats | None = None, moved_m: Floats | None = None
 ) -> StationFixes:
-    """Return fixes, one a second, with errors `common_m` (T, 9), moved by `moved_m` (T, 3, 2), NaN without fix."""
+    """Return fixes, one a second, from simulated ranges of satellites that stand still.
+
+    `common_m`, shape (T, 9): errors of the satellites, common to the receivers. `moved_m`, shape (T, 3, 2): east and
+    north by which the fix of a receiver moves; NaN: it has none, and its C/N0 has fallen.
+    """
     points, axes = points_ecef_m(), enu_axes(35.7, 139.7)
     el, az = np.radians(ELEVATION_DEG), np.radians(AZIMUTH_DEG)
     enu = np.stack([np.cos(el) * np.sin(az), np.cos(el) * np.cos(az), np.sin(el)], axis=1)

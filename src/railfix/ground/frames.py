@@ -144,7 +144,10 @@ class FrameReceiver:
     _at_ns: int = 0
 
     def receive(self, link: str, data: bytes, now_ns: int) -> tuple[Frame | None, Frame | None]:
-        """Return a frame to be answered, and the same to be used; each None where not, as a second copy is not used."""
+        """Return a frame to be answered and the same to be used; each None where it is not.
+
+        A second copy is answered, so that both links are measured, but not used.
+        """
         frame = self._decode(data)
         if frame is None:
             return None, None

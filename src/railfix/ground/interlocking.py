@@ -102,7 +102,10 @@ class Interlocking:
 
 
 class NearbyTrains:
-    """Trains by where their intervals and routes are, or come to be by one more route; made once for a step."""
+    """Trains by where their intervals and routes are, or come to be by one more route.
+
+    Made once for a step, so that the cost of a step is that of its trains and not of their pairs.
+    """
 
     def __init__(self, state: Interlocking, layout: Layout) -> None:
         self._layout = layout
@@ -340,7 +343,10 @@ def to_documents(state: Interlocking, before: Interlocking | None = None) -> dic
 
 
 def from_documents(texts: Mapping[str, str]) -> Interlocking:
-    """Return the state from its texts, with times of release begun again; InputFileError: of an older version."""
+    """Return the state from its texts. Times of release begin again: the clock of the process before is not known.
+
+    InputFileError: when an older version wrote them.
+    """
     head = json.loads(texts[HEAD])
     if "closed" not in head:
         raise InputFileError("the centre's database", "is of an older version of railfix; name another database")

@@ -154,8 +154,13 @@ _STEP_M: Final = 2.0
 
 
 def layout_of(network: Network, *, drive: Literal["left", "right"] = "left") -> Layout:
-    """Return the layout of a single line with passing loops: chainage from one end along track 1 of each station, the
-    one of trains of rising chainage; points reach to `CLEAR_M` between the tracks. MismatchError: another network.
+    """Return the layout of a network that is one single line with passing loops.
+
+    Its chainage begins at one end and runs along the single line and track 1 of each station. A station is a pair of
+    tracks between the same two switches; single line lies between stations and beyond the outer ones. Points reach
+    from the switch to where the two tracks are `CLEAR_M` apart. Trains of rising chainage pass a station on the side on
+    which they drive: their track is track 1. MismatchError: when the network is something else: several lines,
+    branches, stations of three tracks, loops of unequal length.
     """
     ends = _nodes(network)
     at: dict[int, list[int]] = defaultdict(list)

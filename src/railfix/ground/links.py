@@ -123,7 +123,11 @@ class LinkChoice:
     switches: int = 0
 
     def after(self, now_s: float, normal: LinkMeter, spare: LinkMeter) -> LinkChoice:
-        """Return the choice after new results: spare after misses of the normal link alone, and back after answers."""
+        """Return the choice after new results of both links.
+
+        The spare link is taken after misses of the normal one in a row, unless it misses as well; the normal link
+        again after answers in a row and a time, or at once where only the spare one misses.
+        """
         limits = normal.limits
         lost_normal, lost_spare = normal.misses >= limits.misses, spare.misses >= limits.misses
         if self.active == "A" and lost_normal and not lost_spare:
@@ -156,7 +160,11 @@ def round_trips(meters: Iterable[LinkMeter]) -> tuple[Floats, Floats, Floats]:
 
 
 def draw_coverage(path: Path, bearers: Mapping[LinkName, list[LinkMeter]]) -> None:
-    """Draw response rates along the line (P5, figure 7) and round trips over time and place (9, 10), by bearer."""
+    """Draw the links of trains, by bearer.
+
+    A row for each bearer and direction with the response rate along the line (P5, figure 7); and one for each bearer
+    with the round trips over time and over place (P5, figures 9 and 10), unanswered frames at the foot.
+    """
     from matplotlib.figure import Figure
 
     rows = [
@@ -216,7 +224,10 @@ def bearers_of(addresses: dict[LinkName, tuple[str, int]], local: dict[LinkName,
 
 
 class TrainLinks:
-    """The train's end: a connection on each bearer; `received` is called with each new payload of the centre."""
+    """The train's end: two connections, one on each bearer, with the keys of `railfix.ground.quic.write_keys`.
+
+    `received` is called with the payload of each new frame of the centre.
+    """
 
     def __init__(
         self,
@@ -308,8 +319,12 @@ class TrainLinks:
 
 
 class CentreLinks:
-    """The centre's end: listens at one address a bearer, answers every frame, up to `wait_s` later with a payload, and
-    calls `received` with the train's number and each payload once.
+    """The centre's end: listens at one address a bearer, answers every frame, passes each payload on once.
+
+    `received` is called with the train's number and the payload; ports are free ones where none are given, and stand in
+    `addresses` by bearer. Answers wait up to `wait_s` for a payload to go with. `masquerades` counts connections that
+    were rejected for their certificate, `heard_s` has the monotonic clock of a train's last frame over a bearer, by
+    both, and `alarm` what is wrong with the list of revoked certificates.
     """
 
     def __init__(

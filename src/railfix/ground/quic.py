@@ -56,7 +56,11 @@ def configuration(folder: Path, name: str, *, is_client: bool, idle_s: float = I
 
 
 class LinkProtocol(QuicConnectionProtocol):
-    """One end of a connection that carries datagrams; `peer`: common name of the verified certificate, till `ends`."""
+    """One end of a connection that carries datagrams.
+
+    `peer` is the common name of the other end's certificate, None before it was verified; `ends`, when that ends to be
+    valid.
+    """
 
     def __init__(
         self,
@@ -233,7 +237,10 @@ def check_keys(folder: Path, name: str) -> None:
 
 
 def read_revoked(folder: Path) -> frozenset[str]:
-    """Return the names whose certificates do not count (``revoked.txt``); InputFileError: it cannot be read."""
+    """Return the names whose certificates do not count any more: the lines of ``revoked.txt``, such as ``train-7``.
+
+    InputFileError: when the file is there and cannot be read.
+    """
     path = folder / "revoked.txt"
     try:
         return frozenset(path.read_text(encoding="utf-8").split())
@@ -244,8 +251,10 @@ def read_revoked(folder: Path) -> frozenset[str]:
 
 
 def write_keys(folder: Path, trains: list[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
-    """Write ``authority.pem``, and certificate and key of ``centre`` and each ``train-N``, for their owner; the
-    authority's key is not kept. OutputError: a file is there already, or cannot be written.
+    """Write ``authority.pem``, and certificate and key of ``centre`` and of each ``train-N``; return the files.
+
+    The key of the authority is not kept: for another train write a new set. Keys can be read by their owner alone.
+    OutputError: when a file is there already, or cannot be written.
     """
     now = datetime.now(UTC)
 

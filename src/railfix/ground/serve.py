@@ -135,7 +135,11 @@ class CentreFile(Settings):
         return self
 
     def with_stations(self, folder: Path) -> Self:
-        """Return the settings with the stations of the network, whose files are relative to a folder."""
+        """Return the settings with the stations of the network, whose files are relative to a folder.
+
+        InputFileError, MismatchError: when a map file cannot be read, or the network is no single line with passing
+        loops. SettingsError: when a train stands where there is no station.
+        """
         if not self.network:
             return self
         stations = layout_of(read_network([folder / name for name in self.network]), drive=self.drive).stations
@@ -363,7 +367,10 @@ def _is_loopback(host: str) -> bool:
 
 
 def read_password(path: Path) -> str:
-    """Return the first line of a file that its owner alone can read; InputFileError: empty, or others can read it."""
+    """Return the first line of a file that its owner alone can read.
+
+    InputFileError: when the file cannot be read, is empty, or others can read it.
+    """
     try:
         shared = path.stat().st_mode & 0o077
         lines = path.read_text(encoding="utf-8").splitlines()

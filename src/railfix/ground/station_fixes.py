@@ -114,7 +114,10 @@ def station_fixes(
 
 
 def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats, *, cn0_fallen: Masks) -> StationFixes:
-    """Compute single-point fixes at T times from corrected ranges at known points (N, 3); `cn0_fallen` (T, N)."""
+    """Compute fixes from corrected ranges of the same satellites, by the single-point solution of a run.
+
+    At T times, from N ranges at N known points, shape (N, 3); `cn0_fallen` has the shape (T, N).
+    """
     plane = _plane(points_ecef_m)
     fixes = [
         single_point(item, np.broadcast_to(point, (len(time), 3))).ecef_m
@@ -177,8 +180,12 @@ _USUAL_EPOCHS: Final = 600
 
 
 class StationStreams:
-    """Fixes of receivers at known points as epochs arrive: one counts at a whole second when every receiver has it, and
-    drops older ones; `counts` are "used", "incomplete", "without common satellites".
+    """Fixes of receivers at known points from their epochs as they arrive.
+
+    An epoch counts when every receiver has it; older ones that wait are then dropped. A receiver that sends nothing
+    therefore gives no fixes at all, which the monitor finds by their lateness. Records from the streams are added to
+    the navigation known from the start; epochs at whole seconds are used. `counts`: epochs "used",
+    "incomplete", and "without common satellites".
     """
 
     def __init__(self, points_ecef_m: Floats, *, navigation: Navigation | None = None) -> None:

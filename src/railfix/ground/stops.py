@@ -38,7 +38,12 @@ def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
 
 
 def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Interlocking, str | None]:
-    """Return the state with one train released by hand, points under it locked again, and the reason of a refusal."""
+    """Return the state with the stop of one train released by hand, and the reason of a refusal.
+
+    Points under its interval, which a train that has rolled back has passed, are locked for it again; its next
+    report names its line and its clock. Its station becomes the furthest that its front has reached, on the track that
+    it has there.
+    """
     known = state.trains.get(train)
     if known is None or known.stop is None:
         return state, f"train {train} is not stopped"
@@ -115,7 +120,10 @@ def ask_route_back(
 
 
 def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
-    """Return the state after a report that may answer: the route goes where the train, not being stopped, agrees."""
+    """Return the state after a report that may answer: the route goes where the train agrees, and stays where not.
+
+    Of a stopped train, whose report may be the contradicted one, no answer counts until it is released.
+    """
     known = state.trains[message.train]
     if known.asked_m is None or known.stop is not None or message.sequence != known.sequence:
         return state

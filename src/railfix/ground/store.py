@@ -52,7 +52,10 @@ class DatabaseError(OutputError):
 
 
 class Store:
-    """Stored state of a centre in a database (``sqlite:///centre.db``, ``postgresql+psycopg://...``)."""
+    """Stored state of a centre in a database (``sqlite:///centre.db``, ``postgresql+psycopg://...``).
+
+    InputFileError: when the database cannot be opened.
+    """
 
     def __init__(self, url: str) -> None:
         try:
@@ -71,7 +74,10 @@ class Store:
         self._known: dict[str, set[Any]] = {}
 
     def take_charge(self) -> None:
-        """Make this process the only writer; InputFileError: another one on this machine has the database of SQLite."""
+        """Make this process the only one that writes: a centre in charge before cannot commit any more.
+
+        InputFileError: when another process on this machine has the database of SQLite.
+        """
         database = self._engine.url.database
         if self._engine.dialect.name == "sqlite" and database:
             self._lock = Path(f"{database}.lock").open("a")  # noqa: SIM115 (kept until the store is closed)
@@ -105,8 +111,10 @@ class Store:
         self._engine.dispose()
 
     def save(self, *records: TrainRecord, documents: Mapping[str, str] | None = None) -> None:
-        """Commit reports, named texts and lines of the log together. InputFileError: another centre has taken charge.
-        DatabaseError: nothing is stored, the lines of the log are kept.
+        """Commit reports of trains, named texts and the lines of the log together; they may be acknowledged then.
+
+        InputFileError: when another centre has taken charge of the database since `take_charge`. DatabaseError: when
+        the database fails; nothing is stored then, and the lines of the log are kept.
         """
         try:
             self._save(records, documents or {})

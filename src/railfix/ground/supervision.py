@@ -61,7 +61,10 @@ def compute_contradiction(
     granted: int,
     latest_ns: int | None = None,
 ) -> str | None:
-    """Return what a placed report contradicts, None where it may be right; `latest_ns` is the train's clock at most."""
+    """Return what a placed report contradicts, None where it may be right.
+
+    `granted` is the number of the last authorities, `latest_ns` the train's clock at most, by the centre's own clock.
+    """
     assert message.chainage_cm is not None
     assert message.over_cm is not None
     assert message.under_cm is not None
@@ -106,7 +109,10 @@ def compute_contradiction(
 def stop_contradicted(
     known: TrainInterval, message: TrainMessage, reason: str, rear: float, ahead: float
 ) -> TrainInterval:
-    """Return a train that is stopped, its interval extended to the reported place unless that cannot be right."""
+    """Return a train that is stopped, its interval extended to the reported place unless that cannot be right.
+
+    Whatever else is wrong with a report, as its clock, the train may be there.
+    """
     stopped = replace(
         known, stop=known.stop or reason, sequence=message.sequence, standstill=message.standstill, claimed_m=None
     )
@@ -264,7 +270,10 @@ class Supervision:
         self.state = points_reported(self.state, point, track)
 
     def set_route(self, train: int, **step: Any) -> str | None:
-        """Set a route to the next station in `step` (of `route_requested`); return the reason of a refusal."""
+        """Set a route to the next station; return the reason of a refusal.
+
+        `step` is what `route_requested` takes of the step at hand.
+        """
         if train not in self.state.trains:
             return f"there is no train {train}"
         self.state, moved, reason = route_requested(self.state, train, self.layout, **step)

@@ -115,7 +115,10 @@ class SimulatedTrain:
 
 @dataclass(kw_only=True)
 class Traffic:
-    """Trains and points on a line and the centre that supervises them; messages are those of a subclass."""
+    """Traffic on a line: the trains and points, and the centre that supervises them.
+
+    Its messages are those of a subclass: `send_report` and `exchange`.
+    """
 
     trains: dict[int, SimulatedTrain]
     centre: Supervision

@@ -51,7 +51,13 @@ class Authority(Settings):
 
     @classmethod
     def decode(cls, data: bytes) -> Authority:
-        """Return the authority message of some bytes; MessageError: none of this version."""
+        """Return the message of some bytes.
+
+        Raises
+        ------
+        MessageError
+            The bytes are no authority message of this version.
+        """
         if len(data) != _FORM.size:
             raise MessageError(f"has {len(data)} bytes, an authority has {_FORM.size}")
         version, *values = _FORM.unpack(data)
@@ -120,7 +126,10 @@ class OnBoard:
             self._sent.popitem(last=False)
 
     def moved(self, safe_front_m: float | None, speed_mps: float | None) -> None:
-        """Note the train's safe front end and speed; one wrong place alone agrees to no shorter end."""
+        """Note where the train's safe front end is, and its speed; one wrong place alone agrees to no shorter end.
+
+        A train that has rolled back brakes: what the centre granted before does not know of it.
+        """
         before, self._place_m, self.stops_at_m = self._place_m, None, None
         if safe_front_m is not None:
             if self._front_m is not None and self.direction * (safe_front_m - self._front_m) < -ROLLED_M:
@@ -134,7 +143,11 @@ class OnBoard:
             self.stops_at_m = self.direction * max(self.direction * self._place_m, self.direction * before)
 
     def receive(self, authority: Authority) -> bool:
-        """Take an authority; return whether it counts: newer, for this direction, of this side of a turn."""
+        """Take an authority; return whether it counts: it is newer, for this direction, and of this side of a turn.
+
+        One that answers a report from before the last change of ends may have been granted for the direction of now
+        two changes ago.
+        """
         if authority.number <= self.number or authority.direction != self.direction:
             return False
         if authority.report <= self.before_turn:
@@ -227,7 +240,10 @@ async def run_train(
 
 
 def is_complete(path: Path) -> bool:
-    """Whether the train's integrity device has written "complete" in the last `INTEGRITY_S`."""
+    """Whether the train's integrity device has written "complete" in the last `INTEGRITY_S`.
+
+    A file that is absent, unreadable, older, from the future or says anything else is no confirmation.
+    """
     try:
         age_s = time.time() - path.stat().st_mtime
         return abs(age_s) <= INTEGRITY_S and path.read_bytes()[:64].strip() == b"complete"

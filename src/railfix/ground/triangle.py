@@ -336,7 +336,10 @@ class MonitoredLog:
 def monitor_log(
     fixes: StationFixes, *, limits: TriangleLimits | None = None, times: MonitorLimits | None = None
 ) -> MonitoredLog:
-    """Run the monitor, released at the start, over fixes in order of time; SettingsError: sides too short."""
+    """Run the monitor over fixes in order of time, released at the start.
+
+    SettingsError: when the sides of the triangle are too short for the limits.
+    """
     limits, times = limits or TriangleLimits(), times or MonitorLimits()
     triangle = _compare(fixes, limits)
     seconds = (fixes.time - fixes.time[0]) / np.timedelta64(1, "s")

@@ -88,7 +88,10 @@ class Sessions:
 
 
 def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *, sessions: Sessions) -> Starlette:
-    """Return the web application: the snapshot's plain values as events until ``done``, and orders by their address."""
+    """Return the web application: the snapshot's plain values, and orders by the last part of their address.
+
+    ``done`` in the snapshot ends its events.
+    """
     template = (files("railfix.ground") / "page.html").read_text(encoding="utf-8")
     newest: tuple[float, str, bool] | None = None
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from railfix.core.arrays import Codes, Floats, Masks, changed
+from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.integrity.protection import (
@@ -22,7 +23,6 @@ from railfix.integrity.protection import (
 from railfix.integrity.protection.araim import AraimGeometry, AraimResult, IntegritySupport, araim_levels
 from railfix.integrity.protection.level import MapDeviation, RangeBounds
 from railfix.integrity.protection.open_places import places_beyond_the_level
-from railfix.integrity.protection.risk import SUPPORTED_SIDE_PRIOR
 from railfix.integrity.raim import LinearModel
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges

@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Floats
+from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.settings import Settings
 
 
@@ -159,9 +160,9 @@ class TrackingLimits(Settings):
     level_balise_prior: float = Field(default=1e-6, ge=0, le=3e-6)
     #: Probability that all Dopplers, or all phases, are wrong together. An assumption.
     level_motion_prior: float = Field(default=1e-5, ge=0, lt=1)
-    #: Probability that the codes of all satellites ahead, or of all behind, are late together: as for the low ones of a
-    #: side in single epochs (`railfix.integrity.SUPPORTED_SIDE_PRIOR`).
-    level_side_prior: float = Field(default=1.3e-5, ge=0, lt=1)
+    #: Probability that the codes of all satellites ahead, or of all behind, are late together; as for the low ones of a
+    #: side in single epochs. An assumption.
+    level_side_prior: float = Field(default=SUPPORTED_SIDE_PRIOR, ge=0, lt=1)
     #: Probability that the map is wrong by more than its sigma, and by how much. An assumption.
     level_map_prior: float = Field(default=1e-3, ge=0, lt=1)
     level_map_m: float = Field(default=30.0, gt=0)

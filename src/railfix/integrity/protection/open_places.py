@@ -29,7 +29,10 @@ _NEGLIGIBLE: Final = 0.01  #: Share of the risk of a sample below which places a
 
 
 class Forms(NamedTuple):
-    """Squared residuals over the place d under K hypotheses: ``q(d) = constant - 2 d . slope + d^T matrix d``."""
+    """Sum of squared residuals in variances, over the place d from the position, under K hypotheses, T epochs.
+
+    ``q(d) = constant - 2 d . slope + d^T matrix d``, d along, across and up at the position.
+    """
 
     prior: Floats  # (T, K)
     constant: Floats  # (T, K)
@@ -41,7 +44,10 @@ class Forms(NamedTuple):
         return Forms(*(np.concatenate(arrays, axis=1) for arrays in zip(self, *others, strict=True)))
 
     def radius_m(self, risk: float) -> Floats:
-        """Return the radius of the open places of each hypothesis (T, K), beyond which all have 1 % of the risk."""
+        """Return the distance within which the open places of each hypothesis lie, shape (T, K); 0 without a prior.
+
+        Beyond them all have 1 % of the risk, the same for each.
+        """
         covariance = inverse_3x3(self.matrix)
         centre = np.einsum("tkij,tkj->tki", covariance, self.slope)
         form = np.maximum(np.einsum("tki,tki->tk", centre, self.slope), 0.0)
@@ -55,7 +61,12 @@ class Forms(NamedTuple):
 
 
 def whiten_residuals(model: LinearModel, plan: float, height: float, scale: Floats) -> tuple[Compact, Floats, Forms]:
-    """Return whitened residuals, their design (T, n, 3) [1/m] along, across, up, and the form without fault."""
+    """Return the residuals of n channels with the map error in the noise, their design, and the form without fault (K =
+    1).
+
+    The map error is taken alike in all horizontal directions: another place has another tangent. The design, shape (T,
+    n, 3) [1/m], is the decrease of the residuals by a step along, across and up.
+    """
     normal = np.linalg.inv(model.covariance_m2) - model.prior
     prior = scale[:, None, None] ** 2 * np.diag([plan**-2.0, plan**-2.0, height**-2.0])
     covariance = np.asarray(np.linalg.inv(normal + prior), dtype=np.float64)

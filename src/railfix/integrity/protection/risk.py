@@ -23,6 +23,7 @@ from pydantic import Field, model_validator
 from scipy.special import comb, ndtri
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
+from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.settings import Settings
 from railfix.integrity.raim import LinearModel
 
@@ -37,9 +38,6 @@ K_V: Final = 5.33  #: RTCA DO-229D appendix J, vertical: one dimension, two-side
 SATELLITE_PRIOR: Final[Mapping[str, float]] = MappingProxyType(
     {"G": 1e-5, "J": 3e-5, "E": 3e-5, "C": 3e-5, "R": 3e-5, "S": 3e-5, "I": 3e-5}
 )
-#: Prior of one reflection off a side of the track that the largest data set supports: 2 of 30 943 blocks of 30 s of 70
-#: simulated hours in a city, 95 % (docs/integrity-campaign.md); recordings, which are shorter, support 1e-2.
-SUPPORTED_SIDE_PRIOR: Final = 1.3e-5
 MOST_EXCLUDED: Final = 2  #: Exclusions after which a level is still given (P1 2.3(4) excludes up to two satellites).
 MOST_TOGETHER: Final = 4  #: Faulty satellites at a time that can be hypotheses of a level.
 
@@ -134,7 +132,10 @@ class RiskBudget(Settings):
         return k_factor(self.risk_per_sample)
 
     def prior(self, systems: Sequence[str]) -> Floats:
-        """Fault probability of each channel (M,); ValueError: a constellation has none."""
+        """Fault probability of each channel, shape (M,): of the satellite and of what is around the antenna.
+
+        ValueError: a constellation has no prior.
+        """
         unknown = sorted(set(systems) - set(self.satellite_prior))
         if unknown:
             raise ValueError(f"satellite_prior has no value for constellation {unknown[0]!r}: add one")
@@ -160,7 +161,10 @@ class RiskBudget(Settings):
 
 
 def set_sums(prior: Floats, most: int) -> Floats:
-    """Bound the probability of 0 to `most` faults or more, (T, M) to (T, most + 1), by Newton's identities."""
+    """Sums over sets of 0, 1, ..., `most` faults of the product of their priors, shape (T, M) to (T, most + 1).
+
+    Bounds of the probability of as many faults or more (Newton's identities).
+    """
     power, powers = prior, []
     for _ in range(most):
         powers.append(power.sum(axis=1))
@@ -213,7 +217,12 @@ class Allocation:
 def allocate(
     model: LinearModel, systems: Sequence[str], risk: RiskBudget, out: Integers, sides: Masks, *, wrong_map: bool
 ) -> Allocation:
-    """Divide the risk of each epoch; `out` (T,): satellites excluded; `sides` (T, S, M): sets that fail together."""
+    """Divide the risk of each epoch.
+
+    Satellites alone, in pairs (where these are likelier than their share) and with a wrong map, constellations with one
+    satellite, and sides are hypotheses always; so are classes likelier than what may stay unchecked. `out`, shape (T,):
+    satellites excluded; `sides`, shape (T, S, M): sets of satellites that fail together.
+    """
     used = model.used
     if len(used) <= FEW:  # live, where the same satellites are used epoch after epoch
         given = (used.tobytes(), out.tobytes(), (sides & used[:, None]).tobytes())
@@ -334,7 +343,11 @@ class _Classes:
         return np.asarray(each.sum(axis=1) + self.further)
 
     def choose(self, share: float, likely: Sequence[float], satellite: float, used: Integers) -> Indices:
-        """Return how many satellites at most are left out with each set of shared faults, shape (T, B)."""
+        """Return how many satellites at most are left out with each set of shared faults, shape (T, B).
+
+        `share` may stay unchecked; `likely` are the priors of the shared faults, length B, `satellite` that of a
+        satellite.
+        """
         sizes = np.arange(MOST_TOGETHER + 1)
         feasible = comb(used[:, None], sizes) <= _MOST_SETS
         alone = (self.each[..., None] * self.sums[:, None, :-1] > share) & feasible[:, None]

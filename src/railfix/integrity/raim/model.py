@@ -109,7 +109,10 @@ class LinearModel:
 
     @cached_property
     def redundancy(self) -> Floats:
-        """Share of its own error that a range shows in its residual (T, M), diagonal of S; 0 where unchecked."""
+        """Diagonal of S: the share of its own error that a range shows in its residual, shape (T, M).
+
+        0 where not used, and where nothing checks the range.
+        """
         clocks = np.einsum("tgg->tg", self.clock_covariance_m2)[:, self.clock]
         place = ((self.design @ self.covariance_m2) * self.design).sum(axis=2)
         return np.asarray(self.used * (1.0 - self.root_weight**2 * clocks) - place)
@@ -185,7 +188,11 @@ def model_on_line(
 
 
 def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *, unknowns: int) -> LinearModel:
-    """Whiten, take the clocks out, invert; `axes` (T, 3, 3) of the unknowns, NaN without, `prior` (3, 3) [1/m^2]."""
+    """Whiten, take the clocks out, invert.
+
+    `axes`, shape (T, 3, 3): unit vectors of the unknowns at positions (T, 3), NaN without; `prior`, shape (3, 3)
+    [1/m^2].
+    """
     arrays = ranges.arrays
     weight, clock = arrays.weight, arrays.clock
     distance, los = range_with_rotation(arrays.sat_ecef_m, np.ascontiguousarray(place_ecef_m)[:, None, :])

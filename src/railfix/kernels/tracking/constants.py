@@ -181,5 +181,5 @@ JOINED: Final = 0.05
 #: Newton's steps for the level end when one is smaller than this [m].
 PRECISION_M: Final = 1e-7
 ROUNDS: Final = 60
-#: Least part along the line of the sight of a satellite ahead, or behind: a late code below it moves the place by less.
+#: Satellites whose line of sight has at least this component along the track are ahead, or behind.
 AHEAD: Final = 0.3

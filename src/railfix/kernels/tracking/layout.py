@@ -20,6 +20,7 @@ COMBINED = 7
 SENSORS = 7
 #: Sources of sub-filters after the sensors: all Dopplers, all phases, codes of satellites ahead, behind, the map.
 OTHERS = 5
+ALL_DOPPLERS, ALL_PHASES, CODES_AHEAD, CODES_BEHIND = 0, 1, 2, 3
 WHEEL_ROW, RADAR_ROW, FORCE_ROW, PLACE_ROW, RANGE_ROW = 0, 1, 2, 3, 6
 #: Parts of an epoch: all of it; the prediction alone; what follows a prediction that is in the work space already,
 #: places sought in between; the same where the track was lost.

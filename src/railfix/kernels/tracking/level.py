@@ -1,9 +1,10 @@
 """Level of the filtered position by solution separation over a bank of sub-filters.
 
-Each sub-filter runs the same recursion without one satellite, one constellation or one sensor, from its own beginning:
-a fault of that source, however long it has lasted and whatever it has left in the state, is not in it. With the place
-s and its standard deviation sigma, those of the sub-filters, Q the upper tail of the normal distribution and p_b the
-probability that source b is faulty or was so recently that the filter still remembers it, the level L solves::
+Each sub-filter runs the same recursion without one source (a satellite, a constellation, a sensor, all Dopplers, all
+phases, the codes of all satellites ahead or behind) or with a map that may be wrong, from its own beginning: a fault,
+however long it has lasted and whatever it has left in the state, is not in it. With the place s and its standard
+deviation sigma, those of the sub-filters, Q the upper tail of the normal distribution and p_b the probability that
+source b is faulty or was so recently that the filter still remembers it, the level L solves::
 
     2 Q(L / sigma) + sum over b of p_b [Q((L - |s - s_b|) / sigma_b) + Q((L + |s - s_b|) / sigma_b)] = risk
 
@@ -28,8 +29,12 @@ from railfix.kernels.tracking.constants import (
 from railfix.kernels.tracking.course import find_ends, point_at
 from railfix.kernels.tracking.equations import combine, move_sensor_equations, write_equations
 from railfix.kernels.tracking.layout import (
+    ALL_DOPPLERS,
+    ALL_PHASES,
     ARC,
     CODE_CLOCK,
+    CODES_AHEAD,
+    CODES_BEHIND,
     COMBINED,
     DRIFT,
     MAP_LENGTH_ERROR,
@@ -79,8 +84,8 @@ def _sources(epochs: Epochs, t: int, rows: Rows, bank: Subfilters, slots: int, b
     for j in range(rows.counts[3]):
         source[slots + clocks + min(rows.sensors[j], RANGE_ROW)] = True
     first = slots + clocks + SENSORS
-    source[first], source[first + 1] = rows.counts[2] > 0, rows.counts[1] > 0
-    for b in range(first + 2, first + OTHERS):
+    source[first + ALL_DOPPLERS], source[first + ALL_PHASES] = rows.counts[2] > 0, rows.counts[1] > 0
+    for b in range(first + CODES_AHEAD, first + OTHERS):
         source[b] = rows.counts[0] > 0
     for k in range(slots):
         if epochs.remembered[t, k]:
@@ -218,12 +223,13 @@ def advance_subfilters(
             _begin(bank, b, before and not met[b], best, parameters, work, h)
         else:
             continue
-        side = 1.0 if b == others + 2 else (-1.0 if b == others + 3 else 0.0)
+        side = (1.0 if b == others + CODES_AHEAD else 0.0) - (1.0 if b == others + CODES_BEHIND else 0.0)
         for i in range(gnss):
             k = rows.codes[i] if i < nc else (rows.phases[i - nc] if i < nc + nph else rows.dopplers[i - nc - nph])
             own = epochs.slot[k] if satellite else slots + epochs.offset[k]
-            out = own == b or (b == others and i >= nc + nph) or (b == others + 1 and nc <= i < nc + nph)
-            out = out or (i < nc and side * work.design[best, i, 0] < -AHEAD)
+            out = own == b or (b == others + ALL_DOPPLERS and i >= nc + nph)
+            out = out or (b == others + ALL_PHASES and nc <= i < nc + nph)
+            out = out or (i < nc and side * work.design[best, i, 0] < -AHEAD)  # a way ahead shortens its range
             work.masked[i] = math.inf if out else work.variance[i]
         for j in range(rows.counts[3]):
             own = slots + clocks + min(rows.sensors[j], RANGE_ROW)
@@ -284,12 +290,12 @@ def write_level(
     """
     place, sigma = state.mean[0, ARC], math.sqrt(state.covariance[0, ARC, ARC])
     noise, apart = parameters.level_k * sigma, math.nan
-    start, contradicted, sides = noise, False, len(bank.running) - 3
+    start, contradicted, others = noise, False, len(bank.running) - OTHERS
     for b in range(len(bank.running)):
         if bank.running[b]:
             contradicted = contradicted or bank.weak_s[b] > parameters.level_doubt_s
             away = abs(bank.mean[b, ARC] - place)
-            if not sides <= b < sides + 2:  # without half of the codes one is apart by noise
+            if b < others + CODES_AHEAD or b > others + CODES_BEHIND:  # without half of the codes: apart by noise
                 apart = away if math.isnan(apart) else max(apart, away)
             start = max(start, away + bank.k[b] * math.sqrt(bank.covariance[b, ARC, ARC]))
     outputs.level_noise_m[t], outputs.separation_m[t] = noise, apart
