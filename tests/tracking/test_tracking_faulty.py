@@ -12,7 +12,7 @@ import belief_campaign
 from plain_kernels import plain
 from railfix.core.geodesy import enu_axes
 from railfix.core.timescale import seconds
-from railfix.kernels.tracking.constants import BIAS_FAULTY
+from railfix.kernels.tracking.constants import BIAS_FAULTY, BIAS_SHORT
 from railfix.pipeline.config import parse_config
 from railfix.run.processor import processor_of
 from railfix.run.tally import Tally
@@ -24,12 +24,16 @@ from tracking_cases import LATITUDE, LONGITUDE, bent_line, part, ride
 
 @pytest.mark.requirement("E5")
 def test_the_mean_of_clipped_innovations_by_hand() -> None:
-    bias, update = np.array([0.0, 0.345, 0.5]), plain("tracking.learning").update_bias
-    found = [update(bias, slot, innovation, 1.0) for slot, innovation in ((0, -4.0), (1, 3.0), (2, 3.0))]
+    bias, update = np.array([0.0, 0.345, 0.5, -0.345, -0.545]), plain("tracking.learning").update_bias
+    innovations = (-4.0, 3.0, 3.0, -3.0, -3.0)
+    found = [update(bias, slot, innovation, 1.0) for slot, innovation in enumerate(innovations)]
     share = 1.0 - np.exp(-1.0 / 60.0)
-    np.testing.assert_allclose(bias, [-share, 0.345 + share * 0.655, 0.5 + share * 0.5])
+    after = [-share, 0.345 + share * 0.655, 0.5 + share * 0.5, -0.345 - share * 0.655, -0.545 - share * 0.455]
+    np.testing.assert_allclose(bias, after)
     assert bias[1] > BIAS_FAULTY
-    assert found == [False, True, False]
+    assert BIAS_SHORT < bias[3] < -BIAS_FAULTY
+    assert bias[4] < BIAS_SHORT
+    assert found == [False, True, False, False, True]
 
 
 @pytest.mark.requirement("E5", "C6")
@@ -64,6 +68,17 @@ def test_errors_of_orbits_clocks_and_the_ionosphere_are_no_faults() -> None:
     found, _ = track(replace(case.epochs, code_m=case.epochs.code_m + nominal), case.line, levels=True)
     assert np.isfinite(found.level_m[60:]).all()
     assert (np.abs(found.arc_m - case.arc_m) < found.level_m)[60:].all()
+
+
+@pytest.mark.requirement("C6", "E5")
+def test_a_right_code_among_late_ones_counts() -> None:
+    """Reflections of most satellites pull the clock: codes of the highest, which has none, seem too short."""
+    case = ride(400, noise=1.0, seed=3, code_sigma_m=4.0, speed_mps=lambda t: np.full(len(t), 5.0))
+    generator = np.random.default_rng(11)
+    late = np.abs(generator.normal(0.0, 6.0, (400 // 40, case.epochs.code_m.shape[1]))).repeat(40, axis=0)
+    late[:, 0] = 0.0
+    found, _ = track(replace(case.epochs, code_m=case.epochs.code_m + late), case.line)
+    assert not found.faulty[:, 0].any()
 
 
 @pytest.mark.requirement("C6", "E5")

@@ -80,10 +80,11 @@ CODE_LEAK: Final = 1.0
 
 # Satellites whose codes are wrong for long.
 #: Time constant of the mean innovation [s], what one innovation counts at most, and the mean from which on codes are
-#: left out.
+#: left out: where reflections make most codes late, and the clock with them, the right ones seem too short.
 BIAS_MEMORY_S: Final = 60.0
 BIAS_MOST: Final = 1.0
 BIAS_FAULTY: Final = 0.35
+BIAS_SHORT: Final = -0.55
 #: Errors of a satellite's orbit, clock and ionosphere last for hours: a mean below this is no sign of a wrong map [m].
 NOMINAL_M: Final = 0.8
 #: More satellites left out at a time have no faults of their own where the codes of one are too short, which no

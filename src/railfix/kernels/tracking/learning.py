@@ -18,6 +18,7 @@ from railfix.kernels.tracking.constants import (
     BIAS_MEMORY_S,
     BIAS_MOST,
     BIAS_SATELLITES,
+    BIAS_SHORT,
     CODE_LEAK,
     LARGEST_SCALE,
     LEAST_SCALE,
@@ -110,10 +111,16 @@ def update_bias(code_bias: Floats, slot: int, innovation: float, code_s: float) 
 
     Returns whether its codes are left out from here on.
     """
-    before = abs(code_bias[slot])
+    before = is_faulty(code_bias[slot])
     share = 1.0 - math.exp(-min(code_s, 1.0) / BIAS_MEMORY_S)
     code_bias[slot] += share * (min(max(innovation, -BIAS_MOST), BIAS_MOST) - code_bias[slot])
-    return bool(before <= BIAS_FAULTY < abs(code_bias[slot]))
+    return is_faulty(code_bias[slot]) and not before
+
+
+@borrowing
+def is_faulty(code_bias: float) -> bool:
+    """Tell whether a mean of innovations is that of a satellite whose codes are left out."""
+    return bool(code_bias > BIAS_FAULTY or code_bias < BIAS_SHORT)
 
 
 @borrowing

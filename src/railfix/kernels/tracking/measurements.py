@@ -8,7 +8,6 @@ from railfix.core.arrays import Floats
 from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.algebra import insert, median, middle, restart
 from railfix.kernels.tracking.constants import (
-    BIAS_FAULTY,
     BIAS_INFLATED,
     DIRECTION_MPS,
     FIRST_OFFSET_M2,
@@ -37,6 +36,7 @@ from railfix.kernels.tracking.layout import (
     Rows,
     Work,
 )
+from railfix.kernels.tracking.learning import is_faulty
 
 
 @borrowing
@@ -59,7 +59,7 @@ def code_interval_s(epochs: Epochs, t: int, parameters: Parameters, state: Kerne
         epochs.variance[0, t, k] /= min(code_s, 1.0)
         slot = epochs.slot[k]
         if slot >= 0 and epochs.has[0, t, k] and not epochs.fresh[t, slot]:
-            outputs.faulty[t, k] = abs(state.code_bias[slot]) > BIAS_FAULTY
+            outputs.faulty[t, k] = is_faulty(state.code_bias[slot])
             if outputs.faulty[t, k]:
                 epochs.variance[0, t, k] *= BIAS_INFLATED
     return float(code_s)
