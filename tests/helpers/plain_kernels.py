@@ -16,7 +16,7 @@ from railfix import kernels
 from railfix.kernels import compiling
 from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits
-from railfix.tracking.bank import OTHERS, SENSORS, budget, kind_of
+from railfix.tracking.bank import OTHERS, SENSORS, SourceKind, budget, kind_of
 from railfix.tracking.filter import _parameters
 from railfix.tracking.handover import _work_space
 
@@ -82,7 +82,7 @@ def memory(
 
 
 def subfilters(names: list[str], place_m: Any, sigma_m: Any, limits: TrackingLimits, weak_s: Any = 0.0) -> Any:
-    """Running sub-filters at places; the last ones, `OTHERS`, not running."""
+    """Running sub-filters at places, those of satellites first; the last ones, `OTHERS`, not running."""
     given, kinds = budget(limits), [kind_of(name) for name in (*names, *OTHERS)]
     size = len(kinds)
     mean, covariance = np.zeros((size, 12)), np.zeros((size, 12, 12))
@@ -95,4 +95,5 @@ def subfilters(names: list[str], place_m: Any, sigma_m: Any, limits: TrackingLim
         weak_s=np.where(np.arange(size) < len(names), np.resize(weak_s, size), 0.0),
         prior=np.array(given.prior)[kinds],
         k=np.array(given.k_fault)[kinds],
+        clock=np.zeros(kinds.count(SourceKind.SATELLITE), dtype=np.intp),
     )

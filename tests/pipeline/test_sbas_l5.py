@@ -120,7 +120,7 @@ def test_results_say_what_was_asked_and_used(folder: Path) -> None:
 
 def test_beidou_alone_is_corrected_within_its_levels(folder: Path) -> None:
     """On slots of the mask, each satellite by the record of B-CNAV1 with the issue of its correction."""
-    for name, least in (("positions", 0.2), ("train", 0.9)):  # five satellites
+    for name, least in (("positions", 0.2), ("train", 0.5)):  # five satellites: pairs of them take the level away
         error, level = errors_m(folder, "beidou", name)
         assert np.isfinite(level).mean() > least
         assert (error <= level)[np.isfinite(level)].all()

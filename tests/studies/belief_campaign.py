@@ -9,7 +9,7 @@ pipeline with its defaults from a cold start; ``--mask`` changes the elevation m
 Whole recordings first (``--whole``), then a cold start every ``--every`` seconds, ``--length`` seconds each; with
 ``--faults`` instead faults of one satellite, one constellation, all Dopplers, all phases, a step of all codes, the map,
 pairs, few satellites, and sensors on board where there are any, in windows ``--fault-every`` seconds apart; with
-``--frequencies two`` of one satellite's second code too.
+``--frequencies two`` of one satellite's second code too; with ``--pairs N`` of N pairs of satellites a window instead.
 ``--verbose`` lists the trials that fail.
 
 On a wrong map the straight distance counts, against the level on the ground alone. Otherwise an epoch is *exceeded*
@@ -486,6 +486,26 @@ def second_faults(case: Case, random: np.random.Generator) -> Iterator[tuple[str
     yield "second code 0.1 m/s", with_fault(case, Fault("", drift, nothing, nothing))
 
 
+def pair_faults(case: Case, along: np.ndarray, random: np.random.Generator, pairs: int) -> Iterator[tuple[str, Case]]:
+    """Two random satellites faulty at a time, from the first epoch or from 45 s on."""
+    obs = case.observations
+    t = seconds(obs.time - obs.time[0])
+    names = np.unique(obs.satellite[np.isfinite(obs.code_m).sum(axis=0) > 0.5 * len(t)])
+    nothing = np.zeros(obs.code_m.shape)
+    for _ in range(pairs if len(names) > 1 else 0):
+        one, other = ((obs.satellite == name)[None, :] for name in random.choice(names, 2, replace=False))
+        start = 45.0 if random.random() < 0.5 else 0.0
+        after, on = np.maximum(t - start, 0.0)[:, None], (t >= start)[:, None]
+        both, apart = on & (one | other), on * (one.astype(float) - other)
+        tilt = np.where(both, np.sign(along), 0.0)
+        for size in (20.0, 40.0):
+            yield f"pair late by {size:.0f} m", with_fault(case, Fault("", size * both, nothing, nothing))
+            yield f"pair +{size:.0f}, -{size:.0f} m", with_fault(case, Fault("", size * apart, nothing, nothing))
+        yield "pair's clocks 30 m along", with_fault(case, Fault("", 30.0 * tilt, 30.0 * tilt, nothing))
+        for name, rate in (("0.5 m/s", 0.5 * both), ("+0.5, -0.5 m/s", 0.5 * apart)):
+            yield f"pair's clocks {name}", with_fault(case, Fault("", after * rate, after * rate, rate))
+
+
 def sensor_faults(case: Case, sensors: SensorSamples) -> Iterator[tuple[str, Case]]:
     """Every sensor that there is, wrong from 45 s on."""
     start = case.observations.time[0] + np.timedelta64(45, "s")
@@ -539,6 +559,7 @@ def show_faults(case: Case, args: argparse.Namespace) -> None:
         listed = faults(part, along[first:end], random)
         if args.settings.get("frequencies") == "two":
             listed = chain(listed, second_faults(part, random))
+        listed = pair_faults(part, along[first:end], random, args.pairs) if args.pairs else listed
         for label, faulty in listed:
             trial = run(faulty, settings)
             bad = over(label, trial)
@@ -637,6 +658,7 @@ def main() -> int:
     parser.add_argument("--set", dest="sets", nargs="*", default=[], help="settings of the filter, name=value")
     parser.add_argument("--frequencies", choices=("one", "two"), default="one")
     parser.add_argument("--faults", action="store_true")
+    parser.add_argument("--pairs", type=int, default=0, help="with --faults: so many pairs in their place")
     parser.add_argument("--fault-every", type=float, default=90.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--whole", action="store_true")

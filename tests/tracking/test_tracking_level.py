@@ -39,9 +39,9 @@ def level_of(
         np.array([1.0, sigma])[:count],
         np.log(np.maximum([1.0 - probability, probability], 1e-300))[:count],
     )
-    work = work_space(count)
+    work = work_space(count, len(names))
     far = probability if apart > LIMITS.start_separation_m else 0.0
-    work.branch[1:count] = 0.0 if far else apart, ground, sigma
+    work.branch[1:count] = 0.0 if far else apart, ground, sigma, probability
     bank = subfilters(names, place_m, sigma_m, LIMITS, weak_s)
     fields = ("level_m", "ground_level_m", "level_noise_m", "separation_m")
     answers = named_tuple(layout.Outputs, **{name: np.full(1, np.nan) for name in fields})
@@ -84,6 +84,50 @@ def test_other_branches_are_hypotheses_of_the_level(probability: float) -> None:
         else:
             distance = apart if apart <= LIMITS.start_separation_m else 0.0
             assert spent(found["level_m"], distance) == pytest.approx(given.risk, rel=1e-5)
+
+
+@pytest.mark.requirement("C2")
+def test_two_faulty_satellites_are_a_hypothesis_of_the_level() -> None:
+    """Against the equation, with what is known without both by information that adds up; the pair asks for most."""
+    given = budget(LIMITS)
+    shift, sigma = np.array([1.5, -2.5, 0.1]), np.array([1.25, 1.3, 1.01])
+    found = level_of(["G01", "G02", "G03"], list(100.0 + shift), list(sigma))
+    one, other = (0, 0, 1), (1, 2, 2)
+    known = sigma**-2.0
+    left = known[[*one]] + known[[*other]] - 1.0
+    apart = ((known * shift)[[*one]] + (known * shift)[[*other]]) / left
+    place, own = np.append(shift, apart), np.append(sigma, left**-0.5)
+    prior = np.append(np.full(3, given.prior[0]), np.full(3, given.prior[0] ** 2))
+    level = found["level_m"]
+    parts = prior * (norm.sf((level - place) / own) + norm.sf((level + place) / own))
+    assert parts.argmax() == 3
+    assert 2.0 * norm.sf(level) + parts.sum() == pytest.approx(given.risk, rel=5e-3)
+
+
+@pytest.mark.requirement("C2")
+def test_two_satellites_without_which_nothing_is_known_leave_no_level() -> None:
+    assert level_of(["G01", "G02"], [100.0, 100.0], [1.5, 1.4])["level_m"] == np.inf
+    assert np.isfinite(level_of(["G01", "G02"], [100.0, 100.0], [1.5, 1.3])["level_m"])
+
+
+@pytest.mark.requirement("C2")
+@pytest.mark.parametrize(("one", "other"), [(0, 5), (2, 7), (8, 3)])
+def test_what_is_known_without_two_satellites_is_that_of_a_filter_without_them(one: int, other: int) -> None:
+    case = ride(120, noise=1.0, seed=7, code_sigma_m=3.0)
+    _, state = track(case.epochs, case.line, limits=LIMITS, levels=True)
+    assert state.bank is not None
+    rows = [state.bank.without.index(str(case.epochs.satellite[k])) for k in (one, other)]
+    known = 1.0 / state.bank.covariance[rows, 0, 0]
+    left = known.sum() - 1.0 / state.covariance[0, 0, 0]
+    shift = known @ (state.bank.mean[rows, 0] - state.mean[0, 0]) / left
+    fields = ("code_m", "phase_m", "rate_mps")
+    without = {name: getattr(case.epochs, name).copy() for name in fields}
+    for values in without.values():
+        values[:, [one, other]] = np.nan
+    _, expected = track(replace(case.epochs, **without), case.line, limits=LIMITS)
+    sigma = np.sqrt(expected.covariance[0, 0, 0])
+    assert left**-0.5 == pytest.approx(sigma, rel=0.1)
+    assert state.mean[0, 0] + shift == pytest.approx(expected.mean[0, 0], abs=0.3 * sigma)
 
 
 @pytest.mark.requirement("C6")
@@ -157,7 +201,7 @@ def test_a_source_that_is_never_faulty_needs_no_sub_filter() -> None:
     limits = TrackingLimits(level_constellation_prior=0.0)
     _, state = track(case.epochs, case.line, limits=limits, levels=True)
     assert state.bank is not None
-    assert set(state.bank.without) == {*case.epochs.satellite, *OTHERS}
+    assert set(state.bank.without) == {*case.epochs.satellite, *OTHERS} - {"nothing"}
     rare = budget(TrackingLimits(level_constellation_prior=1e-13, level_fault_prior=1e-3))
     assert rare.prior[1] == 0.0
     assert rare.risk < budget(LIMITS).risk

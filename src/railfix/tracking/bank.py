@@ -38,11 +38,12 @@ class SourceKind(IntEnum):
     MAP = 4
     BALISE = 5
     SIDE = 6
+    NOTHING = 7
 
 
 #: Sources beside satellites, constellations and sensors: all Dopplers, phases, codes of satellites ahead or behind,
-#: the map.
-OTHERS: Final = ("doppler", "phase", "ahead", "behind", "map")
+#: the map; and none.
+OTHERS: Final = ("doppler", "phase", "ahead", "behind", "map", "nothing")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +90,7 @@ def budget(limits: TrackingLimits) -> Budget:
         min(local * limits.level_map_prior, 1.0),
         min(local * limits.level_balise_prior, 1.0),
         min(local * limits.level_side_prior, 1.0),
+        0.0,
     ]
     kept = [prior if MOST_SOURCES * prior > SPARED * risk else 0.0 for prior in exposed]
     risk -= MOST_SOURCES * sum(prior for prior, monitored in zip(exposed, kept, strict=True) if not monitored)
@@ -112,7 +114,8 @@ def kind_of(name: str) -> SourceKind:
     if name in CLOCKS:
         return SourceKind.CONSTELLATION
     if name in OTHERS:
-        kinds = {"map": SourceKind.MAP, "ahead": SourceKind.SIDE, "behind": SourceKind.SIDE}
+        kinds = {"map": SourceKind.MAP, "nothing": SourceKind.NOTHING}
+        kinds |= dict.fromkeys(("ahead", "behind"), SourceKind.SIDE)
         return kinds.get(name, SourceKind.MOTION)
     if name in (SENSORS[Kind.BALISE], SENSORS[Kind.NEXT_BALISE]):
         return SourceKind.BALISE

@@ -273,6 +273,7 @@ def _work_space(
 ) -> tuple[layout.Rows, layout.Work]:
     """Lists of rows and work space of the kernel for so many channels, compact unknowns and hypotheses."""
     width, room = unknowns + len(_OF_EPOCH), hypotheses + 1
+    pairs = sources * (sources - 1) // 2
     most = 3 * channels + sensors
     size = channels + layout.COMBINED + sensors
     shapes = {
@@ -282,7 +283,7 @@ def _work_space(
         "information": (room, size, size), "after": (room, size, size), "change": (room, size),
         "weight": (room, most), "residual": (room, most), "fitted": (room, most), "new_mean": (room, unknowns + 1),
         "new_covariance": (room, unknowns, unknowns), "log_before": (room,), "log_after": (room,),
-        "evidence": (room,), "code_evidence": (room,), "joined": (5, room), "branch": (room, 3),
+        "evidence": (room,), "code_evidence": (room,), "joined": (5, room), "branch": (room + pairs, 4),
         "beyond": (room,), "variance": (most,), "masked": (most,),
         "system": (room, size, size), "factor": (size, size), "lower": (size, size), "right": (max(size, room),),
         "diagonal": (size,), "with_clock": (size,),
