@@ -240,7 +240,8 @@ def judged(case: Case, found: Tracked, first: int = 0) -> Judged:
     """Compare what was found with the reference."""
     place = on_line_m(found, case.trajectory)
     straight = straight_distance(place, case.reference_ecef_m, case.trajectory)
-    chainage = np.abs(found.arc_m - case.reference_arc_m)
+    arc = Line.of(case.trajectory).nearest_m(found.arc_m, case.reference_arc_m)
+    chainage = np.abs(arc - case.reference_arc_m)
     known = np.isfinite(case.reference_ecef_m[:, 0])
     known[:first] = False
     # A place off the map has no straight distance: it is as wrong as its arc length.

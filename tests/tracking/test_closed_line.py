@@ -95,6 +95,11 @@ def test_beyond_the_end_the_ring_goes_on() -> None:
         line.nearest_m(both, np.array(2.0 * length + 5.0)), [2.0 * length + 3.0, 2.0 * length - 3.0]
     )
     open_line = Line.of(bent_line())
+    into_itself, last = Line.of(bent_line()), float(open_line.arc_m[-1])
+    into_itself.__dict__["joins_m"] = (np.nan, 200.0)  # its end goes on at 200 m
+    either = np.array([last - 3.0, 203.0])
+    np.testing.assert_allclose(into_itself.nearest_m(either, np.array(last + 5.0)), [last - 3.0, last + 3.0])
+    np.testing.assert_allclose(into_itself.nearest_m(either, np.array(202.0)), [last - 3.0, 203.0])
     np.testing.assert_array_equal(open_line.nearest_m(np.array([3.0]), np.array(5000.0)), [3.0])
 
 

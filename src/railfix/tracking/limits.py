@@ -149,7 +149,8 @@ class TrackingLimits(Settings):
     level_risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
     #: Independent errors an hour: those of codes last about a minute.
     level_samples_per_hour: float = Field(default=60.0, gt=0)
-    #: Probability that a satellite is faulty at such a sample: multipath beyond its weight in a city. An assumption.
+    #: Probability that a satellite is faulty at such a sample, two with its square: multipath beyond its weight in a
+    #: city. An assumption.
     level_fault_prior: float = Field(default=1e-3, ge=0, lt=1)
     #: Probability that a fault is common to a constellation: 1e-4, that of the ARAIM milestone 3 report for Galileo.
     level_constellation_prior: float = Field(default=1e-4, ge=0, lt=1)

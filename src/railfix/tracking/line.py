@@ -129,6 +129,7 @@ class Line:
         for other in (
             np.where(arc_m >= after, arc_m + (last - after), np.nan),
             np.where(arc_m <= before, arc_m - (before - first), np.nan),
+            arc_m + back,
         ):
             nearest = np.where(np.abs(other - inside) < np.abs(nearest - inside), other, nearest)
         return np.asarray(nearest - back)
