@@ -87,6 +87,11 @@ MORE: Final[dict[str, Mistake]] = {
     "vehicle_as_curve": ({}, _RUN + " --cn0-curve {desk}/train.toml", 3, "is not a C/N0 curve"),
     "vehicle_as_model": ({}, _RUN + " --error-model {desk}/train.toml", 3, "is not an error model"),
     "vehicle_as_sbas": ({}, _RUN + " --sbas {desk}/train.toml", 3, "begins no SBAS file"),
+    "support_missing": ({}, _RUN + " --set integrity_support=no.toml", 3, "check what --set integrity_support names"),
+    "base_far_away": (
+        {}, _RUN + " --base {desk}/rear.obs --base-place 50,8,100", 5, "km from the line, expected 100 km at most",
+    ),
+    "place_without_base": ({}, _RUN + " --base-place 35,139,50", 4, "--base-place is given without --base"),
     # -- a run: options
     "end_before_start": (
         {}, _RUN + " --start 2024-03-05T03:10:10 --end 2024-03-05T03:10:05", 4, "give an earlier start",
@@ -290,6 +295,7 @@ MORE: Final[dict[str, Mistake]] = {
         {}, f"cn0-curve {_LOG.replace('--front ', '')} --plot {{desk}}/s.xls --out {{out}}.toml", 8, "ends in .png",
     ),
     # -- live
+    "place_without_station": ({}, _LIVE + " --base-place 35,139,50", 4, "--base-place is given without --base"),
     "state_of_another": ({"s.json": "{}"}, _LIVE + " --state {desk}/s.json", 8, "is no state file of railfix live"),
     "state_over_the_track": ({}, _LIVE + " --state {desk}/line.csv", 8, "is an input, which is never overwritten"),
     "metrics_nowhere": ({}, _LIVE + " --metrics nonsense", 4, "expected HOST:PORT"),

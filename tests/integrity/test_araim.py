@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -158,6 +159,24 @@ def test_levels_are_those_of_a_loop_over_the_modes_to_a_millimetre(
     for q, (phmi, alarm) in enumerate(((1e-9, 4.5e-8), (1e-9, 4.5e-8), (9.8e-8, 3.9e-6))):
         expected = mode_by_mode(given, q, phmi, alarm, 1e-7, faults)
         assert found.level_m[0, q] == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.requirement("C5")
+def test_an_observation_that_is_not_used_may_have_any_design() -> None:
+    """A satellite without a record has no direction: the levels are those of the others."""
+    whole, last = twelve(), np.arange(12) == 11
+    unused = replace(
+        whole,
+        design=np.where(last[:, None], np.nan, whole.design),
+        sigma_int_m=np.where(last, np.nan, whole.sigma_int_m),
+        sigma_acc_m=np.where(last, np.nan, whole.sigma_acc_m),
+    )
+    names = ("design", "sigma_int_m", "sigma_acc_m", "bias_m", "together")
+    others = {name: getattr(whole, name)[:, :11] for name in names}
+    rest = replace(whole, **others, prior=whole.prior[:11])
+    np.testing.assert_allclose(
+        in_space(unused, AraimBudget()).level_m, in_space(rest, AraimBudget()).level_m, atol=1e-9
+    )
 
 
 @pytest.mark.requirement("C5")

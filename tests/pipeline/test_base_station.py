@@ -173,6 +173,23 @@ def test_integers_without_a_base_station_and_two_kinds_of_corrections_are_refuse
         )
 
 
+@pytest.mark.parametrize(
+    ("base", "settings", "words"),
+    [
+        (True, {}, "a base station subtracts errors of one"),
+        (False, {"signals": {"G": ["5Q"]}}, "no satellite has a second code"),
+        (False, {}, ""),
+    ],
+)
+def test_one_frequency_in_place_of_two_is_told(drive: Drive, base: bool, settings: dict[str, Any], words: str) -> None:
+    config = parse_config({"filter": "off", "protection": "off", "frequencies": "two", "systems": ["G"], **settings})
+    stations = Stations(base_ecef_m=PLACE if base else None)
+    processor = EpochProcessor(config, {"front": drive.trajectory}, navigation=drive.navigation, stations=stations)
+    result, _ = processor.process({"front": drive.train[:1]}, base=drive.base[:1] if base else None)
+    told = [note for note in result.notes if note.startswith("frequencies: two asked for, one used: ")]
+    assert [note.split(": ")[-1] for note in told] == ([words] if words else [])
+
+
 @pytest.fixture
 def line_trajectory() -> Trajectory:
     from railfix.track import Track

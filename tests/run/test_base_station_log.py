@@ -1,16 +1,21 @@
 """Log of a base station: read in step with that of the train, at a place that is known."""
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.observations import ObservationHeader, Observations
+from railfix.run.checks import check_base
 from railfix.run.inputs import RunOptions
 from railfix.run.processor import BaseLog, base_log
 from railfix.run.sources import Log
+from railfix.run.tally import AntennaTally, Tally
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
 
 pytestmark = pytest.mark.requirement("A12")
 START = np.datetime64("2026-01-01T00:00:00", "ns")
@@ -60,6 +65,27 @@ def test_the_place_is_the_one_given_or_that_of_the_header() -> None:
     np.testing.assert_allclose(BaseLog(Parts(part([0.0])), given).ecef_m, PLACE + 10.0, atol=1e-3)
     with pytest.raises(SettingsError, match="--base-place '1,2': expected LAT,LON,HEIGHT"):
         BaseLog(Parts(part([0.0])), "1,2")
+
+
+@pytest.mark.parametrize(
+    ("late_s", "east_m", "words"),
+    [
+        (0.0, 0.0, ""),
+        (59.0, 0.0, ""),
+        (-3.0, 0.0, "of 2026-01-01 00:00 to 00:00 and the logs of 2025-12-31 23:59 to 23:59"),
+        (120.0, 0.0, "have no time in common; give one that overlaps"),
+        (0.0, 2e5, "200 km from the line, expected 100 km at most"),
+    ],
+)
+def test_a_station_of_another_time_or_place_does_not_match(late_s: float, east_m: float, words: str) -> None:
+    log = BaseLog(Parts(part([0.0, 1.0, 2.0])), None)
+    first, last = (START + np.timedelta64(round(1e9 * (2.0 + late_s - s)), "ns") for s in (1.0, 0.0))
+    log.until(last)
+    tally = Tally(antennas={"front": AntennaTally(first=first, last=last)})
+    away = np.array([PLACE[1], -PLACE[0], 0.0]) / np.hypot(*PLACE[:2]) * east_m
+    line = Trajectory.from_track(Track.from_ecef(PLACE + away + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 50.0]])))
+    with pytest.raises(MismatchError, match=words) if words else contextlib.nullcontext():
+        check_base(log, tally, {"front": line})
 
 
 def test_what_is_missing_is_one_sentence() -> None:

@@ -1,7 +1,8 @@
 """One against two frequencies on the recordings that have two, printed as a table.
 
 Run ``python tests/studies/frequencies_score.py`` with the recordings beside the checkout. The field of the ionosphere
-was shaped with all of them in view but the phone and, for the satellites' rest, the town.
+was shaped with all of them in view but the phone and, for the satellites' rest, the town. What does not move has no
+direction: the mean over lines of twelve directions is printed as well.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ _LIVE_EPOCHS = 120
 _STARTS = range(0, 50, 5)
 #: Date of the station's day [year].
 _STATION_YEAR = 2020.48
+#: Directions of the lines over which the errors of what does not move are averaged [degrees].
+_DIRECTIONS = range(0, 180, 15)
 
 
 def recordings(data: Path) -> Iterator[tuple[str, Observations, Path, Floats, Trajectory]]:
@@ -92,6 +95,17 @@ def row(log: Observations, navigation: Path, reference: Floats, line: Trajectory
     return " | ".join([*texts, f"{1e3 * taken:6.2f}"])
 
 
+def over_directions(log: Observations, navigation: Path, reference: Floats, frequencies: str) -> tuple[Floats, Floats]:
+    """Percentiles of the errors along lines of all directions, of single epochs: mean, and p95 of each."""
+    config = parse_config({"frequencies": frequencies, "filter": "off", "elevation": {"mask_deg": 15.0}})
+    records, errors = read_navigation([navigation]), []
+    for azimuth in _DIRECTIONS:
+        line = straight_line(reference[0], azimuth)
+        result, _ = processor_of(config, records, {"front": line}).process({"front": log})
+        errors.append(_of_errors(straight_distance(result.antennas["front"].arc_m, reference, line)))
+    return np.mean(errors, axis=0), np.array(errors)[:, 1]
+
+
 def _filtered(processor: EpochProcessor, log: Observations, reference: Floats, line: Trajectory) -> str:
     """Percentiles of the filter's errors, each the mean over starts: by which lap of a road it begins is chance."""
     errors = []
@@ -125,6 +139,13 @@ def main() -> int:
     for name, log, navigation, reference, line in recordings(paths.DATA):
         for frequencies in ("one", "two"):
             print(f"{name:16} {frequencies:3}   {row(log, navigation, reference, line, frequencies)}", flush=True)
+        if name.endswith("az 90"):
+            (one, of_one), (two, of_two) = (over_directions(log, navigation, reference, f) for f in ("one", "two"))
+            wider = f"95 % larger with two on {int((of_two > of_one).sum())} of {len(of_one)}"
+            print(
+                f"{name[:-2] + 'all':16} one   {_text(one)}\n{name[:-2] + 'all':16} two   {_text(two)} | {wider}",
+                flush=True,
+            )
     return 0
 
 

@@ -37,7 +37,7 @@ from railfix.pipeline.received import no_navigation
 from railfix.pipeline.tables import passing_table, positions_table, rounded, train_table
 from railfix.run.driver import time_of
 from railfix.run.output import OutputFolder, Overwrite, check_not_input
-from railfix.run.processor import place_of, processor_of
+from railfix.run.processor import check_base_place, place_of, processor_of
 from railfix.run.sensors import balises_of, check_filter, read_sensors, units_of_ranges
 from railfix.run.sources import OpenedLine, open_line
 
@@ -273,6 +273,7 @@ def _prepare(inputs: LiveInputs, tables: SensorSamples) -> tuple[OpenedLine, Epo
     line = open_line(inputs.track, inputs.vehicle, antennas=inputs.antennas, reading=inputs.reading, at=at)
     balises = balises_of(inputs.sensors.get("balises"), inputs.balise_list, inputs.virtual_balises, line.track, config)
     base: Floats | Literal["stream"] | None = None
+    check_base_place(inputs.base, inputs.base_place)
     if inputs.base is not None:
         base = "stream" if inputs.base_place is None else place_of(inputs.base_place, "--base-place")
     return line, processor_of(

@@ -92,6 +92,18 @@ def second_codes(
     )
 
 
+def missing_notes(received: Received, config: Config, second: SecondCodes | None) -> tuple[str, ...]:
+    """Return notes where no navigation record is known, and where two frequencies are asked for and one is used."""
+    known, notes = received.navigation, []
+    if known.precise is None and not len(known.kepler) and not len(known.glonass):
+        notes.append("no navigation record is known; give navigation to EpochProcessor or to process")
+    if config.frequencies == "two" and second is None:
+        why = "SBAS on L1 corrects one" if config.sbas else "no satellite has a second code"
+        why = why if received.base is None else "a base station subtracts errors of one"
+        notes.append(f"frequencies: two asked for, one used: {why}")
+    return tuple(notes)
+
+
 def noise_of(signal: str) -> float:
     """Return noise and multipath of a signal ("G5Q") over those of L1 C/A at the same C/N0."""
     return _FAST_NOISE if signal[:2] in _FAST else 1.0

@@ -32,7 +32,7 @@ from railfix.pipeline.antennas import (
 )
 from railfix.pipeline.base_station import BaseStation, Stations, check_base
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
-from railfix.pipeline.channels import ChannelBook, combined
+from railfix.pipeline.channels import ChannelBook, combined, missing_notes
 from railfix.pipeline.config import SCREEN_NAMES, Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, Models, conditions_of, correct_ranges
 from railfix.pipeline.filter_result import AlongTrack, FilterState, single_epochs
@@ -294,7 +294,8 @@ class EpochProcessor:
             corrected=with_screens(corrected, ranges), ranges=ranges, rows=dict(zip(names, parts, strict=True)),
             pair=pair, sensors=sensors,
             notes=(
-                *_missing_notes(received), *received.notes, *self._lacking, *self._curve_notes(observations),
+                *missing_notes(received, self.config, corrected.second), *received.notes, *self._lacking,
+                *self._curve_notes(observations),
                 *(self._support.notes(corrected.time) if self._support is not None else ()),
             ),
         )  # fmt: skip
@@ -428,14 +429,6 @@ class EpochProcessor:
             front, rear, front.anchor_ecef_m, self.trajectories["front"], self.trajectories["rear"],
             tolerance_s=self.config.antenna_pair.tag_tolerance_s,
         )  # fmt: skip
-
-
-def _missing_notes(received: Received) -> tuple[str, ...]:
-    """Return a note where no navigation record is known."""
-    known = received.navigation
-    if known.precise is not None or len(known.kepler) or len(known.glonass):
-        return ()
-    return ("no navigation record is known; give navigation to EpochProcessor or to process",)
 
 
 def _check_rising(name: str, observations: Observations, before: AntennaState | None) -> None:

@@ -22,7 +22,7 @@ LONGEST_AGE_S: Final = 60.0
 _PHASE_AGE_S: Final = 1.1
 #: Added for each kilometre between the two: ionosphere, troposphere and orbits seen from elsewhere.
 _PER_KM_M: Final = 0.004
-_LONGEST_KM: Final = 100.0  #: Distance up to which the station is used [km].
+LONGEST_KM: Final = 100.0  #: Distance up to which the station is used [km].
 
 
 class BaseLimits(Settings):
@@ -114,7 +114,7 @@ class BaseErrors:
             nothing = np.full(shape, np.nan)
             return BaseDifferences(code_m=nothing, phase_m=nothing, arc=np.full(shape, -1), sigma_m=nothing)
         age = np.where(row >= 0, seconds(time - self.time[row]), np.inf)
-        near = (distance_km <= _LONGEST_KM)[:, None] & (column >= 0)
+        near = (distance_km <= LONGEST_KM)[:, None] & (column >= 0)
         at = np.ix_(row, column)
         code = np.where(near & (age <= LONGEST_AGE_S)[:, None], self.code_m[at], np.nan)
         fresh = near & (age <= _PHASE_AGE_S)[:, None]

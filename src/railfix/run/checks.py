@@ -13,16 +13,20 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, NoPositionError, RailfixError
 from railfix.core.geodesy import geodetic_from_ecef
+from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io import read_any_positions
 from railfix.io.logs import read_navigation, scan_observations
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
+from railfix.ranges.base_station import LONGEST_AGE_S, LONGEST_KM
 from railfix.ranges.sbas import DfmcService, SbasCorrections
+from railfix.run.processor import BaseLog
 from railfix.run.tally import AntennaTally, Tally
 from railfix.track.read import read_track
 from railfix.track.track import ANOTHER_PLACE_M
+from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import read_vehicle
 
 #: Conventional positions that must all be so far before a run is stopped early.
@@ -117,6 +121,23 @@ def check_sensor_time(sensors: SensorSamples, tally: Tally) -> None:
                 f"the samples of --{name} of {_period(time[0], time[-1])} and the logs of "
                 f"{_period(*spans[0])} (GPS time) have no time in common; give those of that day"
             )
+
+
+def check_base(base: BaseLog, tally: Tally, trajectories: Mapping[str, Trajectory]) -> None:
+    """Raise MismatchError where a base station is too far from the line, or has no epoch in time for a log."""
+    distance = min(np.linalg.norm(own.ecef_m - base.ecef_m, axis=1).min() for own in trajectories.values()) / 1e3
+    if distance > LONGEST_KM:
+        raise MismatchError(
+            f"the base station is {distance:,.0f} km from the line, expected {LONGEST_KM:g} km at most; give its "
+            "position (--base-place), or another station"
+        )
+    first, last = base.span
+    spans = [(a.first, a.last) for a in tally.antennas.values() if a.first is not None and a.last is not None]
+    if spans and not any(start - last <= timedelta(np.array(LONGEST_AGE_S)) and first <= end for start, end in spans):
+        raise MismatchError(
+            f"the log of the base station of {_period(first, last)} and the logs of {_period(*spans[0])} (GPS time) "
+            "have no time in common; give one that overlaps"
+        )
 
 
 def check_whole_run(

@@ -23,7 +23,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import level_facts, prior_basis_text, risk_of
 from railfix.pipeline.processor import EpochProcessor, ScreenedChunk, SolvedChunk, State
 from railfix.run.batch_check import BatchCheck, add_batch
-from railfix.run.checks import check_same_day, check_same_place, check_whole_run
+from railfix.run.checks import check_base, check_same_day, check_same_place, check_whole_run
 from railfix.run.convert import add_mate_results
 from railfix.run.inputs import Antenna, RunInputs, RunOptions
 from railfix.run.output import OutputFolder
@@ -102,6 +102,8 @@ def run_files(
             add_smoothed(rows.replays, processor, folder)
         causes = _causes(tally, logs, processor, config, line)
         check_whole_run(navigation, tally, sbas=processor.received.sbas, sensors=sensors, causes=causes)
+        if base is not None:
+            check_base(base, tally, line.trajectories)
         notes = (
             *notes_of(line, navigation, tally, logs, causes, note_statistic=config.map_offset.note_threshold),
             *_notes_of_levels(config, tally),

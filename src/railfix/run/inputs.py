@@ -68,7 +68,7 @@ class InputFiles(Settings):
     def check_files(self) -> None:
         """Raise InputFileError where a file is missing, a folder, or cannot be opened."""
         for name, path in self.files_by_name():
-            _check_file(f"--{name.replace('_', '-')}", path)
+            _check_file(f"--set {name}" if name == "integrity_support" else f"--{name.replace('_', '-')}", path)
 
     def entries(self, pool: Executor, folder: Path) -> Entries:
         """Hash every file beside other work."""

@@ -105,6 +105,7 @@ class BaseLog:
         if self._waiting is None:
             raise InputFileError(log.paths[0], "has no epoch in the time asked for")
         header = self._waiting.header
+        self.span = self._waiting.time[0], self._waiting.time[-1]  #: Times of the epochs read so far.
         self.ecef_m = header.approximate_ecef_m if place is None else place_of(place, "--base-place")
         if not np.linalg.norm(np.nan_to_num(self.ecef_m)) > 1e6:
             raise InputFileError(log.paths[0], "its header has no position; give that of the station (--base-place)")
@@ -124,13 +125,20 @@ class BaseLog:
                 self._waiting = part[count:]
                 return
             self._waiting = next(self._parts, None)
+            if self._waiting is not None and len(self._waiting):
+                self.span = self.span[0], self._waiting.time[-1]
+
+
+def check_base_place(base: object, place: str | None) -> None:
+    """Raise SettingsError where a position of a base station is given without its observations."""
+    if not base and place is not None:
+        raise SettingsError("--base-place is given without --base; give the observations of the base station, too")
 
 
 def base_log(paths: tuple[Path, ...], options: RunOptions) -> BaseLog | None:
     """Return the log of a base station; None without files."""
+    check_base_place(paths, options.base_place)
     if not paths:
-        if options.base_place is not None:
-            raise SettingsError("--base-place is given without --base; give the observations of the base station, too")
         return None
     log = Log(
         paths=paths, chunk_epochs=options.chunk_epochs, broken_lines=options.broken_lines, date=options.logs.instant

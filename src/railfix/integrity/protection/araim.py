@@ -59,6 +59,7 @@ class AraimGeometry:
     """Observations of T epochs, N of them: ranges, and with a map its two constraints."""
 
     #: Change of each observation with the P unknowns, position first, then a clock a constellation; shape (T, N, P).
+    #: Any value where not used.
     design: Floats
     #: Standard deviations for integrity and accuracy; NaN where not used; shape (T, N).
     sigma_int_m: Floats
@@ -129,7 +130,8 @@ def _block(
     budget: AraimBudget,
 ) -> AraimLevels:
     """Return the levels of a block of epochs."""
-    used, design = geometry.used[rows], geometry.design[rows]
+    used = geometry.used[rows]
+    design = np.where(used[..., None], geometry.design[rows], 0.0)
     components = risks.shape[1]
     prior = _event_priors(geometry, used)
     probability = np.stack([prior[:, s].prod(axis=1) for s in sets], axis=1) if sets else np.zeros((len(used), 0))
