@@ -11,7 +11,6 @@ from math import fsum
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import median_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -96,6 +95,8 @@ def _place(matched: Matched, row: int | np.intp) -> tuple[int, float]:
 
 def _distance_m(log: PlanLog) -> Floats:
     """Distance by the steps between positions, each the median of `_STEPS`, as positions jump; NaN without position."""
+    from scipy.ndimage import median_filter
+
     ecef = ecef_from_geodetic(log.latitude_deg, log.longitude_deg, np.zeros(len(log.time)))
     step = np.linalg.norm(np.diff(ecef, axis=0), axis=1)
     speed = median_filter(np.nan_to_num(step), _STEPS, mode="nearest")
