@@ -25,8 +25,7 @@ from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.integrity.protection.level import Asked, Errors
 from railfix.integrity.protection.open_places import one_after_the_other
-from railfix.integrity.raim.model import LinearModel, ModelArrays, compact
-from railfix.positioning.normal_equations import inverse_3x3
+from railfix.integrity.raim.model import LinearModel, ModelArrays, compact, regular_inverse
 
 #: Effect on the position, in its own sigmas, below which a satellite has none.
 NO_EFFECT: Final = 1e-6
@@ -347,11 +346,3 @@ def tails_of_hypotheses(
             ratio = np.abs(got.moved_m) / np.where(moving, threshold, np.inf)
             separation = np.maximum(separation, ratio.max(axis=1, initial=0.0))
     return full.channel, offset, sigma, weight, separation
-
-
-def regular_inverse(matrix: Floats) -> Floats:
-    """Inverse of symmetric 3 x 3 matrices, each scaled to a unit diagonal; NaN where singular."""
-    diagonal = np.einsum("tii->ti", matrix)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, np.nan))
-    outer = scale[:, :, None] * scale[:, None, :]
-    return np.asarray(inverse_3x3(matrix * outer) * outer)

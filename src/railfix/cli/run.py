@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import signal
 import sys
 from typing import Annotated, Any, Final
@@ -91,6 +90,8 @@ def live(
 
     Exit codes as `railfix --help` says; 9 where two channels disagree; 143 at the end by SIGTERM.
     """
+    import asyncio
+
     from railfix.live.command import run_live
 
     if inputs.channels == "2" or any(text.startswith("cbor@") for text in inputs.send):

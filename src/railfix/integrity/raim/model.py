@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from railfix import kernels
-from railfix.core.arrays import Floats, Indices, Integers, Masks, kernel_array
-from railfix.positioning.normal_equations import Ranges
+from railfix.core.arrays import Floats, Indices, Integers, Masks
+from railfix.core.geodesy import range_with_rotation
+from railfix.positioning.normal_equations import Ranges, inverse_3x3
 from railfix.track.trajectory import Trajectory
 
 
@@ -193,18 +193,62 @@ def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *,
     `axes`, shape (T, 3, 3): unit vectors of the unknowns at positions (T, 3), NaN without; `prior`, shape (3, 3)
     [1/m^2].
     """
-    root, clocks, design, covariance, misfit = kernels.raim.whitened_ranges(
-        ranges.arrays, kernel_array(place_ecef_m), kernel_array(axes), kernel_array(prior)
-    )
+    arrays = ranges.arrays
+    weight, clock = arrays.weight, arrays.clock
+    distance, los = range_with_rotation(arrays.sat_ecef_m, np.ascontiguousarray(place_ecef_m)[:, None, :])
+    root, totals = np.sqrt(weight), weight @ _one_hot(clock, len(arrays.starts))
+    misfit = arrays.code_m - distance
+    if arrays.tied:
+        misfit = misfit - arrays.offset_m[:, clock]
+    # A constant common to all ranges is no residual; subtracting it keeps the digits of the sums.
+    total = totals.sum(axis=1, keepdims=True)
+    misfit = misfit - (weight * misfit).sum(axis=1, keepdims=True) / np.where(total > 0, total, 1.0)
+    rows = root[..., None] * -(los @ axes.swapaxes(1, 2))
+    covariance = _clock_covariance(totals, arrays.sigma_m if arrays.tied else None)
+    design = rows - root[..., None] * _clocks(root, clock, covariance, rows)
+    normal = rows.swapaxes(1, 2) @ design
     return LinearModel(
-        root_weight=root, clock=ranges.arrays.clock, clock_covariance_m2=clocks, design=design,
-        covariance_m2=covariance, prior=prior, misfit=misfit,
-        freedom=ranges.n_used - ranges.n_clocks - unknowns, interest=1 if unknowns == 1 else 2,
+        root_weight=root, clock=clock, clock_covariance_m2=covariance, design=design,
+        covariance_m2=regular_inverse((normal + normal.swapaxes(1, 2)) / 2.0 + prior), prior=prior,
+        misfit=root * misfit, freedom=ranges.n_used - ranges.n_clocks - unknowns, interest=1 if unknowns == 1 else 2,
     )  # fmt: skip
+
+
+def _clock_covariance(totals: Floats, tie_sigma_m: Floats | None) -> Floats:
+    """Covariance of the clocks at a known place, shape (T, G, G) [m^2].
+
+    Of a clock on its own 1/T, T the summed weight of its satellites. Clocks that keep an offset to
+    a common one to sigma: ``diag(sigma^2 rho) + rho rho^T / sum(T rho)``, ``rho = 1/(1 + sigma^2 T)``.
+    0 for clocks without satellites.
+    """
+    seen = totals > 0
+    covariance = np.zeros((*totals.shape, totals.shape[1]))
+    each = np.arange(totals.shape[1])
+    if tie_sigma_m is None:
+        covariance[:, each, each] = np.where(seen, 1.0 / np.where(seen, totals, 1.0), 0.0)
+        return covariance
+    rho = seen / (1.0 + tie_sigma_m**2 * totals)
+    mass = (totals * rho).sum(axis=1)
+    covariance += rho[:, :, None] * (rho / np.where(mass > 0, mass, 1.0)[:, None])[:, None, :]
+    covariance[:, each, each] += tie_sigma_m**2 * rho
+    return covariance
+
+
+def _one_hot(clock: Indices, clocks: int) -> Floats:
+    """Membership of the channels, shape (M, G)."""
+    return np.asarray(clock[:, None] == np.arange(clocks), dtype=np.float64)
 
 
 def _clocks(root: Floats, clock: Indices, covariance: Floats, columns: Floats) -> Floats:
     """Clocks that whitened `columns` (T, M, C) ask for, at each channel: ``K R^T columns``, shape (T, M, C)."""
-    member = np.asarray(clock[:, None] == np.arange(covariance.shape[1]), dtype=np.float64)
+    member = _one_hot(clock, covariance.shape[1])
     sums = np.matmul(member.T, root[..., None] * columns)
     return np.asarray(np.matmul(covariance, sums)[:, clock])
+
+
+def regular_inverse(matrix: Floats) -> Floats:
+    """Inverse of symmetric 3 x 3 matrices, each scaled to a unit diagonal; NaN where singular."""
+    diagonal = np.einsum("tii->ti", matrix)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, np.nan))
+    outer = scale[:, :, None] * scale[:, None, :]
+    return np.asarray(inverse_3x3(matrix * outer) * outer)
