@@ -11,7 +11,7 @@ import ncompress
 import numpy as np
 import pytest
 from hatanaka import rnx2crx
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from railfix.core.errors import InputFileError, MismatchError
@@ -300,6 +300,7 @@ def test_options_are_checked(tmp_path: Path, options: dict[str, str]) -> None:
     old=st.booleans(),
     edits=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 3), st.binary(min_size=1, max_size=4)), min_size=1),
 )
+@example(old=False, edits=[(1549, 0, b"\xb2")])  # a digit, but of no number
 def test_whatever_is_broken_ends_in_one_sentence(
     tmp_path: Path, old: bool, edits: list[tuple[int, int, bytes]]
 ) -> None:

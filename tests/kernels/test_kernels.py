@@ -72,7 +72,7 @@ KERNELS = {
     "hypotheses": ("tails_of_hypotheses",),
     "level": ("solve_level",),
     "off_tangent": ("clear_of_sections", "risk_beyond", "risk_off_tangent"),
-    "ranges": ("reduced_equations", "misfits", "iterated_points", "iterated_along"),
+    "ranges": ("reduced_equations", "misfits", "iterated_points", "dilutions", "iterated_along"),
     "reading": ("decoded_fields", "placed_fields", "line_ends"),
     "robust": ("reweighted",),
     "screens": ("suspicions", "clock_medians"),

@@ -5,6 +5,7 @@ Each command is imported when it is called, so that ``railfix --help`` answers a
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
@@ -12,6 +13,9 @@ import typer
 
 from railfix.cli.command import LazyCommands, run_program
 from railfix.core.commit import version_text
+
+# Read where numpy is imported, which none of these does. Threads of linear algebra wait busily for the next product.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 class _Program(LazyCommands):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import signal
-from typing import Annotated, Any
+import sys
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -14,6 +14,9 @@ from railfix.cli.options import Choices, OutOption, Without, from_models, set_va
 from railfix.core.settings import validated
 from railfix.live.settings import LiveInputs, LiveSettings
 from railfix.run import RunInputs, RunOptions, run_files
+
+#: Time that a thread of a run has the interpreter for while others wait [s]: changes cost more than waiting.
+_TURN_S: Final = 0.05
 
 
 @from_models
@@ -51,6 +54,7 @@ def run(
     settings, asked = settings_of(choices)
     inputs = inputs.replaced(config=choices.config)
     prepare_kernels()
+    sys.setswitchinterval(_TURN_S)
     with progress_bar() as progress:
         summary = run_files(inputs, settings, out=out, options=options, asked=asked, progress=progress)
     show_summary(summary)
@@ -86,6 +90,8 @@ def live(
 
     Exit codes as `railfix --help` says; 9 where two channels disagree; 143 at the end by SIGTERM.
     """
+    import asyncio
+
     from railfix.live.command import run_live
 
     if inputs.channels == "2" or any(text.startswith("cbor@") for text in inputs.send):

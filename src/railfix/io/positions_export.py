@@ -17,7 +17,6 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 import polars.selectors as cs
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from pyproj import CRS
 
 from railfix.core.errors import NoPositionError
@@ -155,6 +154,8 @@ def _style() -> bytes:
 
 
 def _render(template: str, **values: Any) -> bytes:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
     environment = Environment(
         loader=PackageLoader("railfix.io"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,

@@ -101,7 +101,7 @@ def _satellite(text: str) -> str:
     """Return the satellite as ``G01``; SP3-a omits the letter of GPS and may have blanks for zeros."""
     letter = text[0] if text[:1].isalpha() else "G"
     digits = text[1:].strip()
-    if not digits.isdigit():
+    if not digits.isdecimal():
         raise ValueError(text)
     return f"{letter}{int(digits):02d}"
 

@@ -232,6 +232,7 @@ ANNOUNCEMENT: Final = _Announcement()
 event.register("numba:compile", ANNOUNCEMENT)  # type: ignore[no-untyped-call]
 
 
+@cache
 def _files(package: Path, module: str) -> set[Path]:
     """Return the file of a module of this package and those of all that it imports from the package."""
     path = package / f"{module.replace('.', '/')}.py"

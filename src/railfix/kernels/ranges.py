@@ -288,6 +288,25 @@ def iterated_points(
     return place, clock, matrix, covariance, wsse, residual
 
 
+@kernel
+def dilutions(ranges: Any, place_ecef_m: Floats) -> Floats:
+    """Return the position dilution of precision at places (T, 3), shape (T,); NaN where the geometry is singular."""
+    sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
+    epochs, channels = weight.shape
+    groups, no, tied = len(starts), np.empty(0), len(offset_m) == epochs
+    result, unit, inverse, system = np.empty(epochs), np.empty(channels), np.empty((3, 3)), np.empty((4, 4))
+    equations = _Equations(system, np.empty((4, groups)), np.empty((4, channels)), np.empty(groups))
+    for t in range(epochs):
+        for m in range(channels):
+            unit[m] = 1.0 if weight[t, m] > 0.0 else 0.0
+        offset, spread = (offset_m[t], sigma_m[t]) if tied else (no, no)
+        epoch = _Epoch(sat_ecef_m[t], code_m[t], unit, starts, offset, spread)
+        reduce_epoch(epoch, place_ecef_m[t], equations)
+        invert(system, inverse)
+        result[t] = math.sqrt(inverse[0, 0] + inverse[1, 1] + inverse[2, 2])
+    return result
+
+
 @inner
 def _along(
     system: Floats, tangent: Floats, across: Floats, up: Floats, plan: float, height: float

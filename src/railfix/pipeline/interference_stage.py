@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Bytes, Codes, Floats, Indices, Masks, changed, read_only
+from railfix.core.arrays import Bits, Bytes, Codes, Floats, Indices, Integers, Masks, changed, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
 from railfix.core.timescale import GPS_EPOCH
@@ -45,8 +45,10 @@ _UNDER_SPOOFING: Final = np.isin(np.arange(len(Status)), [
     Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN,
     Status.MAP_OFFSET,
 ])  # fmt: skip
-#: Interference is looked for once so long; tags may be so much before the whole second.
-_SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
+#: Interference is looked for once so long [ns].
+_SECOND_NS: Final = 1_000_000_000
+#: Where seconds begin: tags may be 5 ms before the whole one [ns].
+_FIRST_NS: Final = int(GPS_EPOCH.astype(np.int64)) - 5_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,10 +179,11 @@ class _Due(NamedTuple):
     last: int  #: GPS second of the last epoch.
 
 
-def _due(corrected: CorrectedRanges, rows: slice, state: InterferenceState) -> _Due:
+def _due(corrected: CorrectedRanges, gps_second: Integers, rows: slice, state: InterferenceState) -> _Due:
     """Return the epochs of one antenna at which interference is looked for."""
-    second = (corrected.time[rows] - GPS_EPOCH + _TAG) // _SECOND
-    due = second != np.concatenate([[state.second], second[:-1]])[: len(second)]
+    second = gps_second[rows]
+    due = np.empty(len(second), dtype=np.bool_)
+    due[:1], due[1:] = second[:1] != state.second, second[1:] != second[:-1]
     group = due.cumsum()
     count = int(group[-1]) + 1 if len(group) else 1
     alarm, broken = np.zeros(count, dtype=np.uint8), np.zeros(count, dtype=np.bool_)
@@ -244,7 +247,8 @@ def judge_interference(
     """
     if limits.use == "off":
         return solution, [None] * len(states), states
-    due = antennas.apart(lambda _, rows, state: _due(corrected, rows, state), states)
+    second = (corrected.time.astype(np.int64) - _FIRST_NS) // _SECOND_NS
+    due = antennas.apart(lambda _, rows, state: _due(corrected, second, rows, state), states)
     rows = np.concatenate([own.rows for own in due])
     broken = np.concatenate([own.broken[:-1] for own in due])
     if any(len(own.rows) or not len(own.group) for own in due):

@@ -15,7 +15,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, changed
+from railfix import kernels
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, changed, kernel_array
 from railfix.integrity.raim import (
     Exclusion,
     LinearModel,
@@ -39,8 +40,6 @@ from railfix.positioning.normal_equations import (
     SinglePoint,
     SinglePointLimits,
     constrained_on_lines,
-    inverse_3x3,
-    normal_equations,
     single_point,
 )
 from railfix.positioning.section_search import SearchIndex, Section, search_lines
@@ -128,9 +127,7 @@ def position_dilution(ranges: Ranges, ecef_m: Floats) -> Floats:
 
     Root of the trace of the position's covariance for ranges of unit sigma; NaN where the geometry is singular.
     """
-    alike = replace(ranges, weight=(ranges.weight > 0).astype(np.float64))
-    inverse = inverse_3x3(normal_equations(alike, ecef_m).matrix)
-    return np.asarray(np.sqrt(np.einsum("tii->t", inverse)))
+    return kernels.ranges.dilutions(ranges.arrays, kernel_array(ecef_m))
 
 
 def fault_free(

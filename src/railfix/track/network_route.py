@@ -11,9 +11,6 @@ from math import fsum
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import median_filter
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from railfix.core.arrays import Floats, Indices
 from railfix.core.geodesy import ecef_from_geodetic
@@ -96,6 +93,8 @@ def _place(matched: Matched, row: int | np.intp) -> tuple[int, float]:
 
 def _distance_m(log: PlanLog) -> Floats:
     """Distance by the steps between positions, each the median of `_STEPS`, as positions jump; NaN without position."""
+    from scipy.ndimage import median_filter
+
     ecef = ecef_from_geodetic(log.latitude_deg, log.longitude_deg, np.zeros(len(log.time)))
     step = np.linalg.norm(np.diff(ecef, axis=0), axis=1)
     speed = median_filter(np.nan_to_num(step), _STEPS, mode="nearest")
@@ -174,6 +173,9 @@ def _once(network: Network, route: list[int]) -> list[list[int]]:
 
 def _joints(network: Network, route: list[int]) -> list[int]:
     """The joint before each track of a route, and the one after the last: ends that links bring together."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     rows = np.array([(2 * x.first + x.first_end, 2 * x.second + x.second_end) for x in network.links], dtype=np.intp)
     a, b = rows.reshape(-1, 2).T
     count = 2 * len(network.tracks)

@@ -30,7 +30,7 @@ from railfix.integrity.raim.model import constrained_model
 from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
 
-_BLOCK_SIZE: Final = 80_000  #: Numbers of a pair array that a block of epochs holds.
+_BLOCK_SIZE: Final = 200_000  #: Numbers of a pair array that a block of epochs holds.
 _OF_MORE: Final = 3  #: Number of the tails of three faults and more among those of all kinds.
 _SAME: Final = 1e-9  #: Separation, over the sigma of the position, below which the two positions are the same.
 

@@ -125,7 +125,7 @@ def one_after_the_other(columns: Floats, members: Masks) -> tuple[Floats, Floats
     return rows, scaled, checked
 
 
-_BOUND_SIZE: Final = 100_000  #: Numbers that a block of epochs by channels squared holds.
+_BOUND_SIZE: Final = 200_000  #: Numbers that a block of epochs by channels squared holds.
 
 
 def places_beyond_the_level(

@@ -184,7 +184,7 @@ class _HeaderRecords:
         return InputFileError(self._path, message, line=self._line)
 
     def _count(self, text: str, what: str) -> int:
-        if not text.strip().isdigit():
+        if not text.strip().isdecimal():
             raise self._fail(f"{what}: the number of types '{text.strip()}' is no whole number")
         return int(text)
 

@@ -241,7 +241,7 @@ def _ionosphere_4(
 def _record(path: FilePath, block: _Block, version: float, content: NavigationContent) -> RawRecord | None:
     """Read one record; None for a record of a skipped kind, which is counted."""
     system, digits = block.name[:1], block.name[1:].strip()
-    if system not in (*_LINES, *_SKIPPED) or not (digits.isdigit() and int(digits)):
+    if system not in (*_LINES, *_SKIPPED) or not (digits.isdecimal() and int(digits)):
         raise InputFileError(path, f"{block.name!r} is not a satellite name", line=block.line - (version >= 4.0))
     satellite = f"{system}{int(digits):02d}"
     if system in _SKIPPED or (block.message and block.message not in _MESSAGES[system]):

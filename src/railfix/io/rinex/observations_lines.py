@@ -196,7 +196,7 @@ def event_line(lines: Lines, line: int) -> tuple[int, int] | None:
     """Return flag and count of a RINEX 2 event line without a time; None for other lines."""
     text = f"{lines.text(line):<32}"
     flag, count = text[28], text[29:32].strip()
-    if text[:26].strip() or flag not in "2345" or not count.isdigit():
+    if text[:26].strip() or flag not in "2345" or not count.isdecimal():
         return None
     return int(flag), int(count)
 
