@@ -112,6 +112,7 @@ class LinkMeter:
 
 
 LinkName = Literal["A", "B"]
+LinkMode = Literal["both", "spare"]  #: Whether both links carry the payload, or only the one in use.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,7 +236,7 @@ class TrainLinks:
         keys: Path,
         bearers: dict[LinkName, Bearer],
         *,
-        mode: Literal["spare", "both"] = "both",
+        mode: LinkMode = "both",
         received: Callable[[bytes], None] = lambda _: None,
         limits: LinkLimits | None = None,
     ) -> None:

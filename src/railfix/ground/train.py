@@ -20,7 +20,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import Field, ValidationError
 
 from railfix.core.settings import Settings, option
-from railfix.ground.links import Bearer, LinkName, TrainLinks, first_sequence
+from railfix.ground.links import Bearer, LinkMode, LinkName, TrainLinks, first_sequence
 from railfix.ground.quic import check_keys
 from railfix.io.train_message import MessageError, TrainMessage, encode, from_json
 
@@ -86,6 +86,8 @@ class OnBoardLimits(Settings):
     #: Deceleration with which the train can stop before a shorter authority.
     braking_mps2: float = Field(default=0.5, gt=0)
     reaction_s: float = Field(default=3.0, ge=0)  #: Time before the brakes act, with that since the newest report.
+    #: "spare": reports go over bearer B only while A fails.
+    mode: LinkMode = option("Send reports over bearer A alone, and over B while A fails.", "both", name="--spare")
 
 
 @dataclass(kw_only=True)
@@ -223,8 +225,9 @@ async def run_train(
     is not there, or a line is no position message.
     """
     check_keys(keys, f"train-{train}")
-    desk = _Desk(train=train, write=write, limits=limits or OnBoardLimits(), integrity=integrity)
-    links = TrainLinks(train, keys, bearers, received=desk.received)
+    limits = limits or OnBoardLimits()
+    desk = _Desk(train=train, write=write, limits=limits, integrity=integrity)
+    links = TrainLinks(train, keys, bearers, mode=limits.mode, received=desk.received)
     await links.start()
     reading = asyncio.create_task(desk.read(_standard_input() if lines is None else lines))
     sending = asyncio.create_task(desk.work(links))

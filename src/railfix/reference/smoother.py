@@ -12,8 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks
-from railfix.core.timescale import seconds
+from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.timescale import nearest_rows, seconds
 from railfix.io.reference_log import AntennaReference
 from railfix.motion.chain import Chain, singer_steps
 from railfix.reference.fixes import ACCELERATION_BIAS_MPS2, MOTION_MPS2, MOTION_S, Fixes, ReferenceSettings
@@ -353,7 +353,6 @@ def assemble_reference(
 
 def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
     """Bridged instants by the sensors that have a number there, or a second or so from there."""
-    t = seconds(evidence.time - evidence.time[0])
     measured = {
         "doppler": np.isfinite(evidence.doppler_mps),
         "pulses": np.isfinite(evidence.wheel_m),
@@ -361,7 +360,8 @@ def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
     }
     code = np.zeros(len(rows), dtype=np.int64)
     for i, mask in enumerate(measured.values()):
-        code |= _near(t[mask], t[rows]).astype(np.int64) << i
+        near = nearest_rows(evidence.time[mask], evidence.time[rows], within_ns=_NEAR_NS) >= 0
+        code |= near.astype(np.int64) << i
     counts = {}
     for c in np.unique(code).tolist():
         name = " and ".join(name for i, name in enumerate(measured) if c >> i & 1) or "nothing"
@@ -369,13 +369,4 @@ def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
     return counts
 
 
-def _near(known_s: Floats, at_s: Floats) -> Masks:
-    """Return whether one of the known instants, rising, is within `_NEAR_S` of each."""
-    if not len(known_s):
-        return np.zeros(len(at_s), dtype=np.bool_)
-    after = np.clip(np.searchsorted(known_s, at_s), 0, len(known_s) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.asarray(np.minimum(np.abs(known_s[after] - at_s), np.abs(known_s[before] - at_s)) <= _NEAR_S)
-
-
-_NEAR_S: Final = 1.5  #: Sensors of 1 Hz measure everywhere, up to a missing epoch [s].
+_NEAR_NS: Final = 1_500_000_000  #: Sensors of 1 Hz measure everywhere, up to a missing epoch [ns].
