@@ -7,13 +7,14 @@ the closing error of a gap in proportion to what each part may have contributed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices
-from railfix.core.timescale import nearest_rows, seconds
+from railfix.core.timescale import nearest_rows, seconds, timedelta
 from railfix.io.reference_log import AntennaReference
 from railfix.motion.chain import Chain, singer_steps
 from railfix.reference.fixes import ACCELERATION_BIAS_MPS2, MOTION_MPS2, MOTION_S, Fixes, ReferenceSettings
@@ -31,6 +32,24 @@ _OFFSET_DRIFT_MPS2: Final = 1e-3
 #: Least standard deviations: of a reading of the wheel [m], of its difference over a step [m].
 _LEAST_READING_M: Final = 1e-3
 _LEAST_STEP_M: Final = 1e-4
+
+
+SAME_INSTANT_NS: Final = 20_000_000  #: Tags that differ by no more belong to one instant [ns].
+
+
+def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
+    """Return the instants of a reference: rows of the log, receiver epochs, regular steps elsewhere."""
+    merged = rows
+    for other in others:
+        new = other[(other > rows[0]) & (other < rows[-1])]
+        merged = np.union1d(merged, new[nearest_rows(merged, new, within_ns=SAME_INSTANT_NS) < 0])
+    usual = float(np.median(seconds(np.diff(rows))))
+    step = seconds(np.diff(merged))
+    pieces = np.where(step > 1.5 * usual, np.ceil(step / usual - 1e-6), 1.0).astype(np.int64)
+    first = np.repeat(np.arange(len(step)), pieces)
+    number = np.arange(len(first)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    filled = merged[first] + timedelta(step[first] * number / pieces[first])
+    return np.append(filled, merged[-1])
 
 
 @dataclass(frozen=True, kw_only=True)
