@@ -47,7 +47,7 @@ class StopOrder:
     acknowledged_s: float | None = None
     rest_s: float | None = None
 
-    def reported(self, message: TrainMessage, now_s: float) -> bool:
+    def take_report(self, message: TrainMessage, now_s: float) -> bool:
         """Take a report; return whether the train has come to rest by it."""
         taken = message.authority is not None and message.authority >= self.number
         if taken and self.acknowledged_s is None:
@@ -155,7 +155,7 @@ class ControlCentre:
         if was.asked_m is not None and known.asked_m is None:
             what = "has given its route back" if known.held else "keeps its route"
             self.log(f"train {number}: {what}", train=number)
-        if (order := self.stops.get(number)) is not None and order.reported(message, self.clock()):
+        if (order := self.stops.get(number)) is not None and order.take_report(message, self.clock()):
             self.log(f"train {number}: order to stop {order}", train=number)
         self.reports += 1
         after = self.supervision.records[number]
