@@ -152,13 +152,13 @@ def test_inputs_of_a_run_and_two_outputs_of_one_name_are_left(good: Desk, desk: 
 
 def test_a_leftover_is_removed_and_a_living_run_is_not_disturbed(tmp_path: Path) -> None:
     with OutputFolder(tmp_path / "out") as folder:
-        (folder.staged("a.txt")).write_text("a")
+        (folder.stage("a.txt")).write_text("a")
         code = "import sys; from pathlib import Path; from railfix.run.output import OutputFolder as Folder\n"
         code += "Folder(Path(sys.argv[1]))"
         command = [sys.executable, "-c", code, str(tmp_path / "out")]
         other = subprocess.run(command, capture_output=True, text=True, check=False)
         assert f"another railfix (process {os.getpid()}) is writing there" in other.stderr
-        assert folder.staged("a.txt").read_text() == "a"
+        assert folder.stage("a.txt").read_text() == "a"
     # a dead process: files without a lock that anyone holds
     for name, suffix in ((".railfix-dead", ".lock"), (".railfix-gone", "")):
         (tmp_path / "out" / name).mkdir(parents=True)
@@ -167,7 +167,7 @@ def test_a_leftover_is_removed_and_a_living_run_is_not_disturbed(tmp_path: Path)
             (tmp_path / "out" / (name + suffix)).write_text("999999\n")
     with OutputFolder(tmp_path / "out") as folder:
         assert [path.name for path in (tmp_path / "out").iterdir() if "dead" in path.name or "gone" in path.name] == []
-        folder.staged("c.txt").write_text("c")
+        folder.stage("c.txt").write_text("c")
         folder.commit()
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["c.txt"]
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from railfix.cli import app
 from railfix.io import read_observations
-from railfix.simulate import demo_files, load_scenario, shipped_scenarios
+from railfix.simulate import demo_files, list_scenarios, load_scenario
 from railfix.track import read_track
 
 pytestmark = pytest.mark.requirement("D4")
@@ -98,8 +98,8 @@ def test_a_recipe_makes_each_run_in_its_folder(tmp_path: Path) -> None:
 def test_shipped_scenarios_are_listed_and_can_be_read() -> None:
     code, said = call("--list")
     assert code == 0
-    assert [line.split()[0] for line in said.splitlines()] == list(shipped_scenarios())
-    for name, path in shipped_scenarios().items():
+    assert [line.split()[0] for line in said.splitlines()] == list(list_scenarios())
+    for name, path in list_scenarios().items():
         assert f"{name} " in said
         assert len(tomllib.loads(path.read_text())["description"]) > 20
 

@@ -17,7 +17,13 @@ from railfix.core.errors import InputFileError
 from railfix.core.settings import load_settings
 from railfix.ground import stops, supervision
 from railfix.ground.control import ControlCentre, orders_of
-from railfix.ground.interlocking import Interlocking, InterlockingLimits, extended, from_documents, stop_orders
+from railfix.ground.interlocking import (
+    Interlocking,
+    InterlockingLimits,
+    extend_authorities,
+    from_documents,
+    stop_orders,
+)
 from railfix.ground.layout import Layout, LoopStation
 from railfix.ground.serve import CentreFile, _check_line
 from railfix.ground.stops import overlaps_stopped, release_train
@@ -94,7 +100,7 @@ def after(state: Interlocking, *messages: TrainMessage) -> Interlocking:
 
 
 def follower_end_m(state: Interlocking) -> float:
-    return extended(state, LINE, limits=LIMITS).trains[2].end_m
+    return extend_authorities(state, LINE, limits=LIMITS).trains[2].end_m
 
 
 def test_reports_that_agree_move_the_rear_end(state: Interlocking) -> None:
@@ -154,7 +160,7 @@ def test_a_contradiction_stops_the_train_and_its_neighbours(
     later = after(found, *(report(k, 3000.0 + 40.0 * k) for k in range(3, 9)))
     assert later.trains[1].stop == found.trains[1].stop
     assert later.trains[1].rear_m == found.trains[1].rear_m
-    assert extended(later, LINE, limits=LIMITS) == later
+    assert extend_authorities(later, LINE, limits=LIMITS) == later
     sent = Supervision(layout=LINE, state=found).advance(0.0)
     assert [authority.stopped for authority in sent] == [True, True, True]
 
@@ -186,7 +192,7 @@ def test_a_train_that_rolls_back_takes_its_interval_with_it(state: Interlocking)
     """590 m: the follower had authority to 2000 m and gets no more; the train is at 2205 m and more."""
     found = after(state, report(1, 2410.0, speed_cmps=0, standstill=True))
     assert found.trains[1].rear_m == pytest.approx(2410.0 - 205.0)
-    assert extended(found, LINE, limits=LIMITS).trains[2].end_m == 2000.0
+    assert extend_authorities(found, LINE, limits=LIMITS).trains[2].end_m == 2000.0
 
 
 def test_an_authority_from_before_the_last_change_of_ends_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,16 +202,16 @@ def test_an_authority_from_before_the_last_change_of_ends_is_refused(monkeypatch
     def turned_twice() -> OnBoard:
         train = OnBoard(direction=1, end_m=1000.0)
         for sequence in (1, 2, 3):
-            train.reported(sequence, float(sequence))
-        train.turned(-1, 800.0)
-        train.reported(4, 4.0)
-        train.turned(1, 1000.0)
+            train.note_report(sequence, float(sequence))
+        train.turn(-1, 800.0)
+        train.note_report(4, 4.0)
+        train.turn(1, 1000.0)
         return train
 
     train = turned_twice()
     assert not train.receive(late)
     assert (train.end_m, train.number) == (1000.0, -1)
-    train.reported(5, 5.0)
+    train.note_report(5, 5.0)
     assert train.receive(late.replaced(number=8, report=5, end_cm=110_000))
     assert train.end_m == 1100.0
     take_out(monkeypatch, "turns")
@@ -293,7 +299,7 @@ def test_an_authority_from_before_a_start_on_board_is_refused() -> None:
     for number, answered, taken in ((5, first - 1, False), (6, 0, False), (7, first, True)):
         late = Authority(train=1, number=number, report=answered, end_cm=90_000, direction=1, stopped=False)
         written.clear()
-        desk.received(late.encode())
+        desk.receive(late.encode())
         assert bool(written) is taken
 
 

@@ -22,10 +22,10 @@ from railfix.ground.interlocking import (
     PointState,
     TrainInterval,
     _limit_m,
-    extended,
+    extend_authorities,
     from_documents,
     points_reported,
-    released,
+    release_points,
     route_requested,
     stop_orders,
     to_documents,
@@ -147,7 +147,7 @@ def test_a_route_by_hand(state: Interlocking, monkeypatch: pytest.MonkeyPatch) -
     """Train 1 from A to track 1 of B: no points have to move; the authority ends 20 m before the end of track 1."""
     routed, moved, reason = route_requested(state, 1, LAYOUT)
     assert (moved, reason) == ((), None)
-    assert extended(routed, LAYOUT, limits=LIMITS).trains[1].end_m == pytest.approx(2350.0 - 20.0)
+    assert extend_authorities(routed, LAYOUT, limits=LIMITS).trains[1].end_m == pytest.approx(2350.0 - 20.0)
     # now train 2 may neither have the section nor, without that rule, the points
     assert route_requested(routed, 2, LAYOUT)[2] == "train 1 comes the other way"
     assert route_requested(replace(state, stopped=True), 1, LAYOUT)[2] == "satellite positioning is suspended"
@@ -159,10 +159,10 @@ def test_an_authority_ends_before_points_until_they_are_detected(state: Interloc
     """Train 2 leaves track 2: both points move, then the authority passes them."""
     routed, moved, reason = route_requested(state, 2, LAYOUT)
     assert (set(moved), reason) == ({(1, -1), (0, 1)}, None)
-    assert extended(routed, LAYOUT, limits=LIMITS).trains[2].end_m == 2065.0  # 2050 + 20 m is no extension
-    near = extended(points_reported(routed, (1, -1), 2), LAYOUT, limits=LIMITS)
+    assert extend_authorities(routed, LAYOUT, limits=LIMITS).trains[2].end_m == 2065.0  # 2050 + 20 m is no extension
+    near = extend_authorities(points_reported(routed, (1, -1), 2), LAYOUT, limits=LIMITS)
     assert near.trains[2].end_m == pytest.approx(400.0 + 20.0)
-    through = extended(points_reported(near, (0, 1), 2), LAYOUT, limits=LIMITS)
+    through = extend_authorities(points_reported(near, (0, 1), 2), LAYOUT, limits=LIMITS)
     assert through.trains[2].end_m == pytest.approx(50.0 + 20.0)
 
 
@@ -174,21 +174,21 @@ def test_a_follower_ends_before_the_safe_rear_of_the_train_ahead(state: Interloc
     follower = replace(state.trains[1], tracks={0: 1, 1: 1}, station=1)
     points = {name: PointState(locked={1: None, 3: None}) for name in LAYOUT.points()}
     both = replace(routed, trains={1: follower, 3: ahead}, points=points)
-    assert extended(both, LAYOUT, limits=LIMITS).trains[1].end_m == pytest.approx(1390.0 - 20.0)
+    assert extend_authorities(both, LAYOUT, limits=LIMITS).trains[1].end_m == pytest.approx(1390.0 - 20.0)
     both = replace(both, trains={1: follower, 3: replace(ahead, end_m=1800.0)})
     later = twice(both, message(3, 1, 1600.0))
     assert later.trains[3].rear_m == pytest.approx(1600.0 - 110.0)
-    assert extended(later, LAYOUT, limits=LIMITS).trains[1].end_m == pytest.approx(1490.0 - 20.0)
+    assert extend_authorities(later, LAYOUT, limits=LIMITS).trains[1].end_m == pytest.approx(1490.0 - 20.0)
 
 
 def test_points_are_released_after_the_rear_end_and_the_time(state: Interlocking) -> None:
     routed, _, _ = route_requested(state, 1, LAYOUT)
-    assert 1 in released(routed, 10.0, LAYOUT, limits=LIMITS).points[0, 1].locked
-    granted = extended(routed, LAYOUT, limits=LIMITS)
+    assert 1 in release_points(routed, 10.0, LAYOUT, limits=LIMITS).points[0, 1].locked
+    granted = extend_authorities(routed, LAYOUT, limits=LIMITS)
     passed = twice(granted, message(1, 1, 520.0))  # safe rear 410 m, points end at 400 m
-    waiting = released(passed, 20.0, LAYOUT, limits=LIMITS)
-    assert 1 in released(waiting, 22.9, LAYOUT, limits=LIMITS).points[0, 1].locked
-    done = released(waiting, 23.0, LAYOUT, limits=LIMITS)
+    waiting = release_points(passed, 20.0, LAYOUT, limits=LIMITS)
+    assert 1 in release_points(waiting, 22.9, LAYOUT, limits=LIMITS).points[0, 1].locked
+    done = release_points(waiting, 23.0, LAYOUT, limits=LIMITS)
     assert done.points[0, 1].locked == {}
     assert 1 in done.points[1, -1].locked
 
@@ -301,8 +301,8 @@ def authority(number: int, *, report: int = 0, end_m: float = 500.0, direction: 
 def test_the_age_of_an_authority_is_that_of_the_report_it_answers() -> None:
     train = OnBoard(direction=1, end_m=100.0, limits=OnBoardLimits(fresh_s=10.0))
     assert train.brake_reason(0.0) == "no fresh authority"
-    train.reported(1, 50.0)
-    train.reported(2, 51.0)
+    train.note_report(1, 50.0)
+    train.note_report(2, 51.0)
     assert train.receive(authority(1, report=1))
     assert (train.age_s(55.0), train.end_m) == (5.0, 500.0)
     assert train.brake_reason(60.0) is None
@@ -311,7 +311,7 @@ def test_the_age_of_an_authority_is_that_of_the_report_it_answers() -> None:
     assert train.receive(authority(2, report=2))
     assert train.brake_reason(61.1) == "no fresh authority"
     # a centre that hears nothing repeats its authority in vain
-    train.reported(3, 62.0)
+    train.note_report(3, 62.0)
     assert train.receive(authority(3, report=2))
     assert train.brake_reason(62.0) == "no fresh authority"
     assert not train.receive(authority(3, report=3))  # repeated
@@ -483,8 +483,8 @@ def test_a_route_is_taken_back_where_the_train_agrees() -> None:
     assert fast.receive(given)
     assert slow.receive(given)
     for _ in range(2):
-        fast.moved(305.0, 20.0)
-        slow.moved(305.0, 3.0)
+        fast.note_position(305.0, 20.0)
+        slow.note_position(305.0, 3.0)
     before = slow.acknowledgement()
     assert centre.ask_route_back(1) is None
     assert centre.set_route(1) == "a shorter authority is being agreed with the train"

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from railfix.ground import interlocking, stops, supervision
-from railfix.ground.interlocking import Interlocking, PointState, TrainInterval, extended, route_requested
+from railfix.ground.interlocking import Interlocking, PointState, TrainInterval, extend_authorities, route_requested
 from railfix.ground.layout import Layout, LoopStation
 from railfix.ground.stops import release_train, stop_trains
 from railfix.ground.supervision import Supervision, at_start, report_received, standing_train
@@ -33,7 +33,7 @@ RULES["creep"] = {
 }
 RULES["tracks kept"] = {supervision._turn: {"if station in under": "if station == known.station"}}
 RULES["end of the place"] = {OnBoard.receive: {"if not self._granted:": "if False:"}}
-RULES["two places"] = {OnBoard.moved: {"self.direction * before)": "-1e9)"}}
+RULES["two places"] = {OnBoard.note_position: {"self.direction * before)": "-1e9)"}}
 RULES["unknown before"] = {OnBoard.receive: {"authority.shortens and not (agrees or self._granted)": "False"}}
 RULES["station reached"] = {
     interlocking.route_requested: {"layout.is_reached(target, here.front_m, direction)": "False"}
@@ -174,11 +174,11 @@ def test_a_detection_from_before_the_last_command_counts_for_nothing() -> None:
     assert centre.set_route(1) is None
     for now_s, detected, end_m in ((0.0, (1, 1), 2080.0), (2.0, (2, 1), 420.0), (4.0, (2, 2), 80.0)):
         for point, track in zip(((1, -1), (0, 1)), detected, strict=True):
-            centre.detected(point, track)
+            centre.set_detected(point, track)
         centre.advance(now_s)
         assert centre.state.trains[1].end_m == end_m
         assert centre.state.trains[1].stop is None
-    centre.detected((0, 1), None)
+    centre.set_detected((0, 1), None)
     assert centre.state.trains[1].stop == "points of its route have lost their detection"
 
 
@@ -203,7 +203,7 @@ def authority(number: int, end_m: float, *, shortens: bool = False) -> Authority
 def test_a_wrong_place_at_the_start_on_board_is_no_authority(monkeypatch: pytest.MonkeyPatch) -> None:
     def end_m() -> float:
         train = OnBoard(direction=1, end_m=800.0)  # it stands at 300 m
-        train.reported(1, 0.0)
+        train.note_report(1, 0.0)
         assert train.receive(authority(1, 350.0))
         return train.end_m
 
@@ -219,7 +219,7 @@ def test_one_wrong_place_alone_agrees_to_no_shorter_end(monkeypatch: pytest.Monk
         train = OnBoard(direction=1, end_m=0.0)
         train.receive(authority(1, 2000.0))
         for place in (300.0, -200.0):
-            train.moved(place, 20.0)
+            train.note_position(place, 20.0)
         train.receive(authority(2, 330.0, shortens=True))
         return train.end_m
 
@@ -234,7 +234,7 @@ def test_a_start_on_board_while_the_train_runs_agrees_to_nothing(monkeypatch: py
     def acknowledged() -> dict[str, int]:
         train = OnBoard(direction=1, end_m=300.0)
         for _ in range(2):
-            train.moved(305.0, 20.0)
+            train.note_position(305.0, 20.0)
         train.receive(authority(9, 330.0, shortens=True))
         return train.acknowledgement()
 
@@ -251,4 +251,4 @@ def test_a_train_beyond_what_it_agrees_to_keeps_its_route() -> None:
     answer = {"authority": asked.number, "authority_end_cm": asked.end_cm, "facing": -1, "direction": -1}
     centre.report(report(3, 2070.0, speed_cmps=-4000, **answer), 3.0)
     assert (centre.state.trains[1].station, centre.state.trains[1].asked_m) == (0, None)
-    assert extended(centre.state, LINE, limits=LIMITS).trains[1].end_m == 80.0
+    assert extend_authorities(centre.state, LINE, limits=LIMITS).trains[1].end_m == 80.0

@@ -224,7 +224,7 @@ def test_a_train_whose_positions_end_waits_for_its_last_answer(folder: Path, tmp
         await begun.wait()
         counts = await run_train(
             1, folder / "keys", bearers_of(addresses(folder), LOCAL), lines=positions(),
-            write=lambda line: lines.append(json.loads(line)),
+            limits=OnBoardLimits(mode="spare"), write=lambda line: lines.append(json.loads(line)),
         )  # fmt: skip
         centre.cancel()
         with suppress(asyncio.CancelledError):
@@ -436,6 +436,8 @@ def test_an_order_to_stop_is_acknowledged_and_timed(
     control.step()
     lost = control.snapshot()["trains"][0]
     assert (lost["state"], lost["shown"]) == ("simulated", shown["shown"])
+    assert shown["place"] == ""  # without a reference run
+    assert lost["place"] == "A to B, 10 %"  # P5 3.1: 400 m, the stations stop at 250 and 1750 m
     assert orders["release-train"]({"train": 1}) == "the section where train 1 is or may run is closed"
     assert orders["open-section"]({"section": "A"}) is None
     assert (orders["release-train"]({"train": 1}) or "").startswith("train 1 is silent")

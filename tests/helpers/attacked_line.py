@@ -62,10 +62,10 @@ class AttackedTrain:
         """What `railfix.ground.train` makes of a position: it sees ends change, and acknowledges."""
         place, taken = values["chainage_cm"] / 100.0, self.on_board.acknowledgement()
         if values["facing"] != self.on_board.direction and values["standstill"]:
-            self.on_board.turned(values["facing"], place)
+            self.on_board.turn(values["facing"], place)
             self.held_m = None
-        self.on_board.reported(self.sequence, now_s)
-        self.on_board.moved(place + self.on_board.direction * BOUND_M, abs(values["speed_cmps"]) / 100.0)
+        self.on_board.note_report(self.sequence, now_s)
+        self.on_board.note_position(place + self.on_board.direction * BOUND_M, abs(values["speed_cmps"]) / 100.0)
         return TrainMessage(**values, **taken)
 
 
@@ -140,7 +140,7 @@ class AttackedLine:
             if self.rng.random() < 0.6:
                 del self.moving[point]
                 self.points[point] = track
-                self.centre.detected(point, track)
+                self.centre.set_detected(point, track)
                 break
         before = self.centre.state
         for authority in self.centre.advance(self.now_s):

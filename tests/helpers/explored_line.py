@@ -85,7 +85,7 @@ class World:
     def report(self, train: ModelTrain, speed_mps: float, **changes: object) -> TrainMessage:
         """The next report of a train, right unless changed."""
         train.sequence += 1
-        train.on_board.reported(train.sequence, self.now_s)
+        train.on_board.note_report(train.sequence, self.now_s)
         time_ns = round((1000.0 + self.now_s) * 1e9)
         whole = TrainMessage(
             train=train.number, sequence=train.sequence, time_ns=time_ns, sent_ns=time_ns, line=1,
@@ -120,7 +120,7 @@ class World:
             if train.wagons_m is not None or LINE.station_at(*sorted((train.front_m, train.rear_m))) is None:
                 return None
             front = train.rear_m
-            train.on_board.turned(-train.direction, front)
+            train.on_board.turn(-train.direction, front)
             train.front_m, train.held_m = front, None
         if event == "asked back" and world.centre.ask_route_back(number) is not None:
             return None
@@ -150,7 +150,7 @@ class World:
     def answer(self, late: int | None) -> None:
         """Let points move, the centre extend authorities, and the trains have them, but for one whose comes late."""
         for command in self.moved:
-            self.centre.detected(*command)
+            self.centre.set_detected(*command)
         self.moved.clear()
         before = self.centre.state
         for authority in self.centre.advance(self.now_s):

@@ -21,7 +21,7 @@ from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import ObservationHeader, Observations, concatenate
 from railfix.io import read_navigation, read_observations, write_navigation, write_observations
 from railfix.io.rinex.write import RinexVersion, _format_f14_3, packing_of
-from railfix.simulate import Scenario, SkySettings, simulated_navigation
+from railfix.simulate import Scenario, SkySettings, simulate_navigation
 from railfix.simulate.scenario import ReceiverSettings
 
 START = np.datetime64("2024-03-05T23:59:58.5", "ns")
@@ -245,7 +245,7 @@ def navigation(second: Literal["L2", "L5"] = "L2") -> Navigation:
     receiver = ReceiverSettings(signals_per_satellite=2, second=second)
     start, sky = np.datetime64("2024-03-03T00:10:00", "ns"), SkySettings(systems="GJEC")
     scenario = Scenario(start=start, sky=sky, receiver=receiver)
-    made = simulated_navigation(scenario)
+    made = simulate_navigation(scenario)
     rng = np.random.default_rng(1)
     toe = np.datetime64("2024-03-03T00:15:18", "ns") + np.arange(3) * np.timedelta64(1800, "s")
     sent = toe - np.timedelta64(600, "s")

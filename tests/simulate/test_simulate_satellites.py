@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from railfix.simulate import Scenario, SkySettings, build_alignment, simulated_navigation
+from railfix.simulate import Scenario, SkySettings, build_alignment, simulate_navigation
 from railfix.simulate.constellation import SatelliteTable, links
 
 pytestmark = pytest.mark.requirement("D4")
 
 SCENARIO = Scenario(duration_s=7200.0, sky=SkySettings(systems="GJEC"))
-NAVIGATION = simulated_navigation(SCENARIO)
+NAVIGATION = simulate_navigation(SCENARIO)
 NAMES = sorted({str(s) for s in NAVIGATION.kepler.satellite})
 LAST = SCENARIO.start + np.timedelta64(7200, "s")
 PLACE = build_alignment(SCENARIO.line).at(np.zeros(1))[0]

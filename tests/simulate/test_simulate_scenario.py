@@ -31,11 +31,11 @@ from railfix.simulate import (
     Simulation,
     SkySettings,
     Station,
+    list_scenarios,
     load_recipe,
     load_scenario,
     scenario_table,
-    shipped_scenarios,
-    simulated_navigation,
+    simulate_navigation,
     write_run,
 )
 from railfix.simulate.environment.settings import ElectrificationSettings, EnvironmentSettings, SectionSettings
@@ -152,7 +152,7 @@ def test_a_duration_can_be_that_of_the_run(tmp_path: Path) -> None:
 
 def test_paths_are_relative_to_the_file_that_names_them(tmp_path: Path) -> None:
     (tmp_path / "below").mkdir()
-    write_navigation(simulated_navigation(Scenario()), tmp_path / "below" / "sky.nav")
+    write_navigation(simulate_navigation(Scenario()), tmp_path / "below" / "sky.nav")
     path = write_text(tmp_path / "below", '[sky]\nnav = "sky.nav"\nunhealthy = []')
     assert Simulation(load_scenario(path)).navigation.sources == (str(tmp_path / "below" / "sky.nav"),)
     recipe = '[parts.sky]\nsky.nav = "below/sky.nav"\nsky.unhealthy = []\n[[runs]]\nname = "a"\nparts = ["sky"]\n'
@@ -194,7 +194,7 @@ def test_files_that_are_no_scenarios(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if k % 3 else n for k, n in enumerate(shipped_scenarios())]
+    "name", [pytest.param(n, marks=pytest.mark.slow) if k % 3 else n for k, n in enumerate(list_scenarios())]
 )
 def test_every_shipped_run_can_be_set_up(name: str) -> None:
     recipe = load_recipe(name)
@@ -301,7 +301,7 @@ def test_the_truth_tells_acceleration_and_what_stands_along_the_line(tmp_path: P
 
 def test_a_made_sky_read_back_from_its_file_is_the_same_sky(tmp_path: Path) -> None:
     scenario = Scenario(duration_s=5.0, rate_hz=1.0, sky=SkySettings(systems="GJEC", unhealthy=()))
-    write_navigation(simulated_navigation(scenario), tmp_path / "sky.rnx")
+    write_navigation(simulate_navigation(scenario), tmp_path / "sky.rnx")
     filed = scenario.replaced(sky=scenario.sky.replaced(nav=str(tmp_path / "sky.rnx")))
     made, read = whole(scenario).observations, whole(filed).observations
     assert made.satellite.tolist() == read.satellite.tolist()
@@ -332,16 +332,16 @@ def test_a_real_sky_is_corrected_by_the_product(recordings: Path, systems: str) 
 
 
 def test_a_time_outside_of_the_file_is_refused(tmp_path: Path) -> None:
-    write_navigation(simulated_navigation(Scenario()), tmp_path / "sky.rnx")
+    write_navigation(simulate_navigation(Scenario()), tmp_path / "sky.rnx")
     sky = SkySettings(nav=str(tmp_path / "sky.rnx"), unhealthy=())
     for start, duration in (("2024-03-05T09:00:00", 10.0), ("2024-03-04T03:10:00", 10.0), ("2024-03-05T03:10:00", 3e4)):
         scenario = Scenario(start=np.datetime64(start, "ns"), duration_s=duration, sky=sky)
         with pytest.raises(MismatchError, match=r"sky\.rnx: no satellite .* reference times in the file"):
-            simulated_navigation(scenario)
+            simulate_navigation(scenario)
     navigation = replace(read_navigation(tmp_path / "sky.rnx"), klobuchar={})
     write_navigation(navigation, tmp_path / "bare.rnx")
     with pytest.raises(MismatchError, match="Klobuchar"):
-        simulated_navigation(Scenario(sky=sky.replaced(nav=str(tmp_path / "bare.rnx"))))
+        simulate_navigation(Scenario(sky=sky.replaced(nav=str(tmp_path / "bare.rnx"))))
     with pytest.raises(SettingsError, match="unhealthy"):
         SkySettings(nav="x")
 
@@ -424,5 +424,5 @@ def test_the_files_of_the_document_are_scenarios(tmp_path: Path) -> None:
         "rising",
         "falling",
     ]
-    for name in shipped_scenarios():
+    for name in list_scenarios():
         assert f"\n- `{name}`: " in text

@@ -55,7 +55,7 @@ from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import parse_config
 from railfix.run.processor import processor_of
 from railfix.simulate.run import truth_table, vehicle_table
-from railfix.simulate.scenario_file import load_recipe, shipped_scenarios
+from railfix.simulate.scenario_file import list_scenarios, load_recipe
 from railfix.track import Track, antenna_trajectory, read_track, read_vehicle
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line, Tracked, TrackStatus
@@ -676,7 +676,7 @@ def main() -> int:
         if name in known:
             case = known[name]()
         else:
-            case = simulated(name) if name in shipped_scenarios() else case_of_folder(Path(name))
+            case = simulated(name) if name in list_scenarios() else case_of_folder(Path(name))
         case = case.part(0, len(case.observations.time), args.thin) if args.thin > 1 else case
         if args.whole:
             show_whole(case, args)

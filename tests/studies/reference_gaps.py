@@ -26,7 +26,7 @@ from railfix.io.position_log import PositionLog
 from railfix.pipeline.config import DEFAULT_SIGNALS
 from railfix.positioning.doppler_speed import Dopplers, doppler_speed, dopplers_of_log
 from railfix.reference import Pulses, ReferenceData, ReferenceSettings, build_references
-from railfix.reference.matching import match
+from railfix.reference.fixes import match
 from railfix.track.trajectory import Trajectory
 from recordings_score import trajectory_of
 

@@ -24,7 +24,7 @@ from railfix.cli.console import (
 )
 from railfix.cli.options import Choices, OutOption, Without, from_models, settings_of
 from railfix.core.errors import MismatchError, NoPositionError, SettingsError
-from railfix.core.tables import listed, number, percent
+from railfix.core.tables import number, percent, plain_table
 from railfix.evaluate import Score
 from railfix.evaluate.ablation import Ablation, Effect, ablate_files
 from railfix.evaluate.benchmark import heads, run_benchmark, shown_rows
@@ -169,7 +169,7 @@ def benchmark(
     console = TableConsole()
     head = ["\n".join(pair) for pair in zip(*heads(), strict=True)]
     caption = "Errors in metres along the line and straight; second line: performance feature of EN 16803-1"
-    show_table(console, listed(head, shown_rows(table), caption, texts=2))
+    show_table(console, plain_table(head, shown_rows(table), caption, texts=2))
     show_notes(console, notes)
     show_files(console, [out / f"benchmark.{kind}" for kind in ("csv", "json", "md")])
     failed = table["error"].drop_nulls()
@@ -248,7 +248,7 @@ def _show(console: Console, effects: list[Effect]) -> None:
     caption = f"{effects[0].antenna}: {effects[0].epochs:,} epochs"
     if scored:
         caption += "; errors along the line in metres, wrong positions in per cent; all: every epoch with coordinates"
-    show_table(console, listed(head, rows, caption))
+    show_table(console, plain_table(head, rows, caption))
 
 
 def _errors(figures: Score) -> list[str]:

@@ -29,7 +29,7 @@ from railfix.cli.options import (
 )
 from railfix.core.errors import SettingsError
 from railfix.core.settings import validated
-from railfix.core.tables import Column, listed, listing, number, percent, signed
+from railfix.core.tables import Column, listing, number, percent, plain_table, signed
 from railfix.evaluate import EvaluationOptions, RunAndReference, TrackFiles, evaluate_runs, write_evaluation
 from railfix.evaluate.inputs import POSITIONS_TABLE, TABLES, EvaluationInputs, tables_of
 from railfix.evaluate.range_errors import ModelInputs, StationBeside, error_model_from_runs
@@ -282,7 +282,7 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
     )
     figures = [[f"{when}\ncount", "\nbias", "\nsigma", "\nbound"] for when in ("before", "after")]
     head = ["before and\nafter screens", *figures[0], *figures[1]]
-    show_table(console, listed(head, [list(row) for row in summary(model)]))
+    show_table(console, plain_table(head, [list(row) for row in summary(model)]))
     if (rate := model.faults) is not None:
         console.print(
             f"local faults: {rate.faulty} of {rate.ranges:,} used ranges beyond {rate.beyond_sigma:g} sigma of the "
@@ -362,5 +362,5 @@ def _print_curve(curve: Cn0Curve, notes: tuple[str, ...]) -> None:
         spread = f"{float(mean.spread_db.mean()):.1f}"
         rows.append([KINDS.get(mean.kind, mean.kind), mean.signal, f"{int(mean.count.sum()):,}", span, *values, spread])
     head = ["satellites", "signal", "samples", "elevation", "15 deg", "45 deg", "75 deg", "spread"]
-    show_table(console, listed(head, rows, texts=2))
+    show_table(console, plain_table(head, rows, texts=2))
     show_notes(console, notes)

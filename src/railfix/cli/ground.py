@@ -16,7 +16,7 @@ from railfix.cli.console import TableConsole, show_files, show_table
 from railfix.cli.options import check_outputs, from_models
 from railfix.core.errors import MismatchError, OutputError, SettingsError
 from railfix.core.settings import Settings, option
-from railfix.core.tables import listed, plural
+from railfix.core.tables import plain_table, plural
 from railfix.ground.train import OnBoardLimits
 from railfix.ground.triangle import MonitorLimits, TriangleLimits
 from railfix.run.output import Overwrite
@@ -121,7 +121,7 @@ def monitor(
     console = TableConsole()
     counted = zip(*np.unique(result.triangle.verdict, return_counts=True), strict=True)
     rows = [[TriangleVerdict(int(value)).name.lower(), str(count)] for value, count in counted]
-    show_table(console, listed(["verdict", "epochs"], rows, texts=2, boxed=True))
+    show_table(console, plain_table(["verdict", "epochs"], rows, texts=2, boxed=True))
     for time, order, cause, receiver in result.orders:
         named = "" if receiver < 0 else f", receiver {receiver}"
         console.print(f"{np.datetime_as_string(time, unit='s')} {order.value}: {cause.name.lower()}{named}")
@@ -191,7 +191,7 @@ def _monitor_live(
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
     rows = [[name, str(count)] for name, count in sorted(counts.items())]
-    show_table(console, listed(["verdict", "epochs"], rows, texts=2, boxed=True))
+    show_table(console, plain_table(["verdict", "epochs"], rows, texts=2, boxed=True))
     if not monitor.state.stopped:
         console.print("no stop")
     show_files(console, [path])
@@ -417,4 +417,4 @@ def _show_figures(figures: dict[str, Any]) -> None:
         [name, (", ".join(f"{k} {v}" for k, v in value.items()) or "none") if isinstance(value, dict) else str(value)]
         for name, value in figures.items()
     ]
-    show_table(TableConsole(), listed(["what happened", ""], rows, texts=2, boxed=True))
+    show_table(TableConsole(), plain_table(["what happened", ""], rows, texts=2, boxed=True))

@@ -11,7 +11,7 @@ import typer
 from railfix.cli.console import TableConsole, show_files, show_notes, show_table
 from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs, from_models, overwriting, settings_of
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.tables import listed, plural
+from railfix.core.tables import plain_table, plural
 from railfix.evaluate.inputs import TABLES, read_run, tables_of
 from railfix.io.positions_export import style_file, write_positions
 from railfix.pipeline.tables import rounded
@@ -93,7 +93,7 @@ def which_track(
     for k in np.argsort(-last.probability):
         share = facing[k] / last.probability[k] if last.probability[k] > 0.0 and np.isfinite(facing[k]) else np.nan
         rows.append([last.names[k], f"{last.probability[k]:.6f}", "" if np.isnan(share) else f"{share:.4f}"])
-    show_table(console, listed(["track", "probability", "facing its direction"], rows, texts=3))
+    show_table(console, plain_table(["track", "probability", "facing its direction"], rows, texts=3))
     show_notes(console, decision.notes)
     if save_last is not None:
         write_last_place(last, decision.end, save_last)

@@ -15,7 +15,7 @@ from railfix.cli.map_network import Columns, MapReading, match_command, network,
 from railfix.cli.map_runs import service, survey
 from railfix.cli.options import OverwriteOption, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
-from railfix.core.tables import listed, plural
+from railfix.core.tables import plain_table, plural
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import column_names, read_positions
 from railfix.track import (
@@ -173,7 +173,7 @@ def features(
             others = [f"{runs:.0f} of {len(run or ())}", "" if spread is None else f"{spread:.2f}", gap]
         shown.append([f"{chainage:.1f}", quantity, unit, *others])
     caption = f"{track.name}: {len(found)} features"
-    show_table(TableConsole(), listed(columns, shown, caption, texts=len(columns), boxed=True), most=MOST_FINDINGS)
+    show_table(TableConsole(), plain_table(columns, shown, caption, texts=len(columns), boxed=True), most=MOST_FINDINGS)
 
 
 @app.command("from-positions", cls=Command)
@@ -258,7 +258,7 @@ def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
         points = f"{finding.first}-{finding.last}" if finding.last > finding.first else f"{finding.first}"
         rows.append([finding.severity, finding.kind, points, marking, finding.sentence])
     head = ["severity", "kind", "points", "kilometrage", "finding"]
-    show_table(console, listed(head, rows, texts=5), most=MOST_FINDINGS)
+    show_table(console, plain_table(head, rows, texts=5), most=MOST_FINDINGS)
     console.print(f"{plural(quality.errors, 'error')}, {plural(quality.warnings, 'warning')}")
     if picture is not None:
         console.print(f"picture: {picture}")

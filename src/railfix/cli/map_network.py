@@ -14,7 +14,7 @@ from railfix.cli.options import OverwriteOption, Without, check_outputs, from_mo
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.core.tables import listed, plural
+from railfix.core.tables import plain_table, plural
 from railfix.run.inputs import ColumnNames, TrackReading
 from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network
@@ -129,7 +129,7 @@ def network(
         [found.kind, f"{found.latitude_deg:.6f}", f"{found.longitude_deg:.6f}", found.sentence]
         for found in quality.findings
     ]
-    show_table(console, listed(["kind", "latitude", "longitude", "finding"], rows, texts=4), most=MOST_FINDINGS)
+    show_table(console, plain_table(["kind", "latitude", "longitude", "finding"], rows, texts=4), most=MOST_FINDINGS)
     if out is not None:
         from railfix.report.plots.network import plot_network
 

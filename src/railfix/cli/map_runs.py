@@ -15,7 +15,7 @@ from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs
 from railfix.core.errors import SettingsError
 from railfix.core.files import BrokenLines
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.core.tables import Column, count, listed, listing, number, percent, plural
+from railfix.core.tables import Column, count, listing, number, percent, plain_table, plural
 from railfix.run.inputs import ColumnNames, LogReading
 from railfix.track.survey.runs import SurveyLimits
 
@@ -170,7 +170,7 @@ def survey(
     ]
     head = ["run", "positions", "run m", "sigma / stated"]
     caption = "Runs, with their errors across as a share of the standard deviation that they state"
-    show_table(console, listed(head, rows, caption))
+    show_table(console, plain_table(head, rows, caption))
     show_notes(console, [*track.provenance.notes, *surveyed.notes])
     if picture is not None:
         console.print(f"picture: {picture}")

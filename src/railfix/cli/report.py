@@ -158,7 +158,7 @@ def plot_screens(
         with reading_table(run / "observations.parquet"):
             pictures = draw_run_screens(run, folder.staging)
         for picture in pictures:
-            folder.staged(picture.name)
+            folder.stage(picture.name)
         drawn = folder.commit()
     for path in drawn.values():
         typer.echo(f"wrote {path}")

@@ -23,7 +23,7 @@ from railfix.run.output import Overwrite, check_folder
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from railfix.simulate.run import write_run
 from railfix.simulate.scenario import Scenario
-from railfix.simulate.scenario_file import Recipe, load_recipe, shipped_scenarios
+from railfix.simulate.scenario_file import Recipe, list_scenarios, load_recipe
 
 
 class SimulateOptions(Settings):
@@ -87,7 +87,7 @@ def simulate(
     Exit codes as `railfix --help` says; 5 where the navigation file does not serve the scenario's time.
     """
     if list_shipped:
-        for name in shipped_scenarios():
+        for name in list_scenarios():
             recipe = load_recipe(name)
             runs = f" ({len(recipe.names)} runs)" if recipe.names[0] else ""
             typer.echo(f"{name:18} {recipe.description}{runs}")

@@ -120,7 +120,7 @@ class _HatanakaStream(ByteStream):
         return f"the Hatanaka (CRX) data are cut short or damaged{place}: {reason}; download it again"
 
 
-def listed(paths: Paths) -> list[str]:
+def path_names(paths: Paths) -> list[str]:
     """One or several paths as a list of texts; ValueError where there is none."""
     names = [paths] if isinstance(paths, str | PathLike) else list(paths)
     if not names:
@@ -233,12 +233,12 @@ def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
 
     `what` is the kind of file, for the message of the OutputError where it cannot be written.
     """
-    with staged_file(path, what=what) as temporary:
+    with stage_file(path, what=what) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 @contextmanager
-def staged_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
+def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
     """Yield a temporary path beside a file, which replaces the file where the block ends without error."""
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")

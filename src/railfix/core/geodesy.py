@@ -62,10 +62,15 @@ def enu_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Floats:
     return axes
 
 
+def axes_at(ecef_m: ArrayLike) -> Floats:
+    """Compute `enu_axes` at ECEF places of shape (..., 3)."""
+    latitude, longitude, _ = geodetic_from_ecef(ecef_m)
+    return enu_axes(latitude, longitude)
+
+
 def sigma_along(sigma_enu_m: Floats, ecef_m: Floats, direction: Floats) -> Floats:
     """Compute the sigma along unit vectors (T, 3) from those east, north and up, uncorrelated, at places (T, 3)."""
-    latitude, longitude, _ = geodetic_from_ecef(ecef_m)
-    components = np.einsum("tij,tj->ti", enu_axes(latitude, longitude), direction)
+    components = np.einsum("tij,tj->ti", axes_at(ecef_m), direction)
     return np.asarray(np.sqrt(np.sum((components * sigma_enu_m) ** 2, axis=1)))
 
 
@@ -73,8 +78,7 @@ def elevation_azimuth(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tupl
     """Compute elevation and azimuth (clockwise from north) [deg] of satellites (T, N, 3) at receivers (T, 3)."""
     sat = np.asarray(sat_ecef_m, dtype=np.float64)
     receiver = np.asarray(receiver_ecef_m, dtype=np.float64)
-    lat, lon, _ = geodetic_from_ecef(receiver)
-    return angles_of(sat - receiver[:, None, :], enu_axes(lat, lon))
+    return angles_of(sat - receiver[:, None, :], axes_at(receiver))
 
 
 def angles_of(line_ecef_m: Floats, axes: Floats) -> tuple[Floats, Floats]:

@@ -58,7 +58,7 @@ class Table:
     boxed: bool = False  #: A terminal draws a frame around it.
 
 
-def listed(
+def plain_table(
     head: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "", *, texts: int = 1, boxed: bool = False
 ) -> Table:
     """A table that is printed alone; all columns but the first `texts` are numbers."""

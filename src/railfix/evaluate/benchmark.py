@@ -25,7 +25,7 @@ from railfix.core.reasons import Status
 from railfix.core.timescale import seconds
 from railfix.evaluate.cases import Case, check_not_fitted, read_cases
 from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_runs
-from railfix.evaluate.figures import ALL, FIGURE_COLUMNS, positioned
+from railfix.evaluate.figures import ALL, FIGURE_COLUMNS, has_position
 from railfix.evaluate.inputs import CONVENTIONAL, POSITIONS_TABLE, floats, read_run, tables_of
 from railfix.evaluate.integrity import STANFORD_COLUMNS
 from railfix.evaluate.place import TrackFiles, find_trajectory
@@ -292,7 +292,9 @@ def _row(evaluation: Evaluation, run: EvaluatedRun, name: str, kind: str) -> dic
 
 def _time_to_first(epochs: pl.DataFrame, kind: str) -> float | None:
     """Time from the first epoch with observations to the first with a position [s]; None where there is none."""
-    observed, placed = (epochs.filter(mask)["time_gpst"].to_numpy() for mask in (pl.col("observed"), positioned(kind)))
+    observed, placed = (
+        epochs.filter(mask)["time_gpst"].to_numpy() for mask in (pl.col("observed"), has_position(kind))
+    )
     return float(seconds(placed.min() - observed.min())) if len(observed) and len(placed) else None
 
 

@@ -277,7 +277,7 @@ def _satellite_names() -> list[str]:
     return ["unknown", f"under {edges[0]}", *between, f"{edges[-1]} and more"]
 
 
-def positioned(position: str) -> pl.Expr:
+def has_position(position: str) -> pl.Expr:
     """Whether an epoch has a position of one kind of `POSITIONS`."""
     if position == "conventional":
         return pl.col("conventional_positioned")
@@ -290,7 +290,7 @@ def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
     """Epochs with the columns ``has`` (a position) and ``error`` (where the reference is good) of one kind."""
     conventional = position == "conventional"
     column = "conventional_error_m" if conventional else "error_m"
-    has = positioned(position)
+    has = has_position(position)
     if epochs_of == "common":
         has &= pl.col("positioned") & pl.col("conventional_positioned")
     unknown = pl.lit(None, pl.Float64)

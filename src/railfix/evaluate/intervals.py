@@ -12,7 +12,7 @@ import polars as pl
 
 from railfix.core.errors import MismatchError
 from railfix.evaluate.epochs import OF_FILTER, level_columns
-from railfix.evaluate.figures import AIDED, ALL, KEYS, POSITIONS, WRONG_PLACE_M, at_largest, positioned
+from railfix.evaluate.figures import AIDED, ALL, KEYS, POSITIONS, WRONG_PLACE_M, at_largest, has_position
 from railfix.evaluate.inputs import RunFolder, read_run, tables_of
 
 #: Columns of the table of intervals beside its keys, with their unit and meaning.
@@ -47,7 +47,7 @@ def _of_position(epochs: pl.LazyFrame, position: str, by: list[str]) -> pl.DataF
     keys = list(dict.fromkeys([*by, *_OF]))
     spanned = (
         epochs.filter(pl.col("moved_m").is_not_null())
-        .select(*keys, "time_gpst", "chainage_m", "moved_m", has=positioned(position))
+        .select(*keys, "time_gpst", "chainage_m", "moved_m", has=has_position(position))
         .collect()
     )
     edges = (
@@ -223,7 +223,7 @@ def level_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame | None:
             "in_reference", pl.col(level).is_not_null().any().over("run")
         )
         for position in ("constrained", "constrained_ok"):
-            has = positioned(position)
+            has = has_position(position)
             tables.append(
                 spanned.with_columns(has=has, finite=has & pl.col(level).is_finite().fill_null(value=False))
                 .group_by(by, maintain_order=True)

@@ -330,17 +330,15 @@ def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, s
     return [given, (recorded[0], recorded[1], recorded[2])]
 
 
-def track_of(run: RunFolder, files: TrackFiles | None = None) -> Track:
+def track_of(run: RunFolder) -> Track:
     """Return the track that the run used."""
-    files = files or TrackFiles()
-    paths = list(files.track) or run.tracks
-    if not paths:
+    if not run.tracks:
         raise InputFileError(run.path / "run.json", "names no track; give it with --track")
-    *first, last = _readings(run, files)
+    *first, last = _readings(run, TrackFiles())
     for crs, datum, geoid in first:
         with suppress(RailfixError):
-            return read_track(paths, crs=crs, height_datum=datum, geoid=geoid)
-    return read_track(paths, crs=last[0], height_datum=last[1], geoid=last[2])
+            return read_track(run.tracks, crs=crs, height_datum=datum, geoid=geoid)
+    return read_track(run.tracks, crs=last[0], height_datum=last[1], geoid=last[2])
 
 
 def _trajectory(run: RunFolder, antenna: str, track: Track, vehicles: Sequence[Path]) -> Trajectory:

@@ -6,8 +6,8 @@ from .interlocking import (
     InterlockingLimits,
     PointState,
     TrainInterval,
-    extended,
-    released,
+    extend_authorities,
+    release_points,
     route_requested,
 )
 from .layout import Layout, LoopStation
@@ -49,10 +49,10 @@ __all__ = [
     "TriangleVerdict",
     "advance",
     "compare_triangle",
-    "extended",
+    "extend_authorities",
     "limits_for_false_stops",
     "release",
-    "released",
+    "release_points",
     "report_received",
     "route_requested",
     "station_fixes",

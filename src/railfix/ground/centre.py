@@ -138,7 +138,6 @@ class TrainRecord:
     shown_m: float | None = None  #: Place of the front that is shown.
     #: Reported less simulated place at the last resynchronisation, positive in running direction.
     jump_m: float | None = None
-    departure_s: float | None = None  #: Booked departure from the station, centre's clock.
 
 
 class Rejection(Enum):
@@ -212,10 +211,7 @@ def time_passed(
     facing, last = record.message.facing, record.message.chainage_cm / 100.0
     place = last
     if (curve := curves.get(facing)) is not None:
-        start = record.measured_s
-        if record.departure_s is not None and curve.station_at(last) is not None:
-            start = max(start, record.departure_s)
-        place = curve.running_m(last, now_s - start)
+        place = curve.running_m(last, now_s - record.measured_s)
     at_end = authority_m is not None and facing * (authority_m - place) <= 0.0
     if at_end and authority_m is not None:
         place = authority_m if facing * (authority_m - last) > 0.0 else last

@@ -47,7 +47,7 @@ class StopOrder:
     acknowledged_s: float | None = None
     rest_s: float | None = None
 
-    def reported(self, message: TrainMessage, now_s: float) -> bool:
+    def take_report(self, message: TrainMessage, now_s: float) -> bool:
         """Take a report; return whether the train has come to rest by it."""
         taken = message.authority is not None and message.authority >= self.number
         if taken and self.acknowledged_s is None:
@@ -155,7 +155,7 @@ class ControlCentre:
         if was.asked_m is not None and known.asked_m is None:
             what = "has given its route back" if known.held else "keeps its route"
             self.log(f"train {number}: {what}", train=number)
-        if (order := self.stops.get(number)) is not None and order.reported(message, self.clock()):
+        if (order := self.stops.get(number)) is not None and order.take_report(message, self.clock()):
             self.log(f"train {number}: order to stop {order}", train=number)
         self.reports += 1
         after = self.supervision.records[number]
@@ -327,6 +327,7 @@ class ControlCentre:
             speed = 0 if record.message is None else record.message.speed_cmps or 0
             trains.append({
                 "number": number, "state": record.state.value, "shown": record.shown_m, "speed": abs(speed) / 100.0,
+                "place": self._place(train.direction, record.shown_m),
                 "direction": train.direction, "rear": rear, "front": front, "end": train.end_m, "jump": record.jump_m,
                 "interference": self.interference.get(number, SuspectedInterference.NONE).name.lower(),
                 "stop": None if number not in stopped else f"{stopped[number]}; {self.stops.get(number, 'not sent')}",
@@ -348,6 +349,16 @@ class ControlCentre:
             ],
             "monitor": self._monitor_values(), "routes": self.supervision.routes, "rejected": dict(self.rejected),
         }  # fmt: skip
+
+    def _place(self, direction: int, shown_m: float | None) -> str:
+        """Return the station, or the section and the progress in it, as P5 3.1 reports it; "" without a place."""
+        if shown_m is None or (curve := self.curves.get(direction)) is None:
+            return ""
+        names = [station.name for station in self.supervision.layout.stations][::direction]
+        if (station := curve.station_at(shown_m)) is not None:
+            return names[station]
+        section, progress = curve.progress(shown_m)
+        return f"{names[section]} to {names[section + 1]}, {progress:.0f} %"
 
     def point_name(self, point: PointName) -> str:
         """Return the name of points for people."""

@@ -137,7 +137,6 @@ class FrameReceiver:
     limits: ReceiverLimits = field(default_factory=ReceiverLimits)
     #: Frames that were rejected, by threat; deletions are the numbers that a newer one has skipped.
     threats: Counter[Threat] = field(default_factory=Counter)
-    second_copies: int = 0  #: Frames that the other link had brought before.
     _accepted: _Seen = field(default_factory=_Seen)
     _links: dict[tuple[str, FrameKind], _Seen] = field(default_factory=dict)
     _shortest_ns: float | None = None
@@ -159,10 +158,7 @@ class FrameReceiver:
         if self._late(frame, now_ns):
             return self._reject(Threat.DELAY)
         on_link.add(frame.sequence)
-        if frame.kind is not FrameKind.DATA:
-            return frame, None
-        if self._accepted.has(frame.sequence):
-            self.second_copies += 1
+        if frame.kind is not FrameKind.DATA or self._accepted.has(frame.sequence):
             return frame, None
         if frame.sequence < self._accepted.newest:
             self.threats[Threat.RESEQUENCING] += 1

@@ -242,7 +242,7 @@ def _under_interval(state: Interlocking, point: PointName, layout: Layout, nearb
     )
 
 
-def released(state: Interlocking, now_s: float, layout: Layout, *, limits: InterlockingLimits) -> Interlocking:
+def release_points(state: Interlocking, now_s: float, layout: Layout, *, limits: InterlockingLimits) -> Interlocking:
     """Return the state with the points released that safe rear ends have passed long enough ago."""
     points: dict[PointName, PointState] = {}
     for name, point in state.points.items():
@@ -261,7 +261,7 @@ def released(state: Interlocking, now_s: float, layout: Layout, *, limits: Inter
     return replace(state, points={**state.points, **points}) if points else state
 
 
-def extended(
+def extend_authorities(
     state: Interlocking,
     layout: Layout,
     *,

@@ -12,8 +12,6 @@ from typing import Annotated, Final, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats
@@ -162,7 +160,7 @@ def layout_of(network: Network, *, drive: Literal["left", "right"] = "left") -> 
     which they drive: their track is track 1. MismatchError: when the network is something else: several lines,
     branches, stations of three tracks, loops of unequal length.
     """
-    ends = _nodes(network)
+    ends = network.joints.tolist()
     at: dict[int, list[int]] = defaultdict(list)
     for track, (first, last) in enumerate(ends):
         at[first].append(track)
@@ -205,16 +203,6 @@ def _station(names: tuple[str, ...], lengths_m: list[float], lines: list[Floats]
         )
     points = max(_clear_after_m(*lines), _clear_after_m(*(line[::-1] for line in lines)))
     return LoopStation(name=names[0], begin_m=begin_m, end_m=begin_m + lengths_m[0], points_m=round(points + 0.5, 1))
-
-
-def _nodes(network: Network) -> list[tuple[int, int]]:
-    """Return the point at which each track begins and ends, by numbers: ends that are linked are one point."""
-    count = 2 * len(network.tracks)
-    first = [2 * link.first + link.first_end for link in network.links]
-    second = [2 * link.second + link.second_end for link in network.links]
-    linked = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
-    _, point = connected_components(linked, directed=False)
-    return [(int(begin), int(end)) for begin, end in point.reshape(-1, 2)]
 
 
 def _points_m(network: Network, track: int, *, backward: bool) -> Floats:

@@ -64,11 +64,11 @@ class LinkMeter:
 
     _open: dict[int, tuple[float, float | None, int]] = field(default_factory=dict)
 
-    def sent(self, sequence: int, now_s: float, *, chainage_m: float | None = None, direction: int = 0) -> None:
+    def note_sent(self, sequence: int, now_s: float, *, chainage_m: float | None = None, direction: int = 0) -> None:
         """Note a frame that was sent; from a place that is not known it is not in the coverage."""
         self._open[sequence] = (now_s, chainage_m, direction)
 
-    def answered(self, sequence: int, now_s: float, round_trip_s: float) -> None:
+    def note_answer(self, sequence: int, now_s: float, round_trip_s: float) -> None:
         """Note the echo of a frame; one that is too late, or comes twice, is none."""
         self.settle(now_s)
         if (waiting := self._open.pop(sequence, None)) is None:
@@ -112,6 +112,7 @@ class LinkMeter:
 
 
 LinkName = Literal["A", "B"]
+LinkMode = Literal["both", "spare"]  #: Whether both links carry the payload, or only the one in use.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,7 +236,7 @@ class TrainLinks:
         keys: Path,
         bearers: dict[LinkName, Bearer],
         *,
-        mode: Literal["spare", "both"] = "both",
+        mode: LinkMode = "both",
         received: Callable[[bytes], None] = lambda _: None,
         limits: LinkLimits | None = None,
     ) -> None:
@@ -275,7 +276,7 @@ class TrainLinks:
                         self.receiver.clock_restarted()
                     self.protocols[name] = protocol
                     self._resend(name)
-                    while not (protocol.ended or protocol.expired):
+                    while not (protocol.ended or protocol.has_expired):
                         await asyncio.sleep(0.1)
             except (ConnectionError, TimeoutError, OSError):
                 pass  # tried again after a time: the meter counts what is not answered
@@ -292,7 +293,7 @@ class TrainLinks:
         self.choice = self.choice.after(now_s, self.meters["A"], self.meters["B"])
         for name in BEARERS:
             carries = self.mode == "both" or name == self.choice.active
-            self.meters[name].sent(self._sequence, now_s, chainage_m=chainage_m, direction=direction)
+            self.meters[name].note_sent(self._sequence, now_s, chainage_m=chainage_m, direction=direction)
             self._put(name, FrameKind.DATA if carries else FrameKind.PROBE, payload if carries else b"", now_ns)
 
     def _put(self, name: LinkName, kind: FrameKind, payload: bytes, now_ns: int) -> None:
@@ -313,7 +314,7 @@ class TrainLinks:
         if answer is None:
             return
         if answer.kind is FrameKind.ECHO and (echo := Echo.decode(answer.payload)) is not None:
-            self.meters[name].answered(echo.sequence, now_ns / 1e9, echo.round_trip_s(now_ns))
+            self.meters[name].note_answer(echo.sequence, now_ns / 1e9, echo.round_trip_s(now_ns))
         elif use is not None and use.kind is FrameKind.DATA:
             self._received(use.payload)
 
@@ -395,7 +396,7 @@ class CentreLinks:
             except InputFileError as error:
                 self.alarm = f"{error}; the certificates revoked before are still rejected"
             for protocol in self._peers.values():
-                if protocol.peer is not None and (protocol.expired or protocol.peer in self._revoked):
+                if protocol.peer is not None and (protocol.has_expired or protocol.peer in self._revoked):
                     protocol.reject()
             await asyncio.sleep(RETRY_S)
 

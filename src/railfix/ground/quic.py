@@ -118,7 +118,7 @@ class LinkProtocol(QuicConnectionProtocol):
         self.close(error_code=_REJECTED, reason_phrase="certificate")
 
     @property
-    def expired(self) -> bool:
+    def has_expired(self) -> bool:
         """Whether the other end's certificate was valid and is so no more."""
         return self.ends is not None and datetime.now(UTC) > self.ends
 

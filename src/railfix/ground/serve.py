@@ -182,7 +182,7 @@ class SimulatedPoints:
         """Begin to move points to a track."""
         self._moving[point] = self.clock() + self.move_s, track
 
-    def detected(self) -> list[tuple[PointName, int]]:
+    def take_detected(self) -> list[tuple[PointName, int]]:
         """Return the points that have come to their track since the last call."""
         done = [(point, track) for point, (until, track) in self._moving.items() if until <= self.clock()]
         for point, _ in done:
@@ -314,8 +314,8 @@ async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
     due = loop.time()
     while True:
         begin = loop.time()
-        for point, track in points.detected():
-            control.supervision.detected(point, track)
+        for point, track in points.take_detected():
+            control.supervision.set_detected(point, track)
         control.step()
         now = loop.time()
         due = max(due + STEP_S, 2.0 * now - begin)

@@ -13,7 +13,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, freeze_arrays
 from railfix.core.errors import MismatchError
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import axes_at
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import satellite_states
@@ -48,10 +48,8 @@ class StationFixes:
         freeze_arrays(self)
 
 
-def station_fixes(
-    logs: list[Observations], points_ecef_m: Floats, navigation: Navigation, *, config: Config | None = None
-) -> StationFixes:
-    """Compute the fixes of the receivers of a triangle.
+def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: Navigation) -> StationFixes:
+    """Compute the fixes of the receivers of a triangle, with the default settings of a run.
 
     Parameters
     ----------
@@ -59,15 +57,13 @@ def station_fixes(
     points_ecef_m : ndarray, shape (N, 3) [m]
         Known points of the antennas.
     navigation : Navigation
-    config : Config, optional
-        Constellations, signals, mask, noise and atmosphere as in a run.
 
     Raises
     ------
     MismatchError
         The logs have no tag, or no channel, in common.
     """
-    config = config or Config()
+    config = Config()
     book = ChannelBook(config)
     channels = [book.of(log, navigation) for log in logs]
     names = [list(zip(c.satellite.tolist(), c.signal.tolist(), strict=True)) for c in channels]
@@ -118,7 +114,7 @@ def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats
 
     At T times, from N ranges at N known points, shape (N, 3); `cn0_fallen` has the shape (T, N).
     """
-    plane = _plane(points_ecef_m)
+    plane = axes_at(points_ecef_m[0])[:2]
     fixes = [
         single_point(item, np.broadcast_to(point, (len(time), 3))).ecef_m
         for item, point in zip(ranges, points_ecef_m, strict=True)
@@ -137,17 +133,11 @@ def no_fixes(time: Datetimes, points_ecef_m: Floats) -> StationFixes:
     shape = (len(time), len(points_ecef_m))
     return StationFixes(
         time=time,
-        points_m=(points_ecef_m - points_ecef_m[0]) @ _plane(points_ecef_m).T,
+        points_m=(points_ecef_m - points_ecef_m[0]) @ axes_at(points_ecef_m[0])[:2].T,
         fixes_m=np.full((*shape, 2), np.nan),
         n_satellites=np.zeros(len(time), dtype=np.int64),
         cn0_fallen=np.zeros(shape, dtype=bool),
     )
-
-
-def _plane(points_ecef_m: Floats) -> Floats:
-    """Return east and north at the first point, shape (2, 3)."""
-    latitude, longitude, _ = geodetic_from_ecef(points_ecef_m[0])
-    return enu_axes(latitude, longitude)[:2]
 
 
 def round_tags(time: Datetimes) -> Datetimes:

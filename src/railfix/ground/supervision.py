@@ -25,9 +25,9 @@ from railfix.ground.interlocking import (
     NearbyTrains,
     PointState,
     TrainInterval,
-    extended,
+    extend_authorities,
     points_reported,
-    released,
+    release_points,
     route_requested,
     stop_orders,
     with_train,
@@ -227,7 +227,7 @@ class Supervision:
 
     layout: Layout
     state: Interlocking
-    #: Called with points that have to move and the track they are to lead to; `detected` takes what they report.
+    #: Called with points that have to move and the track they are to lead to; `set_detected` takes what they report.
     command: Callable[[PointName, int], None] = lambda *_: None
 
     routes: Literal["automatic", "by hand"] = "automatic"
@@ -265,7 +265,7 @@ class Supervision:
         latest_ns = None if before is None else round((now_s - least_s + CLOCK_TOLERANCE_S) * 1e9)
         return latest_ns, (min(apart_s, least_s), now_s)
 
-    def detected(self, point: PointName, track: int | None) -> None:
+    def set_detected(self, point: PointName, track: int | None) -> None:
         """Take what points are detected at: a track, None where they are at neither end."""
         self.state = points_reported(self.state, point, track)
 
@@ -296,14 +296,16 @@ class Supervision:
         `AUTHORITY_S` are looked at; the others wait for their report.
         """
         self.state = overlaps_stopped(self.state, self.layout)
-        self.state = released(self.state, now_s, self.layout, limits=self.limits)
+        self.state = release_points(self.state, now_s, self.layout, limits=self.limits)
         nearby, stopped = NearbyTrains(self.state, self.layout), stop_orders(self.state)
         due = [number for number in self.state.trains if self._is_due(number, now_s, stopped)]
         if self.routes == "automatic":
             for number in due:
                 if self._wants_route(self.state.trains[number]):
                     self.set_route(number, nearby=nearby, stopped=stopped)
-        self.state = extended(self.state, self.layout, limits=self.limits, trains=due, nearby=nearby, stopped=stopped)
+        self.state = extend_authorities(
+            self.state, self.layout, limits=self.limits, trains=due, nearby=nearby, stopped=stopped
+        )
         stopped = stop_orders(self.state)
         due = [number for number in self.state.trains if self._is_due(number, now_s, stopped)]
         if not due:

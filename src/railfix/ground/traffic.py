@@ -71,7 +71,7 @@ class SimulatedTrain:
     def message(self, now_s: float) -> TrainMessage:
         """Return the position message of an instant."""
         self.sequence += 1
-        self.on_board.reported(self.sequence, now_s)
+        self.on_board.note_report(self.sequence, now_s)
         time = 1_400_000_000_000_000_000 + round(now_s * 1e9)
         head: dict[str, Any] = {
             "train": self.number,
@@ -110,7 +110,7 @@ class SimulatedTrain:
         after = 0.0 if after < 0.05 else after
         self.front_m += self.direction * 0.5 * (self.speed_mps + after) * STEP_S
         self.speed_mps = after
-        self.on_board.moved(self.front_m + self.error_m + self.direction * (self.bound_m + STOP_SHORT_M), after)
+        self.on_board.note_position(self.front_m + self.error_m + self.direction * (self.bound_m + STOP_SHORT_M), after)
 
 
 @dataclass(kw_only=True)
@@ -181,7 +181,7 @@ class Traffic:
         for name, (until, track) in list(self.moving.items()):
             if self.now_s >= until and self.centre_works:
                 del self.moving[name]
-                self.centre.detected(name, track)
+                self.centre.set_detected(name, track)
 
     def _lead(self, train: SimulatedTrain, before_m: float) -> None:
         """Let points lead a train that runs onto them."""
@@ -205,7 +205,7 @@ class Traffic:
         train.waits_s = train.waits_s + STEP_S if turns else 0.0
         if turns and station is not None and train.waits_s > 20.0:
             train.front_m = train.rear_m
-            train.on_board.turned(-train.direction, train.front_m)
+            train.on_board.turn(-train.direction, train.front_m)
             train.waits_s = 0.0
             train.tracks = {station: train.tracks[station]}
 

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import Field, ValidationError
 
 from railfix.core.settings import Settings, option
-from railfix.ground.links import Bearer, LinkName, TrainLinks, first_sequence
+from railfix.ground.links import Bearer, LinkMode, LinkName, TrainLinks, first_sequence
 from railfix.ground.quic import check_keys
 from railfix.io.train_message import MessageError, TrainMessage, encode, from_json
 
@@ -86,6 +86,8 @@ class OnBoardLimits(Settings):
     #: Deceleration with which the train can stop before a shorter authority.
     braking_mps2: float = Field(default=0.5, gt=0)
     reaction_s: float = Field(default=3.0, ge=0)  #: Time before the brakes act, with that since the newest report.
+    #: "spare": reports go over bearer B only while A fails.
+    mode: LinkMode = option("Send reports over bearer A alone, and over B while A fails.", "both", name="--spare")
 
 
 @dataclass(kw_only=True)
@@ -118,14 +120,14 @@ class OnBoard:
     _front_m: float | None = None
     _sent: OrderedDict[int, float] = field(default_factory=OrderedDict)
 
-    def reported(self, sequence: int, now_s: float) -> None:
+    def note_report(self, sequence: int, now_s: float) -> None:
         """Note a report that is sent."""
         self._sent[sequence] = now_s
         self._newest = sequence
         if len(self._sent) > REMEMBERED:
             self._sent.popitem(last=False)
 
-    def moved(self, safe_front_m: float | None, speed_mps: float | None) -> None:
+    def note_position(self, safe_front_m: float | None, speed_mps: float | None) -> None:
         """Note where the train's safe front end is, and its speed; one wrong place alone agrees to no shorter end.
 
         A train that has rolled back brakes: what the centre granted before does not know of it.
@@ -184,7 +186,7 @@ class OnBoard:
             return "ordered to stop"
         return None if self.age_s(now_s) <= self.limits.fresh_s else "no fresh authority"
 
-    def turned(self, direction: int, front_m: float) -> None:
+    def turn(self, direction: int, front_m: float) -> None:
         """Begin in the other direction, without an authority."""
         self.direction, self.end_m, self.before_turn = direction, front_m, self._newest
         self._granted, self.answered_s, self._place_m, self.stops_at_m = False, None, None, None
@@ -223,8 +225,9 @@ async def run_train(
     is not there, or a line is no position message.
     """
     check_keys(keys, f"train-{train}")
-    desk = _Desk(train=train, write=write, limits=limits or OnBoardLimits(), integrity=integrity)
-    links = TrainLinks(train, keys, bearers, received=desk.received)
+    limits = limits or OnBoardLimits()
+    desk = _Desk(train=train, write=write, limits=limits, integrity=integrity)
+    links = TrainLinks(train, keys, bearers, mode=limits.mode, received=desk.receive)
     await links.start()
     reading = asyncio.create_task(desk.read(_standard_input() if lines is None else lines))
     sending = asyncio.create_task(desk.work(links))
@@ -299,18 +302,18 @@ class _Desk:
                 before = self._sequence - 1
                 self._on_board = OnBoard(direction=message.facing, end_m=front, limits=self._limits, before_turn=before)
             elif self._on_board.direction != message.facing and message.standstill:
-                self._on_board.turned(message.facing, front)
+                self._on_board.turn(message.facing, front)
         if self._on_board is not None:
-            self._on_board.reported(self._sequence, now_s)
+            self._on_board.note_report(self._sequence, now_s)
             ahead = speed = None
             if message.chainage_cm is not None and message.under_cm is not None and message.speed_cmps is not None:
                 ahead = (message.chainage_cm + self._on_board.direction * message.under_cm) / 100.0
                 speed = abs(message.speed_cmps) / 100.0
-            self._on_board.moved(ahead, speed)
+            self._on_board.note_position(ahead, speed)
         place = None if message.chainage_cm is None else message.chainage_cm / 100.0
         links.send(encode(message), chainage_m=place, direction=message.facing)
 
-    def received(self, payload: bytes) -> None:
+    def receive(self, payload: bytes) -> None:
         """Take an authority from the links."""
         try:
             authority = Authority.decode(payload)

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from railfix.core.errors import InputFileError, MismatchError
-from railfix.core.files import BrokenLines, Paths, listed
+from railfix.core.files import BrokenLines, Paths, path_names
 from railfix.core.timescale import gps_time
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import Observations, concatenate
@@ -72,7 +72,7 @@ def read_observations(
         raise ValueError(f"reader is {reader!r}, 'railfix' or 'georinex' was expected")
     if reader == "georinex":
         letters = None if systems is None else list(systems)
-        return _by_georinex(listed(path), letters, _instant(start), _instant(end))
+        return _by_georinex(path_names(path), letters, _instant(start), _instant(end))
     pieces = scan_observations(
         path, broken_lines=broken_lines, systems=systems, start=start, end=end, date=date, epochs=1 << 62
     )
@@ -122,7 +122,7 @@ def scan_observations(
     progress: Callable[[float], None] | None = None,
 ) -> Iterator[Observations]:
     """Observations of one receiver in pieces of `epochs` epochs; see `read_observations`."""
-    paths, letters = listed(path), None if systems is None else list(systems)
+    paths, letters = path_names(path), None if systems is None else list(systems)
     if any(mate_table(p) == "S_GNSS_SAT" for p in paths):
         return _mate_pieces(paths, letters, (_instant(start), _instant(end)), epochs)
     receiver = [is_receiver_log(head_of(p)) for p in paths]
@@ -221,7 +221,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
     InputFileError
         A file cannot be read or holds no usable record.
     """
-    names = listed(paths)
+    names = path_names(paths)
     receiver = [is_receiver_log(head_of(name)) for name in names]
     parts = []
     if not all(receiver):

@@ -20,7 +20,7 @@ import polars.selectors as cs
 from pyproj import CRS
 
 from railfix.core.errors import NoPositionError
-from railfix.core.files import staged_file
+from railfix.core.files import stage_file
 from railfix.core.timescale import gpst_to_utc
 
 #: Columns of the tables of positions that become attributes, where a table has them.
@@ -70,7 +70,7 @@ def write_positions(rows: pl.DataFrame, path: Path, *, description: str) -> int:
         contents[style] = _style()
     with ExitStack() as staged:
         for target, content in contents.items():
-            staged.enter_context(staged_file(target)).write_bytes(content)
+            staged.enter_context(stage_file(target)).write_bytes(content)
     return len(points)
 
 

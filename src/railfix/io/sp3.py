@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, Paths, listed, read_text_lines
+from railfix.core.files import FilePath, Paths, path_names, read_text_lines
 from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
 from railfix.gnss.navigation import PreciseEphemeris
 from railfix.gnss.orbits.ephemerides import POINTS
@@ -49,7 +49,7 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
         A file is missing, is not an SP3 file, is in an unknown time system, or is broken; or all files
         together have fewer epochs than the interpolation needs.
     """
-    files = listed(paths)
+    files = path_names(paths)
     states = _States()
     for path in files:
         _read_file(path, states)

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -24,8 +24,8 @@ from railfix.io.reference_log import Acceleration, Pulses
 from railfix.motion.tachometer import Wheel, wheel_of
 from railfix.positioning.doppler_speed import Dopplers, DopplerSpeed, doppler_speed
 from railfix.reference.fixes import Fixes, ReferenceSettings, judge_alone, judge_pair, judge_place, judge_travel
-from railfix.reference.matching import LONGEST_STEP_S, SAME_INSTANT_NS, Speeds, combine_speeds, instants
 from railfix.reference.smoother import (
+    SAME_INSTANT_NS,
     WINDOWS,
     Built,
     Closings,
@@ -33,11 +33,51 @@ from railfix.reference.smoother import (
     SmoothedReference,
     assemble_reference,
     closings,
+    instants,
     lasting_error_mps,
     slip_m,
     smooth,
 )
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
+
+#: Speeds further apart leave the distance between them unknown [s], with this variance [m2].
+LONGEST_STEP_S: Final = 2.5
+UNKNOWN_M2: Final = 1e8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Speeds:
+    """Speeds of one antenna along its path; only instants at which there is one, rising in time."""
+
+    time: Datetimes
+    speed_mps: Floats
+    sigma_mps: Floats
+
+    def way(self, time: Datetimes) -> tuple[Floats, Floats]:
+        """Return the distance travelled (trapezoidal rule) [m] and its variance by white noise [m2]; NaN outside."""
+        if len(self.time) < 2:
+            return np.full(len(time), np.nan), np.full(len(time), np.nan)
+        known, at = seconds(self.time - self.time[0]), seconds(time - self.time[0])
+        step = np.diff(known)
+        way = np.cumsum(step * (self.speed_mps[1:] + self.speed_mps[:-1]) / 2.0)
+        white = step**2 * (self.sigma_mps[1:] ** 2 + self.sigma_mps[:-1] ** 2) / 2.0
+        variance = np.cumsum(np.where(step > LONGEST_STEP_S, UNKNOWN_M2, white))
+        ways = [np.interp(at, known, np.append(0.0, v), left=np.nan, right=np.nan) for v in (way, variance)]
+        return ways[0], ways[1]
+
+
+def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
+    """Combine speeds of all sources, weighted by their variances, shapes (N,); NaN where there is none."""
+    weight, total = np.zeros(len(time)), np.zeros(len(time))
+    for source in sources:
+        at = nearest_rows(time, source.time, within_ns=SAME_INSTANT_NS)
+        rows = np.flatnonzero(at >= 0)
+        w = source.sigma_mps[rows] ** -2.0
+        np.add.at(weight, at[rows], w)
+        np.add.at(total, at[rows], w * source.speed_mps[rows])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(weight > 0, total / weight, np.nan), np.where(weight > 0, weight**-0.5, np.nan)
+
 
 SolvedSpeeds = Mapping[str, tuple[Speeds, DopplerSpeed]]  #: Speeds by Doppler, and how they were solved, by antenna.
 

@@ -1,10 +1,11 @@
-"""Settings of a reference, and its positions selected with reasons (P1 3.1(2), 4.2(2), P2 3.3)."""
+"""Settings of a reference, its positions on the trajectory and selected with reasons (P1 3.1(2), 4.2(2), P2 3.3)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntFlag
+from itertools import pairwise
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -16,8 +17,7 @@ from railfix.core.settings import Settings, option
 from railfix.core.timescale import nearest_rows, seconds
 from railfix.io.position_log import PositionLog
 from railfix.positioning.doppler_speed import DopplerSpeedLimits
-from railfix.reference.matching import match
-from railfix.track.trajectory import Trajectory
+from railfix.track.trajectory import Trajectory, passes_of
 
 
 def _positive(default: float) -> Any:
@@ -209,6 +209,70 @@ def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: Referenc
 
 #: The other antenna's row counts in a pair whatever this check gave it.
 _OF_THE_PAIR: Final = FixRejection.UNPAIRED | FixRejection.SPACING
+
+
+_OUT_OF_REACH_M = 1e6  #: A pass out of reach costs this much more than any other choice [m].
+_JITTER_M = 2.0  #: Positions may jitter by this much more than the train can run [m].
+
+
+def match(
+    time: Datetimes, ecef_m: Floats, trajectory: Trajectory, *, lateral_m: float, height_m: float, max_speed_mps: float
+) -> tuple[Floats, Floats, Floats, Indices]:
+    """Put F positions in order of time on a trajectory: the shortest chain of passes within `max_speed_mps`.
+
+    Returns arc length, NaN where no pass is near enough; distance to the right and above, there or at the nearest
+    point; and segment, shapes (F,).
+    """
+    count = len(ecef_m)
+    nearest, _ = trajectory.nearest(ecef_m)
+    section, _ = trajectory.segment_at(nearest)
+    offset = ecef_m - trajectory.at_arc(nearest)
+    arc = np.full(count, np.nan)
+    lateral, height = _beside(offset, trajectory, section)
+    passes = passes_of(ecef_m, trajectory, float(np.hypot(lateral_m, height_m)))
+    beside, above = _beside(passes.offset_m, trajectory, passes.segment)
+    # beyond the ends of the line there is nothing to be on
+    beyond = np.abs(passes.along_m - passes.foot_m) > 0.5
+    beyond &= (passes.segment == 0) | (passes.segment == len(trajectory.length_m) - 1)
+    within = (np.abs(beside) <= lateral_m) & (np.abs(above) <= height_m) & ~beyond
+    near = np.flatnonzero(passes.lowest & ~passes.again & within)
+    since = seconds(time - time[0]) if count else np.empty(0)
+    along = trajectory.arc_m[passes.segment] + passes.foot_m
+    chosen = near[_chain(passes.position[near], along[near], beside[near], since, max_speed_mps)]
+    at = passes.position[chosen]
+    arc[at], section[at] = along[chosen], passes.segment[chosen]
+    lateral[at], height[at] = beside[chosen], above[chosen]
+    return arc, lateral, height, section
+
+
+def _beside(offset: Floats, trajectory: Trajectory, section: Indices) -> tuple[Floats, Floats]:
+    """Components of offsets to the right, and square to the path and that."""
+    right, along = trajectory.across[section], trajectory.tangent[section]
+    return np.einsum("fi,fi->f", offset, right), np.einsum("fi,fi->f", offset, np.cross(right, along))
+
+
+def _chain(position: Indices, arc_m: Floats, lateral_m: Floats, time_s: Floats, max_speed_mps: float) -> Indices:
+    """One pass a position: the cheapest chain from the first to the last (dynamic programming)."""
+    found, first = np.unique(position, return_index=True)
+    if len(found) == len(position):
+        return np.arange(len(found))
+    edges = np.append(first, len(position)).tolist()
+    cost = np.abs(lateral_m[edges[0] : edges[1]])
+    came: list[Indices] = []
+    for k, (begin, end) in enumerate(pairwise(edges[1:])):
+        start = edges[k]
+        way = np.abs(arc_m[begin:end, None] - arc_m[None, start:begin])
+        reach = max_speed_mps * (time_s[found[k + 1]] - time_s[found[k]]) + _JITTER_M
+        # The shortest way counts; a second pass of a crossing costs what it is longer by.
+        total = cost + way + np.where(way > reach, _OUT_OF_REACH_M, 0.0)
+        came.append(total.argmin(axis=1))
+        cost = total.min(axis=1) + np.abs(lateral_m[begin:end])
+    best = int(np.argmin(cost))
+    chosen = [edges[-2] + best]
+    for k in range(len(came) - 1, -1, -1):
+        best = int(came[k][best])
+        chosen.append(edges[k] + best)
+    return np.array(chosen[::-1], dtype=np.intp)
 
 
 def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSettings) -> Fixes:

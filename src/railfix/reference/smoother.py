@@ -7,13 +7,14 @@ the closing error of a gap in proportion to what each part may have contributed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks
-from railfix.core.timescale import seconds
+from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.timescale import nearest_rows, seconds, timedelta
 from railfix.io.reference_log import AntennaReference
 from railfix.motion.chain import Chain, singer_steps
 from railfix.reference.fixes import ACCELERATION_BIAS_MPS2, MOTION_MPS2, MOTION_S, Fixes, ReferenceSettings
@@ -31,6 +32,24 @@ _OFFSET_DRIFT_MPS2: Final = 1e-3
 #: Least standard deviations: of a reading of the wheel [m], of its difference over a step [m].
 _LEAST_READING_M: Final = 1e-3
 _LEAST_STEP_M: Final = 1e-4
+
+
+SAME_INSTANT_NS: Final = 20_000_000  #: Tags that differ by no more belong to one instant [ns].
+
+
+def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
+    """Return the instants of a reference: rows of the log, receiver epochs, regular steps elsewhere."""
+    merged = rows
+    for other in others:
+        new = other[(other > rows[0]) & (other < rows[-1])]
+        merged = np.union1d(merged, new[nearest_rows(merged, new, within_ns=SAME_INSTANT_NS) < 0])
+    usual = float(np.median(seconds(np.diff(rows))))
+    step = seconds(np.diff(merged))
+    pieces = np.where(step > 1.5 * usual, np.ceil(step / usual - 1e-6), 1.0).astype(np.int64)
+    first = np.repeat(np.arange(len(step)), pieces)
+    number = np.arange(len(first)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    filled = merged[first] + timedelta(step[first] * number / pieces[first])
+    return np.append(filled, merged[-1])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -353,7 +372,6 @@ def assemble_reference(
 
 def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
     """Bridged instants by the sensors that have a number there, or a second or so from there."""
-    t = seconds(evidence.time - evidence.time[0])
     measured = {
         "doppler": np.isfinite(evidence.doppler_mps),
         "pulses": np.isfinite(evidence.wheel_m),
@@ -361,7 +379,8 @@ def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
     }
     code = np.zeros(len(rows), dtype=np.int64)
     for i, mask in enumerate(measured.values()):
-        code |= _near(t[mask], t[rows]).astype(np.int64) << i
+        near = nearest_rows(evidence.time[mask], evidence.time[rows], within_ns=_NEAR_NS) >= 0
+        code |= near.astype(np.int64) << i
     counts = {}
     for c in np.unique(code).tolist():
         name = " and ".join(name for i, name in enumerate(measured) if c >> i & 1) or "nothing"
@@ -369,13 +388,4 @@ def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
     return counts
 
 
-def _near(known_s: Floats, at_s: Floats) -> Masks:
-    """Return whether one of the known instants, rising, is within `_NEAR_S` of each."""
-    if not len(known_s):
-        return np.zeros(len(at_s), dtype=np.bool_)
-    after = np.clip(np.searchsorted(known_s, at_s), 0, len(known_s) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.asarray(np.minimum(np.abs(known_s[after] - at_s), np.abs(known_s[before] - at_s)) <= _NEAR_S)
-
-
-_NEAR_S: Final = 1.5  #: Sensors of 1 Hz measure everywhere, up to a missing epoch [s].
+_NEAR_NS: Final = 1_500_000_000  #: Sensors of 1 Hz measure everywhere, up to a missing epoch [ns].

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from functools import partial
 from importlib.resources import files
@@ -24,7 +24,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import read_json_object, write_whole
 from railfix.core.tables import Table, number, plural, share
 from railfix.core.timescale import seconds
-from railfix.report.plots.chart import Band, Bars, Cells, Chart, Curve, Layer, Marks, Points, RangeBars, SkyEpochs
+from railfix.report.plots.chart import Cells, Chart, Layer, Points, SkyEpochs
 from railfix.report.plots.network import network_plan
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog
@@ -73,34 +73,14 @@ def since_1970(time: np.datetime64) -> float:
 
 
 def _layer(layer: Layer) -> dict[str, Any]:
-    values: dict[str, Any] = {"label": layer.label, "colour": layer.colour}
-    match layer:
-        case Points():
-            values |= {"kind": "points", "shape": layer.shape, "size": layer.size}
-            values |= {"x": pack_array(layer.x), "y": pack_array(layer.y)}
-            if layer.epoch_s is not None:
-                values["epoch"] = pack_array(layer.epoch_s)
-        case Curve():
-            values |= {"kind": "line", "width": layer.width, "dash": layer.dash}
-            values |= {"x": pack_array(layer.x), "y": pack_array(layer.y)}
-        case Band():
-            values |= {
-                "kind": "band",
-                "x": pack_array(layer.x),
-                "low": pack_array(layer.low),
-                "high": pack_array(layer.high),
-            }
-        case Bars():
-            values |= {"kind": "bars", "left": pack_array(layer.left), "right": pack_array(layer.right)}
-            values["height"] = pack_array(layer.height)
-        case Cells():
-            values |= _cells(layer)
-        case RangeBars():
-            values |= {"kind": "ranges", "names": list(layer.names)}
-            values |= {name: pack_array(getattr(layer, name)) for name in ("low", "mid", "high")}
-        case Marks():
-            values |= {"kind": "marks", "x": pack_array(layer.x), "y": pack_array(layer.y), "words": list(layer.words)}
-            values["place"] = layer.place
+    """A layer as plain values by the names of its fields."""
+    values: dict[str, Any] = {"label": layer.label, "colour": layer.colour, "kind": layer.kind}
+    if isinstance(layer, Cells):
+        return values | _cells(layer)
+    for name in (item.name for item in fields(layer) if item.name not in values):
+        if (value := getattr(layer, name)) is not None:
+            packed = pack_array(value) if isinstance(value, np.ndarray) else value
+            values["epoch" if name == "epoch_s" else name] = packed
     return values
 
 
@@ -108,7 +88,6 @@ def _cells(layer: Cells) -> dict[str, Any]:
     """Cells that are not empty; all have equal widths."""
     column, row = np.nonzero(layer.counts)
     return {
-        "kind": "cells",
         "x0": float(layer.x_edges[0]),
         "x1": float(layer.x_edges[-1]),
         "y0": float(layer.y_edges[0]),
@@ -326,11 +305,7 @@ def write_network_page(
 
 
 def _tables(network: Network, quality: NetworkQuality, run: tuple[PlanLog, Matched] | None) -> Sequence[Block]:
-    beside: dict[tuple[int, int], list[str]] = {}
-    for link in network.links:
-        if link.navigable:
-            beside.setdefault((link.first, link.first_end), []).append(network.names[link.second])
-            beside.setdefault((link.second, link.second_end), []).append(network.names[link.first])
+    beside = {end: ", ".join(network.names[t] for t, _ in others) for end, others in network.passages.items()}
     seen = np.zeros(len(network.tracks), dtype=np.int64)
     blocks: list[Block] = [
         Sentence(
@@ -372,8 +347,8 @@ def _tables(network: Network, quality: NetworkQuality, run: tuple[PlanLog, Match
                 (
                     name,
                     number(float(network.length_m[k]), 1),
-                    ", ".join(beside.get((k, 0), [])),
-                    ", ".join(beside.get((k, 1), [])),
+                    beside.get((k, 0), ""),
+                    beside.get((k, 1), ""),
                     f"{seen[k]:,}" if run is not None else "–",
                 )
                 for k, name in enumerate(network.names[:_LISTED])

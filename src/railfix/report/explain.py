@@ -24,7 +24,7 @@ from railfix.core.timescale import gps_time
 from railfix.evaluate.inputs import RunFolder, read_run
 from railfix.report.charts_page import read_template
 from railfix.run.record import reading_table
-from railfix.track import read_track
+from railfix.track import Trajectory, read_track
 
 #: What the status of a single epoch says.
 SINGLE_STATUS: Final[Mapping[str, str]] = {
@@ -133,19 +133,10 @@ def _nearest(times: Any, at: str) -> int:
 
 def _axes(folder: RunFolder, single: Mapping[str, Any]) -> Floats:
     """Return the unit vectors along, across and above the line at the position, in ECEF, from the nearest section."""
-    ecef_m = read_track(folder.tracks).ecef_m
-    place = np.array([single[name] for name in ("x_m", "y_m", "z_m")])
-    sections = np.diff(ecef_m, axis=0)
-    length = np.linalg.norm(sections, axis=1, keepdims=True)
-    tangent = sections / np.where(length > 0, length, np.nan)
-    away = place - ecef_m[:-1]
-    along = np.clip(np.einsum("si,si->s", away, tangent)[:, None], 0.0, length)
-    distance = np.linalg.norm(away - along * tangent, axis=1)
-    along_line = tangent[np.nanargmin(distance)]
-    vertical = enu_axes(single["latitude_deg"], single["longitude_deg"])[2]
-    across = np.cross(along_line, vertical)
-    across /= np.linalg.norm(across)
-    return np.stack([along_line, across, np.cross(across, along_line)])
+    line = Trajectory.from_track(read_track(folder.tracks))
+    arc, _ = line.nearest(np.array([[single[name] for name in ("x_m", "y_m", "z_m")]]))
+    along, across, _ = line.axes_of(line.segment_at(arc)[0])[0]
+    return np.stack([along, across, np.cross(across, along)])
 
 
 def _map_sigma_m(folder: RunFolder) -> tuple[float, float]:

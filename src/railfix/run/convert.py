@@ -18,7 +18,7 @@ import polars.selectors as cs
 
 from railfix import __version__
 from railfix.core.errors import InputFileError, NoPositionError, OutputError
-from railfix.core.files import staged_file
+from railfix.core.files import stage_file
 from railfix.core.timescale import gpst_to_utc, utc_to_gpst
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.logs import read_navigation, scan_observations
@@ -152,7 +152,7 @@ def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
                 message = {"header": header, "para_set": json.dumps({"description": description})} | _track(row, way)
                 writer.write_message(f"/{row['antenna']}/track", track, message, stamp)
         writer.add_metadata("railfix", {"version": __version__, "description": description})
-    with staged_file(path) as staged:
+    with stage_file(path) as staged:
         staged.write_bytes(file.getvalue())
     return len(known)
 
@@ -329,7 +329,7 @@ def add_mate_results(folder: OutputFolder, track: Track, log: Path) -> None:
     passings = folder.staging / "passings.parquet"
     found = result_tables(pl.read_parquet(train), pl.read_parquet(passings) if passings.exists() else None, track)
     for name, table in found.items():
-        table.write_parquet(folder.staged(f"{name}.parquet"))
+        table.write_parquet(folder.stage(f"{name}.parquet"))
 
 
 def _metres(values: np.ndarray) -> pl.Series:

@@ -123,7 +123,7 @@ def run_files(
         record = run_record(made_from, tally, notes, figures, wall)
         folder.write_json("run.json", record)
         if not line.from_file:
-            write_track_csv(line.track, folder.staged(TRACK_FILE))
+            write_track_csv(line.track, folder.stage(TRACK_FILE))
         files = folder.commit()
     return RunSummary(tally=tally, record=record, notes=notes, files=files, wall_s=wall, causes=causes)
 

@@ -289,10 +289,10 @@ class OutputFolder:
 
     @property
     def staging(self) -> Path:
-        """The temporary folder; `staged` registers the files in it that are results."""
+        """The temporary folder; `stage` registers the files in it that are results."""
         return self._staging.path
 
-    def staged(self, name: str) -> Path:
+    def stage(self, name: str) -> Path:
         """Return the temporary path at which to write one file; `commit` moves it in place.
 
         OutputError: the file would overwrite an input, or a folder of that name is there.
@@ -310,14 +310,14 @@ class OutputFolder:
         with _writing(self.path / name):
             first = name not in self._csv
             if first:
-                self._csv[name] = self.staged(name).open("wb")
+                self._csv[name] = self.stage(name).open("wb")
             table.write_csv(self._csv[name], include_header=first, datetime_format=CSV_TIME)
 
     def append_parquet(self, name: str, table: pl.DataFrame) -> None:
         """Append rows to a Parquet file; they are written while the caller goes on (`ParquetFile`)."""
         with _writing(self.path / name):
             if name not in self._parquet:
-                self._parquet[name] = ParquetFile(self.staged(name), table.schema)
+                self._parquet[name] = ParquetFile(self.stage(name), table.schema)
             self._parquet[name].append(table)
 
     def end_parquet(self, metadata: Mapping[str, str] | None = None) -> None:
@@ -338,7 +338,7 @@ class OutputFolder:
         self._csv.pop(f"{name}.csv").close()
         with _writing(self.path / file):
             self._parquet.pop(file).end()
-            before = pl.scan_parquet(self.staged(file).replace(self.staging / f"{file}.before"))
+            before = pl.scan_parquet(self.stage(file).replace(self.staging / f"{file}.before"))
             for start in range(0, before.select(pl.len()).collect().item(), _ROWS):
                 table = transform(before.slice(start, _ROWS).collect())
                 self.append_parquet(file, table)
@@ -354,7 +354,7 @@ class OutputFolder:
         """Write one JSON file; NaN and infinities, which JSON lacks, are written as words."""
         with _writing(self.path / name):
             text = json.dumps(_finite(content), indent=2, ensure_ascii=False, allow_nan=False)
-            self.staged(name).write_text(text + "\n", encoding="utf-8")
+            self.stage(name).write_text(text + "\n", encoding="utf-8")
 
     def commit(self, metadata: Mapping[str, str] | None = None) -> dict[str, Path]:
         """Move every file in place; return where each stands, by its name.
@@ -369,7 +369,7 @@ class OutputFolder:
             ready = staging / f"{READY}.part"
             ready.mkdir()
             for name in self._staged:
-                self.staged(name).replace(ready / name)
+                self.stage(name).replace(ready / name)
             # From this rename on, a killed process has finished: the next one moves the files in place.
             return move_in_place(ready.replace(staging / READY), self.path)
 

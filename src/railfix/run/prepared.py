@@ -26,7 +26,7 @@ import railfix.track
 from railfix import __version__
 from railfix.core.arrays import read_only
 from railfix.core.errors import OutputError
-from railfix.core.files import staged_file
+from railfix.core.files import stage_file
 from railfix.track import Track
 from railfix.track.track import Provenance
 from railfix.track.trajectory import Trajectory
@@ -114,7 +114,7 @@ class PreparedLines:
         text = np.frombuffer(json.dumps(plain).encode(), dtype=np.uint8)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            with staged_file(file, what="prepared line") as temporary, temporary.open("wb") as handle:
+            with stage_file(file, what="prepared line") as temporary, temporary.open("wb") as handle:
                 np.savez(handle, plain=text, **arrays)  # type: ignore[arg-type]  # its stub has allow_pickle
             entries = sorted(self._folder.glob("*.npz"), key=lambda entry: entry.stat().st_mtime)
             for old in entries[:-MOST_ENTRIES]:

@@ -17,6 +17,7 @@ import polars as pl
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import geodetic_from_ecef
+from railfix.core.timescale import nearest_rows
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.position_log import PositionLog
@@ -223,7 +224,7 @@ class RouteOfLog:
         ends = line.chainage_m[np.flatnonzero(np.diff(line.section))]
         number = np.where(known, np.array(self.tracks)[np.searchsorted(ends, np.nan_to_num(chainage))], -1)
         along, _ = self.network.place_on(number, latitude, longitude)
-        epoch = self._nearest_epoch(table["time_gpst"].to_numpy())
+        epoch = nearest_rows(self.log.time, table["time_gpst"].to_numpy(), within_ns=np.iinfo(np.int64).max)
         share = np.where(known, self.probability[epoch], np.nan)
         names: Strings = np.array([*self.network.names, None], dtype=object)
         positions = table.with_columns(
@@ -254,14 +255,6 @@ class RouteOfLog:
         )
         order = np.lexsort((-long["probability"].to_numpy(), row))
         return positions, long[order]
-
-    def _nearest_epoch(self, time: Any) -> Indices:
-        """The matched position nearest in time to each time, shape (n,)."""
-        after = np.clip(np.searchsorted(self.log.time, time), 1, max(len(self.log.time) - 1, 1))
-        before = after - 1
-        after = np.minimum(after, len(self.log.time) - 1)
-        nearer = time - self.log.time[before] <= self.log.time[after] - time
-        return np.asarray(np.where(nearer, before, after), dtype=np.intp)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.constants import CLOCK_GROUP, SPEED_OF_LIGHT
 from railfix.core.errors import MismatchError
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
+from railfix.core.geodesy import axes_at, range_with_rotation
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.pipeline.channels import ChannelBook
@@ -85,10 +85,9 @@ def standstill_codes(
     places = places[np.isfinite(places[:, 0])]
     if len(places) < 2:
         raise MismatchError("the log has no positions; are the navigation files of its day?")
-    latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(places[0]))
     # thirds of the log, as a train that comes back is at its first place in the end
     thirds = np.array([np.median(part, axis=0) for part in np.array_split(places, min(3, len(places)))])
-    level = (thirds - thirds[0]) @ enu_axes(latitude, longitude)[:2].T
+    level = (thirds - thirds[0]) @ axes_at(places[0])[:2].T
     moved = float(np.linalg.norm(level, axis=1).max())
     if moved > _AT_REST_M:
         raise MismatchError(f"the antenna moves by {moved:.0f} m in the log; give --start and --end of a standstill")
@@ -233,9 +232,8 @@ def _phases(train: _Side, base: _Side) -> StandstillPhases:
         sides.append(np.where(usable, phase - computed, np.nan))
         lost.append((lock & _LOST > 0) | obs.break_before[epochs][:, None])
     _, seen, origin, epochs, columns = train
-    latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(origin))
     line = seen.ranges.sat_ecef_m[np.ix_(epochs, columns)] - origin
-    toward = line @ enu_axes(latitude, longitude).T
+    toward = line @ axes_at(origin).T
     satellite = seen.channels.satellite[columns]
     kept = np.array([not str(name).startswith("R") for name in satellite], dtype=np.bool_)
     signals = zip(satellite, seen.channels.signal[columns], strict=True)

@@ -1,7 +1,7 @@
 # The names of `railfix.simulate`, imported at their first use (lazy-loader).
 
 from .alignment import Alignment, build_alignment
-from .constellation import simulated_navigation
+from .constellation import simulate_navigation
 from .demonstration import DEMO_FILES, demo_files, demo_folder
 from .environment.settings import Disturbance, Disturbances, SightGeometry
 from .line_file import Element, GeneratedLine, Gradient, LineFile, LineSettings, MapError, Terrain
@@ -17,7 +17,7 @@ from .scenario import (
     Station,
     VehicleSettings,
 )
-from .scenario_file import Recipe, load_recipe, load_scenario, scenario_table, shipped_scenarios
+from .scenario_file import Recipe, list_scenarios, load_recipe, load_scenario, scenario_table
 from .sensor_tables import sensor_tables
 from .settings import ErrorSettings, SensorSettings
 from .signals import Piece, Simulation
@@ -55,15 +55,15 @@ __all__ = [
     "build_motion",
     "demo_files",
     "demo_folder",
+    "list_scenarios",
     "load_recipe",
     "load_scenario",
     "run_curve",
     "scenario_table",
     "section_table",
     "sensor_tables",
-    "shipped_scenarios",
     "shuttle",
-    "simulated_navigation",
+    "simulate_navigation",
     "truth_table",
     "write_run",
 ]

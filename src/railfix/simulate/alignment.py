@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicHermiteSpline
 
 from railfix.core.arrays import Floats, read_only
-from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import axes_at, ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.simulate.errors import RandomFunction
 from railfix.simulate.line_file import (
     PATTERN_LENGTH_M,
@@ -103,8 +103,7 @@ class Alignment(Knots):
     def point_beside(self, chainage_m: Floats, lateral_m: float, height_m: float) -> Floats:
         """Points to the right of the curve and above it, square to it and level, shape (n, 3) ECEF [m]."""
         place, tangent = self.at(chainage_m), self.tangent_at(chainage_m)
-        latitude, longitude, _ = geodetic_from_ecef(place)
-        up = enu_axes(latitude, longitude)[:, 2]
+        up = axes_at(place)[:, 2]
         right = np.cross(tangent, up)
         right /= np.linalg.norm(right, axis=-1, keepdims=True)
         return np.asarray(place + lateral_m * right + height_m * up)
@@ -138,8 +137,7 @@ class Alignment(Knots):
         if self.file is not None and exact:
             return self.file.track
         if not exact:
-            there = geodetic_from_ecef(ecef)
-            ecef = ecef + np.einsum("ni,nij->nj", self.map_error_m(chainage), enu_axes(there[0], there[1]))
+            ecef = ecef + np.einsum("ni,nij->nj", self.map_error_m(chainage), axes_at(ecef))
         place = geodetic_from_ecef(ecef)
         if self.file is not None:
             latitude, longitude, height = (read_only(part) for part in place)

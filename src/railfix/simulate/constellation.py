@@ -134,7 +134,7 @@ class _Orbit:
     mean_anomaly: float
 
 
-def simulated_navigation(scenario: Scenario) -> Navigation:
+def simulate_navigation(scenario: Scenario) -> Navigation:
     """Broadcast records for the whole of a run, as `railfix.io.write_navigation` writes them.
 
     All values are rounded to the digits of the file, so that file and arrays are the same satellites. Where the

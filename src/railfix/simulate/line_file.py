@@ -20,7 +20,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from railfix.core.arrays import Floats, Masks
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import axes_at
 from railfix.simulate.settings import (
     Between,
     Finite,
@@ -391,8 +391,7 @@ def _arc_length(chord: CubicSpline[np.float64], knots: Floats) -> tuple[Floats, 
 
 def _curvature_and_grade(place: Floats, slope: Floats, bend: Floats) -> tuple[Floats, Floats]:
     """Curvature in plan, right positive [1/m], and gradient [m/m]."""
-    latitude, longitude, _ = geodetic_from_ecef(place)
-    axes = enu_axes(latitude, longitude)
+    axes = axes_at(place)
     v, a = np.einsum("nij,nj->ni", axes, slope), np.einsum("nij,nj->ni", axes, bend)
     plan = np.hypot(v[:, 0], v[:, 1])
     return (v[:, 1] * a[:, 0] - v[:, 0] * a[:, 1]) / plan**3, v[:, 2] / plan

@@ -19,7 +19,7 @@ from scipy.signal import cont2discrete, lfilter
 
 from railfix.core.arrays import Floats
 from railfix.core.constants import GRAVITY_MPS2
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import axes_at
 from railfix.simulate.alignment import Alignment
 from railfix.simulate.errors import RandomFunction
 from railfix.simulate.scenario import RunSettings, Scenario, Station, VehicleSettings
@@ -261,8 +261,7 @@ def antenna_truth(
     forward = front - rear
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
     origin = 0.5 * (rear + front)
-    latitude, longitude, _ = geodetic_from_ecef(origin)
-    vertical = enu_axes(latitude, longitude)[:, 2]
+    vertical = axes_at(origin)[:, 2]
     upright = vertical - np.einsum("ni,ni->n", vertical, forward)[:, None] * forward
     upright /= np.linalg.norm(upright, axis=-1, keepdims=True)
     contact = vehicle.gauge_m + _RAIL_HEAD_M

@@ -246,7 +246,7 @@ def _write_files(
         names["sbas"] = "messages.sbs"
     names |= {name: f"{name}.{'parquet' if packed else 'csv'}" for name in tables}
     names |= {"scenario": "scenario.toml", "readme": "README.md"}
-    files = {key: out.staged(name) for key, name in names.items()}
+    files = {key: out.stage(name) for key, name in names.items()}
     for antenna in scenario.receivers:
 
         def chunks(antenna: str = antenna) -> Iterator[Observations]:

@@ -82,14 +82,14 @@ def whole_run_s(scenario: Scenario) -> float:
     return float(math.ceil(float(motion.time_s[-1]) + last))
 
 
-def shipped_scenarios() -> dict[str, Path]:
+def list_scenarios() -> dict[str, Path]:
     """Scenario files that come with railfix, by name."""
     return {path.stem: path for path in sorted(_FOLDER.glob("*.toml"))}
 
 
 def find_scenario(name: str | PathLike[str]) -> Path:
     """A scenario file by its path, or by the name of a shipped one; InputFileError when it is neither."""
-    shipped, path = shipped_scenarios(), Path(name)
+    shipped, path = list_scenarios(), Path(name)
     if path.is_file() or (path.suffix and str(name) not in shipped):
         return path
     if str(name) not in shipped:

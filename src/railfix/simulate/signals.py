@@ -16,7 +16,7 @@ from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.simulate.alignment import Alignment, build_alignment
-from railfix.simulate.constellation import SatelliteTable, links, simulated_navigation
+from railfix.simulate.constellation import SatelliteTable, links, simulate_navigation
 from railfix.simulate.environment import Environment
 from railfix.simulate.environment.settings import CN0_SECOND_DB, Disturbances, SightGeometry
 from railfix.simulate.errors import CommonErrors, fault_m
@@ -61,7 +61,7 @@ class Simulation:
         )
         place = () if scenario.environment.empty else (self.environment,)
         self.disturbances: tuple[Disturbances, ...] = (*place, *scenario.multipath)
-        self.navigation: Navigation = simulated_navigation(scenario)
+        self.navigation: Navigation = simulate_navigation(scenario)
         self.clocks = ReceiverClocks(scenario)
 
     def time(self, first: int = 0, last: int | None = None) -> Datetimes:

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import axes_at
 from railfix.core.settings import Settings
 from railfix.core.tables import plural
 from railfix.core.timescale import seconds
@@ -63,8 +63,7 @@ def stationary(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: f
     t = seconds(time - time[0])
     first = np.searchsorted(t, t - window_s - 1e-6, side="left")
     last = np.searchsorted(t, t + window_s + 1e-6, side="right") - 1
-    latitude, longitude, _ = geodetic_from_ecef(ecef_m)
-    moved = np.einsum("tij,tj->ti", enu_axes(latitude, longitude), ecef_m[last] - ecef_m[first])
+    moved = np.einsum("tij,tj->ti", axes_at(ecef_m), ecef_m[last] - ecef_m[first])
     distance = np.hypot(moved[:, 0], moved[:, 1])
     # at least half of the window must have data
     known = t[last] - t[first] >= window_s

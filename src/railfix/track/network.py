@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Floats, Indices, Masks, read_only
+from railfix.core.arrays import Floats, Indices, Integers, Masks, read_only
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.route import Segment, one_frame, sigma_of_files
@@ -125,6 +125,29 @@ class Network:
                 graph.add_edge(a + 1, b, weight=0.0)
                 graph.add_edge(b + 1, a, weight=0.0)
         return graph
+
+    @cached_property
+    def joints(self) -> Integers:
+        """Joint at each end of each track, shape (tracks, 2): ends that links bring together have one number."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        count = 2 * len(self.tracks)
+        first = [2 * link.first + link.first_end for link in self.links]
+        second = [2 * link.second + link.second_end for link in self.links]
+        linked = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
+        return connected_components(linked, directed=False)[1].astype(np.int64).reshape(-1, 2)
+
+    @cached_property
+    def passages(self) -> dict[tuple[int, int], dict[tuple[int, int], None]]:
+        """Ends (track, end), in order, to which a train passes from each end that has a navigable connection."""
+        passages: dict[tuple[int, int], dict[tuple[int, int], None]] = {}
+        for link in self.links:
+            if link.navigable:
+                a, b = (link.first, link.first_end), (link.second, link.second_end)
+                passages.setdefault(a, {})[b] = None
+                passages.setdefault(b, {})[a] = None
+        return passages
 
     @cached_property
     def height_m(self) -> Floats:

@@ -206,17 +206,11 @@ def check_network(network: Network) -> NetworkQuality:
     joined: nx.Graph[int] = nx.Graph()
     joined.add_nodes_from(range(len(network.tracks)))
     joined.add_edges_from((link.first, link.second) for link in network.links)
-    passages: dict[tuple[int, int], set[tuple[int, int]]] = {}
-    for link in network.links:
-        if link.navigable:
-            a, b = (link.first, link.first_end), (link.second, link.second_end)
-            passages.setdefault(a, set()).add(b)
-            passages.setdefault(b, set()).add(a)
-    loose = [(t, e) for t in range(len(network.tracks)) for e in (0, 1) if (t, e) not in passages]
+    loose = [(t, e) for t in range(len(network.tracks)) for e in (0, 1) if (t, e) not in network.passages]
     findings = [*_gaps(network, loose), *_joints(network), *_too_near(network)]
     return NetworkQuality(
         tracks=len(network.tracks),
-        switches=sum(len(others) > 1 for others in passages.values()),
+        switches=sum(len(others) > 1 for others in network.passages.values()),
         ends=len(loose),
         parts=nx.number_connected_components(joined),
         length_m=float(network.length_m.sum()),

@@ -172,23 +172,16 @@ def _once(network: Network, route: list[int]) -> list[list[int]]:
 
 
 def _joints(network: Network, route: list[int]) -> list[int]:
-    """The joint before each track of a route, and the one after the last: ends that links bring together."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    rows = np.array([(2 * x.first + x.first_end, 2 * x.second + x.second_end) for x in network.links], dtype=np.intp)
-    a, b = rows.reshape(-1, 2).T
-    count = 2 * len(network.tracks)
-    _, joint = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)
-    entry = 0
+    """The joint before each track of a route, and the one after the last."""
+    joint, entry = network.joints, 0
     found: list[int] = []
     for track, after in pairwise([*route, route[-1]]):
-        ends = [e for e in (0, 1) if joint[2 * track + e] in (joint[2 * after], joint[2 * after + 1])]
+        ends = [e for e in (0, 1) if joint[track, e] in joint[after]]
         if not found:
             entry = 1 - ends[0]
-            found.append(int(joint[2 * track + entry]))
-        found.append(int(joint[2 * track + 1 - entry]))
-        entry = 0 if joint[2 * after] == found[-1] else 1
+            found.append(int(joint[track, entry]))
+        found.append(int(joint[track, 1 - entry]))
+        entry = 0 if joint[after, 0] == found[-1] else 1
     return found
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats, FrozenArrays, Indices, Masks, freeze_arrays, read_only
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import axes_at
 from railfix.core.tables import NotebookTable, plural
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Track, interpolate_kilometrage
 
@@ -210,8 +210,7 @@ class Trajectory(FrozenArrays, NotebookTable):
     @cached_property
     def _axes(self) -> Floats:
         """East, north, up at the middle of each segment, shape (V - 1, 3, 3)."""
-        latitude, longitude, _ = geodetic_from_ecef((self.ecef_m[1:] + self.ecef_m[:-1]) / 2.0)
-        return enu_axes(latitude, longitude)
+        return axes_at((self.ecef_m[1:] + self.ecef_m[:-1]) / 2.0)
 
     @cached_property
     def up(self) -> Floats:

@@ -15,7 +15,7 @@ from pydantic import ConfigDict, Field
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError, SettingsError
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import axes_at, enu_axes
 from railfix.core.settings import Settings, load_settings
 from railfix.track.from_positions import ANTENNA_PATH
 from railfix.track.track import Track
@@ -188,8 +188,7 @@ def _pose(line: _VehicleLine, track: Track, vehicle: Vehicle, middle: Floats) ->
     first, second = line.at(lower), line.at(upper)
     origin = (first + second) / 2.0
     forward = (second - first) / np.linalg.norm(second - first, axis=1, keepdims=True)
-    latitude, longitude, _ = geodetic_from_ecef(origin)
-    gravity_up = enu_axes(latitude, longitude)[:, 2]
+    gravity_up = axes_at(origin)[:, 2]
     level_right = np.cross(forward, gravity_up)
     level_right /= np.linalg.norm(level_right, axis=1, keepdims=True)
     level_up = np.cross(level_right, forward)

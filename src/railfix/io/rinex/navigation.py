@@ -13,7 +13,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import BrokenLines, FilePath, Paths, listed, read_text_lines
+from railfix.core.files import BrokenLines, FilePath, Paths, path_names, read_text_lines
 from railfix.gnss.navigation import Navigation
 from railfix.io.rinex.header import read_version
 from railfix.io.rinex.navigation_records import (
@@ -137,7 +137,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navi
     A broken record stops the reading, or is counted in `skipped` and described in `notes`. InputFileError: a file is
     missing, is no navigation file, or (with "stop") a record is broken; or no file has a usable record.
     """
-    files = listed(paths)
+    files = path_names(paths)
     content = NavigationContent(broken_lines=broken_lines)
     for path in files:
         _read_file(path, content)

@@ -17,7 +17,7 @@ import numpy as np
 
 from railfix.core.arrays import Integers, Masks
 from railfix.core.errors import InputFileError, MismatchError
-from railfix.core.files import BrokenLines, ByteStream, FilePath, Paths, listed, open_stream
+from railfix.core.files import BrokenLines, ByteStream, FilePath, Paths, open_stream, path_names
 from railfix.core.timescale import bdt_to_gpst, gps_time, utc_to_gpst
 from railfix.gnss.observations import Observations, channels_with_data, concatenate
 from railfix.io.rinex.header import RinexHeader, apply_records, parse_header, read_header_bytes
@@ -228,7 +228,7 @@ def scan_observations(
     limits = {"start_ns": start, "end_ns": end}
     limits_ns = {name: int(gps_time(time).astype(np.int64)) for name, time in limits.items() if time is not None}
     selection = Selection(broken_lines=broken_lines, systems=letters, **limits_ns)
-    return in_pieces(_runs(listed(path), selection, progress), epochs)
+    return in_pieces(_runs(path_names(path), selection, progress), epochs)
 
 
 def _runs(

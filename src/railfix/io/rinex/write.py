@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.errors import OutputError
-from railfix.core.files import FilePath, staged_file
+from railfix.core.files import FilePath, stage_file
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.io.rinex.observations_lines import KINDS
 
@@ -48,7 +48,7 @@ def open_target(path: FilePath, *, packing: Packing | None = None) -> Iterator[I
     kind = packing_of(path) if packing is None else packing
     if kind not in get_args(Packing):
         raise ValueError(f"packing {kind!r} is unknown; expected one of {', '.join(get_args(Packing))}")
-    with staged_file(path) as temporary, temporary.open("xb") as raw, ExitStack() as held:
+    with stage_file(path) as temporary, temporary.open("xb") as raw, ExitStack() as held:
         sink = cast("IO[bytes]", raw)
         if kind.endswith("gz"):
             zipped = gzip.GzipFile(filename="", mode="wb", fileobj=raw, mtime=0, compresslevel=6)

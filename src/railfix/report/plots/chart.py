@@ -8,7 +8,7 @@ a page, so a notebook and the report show the same numbers.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import ClassVar, Final, Literal
 
 import numpy as np
 import polars as pl
@@ -55,12 +55,13 @@ class _Layer:
 class Points(_Layer):
     """Points, P of them."""
 
+    kind: ClassVar[str] = "points"
+    shape: Shape = "dot"
+    size: float = 3.0  #: Width in pixels of a page.
     #: NaN is not drawn, shape (P,).
     x: Floats
     y: Floats
 
-    shape: Shape = "dot"
-    size: float = 3.0  #: Width in pixels of a page.
     #: Time since the start of the run; a click on a point shows the sky at that time; shape (P,).
     epoch_s: Floats | None = None
 
@@ -69,16 +70,18 @@ class Points(_Layer):
 class Curve(_Layer):
     """A line through P points, broken where one is NaN."""
 
-    x: Floats
-    y: Floats
+    kind: ClassVar[str] = "line"
     width: float = 1.5
     dash: Literal["solid", "dashed", "dotted"] = "solid"
+    x: Floats
+    y: Floats
 
 
 @dataclass(frozen=True, kw_only=True)
 class Band(_Layer):
     """The area between two lines of P points, broken where one is NaN."""
 
+    kind: ClassVar[str] = "band"
     x: Floats
     low: Floats
     high: Floats
@@ -88,6 +91,7 @@ class Band(_Layer):
 class Bars(_Layer):
     """Upright bars from `left` to `right`, each B long."""
 
+    kind: ClassVar[str] = "bars"
     left: Floats
     right: Floats
     height: Floats
@@ -97,6 +101,7 @@ class Bars(_Layer):
 class Cells(_Layer):
     """Numbers of points in the cells of a grid; darker cells have more."""
 
+    kind: ClassVar[str] = "cells"
     #: Shape (A + 1,), (B + 1,).
     x_edges: Floats
     y_edges: Floats
@@ -111,6 +116,7 @@ class Cells(_Layer):
 class RangeBars(_Layer):
     """A bar from minimum to maximum with a mark at the mean for each name, from the top down."""
 
+    kind: ClassVar[str] = "ranges"
     names: tuple[str, ...]
     #: NaN is not drawn, shape (N,).
     low: Floats
@@ -122,6 +128,7 @@ class RangeBars(_Layer):
 class Marks(_Layer):
     """Text at points."""
 
+    kind: ClassVar[str] = "marks"
     #: Shape (P,).
     x: Floats
     y: Floats

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, ParamSpec, cast
 
 import numpy as np
 
-from railfix.core.files import staged_file
+from railfix.core.files import stage_file
 from railfix.core.timescale import timedelta
 from railfix.report.plots.chart import (
     BLUE,
@@ -64,7 +64,7 @@ def draw_figure(chart: Chart) -> Figure:
 
 def save_figure(figure: Figure, path: str | PathLike[str]) -> Path:
     """Write a figure as PNG, or SVG where the name says so; OutputError where it cannot be written."""
-    with staged_file(path, what="picture") as staged:
+    with stage_file(path, what="picture") as staged:
         figure.savefig(staged, format="svg" if str(path).endswith(".svg") else "png", dpi=110)
     return Path(path)
 

@@ -11,8 +11,9 @@ from railfix.core.arrays import Floats, Indices
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.report.plots.chart import BLACK, BLUE, GREEN, GREY, ORDERED, RED, Chart, Curve, Layer, Marks, Points
 from railfix.report.plots.draw import draw_figure, save_figure
+from railfix.report.plots.line import LocalFrame
 from railfix.run.locate import Surveyed
-from railfix.track import Track, TrackQuality
+from railfix.track import TrackQuality
 from railfix.track.network import Network, end_points
 from railfix.track.network_match import Matched, PlanLog
 from railfix.track.network_read import NetworkQuality
@@ -135,17 +136,8 @@ def _line(label: str, colour: str, place: tuple[Floats, Floats], breaks: Indices
 
 def _switches(network: Network) -> Indices:
     """Track and end of each stem of a switch, shape (n, 2)."""
-    ends = np.array(
-        [
-            pair
-            for link in network.links
-            if link.navigable
-            for pair in ((link.first, link.first_end), (link.second, link.second_end))
-        ],
-        dtype=np.intp,
-    ).reshape(-1, 2)
-    stems, count = np.unique(ends, axis=0, return_counts=True)
-    return np.asarray(stems[count > 1], dtype=np.intp)
+    stems = sorted(end for end, others in network.passages.items() if len(others) > 1)
+    return np.array(stems, dtype=np.intp).reshape(-1, 2)
 
 
 def _positions(at: tuple[float, float], log: PlanLog, matched: Matched) -> list[Layer]:
@@ -181,13 +173,6 @@ _PANELS: Final = {
 }
 
 
-def _plan(track: Track) -> tuple[Floats, Floats]:
-    """East and north of the points from the first [m]."""
-    axes = enu_axes(track.latitude_deg[0], track.longitude_deg[0])
-    enu = (track.ecef_m - track.ecef_m[0]) @ axes.T
-    return enu[:, 0], enu[:, 1]
-
-
 def plot_track_quality(quality: TrackQuality, path: str | PathLike[str]) -> None:
     """Draw plan, mid-chord deviation, spacing, turns, gradient and cant, with the findings marked, as a PNG file."""
     from matplotlib.figure import Figure
@@ -203,7 +188,7 @@ def plot_track_quality(quality: TrackQuality, path: str | PathLike[str]) -> None
 
 def _draw_plan(axes: Axes, quality: TrackQuality) -> None:
     track = quality.track
-    east, north = _plan(track)
+    east, north = LocalFrame.around(track.ecef_m[:1]).plane(track.ecef_m).T
     axes.plot(east, north, "-", color=_LINE, linewidth=1.2)
     axes.plot(east[0], north[0], "o", color=_LINE, markersize=6, label="start")
     for severity, found in (("error", quality.errors), ("warning", quality.warnings)):
@@ -259,21 +244,24 @@ def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
     from matplotlib.figure import Figure
 
     survey, track = surveyed.survey, surveyed.survey.track
-    axes = enu_axes(track.latitude_deg[0], track.longitude_deg[0])
+    frame = LocalFrame.around(track.ecef_m[:1])
     figure = Figure(figsize=(10, 12), layout="constrained")
     grid = figure.add_gridspec(3, 1, height_ratios=[3.0, 1.0, 1.0])
     plan, height, sigma = (figure.add_subplot(grid[i]) for i in range(3))
     for number, run in enumerate(surveyed.runs):
-        enu = (run.ecef_m - track.ecef_m[0]) @ axes.T
         plan.plot(
-            enu[:, 0], enu[:, 1], ".", color=_COLOURS["error"], markersize=2, label="positions" if not number else None
+            *frame.plane(run.ecef_m).T,
+            ".",
+            color=_COLOURS["error"],
+            markersize=2,
+            label="positions" if not number else None,
         )
-    enu = (track.ecef_m - track.ecef_m[0]) @ axes.T
-    plan.plot(enu[:, 0], enu[:, 1], color=_LINE, label="map")
-    margin = 0.05 * max(float(enu[:, i].max() - enu[:, i].min()) for i in range(2)) + 20.0
+    east, north = frame.plane(track.ecef_m).T
+    plan.plot(east, north, color=_LINE, label="map")
+    margin = 0.05 * max(float(np.ptp(east)), float(np.ptp(north))) + 20.0
     plan.set(
-        xlim=(enu[:, 0].min() - margin, enu[:, 0].max() + margin),
-        ylim=(enu[:, 1].min() - margin, enu[:, 1].max() + margin),
+        xlim=(east.min() - margin, east.max() + margin),
+        ylim=(north.min() - margin, north.max() + margin),
         xlabel="east of the first point [m]",
         ylabel="north [m]",
         title=track.name,

@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from railfix.core.arrays import Floats, Indices, Integers
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import axes_at
 from railfix.core.tables import plural
 from railfix.track.from_positions import ANTENNA_PATH
 from railfix.track.survey import equations as eq
@@ -81,8 +81,7 @@ def adjust(
     measured: list[int] = []
     for r, (run, of_run) in enumerate(zip(runs, columns, strict=True)):
         near = near_ecef_m[r] - origin
-        latitude, longitude, _ = geodetic_from_ecef(np.mean(near_ecef_m[r], axis=0))
-        axes = np.asarray(enu_axes(latitude, longitude))
+        axes = axes_at(np.mean(near_ecef_m[r], axis=0))
         share = independent_share(run, near, limits) / (1.0 if repeats is None else repeats[r])
         measured.append(len(systems))
         if run.signals is None:
@@ -222,8 +221,7 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
     """Adjust runs to the map of one line, alone, then as passes. ValueError: they never move, or lie apart."""
     limits = limits or SurveyLimits()
     origin = np.nanmean(np.concatenate([run.ecef_m for run in runs]), axis=0)
-    latitude, longitude, _ = geodetic_from_ecef(origin)
-    axes = np.asarray(enu_axes(latitude, longitude))
+    axes = axes_at(origin)
     plain = [replace(run, signals=None) for run in runs]
     near = adjust(plain, [_interpolate_positions(run) for run in runs], limits=limits).ecef_m
     adjusted = adjust(runs, near, limits=limits) if any(run.signals is not None for run in runs) else None
