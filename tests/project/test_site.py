@@ -86,6 +86,12 @@ def commands() -> Iterator[str]:
         yield from (f"{name} {sub}" for sub in inner) if inner else (name,)
 
 
+def test_pages_of_packages_and_modules_list_their_own_names_alone() -> None:
+    listed = re.findall(r"^   (railfix\.[\w.]+)$", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), flags=re.M)
+    assert len(listed) > 20
+    assert [name for name in listed if not hasattr(importlib.import_module(name), "__all__")] == []
+
+
 def test_the_readme_has_every_command() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     table = "\n".join(line for line in readme.splitlines() if line.startswith("| `railfix "))

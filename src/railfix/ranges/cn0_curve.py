@@ -27,6 +27,20 @@ from railfix.gnss.observations import ObservationHeader
 if TYPE_CHECKING:
     from scipy.interpolate import PchipInterpolator
 
+__all__ = [
+    "KINDS",
+    "Cn0Curve",
+    "Cn0CurveSource",
+    "Cn0Mean",
+    "Cn0Samples",
+    "CurveFit",
+    "SourceFile",
+    "fit_cn0_curve",
+    "read_cn0_curve",
+    "satellite_kind",
+    "write_cn0_curve",
+]
+
 
 #: Standard deviation of a normal variable against its median absolute deviation.
 _NORMAL_MAD: Final = 1.482_602_218_505_602

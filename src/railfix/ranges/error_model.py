@@ -19,6 +19,20 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
 from railfix.core.settings import Settings, option, read_model_file, write_toml
 
+__all__ = [
+    "LARGEST_PRIOR",
+    "POOLED",
+    "BinStatistics",
+    "Conditions",
+    "ErrorBins",
+    "ErrorModel",
+    "ErrorModelSource",
+    "FaultRate",
+    "condition_differences",
+    "read_error_model",
+    "write_error_model",
+]
+
 
 class Conditions(Settings):
     """Settings of a run that the errors of its corrected pseudoranges depend on."""
