@@ -65,7 +65,7 @@ def memory(
     count = len(place_m)
     mean, covariance = np.zeros((count, 12)), np.zeros((count, 12, 12))
     mean[:, layout.ARC], covariance[:, layout.ARC, layout.ARC] = place_m, sigma_m**2
-    values = np.zeros(20)
+    values = np.zeros(layout.MOTION_MISFIT + 1)
     values[layout.HYPOTHESES] = count
     for name, value in scalars.items():
         values[getattr(layout, name)] = value

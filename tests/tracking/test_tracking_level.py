@@ -15,6 +15,7 @@ from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotati
 from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits, TrackStatus, track
 from railfix.tracking.bank import OTHERS, budget
+from railfix.tracking.state import StateIndex
 from tracking_cases import bent_line, part, ride, wheel, without_epochs
 
 LIMITS = TrackingLimits()
@@ -150,6 +151,39 @@ def test_what_a_map_is_off_across_is_off_along_after_a_bend() -> None:
     expected[layout.RIGHT, layout.RIGHT] += (30.0 * np.sin(turn)) ** 2
     np.testing.assert_allclose(work.mean[0], step @ mean, rtol=0, atol=1e-12)
     np.testing.assert_allclose(work.spread[0], expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.requirement("C6")
+@pytest.mark.parametrize("name", OTHERS)
+def test_only_the_map_that_lies_aside_withholds_the_level(name: str) -> None:
+    """A displacement of 9 m does in the sub-filter of the map, in no other."""
+    held = memory(np.array([100.0]), np.ones(1), np.zeros(1))
+    bank = subfilters([], [], [], LIMITS)
+    at = OTHERS.index(name)
+    bank.running[at], bank.mean[at, layout.RIGHT], bank.covariance[at, layout.RIGHT, layout.RIGHT] = True, 9.0, 1.0
+    held.scalars[layout.BRANCH_S] = LIMITS.level_start_s
+    plain("tracking.monitors").watch(parameters(LIMITS), held, bank, np.nan, 0.0, 0.0, 1.0, 1.0)
+    assert held.scalars[layout.WITHHELD] == (LIMITS.level_hold_s if name == "map" else 0.0)
+
+
+@pytest.mark.requirement("C6")
+def test_a_map_that_may_be_wrong_is_so_where_nothing_is_measured() -> None:
+    """In a gap too its displacement across changes with the way: by 30 m of the map that may be wrong, by no other."""
+    case = ride(120, noise=1.0)
+    gap = np.arange(120) >= 60
+    _, before = track(part(case.epochs, slice(0, 60)), case.line, limits=LIMITS, levels=True)
+    _, after = track(without_epochs(case.epochs, gap), case.line, limits=LIMITS, levels=True)
+    assert before.bank is not None
+    assert after.bank is not None
+    kept = np.exp(-2.0 * after.distance_since_code_m / LIMITS.map_absolute_m)
+    assert kept < 0.5
+    for name, wrong_m in (("map", LIMITS.level_map_m), ("G", 0.0)):
+        old, new = (
+            bank.covariance[bank.without.index(name), StateIndex.MAP_RIGHT, StateIndex.MAP_RIGHT]
+            for bank in (before.bank, after.bank)
+        )
+        walked = (case.line.sigma_plan_m**2 + wrong_m**2) * (1.0 - kept)
+        assert new == pytest.approx(kept * old + walked, rel=0.05)
 
 
 @pytest.mark.requirement("C6")

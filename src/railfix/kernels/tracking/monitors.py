@@ -38,6 +38,7 @@ from railfix.kernels.tracking.layout import (
     HYPOTHESES,
     MAP_LOG_VARIANCE,
     MOTION_MISFIT,
+    OTHERS,
     RIGHT,
     SHIFT,
     SHIFT_VARIANCE,
@@ -46,6 +47,7 @@ from railfix.kernels.tracking.layout import (
     WEAK_CODE,
     WEAK_MOTION,
     WITHHELD,
+    WRONG_MAP,
     Epochs,
     KernelState,
     LineArrays,
@@ -131,7 +133,7 @@ def watch(
     for b in range(len(bank.running)):
         if bank.running[b] and bank.weak_s[b] > parameters.level_doubt_s:
             withheld = parameters.level_hold_s
-    wrong = len(bank.running) - 1
+    wrong = len(bank.running) - OTHERS + WRONG_MAP
     if wrong >= 0 and bank.running[wrong]:
         reach = BESIDE_SIGMAS * math.sqrt(bank.covariance[wrong, RIGHT, RIGHT])
         if abs(bank.mean[wrong, RIGHT]) > max(BESIDE_M, reach):

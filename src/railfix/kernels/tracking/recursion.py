@@ -52,6 +52,7 @@ from railfix.kernels.tracking.layout import (
     MOTION_MISFIT,
     OF_EPOCH,
     OPEN,
+    OTHERS,
     PREDICTION,
     PREVIOUS_ARC,
     REST,
@@ -61,6 +62,7 @@ from railfix.kernels.tracking.layout import (
     WEAK_MOTION,
     WHOLE,
     WITHHELD,
+    WRONG_MAP,
     Active,
     Epochs,
     Inputs,
@@ -156,7 +158,7 @@ def _coast(inputs: Inputs, t: int, state: KernelState, bank: Subfilters, work: W
     for b in range(len(bank.running)):
         if bank.running[b]:
             scale = state.scalars[MAP_LOG_VARIANCE]
-            wrong_m = inputs.parameters.level_map_m if b == len(bank.running) - 1 else 0.0
+            wrong_m = inputs.parameters.level_map_m if b == len(bank.running) - OTHERS + WRONG_MAP else 0.0
             predict(inputs, t, bank.mean[b], bank.covariance[b], scale, wrong_m, work, h)
             _take(bank.mean, bank.covariance, b, work.mean, work.spread, h)
 
