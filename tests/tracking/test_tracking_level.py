@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,9 @@ import belief_campaign
 from plain_kernels import memory, named_tuple, parameters, plain, subfilters, work_space
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
 from railfix.kernels.tracking import layout
-from railfix.tracking import TrackingLimits, TrackStatus, track
+from railfix.tracking import GnssEpochs, Line, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.bank import OTHERS, budget
-from railfix.tracking.state import StateIndex
+from railfix.tracking.state import StateIndex, TrackState
 from tracking_cases import bent_line, part, ride, wheel, without_epochs
 
 LIMITS = TrackingLimits()
@@ -106,6 +107,19 @@ def test_two_faulty_satellites_are_a_hypothesis_of_the_level() -> None:
 
 
 @pytest.mark.requirement("C2")
+def test_many_pairs_that_ask_for_little_spend_no_more_than_is_taken_off_for_them() -> None:
+    given, sigma = budget(LIMITS), 1.05
+    level = level_of([f"G{k:02d}" for k in range(20)], [100.0] * 20, [sigma] * 20)["level_m"]
+    pair = (2.0 * sigma**-2.0 - 1.0) ** -0.5
+    parts = [
+        norm.sf(level),
+        20 * given.prior[0] * norm.sf(level / sigma),
+        190 * given.prior[0] ** 2 * norm.sf(level / pair),
+    ]
+    assert 0.9 * given.risk < 2.0 * sum(parts) <= given.risk
+
+
+@pytest.mark.requirement("C2")
 def test_two_satellites_without_which_nothing_is_known_leave_no_level() -> None:
     assert level_of(["G01", "G02"], [100.0, 100.0], [1.5, 1.4])["level_m"] == np.inf
     assert np.isfinite(level_of(["G01", "G02"], [100.0, 100.0], [1.5, 1.3])["level_m"])
@@ -129,6 +143,36 @@ def test_what_is_known_without_two_satellites_is_that_of_a_filter_without_them(o
     sigma = np.sqrt(expected.covariance[0, 0, 0])
     assert left**-0.5 == pytest.approx(sigma, rel=0.1)
     assert state.mean[0, 0] + shift == pytest.approx(expected.mean[0, 0], abs=0.3 * sigma)
+
+
+@pytest.mark.requirement("C2")
+def test_a_satellite_that_rises_after_a_switch_brings_no_older_knowledge() -> None:
+    """What the filter knows from before a switch has every satellite in it: no pair goes by it, nor by a copy of it."""
+    case = ride(40, noise=1.0, code_sigma_m=3.0, seed=7)
+    measured = {name: getattr(case.epochs, name).copy() for name in ("code_m", "phase_m", "rate_mps")}
+    for values in measured.values():
+        values[:33, 3] = np.nan
+    epochs = replace(case.epochs, **measured)
+    _, state = track(part(epochs, slice(0, 30)), case.line, limits=LIMITS, levels=True)
+    _, state = track(part(epochs, slice(30, 34)), case.line, replace(state, bank=None), limits=LIMITS, levels=True)
+    assert state.bank is not None
+    sigma = dict(zip(state.bank.without, np.sqrt(state.bank.covariance[:, 0, 0]), strict=True))
+    assert sigma["nothing"] > 1.1 * np.sqrt(state.covariance[0, 0, 0])
+    assert sigma[str(epochs.satellite[3])] >= sigma["nothing"]
+
+
+@pytest.mark.requirement("C2")
+def test_the_sub_filter_that_leaves_nothing_out_begins_without_codes_too_and_ends_beside_the_filter() -> None:
+    case = ride(100, noise=1.0, code_sigma_m=3.0, seed=7)
+    _, state = track(part(case.epochs, slice(0, 30)), case.line, limits=LIMITS, levels=True)
+    code = case.epochs.code_m.copy()
+    code[30:32] = np.nan
+    epochs, state, there = replace(case.epochs, code_m=code), replace(state, bank=None), []
+    for begin, end in ((30, 31), (31, 34), (34, 100)):
+        _, state = track(part(epochs, slice(begin, end)), case.line, state, limits=LIMITS, levels=True)
+        assert state.bank is not None
+        there.append("nothing" in state.bank.without)
+    assert there == [True, True, False]
 
 
 @pytest.mark.requirement("C6")
@@ -332,6 +376,29 @@ def test_cutting_changes_no_level() -> None:
         result, state = track(part(case.epochs, slice(begin, end)), case.line, state, limits=LIMITS, levels=True)
         levels.append(result.level_m)
     np.testing.assert_array_equal(np.concatenate(levels), whole.level_m)
+
+
+@pytest.mark.requirement("C2")
+def test_cutting_after_a_switch_changes_no_level(recordings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the deep city another place takes over after some seconds, and all sub-filters begin anew."""
+    given = []
+
+    def kept(epochs: GnssEpochs, line: Line, state: TrackState | None, **settings: Any) -> tuple[Tracked, TrackState]:
+        given.append((epochs, line))
+        return track(epochs, line, state, **settings)
+
+    monkeypatch.setattr("railfix.tracking.levels.track", kept)
+    belief_campaign.run(belief_campaign.cases(recordings)["berlin"]().part(0, 300), {})
+    epochs, line = given[0]
+    whole, _ = track(epochs, line, limits=LIMITS, levels=True)
+    for cut in (11, 12, 15, 24):
+        _, state = track(epochs.take(slice(0, cut)), line, limits=LIMITS, levels=True)
+        assert state.bank is not None
+        assert ("nothing" in state.bank.without) == (cut > 11)
+        found, _ = track(epochs.take(slice(cut, None)), line, state, limits=LIMITS, levels=True)
+        for name in ("level_m", "ground_level_m", "separation_m"):
+            np.testing.assert_allclose(getattr(found, name), getattr(whole, name)[cut:], rtol=1e-6)
+    assert np.isfinite(whole.ground_level_m[12:]).any()
 
 
 @pytest.mark.requirement("C2")
