@@ -29,10 +29,12 @@ def level_of(
     *,
     branch: tuple[float, float, float, float] | None = None,
     weak_s: float = 0.0,
+    nothing: tuple[float, float] | None = None,
 ) -> dict[str, float]:
     """Levels of a place at 100 m with a standard deviation of 1 m, by sub-filters and at most one other branch.
 
-    The branch has a probability, a distance along the line, a straight one, and a standard deviation.
+    The branch has a probability, a distance along the line, a straight one, and a standard deviation; `nothing` is
+    place and standard deviation of the sub-filter that leaves nothing out, where it runs.
     """
     probability, apart, ground, sigma = branch or (0.0, 0.0, 0.0, 0.0)
     count = 1 if branch is None else 2
@@ -45,6 +47,8 @@ def level_of(
     far = probability if apart > LIMITS.start_separation_m else 0.0
     work.branch[1:count] = 0.0 if far else apart, ground, sigma, probability
     bank = subfilters(names, place_m, sigma_m, LIMITS, weak_s)
+    if nothing is not None:
+        bank.running[-1], bank.mean[-1, 0], bank.covariance[-1, 0, 0] = True, nothing[0], nothing[1] ** 2
     fields = ("level_m", "ground_level_m", "level_noise_m", "separation_m")
     answers = named_tuple(layout.Outputs, **{name: np.full(1, np.nan) for name in fields})
     plain("tracking.level").write_level(held, count, far, bank, parameters(LIMITS), work, answers, 0)
@@ -89,20 +93,23 @@ def test_other_branches_are_hypotheses_of_the_level(probability: float) -> None:
 
 
 @pytest.mark.requirement("C2")
-def test_two_faulty_satellites_are_a_hypothesis_of_the_level() -> None:
+@pytest.mark.parametrize("nothing", [None, (103.0, 1.1)])
+def test_two_faulty_satellites_are_a_hypothesis_of_the_level(nothing: tuple[float, float] | None) -> None:
     """Against the equation, with what is known without both by information that adds up; the pair asks for most."""
     given = budget(LIMITS)
     shift, sigma = np.array([1.5, -2.5, 0.1]), np.array([1.25, 1.3, 1.01])
-    found = level_of(["G01", "G02", "G03"], list(100.0 + shift), list(sigma))
+    found = level_of(["G01", "G02", "G03"], list(100.0 + shift), list(sigma), nothing=nothing)
     one, other = (0, 0, 1), (1, 2, 2)
-    known = sigma**-2.0
-    left = known[[*one]] + known[[*other]] - 1.0
-    apart = ((known * shift)[[*one]] + (known * shift)[[*other]]) / left
-    place, own = np.append(shift, apart), np.append(sigma, left**-0.5)
+    with_all, own = nothing or (100.0, 1.0)
+    known, whole = sigma**-2.0, own**-2.0
+    left = known[[*one]] + known[[*other]] - whole
+    apart = ((known * shift)[[*one]] + (known * shift)[[*other]] - whole * (with_all - 100.0)) / left
+    place, spread = np.append(shift, apart), np.append(sigma, left**-0.5)
     prior = np.append(np.full(3, given.prior[0]), np.full(3, given.prior[0] ** 2))
     level = found["level_m"]
-    parts = prior * (norm.sf((level - place) / own) + norm.sf((level + place) / own))
+    parts = prior * (norm.sf((level - place) / spread) + norm.sf((level + place) / spread))
     assert parts.argmax() == 3
+    assert found["separation_m"] == pytest.approx(2.5)
     assert 2.0 * norm.sf(level) + parts.sum() == pytest.approx(given.risk, rel=5e-3)
 
 
