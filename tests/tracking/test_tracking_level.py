@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,9 @@ import belief_campaign
 from plain_kernels import memory, named_tuple, parameters, plain, subfilters, work_space
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
 from railfix.kernels.tracking import layout
-from railfix.tracking import TrackingLimits, TrackStatus, track
+from railfix.tracking import GnssEpochs, Line, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.bank import OTHERS, budget
-from railfix.tracking.state import StateIndex
+from railfix.tracking.state import StateIndex, TrackState
 from tracking_cases import bent_line, part, ride, wheel, without_epochs
 
 LIMITS = TrackingLimits()
@@ -28,10 +29,12 @@ def level_of(
     *,
     branch: tuple[float, float, float, float] | None = None,
     weak_s: float = 0.0,
+    nothing: tuple[float, float] | None = None,
 ) -> dict[str, float]:
     """Levels of a place at 100 m with a standard deviation of 1 m, by sub-filters and at most one other branch.
 
-    The branch has a probability, a distance along the line, a straight one, and a standard deviation.
+    The branch has a probability, a distance along the line, a straight one, and a standard deviation; `nothing` is
+    place and standard deviation of the sub-filter that leaves nothing out, where it runs.
     """
     probability, apart, ground, sigma = branch or (0.0, 0.0, 0.0, 0.0)
     count = 1 if branch is None else 2
@@ -44,6 +47,8 @@ def level_of(
     far = probability if apart > LIMITS.start_separation_m else 0.0
     work.branch[1:count] = 0.0 if far else apart, ground, sigma, probability
     bank = subfilters(names, place_m, sigma_m, LIMITS, weak_s)
+    if nothing is not None:
+        bank.running[-1], bank.mean[-1, 0], bank.covariance[-1, 0, 0] = True, nothing[0], nothing[1] ** 2
     fields = ("level_m", "ground_level_m", "level_noise_m", "separation_m")
     answers = named_tuple(layout.Outputs, **{name: np.full(1, np.nan) for name in fields})
     plain("tracking.level").write_level(held, count, far, bank, parameters(LIMITS), work, answers, 0)
@@ -88,21 +93,37 @@ def test_other_branches_are_hypotheses_of_the_level(probability: float) -> None:
 
 
 @pytest.mark.requirement("C2")
-def test_two_faulty_satellites_are_a_hypothesis_of_the_level() -> None:
+@pytest.mark.parametrize("nothing", [None, (103.0, 1.1)])
+def test_two_faulty_satellites_are_a_hypothesis_of_the_level(nothing: tuple[float, float] | None) -> None:
     """Against the equation, with what is known without both by information that adds up; the pair asks for most."""
     given = budget(LIMITS)
     shift, sigma = np.array([1.5, -2.5, 0.1]), np.array([1.25, 1.3, 1.01])
-    found = level_of(["G01", "G02", "G03"], list(100.0 + shift), list(sigma))
+    found = level_of(["G01", "G02", "G03"], list(100.0 + shift), list(sigma), nothing=nothing)
     one, other = (0, 0, 1), (1, 2, 2)
-    known = sigma**-2.0
-    left = known[[*one]] + known[[*other]] - 1.0
-    apart = ((known * shift)[[*one]] + (known * shift)[[*other]]) / left
-    place, own = np.append(shift, apart), np.append(sigma, left**-0.5)
+    with_all, own = nothing or (100.0, 1.0)
+    known, whole = sigma**-2.0, own**-2.0
+    left = known[[*one]] + known[[*other]] - whole
+    apart = ((known * shift)[[*one]] + (known * shift)[[*other]] - whole * (with_all - 100.0)) / left
+    place, spread = np.append(shift, apart), np.append(sigma, left**-0.5)
     prior = np.append(np.full(3, given.prior[0]), np.full(3, given.prior[0] ** 2))
     level = found["level_m"]
-    parts = prior * (norm.sf((level - place) / own) + norm.sf((level + place) / own))
+    parts = prior * (norm.sf((level - place) / spread) + norm.sf((level + place) / spread))
     assert parts.argmax() == 3
+    assert found["separation_m"] == pytest.approx(2.5)
     assert 2.0 * norm.sf(level) + parts.sum() == pytest.approx(given.risk, rel=5e-3)
+
+
+@pytest.mark.requirement("C2")
+def test_many_pairs_that_ask_for_little_spend_no_more_than_is_taken_off_for_them() -> None:
+    given, sigma = budget(LIMITS), 1.05
+    level = level_of([f"G{k:02d}" for k in range(20)], [100.0] * 20, [sigma] * 20)["level_m"]
+    pair = (2.0 * sigma**-2.0 - 1.0) ** -0.5
+    parts = [
+        norm.sf(level),
+        20 * given.prior[0] * norm.sf(level / sigma),
+        190 * given.prior[0] ** 2 * norm.sf(level / pair),
+    ]
+    assert 0.9 * given.risk < 2.0 * sum(parts) <= given.risk
 
 
 @pytest.mark.requirement("C2")
@@ -129,6 +150,36 @@ def test_what_is_known_without_two_satellites_is_that_of_a_filter_without_them(o
     sigma = np.sqrt(expected.covariance[0, 0, 0])
     assert left**-0.5 == pytest.approx(sigma, rel=0.1)
     assert state.mean[0, 0] + shift == pytest.approx(expected.mean[0, 0], abs=0.3 * sigma)
+
+
+@pytest.mark.requirement("C2")
+def test_a_satellite_that_rises_after_a_switch_brings_no_older_knowledge() -> None:
+    """What the filter knows from before a switch has every satellite in it: no pair goes by it, nor by a copy of it."""
+    case = ride(40, noise=1.0, code_sigma_m=3.0, seed=7)
+    measured = {name: getattr(case.epochs, name).copy() for name in ("code_m", "phase_m", "rate_mps")}
+    for values in measured.values():
+        values[:33, 3] = np.nan
+    epochs = replace(case.epochs, **measured)
+    _, state = track(part(epochs, slice(0, 30)), case.line, limits=LIMITS, levels=True)
+    _, state = track(part(epochs, slice(30, 34)), case.line, replace(state, bank=None), limits=LIMITS, levels=True)
+    assert state.bank is not None
+    sigma = dict(zip(state.bank.without, np.sqrt(state.bank.covariance[:, 0, 0]), strict=True))
+    assert sigma["nothing"] > 1.1 * np.sqrt(state.covariance[0, 0, 0])
+    assert sigma[str(epochs.satellite[3])] >= sigma["nothing"]
+
+
+@pytest.mark.requirement("C2")
+def test_the_sub_filter_that_leaves_nothing_out_begins_without_codes_too_and_ends_beside_the_filter() -> None:
+    case = ride(100, noise=1.0, code_sigma_m=3.0, seed=7)
+    _, state = track(part(case.epochs, slice(0, 30)), case.line, limits=LIMITS, levels=True)
+    code = case.epochs.code_m.copy()
+    code[30:32] = np.nan
+    epochs, state, there = replace(case.epochs, code_m=code), replace(state, bank=None), []
+    for begin, end in ((30, 31), (31, 34), (34, 100)):
+        _, state = track(part(epochs, slice(begin, end)), case.line, state, limits=LIMITS, levels=True)
+        assert state.bank is not None
+        there.append("nothing" in state.bank.without)
+    assert there == [True, True, False]
 
 
 @pytest.mark.requirement("C6")
@@ -332,6 +383,29 @@ def test_cutting_changes_no_level() -> None:
         result, state = track(part(case.epochs, slice(begin, end)), case.line, state, limits=LIMITS, levels=True)
         levels.append(result.level_m)
     np.testing.assert_array_equal(np.concatenate(levels), whole.level_m)
+
+
+@pytest.mark.requirement("C2")
+def test_cutting_after_a_switch_changes_no_level(recordings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the deep city another place takes over after some seconds, and all sub-filters begin anew."""
+    given = []
+
+    def kept(epochs: GnssEpochs, line: Line, state: TrackState | None, **settings: Any) -> tuple[Tracked, TrackState]:
+        given.append((epochs, line))
+        return track(epochs, line, state, **settings)
+
+    monkeypatch.setattr("railfix.tracking.levels.track", kept)
+    belief_campaign.run(belief_campaign.cases(recordings)["berlin"]().part(0, 300), {})
+    epochs, line = given[0]
+    whole, _ = track(epochs, line, limits=LIMITS, levels=True)
+    for cut in (11, 12, 15, 24):
+        _, state = track(epochs.take(slice(0, cut)), line, limits=LIMITS, levels=True)
+        assert state.bank is not None
+        assert ("nothing" in state.bank.without) == (cut > 11)
+        found, _ = track(epochs.take(slice(cut, None)), line, state, limits=LIMITS, levels=True)
+        for name in ("level_m", "ground_level_m", "separation_m"):
+            np.testing.assert_allclose(getattr(found, name), getattr(whole, name)[cut:], rtol=1e-6)
+    assert np.isfinite(whole.ground_level_m[12:]).any()
 
 
 @pytest.mark.requirement("C2")

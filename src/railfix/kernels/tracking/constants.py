@@ -87,8 +87,8 @@ BIAS_FAULTY: Final = 0.35
 BIAS_SHORT: Final = -0.55
 #: Errors of a satellite's orbit, clock and ionosphere last for hours: a mean below this is no sign of a wrong map [m].
 NOMINAL_M: Final = 0.8
-#: More satellites left out at a time have no faults of their own where the codes of one are too short, which no
-#: reflection makes: the map or a constellation is wrong.
+#: More satellites beyond `BIAS_FAULTY` at a time, too short ones like late ones, are no faults of their own where the
+#: codes of one are too short: the map or a constellation is wrong, or reflections pull the clock. There is no level.
 BIAS_SATELLITES: Final = 2
 #: Factor on the variance of codes that are left out: their innovations go on telling when the fault ends.
 BIAS_INFLATED: Final = 1e6

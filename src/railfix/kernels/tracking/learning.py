@@ -3,7 +3,7 @@
 The innovation of a code over its standard deviation has a mean near 0 over a minute, reflections included: they come
 and go. A clock record that is wrong, or a reflection that lasts, keeps its sign. The mean of the innovations, each
 clipped to a standard deviation, so that single large ones count little, tells one from the other: such a satellite's
-codes are left out (`BIAS_FAULTY`).
+codes are left out (`is_faulty`).
 """
 
 from __future__ import annotations
@@ -90,17 +90,17 @@ def learn(
         gone = max(scalars[WEAK_CODE] - CODE_LEAK * code_s, 0.0)
         scalars[WEAK_CODE] = scalars[WEAK_CODE] + code_s if weak else gone
     learn_map(scalars, 0.0 if best else shift, code_s, parameters)
-    left_out = early = 0
+    beyond = early = 0
     for i in range(nc):
         k = rows.codes[i]
         sigma = epochs.code_sigma_m[t, k] * math.sqrt(1.0 + parameters.code_white_share**2)
         bias = state.code_bias[epochs.slot[k]]
         if abs(bias) > BIAS_FAULTY and abs(bias) * sigma > NOMINAL_M:
-            left_out += 1
+            beyond += 1
             early += bias < 0.0
         now = update_bias(state.code_bias, epochs.slot[k], innovation[best, i] / sigma, code_s)
         found = found or now
-    if early and left_out > BIAS_SATELLITES:
+    if early and beyond > BIAS_SATELLITES:
         scalars[WITHHELD] = max(scalars[WITHHELD], parameters.level_hold_s)
     return found
 
@@ -119,7 +119,7 @@ def update_bias(code_bias: Floats, slot: int, innovation: float, code_s: float) 
 
 @borrowing
 def is_faulty(code_bias: float) -> bool:
-    """Tell whether a mean of innovations is that of a satellite whose codes are left out."""
+    """Return whether a mean of innovations is that of a satellite whose codes are left out."""
     return bool(code_bias > BIAS_FAULTY or code_bias < BIAS_SHORT)
 
 
