@@ -184,5 +184,7 @@ PRECISION_M: Final = 1e-7
 ROUNDS: Final = 60
 #: A pair of satellites that asks for less than this share of the risk has it taken off, in place of a term of its own.
 PAIR_SHARE: Final = 1e-3
+#: Less than this share of what is known of the place, without both of a pair, is nothing.
+PAIR_LEFT: Final = 1e-3
 #: Satellites whose line of sight has at least this component along the track are ahead, or behind.
 AHEAD: Final = 0.3

@@ -23,6 +23,7 @@ from railfix.kernels.tracking.algebra import invert, restart
 from railfix.kernels.tracking.constants import (
     AHEAD,
     JOINED,
+    PAIR_LEFT,
     PAIR_SHARE,
     PRECISION_M,
     ROUNDS,
@@ -307,7 +308,7 @@ def _add_pairs(
                 continue
             both = 1.0 / bank.covariance[other, ARC, ARC]
             left, prior = one + both - known, bank.prior[b] * bank.prior[other]
-            if left <= 0.0:
+            if left <= PAIR_LEFT * known:
                 spent += prior
                 continue
             away = abs(moved + both * (bank.mean[other, ARC] - place)) / left
