@@ -29,12 +29,12 @@ def level_of(
     *,
     branch: tuple[float, float, float, float] | None = None,
     weak_s: float = 0.0,
-    nothing: tuple[float, float] | None = None,
+    in_view: tuple[float, float] | None = None,
 ) -> dict[str, float]:
     """Levels of a place at 100 m with a standard deviation of 1 m, by sub-filters and at most one other branch.
 
-    The branch has a probability, a distance along the line, a straight one, and a standard deviation; `nothing` is
-    place and standard deviation of the sub-filter that leaves nothing out, where it runs.
+    The branch has a probability, a distance along the line, a straight one, and a standard deviation; `in_view` is
+    place and standard deviation of the sub-filter with all satellites in view, where it runs.
     """
     probability, apart, ground, sigma = branch or (0.0, 0.0, 0.0, 0.0)
     count = 1 if branch is None else 2
@@ -47,8 +47,8 @@ def level_of(
     far = probability if apart > LIMITS.start_separation_m else 0.0
     work.branch[1:count] = 0.0 if far else apart, ground, sigma, probability
     bank = subfilters(names, place_m, sigma_m, LIMITS, weak_s)
-    if nothing is not None:
-        bank.running[-1], bank.mean[-1, 0], bank.covariance[-1, 0, 0] = True, nothing[0], nothing[1] ** 2
+    if in_view is not None:
+        bank.running[-1], bank.mean[-1, 0], bank.covariance[-1, 0, 0] = True, in_view[0], in_view[1] ** 2
     fields = ("level_m", "ground_level_m", "level_noise_m", "separation_m")
     answers = named_tuple(layout.Outputs, **{name: np.full(1, np.nan) for name in fields})
     plain("tracking.level").write_level(held, count, far, bank, parameters(LIMITS), work, answers, 0)
@@ -93,14 +93,14 @@ def test_other_branches_are_hypotheses_of_the_level(probability: float) -> None:
 
 
 @pytest.mark.requirement("C2")
-@pytest.mark.parametrize("nothing", [None, (103.0, 1.1)])
-def test_two_faulty_satellites_are_a_hypothesis_of_the_level(nothing: tuple[float, float] | None) -> None:
+@pytest.mark.parametrize("in_view", [None, (103.0, 1.1)])
+def test_two_faulty_satellites_are_a_hypothesis_of_the_level(in_view: tuple[float, float] | None) -> None:
     """Against the equation, with what is known without both by information that adds up; the pair asks for most."""
     given = budget(LIMITS)
     shift, sigma = np.array([1.5, -2.5, 0.1]), np.array([1.25, 1.3, 1.01])
-    found = level_of(["G01", "G02", "G03"], list(100.0 + shift), list(sigma), nothing=nothing)
+    found = level_of(["G01", "G02", "G03"], list(100.0 + shift), list(sigma), in_view=in_view)
     one, other = (0, 0, 1), (1, 2, 2)
-    with_all, own = nothing or (100.0, 1.0)
+    with_all, own = in_view or (100.0, 1.0)
     known, whole = sigma**-2.0, own**-2.0
     left = known[[*one]] + known[[*other]] - whole
     apart = ((known * shift)[[*one]] + (known * shift)[[*other]] - whole * (with_all - 100.0)) / left
@@ -164,12 +164,12 @@ def test_a_satellite_that_rises_after_a_switch_brings_no_older_knowledge() -> No
     _, state = track(part(epochs, slice(30, 34)), case.line, replace(state, bank=None), limits=LIMITS, levels=True)
     assert state.bank is not None
     sigma = dict(zip(state.bank.without, np.sqrt(state.bank.covariance[:, 0, 0]), strict=True))
-    assert sigma["nothing"] > 1.1 * np.sqrt(state.covariance[0, 0, 0])
-    assert sigma[str(epochs.satellite[3])] >= sigma["nothing"]
+    assert sigma["all in view"] > 1.1 * np.sqrt(state.covariance[0, 0, 0])
+    assert sigma[str(epochs.satellite[3])] >= sigma["all in view"]
 
 
 @pytest.mark.requirement("C2")
-def test_the_sub_filter_that_leaves_nothing_out_begins_without_codes_too_and_ends_beside_the_filter() -> None:
+def test_the_sub_filter_with_all_in_view_begins_without_codes_too_and_ends_beside_the_filter() -> None:
     case = ride(100, noise=1.0, code_sigma_m=3.0, seed=7)
     _, state = track(part(case.epochs, slice(0, 30)), case.line, limits=LIMITS, levels=True)
     code = case.epochs.code_m.copy()
@@ -178,7 +178,7 @@ def test_the_sub_filter_that_leaves_nothing_out_begins_without_codes_too_and_end
     for begin, end in ((30, 31), (31, 34), (34, 100)):
         _, state = track(part(epochs, slice(begin, end)), case.line, state, limits=LIMITS, levels=True)
         assert state.bank is not None
-        there.append("nothing" in state.bank.without)
+        there.append("all in view" in state.bank.without)
     assert there == [True, True, False]
 
 
@@ -210,7 +210,7 @@ def test_only_the_map_that_lies_aside_withholds_the_level(name: str) -> None:
     """A displacement of 9 m does in the sub-filter of the map, in no other."""
     held = memory(np.array([100.0]), np.ones(1), np.zeros(1))
     bank = subfilters([], [], [], LIMITS)
-    at = OTHERS.index(name)
+    at = list(OTHERS).index(name)
     bank.running[at], bank.mean[at, layout.RIGHT], bank.covariance[at, layout.RIGHT, layout.RIGHT] = True, 9.0, 1.0
     held.scalars[layout.BRANCH_S] = LIMITS.level_start_s
     plain("tracking.monitors").watch(parameters(LIMITS), held, bank, np.nan, 0.0, 0.0, 1.0, 1.0)
@@ -286,7 +286,7 @@ def test_a_source_that_is_never_faulty_needs_no_sub_filter() -> None:
     limits = TrackingLimits(level_constellation_prior=0.0)
     _, state = track(case.epochs, case.line, limits=limits, levels=True)
     assert state.bank is not None
-    assert set(state.bank.without) == {*case.epochs.satellite, *OTHERS} - {"nothing"}
+    assert set(state.bank.without) == {*case.epochs.satellite, *OTHERS} - {"all in view"}
     rare = budget(TrackingLimits(level_constellation_prior=1e-13, level_fault_prior=1e-3))
     assert rare.prior[1] == 0.0
     assert rare.risk < budget(LIMITS).risk
@@ -401,7 +401,7 @@ def test_cutting_after_a_switch_changes_no_level(recordings: Path, monkeypatch: 
     for cut in (11, 12, 15, 24):
         _, state = track(epochs.take(slice(0, cut)), line, limits=LIMITS, levels=True)
         assert state.bank is not None
-        assert ("nothing" in state.bank.without) == (cut > 11)
+        assert ("all in view" in state.bank.without) == (cut > 11)
         found, _ = track(epochs.take(slice(cut, None)), line, state, limits=LIMITS, levels=True)
         for name in ("level_m", "ground_level_m", "separation_m"):
             np.testing.assert_allclose(getattr(found, name), getattr(whole, name)[cut:], rtol=1e-6)

@@ -14,7 +14,7 @@ import typer
 from railfix.cli.command import LazyCommands, run_program
 from railfix.core.commit import version_text
 
-# Read where numpy is imported, which none of these does. Threads of linear algebra wait busily for the next product.
+# Threads of linear algebra spin while they wait for the next product. It must be set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 

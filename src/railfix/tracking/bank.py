@@ -38,12 +38,19 @@ class SourceKind(IntEnum):
     MAP = 4
     BALISE = 5
     SIDE = 6
-    NOTHING = 7
+    ALL_IN_VIEW = 7
 
 
 #: Sources beside satellites, constellations and sensors: all Dopplers, phases, codes of satellites ahead or behind,
-#: the map; and none.
-OTHERS: Final = ("doppler", "phase", "ahead", "behind", "map", "nothing")
+#: the map; and none, for all satellites in view.
+OTHERS: Final = {
+    "doppler": SourceKind.MOTION,
+    "phase": SourceKind.MOTION,
+    "ahead": SourceKind.SIDE,
+    "behind": SourceKind.SIDE,
+    "map": SourceKind.MAP,
+    "all in view": SourceKind.ALL_IN_VIEW,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,9 +121,7 @@ def kind_of(name: str) -> SourceKind:
     if name in CLOCKS:
         return SourceKind.CONSTELLATION
     if name in OTHERS:
-        kinds = {"map": SourceKind.MAP, "nothing": SourceKind.NOTHING}
-        kinds |= dict.fromkeys(("ahead", "behind"), SourceKind.SIDE)
-        return kinds.get(name, SourceKind.MOTION)
+        return OTHERS[name]
     if name in (SENSORS[Kind.BALISE], SENSORS[Kind.NEXT_BALISE]):
         return SourceKind.BALISE
     return SourceKind.SENSOR if name in SENSORS.values() else SourceKind.SATELLITE

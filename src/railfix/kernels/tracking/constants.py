@@ -79,16 +79,16 @@ MOTION_LEAK: Final = 0.5
 CODE_LEAK: Final = 1.0
 
 # Satellites whose codes are wrong for long.
-#: Time constant of the mean innovation [s], what one innovation counts at most, and the mean from which on codes are
-#: left out: where reflections make most codes late, and the clock with them, the right ones seem too short.
+#: Time constant of the mean innovation [s], what one innovation counts at most, and the means beyond which codes are
+#: left out: too long, and too short. Late codes of other satellites pull the clock, so that right ones seem too short.
 BIAS_MEMORY_S: Final = 60.0
 BIAS_MOST: Final = 1.0
 BIAS_FAULTY: Final = 0.35
 BIAS_SHORT: Final = -0.55
 #: Errors of a satellite's orbit, clock and ionosphere last for hours: a mean below this is no sign of a wrong map [m].
 NOMINAL_M: Final = 0.8
-#: More satellites beyond `BIAS_FAULTY` at a time, too short ones like late ones, are no faults of their own where the
-#: codes of one are too short: the map or a constellation is wrong, or reflections pull the clock. There is no level.
+#: With more satellites beyond `BIAS_FAULTY`, too long or too short, and one of them too short, there is no level: the
+#: map or a constellation is wrong, or reflections pull the clock.
 BIAS_SATELLITES: Final = 2
 #: Factor on the variance of codes that are left out: their innovations go on telling when the fault ends.
 BIAS_INFLATED: Final = 1e6

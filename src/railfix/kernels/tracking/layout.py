@@ -18,10 +18,10 @@ C_WAY, C_CLOCK, C_RIGHT, C_UP, C_SPEED, C_DRIFT = 1, 2, 3, 4, 5, 6
 COMBINED = 7
 #: Kinds of sensors, and their columns: wheel, radar, force, place, balises in turn, and one for each range to a unit.
 SENSORS = 7
-#: Sources of sub-filters after the sensors: all Dopplers, all phases, codes of satellites ahead, behind, the map; the
-#: last one leaves nothing out.
+#: Sources of sub-filters after the sensors: all Dopplers, all phases, codes of satellites ahead, behind, the map; and
+#: none, for all satellites in view.
 OTHERS = 6
-ALL_DOPPLERS, ALL_PHASES, CODES_AHEAD, CODES_BEHIND, WRONG_MAP, NOTHING = 0, 1, 2, 3, 4, 5
+ALL_DOPPLERS, ALL_PHASES, CODES_AHEAD, CODES_BEHIND, WRONG_MAP, ALL_IN_VIEW = 0, 1, 2, 3, 4, 5
 WHEEL_ROW, RADAR_ROW, FORCE_ROW, PLACE_ROW, RANGE_ROW = 0, 1, 2, 3, 6
 #: Parts of an epoch: all of it; the prediction alone; what follows a prediction that is in the work space already,
 #: places sought in between; the same where the track was lost.

@@ -32,6 +32,7 @@ from railfix.kernels.tracking.course import find_ends, point_at
 from railfix.kernels.tracking.equations import combine, move_sensor_equations, write_equations
 from railfix.kernels.tracking.layout import (
     ALL_DOPPLERS,
+    ALL_IN_VIEW,
     ALL_PHASES,
     ARC,
     CODE_CLOCK,
@@ -40,7 +41,6 @@ from railfix.kernels.tracking.layout import (
     COMBINED,
     DRIFT,
     MAP_LENGTH_ERROR,
-    NOTHING,
     OF_EPOCH,
     OTHERS,
     PHASE_CLOCK,
@@ -89,9 +89,9 @@ def _sources(epochs: Epochs, t: int, rows: Rows, bank: Subfilters, slots: int, b
         source[slots + clocks + min(rows.sensors[j], RANGE_ROW)] = True
     first = slots + clocks + SENSORS
     source[first + ALL_DOPPLERS], source[first + ALL_PHASES] = rows.counts[2] > 0, rows.counts[1] > 0
-    for b in range(first + CODES_AHEAD, first + NOTHING):
+    for b in range(first + CODES_AHEAD, first + ALL_IN_VIEW):
         source[b] = rows.counts[0] > 0
-    source[first + NOTHING] = not before
+    source[first + ALL_IN_VIEW] = not before
     for k in range(slots):
         if epochs.remembered[t, k]:
             met[slots + bank.clock[k]] = True
@@ -189,7 +189,8 @@ def advance_subfilters(
 
     Each has equations of its own about its place: where the line bends between the two, those of the filter are none
     of it. One that its own measurements contradict has settled somewhere else and begins anew. The filter itself is
-    one without a source that it has not met.
+    one without a source that it has not met. Where all begin anew, so does one with all satellites in view, until it
+    has become the filter: pairs are compared with it.
     """
     epochs, line, parameters, active = inputs.epochs, inputs.line, inputs.parameters, inputs.active
     mean, spread = work.mean, work.spread
@@ -199,7 +200,7 @@ def advance_subfilters(
     slots = len(active.satellite)
     clocks = len(bank.running) - OTHERS - SENSORS - slots
     others = slots + clocks + SENSORS
-    nothing, before = others + NOTHING, False
+    all_in_view, before = others + ALL_IN_VIEW, False
     for b in range(len(bank.running)):
         before = before or bank.running[b]
     before = before and not best
@@ -212,10 +213,11 @@ def advance_subfilters(
         if bank.running[b] and bank.weak_s[b] >= parameters.lost_motion_s:
             bank.running[b], met[b] = False, True
         rises = satellite and before and source[b] and not bank.running[b] and not met[b] and bank.prior[b] > 0.0
-        of = nothing if rises else b
-        if bank.running[of]:
+        begun_from = all_in_view if rises else b
+        if bank.running[begun_from]:
             wrong_m = parameters.level_map_m if b == others + WRONG_MAP else 0.0
-            predict(inputs, t, bank.mean[of], bank.covariance[of], map_log_variance, wrong_m, work, h)
+            begun_mean, begun_covariance = bank.mean[begun_from], bank.covariance[begun_from]
+            predict(inputs, t, begun_mean, begun_covariance, map_log_variance, wrong_m, work, h)
             find_ends(line, mean[h, ARC], mean[h, n + PREVIOUS_ARC], work)
             if wrong_m > 0.0:
                 _turn_map(wrong_m, work, h)
@@ -223,12 +225,12 @@ def advance_subfilters(
             sigma = math.sqrt(spread[h, ARC, ARC])
             near = abs(mean[h, ARC] - mean[best, ARC]) < JOINED * sigma
             near = near and sigma < (1.0 + JOINED) * math.sqrt(spread[best, ARC, ARC])
-            if near and (satellite or b == nothing) and not source[b]:
+            if near and (satellite or b == all_in_view) and not source[b]:
                 bank.running[b] = False
                 continue
             if rises:
                 bank.running[b], bank.weak_s[b] = True, 0.0
-        elif source[b] and (bank.prior[b] > 0.0 or b == nothing):
+        elif source[b] and (bank.prior[b] > 0.0 or b == all_in_view):
             _begin(bank, b, before and not met[b], best, parameters, work, h)
         else:
             continue
@@ -286,38 +288,38 @@ def _add_pairs(
 ) -> tuple[int, float]:
     """Add pairs of faulty satellites to the branches, from row `count` on.
 
-    What is known of the place without both follows from what is known with all, and without each: information adds
-    up. The standard deviation is mostly within a tenth of that of a filter without both; with few satellites it can be
-    half of it.
+    Information adds up: what is known of the place without both is the sum of what is known without each, less what
+    is known with all in view. The standard deviation is mostly within a tenth of that of a filter without both; with
+    few satellites it can be half of it.
 
     Returns the number of rows, and the risk that is spent on pairs that have none: those that ask for less than the
     level `start`, and those without whose satellites nothing is known, which nothing bounds.
     """
-    place, known, shift, spent = state.mean[0, ARC], 1.0 / state.covariance[0, ARC, ARC], 0.0, 0.0
-    nothing = len(bank.running) - OTHERS + NOTHING
-    if bank.running[nothing]:
-        known = 1.0 / bank.covariance[nothing, ARC, ARC]
-        shift = known * (bank.mean[nothing, ARC] - place)
-    for b in range(len(bank.clock)):
-        if not (bank.running[b] and bank.prior[b] > 0.0):
+    place, in_view, spent = state.mean[0, ARC], len(bank.running) - OTHERS + ALL_IN_VIEW, 0.0
+    whole, whole_shift = 1.0 / state.covariance[0, ARC, ARC], 0.0
+    if bank.running[in_view]:
+        whole = 1.0 / bank.covariance[in_view, ARC, ARC]
+        whole_shift = whole * (bank.mean[in_view, ARC] - place)
+    for first in range(len(bank.clock)):
+        if not (bank.running[first] and bank.prior[first] > 0.0):
             continue
-        one = 1.0 / bank.covariance[b, ARC, ARC]
-        moved = one * (bank.mean[b, ARC] - place) - shift
-        for other in range(b):
-            if not bank.running[other]:
+        information = 1.0 / bank.covariance[first, ARC, ARC] - whole
+        shift = (bank.mean[first, ARC] - place) / bank.covariance[first, ARC, ARC] - whole_shift
+        for second in range(first):
+            if not bank.running[second]:
                 continue
-            both = 1.0 / bank.covariance[other, ARC, ARC]
-            left, prior = one + both - known, bank.prior[b] * bank.prior[other]
-            if left <= PAIR_LEFT * known:
+            remaining = information + 1.0 / bank.covariance[second, ARC, ARC]
+            prior = bank.prior[first] * bank.prior[second]
+            if remaining <= PAIR_LEFT * whole:
                 spent += prior
                 continue
-            away = abs(moved + both * (bank.mean[other, ARC] - place)) / left
-            tail = prior * math.erfc((start - away) * math.sqrt(0.5 * left))  # on the far side it is less
+            away = abs(shift + (bank.mean[second, ARC] - place) / bank.covariance[second, ARC, ARC]) / remaining
+            tail = prior * math.erfc((start - away) * math.sqrt(0.5 * remaining))  # on the far side it is less
             if tail < PAIR_SHARE * parameters.level_risk:
                 spent += tail
                 continue
             work.branch[count, 0] = work.branch[count, 1] = away
-            work.branch[count, 2], work.branch[count, 3] = 1.0 / math.sqrt(left), prior
+            work.branch[count, 2], work.branch[count, 3] = 1.0 / math.sqrt(remaining), prior
             count += 1
     return count, spent
 
@@ -337,13 +339,14 @@ def write_level(
 
     Infinite without a sub-filter, and where the measurements of one have contradicted it for longer than
     `TrackingLimits.level_doubt_s`: it has settled somewhere else, or began where the fault of its source had led the
-    filter, and bounds nothing. Along the line it is infinite where another place of it, further away than a bound may
+    filter, and bounds nothing; and where pairs of satellites that nothing bounds are more probable than the risk. Along
+    the line it is infinite where another place of it, further away than a bound may
     reach, is more probable than the risk; the straight distance is bounded with all branches and a map that lies aside.
     """
     place, sigma = state.mean[0, ARC], math.sqrt(state.covariance[0, ARC, ARC])
     noise, apart, branches = parameters.level_k * sigma, math.nan, count
     start, contradicted, others = noise, False, len(bank.running) - OTHERS
-    for b in range(others + NOTHING):
+    for b in range(others + ALL_IN_VIEW):
         if bank.running[b]:
             contradicted = contradicted or bank.weak_s[b] > parameters.level_doubt_s
             away = abs(bank.mean[b, ARC] - place)
@@ -389,7 +392,7 @@ def _solve(
         excess = work.branch[h, 3] / (2.0 * risk)
         k = math.sqrt(2.0 * math.log(excess)) if excess > 1.0 else 0.0
         level = max(level, work.branch[h, which] + k * work.branch[h, 2])
-    low, high, sources = 0.0, math.inf, len(bank.running) - OTHERS + NOTHING
+    low, high, sources = 0.0, math.inf, len(bank.running) - OTHERS + ALL_IN_VIEW
     for _ in range(ROUNDS):
         away = level / sigma
         spent = math.erfc(away / math.sqrt(2.0))
@@ -424,7 +427,7 @@ def _solve(
 def speed_bound(speed: float, sigma: float, bank: Subfilters, parameters: Parameters) -> float:
     """Return the bound of the error of the speed: what carries the level over the epochs until the next one."""
     bound = parameters.level_k_speed * sigma
-    for b in range(len(bank.running) - OTHERS + NOTHING):
+    for b in range(len(bank.running) - OTHERS + ALL_IN_VIEW):
         if bank.running[b]:
             own = math.sqrt(bank.covariance[b, SPEED, SPEED])
             bound = max(bound, abs(bank.mean[b, SPEED] - speed) + bank.k_speed[b] * own)
