@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import raim_oracle as oracle
 import synthetic
 from railfix.integrity.raim import constrained_model
-from railfix.integrity.raim.model import compact, regular_inverse
+from railfix.integrity.raim.model import compact, model_on_line
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, constrained_position, single_point
 from raim_oracle import point_model
 
@@ -152,8 +152,14 @@ def test_ties_of_some_epochs_go_with_them():
     assert np.array_equal(model.take(np.array([4, 1])).wsse, model.wsse[[4, 1]])
 
 
-def test_an_inverse_does_not_depend_on_the_unit_of_an_axis():
-    """A map of a millimetre beside a place known to kilometres is regular; two axes that are one are not."""
-    matrix = np.diag([1e-8, 1.0, 1e8])[None]
-    np.testing.assert_allclose(regular_inverse(matrix)[0], np.diag([1e8, 1.0, 1e-8]), rtol=1e-12)
-    assert np.isnan(regular_inverse(np.ones((1, 3, 3)))).all()
+def test_a_map_of_a_millimetre_beside_a_place_known_to_kilometres():
+    """The inverse does not depend on the unit of an axis; two axes that are one are singular."""
+    arc = np.array([731.0])
+    ranges = oracle.made(arc, "GGGGGG", seed=3, sigma_m=np.full(6, 1e4))
+    place, axes = oracle.LINE.at_arc(arc), oracle.LINE.axes_of(oracle.LINE.segment_at(arc)[0])
+    exact = model_on_line(ranges, place, axes, 1e-4, 1e-4)
+    assert exact.covariance_m2[0, 1, 1] == pytest.approx(1e-8, rel=1e-6)
+    information = (exact.design[0, :, 0] ** 2).sum()
+    assert exact.covariance_m2[0, 0, 0] == pytest.approx(1.0 / information, rel=1e-9)
+    alike = np.repeat(axes[:, :1], 3, axis=1)
+    assert np.isnan(model_on_line(ranges, place, alike, 1e12, 1e12).covariance_m2).all()

@@ -71,6 +71,7 @@ def copied(value: Any) -> Any:
 KERNELS = {
     "hypotheses": ("tails_of_hypotheses",),
     "level": ("solve_level",),
+    "model": ("linearised", "residuals"),
     "off_tangent": ("clear_of_sections", "risk_beyond", "risk_off_tangent"),
     "ranges": ("reduced_equations", "misfits", "iterated_points", "dilutions", "iterated_along"),
     "reading": ("decoded_fields", "placed_fields", "line_ends"),

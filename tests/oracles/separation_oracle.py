@@ -25,7 +25,8 @@ from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.integrity.protection.level import Asked, Errors
 from railfix.integrity.protection.open_places import one_after_the_other
-from railfix.integrity.raim.model import LinearModel, ModelArrays, compact, regular_inverse
+from railfix.integrity.raim.model import LinearModel, ModelArrays, compact
+from railfix.positioning.normal_equations import inverse_3x3
 
 #: Effect on the position, in its own sigmas, below which a satellite has none.
 NO_EFFECT: Final = 1e-6
@@ -225,6 +226,14 @@ def without_group(full: AllInView, members: Masks | None) -> Remaining:
     blind: Masks = np.any(~checked & (np.abs(rows[..., n]) > limit), axis=1)
     gone = np.einsum("tm,tmc->tc", rows[..., n], scaled[..., n:])
     return Remaining(full, columns - rows[..., :n].swapaxes(1, 2) @ scaled, gone, blind)
+
+
+def regular_inverse(matrix: Floats) -> Floats:
+    """Inverse of symmetric 3 x 3 matrices, each scaled to a unit diagonal; NaN where singular."""
+    diagonal = np.einsum("tii->ti", matrix)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, np.nan))
+    outer = scale[:, :, None] * scale[:, None, :]
+    return np.asarray(inverse_3x3(matrix * outer) * outer)
 
 
 def without_map(full: AllInView, model: LinearModel, seen_m: Floats, information: Floats) -> WithoutMap:

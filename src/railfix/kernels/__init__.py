@@ -12,9 +12,9 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from railfix.kernels import hypotheses, level, off_tangent, ranges, reading, robust, screens, search, windows
+    from railfix.kernels import hypotheses, level, model, off_tangent, ranges, reading, robust, screens, search, windows
 
-__all__ = ["hypotheses", "level", "off_tangent", "ranges", "reading", "robust", "screens", "search", "windows"]
+__all__ = ["hypotheses", "level", "model", "off_tangent", "ranges", "reading", "robust", "screens", "search", "windows"]
 
 #: The compiled function of the filter.
 FILTER: Final = "advance"

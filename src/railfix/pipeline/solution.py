@@ -24,7 +24,7 @@ from railfix.pipeline.solve import (
     Place,
     fault_free,
     lasting_errors,
-    line_model,
+    model_again,
     place_on_lines,
     redundancy_of,
     validate_point,
@@ -155,9 +155,9 @@ def solve(
         corrected = corrected.rejected(lasting, Reason.LASTING_ERROR)
         on_line, teaching = _fit_on_line(corrected, ranges, antennas, place, config)
     robust, robust_sums = robust_scale([noise.robust for noise in noises])
-    tested, (ranges, place, raim) = ranges, fault_free(ranges, antennas, place, robust, on_line.kept, config)
+    ranges, place, raim = fault_free(ranges, antennas, place, robust, on_line.kept, config)
     constrained, redundancy = place.constrained, redundancy_of(ranges)
-    model = model if ranges is tested else line_model(ranges, antennas, constrained)
+    model = model_again(model, ranges, antennas, constrained, np.flatnonzero(raim.excluded.any(axis=1)))
     off_map = _off_map(ranges, antennas, place, constrained.arc_m, config)
     teaching = ~off_map & ~raim.faulty
     if "raim" not in config.screens:

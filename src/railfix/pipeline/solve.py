@@ -88,6 +88,16 @@ def line_model(ranges: Ranges, antennas: AntennaRows, constrained: Constrained) 
     return model_on_line(ranges, place, antennas.axes_of(section), antennas.sigma_plan_m, antennas.sigma_height_m)
 
 
+def model_again(
+    model: LinearModel, ranges: Ranges, antennas: AntennaRows, constrained: Constrained, epochs: Indices
+) -> LinearModel:
+    """Return the model with that of some rising epochs made again, from other ranges and places."""
+    for index, own in antennas.split(epochs):
+        arc, section = constrained.arc_m[own], np.maximum(constrained.section[own], 0)
+        model = model.patched(own, constrained_model(ranges.take(own), index.trajectory, arc, section=section))
+    return model
+
+
 def redundancy_of(ranges: Ranges) -> Integers:
     """Return the number of ranges beyond the clocks and the distance along the line, shape (T,)."""
     return np.asarray(ranges.n_used - ranges.n_clocks - 1, dtype=np.int64)
@@ -299,9 +309,10 @@ def lasting_errors(
         left_out |= found
         if found.any():
             ranges = without(ranges, found)
-            for index, epochs in antennas.split(np.flatnonzero(found.any(axis=1))):
+            solved = np.flatnonzero(found.any(axis=1))
+            for index, epochs in antennas.split(solved):
                 place = solved_again(ranges, index, place, epochs, config)
-            model = line_model(ranges, antennas, place.constrained)
+            model = model_again(model, ranges, antennas, place.constrained, solved)
             error = _own_errors(model, noise, limits.clipped)
     after_states = [
         changed(state, time=when, age=age, channel=channel, sums=sums[:, k].T) if len(time[rows]) else state

@@ -9,15 +9,15 @@ with `LinearModel.freedom` degrees of freedom.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks
-from railfix.core.geodesy import range_with_rotation
-from railfix.positioning.normal_equations import Ranges, inverse_3x3
+from railfix import kernels
+from railfix.core.arrays import Floats, Indices, Integers, Masks, kernel_array
+from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
 
 
@@ -65,7 +65,17 @@ class LinearModel:
             freedom=self.freedom[epochs], interest=self.interest,
         )  # fmt: skip
 
-    @property
+    def patched(self, epochs: Indices, part: LinearModel) -> LinearModel:
+        """The model with some epochs, by index, replaced by those of another."""
+        if len(epochs) == len(self):
+            return part
+        changed = {}
+        for name in ("root_weight", "clock_covariance_m2", "design", "covariance_m2", "misfit", "freedom"):
+            changed[name] = getattr(self, name).copy()
+            changed[name][epochs] = getattr(part, name)
+        return replace(self, **changed)
+
+    @cached_property
     def arrays(self) -> ModelArrays:
         """The same as plain arrays, without `freedom` and `interest`."""
         return ModelArrays(*(np.ascontiguousarray(getattr(self, name)) for name in ModelArrays._fields))
@@ -81,16 +91,26 @@ class LinearModel:
         return np.asarray(1.0 / np.where(self.used, self.root_weight, np.nan))
 
     @cached_property
+    def _fitted(self) -> tuple[Floats, Floats, Floats]:
+        return kernels.model.residuals(self.arrays)
+
+    @property
     def step_m(self) -> Floats:
         """The place that fits best, from the position the model stands at, shape (T, 3) [m]; near 0 at a solution."""
-        pull = np.matmul(self.misfit[:, None, :], self.design)
-        return np.asarray(np.matmul(pull, self.covariance_m2)[:, 0])
+        return self._fitted[0]
 
-    @cached_property
+    @property
     def residual(self) -> Floats:
         """Whitened residuals ``nu = S y``, shape (T, M)."""
-        clocks = _clocks(self.root_weight, self.clock, self.clock_covariance_m2, self.misfit[..., None])[..., 0]
-        return np.asarray(self.misfit - self.root_weight * clocks - np.einsum("tmi,ti->tm", self.design, self.step_m))
+        return self._fitted[1]
+
+    @property
+    def redundancy(self) -> Floats:
+        """Diagonal of S: the share of its own error that a range shows in its residual, shape (T, M).
+
+        0 where not used, and where nothing checks the range.
+        """
+        return self._fitted[2]
 
     @cached_property
     def residual_m(self) -> Floats:
@@ -106,16 +126,6 @@ class LinearModel:
     def gain_m(self) -> Floats:
         """Change of the position with a whitened range, shape (T, M, interest) [m]."""
         return np.asarray(self.design @ self.covariance_m2[:, :, : self.interest])
-
-    @cached_property
-    def redundancy(self) -> Floats:
-        """Diagonal of S: the share of its own error that a range shows in its residual, shape (T, M).
-
-        0 where not used, and where nothing checks the range.
-        """
-        clocks = np.einsum("tgg->tg", self.clock_covariance_m2)[:, self.clock]
-        place = ((self.design @ self.covariance_m2) * self.design).sum(axis=2)
-        return np.asarray(self.used * (1.0 - self.root_weight**2 * clocks) - place)
 
     def position_covariance_m2(self, scale: Floats) -> Floats:
         """Covariance of the wanted components, shape (T, interest, interest) [m^2].
@@ -194,61 +204,11 @@ def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *,
     [1/m^2].
     """
     arrays = ranges.arrays
-    weight, clock = arrays.weight, arrays.clock
-    distance, los = range_with_rotation(arrays.sat_ecef_m, np.ascontiguousarray(place_ecef_m)[:, None, :])
-    root, totals = np.sqrt(weight), weight @ _one_hot(clock, len(arrays.starts))
-    misfit = arrays.code_m - distance
-    if arrays.tied:
-        misfit = misfit - arrays.offset_m[:, clock]
-    # A constant common to all ranges is no residual; subtracting it keeps the digits of the sums.
-    total = totals.sum(axis=1, keepdims=True)
-    misfit = misfit - (weight * misfit).sum(axis=1, keepdims=True) / np.where(total > 0, total, 1.0)
-    rows = root[..., None] * -(los @ axes.swapaxes(1, 2))
-    covariance = _clock_covariance(totals, arrays.sigma_m if arrays.tied else None)
-    design = rows - root[..., None] * _clocks(root, clock, covariance, rows)
-    normal = rows.swapaxes(1, 2) @ design
+    root, clocks, design, covariance, misfit = kernels.model.linearised(
+        arrays, kernel_array(place_ecef_m), kernel_array(axes), kernel_array(prior)
+    )
     return LinearModel(
-        root_weight=root, clock=clock, clock_covariance_m2=covariance, design=design,
-        covariance_m2=regular_inverse((normal + normal.swapaxes(1, 2)) / 2.0 + prior), prior=prior,
-        misfit=root * misfit, freedom=ranges.n_used - ranges.n_clocks - unknowns, interest=1 if unknowns == 1 else 2,
+        root_weight=root, clock=arrays.clock, clock_covariance_m2=clocks, design=design, covariance_m2=covariance,
+        prior=prior, misfit=misfit, freedom=ranges.n_used - ranges.n_clocks - unknowns,
+        interest=1 if unknowns == 1 else 2,
     )  # fmt: skip
-
-
-def _clock_covariance(totals: Floats, tie_sigma_m: Floats | None) -> Floats:
-    """Covariance of the clocks at a known place, shape (T, G, G) [m^2].
-
-    Of a clock on its own 1/T, T the summed weight of its satellites. Clocks that keep an offset to
-    a common one to sigma: ``diag(sigma^2 rho) + rho rho^T / sum(T rho)``, ``rho = 1/(1 + sigma^2 T)``.
-    0 for clocks without satellites.
-    """
-    seen = totals > 0
-    covariance = np.zeros((*totals.shape, totals.shape[1]))
-    each = np.arange(totals.shape[1])
-    if tie_sigma_m is None:
-        covariance[:, each, each] = np.where(seen, 1.0 / np.where(seen, totals, 1.0), 0.0)
-        return covariance
-    rho = seen / (1.0 + tie_sigma_m**2 * totals)
-    mass = (totals * rho).sum(axis=1)
-    covariance += rho[:, :, None] * (rho / np.where(mass > 0, mass, 1.0)[:, None])[:, None, :]
-    covariance[:, each, each] += tie_sigma_m**2 * rho
-    return covariance
-
-
-def _one_hot(clock: Indices, clocks: int) -> Floats:
-    """Membership of the channels, shape (M, G)."""
-    return np.asarray(clock[:, None] == np.arange(clocks), dtype=np.float64)
-
-
-def _clocks(root: Floats, clock: Indices, covariance: Floats, columns: Floats) -> Floats:
-    """Clocks that whitened `columns` (T, M, C) ask for, at each channel: ``K R^T columns``, shape (T, M, C)."""
-    member = _one_hot(clock, covariance.shape[1])
-    sums = np.matmul(member.T, root[..., None] * columns)
-    return np.asarray(np.matmul(covariance, sums)[:, clock])
-
-
-def regular_inverse(matrix: Floats) -> Floats:
-    """Inverse of symmetric 3 x 3 matrices, each scaled to a unit diagonal; NaN where singular."""
-    diagonal = np.einsum("tii->ti", matrix)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, np.nan))
-    outer = scale[:, :, None] * scale[:, None, :]
-    return np.asarray(inverse_3x3(matrix * outer) * outer)
