@@ -8,13 +8,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
-from railfix.core.constants import ALONG, CLEAR_M, LEAST_REDUNDANCY, ON_TANGENT_M
+from railfix.core.constants import ALONG, CLEAR_M, FAN_OUT, LEAST_REDUNDANCY, ON_TANGENT_M
 from railfix.kernels.compiling import inner, kernel
+from railfix.kernels.search import points_within
 
 
 @kernel
 def clear_of_sections(
-    ecef_m: Floats, tangent: Floats, across: Floats, length_m: Floats, section: Indices, count: Indices, vertex: Indices
+    ecef_m: Floats,
+    tangent: Floats,
+    across: Floats,
+    length_m: Floats,
+    stretches: tuple[Indices, Floats, Indices],
+    section: Indices,
 ) -> Floats:
     """Return a distance within which no part of a line lies off the tangents of its sections, shape (S,) [m].
 
@@ -22,18 +28,23 @@ def clear_of_sections(
     ----------
     ecef_m, tangent, across, length_m : ndarray
         Of the line: points (P, 3), the others of its sections.
+    stretches
+        `SearchIndex.stretches`.
     section : ndarray of int, shape (S,)
-    count : ndarray of int, shape (S,)
-        Numbers of points around each of them.
-    vertex : ndarray of int, shape (sum of `count`,)
-        These points, section after section.
     """
-    clear, first = np.full(len(section), CLEAR_M), 0
+    clear, sections, longest = np.full(len(section), CLEAR_M), len(length_m), length_m.max()
+    nodes, below = np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp), np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp)
+    middle = np.empty(3)
     for s in range(len(section)):
         here, length = section[s], length_m[section[s]]
-        for at in range(first, first + count[s]):
-            v = vertex[at]
-            if v >= len(length_m) or v == here:
+        for a in range(3):
+            middle[a] = ecef_m[here, a] + 0.5 * length * tangent[here, a]
+        reach = CLEAR_M + 0.5 * length + longest
+        centre = middle[0], middle[1], middle[2]
+        nodes, below, held = points_within(ecef_m, stretches, centre, reach, nodes, below)
+        for at in range(held):
+            v = nodes[at]
+            if v >= sections or v == here:
                 continue
             off, nearest, low, high = False, np.inf, np.inf, -np.inf
             for end in (v, v + 1):
@@ -45,13 +56,12 @@ def clear_of_sections(
                 for a in range(3):
                     square += (ecef_m[end, a] - ecef_m[here, a] - ahead * tangent[here, a]) ** 2
                 beside, least = math.sqrt(square), max(max(ahead - length, -ahead), 0.0)
-                nearest = min(nearest, math.hypot(least, aside))
-                off |= least < ALONG * math.hypot(least, beside) and beside > ON_TANGENT_M
+                nearest = min(nearest, math.sqrt(least * least + aside * aside))
+                off |= least < ALONG * math.sqrt(least * least + square) and beside > ON_TANGENT_M
                 low, high = min(low, ahead), max(high, ahead)
             if off or min(high, length) - max(low, 0.0) > ON_TANGENT_M:
                 clear[s] = min(clear[s], nearest - length_m[v])
         clear[s] = max(clear[s], 0.0)
-        first += count[s]
     return clear
 
 

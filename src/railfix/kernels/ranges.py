@@ -30,51 +30,50 @@ class _Equations(NamedTuple):
     means: Floats
     rows: Floats
     totals: Floats
+    apart: Floats  # (5, G), work space
 
 
 @inner
 def reduce_epoch(epoch: _Epoch, place_ecef_m: Floats, equations: _Equations) -> None:
-    """Compute the normal equations of one epoch."""
+    """Compute the normal equations of one epoch.
+
+    Loops without branches, over all channels, are done several channels at a time: unused ones have finite places.
+    """
     sat_ecef_m, code_m, weight, starts, offset_m, _ = epoch
-    system, means, rows, totals = equations
+    system, means, rows, totals, _ = equations
     channels, groups = len(weight), len(starts)
     x, y, z = place_ecef_m[0], place_ecef_m[1], place_ecef_m[2]
-    for i in range(4):
-        for j in range(4):
-            system[i, j] = 0.0
-        for m in range(channels):
-            rows[i, m] = 0.0
+    of_x, of_y, of_z, residual = rows[0], rows[1], rows[2], rows[3]
+    for m in range(channels):
+        distance, of_x[m], of_y[m], of_z[m] = sight(sat_ecef_m[m, 0], sat_ecef_m[m, 1], sat_ecef_m[m, 2], x, y, z)
+        residual[m] = distance - code_m[m]
     for g in range(groups):
         stop = starts[g + 1] if g + 1 < groups else channels
-        total, mean_x, mean_y, mean_z, mean_r = 0.0, 0.0, 0.0, 0.0, 0.0
+        total = mean_x = mean_y = mean_z = mean_r = 0.0
         for m in range(starts[g], stop):
             w = weight[m]
-            if not w > 0.0:
-                continue
-            distance, ux, uy, uz = sight(sat_ecef_m[m, 0], sat_ecef_m[m, 1], sat_ecef_m[m, 2], x, y, z)
-            residual = code_m[m] - distance
-            rows[0, m], rows[1, m], rows[2, m], rows[3, m] = -ux, -uy, -uz, residual
             total += w
-            mean_x -= w * ux
-            mean_y -= w * uy
-            mean_z -= w * uz
-            mean_r += w * residual
+            mean_x += w * of_x[m]
+            mean_y += w * of_y[m]
+            mean_z += w * of_z[m]
+            mean_r += w * residual[m]
         totals[g] = total
         if total > 0.0:
             mean_x, mean_y, mean_z, mean_r = mean_x / total, mean_y / total, mean_z / total, mean_r / total
-        means[0, g], means[1, g], means[2, g], means[3, g] = mean_x, mean_y, mean_z, mean_r
+        means[0, g], means[1, g], means[2, g], means[3, g] = -mean_x, -mean_y, -mean_z, -mean_r
         for m in range(starts[g], stop):
-            w = weight[m]
-            if not w > 0.0:
-                continue
-            rows[0, m] -= mean_x
-            rows[1, m] -= mean_y
-            rows[2, m] -= mean_z
-            rows[3, m] -= mean_r
-            for i in range(4):
-                wi = w * rows[i, m]
-                for j in range(i, 4):
-                    system[i, j] += wi * rows[j, m]
+            used = 1.0 if weight[m] > 0.0 else 0.0
+            of_x[m], of_y[m] = used * (mean_x - of_x[m]), used * (mean_y - of_y[m])
+            of_z[m], residual[m] = used * (mean_z - of_z[m]), used * (mean_r - residual[m])
+    xx = xy = xz = xr = yy = yz = yr = zz = zr = rr = 0.0
+    for m in range(channels):
+        a, b, c, d = weight[m] * of_x[m], weight[m] * of_y[m], weight[m] * of_z[m], residual[m]
+        xx, xy, xz, xr = xx + a * of_x[m], xy + a * of_y[m], xz + a * of_z[m], xr + a * d
+        yy, yz, yr = yy + b * of_y[m], yz + b * of_z[m], yr + b * d
+        zz, zr, rr = zz + c * of_z[m], zr + c * d, rr + weight[m] * d * d
+    system[0, 0], system[0, 1], system[0, 2], system[0, 3] = xx, xy, xz, xr
+    system[1, 1], system[1, 2], system[1, 3] = yy, yz, yr
+    system[2, 2], system[2, 3], system[3, 3] = zz, zr, rr
     if len(offset_m):
         _tie(epoch, equations)
     for i in range(4):
@@ -86,25 +85,22 @@ def reduce_epoch(epoch: _Epoch, place_ecef_m: Floats, equations: _Equations) -> 
 def _tie(epoch: _Epoch, equations: _Equations) -> None:
     """Add the known offsets between the clocks of one epoch."""
     weight, starts, offset_m, sigma_m = epoch.weight, epoch.starts, epoch.offset_m, epoch.sigma_m
-    system, means, rows, totals = equations
-    channels, groups = len(weight), len(starts)
-    mass, apart, common = np.zeros(groups), np.empty((4, groups)), np.zeros(4)
-    all_mass = 0.0
+    system, means, rows, totals, apart = equations
+    channels, groups, all_mass = len(weight), len(starts), 0.0
+    mass = apart[4]
     for g in range(groups):
-        if totals[g] > 0.0:
-            mass[g] = 1.0 / (1.0 / totals[g] + sigma_m[g] ** 2)
+        mass[g] = 1.0 / (1.0 / totals[g] + sigma_m[g] ** 2) if totals[g] > 0.0 else 0.0
         all_mass += mass[g]
     for i in range(4):
+        common = 0.0
         for g in range(groups):
             apart[i, g] = means[i, g] - (offset_m[g] if i == 3 else 0.0)
-            common[i] += mass[g] * apart[i, g]
-        if all_mass > 0.0:
-            common[i] /= all_mass
+            common += mass[g] * apart[i, g]
+        for g in range(groups):
+            apart[i, g] -= common / all_mass if all_mass > 0.0 else 0.0
     for g in range(groups):
         if not totals[g] > 0.0:
             continue
-        for i in range(4):
-            apart[i, g] -= common[i]
         stop = starts[g + 1] if g + 1 < groups else channels
         own = 1.0 / (totals[g] * sigma_m[g] ** 2 + 1.0)
         for i in range(4):
@@ -144,12 +140,12 @@ def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats
     groups, no = len(starts), np.empty(0)
     tied = len(offset_m) == epochs
     system, means = np.empty((epochs, 4, 4)), np.empty((epochs, 4, groups))
-    rows, totals = np.empty((epochs, 4, channels)), np.empty(groups)
+    rows, totals, apart = np.empty((epochs, 4, channels)), np.empty(groups), np.empty((5, groups))
     seen = np.empty((epochs, groups), dtype=np.bool_)
     for t in range(epochs):
         offset, spread = (offset_m[t], sigma_m[t]) if tied else (no, no)
         epoch = _Epoch(sat_ecef_m[t], code_m[t], weight[t], starts, offset, spread)
-        reduce_epoch(epoch, place_ecef_m[t], _Equations(system[t], means[t], rows[t], totals))
+        reduce_epoch(epoch, place_ecef_m[t], _Equations(system[t], means[t], rows[t], totals, apart))
         for g in range(groups):
             seen[t, g] = totals[g] > 0.0
     return system, means, rows, seen
@@ -254,7 +250,7 @@ def iterated_points(
     wsse, residual = np.full(epochs, np.nan), np.full((epochs, channels), np.nan)
     system, means = np.empty((4, 4)), np.empty((4, groups))
     rows, totals = np.empty((4, channels)), np.empty(groups)
-    equations = _Equations(system, means, rows, totals)
+    equations = _Equations(system, means, rows, totals, np.empty((5, groups)))
     current, step, inverse = np.empty(3), np.empty(3), np.empty((3, 3))
     for t in range(epochs):
         if not enough[t]:
@@ -295,7 +291,8 @@ def dilutions(ranges: Any, place_ecef_m: Floats) -> Floats:
     epochs, channels = weight.shape
     groups, no, tied = len(starts), np.empty(0), len(offset_m) == epochs
     result, unit, inverse, system = np.empty(epochs), np.empty(channels), np.empty((3, 3)), np.empty((4, 4))
-    equations = _Equations(system, np.empty((4, groups)), np.empty((4, channels)), np.empty(groups))
+    means, apart = np.empty((4, groups)), np.empty((5, groups))
+    equations = _Equations(system, means, np.empty((4, channels)), np.empty(groups), apart)
     for t in range(epochs):
         for m in range(channels):
             unit[m] = 1.0 if weight[t, m] > 0.0 else 0.0
@@ -308,6 +305,15 @@ def dilutions(ranges: Any, place_ecef_m: Floats) -> Floats:
 
 
 @inner
+def _form(system: Floats, a: Floats, b: Floats) -> float:
+    """Return the normal matrix between two directions."""
+    form = 0.0
+    for i in range(3):
+        form += a[i] * (system[i, 0] * b[0] + system[i, 1] * b[1] + system[i, 2] * b[2])
+    return form
+
+
+@inner
 def _along(
     system: Floats, tangent: Floats, across: Floats, up: Floats, plan: float, height: float
 ) -> tuple[float, float, float, float]:
@@ -315,34 +321,25 @@ def _along(
 
     The Schur complement of the map error leaves what depends on the distance along the line alone.
     """
-    axes, turned = np.empty((3, 3)), np.empty((3, 3))
-    matrix, vector, inverse = np.zeros((3, 3)), np.zeros(3), np.empty((3, 3))
+    own, a, c = _form(system, tangent, tangent), _form(system, across, across), _form(system, up, up)
+    to_plan, to_height, b = _form(system, tangent, across), _form(system, tangent, up), _form(system, across, up)
+    a, c = a + 1.0 / plan**2, c + 1.0 / height**2
+    ahead = aside = above = 0.0
     for k in range(3):
-        axes[0, k], axes[1, k], axes[2, k] = tangent[k], across[k], up[k]
-    for i in range(3):
-        for k in range(3):
-            turned[i, k] = axes[i, 0] * system[0, k] + axes[i, 1] * system[1, k] + axes[i, 2] * system[2, k]
-            vector[i] += axes[i, k] * system[k, 3]
-        for j in range(3):
-            matrix[i, j] = turned[i, 0] * axes[j, 0] + turned[i, 1] * axes[j, 1] + turned[i, 2] * axes[j, 2]
-    matrix[1, 1] += 1.0 / plan**2
-    matrix[2, 2] += 1.0 / height**2
-    own, to_plan, to_height = matrix[0, 0], matrix[0, 1], matrix[0, 2]
-    a, b, c = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+        ahead += tangent[k] * system[k, 3]
+        aside += across[k] * system[k, 3]
+        above += up[k] * system[k, 3]
     determinant = a * c - b * b
     if not determinant > 0.0:
         determinant = math.nan
     first, second = (c * to_plan - b * to_height) / determinant, (a * to_height - b * to_plan) / determinant
     information = own - (to_plan * first + to_height * second)
-    gradient = vector[0] - (first * vector[1] + second * vector[2])
+    gradient = ahead - (first * aside + second * above)
     step = sigma = math.nan
     if information > 1e-12 * own:
         step, sigma = gradient / information, 1.0 / math.sqrt(information)
-    invert(matrix, inverse)
-    least = system[3, 3]
-    for i in range(3):
-        for j in range(3):
-            least -= vector[i] * inverse[i, j] * vector[j]
+    of_map = (c * aside * aside - 2.0 * b * aside * above + a * above * above) / determinant
+    least = system[3, 3] - of_map - gradient * step
     return step, sigma, (1.0 / math.sqrt(own) if own > 0.0 else math.nan), least
 
 
@@ -380,7 +377,7 @@ def iterated_along(
     clock, residual = np.full((epochs, groups), np.nan), np.full((epochs, channels), np.nan)
     system, means = np.empty((4, 4)), np.empty((4, groups))
     rows, totals = np.empty((4, channels)), np.empty(groups)
-    equations = _Equations(system, means, rows, totals)
+    equations = _Equations(system, means, rows, totals, np.empty((5, groups)))
     place, jump, unit = np.empty(3), np.empty(3), np.empty(channels)
     for t in range(epochs):
         solved[4, t] = 0.0

@@ -68,6 +68,44 @@ def radii_of_balls(
     return result
 
 
+@inner
+def points_within(
+    points_m: Floats,
+    stretches: tuple[Indices, Floats, Indices],
+    centre_m: tuple[float, float, float],
+    radius_m: float,
+    nodes: Indices,
+    below: Indices,
+) -> tuple[Indices, Indices, int]:
+    """Find the points of a line in a ball, by `SearchIndex.stretches`.
+
+    Returns the array of the two of work space that has them, the other, and how many they are.
+    """
+    middle, reach_m, first = stretches
+    x, y, z = centre_m
+    top = len(first) - 2
+    held = first[top + 1] - first[top]
+    for i in range(held):
+        nodes[i] = i
+    for level in range(top, -1, -1):
+        kept, size = 0, first[level] - first[level - 1] if level else 0
+        for i in range(held):
+            at = first[level] + nodes[i]
+            p = middle[at]
+            dx, dy, dz = points_m[p, 0] - x, points_m[p, 1] - y, points_m[p, 2] - z
+            reach = radius_m + (reach_m[at] + _SLACK_M if level else 0.0)
+            if dx * dx + dy * dy + dz * dz > reach * reach:
+                continue
+            if not level:
+                below[kept] = nodes[i]
+                kept += 1
+            for child in range(FAN_OUT * nodes[i], min(FAN_OUT * nodes[i] + FAN_OUT, size)):
+                below[kept] = child
+                kept += 1
+        nodes, below, held = below, nodes, kept
+    return nodes, below, held
+
+
 @kernel
 def points_in_balls(
     points_m: Floats,
@@ -100,32 +138,13 @@ def points_in_balls(
     unsure : ndarray of bool, shape (p,)
         The error of the quadratic form leaves open which point of the epoch is the best, and this may be it.
     """
-    middle, reach_m, first = stretches
-    epochs, top = len(radius_m), len(first) - 2
+    epochs = len(radius_m)
     count, found = np.zeros(epochs, dtype=np.intp), 0
     vertex, values, unsure = np.empty(1024, dtype=np.intp), np.empty((1024, 6)), np.empty(1024, dtype=np.bool_)
     nodes, below = np.empty(len(points_m) + FAN_OUT, dtype=np.intp), np.empty(len(points_m) + FAN_OUT, dtype=np.intp)
     for t in range(epochs):
         x, y, z = centre_m[t, 0], centre_m[t, 1], centre_m[t, 2]
-        held = first[top + 1] - first[top]
-        for i in range(held):
-            nodes[i] = i
-        for level in range(top, -1, -1):
-            kept, size = 0, first[level] - first[level - 1] if level else 0
-            for i in range(held):
-                at = first[level] + nodes[i]
-                p = middle[at]
-                dx, dy, dz = points_m[p, 0] - x, points_m[p, 1] - y, points_m[p, 2] - z
-                reach = radius_m[t] + (reach_m[at] + _SLACK_M if level else 0.0)
-                if dx * dx + dy * dy + dz * dz > reach * reach:
-                    continue
-                if not level:
-                    below[kept] = nodes[i]
-                    kept += 1
-                for child in range(FAN_OUT * nodes[i], min(FAN_OUT * nodes[i] + FAN_OUT, size)):
-                    below[kept] = child
-                    kept += 1
-            nodes, below, held = below, nodes, kept
+        nodes, below, held = points_within(points_m, stretches, (x, y, z), radius_m[t], nodes, below)
         count[t] = held
         if found + held > len(vertex):
             room, old_vertex, old_values, old_unsure = 2 * (found + held), vertex, values, unsure

@@ -15,4 +15,5 @@ def sight(sx: float, sy: float, sz: float, x: float, y: float, z: float) -> tupl
     """Return the range of a signal sent at (sx, sy, sz) and received at (x, y, z) [m], and the unit vector to there."""
     dx, dy, dz = sx - x, sy - y, sz - z
     distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-    return distance + TURN * (sx * y - sy * x), dx / distance, dy / distance, dz / distance
+    inverse = 1.0 / distance
+    return distance + TURN * (sx * y - sy * x), dx * inverse, dy * inverse, dz * inverse

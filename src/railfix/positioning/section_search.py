@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from scipy.special import chdtri
 
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers
-from railfix.core.constants import CLEAR_M, FAN_OUT, ROTATION_GRADIENT
+from railfix.core.constants import FAN_OUT, ROTATION_GRADIENT
 from railfix.core.settings import Settings
 from railfix.positioning.normal_equations import Ranges, SinglePoint, fit, normal_equations
 from railfix.track.trajectory import Trajectory
@@ -106,13 +105,8 @@ class SearchIndex:
         unknown = np.isnan(self._clear_m[section])
         if unknown.any():
             new = np.unique(section[unknown])
-            middle = line.ecef_m[new] + 0.5 * line.length_m[new, None] * line.tangent[new]
-            reach = CLEAR_M + 0.5 * line.length_m[new] + line.length_m.max()
-            lists = self.tree.query_ball_point(middle, reach)
-            count = np.fromiter(map(len, lists), dtype=np.intp, count=len(lists))
-            vertex = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=int(count.sum()))
             self._clear_m[new] = kernels.off_tangent.clear_of_sections(
-                line.ecef_m, line.tangent, line.across, line.length_m, new.astype(np.intp), count, vertex
+                line.ecef_m, line.tangent, line.across, line.length_m, self.stretches, new
             )
         return np.asarray(self._clear_m[section])
 
