@@ -70,6 +70,8 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     troposphere_m: Floats
     #: Standard deviation of satellites and atmosphere: by SBAS, otherwise by `Config.nominal`; shape (T, K).
     nominal_m: Floats
+    #: What `Config.nominal` assumes at the elevation alone; 0 with SBAS; shape (T, K).
+    unmodelled_m: Floats
     #: Overbounding sigma and largest nominal bias of each range by the error model; 0 without one; shape (T, K).
     bound_sigma_m: Floats
     bias_m: Floats
@@ -162,6 +164,7 @@ def correct_ranges(
     if isinstance(sbas, SbasCorrections) and isinstance(fixes, SatelliteCorrections):
         delays = sbas_delays(sbas, fixes, obs.time, seen, frequency)
         beyond = nominal = delays.sigma_m
+        unmodelled = np.zeros(code.shape)
         reason = np.where(observed, reason | delays.reason, reason)
     else:
         delays = model_delays(
@@ -169,10 +172,12 @@ def correct_ranges(
             troposphere=config.troposphere,
         )  # fmt: skip
         beyond = np.hypot(delays.sigma_m, config.nominal.unusual_sigma_m(states.accuracy_m))
-        nominal = np.hypot(config.nominal.sigma_m(seen.elevation_deg), beyond)
+        unmodelled = config.nominal.sigma_m(seen.elevation_deg)
+        nominal = np.hypot(unmodelled, beyond)
         if isinstance(fixes, DfmcCorrections):
             delays = dfmc_delays(fixes, obs.time, seen, delays)
             beyond = nominal = delays.sigma_m
+            unmodelled = np.zeros(code.shape)
     second = base = None
     if received.base is not None:
         base = received.base.at(obs.time, satellite, signal, anchor, config.base)
@@ -200,7 +205,7 @@ def correct_ranges(
         signal=signal, frequency_hz=frequency, code_m=code, doppler_hz=obs.doppler_hz[:, columns], cn0_dbhz=cn0,
         satellites=states, anchor_ecef_m=anchor, elevation_deg=seen.elevation_deg, azimuth_deg=seen.azimuth_deg,
         ionosphere_m=delays.ionosphere_m, troposphere_m=delays.troposphere_m, corrected_code_m=clean, sigma_m=sigma,
-        nominal_m=nominal, bound_sigma_m=bound, bias_m=bias,
+        nominal_m=nominal, unmodelled_m=unmodelled, bound_sigma_m=bound, bias_m=bias,
         reason=np.where(uncorrected, int(Reason.NO_CORRECTION), reason), second=second, base=base,
     )  # fmt: skip
 

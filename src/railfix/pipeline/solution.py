@@ -192,7 +192,7 @@ def solve(
     own_sigma = own_sigma_m(redundancy, constrained.wsse, constrained.exact_map_sigma_m, scale)
     arc, exact, total = constrained.arc_m, constrained.exact_map_sigma_m, constrained.sigma_m
     variance = epoch_variance(scale, constrained.wsse, redundancy, limits=config.noise_scale)
-    nominal = _nominal_variance_m2(model, corrected, config)
+    nominal = _nominal_variance_m2(model, corrected)
     phase, carriers = None, [state.carrier for state in states]
     if config.carrier in ("float", "fixed"):
 
@@ -264,13 +264,10 @@ def _fit_on_line(
     return fit, known & ~_off_map(ranges, antennas, place, arc, config)
 
 
-def _nominal_variance_m2(model: LinearModel, corrected: CorrectedRanges, config: Config) -> Floats:
+def _nominal_variance_m2(model: LinearModel, corrected: CorrectedRanges) -> Floats:
     """Return the variance along the line by satellites and atmosphere, where the ranges' sigmas leave them out."""
-    if config.sbas:
-        return np.zeros(len(model))
-    nominal = config.nominal.sigma_m(corrected.elevation_deg)  # what is beyond it is in the ranges' sigmas
-    share = model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.fmax(nominal, 0.0), 0.0)
-    return np.asarray((share**2).sum(axis=1))
+    share = model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.fmax(corrected.unmodelled_m, 0.0), 0.0)
+    return np.asarray(np.einsum("tk,tk->t", share, share))
 
 
 def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, place: Place, arc: Floats, config: Config) -> Floats:

@@ -9,7 +9,7 @@ number of satellites are a class.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from itertools import combinations, groupby
 from math import prod
@@ -224,10 +224,17 @@ def allocate(
     satellites excluded; `sides`, shape (T, S, M): sets of satellites that fail together.
     """
     used = model.used
+    sides = sides & used[:, None]
     if len(used) <= FEW:  # live, where the same satellites are used epoch after epoch
-        given = (used.tobytes(), out.tobytes(), (sides & used[:, None]).tobytes())
+        given = (used.tobytes(), out.tobytes(), sides.tobytes())
         return _of_few_epochs(_Same(risk), tuple(systems), *given, sides.shape[1], wrong_map)
-    return _allocate(used, systems, risk, out, sides, wrong_map=wrong_map)
+    # Most epochs of a chunk have the satellites of others: each set once.
+    bits = np.packbits(np.concatenate([used, sides.reshape(len(used), -1)], axis=1), axis=1)
+    keys = np.concatenate([bits, np.ascontiguousarray(out)[:, None].view(np.uint8)], axis=1)
+    _, first, which = np.unique(keys.view(f"V{keys.shape[1]}")[:, 0], return_index=True, return_inverse=True)
+    plan = _allocate(used[first], systems, risk, out[first], sides[first], wrong_map=wrong_map)
+    of_epochs = (f.name for f in fields(plan) if f.name not in ("groups", "shared"))
+    return replace(plan, **{name: getattr(plan, name)[which] for name in of_epochs})
 
 
 class _Same:
