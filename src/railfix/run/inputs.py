@@ -348,7 +348,7 @@ class RunOptions(Settings):
     )
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
     chunk_epochs: int = option(
-        "Epochs in memory at a time; the results do not depend on it.", 3000, name="--chunk", metavar="EPOCHS", ge=1
+        "Epochs in memory at a time; the results do not depend on it.", 4000, name="--chunk", metavar="EPOCHS", ge=1
     )
     smooth: Literal["off", "on"] = option(
         "Also smooth the filter along the track: places by everything measured before and after, in columns of train.*",
