@@ -169,19 +169,17 @@ def ambiguity_m(
 
 def largest_changes(elevation: Floats, azimuth: Floats, elevation_error: float, azimuth_error: float) -> Floats:
     """Largest change of ``cos(elevation) cos(azimuth)`` within the errors of both, shape (T, M); all in radians."""
-    exact = np.cos(elevation) * np.cos(azimuth)
     # the product of two cosines is extremal where each of them is
-    ends = _extremes(elevation, elevation_error), _extremes(azimuth, azimuth_error)
-    return np.asarray(np.max([np.abs(a * b - exact) for a, b in product(*ends)], axis=0))
+    (up, *ups), (aside, *asides) = _cosines(elevation, elevation_error), _cosines(azimuth, azimuth_error)
+    return np.asarray(np.max([np.abs(a * b - up * aside) for a, b in product(ups, asides)], axis=0))
 
 
-def _extremes(angle: Floats, error: float) -> tuple[Floats, Floats]:
-    """Least and largest cosine within an error of an angle; NaN for NaN."""
-    ends = np.cos(angle - error), np.cos(angle + error)
-    low, high = np.minimum(*ends), np.maximum(*ends)
-    zero = np.abs((angle + np.pi) % (2.0 * np.pi) - np.pi) <= error
-    half = np.abs(angle % (2.0 * np.pi) - np.pi) <= error
-    return np.where(half, -1.0, low), np.where(zero, 1.0, high)
+def _cosines(angle: Floats, error: float) -> tuple[Floats, Floats, Floats]:
+    """Return cosines of angles, and the least and the largest within an error of them; NaN for NaN."""
+    cosine, least = np.cos(angle), math.cos(error)
+    middle, half = cosine * least, np.abs(np.sin(angle)) * math.sin(error)
+    low = np.where(cosine <= -least, -1.0, middle - half)
+    return cosine, low, np.where(cosine >= least, 1.0, middle + half)
 
 
 def antenna_pair_screen(
