@@ -198,9 +198,12 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
     reduced, taken, blinds = np.empty((2, n + 4, n)), np.zeros((3, 4)), np.zeros(3, dtype=np.bool_)
     start, place, product = np.zeros(3, dtype=np.intp), np.zeros(3, dtype=np.intp), np.zeros(3)
     member, single, gone = np.empty(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_), np.zeros(4)
-    own, likely, others, spread = np.empty(n), np.empty(n), np.empty(n), np.empty((n, 3))
+    own, likely, others, spread = np.empty(n), np.empty(n), np.empty(n), np.empty(3)
+    # Of the channels in use, side by side: root of the weight, design, clock, and what they share by their clocks.
+    roots, along, across, up = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    group, shared = np.zeros(n, dtype=np.intp), np.empty((n, n))
     range_bias, beyond, common, free = np.zeros(n), np.zeros(n), np.zeros(10), np.zeros(10)
-    requested, pull, step, shift = np.empty(clocks), np.empty(3), np.empty(3), np.empty(3)
+    requested, of_clocks, pull, step, shift = np.empty(clocks), np.empty(clocks), np.empty(3), np.empty(3), np.empty(3)
     root_across, root_up = math.sqrt(map_prior[1, 1]), math.sqrt(map_prior[2, 2])
     for t in range(epochs):
         root, y, q, used = root_weight[t], model.misfit[t], model.covariance_m2[t], channel[t]
@@ -226,28 +229,28 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
                 pull[a] += y[m] * design[t, m, a]
         for a in range(3):
             step[a] = pull[0] * q[0, a] + pull[1] * q[1, a] + pull[2] * q[2, a]
-        for i in range(n + 4):
-            for j in range(n):
-                rows[i, j] = 0.0
-        for i in range(count):
+        for g in range(clocks):
+            of_clocks[g] = 0.0
+            for k in range(clocks):
+                of_clocks[g] += clock_covariance_m2[t, g, k] * requested[k]
+        for i in range(n):
             m = used[i]
-            b = design[t, m]
+            roots[i], group[i] = (root[m], clock[m]) if i < count else (0.0, 0)
+            along[i], across[i], up[i] = design[t, m, 0], design[t, m, 1], design[t, m, 2]
+            if not i < count:
+                along[i] = across[i] = up[i] = 0.0
+        for i in range(n):
+            of_clock, own_root = clock_covariance_m2[t, group[i]], roots[i]
+            for j in range(n):
+                shared[i, j] = own_root * roots[j] * of_clock[group[j]]
             for a in range(3):
-                spread[i, a] = b[0] * q[0, a] + b[1] * q[1, a] + b[2] * q[2, a]
-            of_clock = 0.0
-            for g in range(clocks):
-                of_clock += clock_covariance_m2[t, clock[m], g] * requested[g]
-            rows[n, i] = spread[i, 0]
-            rows[n + 1, i] = y[m] - root[m] * of_clock - (b[0] * step[0] + b[1] * step[1] + b[2] * step[2])
-            rows[n + 2, i], rows[n + 3, i] = -spread[i, 1] * root_across, -spread[i, 2] * root_up
-            for j in range(i + 1):
-                k = used[j]
-                value = -root[m] * root[k] * clock_covariance_m2[t, clock[m], clock[k]]
-                value -= (
-                    spread[i, 0] * design[t, k, 0] + spread[i, 1] * design[t, k, 1] + spread[i, 2] * design[t, k, 2]
-                )
-                rows[i, j], rows[j, i] = value, value
-            rows[i, i] += 1.0
+                spread[a] = along[i] * q[0, a] + across[i] * q[1, a] + up[i] * q[2, a]
+            for j in range(n):
+                rows[i, j] = -shared[i, j] - (spread[0] * along[j] + spread[1] * across[j] + spread[2] * up[j])
+            rows[i, i] += 1.0 if i < count else 0.0
+            rows[n, i], rows[n + 2, i], rows[n + 3, i] = spread[0], -spread[1] * root_across, -spread[2] * root_up
+            of_place = along[i] * step[0] + across[i] * step[1] + up[i] * step[2]
+            rows[n + 1, i] = (y[used[i]] if i < count else 0.0) - own_root * of_clocks[group[i]] - of_place
         for i in range(n):
             m = used[i]
             likely[i] = asked.prior[t, m] if i < count else 0.0
@@ -277,25 +280,14 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
                     shift[a] += covariance[a, b] * pull[b]
             free[0], free[1], free[7], free[8], free[9] = common[0], covariance[0, 0], np.inf, 1.0, shift[0]
             lost = _NO_EFFECT * math.sqrt(covariance[0, 0])
-            for i in range(n + 4):
+            for i in range(n):
+                for a in range(3):
+                    spread[a] = along[i] * covariance[0, a] + across[i] * covariance[1, a] + up[i] * covariance[2, a]
                 for j in range(n):
-                    free_rows[i, j] = 0.0
-            for i in range(count):
-                m = used[i]
-                for a in range(3):
-                    spread[i, a] = 0.0
-                    for b in range(3):
-                        spread[i, a] += design[t, m, b] * covariance[b, a]
-                free_rows[n, i], free_rows[n + 1, i] = spread[i, 0], rows[n + 1, i]
-                for a in range(3):
-                    free_rows[n + 1, i] -= design[t, m, a] * shift[a]
-                for j in range(i + 1):
-                    k = used[j]
-                    value = -root[m] * root[k] * clock_covariance_m2[t, clock[m], clock[k]]
-                    for a in range(3):
-                        value -= spread[i, a] * design[t, k, a]
-                    free_rows[i, j], free_rows[j, i] = value, value
-                free_rows[i, i] += 1.0
+                    free_rows[i, j] = -shared[i, j] - (spread[0] * along[j] + spread[1] * across[j] + spread[2] * up[j])
+                free_rows[i, i] += 1.0 if i < count else 0.0
+                of_shift = along[i] * shift[0] + across[i] * shift[1] + up[i] * shift[2]
+                free_rows[n, i], free_rows[n + 1, i] = spread[0], rows[n + 1, i] - of_shift
 
         for base in range(len(asked.first)):
             order, first = asked.order[t, base], asked.first[base]
