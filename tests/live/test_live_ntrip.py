@@ -14,10 +14,13 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
+from typer.testing import CliRunner
 
+from railfix.cli import app
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.live.settings import LiveSettings
 from railfix.live.sources import read_source
+from railfix.simulate.demonstration import demo_files
 
 pytestmark = pytest.mark.requirement("A8")
 SETTINGS = LiveSettings(reconnect="off", silence_s=2.0)
@@ -104,6 +107,14 @@ def test_a_caster_hears_the_place_in_the_request_and_then_every_interval(certifi
     assert received(caster, certificate, settings, place=GGA) == b"corrections"
     assert b"\r\nNtrip-GGA: " + GGA.strip() + b"\r\n" in caster.request
     assert caster.lines == [GGA] * 3
+
+
+@pytest.mark.parametrize("base", [[], ["--base", "tcp://127.0.0.1:1"]])
+def test_positions_for_a_caster_that_is_not_there_are_one_sentence(tmp_path: Path, base: list[str]) -> None:
+    words = ["live", "--front", "tcp://127.0.0.1:1", "--track", str(demo_files()["track"]), "--live", "gga_s=10", *base]
+    done = CliRunner().invoke(app, [*words, "--send", f"json@{tmp_path / 'messages'}"])
+    assert done.exit_code == 4
+    assert "--live gga_s is given without an NTRIP caster" in " ".join(done.output.split())
 
 
 @pytest.mark.parametrize(

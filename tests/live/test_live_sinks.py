@@ -301,6 +301,13 @@ def test_mqtt_without_a_broker() -> None:
         asyncio.run(open_sink(f"json@mqtt://127.0.0.1:{free_port()}/x"))
 
 
+def test_a_session_that_does_not_begin_leaves_no_file(tmp_path: Path) -> None:
+    words = ["live", "--front", f"tcp://127.0.0.1:{free_port()}", "--track", str(demo_files()["track"])]
+    done = RUNNER.invoke(app, [*words, "--send", f"json@{tmp_path / 'messages'}"])
+    assert "cannot be connected to" in " ".join(done.output.split())
+    assert not list(tmp_path.iterdir())
+
+
 # --- forms --------------------------------------------------------------------
 
 

@@ -119,6 +119,8 @@ async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
     """
     for source in (*inputs.sources.values(), *inputs.sensors.values()):
         check_source(source)
+    if inputs.live.gga_s > 0.0 and not (inputs.base or "").startswith("ntrip"):
+        raise SettingsError("--live gga_s is given without an NTRIP caster as --base; name one, or leave gga_s out")
     _check_outputs(inputs)
     check_filter(inputs.config, inputs.sensors)
     live = inputs.live

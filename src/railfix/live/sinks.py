@@ -133,6 +133,7 @@ class ByteTarget:
 
     form: Form
     file: IO[bytes]
+    path: Path | None = None  #: None for the standard output.
 
     def send(self, output: LiveOutput) -> None:
         """Write one message."""
@@ -141,9 +142,11 @@ class ByteTarget:
             data = data[self.file.write(data) :]
 
     def close(self) -> None:
-        """Close the file; the standard output stays open."""
-        if self.file is not standard_output():
+        """Close the file, and remove it where no message came; the standard output stays open."""
+        if self.path is not None:
             self.file.close()
+            if self.path.is_file() and not self.path.stat().st_size:
+                self.path.unlink()
 
 
 def standard_output() -> IO[bytes]:
@@ -338,10 +341,11 @@ async def open_sink(
         except OSError as error:
             raise OutputError(f"{shown}: cannot be opened ({error.strerror or error})") from None
     else:
-        if Path(target).exists() and overwrite == "refuse":
+        path = Path(target)
+        if path.exists() and overwrite == "refuse":
             raise OutputError(f"{target}: the file exists already; name another one, or give --overwrite")
         try:
-            opened = ByteTarget(form, Path(target).open("wb", buffering=0))  # noqa: SIM115 (closed with the sink)
+            opened = ByteTarget(form, path.open("wb", buffering=0), path)
         except OSError as error:
             raise OutputError(f"{target}: cannot be written ({error.strerror or error})") from None
     return OutletSink(shown, opened, waiting=settings.waiting, full=full)
