@@ -124,7 +124,7 @@ def test_the_filter_gives_no_bound_and_the_message_says_why() -> None:
     # the filter's own monitors have the place in doubt before, or with, the suspicion
     assert np.isin(tracked.status[spoofed][:5], (TrackStatus.DOUBTFUL, TrackStatus.SPOOFING_SUSPECTED)).all()
     assert not np.isfinite(tracked.level_m[spoofed]).any()
-    message = message_of(whole, LiveSettings(), sequence=1, sent_ns=0)
+    message = message_of(whole, LiveSettings())
     assert message.interference == Suspicion.SPOOFING_SUSPECTED
     assert message.over_cm is None
 

@@ -298,7 +298,7 @@ class LiveEngine:
             self._due_ns += self._patience_ns()
             self._silent = True
             last = max(self._last_tag.values(), default=sent_ns or 0)
-            message = no_input_message(self.settings, sequence=0, time_ns=last, sent_ns=last)
+            message = no_input_message(self.settings, last)
             numbered.append(self._send(LiveOutput(message=message, result=None), last if sent_ns is None else sent_ns))
         return numbered
 
@@ -389,7 +389,7 @@ class LiveEngine:
         )
         self._tell_changes((self._state.received or self.processor.received).notes)
         self._check_order(result)
-        return LiveOutput(message=message_of(result, self.settings, sequence=0, sent_ns=0), result=result)
+        return LiveOutput(message=message_of(result, self.settings), result=result)
 
     def _samples_until(self, tag_ns: int) -> SensorSamples:
         """Samples since the epoch before up to an epoch; later ones wait."""

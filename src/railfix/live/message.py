@@ -28,13 +28,13 @@ _SOURCE_OF_KIND = {
 _SOURCE_OF_ANTENNA = {"front": Source.FRONT_RECEIVER, "rear": Source.REAR_RECEIVER}
 
 
-def no_input_message(settings: LiveSettings, *, sequence: int, time_ns: int, sent_ns: int) -> TrainMessage:
-    """The message of a period in which nothing was received."""
+def no_input_message(settings: LiveSettings, time_ns: int) -> TrainMessage:
+    """The message of a period in which nothing was received; the sender numbers it."""
     return TrainMessage(
         train=settings.train,
-        sequence=sequence,
+        sequence=0,
         time_ns=time_ns,
-        sent_ns=sent_ns,
+        sent_ns=time_ns,
         line=settings.line,
         facing=settings.facing,
         length_cm=_up_cm(settings.length_m),
@@ -42,8 +42,8 @@ def no_input_message(settings: LiveSettings, *, sequence: int, time_ns: int, sen
     )
 
 
-def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns: int) -> TrainMessage:
-    """Return the message of one processed epoch.
+def message_of(result: Result, settings: LiveSettings) -> TrainMessage:
+    """Return the message of one processed epoch; the sender numbers it.
 
     The place is that of the filter along the track where it runs, else that of the single epoch, of the antenna that
     `antenna_of` names. The bounds are the filter's over- and under-reading amounts where it has a level
@@ -94,9 +94,9 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
             values["track_permille"] = int(min(max(probability, 0.0), 1.0) * 1000.0)
     return TrainMessage(
         train=settings.train,
-        sequence=sequence,
+        sequence=0,
         time_ns=int((antenna.time[-1] - GPS_EPOCH).astype(np.int64)),
-        sent_ns=sent_ns,
+        sent_ns=0,
         line=settings.line,
         facing=settings.facing,
         length_cm=_up_cm(settings.length_m),

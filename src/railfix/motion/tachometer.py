@@ -153,9 +153,11 @@ class SpeedCheck:
     lag_s: float  #: By how much its time tags are late.
 
 
-def check_speeds(
-    time: Datetimes, speed_mps: Floats, right_time: Datetimes, right_mps: Floats, *, largest_lag_s: float = 3.0
-) -> SpeedCheck:
+#: Largest lag that is looked for [s].
+_LARGEST_LAG_S: Final = 3.0
+
+
+def check_speeds(time: Datetimes, speed_mps: Floats, right_time: Datetimes, right_mps: Floats) -> SpeedCheck:
     """Return scale, unit and lag of logged speeds (N,) by the least squares of their sizes over a search of lags.
 
     `right_time`, `right_mps`, shape (M,), for example by Doppler. ValueError with fewer than ten speeds over 1 m/s in
@@ -165,7 +167,7 @@ def check_speeds(
     right_t = seconds(right_time[known] - right_time[0])
     size = np.abs(right_mps[known])
     t = seconds(time - right_time[0])
-    lags = np.arange(-largest_lag_s, largest_lag_s + 0.05, 0.1)
+    lags = np.arange(-_LARGEST_LAG_S, _LARGEST_LAG_S + 0.05, 0.1)
     costs, ratios = np.full(len(lags), np.inf), np.full(len(lags), np.nan)
     for k, lag in enumerate(lags.tolist()):
         right = np.interp(t - lag, right_t, size, left=np.nan, right=np.nan)

@@ -171,29 +171,30 @@ def _cells(statistics: BinStatistics, axis: int, k: int) -> tuple[str, str, str,
     return f"{total:,}", f"{mean:+.2f}", f"{spread:.2f}", f"{np.nanmin(bound):.1f}-{np.nanmax(bound):.1f}"
 
 
+#: A range that passed the screens is faulty beyond so many of its sigmas; confidence of the bounds of the rates.
+_BEYOND_SIGMA: Final = 5.0
+_CONFIDENCE: Final = 0.95
+#: Elevation up to which satellites count as low, as `RiskBudget.side_elevation_deg` [deg].
+_SIDE_ELEVATION_DEG: Final = 45.0
+#: Parts of the line that are compared with the whole of it [m].
+_STRETCH_M: Final = 100.0
 #: Blocks of one satellite are numbered by time and satellite (`ErrorSamples.block`): satellites a block of time.
 _SATELLITES: Final = 1_000_000
 
 
-def fault_rate(
-    samples: ErrorSamples, *, beyond_sigma: float = 5.0, confidence: float = 0.95, side_elevation_deg: float = 45.0
-) -> FaultRate:
-    """Measure the rate of local faults among the ranges that passed every screen, singly and by sides of the track.
-
-    `confidence` is of the upper bounds, `side_elevation_deg` the elevation up to which satellites count as low, as
-    `RiskBudget.side_elevation_deg`.
-    """
+def fault_rate(samples: ErrorSamples) -> FaultRate:
+    """Measure the rate of local faults among the ranges that passed every screen, singly and by sides of the track."""
     used = samples.used & np.isfinite(samples.error_m) & np.isfinite(samples.sigma_m)
-    faulty = used & (np.abs(samples.error_m) > beyond_sigma * samples.sigma_m)
+    faulty = used & (np.abs(samples.error_m) > _BEYOND_SIGMA * samples.sigma_m)
     every, bad = np.unique(samples.block[used]), np.unique(samples.block[faulty])
     ranges, count = int(used.sum()), int(faulty.sum())
     # Within a faulty block only a part of the ranges is faulty; without one, one range of a block would be.
     part = (count / ranges) / (len(bad) / len(every)) if len(bad) else 1.0
-    upper = _upper(len(bad), len(every), confidence)
-    low = used & (samples.elevation_deg < side_elevation_deg)
+    upper = _upper(len(bad), len(every))
+    low = used & (samples.elevation_deg < _SIDE_ELEVATION_DEG)
     sides, side_faults = (_sides_of_two(samples, which) for which in (low, low & faulty))
     return FaultRate(
-        beyond_sigma=beyond_sigma,
+        beyond_sigma=_BEYOND_SIGMA,
         ranges=ranges,
         faulty=count,
         blocks=len(every),
@@ -203,13 +204,13 @@ def fault_rate(
         together=_together(every, bad),
         side_blocks=sides,
         side_faulty_blocks=side_faults,
-        side_upper=min(1.0, part * _upper(side_faults, sides, confidence)),
+        side_upper=min(1.0, part * _upper(side_faults, sides)),
     )
 
 
-def _upper(hits: int, trials: int, confidence: float) -> float:
+def _upper(hits: int, trials: int) -> float:
     """Upper end of the one-sided interval of a probability (Clopper and Pearson)."""
-    return float(betaincinv(hits + 1, trials - hits, confidence)) if trials > hits else 1.0
+    return float(betaincinv(hits + 1, trials - hits, _CONFIDENCE)) if trials > hits else 1.0
 
 
 def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
@@ -220,9 +221,7 @@ def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
     return int(np.count_nonzero(satellites >= 2))
 
 
-def faulty_stretches(
-    samples: ErrorSamples, *, length_m: float = 100.0, beyond_sigma: float = 5.0, confidence: float = 0.95
-) -> tuple[tuple[float, float], ...]:
+def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
     """Stretches of the line, chainages from and to [m], where local faults are more frequent than on the whole line.
 
     A stretch is one whose share of faulty blocks is, at the lower end of its interval (Clopper and Pearson, one-sided),
@@ -230,21 +229,21 @@ def faulty_stretches(
     the line bounds the local faults: there the settings leave the train without a level (`Config.no_level_m`).
     """
     used = samples.used & np.isfinite(samples.error_m) & np.isfinite(samples.sigma_m) & np.isfinite(samples.chainage_m)
-    faulty = used & (np.abs(samples.error_m) > beyond_sigma * samples.sigma_m)
+    faulty = used & (np.abs(samples.error_m) > _BEYOND_SIGMA * samples.sigma_m)
     if not faulty.any():
         return ()
-    part = np.floor(samples.chainage_m[used] / length_m).astype(np.int64)
+    part = np.floor(samples.chainage_m[used] / _STRETCH_M).astype(np.int64)
     pairs, number = np.unique(np.stack([part, samples.block[used]], axis=1), axis=0, return_inverse=True)
     bad = np.zeros(len(pairs), dtype=bool)
     bad[number.ravel()[faulty[used]]] = True
     places, of = np.unique(pairs[:, 0], return_inverse=True)
     blocks, hits = np.bincount(of), np.bincount(of, weights=bad)
-    upper = betaincinv(bad.sum() + 1, max(len(bad) - bad.sum(), 1), confidence)
-    lower = np.where(hits > 0, betaincinv(np.maximum(hits, 1), blocks - hits + 1, 1.0 - confidence), 0.0)
+    upper = betaincinv(bad.sum() + 1, max(len(bad) - bad.sum(), 1), _CONFIDENCE)
+    lower = np.where(hits > 0, betaincinv(np.maximum(hits, 1), blocks - hits + 1, 1.0 - _CONFIDENCE), 0.0)
     marked = places[lower > upper]
     edges = np.flatnonzero(np.diff(marked, prepend=marked[:1] - 2, append=marked[-1:] + 2) > 1)
     return tuple(
-        (float(marked[first] * length_m), float((marked[end - 1] + 1) * length_m))
+        (float(marked[first] * _STRETCH_M), float((marked[end - 1] + 1) * _STRETCH_M))
         for first, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
     )
 

@@ -192,7 +192,7 @@ _MOSCOW_S: Final = 3 * 3600.0
 
 def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record:
     """Return the record of GPS or QZSS (LNAV 1 to 3, RTCM 1019, 1044); `time` of reception resolves the week."""
-    week, epoch = _week_and_toc(values, _near_week(values["week"], 1024, time), time)
+    week, epoch = _week_and_toc(values, _near_week(values["week"], time), time)
     numbers = {
         **values,
         "data_source": values["codes"],
@@ -325,10 +325,10 @@ def _raw(satellite: str, message: str, epoch: Datetimes | np.datetime64, numbers
     )
 
 
-def _near_week(broadcast: float, modulus: int, time: np.datetime64) -> int:
-    """Full week nearest to a time from a week number that rolls over."""
+def _near_week(broadcast: float, time: np.datetime64) -> int:
+    """Full week nearest to a time from a week number of ten bits."""
     week = int(to_week(time)[0])
-    return week + (int(broadcast) - week + modulus // 2) % modulus - modulus // 2
+    return week + (int(broadcast) - week + 512) % 1024 - 512
 
 
 def _near_day(second_of_day: float, near: Datetimes) -> np.datetime64:

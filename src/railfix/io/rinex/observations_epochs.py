@@ -65,9 +65,9 @@ class FaultLog:
         self.count(kind, rest)
         self._problems += rest
 
-    def note(self, message: str, *, kind: str = RECORDS) -> None:
-        """Record a fault by its complete message."""
-        self.count(kind, 1)
+    def note(self, message: str) -> None:
+        """Record a fault of records by its complete message."""
+        self.count(RECORDS, 1)
         self._problems += 1
         if len(self._messages) < MAX_PROBLEMS:
             self._messages.append(message)

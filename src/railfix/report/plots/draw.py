@@ -84,17 +84,13 @@ def draw_chart(chart: Chart, axes: Axes) -> Axes:
     return axes
 
 
-def draw_sky(sky: SkyEpochs, time: np.datetime64, axes: Axes | None = None) -> Axes:
-    """Draw the satellites at the epoch nearest to a GPS time into polar axes; ValueError: there is no epoch."""
+def draw_sky(sky: SkyEpochs, time: np.datetime64) -> Axes:
+    """Draw the satellites at the epoch nearest to a GPS time; ValueError: there is no epoch."""
     from matplotlib.figure import Figure
 
     if sky.empty:
         raise ValueError("there are no satellites to draw")
-    polar: Any = (
-        axes
-        if axes is not None
-        else Figure(figsize=(6, 6), layout="constrained").subplots(subplot_kw={"projection": "polar"})
-    )
+    polar: Any = Figure(figsize=(6, 6), layout="constrained").subplots(subplot_kw={"projection": "polar"})
     k = int(np.argmin(np.abs(sky.start + timedelta(sky.epoch_s) - time)))
     rows = slice(int(sky.first[k]), int(sky.first[k + 1]))
     polar.set_theta_zero_location("N")

@@ -151,13 +151,11 @@ def sky_epochs(
     *,
     wanted: Datetimes | None = None,
     epochs: int = SKY_EPOCHS,
-    start: np.datetime64 | None = None,
     title: str = "Sky",
 ) -> SkyEpochs:
     """Satellites in view of one antenna, each once with the signal that was used, at some epochs, for sky plots.
 
-    At most `epochs` epochs, evenly spaced; of these up to half are the `wanted` ones. `start` is the origin of the
-    times, the first epoch if not given.
+    At most `epochs` epochs, evenly spaced; of these up to half are the `wanted` ones.
     """
     rows = observations.lazy().filter(pl.col("elevation_deg") >= 0.0, pl.col("azimuth_deg").is_not_null())
     times = rows.select(pl.col("time_gpst").unique().sort()).collect()["time_gpst"]
@@ -176,7 +174,7 @@ def sky_epochs(
         .sort("time_gpst", "satellite", "aside", maintain_order=True)
         .unique(["time_gpst", "satellite"], keep="first", maintain_order=True)
     )
-    start = (start_of(known) if len(known) else np.datetime64(0, "ns")) if start is None else start
+    start = start_of(known) if len(known) else np.datetime64(0, "ns")
     seconds = since(known, start)
     epoch, first = np.unique(seconds, return_index=True)
     names = reason_names() | {0: "used"}
