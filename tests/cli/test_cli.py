@@ -12,9 +12,8 @@ from typer.testing import CliRunner
 
 from conftest import ROOT
 from railfix import __version__
-from railfix.cli import app
+from railfix.cli import app, version_text
 from railfix.core import errors
-from railfix.core.commit import version_text
 
 RUNNER = CliRunner(env={"COLUMNS": "200", "TERM": "dumb", "NO_COLOR": "1"})
 COMMANDS = [

@@ -20,8 +20,7 @@ from packaging.requirements import Requirement
 from conftest import ROOT
 from public_names import KEPT, public_names
 from python_matrix import PROJECT, interpreter, supported_versions
-from railfix.core.commit import read_commit
-from railfix.core.files import file_sha256
+from railfix.core.files import file_sha256, read_commit
 from reproducible_build import built_twice
 from sbom import bill_of_materials
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 import paths
-from railfix.core.commit import version_text
+from railfix.cli import version_text
 from railfix.run.record import package_versions
 from traceability import ROWS, proofs
 

@@ -11,8 +11,9 @@ from typing import Annotated, ClassVar
 
 import typer
 
+from railfix import __version__
 from railfix.cli.command import LazyCommands, run_program
-from railfix.core.commit import version_text
+from railfix.core.files import source_commit
 
 # Threads of linear algebra spin while they wait for the next product. It must be set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -71,6 +72,11 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def version_text() -> str:
+    """Return version and commit in one line."""
+    return f"railfix {__version__} (commit {source_commit()})"
 
 
 def _print_version(*, asked: bool) -> None:

@@ -22,7 +22,7 @@ from rich.text import Text
 from railfix import kernels
 from railfix.core.reasons import Status
 from railfix.core.tables import Table, plural
-from railfix.run.budget import budget_tables, level_basis
+from railfix.run.record import budget_tables, level_basis
 
 if TYPE_CHECKING:
     from railfix.evaluate import Evaluation

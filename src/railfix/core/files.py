@@ -1,4 +1,4 @@
-"""Files from receivers and archives: plain, gzip, compress (.Z), each also Hatanaka-compressed.
+"""Files from receivers and archives: plain, gzip, compress (.Z), each also Hatanaka-compressed; commit of the source.
 
 The first bytes of a file decide how it is read, never its name. Memory is bounded: plain and gzip are streamed,
 compress is unpacked to a temporary file by `ncompress`, Hatanaka is piped through ``crx2rnx`` (a packed CRX file by a
@@ -22,6 +22,7 @@ import tempfile
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from functools import cache
 from os import PathLike
 from pathlib import Path
 from typing import IO, Any, Final, Literal, cast
@@ -311,3 +312,38 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     if process.poll() is None:
         process.terminate()
     process.wait()
+
+
+#: Written into wheels and source archives by their build (``.ci/hatch_build.py``), never in a checkout.
+FROM_BUILD: Final = Path(__file__).parents[1] / "_commit.txt"
+
+
+@cache
+def source_commit() -> str:
+    """Return the commit of the source, "unknown" where neither the build nor a checkout has it.
+
+    "+changed" follows where files were not as committed when the package was built. For a checkout
+    (``pip install -e``) git's files are read; changes since its commit are not seen.
+    """
+    if FROM_BUILD.is_file():
+        return FROM_BUILD.read_text(encoding="ascii").strip()
+    return read_commit(Path(__file__).parents[3]) or "unknown"
+
+
+def read_commit(root: Path) -> str:
+    """Return the commit that is checked out in a folder (or a further work tree), from git's files; "" without any."""
+    git = root / ".git"
+    if git.is_file():
+        git = root / git.read_text(encoding="utf-8").removeprefix("gitdir:").strip()
+    head = _first_line(git / "HEAD")
+    if not head.startswith("ref: "):
+        return head
+    branch = head.removeprefix("ref: ")
+    common = git / _first_line(git / "commondir")
+    packed = common / "packed-refs"
+    lines = packed.read_text(encoding="utf-8").splitlines() if packed.is_file() else []
+    return _first_line(common / branch) or next((line.split()[0] for line in lines if line.endswith(f" {branch}")), "")
+
+
+def _first_line(path: Path) -> str:
+    return path.read_text(encoding="utf-8").partition("\n")[0].strip() if path.is_file() else ""

@@ -15,7 +15,7 @@ from railfix.evaluate import Evaluation
 from railfix.evaluate.figures import PASSED
 from railfix.evaluate.inputs import floats
 from railfix.report.runs import ReportedRun, figures_of
-from railfix.run.budget import level_basis
+from railfix.run.record import level_basis
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,7 +33,7 @@ from railfix.report.headline import headline
 from railfix.report.plots.errors import error_ranges
 from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.runs import ReportedRun, figures_of, read_runs
-from railfix.run.budget import budget_tables, level_basis
+from railfix.run.record import budget_tables, level_basis
 
 
 def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table:
