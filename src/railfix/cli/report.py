@@ -14,14 +14,13 @@ import typer
 
 from railfix.cli.console import TableConsole, show_table
 from railfix.cli.options import OverwriteOption, check_outputs, from_models, overwriting
-from railfix.core.tables import Column, digits, listing
+from railfix.core.tables import Column, digits, listing, reading_table
 from railfix.evaluate import EvaluationOptions
 from railfix.report import write_report
 from railfix.report.explain import explain_epoch, time_text, write_explanation
 from railfix.report.plots.screens import draw_run_screens
 from railfix.run.inputs import ColumnNames
 from railfix.run.output import OutputFolder
-from railfix.run.record import reading_table
 
 #: Columns of the satellites of an explained epoch.
 _SATELLITES: Final[Sequence[Column]] = (

@@ -1,17 +1,33 @@
-"""Tables for terminal and HTML, and objects shown in a notebook."""
+"""Tables for terminal and HTML, objects shown in a notebook, and errors of reading tables."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Sized
+from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from html import escape
+from os import PathLike
 from typing import Any, ClassVar, Final
 
 import numpy as np
 import polars as pl
+from polars.exceptions import PanicException, PolarsError
 
 from railfix.core.arrays import Datetimes, Floats
+from railfix.core.errors import InputFileError
+
+
+@contextmanager
+def reading_table(
+    path: str | PathLike[str], message: str = "cannot be read as a table ({}); run railfix run again"
+) -> Iterator[None]:
+    """Raise errors of reading a table, also of a lazy one, as `InputFileError`; the reason goes into `message`."""
+    try:
+        yield
+    except (PolarsError, PanicException, OSError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputFileError(path, message.format(reason)) from None
 
 
 def number(value: float | None, digits: int = 2, unit: str = "", *, sign: str = "") -> str:

@@ -18,10 +18,11 @@ from railfix.core.arrays import Floats, Strings
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.reasons import Status
 from railfix.core.settings import INPUTS, Settings, option
+from railfix.core.tables import reading_table
 from railfix.io.named_columns import read_named_columns
 from railfix.pipeline.level_stage import KINDS
 from railfix.run.inputs import ColumnNames
-from railfix.run.record import RunRecord, read_parquet, read_record, reading_table
+from railfix.run.record import RunRecord, read_parquet, read_record
 
 #: Columns that every table of positions has.
 NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")

@@ -13,9 +13,9 @@ from typing import Any, Final
 
 import numpy as np
 import polars as pl
-from polars.exceptions import PolarsError
 
 from railfix.core.errors import InputFileError
+from railfix.core.tables import reading_table
 from railfix.core.timescale import from_week, seconds
 from railfix.gnss.observations import ObservationHeader, Observations
 
@@ -82,14 +82,11 @@ def mate_table(path: str | PathLike[str]) -> str:
 def read_mate(path: str | PathLike[str], needed: tuple[str, ...]) -> pl.DataFrame:
     """Read a table, CSV (also .gz) or Parquet, with upper-case names; columns not in the file are empty."""
     name, file = mate_table(path), Path(path)
-    try:
+    with reading_table(path, f"cannot be read as the table {name} of EGNSS MATE ({{}})"):
         if file.suffix.lower() == ".parquet":
             table = pl.read_parquet(file)
         else:
             table = pl.read_csv(file, infer_schema_length=None, schema_overrides=dict.fromkeys(_TEXTS, pl.String()))
-    except (PolarsError, OSError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputFileError(path, f"cannot be read as the table {name} of EGNSS MATE ({reason})") from error
     table = table.rename({column: column.upper() for column in table.columns})
     unknown = [column for column in table.columns if column not in READ[name]]
     if unknown:

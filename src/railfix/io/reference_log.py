@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_rows
 from railfix.core.errors import InputFileError
 from railfix.core.files import ending
+from railfix.core.tables import reading_table
 from railfix.core.timescale import seconds
 from railfix.io.named_columns import NamedColumns, parse_named_columns, read_named_columns
 from railfix.io.nmea import read_any_positions
@@ -290,10 +291,8 @@ def read_acceleration(path: str | PathLike[str]) -> Acceleration:
 
 def _sensor_table(path: str | PathLike[str]) -> NamedColumns:
     if Path(path).suffix == ".parquet":
-        try:
+        with reading_table(path, "cannot be read as a Parquet table ({})"):
             return parse_named_columns(pl.read_parquet(Path(path)).write_csv(datetime_format=_ISO).splitlines(), path)
-        except (OSError, pl.exceptions.PolarsError) as error:
-            raise InputFileError(path, f"cannot be read as a Parquet table ({error})") from None
     return read_named_columns(path)
 
 

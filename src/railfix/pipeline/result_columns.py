@@ -150,22 +150,32 @@ class Observed:
         return innovations(self.tracked, self.result.columns, self.result.reason.shape)
 
 
+#: Columns that the tables of positions and of the filter share: of the epoch, the line, the place.
+EPOCH: Final[tuple[Column[Any], ...]] = (
+    Column("time_gpst", "time tag of the receiver, GPS time", "time", dtype=pl.Datetime("ns")),
+    Column("antenna", "`front` or `rear`", None, dtype=pl.String()),
+)
+ON_LINE: Final[tuple[Column[Any], ...]] = (
+    Column("chainage_m", "distance along the line from the first point of the track"),
+    Column("kilometrage_m", "the line's own marking, where the track has one"),
+)
+IN_SPACE: Final[tuple[Column[Any], ...]] = (
+    Column("latitude_deg", "antenna, WGS 84"),
+    Column("longitude_deg", "antenna, WGS 84"),
+    Column("height_m", "antenna, above the ellipsoid"),
+    Column("x_m", "antenna, ECEF", lambda r: r.ecef_m[:, 0]),
+    Column("y_m", "antenna, ECEF", lambda r: r.ecef_m[:, 1]),
+    Column("z_m", "antenna, ECEF", lambda r: r.ecef_m[:, 2]),
+)
 #: Columns of the table of positions.
 POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
     (
-        Column("time_gpst", "time tag of the receiver, GPS time", "time", dtype=pl.Datetime("ns")),
-        Column("antenna", "`front` or `rear`", None, dtype=pl.String()),
+        *EPOCH,
         Column("status", "see `railfix.core.reasons.Status`", words=tuple(s.text for s in Status)),
-        Column("chainage_m", "distance along the line from the first point of the track"),
-        Column("kilometrage_m", "the line's own marking, where the track has one"),
+        *ON_LINE,
         Column("along_sigma_m", "standard deviation along the line, other places of an ambiguous epoch included"),
         Column("own_sigma_m", "single-epoch sigma, from the codes of the epoch alone; `uncertain` above its limit"),
-        Column("latitude_deg", "antenna, WGS 84"),
-        Column("longitude_deg", "antenna, WGS 84"),
-        Column("height_m", "antenna, above the ellipsoid"),
-        Column("x_m", "antenna, ECEF", lambda r: r.ecef_m[:, 0]),
-        Column("y_m", "antenna, ECEF", lambda r: r.ecef_m[:, 1]),
-        Column("z_m", "antenna, ECEF", lambda r: r.ecef_m[:, 2]),
+        *IN_SPACE,
         Column("n_used", "satellites used", dtype=pl.Int16()),
         Column("n_rejected", "satellites with a pseudorange that were not used", dtype=pl.Int16()),
         Column("noise_scale", "noise of this receiver over that of the weights, estimated so far"),
@@ -398,8 +408,7 @@ _REASON: Final = CHANNEL_COLUMNS["reason"]
 #: Columns of the table of observations.
 OBSERVATION_COLUMNS: Final[Mapping[str, Column[Any]]] = by_name(
     (
-        POSITION_COLUMNS["time_gpst"],
-        POSITION_COLUMNS["antenna"],
+        *EPOCH,
         Column("satellite", "`G01`, `J02`", None, dtype=pl.String()),
         Column("signal", "RINEX 3 code without its type letter, `1C`", None, dtype=pl.String()),
         _REASON,

@@ -21,7 +21,10 @@ from railfix.pipeline.balises import VERDICTS, Passing
 from railfix.pipeline.filter_result import AlongTrack, SmoothedTrack
 from railfix.pipeline.result_columns import (
     CHANNEL_COLUMNS,
+    EPOCH,
+    IN_SPACE,
     OBSERVATION_COLUMNS,
+    ON_LINE,
     POSITION_COLUMNS,
     Column,
     Observed,
@@ -184,16 +187,14 @@ def _innovation(result: AlongTrack, kind: Kind) -> Floats:
 #: Columns of the table of the filter along the track.
 TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
     (
-        Column("time_gpst", "time tag of the receiver, GPS time", "time", dtype=pl.Datetime("ns")),
-        Column("antenna", "`front` or `rear`", None, dtype=pl.String()),
+        *EPOCH,
         Column(
             "status",
             "see `railfix.tracking.TrackStatus`; `tracking` and `coasting` alone have a finite level along the line",
             "tracked.status",
             words=tuple(s.text for s in TrackStatus),
         ),
-        Column("chainage_m", "distance along the line from the first point of the track"),
-        Column("kilometrage_m", "the line's own marking, where the track has one"),
+        *ON_LINE,
         Column(
             "along_sigma_m",
             "standard deviation of the place, with the straight distance to other branches in it",
@@ -251,12 +252,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             _sources,
             dtype=pl.String(),
         ),
-        Column("latitude_deg", "antenna, WGS 84"),
-        Column("longitude_deg", "antenna, WGS 84"),
-        Column("height_m", "antenna, above the ellipsoid"),
-        Column("x_m", "antenna, ECEF", lambda r: r.ecef_m[:, 0]),
-        Column("y_m", "antenna, ECEF", lambda r: r.ecef_m[:, 1]),
-        Column("z_m", "antenna, ECEF", lambda r: r.ecef_m[:, 2]),
+        *IN_SPACE,
         Column(
             "code_weight",
             "mean weight of codes; 1 is that of an error of one standard deviation",
@@ -396,7 +392,7 @@ PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
         Column("earliest_gpst", "begin of the interval of the passing, by the level: before, the train was not there",
                _of("earliest"), dtype=_TIME),
         Column("latest_gpst", "its end", _of("latest"), dtype=_TIME),
-        Column("antenna", "`front` or `rear`", None, dtype=pl.String()),
+        EPOCH[1],
         Column("balise", "name in the list, or as read", _of("balise"), dtype=pl.String()),
         Column(
             "verdict",

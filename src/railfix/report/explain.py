@@ -20,10 +20,10 @@ from railfix.core.constants import CLOCK_GROUP
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.geodesy import enu_axes
+from railfix.core.tables import reading_table
 from railfix.core.timescale import gps_time
 from railfix.evaluate.inputs import RunFolder, read_run
 from railfix.report.charts_page import read_template
-from railfix.run.record import reading_table
 from railfix.track import Trajectory, read_track
 
 #: What the status of a single epoch says.

@@ -11,13 +11,13 @@ import polars as pl
 import polars.selectors as cs
 
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
+from railfix.core.tables import reading_table
 from railfix.evaluate import Evaluation, EvaluationOptions, RunAndReference, evaluate_runs
 from railfix.evaluate.evaluation import EvaluatedRun, short_names
 from railfix.evaluate.inputs import NO_MORE, POSITIONS_TABLE, RunFolder, read_run, read_table, tables_of
 from railfix.evaluate.place import track_of
 from railfix.pipeline.config import Config
 from railfix.ranges.cn0_curve import Cn0Curve, read_cn0_curve
-from railfix.run.record import reading_table
 from railfix.screens import SCREENS
 from railfix.track import Track
 

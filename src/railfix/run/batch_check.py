@@ -11,7 +11,7 @@ import polars as pl
 
 from railfix.core.arrays import Floats, Masks
 from railfix.pipeline.filter_result import AlongTrack
-from railfix.pipeline.result_columns import Column, by_name, float_column
+from railfix.pipeline.result_columns import Column, by_name, table_of
 from railfix.run.output import OutputFolder
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs
@@ -71,27 +71,19 @@ class BatchCheck:
 
 def add_batch(checks: Mapping[str, BatchCheck], folder: OutputFolder) -> list[str]:
     """Write ``train.*`` again with `BATCH_COLUMNS`, after the last chunk; return a note an antenna."""
-    found: dict[str, tuple[BatchTrack, Trajectory]] = {}
+    found: list[pl.DataFrame] = []
     notes: list[str] = []
     for name, check in checks.items():
         if check:
             batch, apart, wrong = check.fit()
-            found[name] = (batch, check.trajectory)
+            table = table_of(BATCH_COLUMNS, (batch, check.trajectory), len(batch.time))
+            found.append(table.with_columns(time_gpst=batch.time, antenna=pl.lit(name)))
             notes += _note(name, batch, apart, wrong, check.trajectory)
-
-    def with_batch(table: pl.DataFrame) -> pl.DataFrame:
-        antenna, time = table["antenna"].to_numpy(), table["time_gpst"].to_numpy().astype("datetime64[ns]")
-        values = {column: np.full(len(table), np.nan) for column in BATCH_COLUMNS}
-        for name, own in found.items():
-            rows = np.flatnonzero(antenna == name)
-            at = np.minimum(np.searchsorted(own[0].time, time[rows]), len(own[0].time) - 1)
-            known = own[0].time[at] == time[rows]
-            for column, spec in BATCH_COLUMNS.items():
-                values[column][rows[known]] = np.asarray(spec.of(own))[at[known]]
-        return table.with_columns(**{column: float_column(value) for column, value in values.items()})
-
     if found:
-        folder.change("train", with_batch)
+        rows = pl.concat(found)
+        folder.change(
+            "train", lambda table: table.join(rows, on=["time_gpst", "antenna"], how="left", maintain_order="left")
+        )
     return notes
 
 

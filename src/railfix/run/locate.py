@@ -14,6 +14,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.errors import InputFileError, MismatchError, NoPositionError
 from railfix.core.files import BrokenLines, ending, write_whole
 from railfix.core.geodesy import geodetic_from_ecef
+from railfix.core.tables import reading_table
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
@@ -272,11 +273,8 @@ def read_measured(folder: Path) -> pl.DataFrame:
     InputFileError: the folder has no results of a filter, or these none by wheel and inertial unit.
     """
     path = folder / "train.parquet"
-    try:
+    with reading_table(path, "has no measured line ({}); give a folder of railfix run"):
         table = pl.read_parquet(path, columns=["time_gpst", "antenna", "motion", *_COLUMNS])
-    except (OSError, pl.exceptions.PolarsError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputFileError(path, f"has no measured line ({reason}); give a folder of railfix run") from None
     table = table.filter(pl.col("antenna") == pl.col("antenna").first())
     time = table["time_gpst"].to_numpy().astype("datetime64[ns]")
     slips = time[(table["motion"] != "normal").to_numpy()]

@@ -6,7 +6,6 @@ import platform
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
@@ -15,14 +14,13 @@ from typing import Any, Final
 
 import polars as pl
 import polars.selectors as cs
-from polars.exceptions import PanicException, PolarsError
 
 from railfix import __version__
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import file_sha256, read_json_object, source_commit
 from railfix.core.reasons import Status
 from railfix.core.settings import Model, validated
-from railfix.core.tables import Table, count, number, share
+from railfix.core.tables import Table, count, number, reading_table, share
 from railfix.gnss.navigation import Navigation
 from railfix.kernels import numba_version
 from railfix.pipeline.config import Config, parse_config
@@ -263,16 +261,6 @@ def read_parquet(path: Path, *, columns: cs.Selector | None = None) -> pl.DataFr
         if columns is None:
             return pl.read_parquet(path)
         return pl.scan_parquet(path).select(columns).collect()
-
-
-@contextmanager
-def reading_table(path: Path) -> Iterator[None]:
-    """Raise errors of reading a table, also of a lazy one, as `InputFileError`."""
-    try:
-        yield
-    except (PolarsError, PanicException, OSError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputFileError(path, f"cannot be read as a table ({reason}); run railfix run again") from None
 
 
 Facts = Mapping[str, Any]

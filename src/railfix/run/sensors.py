@@ -9,10 +9,10 @@ from typing import Any, Final
 
 import numpy as np
 import polars as pl
-from polars.exceptions import PolarsError
 
 from railfix.core.arrays import Floats, Strings
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.tables import reading_table
 from railfix.io.mate import mate_table
 from railfix.motion.samples import (
     BaliseReadings,
@@ -247,7 +247,7 @@ def _columns_of(table: pl.DataFrame, kind: str) -> pl.Expr:
 
 
 def _columns(path: Path, kind: str) -> pl.DataFrame:
-    try:
+    with reading_table(path, f"cannot be read as a table of the {kind} ({{}})"):
         if mate_table(path):
             table = sensor_table(path, kind)
         elif path.suffix == ".parquet":
@@ -259,9 +259,6 @@ def _columns(path: Path, kind: str) -> pl.DataFrame:
                 infer_schema_length=None,
                 comment_prefix="#",
             )
-    except (PolarsError, OSError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputFileError(path, f"cannot be read as a table of the {kind} ({reason})") from error
     stamp = () if kind in _TIMELESS else ("time_gpst",)
     needed = (*stamp, *(name for name in COLUMNS[kind] if not name.startswith("[")))
     missing = [name for name in needed if name not in table.columns]
