@@ -16,7 +16,7 @@ from railfix.core.errors import SettingsError
 from railfix.core.files import BrokenLines
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.core.tables import Column, count, listing, number, percent, plain_table, plural
-from railfix.run.inputs import ColumnNames, LogReading
+from railfix.run.inputs import BROKEN_LINES, ColumnNames, LogReading
 from railfix.track.survey.runs import SurveyLimits
 
 #: Share of the epochs of a stretch within the alarm limit from which satellites serve there.
@@ -93,9 +93,7 @@ class SurveyFiles(Settings):
     )
     picture: Path | None = option("Picture of map, runs and standard deviations (.png or .svg).", None, metavar="FILE")
     name: str | None = option("Name of the track; else that of the file.", None, metavar="NAME")
-    broken_lines: BrokenLines = option(
-        "Count broken lines of the input files and continue, instead of stopping.", "stop", name="--lenient"
-    )
+    broken_lines: BrokenLines = BROKEN_LINES
 
 
 @from_models

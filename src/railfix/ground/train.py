@@ -86,7 +86,6 @@ class OnBoardLimits(Settings):
     #: Deceleration with which the train can stop before a shorter authority.
     braking_mps2: float = Field(default=0.5, gt=0)
     reaction_s: float = Field(default=3.0, ge=0)  #: Time before the brakes act, with that since the newest report.
-    #: "spare": reports go over bearer B only while A fails.
     mode: LinkMode = option("Send reports over bearer A alone, and over B while A fails.", "both", name="--spare")
 
 

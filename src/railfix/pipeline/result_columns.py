@@ -6,7 +6,7 @@ reference document are made from the same `Column` objects.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final, Generic, TypeVar
@@ -103,6 +103,11 @@ def decimals(name: str) -> int:
 def by_name(columns: Iterable[Column[Source]]) -> dict[str, Column[Source]]:
     """Return columns by their name, in order."""
     return {column.name: column for column in columns}
+
+
+def of_one_meaning(meaning: str, **values: str | Callable[[Any], NDArray[Any] | None]) -> Iterator[Column[Any]]:
+    """Yield columns of floats with one meaning, and each with values of its own."""
+    return (Column(name, meaning, source) for name, source in values.items())
 
 
 def float_column(values: Floats) -> pl.Series:
@@ -219,19 +224,17 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "level for noise alone, with its share of the risk; may exceed `protection_level_m`",
             "protection.level.fault_free_m",
         ),
-        Column(
-            "protection_one_fault_m",
+        *of_one_meaning(
             "the same for faults of one satellite, of two; 0 where less likely than its share",
-            "protection.level.one_fault_m",
+            protection_one_fault_m="protection.level.one_fault_m",
+            protection_two_faults_m="protection.level.two_fault_m",
         ),
-        Column(
-            "protection_two_faults_m",
-            "the same for faults of one satellite, of two; 0 where less likely than its share",
-            "protection.level.two_fault_m",
+        *of_one_meaning(
+            "K of each part",
+            protection_k_fault_free="protection.level.k_fault_free",
+            protection_k_one_fault="protection.level.k_one_fault",
+            protection_k_two_faults="protection.level.k_two_faults",
         ),
-        Column("protection_k_fault_free", "K of each part", "protection.level.k_fault_free"),
-        Column("protection_k_one_fault", "K of each part", "protection.level.k_one_fault"),
-        Column("protection_k_two_faults", "K of each part", "protection.level.k_two_faults"),
         Column(
             "protection_separation",
             "largest distance of the position of a hypothesis, over its threshold",
@@ -293,15 +296,10 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "map_offset.across_m",
         ),
         Column("map_offset_up_m", "the same, above the line", "map_offset.up_m"),
-        Column(
-            "map_detectable_across_m",
+        *of_one_meaning(
             "smallest offset, across and up, that the status `map_offset` names (99 %)",
-            lambda r: r.map_offset.detectable_m[:, 0],
-        ),
-        Column(
-            "map_detectable_up_m",
-            "smallest offset, across and up, that the status `map_offset` names (99 %)",
-            lambda r: r.map_offset.detectable_m[:, 1],
+            map_detectable_across_m=lambda r: r.map_offset.detectable_m[:, 0],
+            map_detectable_up_m=lambda r: r.map_offset.detectable_m[:, 1],
         ),
         Column(
             "map_offset_statistic",
@@ -387,15 +385,10 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
             "filter along the track: code less what earlier epochs predict, where codes count (once a second)",
             lambda o: o.innovations["innovation_code_m"],
         ),
-        Column(
-            "innovation_phase_m",
+        *of_one_meaning(
             "the same of the carrier phase's change, of the Doppler",
-            lambda o: o.innovations["innovation_phase_m"],
-        ),
-        Column(
-            "innovation_doppler_mps",
-            "the same of the carrier phase's change, of the Doppler",
-            lambda o: o.innovations["innovation_doppler_mps"],
+            innovation_phase_m=lambda o: o.innovations["innovation_phase_m"],
+            innovation_doppler_mps=lambda o: o.innovations["innovation_doppler_mps"],
         ),
         Column(
             "weight_code",

@@ -83,7 +83,6 @@ class ErrorBins(Settings):
     elevation_deg: tuple[Annotated[float, Field(ge=0.0, le=90.0)], ...] = option(
         "Edges of the bins of elevation.", (0.0, 15.0, 30.0, 45.0, 60.0, 90.0), name="--elevations", metavar="DEG,..."
     )
-    #: Sectors of azimuth relative to the car body, the first one centred ahead, clockwise.
     sectors: int = option("Sectors of azimuth, the first centred ahead of the car.", 4, metavar="N", ge=1)
     #: Edges, rising, C + 1 of them; values beyond the outer ones belong to the outer bins. Observations without C/N0 go
     #: into the lowest.

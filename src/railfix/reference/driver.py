@@ -31,6 +31,7 @@ from railfix.reference.build import ReferenceData, build_references
 from railfix.reference.fixes import FixRejection, ReferenceSettings
 from railfix.reference.smoother import Built
 from railfix.run.inputs import (
+    BROKEN_LINES,
     TRACK,
     VEHICLE,
     Antenna,
@@ -49,7 +50,6 @@ from railfix.track.trajectory import Trajectory
 class ReferenceInputs(InputFiles):
     """Input files of a reference."""
 
-    #: Positions of the front (or only) and of the rear antenna.
     rtk: Path | None = input_option(
         "Positions of the front (or only) antenna: RTKLIB .pos, NMEA (.nmea) or CSV with named columns.", None
     )
@@ -57,7 +57,6 @@ class ReferenceInputs(InputFiles):
 
     track: tuple[Path, ...] = input_option(TRACK, metavar="TRACK")
     vehicle: Path | None = input_option(VEHICLE, None, metavar="TOML")
-    #: Observation files of either antenna and navigation files, for Doppler speeds; may be empty.
     front: tuple[Path, ...] = input_option(
         "RINEX observation file of the front antenna, for Doppler speeds; repeat it for several.", (), metavar="OBS"
     )
@@ -101,14 +100,10 @@ class ReferenceInputs(InputFiles):
 class ReferenceOptions(Settings):
     """Options that do not change the reference."""
 
-    #: Of NMEA logs that have none (UTC), and of RTCM 3 logs (to within half a week).
     date: dt.date | None = option(
         "UTC date of an NMEA log without RMC sentences, or of an RTCM 3 log.", None, metavar="DATE"
     )
-    #: What to do with lines that cannot be read.
-    broken_lines: BrokenLines = option(
-        "Count broken lines of the input files and continue, instead of stopping.", "stop", name="--lenient"
-    )
+    broken_lines: BrokenLines = BROKEN_LINES
 
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
     track: TrackReading = Field(default_factory=TrackReading)

@@ -49,6 +49,11 @@ BALISE_LIST: Final = (
 VIRTUAL_BALISES: Final = "Places whose passing is reported with its interval: a list as of --balise-list. Needs levels."
 
 
+BROKEN_LINES: Final[Any] = option(
+    "Count broken lines of the input files and continue, instead of stopping.", "stop", name="--lenient"
+)
+
+
 class InputFiles(Settings):
     """Input files of a command, each field a path, several paths, or None."""
 
@@ -343,9 +348,7 @@ class RunOptions(Settings):
         "skip",
         name="--observations",
     )
-    broken_lines: BrokenLines = option(
-        "Count broken lines of the input files and continue, instead of stopping.", "stop", name="--lenient"
-    )
+    broken_lines: BrokenLines = BROKEN_LINES
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
     chunk_epochs: int = option(
         "Epochs in memory at a time; the results do not depend on it.", 4000, name="--chunk", metavar="EPOCHS", ge=1

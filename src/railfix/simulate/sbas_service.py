@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -229,22 +230,15 @@ class Service:
 
     def fast_messages(self) -> list[Callable[[int, int], Bytes]]:
         """Messages of types 2 to 5 and 24, each a function of the second and of the issue (IODF)."""
-        count = len(self.satellites)
+        return [partial(self._fast, block=block) for block in range(-(-len(self.satellites) // _FAST))]
 
-        def of_block(block: int) -> Callable[[int, int], Bytes]:
-            first = _FAST * block
-            part = slice(first, first + _FAST)
-
-            def compose(second: int, issue: int) -> Bytes:
-                values, grades = self.fast_m(second)[part].tolist(), self.indicators(second)[part]
-                if first > 0 and count - first <= _MIXED:
-                    pair = self.orbits(second)[-2:]
-                    return mixed(second, values, grades, pair, block=block, iodf=issue)
-                return fast(second, values, grades, kind=2 + block, iodf=issue)
-
-            return compose
-
-        return [of_block(block) for block in range(-(-count // _FAST))]
+    def _fast(self, second: int, issue: int, block: int) -> Bytes:
+        first = _FAST * block
+        part = slice(first, first + _FAST)
+        values, grades = self.fast_m(second)[part].tolist(), self.indicators(second)[part]
+        if first > 0 and len(self.satellites) - first <= _MIXED:
+            return mixed(second, values, grades, self.orbits(second)[-2:], block=block, iodf=issue)
+        return fast(second, values, grades, kind=2 + block, iodf=issue)
 
     def slow_messages(self) -> list[Callable[[int], Bytes]]:
         """All other messages in the order in which they are sent in turn, each a function of the second."""
@@ -256,20 +250,18 @@ class Service:
             lambda second: parameters(second, iltc_v0=120, iiono=300),
             lambda second: integrity(second, self.indicators(second), iodf=(3, 3, 3, 3)),
         ]
-        messages += [self._long_term(first) for first in range(0, count, _LONG_TERM)]
+        messages += [partial(self._long_term, first=first) for first in range(0, count, _LONG_TERM)]
         for band, points in self.bands.items():
-            messages.append(self._grid_mask(band))
-            messages += [self._grid_delays(band, block) for block in range(-(-len(points) // _DELAYS))]
+            bits = [point[0] for point in points]
+            messages.append(partial(grid_mask, band=band, bits=bits, bands=len(self.bands)))
+            messages += [
+                partial(self._grid_delays, band=band, block=block) for block in range(-(-len(points) // _DELAYS))
+            ]
         return messages
 
-    def _long_term(self, first: int) -> Callable[[int], Bytes]:
-        return lambda second: long_term(second, self.orbits(second)[first : first + _LONG_TERM])
+    def _long_term(self, second: int, first: int) -> Bytes:
+        return long_term(second, self.orbits(second)[first : first + _LONG_TERM])
 
-    def _grid_mask(self, band: int) -> Callable[[int], Bytes]:
-        bits = [point[0] for point in self.bands[band]]
-        return lambda second: grid_mask(second, band, bits, bands=len(self.bands))
-
-    def _grid_delays(self, band: int, block: int) -> Callable[[int], Bytes]:
+    def _grid_delays(self, second: int, band: int, block: int) -> Bytes:
         points = self.bands[band][_DELAYS * block : _DELAYS * (block + 1)]
-        grades = [self._settings.givei] * len(points)
-        return lambda second: grid_delay(second, band, block, self.delays_m(second, points), grades)
+        return grid_delay(second, band, block, self.delays_m(second, points), [self._settings.givei] * len(points))

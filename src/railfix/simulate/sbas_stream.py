@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -133,20 +134,16 @@ class SimulatedDfmc(Service):
             lambda second: mask(second, slots),
             lambda second: parameters(second, valid_s=240.0, degradation=(30.0, 0.0, _GROWTH_MPS)),
         ]
-        return messages + [self._correction(k, slot) for k, slot in enumerate(slots)]
+        return messages + [partial(self._correction, k=k, slot=slot) for k, slot in enumerate(slots)]
 
-    def _correction(self, k: int, slot: int) -> Callable[[int], Bytes]:
+    def _correction(self, second: int, k: int, slot: int) -> Bytes:
         day_s = float(seconds(self._start - self._start.astype("datetime64[D]")))
-
-        def compose(second: int) -> Bytes:
-            _, issue, place, _ = self.orbits(second)[k]
-            moved = (*place, float(self.clocks_m(second)[k]))
-            return correction(
-                second, slot, issue, moved, time_of_day_s=(day_s + second) % SECONDS_PER_DAY,
-                covariance=_COVARIANCE, dfrei=self.indicators(second)[k],
-            )  # fmt: skip
-
-        return compose
+        _, issue, place, _ = self.orbits(second)[k]
+        moved = (*place, float(self.clocks_m(second)[k]))
+        return correction(
+            second, slot, issue, moved, time_of_day_s=(day_s + second) % SECONDS_PER_DAY,
+            covariance=_COVARIANCE, dfrei=self.indicators(second)[k],
+        )  # fmt: skip
 
 
 LOST: Final = 53  #: Stream of random numbers of lost messages.

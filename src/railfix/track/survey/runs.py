@@ -37,7 +37,6 @@ class SurveyLimits(Settings):
     #: curves and braking last, three road vehicles' changes are 1.2 to 1.8 times the root of the time.
     acceleration_mps2: float = Field(default=1.5, gt=0)
     freedom: float = Field(default=3.0, gt=0)  #: Degrees of freedom of Student's t errors: outliers lose their weight.
-    #: Passes so near to each other, in the same or the opposite direction, are on one line.
     same_line_m: float = option(
         "Passes nearer to each other than this, in the same or the opposite direction, are on one line.",
         20.0,
@@ -45,7 +44,6 @@ class SurveyLimits(Settings):
         metavar="M",
         gt=0,
     )
-    #: Standard deviation of the distance of a pass from the line: lanes, other antennas.
     apart_m: float = option(
         "Standard deviation of the distance of a pass from the line: lanes, antennas on other places of the vehicle.",
         0.5,
@@ -53,7 +51,6 @@ class SurveyLimits(Settings):
         metavar="M",
         gt=0,
     )
-    #: Distance between points of the map.
     spacing_m: float = option(
         "Distance between the points of the map.", 5.0, name="--spacing", metavar="M", gt=0, le=100.0
     )
