@@ -277,9 +277,7 @@ def _write_files(
 
 
 def _csv(table: pl.DataFrame, decimals: int | None) -> bytes:
-    text = BytesIO()
-    table.write_csv(text, float_precision=decimals, datetime_format=CSV_TIME)
-    return text.getvalue()
+    return table.write_csv(float_precision=decimals, datetime_format=CSV_TIME).encode()
 
 
 def _parquet(table: pl.DataFrame) -> bytes:
