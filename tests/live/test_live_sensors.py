@@ -21,12 +21,12 @@ from railfix.core.settings import write_toml
 from railfix.core.timescale import GPS_EPOCH
 from railfix.io.train_message import MessageStatus, Source
 from railfix.live import watches
+from railfix.live.console import SensorWatch
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
 from railfix.live.forms import passing_rows
 from railfix.live.settings import LiveSettings
 from railfix.live.state import SavedSession, load_state, write_state
 from railfix.live.stream import FOREVER, Sensed, SensorLines
-from railfix.live.watches import SensorWatch
 from railfix.motion.samples import SENSORS, BaliseReadings, RadarSpeeds, SensorSamples, StationRanges
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.filter_result import AlongTrack

@@ -20,7 +20,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import OutputError, SettingsError
 from railfix.io.logs import read_navigation
 from railfix.live.channels import TwoChannels
-from railfix.live.console import SessionLog, check_log_file, serve_metrics
+from railfix.live.console import PlaceWatch, SensorWatch, SessionLog, check_log_file, serve_metrics
 from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveInputs, LiveSettings
@@ -29,7 +29,6 @@ from railfix.live.sources import check_source, is_file
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
 from railfix.live.stream import FOREVER, Sensed
 from railfix.live.warm_up import prepare_kernels
-from railfix.live.watches import PlaceWatch, SensorWatch
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.balises import balise_notes
 from railfix.pipeline.processor import EpochProcessor

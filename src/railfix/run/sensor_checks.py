@@ -250,7 +250,7 @@ class SensorChecks:
         return notes
 
     def radar_alarms(self, radar: RadarSpeeds) -> tuple[str, ...]:
-        """Return a sentence on each alarm of the radar while its table lasts (live: `railfix.live.watches`)."""
+        """Return a sentence on each alarm of the radar while its table lasts (live: `railfix.live.console`)."""
         if not self.speeds or not len(radar):
             return ()
         speeds = pl.concat(self.speeds)
