@@ -94,6 +94,11 @@ class SearchIndex:
         middles, radii = zip(*self.levels, strict=True)
         return np.concatenate(middles), np.concatenate(radii), np.cumsum([0, *map(len, middles)])
 
+    @cached_property
+    def arc_of_points_m(self) -> Floats:
+        """Arc length of each point, the least of those that a line has there, shape (V,) [m]."""
+        return self.trajectory.nearest(self.trajectory.ecef_m)[0]
+
     def clear_of_tangent_m(self, arc_m: Floats) -> Floats:
         """Return a distance within which no part of the line lies off the tangent, at positions on it, shape (T,) [m].
 
