@@ -110,7 +110,7 @@ class SearchIndex:
         unknown = np.isnan(self._clear_m[section])
         if unknown.any():
             new = np.unique(section[unknown])
-            self._clear_m[new] = kernels.off_tangent.clear_of_sections(
+            self._clear_m[new] = kernels.search.clear_of_sections(
                 line.ecef_m, line.tangent, line.across, line.length_m, self.stretches, new
             )
         return np.asarray(self._clear_m[section])
