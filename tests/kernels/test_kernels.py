@@ -76,7 +76,7 @@ KERNELS = {
     "ranges": ("reduced_equations", "misfits", "iterated_points", "dilutions", "iterated_along"),
     "reading": ("decoded_fields", "placed_fields", "line_ends"),
     "robust": ("reweighted",),
-    "screens": ("suspicions", "clock_medians"),
+    "screens": ("suspicions", "clock_medians", "falls_of_cn0", "clock_steps", "holds"),
     "search": ("radii_of_balls", "points_in_balls", "best_points", "clear_of_sections"),
     "windows": ("window_ages", "decayed_sums"),
 }
